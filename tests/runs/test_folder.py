@@ -16,7 +16,7 @@ import pytest
 from dyngs.api.prune import prune_run
 from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import train
-from dyngs.cli.demo_run import is_unused
+from dyngs.cli.demo import is_unused
 from dyngs.config import Config, DataConfig, RandomInit, RunConfig, TrainConfig
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
