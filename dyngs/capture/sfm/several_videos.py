@@ -119,8 +119,6 @@ def _write_capture(
             f"{source}: holds {len(videos)} videos, two or more are needed; give one video as the file itself"
         )
     starts, held_out = read_given(source, [video.name for video in videos])
-    if options.starts is not None:
-        starts = checked_starts(options.starts, [video.name for video in videos], "--start")
     lines = colour_notes(video.info for video in videos)
     images, line = _static_images(source, videos, report)
     lines.append(line)
