@@ -70,7 +70,7 @@ class Reader:
 def read_whole_capture(root: Path) -> object:
     """Read as ``dyngs data inspect --deep`` and ``dyngs train`` do: report, views, points, body,
     images."""
-    from dyngs.capture.inspection.report import format_report, inspect_capture
+    from dyngs.capture.inspection import format_report, inspect_capture
     from dyngs.config import DataConfig
     from dyngs.core.errors import DyngsError
     from dyngs.data.loader import ImageLoader

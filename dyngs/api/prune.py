@@ -114,14 +114,14 @@ def prune_within(
     with kernel_threads(config.run.threads or num_cores()), bytewise:
         trainer = assemble(config, read_capture_of(config.data, start.info), restored=True)
         trainer.restore(start)
-        chosen, file, promise = Search(trainer, start, tell, unseen_images(trainer)).run(max_loss)
+        chosen, data, promise = Search(trainer, start, tell, unseen_images(trainer)).run(max_loss)
     with new_folder(out, require_empty) as started:
         _copy_start(run_dir, started)
         seconds = seconds_at(run_dir, start.info.step) + time.perf_counter() - begun
         smaller = replace(chosen.checkpoint, settings=settings_of(chosen.config))
         save_checkpoint(started, smaller, seconds)
         write_config(chosen.config, started)
-        write_scene(started / EXPORT_FOLDER / SCENE_FILE, file.data)
+        write_scene(started / EXPORT_FOLDER / SCENE_FILE, data)
         write_config(chosen.config, started / EXPORT_FOLDER)
     return promise
 

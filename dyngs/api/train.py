@@ -142,8 +142,8 @@ def train(
         return folder
     keep_freed_memory()
     bytewise = deterministic(device, config.run.deterministic)
-    with writing(folder) as held, kernel_threads(_num_threads(config, processes)), bytewise:
-        tidy(folder, sole_writer=held.alone)
+    with writing(folder) as alone, kernel_threads(_num_threads(config, processes)), bytewise:
+        tidy(folder, sole_writer=alone)
         resumed = None
         if resume_from is None:
             plan = replace(plan, requested=plan.resolved)

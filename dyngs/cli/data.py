@@ -210,7 +210,7 @@ def _add_synth(verbs: args.Commands) -> None:
 
 def run_inspect(arguments: argparse.Namespace) -> int:
     """Print a report on a capture, or on videos without poses."""
-    from dyngs.capture.inspection.report import format_report, inspect_capture
+    from dyngs.capture.inspection import format_report, inspect_capture
     from dyngs.capture.sfm.unposed import is_videos
     from dyngs.data.read import capture_folder
 
@@ -227,7 +227,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
         raise DyngsError(report.problems[0])
     print_lines(format_report(report))
     if arguments.image is not None:
-        from dyngs.capture.inspection.report import draw_cameras
+        from dyngs.capture.inspection import draw_cameras
 
         draw_cameras(report.capture, arguments.image)
         print(f"written: {arguments.image}")
@@ -235,7 +235,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
 
 
 def _inspect_videos(arguments: argparse.Namespace) -> int:
-    from dyngs.capture.inspection.report import video_report
+    from dyngs.capture.inspection import video_report
 
     if arguments.image is not None:
         raise DyngsError(

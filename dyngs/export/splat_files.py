@@ -46,7 +46,6 @@ from dyngs.io.formats.splat_file import (
     SplatFile,
     drawable,
     from_linear,
-    geo_comment,
     header_comments,
     offset_notes,
     require_writable,
@@ -326,8 +325,6 @@ def splats_at(
     splat = SplatFile(gaussians, model.rasterize_mode, model.eps2d, (x, y, z), tuple(comments))
     if opened.edited is not None:
         splat = moved_file(splat, opened.frame.after(opened.file_unit.inverse()), opened.edited.up)
-        if any(opened.edited.offset):
-            splat = replace(splat, comments=(*splat.comments, geo_comment(opened.edited.offset)))
     splat = turned_file(splat, how.turn, how.up)
     return splat if how.edit == UNMOVED else moved_file(splat, how.edit, how.up)
 

@@ -7,15 +7,13 @@ import errno
 import json
 import os
 import platform
-import stat
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 
-from dyngs.core.errors import DyngsError, warn
+from dyngs.core.errors import DyngsError, require_regular, warn
 from dyngs.io.containment import leaving_links
 from dyngs.io.outputs import require_within_run
 
@@ -40,23 +38,10 @@ class InUseError(DyngsError):
     """Another process writes into the folder."""
 
 
-@dataclass(frozen=True)
-class Held:
-    """A folder that this process writes into; ``alone``: no other does, which is not known where
-    there are no locks."""
-
-    path: Path
-    alone: bool
-
-    def folder(self) -> Path | None:
-        """Return the folder; None: it was removed, or has another name by now."""
-        return self.path if self.path.is_dir() else None
-
-
 @contextmanager
-def writing(folder: Path) -> Iterator[Held]:
-    """Yield the folder, into which no other process writes in the block, if its file system has
-    locks.
+def writing(folder: Path) -> Iterator[bool]:
+    """Yield whether no other process writes into the folder in the block, which is not known where
+    its file system has no locks.
 
     The folder is made where it is missing, and removed where nothing came of it. The file
     ``run.lock`` says who writes. A file system that has no locks (some network file systems) is
@@ -76,7 +61,7 @@ def writing(folder: Path) -> Iterator[Held]:
     try:
         file, is_locked = _locked(folder / LOCK_NAME)
         try:
-            yield Held(folder, is_locked)
+            yield is_locked
         finally:
             _freed(folder / LOCK_NAME, file)
     finally:
@@ -133,16 +118,13 @@ def _made(folder: Path) -> list[Path]:
 def _locked(path: Path) -> tuple[int, bool]:
     """Return the lock file ``path``, open, and whether it is locked."""
     folder = path.parent
-    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
     while True:
+        require_regular(path)
         try:
             file = os.open(path, flags, 0o666)
         except OSError as error:
-            link = "; it is a link, remove it" if path.is_symlink() else ""
-            raise DyngsError(f"cannot write {path}: {error.strerror or error}{link}") from error
-        if not stat.S_ISREG(os.fstat(file).st_mode):
-            os.close(file)
-            raise DyngsError(f"cannot write {path}: not a file; remove it")
+            raise DyngsError(f"cannot write {path}: {error.strerror or error}") from error
         try:
             _lock(file)
         except OSError as error:

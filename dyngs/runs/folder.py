@@ -16,7 +16,7 @@ from dyngs.io.lock import LOCK_NAME, writing
 from dyngs.io.outputs import new_folder
 from dyngs.io.write import remove_leftovers
 from dyngs.models.kind import Predicts, capability
-from dyngs.runs.capture_record import RECORD_NAME, changed_files
+from dyngs.runs.capture_record import RECORD_NAME, require_same_capture
 from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, checkpoint_paths, step_of
 from dyngs.runs.config_file import BODY_FOLDER, with_body_of, write_config
 
@@ -40,23 +40,6 @@ def default_folder(name: str) -> Path:
             f"run.name={name!r}: must name a folder below runs; for another place give run.dir=FOLDER"
         )
     return Path("runs", name)
-
-
-def require_no_run(folder: Path) -> None:
-    """Raise unless a new run can be written to ``folder`` without replacing anything."""
-    found = _found(folder)
-    if checkpoint_paths(folder):
-        raise DyngsError(
-            f"{folder} already holds a run; go on with `dyngs train --resume {as_word(folder)}` or give another folder"
-        )
-    if SCENE_FILE in found:
-        raise DyngsError(
-            f"{folder} already holds a run, as {SCENE_FILE}, which can be drawn but not trained on; give another folder"
-        )
-    if found:
-        raise DyngsError(
-            f"{folder} already holds {found[0]}, which a new run would replace; give another folder"
-        )
 
 
 def require_empty(folder: Path) -> None:
@@ -111,14 +94,22 @@ def require_startable(folder: Path, config: Config) -> None:
     """Raise unless the run of ``config`` would replace nothing in ``folder`` but what the same run
     has only begun."""
     begun = _config_of_begun(folder)
-    if begun is None:
-        if checkpoint_paths(folder):
-            raise DyngsError(_about_other(folder, config))
-        require_no_run(folder)
-    elif not (_is_same_run(begun, config) or _is_as_asked(folder, config)):
+    paths = checkpoint_paths(folder)
+    found = _found(folder)
+    go_on = f"`dyngs train --resume {as_word(folder)}`, or give another run.dir"
+    if paths:
         raise DyngsError(
-            f"{folder} already holds another run, stopped before its first checkpoint; begin that again with `dyngs "
-            f"train --resume {as_word(folder)}`, give another run.dir, or remove the folder"
+            f"{folder} already holds a run, stopped after step {step_of(paths[-1]):,}; go on with {go_on}"
+        )
+    if begun is not None:
+        if not (_is_same_run(begun, config) or _is_as_asked(folder, config)):
+            raise DyngsError(
+                f"{folder} already holds another run, stopped before its first checkpoint; "
+                f"begin that again with {go_on}"
+            )
+    elif found:
+        raise DyngsError(
+            f"{folder} already holds {found[0]}, which a new run would replace; give another run.dir"
         )
 
 
@@ -149,7 +140,7 @@ def note_root(folder: Path, data: DataConfig) -> None:
         if stored is not None and stored.data.root != data.root:
             is_network = capability(stored.model, Predicts) is not None
             capture = None if is_network else read_capture(data)
-            changed_files(folder, data, capture)
+            require_same_capture(folder, data, capture)
             save_config(
                 stored.model_copy(
                     update={"data": stored.data.model_copy(update={"root": data.root})}
@@ -169,27 +160,6 @@ def _is_as_asked(folder: Path, config: Config) -> bool:
         return _is_same_run(asked_for(folder), config)
     except DyngsError:  # a file of that name, but not of a run
         return False
-
-
-def _about_other(folder: Path, config: Config) -> str:
-    """Return why the run of ``config`` cannot begin in ``folder``, which has checkpoints, and what
-    to do."""
-    try:
-        stored = load_resolved(folder)
-        asked = asked_for(folder)
-    except DyngsError:
-        return f"{folder} already holds a run, whose {RESOLVED_NAME} cannot be read; give another run.dir"
-    done = step_of(checkpoint_paths(folder)[-1])
-    if _is_same_run(asked, config):
-        return (
-            f"{folder} already holds a run, this very one, stopped after step {done:,} of {stored.total_steps:,}; go "
-            f"on with `dyngs train --resume {as_word(folder)}`"
-        )
-    train = config.train.model_copy(update={"steps": asked.train.steps})
-    is_longer = config.train.steps > done
-    longer = is_longer and _is_same_run(asked, config.model_copy(update={"train": train}))
-    go_on = f", or go on to that with `dyngs train --resume {as_word(folder)} train.steps={config.train.steps}`"
-    return f"{folder} already holds another run; give another run.dir to keep both{go_on if longer else ''}"
 
 
 def was_only_begun(folder: Path) -> bool:

@@ -4,12 +4,12 @@ moved."""
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import numpy as np
-
-from dyngs.core.errors import DyngsError, require_regular
+from dyngs.core.errors import DyngsError
+from dyngs.io.fields import read_limited
 from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity, similarity_of
 from dyngs.io.write import write_text
 
@@ -48,22 +48,15 @@ def read_frame(folder: Path) -> RunFrame | None:
     path = folder / FRAME_NAME
     if not path.exists():
         return None
-    require_regular(path)
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise ValueError("too large")
-        told = json.loads(path.read_bytes())
-        similarity, (x, y, z) = (
-            similarity_of([float(a) for a in told["similarity"]]),
-            map(float, told["offset"]),
-        )
+        told = json.loads(read_limited(path, _MOST_BYTES))
+        similarity = similarity_of([float(a) for a in told["similarity"]])
+        x, y, z = map(float, told["offset"])
         up = told["up"]
         fixed = told["fixed"]
-        if not (
-            np.isfinite((x, y, z)).all() and (up is None or up in AXES) and isinstance(fixed, bool)
-        ):
+        if not math.isfinite(x + y + z) or up not in (None, *AXES) or not isinstance(fixed, bool):
             raise ValueError("no offset or no axis")
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (DyngsError, ValueError, KeyError, TypeError, RecursionError):
         raise DyngsError(
             f"{path}: is no frame of `dyngs edit`; edit the original run again"
         ) from None

@@ -282,9 +282,7 @@ def open_scene(
     Raises:
         DyngsError: nothing is there, it is damaged, or it is something else.
     """
-    if (path.is_dir() and format_to_read(path) is None) or (
-        path.name == SCENE_FILE and path.exists()
-    ):
+    if path.is_dir() or (path.name == SCENE_FILE and path.exists()):
         folder = path if path.is_dir() else path.parent
         return open_run(folder, data_root=data_root, with_capture=with_capture)
     if not path.exists():

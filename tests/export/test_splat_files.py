@@ -299,7 +299,7 @@ def test_the_animation_of_bodies_shows_the_scene_at_all_times(
     assert seconds[-1] == pytest.approx(rolling.seconds)
     assert (samples["rotation"][1:] * samples["rotation"][:-1]).sum(1).min() > 0
     turns = Slerp(seconds, Rotation.from_quat(samples["rotation"]))
-    local = found.means[:2].numpy() - body.translation
+    local = found.means[:2].numpy() - np.array(body["translation"])
     for time in (0.0, 0.25, 0.3, 0.875):
         now = time * rolling.seconds
         place = np.array([np.interp(now, seconds, samples["translation"][:, k]) for k in range(3)])

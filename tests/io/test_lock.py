@@ -58,8 +58,8 @@ def test_a_killed_owner_frees_it(tmp_path: Path) -> None:
         process.send_signal(signal.SIGKILL)
         process.wait()
         assert json.loads((run / LOCK_NAME).read_text())["pid"] == process.pid
-        with writing(run) as held:
-            assert held.alone
+        with writing(run) as alone:
+            assert alone
             assert json.loads((run / LOCK_NAME).read_text())["pid"] == os.getpid()
     assert not run.exists() or not list(run.iterdir())
 

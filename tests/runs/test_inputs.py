@@ -12,7 +12,7 @@ from moving_scene import write_moving_run
 import dyngs
 from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import train
-from dyngs.capture.inspection.report import draw_cameras
+from dyngs.capture.inspection import draw_cameras
 from dyngs.config import RunConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.core.errors import DyngsError

@@ -78,10 +78,7 @@ class SfmTask:
     def has_one_lens(self) -> bool:
         """Whether all images share a lens: of a video, or of the same size, camera model and focal
         length (EXIF)."""
-        kinds = {
-            (p.header.upright_size, p.header.tags.model, p.header.tags.focal_px)
-            for p in self.photos
-        }
+        kinds = {(p.header.upright_size, p.header.camera, p.header.focal_px) for p in self.photos}
         return self.is_video or len(kinds) == 1
 
 

@@ -193,7 +193,7 @@ def posed_by_avatar(
 
 def _fitted(player: HumanScene, images: ImageLoader) -> HumanScene:
     nothing = player.gaussians.means.new_zeros(3)
-    return fitted_to_images(player, images, nothing, SILHOUETTES).scene
+    return fitted_to_images(player, images, nothing, SILHOUETTES)[0]
 
 
 def _left_out(views: Sequence[View]) -> tuple[list[View], list[View]]:
