@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from dyngs.models.renderable import (
     Renderable,
     Rendering,
     Surface,
+    SurfaceOptions,
     TimeStep,
     composited,
     fixed_cameras,
@@ -56,6 +57,10 @@ class FieldScene(Renderable):
     seen_at: tuple[float, ...] = ()
     options: DrawOptions = dataclasses.field(default_factory=DrawOptions)
     background: Tensor | None = None
+    surface_options: ClassVar[frozenset[str]] = frozenset({"level", "cells"})
+
+    def own_surface(self, time: float, options: SurfaceOptions) -> Surface:
+        return surface_of(self, time, options.level, options.cells)
 
     @property
     def times(self) -> tuple[float, ...]:

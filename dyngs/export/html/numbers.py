@@ -20,8 +20,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dyngs.baselines.triangles.patches import CORNERS
-from dyngs.baselines.triangles.scene import TriangleScene
 from dyngs.core.gaussians import storage_order
 from dyngs.deform.control_nodes import FOLLOWED, ControlNodes, spline_basis
 from dyngs.deform.field import DeformationField, Offsets
@@ -168,27 +166,6 @@ def block_files(levels: Levels, *, with_rest: bool) -> Iterator[tuple[str, bytes
         for place in range(len(balls)):
             numbers = block_numbers(levels, (level, place), with_rest=with_rest)
             yield f"{level}-{place}.bin", numbers.deflated()
-
-
-def add_triangles(scene: TriangleScene, lists: Lists) -> dict[str, Any]:
-    """Add the numbers of curved triangles to ``lists`` and return what the page needs to know about
-    them."""
-    patches = scene.patches
-    middles = _numpy(patches.points[:, CORNERS].mean(1))
-    order = torch.from_numpy(storage_order(middles, np.zeros(0, dtype=np.int64)))
-    lists.quantised("points", _numpy(patches.points[order].flatten(1)), 16)
-    lists.quantised("colours", _numpy(patches.colours[order].flatten(1)), 8)
-    if patches.sh_degree:
-        lists.quantised("rest", _numpy(patches.harmonics[order].flatten(1)), 8)
-    return {
-        "count": len(scene),
-        "frames": 0,
-        "moves": False,
-        "degree": patches.sh_degree,
-        "texture": patches.texture,
-        "segments": scene.options.segments,
-        "bounds": scene.bounds.tolist(),
-    }
 
 
 def _add_gaussians(gaussians: Gaussians, lists: Lists, *, with_rest: bool) -> dict[str, Any]:
