@@ -18,7 +18,6 @@ from moving_scene import (
     write_moving_run,
 )
 from pretend_gpu import GPU, pretend_gpu
-from scene_kinds import scene_of_kind
 from splat_scenes import cloud
 from view_sessions import balls, looking_at_balls, opened_at
 
@@ -30,7 +29,7 @@ from dyngs.gaussians import levels
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.runs.opened import Opened, open_run, open_scene
-from dyngs.view.controls import Frusta, distinct, frustum_size
+from dyngs.view.controls import Frusta
 from dyngs.view.layers import (
     LAYERS,
     PARTS,
@@ -38,7 +37,6 @@ from dyngs.view.layers import (
     coarser,
     draw,
     motion_colours,
-    shows_filled,
 )
 from dyngs.view.views import (
     Viewpoint,
@@ -128,22 +126,6 @@ def test_the_line_divides_render_and_truth(run: Opened) -> None:
     assert not np.array_equal(render, truth)
 
 
-def test_what_no_training_view_shows_of_a_person_is_marked() -> None:
-    scene = scene_of_kind("human")
-    opened = opened_at(scene, "person")
-    assert not shows_filled(opened)
-    seen = torch.ones(len(scene))
-    plain = draw(opened_at(replace(scene, seen=seen)), Shot(camera(80, 56), layer="filled"))
-    assert np.array_equal(plain, draw(opened, Shot(camera(80, 56)))), "all was seen"
-    nothing = opened_at(replace(scene, seen=0 * seen))
-    assert shows_filled(nothing)
-    marked = draw(nothing, Shot(camera(80, 56), layer="filled")).astype(int)
-    covered = draw(opened, Shot(camera(80, 56), layer="alpha"))[..., 0] > 250
-    assert covered.any()
-    assert (marked[covered] >= [240, 0, 240]).all()
-    assert (marked[covered][:, 1] < 20).all(), "magenta"
-
-
 def looking(
     eye: tuple[float, float, float], target: tuple[float, float, float] = (0, 0, 0)
 ) -> Cameras:
@@ -177,26 +159,13 @@ def test_the_nearest_view_is_near_in_place_direction_and_time(tmp_path: Path) ->
     opened = open_scene(write_moving_run(tmp_path))
     shown = views_of(opened)
     for index in range(len(shown)):
-        time = shown.times[index] or 0.0
+        time = shown.views[index].time or 0.0
         assert nearest_view(opened, shown.cameras[index], time) == index
-    assert set(shown.times) == {*TRAIN_TIMES, *TEST_TIMES}
+    assert {view.time for view in shown.views} == {*TRAIN_TIMES, *TEST_TIMES}
     assert has_timeline(opened)
     begin = viewpoint_of(opened)
     assert torch.equal(begin.start.cam_from_world, shown.cameras[0].cam_from_world)
     assert views_of(replace(opened, as_captured=False)).images is None
-
-
-@pytest.mark.parametrize("unit", [1.0, 1e-9])
-def test_a_fixed_camera_has_one_frustum_of_a_size_that_fits(unit: float) -> None:
-    poses = np.tile(np.eye(4), (6, 1, 1))
-    poses[[1, 3], 0, 3] = unit
-    poses[5, 2, 3] = 2.0 * unit
-    assert distinct(poses) == [0, 1, 5]
-    poses = np.tile(np.eye(4), (4, 1, 1))
-    assert frustum_size(poses, 4.0) == pytest.approx(0.2)  # one fixed camera
-    poses[:, 0, 3] = [-1, 1, -1, 1]
-    assert frustum_size(poses, 4.0) == pytest.approx(0.15)
-    assert frustum_size(100 * poses, 4.0) == pytest.approx(0.2)
 
 
 def test_a_frustum_that_the_camera_stands_in_is_hidden() -> None:

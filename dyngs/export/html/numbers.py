@@ -61,33 +61,24 @@ class Lists:
         """
         rows, columns = values.shape
         count = -(-rows // CHUNK)
-        ranges = np.zeros((count, columns, 2), dtype="<f4")
-        quantised = np.zeros((rows, columns), dtype=np.uint16)
-        for i in range(count):
-            part = slice(i * CHUNK, (i + 1) * CHUNK)
-            low = values[part].min(0)
-            high = values[part].max(0)
-            step = ((high.astype(np.float64) - low) / (2**bits - 1)).astype(np.float32)
-            ranges[i] = np.stack([low, step], axis=1)
-            relative = (values[part].astype(np.float64) - low) / np.where(step > 0, step, 1)
-            quantised[part] = relative.round().clip(0, 2**bits - 1)
+        filled = np.pad(values, ((0, count * CHUNK - rows), (0, 0)), mode="edge")
+        chunks = filled.reshape(count, CHUNK, columns).astype(np.float64)
+        low = chunks.min(axis=1)
+        step = ((chunks.max(axis=1) - low) / (2**bits - 1)).astype(np.float32)
+        relative = (chunks - low[:, None]) / np.where(step > 0, step, 1)[:, None]
+        quantised = relative.round().clip(0, 2**bits - 1).astype(np.uint16)
+        quantised = quantised.reshape(-1, columns)[:rows]
         planes = [quantised >> 8, quantised & 255] if bits == 16 else [quantised]
         # (D, planes, R)
         bytes_of = np.stack([plane.T.astype(np.uint8) for plane in planes], axis=1)
+        ranges = np.stack([low, step], axis=2).astype("<f4")
         data = ranges.tobytes() + bytes_of.tobytes()
         self._add(name, data, "quantised", values.shape, bits=bits, chunk=CHUNK)
 
     def exact(self, name: str, values: NDArray[Any]) -> None:
         """Add ``values`` (R, D) as they are: uint8, uint16 or float32."""
-        kind = values.dtype.name
-        if kind not in ("uint8", "uint16", "float32"):
-            raise ValueError(f"{name}: a list of {kind} cannot be added")
-        self._add(name, values.astype(values.dtype.newbyteorder("<")).tobytes(), kind, values.shape)
-
-    @property
-    def size(self) -> int:
-        """Number of bytes before they are deflated."""
-        return self._size
+        data = values.astype(values.dtype.newbyteorder("<")).tobytes()
+        self._add(name, data, values.dtype.name, values.shape)
 
     def deflated(self) -> bytes:
         """Return the block as zlib writes it."""
