@@ -271,11 +271,9 @@ def _written_moving(found: _Source, out: Path, edits: Edits, tell: Tell) -> Edit
     how, up = _frame(found, edits, _up(found, edits.frame), UP)
     _tell_frame(edits, up, UP, tell)
     writing = Writing(edit=how, up=up) if _has_frame(edits) else Writing(turn=how.turn, up=up)
-    written = write_moving(found.opened, out, scene.times, how=writing)
-    redrawn = compare_run(
-        found.opened, scene, scene.times[0], written.splats[0], read_moment(out, 0)
-    )
-    return EditedFile(out, redrawn, written.notes)
+    splats, notes = write_moving(found.opened, out, scene.times, how=writing)
+    redrawn = compare_run(found.opened, scene, scene.times[0], splats[0], read_moment(out, 0))
+    return EditedFile(out, redrawn, notes)
 
 
 def _written_run(

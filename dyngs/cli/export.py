@@ -373,15 +373,14 @@ def _export_moving(
         raise DyngsError(
             f"{out}: players know these files by the suffix {SUFFIX}; give --out {out.name}{SUFFIX}"
         )
-    written = write_moving(
-        opened, out / f"splats{SUFFIX}" if out.is_dir() else out, times, part, how
-    )
+    path = out / f"splats{SUFFIX}" if out.is_dir() else out
+    splats, notes = write_moving(opened, path, times, part, how)
     found = [
-        compare_run(opened, scene, times[i], written.splats[i], read_moment(written.path, i))
+        compare_run(opened, scene, times[i], splats[i], read_moment(path, i))
         for i in _shown(len(times))
     ]
-    print_redrawn(written.notes, found)
-    return [written.path]
+    print_redrawn(notes, found)
+    return [path]
 
 
 def _export_tracks(
