@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from dyngs.view.server import Browsing
 
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
-NEAREST = "nearest"
 AS_CAPTURED, AT_REST = "as captured", "rest pose"
 FILE_NAME = "camera_path.json"
 MOTION_SUFFIXES = (".npz", ".bvh", ".glb", ".gltf", ".vrma")
@@ -114,8 +113,7 @@ class Controls:
     def _add_display(self, gui: viser.GuiApi, opened: Opened) -> None:
         session = self._browsing.session
         scene = opened.renderable if isinstance(opened.renderable, GaussianScene) else None
-        lacking = {"error": not len(views_of(opened)), "motion": scene is None}
-        layers = [name for name in LAYERS if not lacking.get(name)]
+        layers = [name for name in LAYERS if name != "error" or len(views_of(opened))]
         if session.look.layer not in layers:
             session.change(layer="colour")
         hint = "error: against the truth, at a camera of the capture"
@@ -160,27 +158,16 @@ class Controls:
 
     def _add_capture(self, gui: viser.GuiApi, opened: Opened) -> None:
         session = self._browsing.session
-        names = views_of(opened).names
         hint = "frusta with their images; click one to go there"
         cameras = gui.add_checkbox("Cameras", False, hint=hint)
         cameras.on_update(
             lambda _: self._frusta.show(opened) if cameras.value else self._frusta.remove()
         )
-        hint = "with the truth, on the right of the line"
+        hint = "with the nearest image, on the right of the line"
         compare = gui.add_checkbox("Compare", session.look.comparing, hint=hint)
         compare.on_update(lambda _: self._change(comparing=bool(compare.value)))
         divide = gui.add_slider("Divide", 0.0, 1.0, 0.01, session.look.divide)
         divide.on_update(lambda _: session.change(divide=float(divide.value)))
-        view = gui.add_dropdown("Image", (NEAREST, *names))
-        session.change(view=None)
-
-        def choose(_: Any) -> None:
-            index = None if view.value == NEAREST else names.index(str(view.value))
-            session.change(view=index)
-            if index is not None:
-                self._browsing.go_to(index)
-
-        view.on_update(choose)
 
     def _add_motions(self, gui: viser.GuiApi) -> None:
         """Add the motion picker, for files by name."""

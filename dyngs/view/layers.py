@@ -1,5 +1,4 @@
-"""Images of a scene for the viewer: colours, depth, opacity, motion, and the error against the
-truth."""
+"""Images of a scene for the viewer: colours, depth, opacity, and the error against the truth."""
 
 from __future__ import annotations
 
@@ -8,21 +7,18 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
-from torch import Tensor
 from torch.nn.functional import interpolate
 
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import SH_C0
 from dyngs.export.camera_paths import resize_cameras
 from dyngs.export.images import color_map, depth_to_rgb
 from dyngs.gaussians.levels import LevelScene
-from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.io.write import to_uint8
 from dyngs.models.renderable import Rendering, TimeStep
 from dyngs.runs.opened import Opened
 from dyngs.view.views import views_of
 
-Layer = Literal["colour", "depth", "alpha", "motion", "error"]
+Layer = Literal["colour", "depth", "alpha", "error"]
 Part = Literal["all", "moving", "still"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 PARTS: tuple[Part, ...] = get_args(Part)
@@ -103,8 +99,6 @@ def _layer(opened: Opened, shot: Shot) -> np.ndarray:
             return depth_to_rgb(*depth_of(opened, shot))
         case "alpha":
             pixels = _rendering(opened, shot).alpha[0, ..., None].expand(-1, -1, 3)
-        case "motion":
-            pixels = _motion(opened, shot).rgb[0]
         case _:
             pixels = _rendering(opened, shot).rgb[0]
     return to_uint8(pixels.clamp(0, 1).cpu().numpy())
@@ -140,43 +134,3 @@ def depth_of(opened: Opened, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
     (H, W) there."""
     made = _rendering(opened, shot, depth="expected")
     return np.zeros(0) if made.depth is None else made.depth[0].numpy(), made.alpha[0].numpy()
-
-
-def _motion(opened: Opened, shot: Shot) -> Rendering:
-    """Return the image of the motion, on black."""
-    scene = replace(opened.scene.unmasked(), colour=None, background=None)
-    gaussians = scene.at(shot.time)
-    sh = ((motion_colours(opened) - 0.5) / SH_C0)[:, None].to(gaussians.means)
-    coloured = gaussians.replace(sh=sh)
-    if shot.part != "all":
-        moves = torch.zeros(len(scene), dtype=torch.bool, device=sh.device)
-        moves[scene.rows] = not scene.is_static
-        coloured = coloured.select(moves if shot.part == "moving" else ~moves)
-    options = replace(scene.options, sh_degree=0)
-    return scene.render(shot.camera, GaussianTimeStep(coloured, shot.time), options=options)
-
-
-def motion_colours(opened: Opened) -> Tensor:
-    """Return (N, 3) colours of how far each Gaussian moves over all times: dark blue is not at all,
-    red is far.
-
-    Red begins where 99% of those that move are left behind. On the CPU.
-    """
-    return opened.once("motion", lambda: _motion_colours(opened.scene))
-
-
-def _motion_colours(scene: GaussianScene) -> Tensor:
-    far = torch.zeros(len(scene), device=scene.device)
-    if not scene.is_static:
-        whole = scene.unmasked()
-        low = high = whole.at(0.0).means
-        for time in np.linspace(0, 1, 12)[1:].tolist():
-            means = whole.at(time).means
-            low = torch.minimum(low, means)
-            high = torch.maximum(high, means)
-        far = (high - low).norm(dim=1)
-        moves = far[scene.rows]
-        moves = moves[:: max(1, len(moves) // 100_000)]
-        far = far / torch.quantile(moves, 0.99).clamp_min(1e-12)
-    coloured = color_map(far.cpu().numpy()[None], "turbo")[0]
-    return torch.from_numpy(coloured.astype(np.float32) / 255.0)

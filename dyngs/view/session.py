@@ -92,13 +92,11 @@ class Display:
     Attributes:
         layer, part, divide: as in ``Shot``.
         comparing: show the truth next to the render.
-        view: index of the view that is compared with; None: the nearest.
     """
 
     layer: Layer = "colour"
     part: Part = "all"
     comparing: bool = False
-    view: int | None = None
     divide: float = 0.5
 
 
@@ -204,7 +202,9 @@ class Session:
         self._changed_at = self._drawn_at = -1e9
         self._is_stale = True
         self._area = float(_SMALLEST_AREA)  # pixels of an image while something moves
-        self._refined_area = 0.0  # pixels of the image that is shown, if it is of what is there now
+        self._is_refined = (
+            False  # whether the image that is shown is full, and of what is there now
+        )
         self._preview: tuple[Recording, float] | None = None
         self.on_change: Callable[[], None] = lambda: None
         self.on_play: Callable[[bool], None] = lambda playing: None
@@ -244,8 +244,6 @@ class Session:
     def show(self, opened: Opened) -> None:
         """Look at another scene, at the same time."""
         self.opened = opened
-        if (self.look.view or 0) >= len(views_of(opened)):
-            self.change(view=None)
         self.change_timeline(seconds=opened.seconds)
 
     def preview(self, recording: Recording) -> None:
@@ -277,7 +275,7 @@ class Session:
         has_truth = look.comparing or look.layer == "error"
         if eye is None or not has_truth or not len(views_of(opened)):
             return None
-        return nearest_view(opened, eye.camera(), self.time) if look.view is None else look.view
+        return nearest_view(opened, eye.camera(), self.time)
 
     def due(self) -> float | None:
         """Return in how many seconds something is to be drawn; 0: now, None: not before something
@@ -290,7 +288,7 @@ class Session:
         soonest = max(0.0, self._drawn_at + 1 / 30 - now)
         if self._is_moving or self._is_stale:
             return soonest
-        if self._refined_area < 0.99 * math.prod(self._full_size):
+        if not self._is_refined:
             return max(soonest, self._changed_at + STILL_AFTER - now)
         return None
 
@@ -304,13 +302,10 @@ class Session:
         start = self._drawn_at = self._clock()
         version = self._changed_at
         is_moving = self._is_moving or start < version + STILL_AFTER
-        # refined in steps, so that a browser that moves again need not wait long
-        area = self._area if is_moving else max(self._area, 6.0 * self._refined_area)
         full = self._full_size
-        area = min(area, math.prod(full))
-        size = _scaled(full, math.sqrt(area / math.prod(full)))
+        size = _scaled(full, math.sqrt(self._area / math.prod(full))) if is_moving else full
         self._is_stale = False
-        self._refined_area = math.inf  # if it fails, it is not tried again
+        self._is_refined = True  # if it fails, it is not tried again
         image = draw(self.opened, replace(self.shot(size), is_moving=is_moving))
         if not self.closed:
             self._send(Sent(image, not is_moving, self._clock() - start))
@@ -318,9 +313,7 @@ class Session:
         if is_moving:
             factor = min(max(self._target / max(now - start, 1e-9), 0.5), 2.0)
             self._area = max(math.prod(size) * math.sqrt(factor), _SMALLEST_AREA)
-        # Also a full image is drawn once more when all is still: in better quality.
-        is_current = version == self._changed_at
-        self._refined_area = area * (0.9 if is_moving else 1.0) if is_current else 0.0
+        self._is_refined = not is_moving and version == self._changed_at
         timeline = self.timeline
         preview = self._preview
         if timeline.playing and not timeline.loops and timeline.at(now) >= 1.0:
@@ -362,7 +355,7 @@ class Session:
     def _note_change(self) -> None:
         self._changed_at = self._clock()
         self._is_stale = True
-        self._refined_area = 0.0
+        self._is_refined = False
         self.on_change()
 
 

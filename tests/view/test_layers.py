@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from moving_scene import (
-    MOVING_ROWS,
     TEST_TIMES,
     TRAIN_TIMES,
     camera,
@@ -36,7 +35,6 @@ from dyngs.view.layers import (
     Shot,
     coarser,
     draw,
-    motion_colours,
 )
 from dyngs.view.views import (
     Viewpoint,
@@ -94,14 +92,6 @@ def test_many_gaussians_are_drawn_in_levels_while_anything_moves(
     assert np.array_equal(draw(edited, replace(shot, is_moving=True)), draw(edited, shot))
     with pytest.raises(DyngsError, match="for still scenes"):
         coarser(balls(), 300)
-
-
-def test_motion_is_red_where_it_is_far_and_dark_where_nothing_moves() -> None:
-    colours = motion_colours(balls())
-    moving = colours[list(MOVING_ROWS)]
-    assert bool((moving[:, 0] > moving[:, 2]).all())
-    assert bool((colours[0] == colours[2]).all())
-    assert not bool(torch.isclose(moving[0], colours[0]).all())
 
 
 def test_the_moment_of_a_time_is_computed_once() -> None:

@@ -240,7 +240,7 @@ def test_texts_of_strangers_are_shown_and_never_run(browser: Browser, tmp_path: 
             until(lambda viewer=viewer: any(one.num_sent for one in viewer.browsing), page)
             (browsing,) = viewer.browsing
             if folder == run:
-                browsing.session.change(view=0, comparing=True)
+                browsing.session.change(comparing=True)
                 browsing.notify(SCRIPT, FRAME)
             else:
                 page.click("text=Help")

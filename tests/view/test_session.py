@@ -89,9 +89,6 @@ def test_small_while_moving_then_whole_and_then_nothing_until_something_changes(
     looked.after(0.1)
     assert looked.sent[-1].is_refined
     assert looked.sent[-1].image.shape == (900, 1200, 3)
-    refined = [sent.image.size for sent in looked.sent if sent.is_refined]
-    assert refined == sorted(set(refined))
-    assert len(refined) > 1, "in steps"
     assert [shot.is_moving for shot in shots] == [not sent.is_refined for sent in looked.sent]
     assert looked.session.due() is None
     looked.session.move(eye(size=(1200, 900)))  # the same

@@ -134,10 +134,9 @@ def write_folder(
 
 def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
     notes: list[str] = []
-    if opened.captured is not None and opened.missing is not None:
-        up = "" if opened.person is not None else f", {opened.stated_up or 'z'} up"
+    if opened.missing is not None:
         notes.append(
-            f"without the capture ({opened.missing}) the page begins with a view from outside{up}"
+            f"without the capture ({opened.missing}) the page begins with a view from outside"
         )
     if any(opened.world_offset):
         offset = " ".join(f"{x:.12g}" for x in opened.world_offset)
