@@ -1,9 +1,8 @@
 """The controls of the page: what is shown, the time, the truth, the cameras of the capture, motions
-of a person, camera paths, screenshots. Each browser has its own."""
+of a person, camera paths. Each browser has its own."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.write import to_uint8
 from dyngs.runs.opened import Opened
 from dyngs.view.edit import EditControls, can_be_edited
-from dyngs.view.layers import LAYERS, PARTS, draw
+from dyngs.view.layers import LAYERS, PARTS
 from dyngs.view.session import Keyframe, Recording
 from dyngs.view.source import Source
 from dyngs.view.views import centers_of, has_timeline, pose_of, viewpoint_of, views_of
@@ -125,19 +124,7 @@ class Controls:
             part.on_update(lambda _: session.change(part=part.value))
         else:
             session.change(part="all")
-        screenshot = gui.add_button("Screenshot", hint="as .png, of the size of the window")
-        screenshot.on_click(lambda _: session.ask(self._screenshot))
         gui.add_button("Back to start").on_click(lambda _: self._browsing.go_to(None))
-
-    def _screenshot(self) -> None:
-        """Send what is shown as a .png, in the thread that draws."""
-        from PIL import Image
-
-        session = self._browsing.session
-        stream = io.BytesIO()
-        Image.fromarray(draw(session.opened, session.shot())).save(stream, "png")
-        name = f"{session.opened.name}_{session.time:.3f}.png"
-        self._browsing.client.send_file_download(name, stream.getvalue(), save_immediately=True)
 
     def _add_time(self, gui: viser.GuiApi) -> None:
         session = self._browsing.session
