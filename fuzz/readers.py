@@ -70,7 +70,7 @@ class Reader:
 def read_whole_capture(root: Path) -> object:
     """Read as ``dyngs data inspect --deep`` and ``dyngs train`` do: report, views, points, body,
     images."""
-    from dyngs.capture.inspection.report import format_report, inspect_capture
+    from dyngs.capture.inspection import format_report, inspect_capture
     from dyngs.config import DataConfig
     from dyngs.core.errors import DyngsError
     from dyngs.data.loader import ImageLoader
@@ -291,7 +291,7 @@ def read_a_path(root: Path) -> object:
 def read_a_point(root: Path) -> object:
     """The measurement and its row of the report."""
     from dyngs.study.measure import read_measurement
-    from dyngs.study.sweep import table_rows
+    from dyngs.study.tradeoff import table_rows
 
     measurement = read_measurement(only(root))
     return table_rows([measurement]), measurement
@@ -301,13 +301,12 @@ def read_option_values(root: Path) -> object:
     """Parse values of options of the command line."""
     from dyngs.data.times import parse_frames
     from dyngs.export.camera_paths import parse_times
-    from dyngs.study.sweep import parse_requirements
-    from dyngs.study.variants import parse_variations
+    from dyngs.study.tradeoff import parse_requirements, parse_variations
 
     parsers: tuple[Callable[[str], object], ...]
     parsers = (
         parse_requirements,
-        lambda word: parse_variations([word], trains=True),
+        lambda word: parse_variations([word]),
         parse_frames,
         parse_times,
     )

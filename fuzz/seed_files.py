@@ -389,12 +389,11 @@ def write_measurement(root: Path) -> None:
     """Write a measured point of ``dyngs tradeoff``."""
     from dataclasses import asdict
 
-    from dyngs.study.measure import Measurement, Quartiles, Speed
+    from dyngs.study.measure import Measurement
     from dyngs.study.runs import write_stored
 
-    speed = Speed(Quartiles(3.0, 2.0, 4.0), Quartiles(1.0, 0.9, 1.1))
-    scores = (3, 30.0, 0.9, 0.1, 29.0, None, 100, 1.5, 20.0, 7, 1.5)
-    point = Measurement("prune=0.5", {"prune": 0.5}, *scores, speed=speed)
+    scores = (3, 30.0, 0.9, 0.1, 29.0, None, 100, 1.5, 7, 1.5)
+    point = Measurement("prune=0.5", *scores, ms=3.0, gain=1.1)
     write_stored(root / "a.json", asdict(point))
 
 

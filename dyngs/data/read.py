@@ -435,7 +435,7 @@ def _first_image(views: tuple[View, ...]) -> tuple[bool, list[str]]:
             header = read_header(view.image_path)
         except DyngsError:
             continue
-        return header.has_alpha, [
+        return header.alpha is not None, [
             f"the layer {header.layer} of EXR images is read"
         ] if header.layer else []
     return False, []

@@ -50,7 +50,7 @@ from dyngs.io.write import atomic_file
 from dyngs.models.kind import HasBody, capability
 from dyngs.ops.quaternions import shorter_ways
 from dyngs.runs.checkpoint import LoadedRun
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 
 _MOST_ROWS = 4000  # anchors whose places determine the shape; each gives three equations
 

@@ -28,8 +28,7 @@ from dyngs.data.read import is_capture, read_capture
 from dyngs.human.detect.detector import SURE, Detection, Detector, MediaPipe
 from dyngs.human.fit.capture_fit import cheapest_path
 from dyngs.human.fit.fitted_capture import FitInputs, FittedCapture, write_fitted_capture
-from dyngs.io.lock import make_once
-from dyngs.io.outputs import note_source, require_new_folder
+from dyngs.io.outputs import make_once, note_source, require_new_folder
 from dyngs.io.write import cache_folder, temporary_folder_beside, write_image, write_text
 
 SWAP = 0.04

@@ -49,8 +49,7 @@ from dyngs.human.fit.capture_fit import (
 from dyngs.human.fit.keypoints import read_joints, read_keypoints
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion
-from dyngs.io.lock import make_once
-from dyngs.io.outputs import new_folder
+from dyngs.io.outputs import make_once, new_folder
 from dyngs.io.write import atomic_file, cache_folder, write_image, write_text
 
 _BODY = "body_train.npz"
@@ -374,7 +373,7 @@ def posed_by_avatar(
 
     def fitted(views: Sequence[View]) -> HumanScene:
         nothing = scene.gaussians.means.new_zeros(3)
-        return fitted_to_images(scene, ImageLoader(views, small), nothing, SILHOUETTES).scene
+        return fitted_to_images(scene, ImageLoader(views, small), nothing, SILHOUETTES)[0]
 
     before = _overlap(scene, tested)
     after = _overlap(fitted(others), tested)

@@ -153,19 +153,6 @@ def test_broken_json_names_line_and_column(blender_root: Path) -> None:
         read_blender(blender_root)
 
 
-def test_images_of_two_sizes_need_intrinsics_of_their_own(blender_root: Path) -> None:
-    write_image(blender_root / "train/r_7.png", random_pixels(4, 6, 4))
-    with pytest.raises(DyngsError, match=r"different sizes.*r_7\.png"):
-        read_blender(blender_root)
-    edit_json(
-        blender_root / "transforms_train.json",
-        lambda c: [f.update(camera_angle_x=0.7) for f in c["frames"]],
-    )
-    view = read_blender(blender_root).splits["train"][7]
-    assert view.width == 6
-    assert view.intrinsics[0, 0] == pytest.approx(3 / np.tan(0.35))
-
-
 def test_missing_image_takes_the_size_of_the_others(blender_root: Path) -> None:
     (blender_root / "train/r_3.png").unlink()
     assert read_blender(blender_root).splits["train"][3].width == 12

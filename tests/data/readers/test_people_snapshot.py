@@ -148,7 +148,7 @@ def test_missing_files(root: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "line"),
     [
-        ({"pose": None}, "the data set 'pose' is missing"),
+        ({"pose": None}, "'pose' must be a data set"),
         ({"pose": np.ones((3, 72))}, "'pose' has 3 rows but 'trans' 7"),
         ({"pose": np.zeros((7, 72)), "trans": np.zeros((7, 3))}, "holds no frame"),
     ],
