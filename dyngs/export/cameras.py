@@ -15,7 +15,7 @@ from dyngs.data.geometry import opengl_from_cam
 from dyngs.io.formats.ply import double_ply
 from dyngs.io.formats.similarity import Similarity
 from dyngs.io.write import atomic_file, write_text
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 
 NAME, POINTS_NAME = "transforms.json", "points.ply"
 _OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -64,9 +64,7 @@ def _frame(view: View, folder: Path, capture: Capture, world: Similarity) -> dic
         [world.rotation @ pose[:3, :3], world.points(pose[:3, 3])[:, None]], axis=1
     )
     first, last = capture.span or (0.0, 1.0)
-    (fx, _, cx), (_, fy, cy) = (
-        view.intrinsics @ np.diag([view.lens.focal_ratio] * 2 + [1])
-    ).tolist()[:2]
+    (fx, _, cx), (_, fy, cy) = view.intrinsics.tolist()[:2]
     frame: dict[str, object] = {
         "file_path": _way(view.image_path, folder),
         "transform_matrix": pose.tolist(),

@@ -75,7 +75,6 @@ def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
             path = read_path(file, opened.world_offset, options.size)
             path = replace(path, cameras=opened.frame.inverse().cameras(path.cameras))
         if times is not None:
-            path = replace(path, warnings=())
             path = with_times(path, times * len(path) if len(times) == 1 else times)
     notes = path.notes
     if scene.is_static and times is not None:

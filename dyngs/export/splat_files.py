@@ -25,7 +25,6 @@ from dyngs.gaussians.levels import MERGED, Levels, levels_of
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
     SOG_INDEX,
-    Format,
     Written,
     fitted,
     format_named,
@@ -47,7 +46,6 @@ from dyngs.io.formats.splat_file import (
     SplatFile,
     drawable,
     from_linear,
-    geo_comment,
     header_comments,
     offset_notes,
     require_writable,
@@ -58,7 +56,7 @@ from dyngs.io.gltf import GlbDocument
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import atomic_file, remove_quietly, temporary_folder_beside
 from dyngs.ops.quaternions import rotation_matrices, shorter_ways, unit_quats
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import Opened
 
 PER_LEAF = MERGED**7  # Gaussians of a leaf at level 0
@@ -160,7 +158,6 @@ class Writing:
     # degree of the harmonics in the file; None: as they are, up to what the format holds
     sh_degree: int | None = None
     edit: Similarity = UNMOVED  # made after ``turn``, and stored so that it can be undone
-    own: Format | None = None  # a variant of the format that the suffix names; None: the usual one
 
 
 AS_THEY_ARE = Writing()
@@ -328,16 +325,12 @@ def splats_at(
     splat = SplatFile(gaussians, model.rasterize_mode, model.eps2d, (x, y, z), tuple(comments))
     if opened.edited is not None:
         splat = moved_file(splat, opened.frame.after(opened.file_unit.inverse()), opened.edited.up)
-        if any(opened.edited.offset):
-            splat = replace(splat, comments=(*splat.comments, geo_comment(opened.edited.offset)))
     splat = turned_file(splat, how.turn, how.up)
     return splat if how.edit == UNMOVED else moved_file(splat, how.edit, how.up)
 
 
 def _write(opened: Opened, scene: GaussianScene, path: Path, time: float, how: Writing) -> Written:
-    return write_splats(
-        path, splats_at(opened, scene, time, how), sh_degree=how.sh_degree, own=how.own
-    )
+    return write_splats(path, splats_at(opened, scene, time, how), sh_degree=how.sh_degree)
 
 
 MAX_BYTES = 4_000_000_000  # largest size of the positions, which are held in memory

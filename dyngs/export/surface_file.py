@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dyngs.baselines.fields.keys import NgpModel
+from dyngs.baselines.fields.kind import NgpModel
 from dyngs.baselines.fields.scene import FieldScene, space_of
 from dyngs.baselines.fields.scene import surface_of as surface_of_field
 from dyngs.baselines.triangles import mesh as triangles
@@ -27,7 +27,7 @@ from dyngs.io.write import atomic_file
 from dyngs.models.renderable import Surface
 from dyngs.models.views import training_cameras
 from dyngs.ops.patches import MOST_SEGMENTS
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import Opened
 
 SUFFIXES = ".ply", ".glb", ".obj"

@@ -16,7 +16,6 @@ from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.core.errors import DyngsError
 from dyngs.data.read import captures_in, read_capture
-from dyngs.io.formats.formats import format_to_read
 from dyngs.io.outputs import command_for
 from dyngs.models.kind import Predicts, capability
 from dyngs.ops.device import CPU
@@ -132,7 +131,7 @@ def open_source(
         raise DyngsError(
             f"--capture goes with the run of a network of people, {path} is none; leave it out"
         )
-    if not path.is_dir() or _is_run(path) or format_to_read(path) is not None:
+    if not path.is_dir() or _is_run(path):
         runs = {path.name or str(path): path}
     elif data_root is not None:
         raise DyngsError(f"data.root= goes with one run, {path} is none; leave it out")

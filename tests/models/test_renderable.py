@@ -15,7 +15,7 @@ from small_triangles import bent
 from splat_scenes import cloud
 from torch import Tensor
 
-from dyngs.baselines.fields.keys import NerfModel, NgpModel
+from dyngs.baselines.fields.kind import NerfModel, NgpModel
 from dyngs.baselines.fields.nerf import NerfField
 from dyngs.baselines.fields.ngp import NgpField
 from dyngs.baselines.fields.scene import FieldScene

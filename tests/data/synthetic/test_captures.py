@@ -9,7 +9,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from dyngs.capture.inspection.report import inspect_capture
+from dyngs.capture.inspection import inspect_capture
 from dyngs.data.synthetic.captures import (
     CAMERA_ANGLE_X,
     POINTS_PER_THING,
