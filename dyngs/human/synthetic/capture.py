@@ -720,18 +720,8 @@ def write_people(
         raise DyngsError(
             f"people need size, cameras and frames of at least 1, a seed of at least 0, and be 1 to {_MOST:,}"
         )
-    _begin(out, {name: value for name, value in asdict(options).items() if name != "people"})
-    for number in range(options.people):
-        person = out / f"s{number // SHARD:04d}" / f"p{number:06d}"
-        if not person.is_dir():
-            write_human_capture(person, person_options(options, number))
-        report("people", number + 1, options.people)
-    return out
-
-
-def _begin(out: Path, made_with: dict[str, int]) -> None:
-    """Write that people in ``out`` are made with these options, or check that they were."""
     mark = out / PEOPLE_FILE
+    made_with = {name: value for name, value in asdict(options).items() if name != "people"}
     text = json.dumps(made_with) + "\n"
     if not mark.is_file():
         require_new_folder(out)
@@ -740,6 +730,12 @@ def _begin(out: Path, made_with: dict[str, int]) -> None:
         raise DyngsError(
             f"{out}: holds people of other options ({PEOPLE_FILE}); name a new folder, or give the same"
         )
+    for number in range(options.people):
+        person = out / f"s{number // SHARD:04d}" / f"p{number:06d}"
+        if not person.is_dir():
+            write_human_capture(person, person_options(options, number))
+        report("people", number + 1, options.people)
+    return out
 
 
 def person_options(options: PeopleOptions, number: int) -> HumanOptions:

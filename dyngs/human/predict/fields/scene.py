@@ -102,14 +102,14 @@ class PredictedField(Renderable):
         return composited(rgb, through, depth, options, behind)
 
 
-def stored_field(name: str, checkpoint: Checkpoint) -> PredictedField:
-    """Return what the network ``name`` has predicted. Raises KeyError or ValueError where tensors
+def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedField:
+    """Return the field of a checkpoint. Raises KeyError or ValueError where tensors
     do not fit."""
     stored = checkpoint.part("field")
     # earlier versions stored sizes of the network behind the scale
     numbers = require_tensor("numbers", stored["numbers"][:1], (1,), torch.float64)
     require_positive("scale", numbers)
-    network = NETWORKS[name](torch.Generator())
+    network = NETWORKS[model.network](torch.Generator())
     load_weights(network, checkpoint, "field.network")
     rgba = require_tensor("rgba", stored["sources.rgba"], (None, 4, None, None))
     count, _, height, width = rgba.shape
@@ -135,7 +135,7 @@ class PredictedModel(Model[PredictedField]):
     def __init__(self, run: RunStart) -> None:
         assert isinstance(run.config.model, PredictedFieldModel)
         self._run_dir = run.config.run.dir
-        self._name = run.config.model.network
+        self._section = run.config.model
         self._scene: PredictedField | None = None
 
     def begin_with(self, scene: PredictedField) -> None:
@@ -167,12 +167,7 @@ class PredictedModel(Model[PredictedField]):
         return self.scene.state()
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        self._scene = stored_field(self._name, checkpoint)
+        self._scene = restore(self._section, checkpoint)
 
     def place(self, device: torch.device) -> None:
         self._scene = None if self._scene is None else self._scene.to(device)
-
-
-def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedField:
-    """Return the scene of a checkpoint."""
-    return stored_field(model.network, checkpoint)

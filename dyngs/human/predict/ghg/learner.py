@@ -232,11 +232,9 @@ def new_network(model: HumanPredictorModel, generator: torch.Generator) -> Atlas
 def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int) -> Tensor:
     """Return the mean colours (3, S, S) of a checkpoint, whose weights ``network`` takes; S is the
     ``resolution``."""
-    mean = checkpoint.tensors.get("model.mean")
     load_weights(network, checkpoint)
-    if mean is None:
-        raise DyngsError(f"{checkpoint.name} is not of this network; was its config changed?")
     with reading(checkpoint.name, OTHER_CONFIG):
+        mean = checkpoint.tensors["model.mean"]
         return require_tensor("mean", mean, (3, resolution, resolution))
 
 

@@ -15,7 +15,7 @@ from dyngs.human.predict.fields.keypoint_nerf import KeypointNerf
 from dyngs.human.predict.fields.scene import (
     NETWORKS,
     PredictedField,
-    stored_field,
+    restore,
 )
 from dyngs.human.predict.keys import PredictedFieldModel
 from dyngs.human.predict.people import Person, sources_of
@@ -88,4 +88,4 @@ def test_what_does_not_fit_is_refused(scene: PredictedField, name: str) -> None:
             )
     del whole.tensors[f"field.{name}"]
     with pytest.raises((KeyError, DyngsError)):
-        stored_field(kind_of(scene), whole)
+        restore(PredictedFieldModel(network=kind_of(scene)), whole)
