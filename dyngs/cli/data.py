@@ -103,8 +103,6 @@ def _add_sfm(verbs: args.Commands) -> None:
     )
     frames = "frames to take of a video (default 100; of each of several: up to 300)"
     parser.add_argument("--frames", type=int, metavar="N", help=frames)
-    start = "when a video of several begins; once for each"
-    parser.add_argument("--start", action="append", default=[], metavar="NAME=SECONDS", help=start)
     args.add_threads(parser)
     args.add_overrides(parser, "data.key=value", "data.follow_links")
 
@@ -261,13 +259,10 @@ def run_sfm(arguments: argparse.Namespace) -> int:
     several = is_several_videos(images)
     if several:
         _require_options_of_videos(arguments)
-    elif arguments.start:
-        raise DyngsError(f"{images}: --start is for a folder of several videos")
     options = SfmOptions(
         matching=arguments.matching,
         num_frames=arguments.frames,
         masks=arguments.masks,
-        starts=_starts(arguments.start),
         num_threads=arguments.threads,
         follow_links=limits.follow_links,
     )
@@ -290,22 +285,6 @@ def _require_options_of_videos(arguments: argparse.Namespace) -> None:
         )
     if arguments.frames is not None and arguments.frames < 2:
         raise DyngsError("--frames must be at least 2")
-
-
-def _starts(words: list[str]) -> dict[str, float] | None:
-    """Return the seconds of ``NAME=SECONDS``, None without any."""
-    starts: dict[str, float] = {}
-    for word in words:
-        name, _, seconds = word.rpartition("=")
-        try:
-            starts[name] = float(seconds)
-        except ValueError:
-            name = ""
-        if not name:
-            raise DyngsError(
-                f"--start {word!r}: give the name of a video without its suffix and seconds, as cam01=0.5"
-            )
-    return starts or None
 
 
 def run_fit(arguments: argparse.Namespace) -> int:

@@ -141,14 +141,11 @@ def _check_plausible(intrinsics: np.ndarray, described: tuple[int, int], where: 
     low = FOCAL_RANGE[0] * side
     high = FOCAL_RANGE[1] * side
     fx, fy, *center = (float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    if not (low <= fx <= high and low <= fy <= high):
+    if not (low <= fx <= high and low <= fy <= high and all(abs(x) <= high for x in center)):
         raise DyngsError(
-            f"{where}: the focal length ({fx:g}, {fy:g}) px does not suit an image of {described[0]}x{described[1]}; "
-            "correct it, or the field of view that it follows from"
-        )
-    if not all(abs(x) <= high for x in center):
-        raise DyngsError(
-            f"{where}: the principal point ({center[0]:g}, {center[1]:g}) px lies too far out; correct it"
+            f"{where}: the focal length ({fx:g}, {fy:g}) px or the principal point ({center[0]:g}, {center[1]:g}) px "
+            f"does not suit an image of {described[0]}x{described[1]}; correct it, or the field of view that it "
+            "follows from"
         )
 
 

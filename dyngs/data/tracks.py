@@ -69,8 +69,6 @@ def read_tracks(path: Path) -> ImageTracks:
     listed = tuple(
         x.decode("utf-8", "replace") if isinstance(x, bytes) else str(x) for x in names.tolist()
     )
-    if len(set(listed)) < len(listed):
-        raise DyngsError(f"{path}: names holds one name more than once; give one row per image")
     xy = xy.astype(np.float64)
     good = np.all(np.abs(xy) < _LARGEST, axis=-1)  # phrased so that NaN fails it
     return ImageTracks(

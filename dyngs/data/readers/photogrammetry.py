@@ -27,32 +27,37 @@ _Fields = dict[str, Any]
 """Fields of a frame in a transforms file."""
 
 
-class _Photos:
-    """The photos of a capture: in ``images``, else anywhere below its folder."""
+def _photos_of(root: Path) -> dict[str, Path]:
+    """Return the photos of a capture by name, with and without suffix: those in ``images``, else
+    anywhere below its folder."""
+    folder = root / "images" if (root / "images").is_dir() else root
+    found: dict[str, Path] = {}
+    for path in sorted(folder.rglob("*"), key=lambda path: len(path.parts)):
+        if path.suffix.lower() in SUFFIXES:
+            found.setdefault(path.name, path)
+            found.setdefault(path.stem, path)
+    return found
 
-    def __init__(self, root: Path) -> None:
-        self.folder = root / "images" if (root / "images").is_dir() else root
-        self._by_name: dict[str, Path] = {}
-        for path in sorted(self.folder.rglob("*"), key=lambda path: len(path.parts)):
-            if path.suffix.lower() in SUFFIXES:
-                self._by_name.setdefault(path.name, path)
-                self._by_name.setdefault(path.stem, path)
 
-    def find(self, name: str) -> Path | None:
-        """Return the photo that a program calls ``name``, with or without its folder and suffix."""
-        path = PureWindowsPath(name)
-        return self._by_name.get(path.name, self._by_name.get(path.stem))
+def _find(photos: dict[str, Path], name: str) -> Path | None:
+    """Return the photo that a program calls ``name``, with or without its folder and suffix."""
+    path = PureWindowsPath(name)
+    return photos.get(path.name, photos.get(path.stem))
 
 
 def _capture(
-    root: Path, format: str, path: Path, photos: _Photos, cameras: Sequence[tuple[str, _Fields]]
+    root: Path,
+    format: str,
+    path: Path,
+    photos: dict[str, Path],
+    cameras: Sequence[tuple[str, _Fields]],
 ) -> Capture:
     """Return a capture of the cameras, each the name of a photo and its fields, which lack a pose
     if it has none."""
     frames: list[FrameEntry] = []
     left_out: list[str] = []
     for name, fields in cameras:
-        image = photos.find(name)
+        image = _find(photos, name)
         if image is None or "transform_matrix" not in fields:
             left_out.append(name)
         else:
@@ -61,7 +66,7 @@ def _capture(
             )
     if not frames:
         raise DyngsError(
-            f"{path}: no photo in {photos.folder} has the name of a camera with a pose; put the photos there"
+            f"{path}: no photo in {root} has the name of a camera with a pose; put the photos there"
         )
     count = f"{len(left_out)} of {counted(len(cameras), 'camera')}"
     line = f"{path.name}: {count} have no pose or no photo and are left out: {first_few(left_out)}"
@@ -130,7 +135,7 @@ def read_metashape(root: Path) -> Capture:
                 placed = _placed(placement, np.array(pose.split(), np.float64).reshape(4, 4))
                 fields["transform_matrix"] = (placed @ OPENGL_FROM_OPENCV).tolist()
             cameras.append((camera.attrib["label"], fields))
-    return _capture(root, "metashape", path, _Photos(root), cameras)
+    return _capture(root, "metashape", path, _photos_of(root), cameras)
 
 
 def _placed(transform: ElementTree.Element | None, pose: np.ndarray) -> np.ndarray:
@@ -204,13 +209,13 @@ def read_realitycapture(root: Path) -> Capture:
     ``t1`` and ``t2`` are OpenCV's p2 and p1.
     """
     path = _only(_exports(root, ".csv", _REALITYCAPTURE_MARK))
-    photos = _Photos(root)
+    photos = _photos_of(root)
     cameras: list[tuple[str, _Fields]] = []
     with reading(path, _ADVICE), path.open(encoding="utf-8-sig", newline="") as file:
         titles = next(line for line in file if line.startswith("#name")).strip().split(",")
         for row in csv.DictReader(file, [_RENAMED.get(title, title) for title in titles]):
             name = row.pop("#name")
-            image = photos.find(name)
+            image = _find(photos, name)
             fields: _Fields = {}
             if image is not None:
                 width, height = read_header(image).size
@@ -297,7 +302,7 @@ def read_odm(root: Path) -> Capture:
                 for feature in content["features"]
             }
         cameras = [(name, _odm_camera(path, name, shot, lenses)) for name, shot in shots.items()]
-    capture = _capture(root, "odm", path, _Photos(root), cameras)
+    capture = _capture(root, "odm", path, _photos_of(root), cameras)
     return capture.replace(points=points or capture.points, warnings=(*warnings, *capture.warnings))
 
 
