@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import colorsys
 import json
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -502,7 +501,7 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
             motion = replace(
                 clip, trans=outfit.size * clip.trans, scale=outfit.size * clip.scale, betas=betas
             )
-            meshes = list(_posed_meshes(clothed, motion, texture))
+            meshes = _posed_meshes(clothed, motion, texture)
             for split, cameras in splits.items():
                 _write_split(started, split, meshes, cameras, options)
             layout = "smpl" if options.body_seed is None else "anny"
@@ -629,17 +628,12 @@ def _depth_map(mesh: PosedMesh, world_from_cam: np.ndarray, size: int) -> np.nda
     return depth.reshape(size, size)
 
 
-def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> Iterator[PosedMesh]:
+def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> list[PosedMesh]:
     uv, uv_faces = texture_coordinates(body)
-    exact = body.to(dtype=torch.float64)
+    poses, trans, scale = (x.double() for x in (motion.poses, motion.trans, motion.scale))
+    posed = posed_vertices(body.to(dtype=torch.float64), poses, trans, scale=scale).cpu().numpy()
     faces = body.faces.cpu().numpy()
-    for pose, trans, scale in zip(
-        *(x.double() for x in (motion.poses, motion.trans, motion.scale)), strict=True
-    ):
-        vertices = (
-            posed_vertices(exact, pose[None], trans[None], scale=scale[None])[0].cpu().numpy()
-        )
-        yield PosedMesh(vertices, faces, uv, uv_faces, texture)
+    return [PosedMesh(vertices, faces, uv, uv_faces, texture) for vertices in posed]
 
 
 def _cameras(options: HumanOptions) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:

@@ -18,10 +18,10 @@ from dyngs.data.times import distinct_times
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template, read_body
 from dyngs.human.fit.fitted_capture import with_fitted_body
-from dyngs.human.predict.fields.keys import FieldPredictorModel, PredictedFieldModel
 from dyngs.human.predict.fields.network import FieldNetwork
 from dyngs.human.predict.fields.scene import NETWORKS, PredictedField
 from dyngs.human.predict.gps.rectification import MIN_ANGLE, angle, moments, spread, well_spread
+from dyngs.human.predict.keys import FieldPredictorModel, PredictedFieldModel
 from dyngs.human.predict.people import (
     Person,
     metric,

@@ -19,8 +19,8 @@ from dyngs.core.tensor_checks import require_indices, require_positive, require_
 from dyngs.data.loader import Image
 from dyngs.human.predict.fields.eg_human_nerf import EgHumanNerf
 from dyngs.human.predict.fields.keypoint_nerf import AROUND, KeypointNerf
-from dyngs.human.predict.fields.keys import PredictedFieldModel
 from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
+from dyngs.human.predict.keys import PredictedFieldModel
 from dyngs.human.predict.people import MULTIPLE, PosedBody, Sources, metric
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart

@@ -30,11 +30,12 @@ from dyngs.human.avatar.posing import (
 )
 from dyngs.human.avatar.scene import HumanScene, first_scene
 from dyngs.human.body.atlas import Texels, atlas_texels
-from dyngs.human.body.mesh import interpolate, rasterize, vertex_normals
+from dyngs.human.body.mesh import vertex_normals
 from dyngs.human.keys import HumanPredictorModel
-from dyngs.human.predict.people import Person
+from dyngs.human.predict.gps.rectification import spread
+from dyngs.human.predict.people import Person, depths
 from dyngs.models.prediction import Encoder, ResidualBlock, begin_weights, upsampled
-from dyngs.ops.quaternions import unit_quats
+from dyngs.ops.quaternions import quat_product, unit_quats
 
 
 @dataclass(frozen=True)
@@ -77,57 +78,33 @@ def atlas_person(person: Person, model: HumanPredictorModel) -> AtlasPerson:
 
 
 def spread_views(person: AtlasPerson, count: int, first: int | None = None) -> list[int]:
-    """Return the indices, ascending, of ``count`` views that see as much of the person as possible.
+    """Return the indices, ascending, of ``count`` views, evenly around the body: from the one that
+    is most from the front on, or from the view ``first``.
 
-    The views are of one frame, the first with the most views, if it has enough; else of all frames.
-    They maximize the mean over texels of the best view's cosine between normal and view direction,
-    in the rest pose and without occlusion; found greedily, then by exchanging one view after the
-    other. All views if there are fewer than ``count``; the view ``first`` must be among them, and
-    its frame is chosen.
+    They are of one frame, that of ``first`` or the first with the most views, if it has enough;
+    else of all frames. All views if there are fewer than ``count``.
     """
-    views = person.person.views
-    frames = [view.frame for view in views]
+    shown = person.person.views
+    frames = [view.frame for view in shown]
     frame = max(dict.fromkeys(frames), key=frames.count) if first is None else frames[first]
     allowed = [i for i, own in enumerate(frames) if own == frame]
     if len(allowed) < count:
-        allowed = list(range(len(views)))
-    if len(allowed) <= count:
-        return allowed
-    normals = person.texels.normals[:: max(1, len(person.texels) // 1000)]
-    cosines = normals @ torch.stack([_direction(person, views[i]) for i in allowed], dim=1)
-    start = [] if first is None else [allowed.index(first)]
-    chosen = start + _best(cosines, start, count - len(start))
-    for _ in range(count):
-        before = list(chosen)
-        for place in range(len(start), count):
-            chosen[place] = _best(cosines, chosen[:place] + chosen[place + 1 :], 1)[0]
-        if chosen == before:
-            break
-    return sorted(allowed[i] for i in chosen)
+        allowed = list(range(len(shown)))
+    azimuths = {i: _azimuth(person, shown[i]) for i in allowed}
+    ring = sorted(allowed, key=lambda i: azimuths[i])
+    if first is None:
+        first = min(ring, key=lambda i: abs(azimuths[i]))
+    return sorted(set(spread(ring, count, ring.index(first))))
 
 
-def _best(cosines: Tensor, others: list[int], count: int) -> list[int]:
-    """Return the columns of ``cosines`` (P, V) that add most to ``others``, chosen greedily."""
-    chosen: list[int] = []
-    for _ in range(count):
-        taken = others + chosen
-        seen = (
-            cosines[:, taken].amax(1, keepdim=True) if taken else cosines.new_zeros(len(cosines), 1)
-        )
-        gain = torch.maximum(cosines, seen).clamp_min(0).mean(0)
-        gain[taken] = -1
-        chosen.append(int(gain.argmax()))
-    return chosen
-
-
-def _direction(person: AtlasPerson, view: View) -> Tensor:
-    """Return the unit vector (3,) from the pelvis to the camera, in the axes of the body at
-    rest."""
+def _azimuth(person: AtlasPerson, view: View) -> float:
+    """Return the angle of a camera around the vertical of the body at rest, rad; 0 is before it."""
     pose = person.person.pose_in(view)
     cam_from_world = torch.from_numpy(view.cam_from_world).to(pose.trans)
     center = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
     pelvis = pose.scale * person.scene.skeleton.joints[0] + pose.trans
-    return torch.nn.functional.normalize(pose.rotations[0].T @ (center - pelvis), dim=0)
+    x, _, z = pose.rotations[0].T @ (center - pelvis)
+    return float(torch.atan2(x, z))
 
 
 _NEAREST = 16  # seen texels that an unseen one takes its colour from
@@ -287,23 +264,13 @@ def _edge_distances(image: Image) -> Tensor:
 def _nearest_depth(vertices: np.ndarray, faces: np.ndarray, camera: Cameras, at: Tensor) -> Tensor:
     """Return the least depth (P,) of a mesh in the four pixels around ``at`` (P, 2); infinite off
     the mesh."""
-    projected, distance, _ = project_points(torch.from_numpy(vertices), camera)
-    pixels = projected.double().numpy()
-    depth = distance.double().numpy()
-    corners = np.concatenate([pixels - 0.5, 1.0 / depth[:, None]], axis=1)[faces]
-    # behind the camera: zero area, which covers nothing
-    corners[(depth[faces] <= 0).any(axis=1)] = 0.0
-    fragments = rasterize(corners, camera.width, camera.height)
-    buffer = np.full((camera.height + 2, camera.width + 2), np.inf)
-    buffer[fragments.index // camera.width + 1, fragments.index % camera.width + 1] = interpolate(
-        fragments.barycentric, depth[faces[fragments.faces]][..., None]
-    )[:, 0]
-    least = np.minimum.reduce([buffer[:-1, :-1], buffer[1:, :-1], buffer[:-1, 1:], buffer[1:, 1:]])
+    depth = np.pad(depths(vertices, faces, camera).numpy(), 1, constant_values=np.inf)
+    least = np.minimum.reduce([depth[:-1, :-1], depth[1:, :-1], depth[:-1, 1:], depth[1:, 1:]])
     column, row = (
         (at[:, i] + 0.5).floor().nan_to_num().clamp(0, size).long()
         for i, size in enumerate((camera.width, camera.height))
     )
-    return torch.from_numpy(least)[row.cpu(), column.cpu()].float().to(at.device)
+    return torch.from_numpy(least)[row.cpu(), column.cpu()].to(at)
 
 
 def _sampled(image: Tensor, at: Tensor) -> Tensor:
@@ -453,29 +420,13 @@ def predict_avatar(
     fractions = (part["guess"] + part["guess"].new_tensor(_GUESS_LOGITS)).softmax(dim=1)
     guess = (fractions.T[..., None] * guesses[:, texel]).sum(0) + part["colour"]
     rgb = weight * maps.rgb.flatten(0, 1)[rows] + (1 - weight) * guess
+    one = rgb.new_tensor([1.0, 0.0, 0.0, 0.0])
     limit = min((0.5 * (b - a) for a, b in pairwise(person.heights)), default=_MAX_HEIGHT)
     gaussians = Gaussians(
         means=first.means + limit * part["height"].tanh() * person.texels.normals[texel],
-        quats=_rotated(first.quats, part["rotation"]),
+        quats=quat_product(first.quats, unit_quats(one + part["rotation"])),
         log_scales=first.log_scales + _MAX_LOG_SCALE * (part["scale"] / _MAX_LOG_SCALE).tanh(),
         logit_opacities=first.logit_opacities + part["opacity"][:, 0],
         sh=((rgb - 0.5) / SH_C0)[:, None],
     )
     return replace(scene, gaussians=gaussians)
-
-
-def _rotated(quats: Tensor, changes: Tensor) -> Tensor:
-    """Return Hamilton products q r (N, 4), wxyz, of ``quats`` q with normalised quaternions r of 1
-    + ``changes``.
-
-    Not ``quat_product``, whose sums round otherwise: predictions would differ in last bits.
-    """
-    one = changes.new_tensor([1.0, 0.0, 0.0, 0.0])
-    w, *xyz = unit_quats(one + changes).unbind(1)
-    a = quats[:, :1]
-    vector = quats[:, 1:]
-    other = torch.stack(xyz, dim=1)
-    real = a * w[:, None] - (vector * other).sum(1, keepdim=True)
-    return torch.cat(
-        [real, a * other + w[:, None] * vector + torch.linalg.cross(vector, other, dim=1)], dim=1
-    )

@@ -23,7 +23,6 @@ from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.scene import render_options
 from dyngs.gaussians.static_scene import Sides, StaticScene
 from dyngs.gaussians.static_training import StaticTraining
-from dyngs.human.predict.gps.keys import GpsModel
 from dyngs.human.predict.gps.rectification import (
     MAX_ANGLE,
     RectifiedPair,
@@ -36,6 +35,7 @@ from dyngs.human.predict.gps.rectification import (
     well_spread,
 )
 from dyngs.human.predict.gps.stereo import GpsNetwork, gaussians_of, offset_loss
+from dyngs.human.predict.keys import GpsModel
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.prediction import (
     Example,

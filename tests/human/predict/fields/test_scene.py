@@ -13,13 +13,13 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
 from dyngs.human.predict.fields.keypoint_nerf import KeypointNerf
-from dyngs.human.predict.fields.keys import PredictedFieldModel
 from dyngs.human.predict.fields.scene import (
     NETWORKS,
     PredictedField,
     around_in,
     stored_field,
 )
+from dyngs.human.predict.keys import PredictedFieldModel
 from dyngs.human.predict.people import Person, sources_of
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, restored_model
 from dyngs.models.renderable import DrawOptions
@@ -96,7 +96,7 @@ def test_what_does_not_fit_is_refused(scene: PredictedField, name: str) -> None:
     own = whole.tensors[f"field.{name}"]
     broken = own + 10**9 if name == "body.faces" else own[..., :-1]
     for changed in (broken, own * float("nan") if own.is_floating_point() else broken):
-        with pytest.raises(DyngsError, match="it[: ]"):
+        with pytest.raises(DyngsError, match=r"it[: ]"):
             restored_model(
                 checkpoint_of(scene, **{name: changed}), PredictedFieldModel(network=kind_of(scene))
             )
