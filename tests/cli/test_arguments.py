@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
@@ -99,11 +98,9 @@ def read_of(known: dict[str, Path], kind: str) -> list[Path]:
 
 
 def names_of(path: Path, folder: Path) -> list[Path]:
-    """The path, spelled in another way, and links to it."""
+    """The path, spelled in another way, and a link to it."""
     folder.mkdir(parents=True)
     (folder / "symbolic").symlink_to(path)
-    if path.is_file():
-        os.link(path, folder / "hard")
     return [path, path.parent / ".." / path.parent.name / path.name, *folder.iterdir()]
 
 
