@@ -1,5 +1,5 @@
-"""Camera paths for rendering: their scene times, JSON files (docs/camera_paths.md) of dyngs and of
-other programs, and the interpolation of keyframes."""
+"""Camera paths for rendering: their scene times, JSON files (docs/camera_paths.md), and
+the interpolation of keyframes."""
 
 from __future__ import annotations
 
@@ -135,7 +135,6 @@ def read_path(
         DyngsError: names the file, the frame and the key that is missing or wrong.
     """
     document = read_json_object(file, "a camera path is a JSON object; see docs/camera_paths.md")
-    document, notes = _as_document(document, file)
     if size is not None:
         document = {"width": size[0], "height": size[1]} | document
     (name, *others) = [key for key in ("frames", "keyframes") if key in document] or ["frames"]
@@ -163,19 +162,17 @@ def read_path(
         keys, num_frames = _with_seconds(keys, document, fps, file)
         keys = interpolate_keyframes(keys, np.arange(num_frames) / fps)
     poses, matrices = (torch.from_numpy(x).float() for x in (keys.cam_from_world, keys.intrinsics))
-    path = CameraPath(Cameras(poses, matrices, width, height), fps, notes=notes)
+    path = CameraPath(Cameras(poses, matrices, width, height), fps)
     return path if keys.times is None else with_times(path, keys.times.tolist())
 
 
 def _read_pose(frame: object, where: str) -> np.ndarray:
-    """Return the world-to-camera pose (4, 4) of a frame; 12 or 16 numbers may stand in a row."""
+    """Return the world-to-camera pose (4, 4) of a frame."""
     fields = frame if isinstance(frame, dict) else {}
     given = [key for key in ("cam_from_world", "transform_matrix") if key in fields]
     if len(given) != 1:
         raise DyngsError(f"{where} needs exactly one of 'cam_from_world' and 'transform_matrix'")
     matrix = float_array(fields[given[0]])
-    if matrix is not None and matrix.shape in ((12,), (16,)):
-        matrix = matrix.reshape(-1, 4)
     pose, _ = checked_pose(np.zeros(0) if matrix is None else matrix, f"{where}: '{given[0]}'")
     return cam_from_opengl(pose) if given[0] == "transform_matrix" else pose
 
@@ -338,44 +335,3 @@ def _tangents(knots: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _shortened(vectors: np.ndarray, speeds: np.ndarray) -> np.ndarray:
     length = np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)
     return vectors * np.minimum(3.0 * speeds / length, 1.0)[:, None]
-
-
-# Paths of other programs, rewritten as documents of our own.
-
-
-def _as_document(found: dict[str, Any], file: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return what the JSON of a camera path holds as a document with 'width', 'height' and
-    'frames', and notes: of nerfstudio's ``camera_path.json`` and ``transforms.json``.
-
-    What is no path of another program stays as it is. Raises DyngsError: a path that cannot be
-    read.
-    """
-    kind = str(found.get("camera_type", found.get("camera_model")))
-    panoramic = ("fisheye", "equirectangular", "spherical", "omni", "vr180")
-    if any(name in kind.lower() for name in panoramic):
-        raise DyngsError(
-            f"{file}: its cameras are {printable(kind, 40)}; cameras of a path are pinholes"
-        )
-    views = found.get("camera_path", found.get("frames"))
-    views = [x for x in views if isinstance(x, dict)] if isinstance(views, list) else []
-    if "camera_path" not in found:
-        size = {**found, **(views[0] if views else {})}
-        keys = {"width": "w", "height": "h"}
-        return {key: size[w] for key, w in keys.items() if w in size} | found, ()
-    height = _number(found, "render_height", file, 1, 65536)
-    frames = []
-    for i, view in enumerate(views):
-        view = {"fov": found.get("default_fov")} | view
-        # vertical, in degrees
-        degrees = _number(view, "fov", f"{file}: camera_path[{i}]", 0.01, 179)
-        frame = {
-            "transform_matrix": view.get("camera_to_world"),
-            "fl_x": 0.5 * height / math.tan(math.radians(degrees) / 2),
-        }
-        frames.append(frame | {"time": view["render_time"]} if "render_time" in view else frame)
-    note = (
-        "nerfstudio's path is taken to be in the coordinates of the capture; its viewer has others if it turned, "
-        "shifted or scaled the capture (dataparser_transforms.json)"
-    )
-    size = {"width": found.get("render_width"), "height": height}
-    return {**size, "fps": found.get("fps", 30.0), "frames": frames}, (note,)

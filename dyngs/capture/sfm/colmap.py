@@ -3,7 +3,7 @@ in."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,8 +36,6 @@ class SfmOptions:
         num_frames: images to take at most from a video, None = 100; of several videos time steps,
             None = ``times.MOST_STEPS``, fewer for many cameras.
         masks: folder of masks of the photos, named as in captures; white = keep. None without.
-        starts: of several videos: camera to the second at which its video begins; None: as in
-            ``videos.json``, else found.
         num_threads: for features and matches, 0 = all cores; mapping has one, so that the result is
             always the same.
         follow_links: photos and videos may be links that lead out of their folder.
@@ -46,7 +44,6 @@ class SfmOptions:
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     num_frames: int | None = None
     masks: Path | None = None
-    starts: Mapping[str, float] | None = None
     num_threads: int = 0
     follow_links: bool = False
 
