@@ -111,8 +111,6 @@ def poses_of_videos(
                 f"{source}: holds {len(videos)} videos, two or more are needed; give one video as the file itself"
             )
         starts, test = read_given(source, names)
-        if options.starts is not None:
-            starts = checked_starts(options.starts, names, "--start")
         lines = colour_notes(video.info for video in videos)
         images, line = _static_images(source, videos, report)
         lines.append(line)
