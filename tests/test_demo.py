@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dyngs.cli import demo, main
-from dyngs.io.lock import LOCK_NAME
+from dyngs.io.outputs import LOCK_NAME
 
 
 def test_everything_that_is_promised_lies_there_and_the_command_prints_it(

@@ -29,9 +29,7 @@ from dyngs.export.splat_files import (
     up_of,
     write_moving,
 )
-from dyngs.gaussians.rendering import drawing_options
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import (
     all_suffixes,
     format_of,
@@ -57,11 +55,15 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
-from dyngs.runs.config_file import write_config
-from dyngs.runs.folder import LOG_NAME, require_empty
-from dyngs.runs.frame import RunFrame, write_frame
-from dyngs.runs.inputs import inputs_of
-from dyngs.runs.opened import Opened, open_scene, opened_scene
+from dyngs.runs.folder import (
+    LOG_NAME,
+    RunFrame,
+    inputs_of,
+    require_empty,
+    write_config,
+    write_frame,
+)
+from dyngs.runs.opened import Opened, open_scene, opened_file
 
 Tell = Callable[[str], None]
 
@@ -201,13 +203,9 @@ def _opened(source: Path, data_root: Path | None) -> EditSource:
     own = format_to_read(source)
     if own is not None and data_root is None:
         splat = read_splats(source, nonfinite="skip")
-        opened = opened_scene(
-            StaticScene(gaussians=splat.gaussians, options=drawing_options(splat)), source
-        )
+        opened = opened_file(splat, source)
         info = replace(opened.info, world_offset=splat.file_offset)
-        return EditSource(
-            replace(opened, info=info, stated_up=splat.up, notes=splat.notes), splat, own.up
-        )
+        return EditSource(replace(opened, info=info), splat, own.up)
     return EditSource(open_scene(source, data_root=data_root))
 
 

@@ -29,9 +29,7 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
-from dyngs.runs.config_file import write_config
-from dyngs.runs.folder import EXPORT_FOLDER, LOG_NAME, require_empty
-from dyngs.runs.frame import FRAME_NAME
+from dyngs.runs.folder import EXPORT_FOLDER, FRAME_NAME, LOG_NAME, require_empty, write_config
 from dyngs.runs.stored_file import write_scene
 from dyngs.training.new_trainer import assemble
 

@@ -10,10 +10,7 @@ from dyngs.config.io import load_resolved
 from dyngs.models.checkpoint import restored_model
 from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
-from dyngs.runs.config_file import write_config
-from dyngs.runs.folder import folder_of_export
-from dyngs.runs.frame import read_frame, write_frame
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import folder_of_export, inputs_of, read_frame, write_config, write_frame
 from dyngs.runs.stored_file import drawable, encoded, write_scene
 
 
@@ -38,7 +35,8 @@ def write_scene_file(
 
     ``out`` may be the run's own folder, or hold a former export of it. ``max_change``: root mean
     square over all values of some training images, grey levels of 255; None: what lowers their PSNR
-    by ``LOSS_DB``. Raises DyngsError: no such run, or ``out`` holds another one; nothing is written then.
+    by ``LOSS_DB``. Raises DyngsError: no such run, or ``out`` holds another one; nothing is written
+    then.
     """
     config = load_resolved(run_dir, data_root=data_root)
     inputs_of(run_dir).require_output(out)

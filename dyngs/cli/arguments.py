@@ -240,7 +240,7 @@ def require_outputs_apart(parser: argparse.ArgumentParser, arguments: argparse.N
     existing = [Path(out) for out in outputs if os.path.lexists(out)]
     if not existing:
         return
-    from dyngs.runs.inputs import inputs_of
+    from dyngs.runs.folder import inputs_of
 
     named = (value if equals else key for key, equals, value in words if key != "run.dir")
     read = [

@@ -39,7 +39,7 @@ def add_parser(commands: Commands) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo in ``--out``, or in ``OUT-2`` and so on if that is not empty."""
     from dyngs.cli.training_progress import TrainingProgress
-    from dyngs.io.lock import writing
+    from dyngs.io.outputs import writing
 
     folder: Path = arguments.out
     numbers = count(2)
@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def is_unused(folder: Path) -> bool:
     """Whether ``folder`` can be made, or holds at most a lock file."""
-    from dyngs.io.lock import LOCK_NAME
+    from dyngs.io.outputs import LOCK_NAME
 
     return not folder.exists() or (
         folder.is_dir() and all(path.name == LOCK_NAME for path in folder.iterdir())

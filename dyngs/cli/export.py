@@ -411,7 +411,7 @@ def _export_dyngs(arguments: argparse.Namespace) -> None:
 
 def _export_avatar(arguments: argparse.Namespace) -> None:
     from dyngs.human.avatar.avatar_file import write_avatar
-    from dyngs.runs.inputs import inputs_of
+    from dyngs.runs.folder import inputs_of
     from dyngs.runs.opened import open_run
 
     path = _target(arguments, "avatar.safetensors")

@@ -124,8 +124,8 @@ def amount(text: str) -> float:
 def run_compare(arguments: argparse.Namespace) -> int:
     """Train, compare, print the table and write the report; the folder is locked against other
     commands."""
-    from dyngs.io.lock import writing
-    from dyngs.runs.inputs import inputs_of
+    from dyngs.io.outputs import writing
+    from dyngs.runs.folder import inputs_of
     from dyngs.study.compare import ModelComparison
     from dyngs.study.report import Report, can_plot, plot_curves, shown_views, table_of
     from dyngs.study.tradeoff import table_rows
@@ -191,7 +191,7 @@ def _print_report(report: Report, stem: Path, *, is_json: bool) -> None:
 def run_tradeoff(arguments: argparse.Namespace) -> int:
     """Measure, print and write the tables, and choose a run; the folder is locked against other
     commands."""
-    from dyngs.io.lock import writing
+    from dyngs.io.outputs import writing
 
     if not arguments.run_dir.is_dir():
         raise DyngsError(

@@ -53,7 +53,7 @@ from dyngs.runs.checkpoint import (
     latest_checkpoint,
     load_run,
 )
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import scene_of_split, split_views
 from dyngs.training.corrections.camera_refinement import (
     CameraCorrections,

@@ -15,7 +15,7 @@ from dyngs.data.geometry import opengl_from_cam
 from dyngs.io.formats.ply import double_ply
 from dyngs.io.formats.similarity import Similarity
 from dyngs.io.write import atomic_file, write_text
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 
 NAME, POINTS_NAME = "transforms.json", "points.ply"
 _OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")

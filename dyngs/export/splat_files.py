@@ -56,7 +56,7 @@ from dyngs.io.gltf import GlbDocument
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import atomic_file, remove_quietly, temporary_folder_beside
 from dyngs.ops.quaternions import rotation_matrices, shorter_ways, unit_quats
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import Opened
 
 PER_LEAF = MERGED**7  # Gaussians of a leaf at level 0

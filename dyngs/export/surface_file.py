@@ -27,7 +27,7 @@ from dyngs.io.write import atomic_file
 from dyngs.models.renderable import Surface
 from dyngs.models.views import training_cameras
 from dyngs.ops.patches import MOST_SEGMENTS
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import Opened
 
 SUFFIXES = ".ply", ".glb", ".obj"

@@ -41,8 +41,7 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
-from dyngs.runs.config_file import write_config
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of, write_config
 from dyngs.runs.opened import split_views
 from dyngs.study.measure import SCORES, Bench, Measurement, Subject
 from dyngs.study.runs import AS_STORED, done_in_turn, finished, require_same_study

@@ -22,7 +22,7 @@ from dyngs.api.budget import time as budget_time
 from dyngs.cli import main
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.evaluate.report import evaluate_run
-from dyngs.io.lock import LOCK_NAME, writing
+from dyngs.io.outputs import LOCK_NAME, writing
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.study import compare
 from dyngs.study.measure import TRUTH

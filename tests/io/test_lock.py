@@ -16,12 +16,11 @@ from pathlib import Path
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.io import lock as run_lock
-from dyngs.io.lock import LOCK_NAME, InUseError, make_once, writing
-from dyngs.io.outputs import new_folder
+from dyngs.io import outputs
+from dyngs.io.outputs import LOCK_NAME, InUseError, make_once, new_folder, writing
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-HOLD = "import sys, time; from pathlib import Path; from dyngs.io.lock import writing\n"
+HOLD = "import sys, time; from pathlib import Path; from dyngs.io.outputs import writing\n"
 HOLD += "with writing(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
 
 
@@ -137,7 +136,7 @@ def _publish(folder: Path, content: str) -> None:
 
 @pytest.fixture
 def short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_lock, "_WAIT", 0.02)
+    monkeypatch.setattr(outputs, "_WAIT", 0.02)
 
 
 @pytest.mark.usefixtures("short_wait")

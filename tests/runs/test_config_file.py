@@ -16,7 +16,7 @@ from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.runs.checkpoint import latest_checkpoint
-from dyngs.runs.config_file import is_same_body, with_body_of
+from dyngs.runs.folder import is_same_body, with_body_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -20,8 +20,7 @@ from dyngs.models.checkpoint import CheckpointInfo, restored_model
 from dyngs.models.renderable import Renderable
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE
-from dyngs.runs.config_file import write_config
-from dyngs.runs.folder import EXPORT_FOLDER
+from dyngs.runs.folder import EXPORT_FOLDER, write_config
 from dyngs.runs.stored_file import decoded, drawable, encoded, step_below, write_scene
 from dyngs.training.trainer import Trainer
 
