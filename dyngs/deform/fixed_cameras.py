@@ -319,7 +319,8 @@ def surface(hulls: Sequence[Hull]) -> tuple[np.ndarray, float]:
     side = float(np.median([hull.side for hull in whole]))
     cells = [np.unique(np.round((x.cubes - x.center) / side), axis=0) for x in whole]
     cubes, counts = np.unique(np.concatenate(cells), axis=0, return_counts=True)
-    cubes = cubes[counts >= min(0.4 * len(whole), counts.max())]
+    often = counts >= 0.4 * len(whole)
+    cubes = cubes[often] if often.any() else cubes
     beside = KDTree(cubes).query_pairs(1, p=1, output_type="ndarray")
     return cubes[np.bincount(beside.ravel(), minlength=len(cubes)) < 6] * side, side
 

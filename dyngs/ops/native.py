@@ -136,11 +136,13 @@ class _Threads:
 
     started = False
     lost = False
+    warned = False
 
 
 def _begin_child() -> None:
     """Set the number of threads; called in the child just after the fork."""
     _Threads.lost = _Threads.started
+    _Threads.warned = False
     if _Threads.lost:
         torch.set_num_threads(1)
 
@@ -156,7 +158,8 @@ def num_threads() -> int:
     if not _Threads.lost:
         _Threads.started |= wanted > 1
         return wanted
-    if torch.utils.data.get_worker_info() is None:
+    if not _Threads.warned and torch.utils.data.get_worker_info() is None:
+        _Threads.warned = True
         warnings.warn(
             "dyngs and torch run on one thread: this process was forked from one that had "
             "started threads, which it has not got; start processes with multiprocessing's "

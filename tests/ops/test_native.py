@@ -161,7 +161,7 @@ def fork(before):
     if child == 0:
         signal.alarm(100)  # ends a child that hangs
         with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("once")
+            warnings.simplefilter("always")
             after = draw(5000)
             with kernel_threads(4):
                 again = draw(5000)
