@@ -82,8 +82,8 @@ def scores(run: Path) -> list[str]:
     means = [
         fmean(plain),
         fmean(fitted),
-        fmean(x["psnr_right"] or 0.0 for x in halves),
-        fmean(x["psnr_right_fitted"] or 0.0 for x in halves),
+        fmean(x.get("psnr_right", 0.0) for x in halves),
+        fmean(x.get("psnr_right_fitted", 0.0) for x in halves),
     ]
     return [config.train.exposure, *(f"{mean:.2f}" for mean in means)]
 

@@ -32,7 +32,7 @@ from dyngs.data.capture import View, all_views
 from dyngs.data.images.images import area_downscale, read_image, target_size
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import evaluate_run
-from dyngs.export.video import VideoWriter
+from dyngs.export.video import video_writer
 from dyngs.io.write import to_uint8, write_image
 from dyngs.runs.checkpoint import checkpoint_paths
 
@@ -53,9 +53,9 @@ def unposed(views: Sequence[View], folder: Path, side: int, video: bool) -> Path
     if video:
         path = folder.with_suffix(".mp4")
         if not path.exists():
-            with VideoWriter(path, fps=FPS, quality=9) as writer:
+            with video_writer(path, fps=FPS, quality=9) as add:
                 for view in views:
-                    writer.add(shrunk(view, side))
+                    add(shrunk(view, side))
         return path
     for view in views:
         target = folder / f"{view.image_path.stem}.png"

@@ -9,19 +9,17 @@ from pathlib import Path
 import numpy as np
 import torch
 from motion_files import Clip, as_local, glb_of, random_motion, skeleton, tiny_body, write_bvh
-from moving_scene import camera, row_of_balls
+from moving_scene import row_of_balls
 from synthetic_bodies import model, write_npz, write_obj, write_pickle
 from tiny_captures import random_pixels, write_image, write_video
 from tiny_fields import stirred_field
 
 from dyngs.config import Config, DataConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, save_config
-from dyngs.core.camera import Cameras
 from dyngs.core.state import tensors_of
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
 from dyngs.deform.keys import DynamicModel
-from dyngs.export.camera_paths import CameraPath, write_path
 from dyngs.gaussians.scene import GaussianScene, restored_scene
 from dyngs.human.avatar.avatar_file import _KIND as AVATAR_KIND
 from dyngs.human.body.joints import JOINT_NAMES
@@ -388,13 +386,16 @@ def write_overrides(root: Path) -> None:
 
 def write_frames_path(root: Path) -> None:
     """Write a camera path of two frames."""
-    one = camera()
-    poses = one.cam_from_world.expand(2, 4, 4).clone()
-    intrinsics = one.intrinsics.expand(2, 3, 3).clone()
-    write_path(
-        root / "a.json",
-        CameraPath(Cameras(poses, intrinsics, one.width, one.height), 30.0, (0.0, 1.0)),
-    )
+    frame = {
+        "cam_from_world": np.eye(4).tolist(),
+        "fl_x": 20.0,
+        "fl_y": 20.0,
+        "cx": 10.0,
+        "cy": 7.0,
+    }
+    frames = [{**frame, "time": 0.0}, {**frame, "time": 1.0}]
+    document = {"width": 20, "height": 14, "fps": 30.0, "frames": frames}
+    (root / "a.json").write_text(json.dumps(document))
 
 
 def write_keyframes(root: Path) -> None:
@@ -415,12 +416,11 @@ def write_measurement(root: Path) -> None:
     """Write a measured point of ``dyngs tradeoff``."""
     from dataclasses import asdict
 
-    from dyngs.study.measure import Measurement, Quartiles, Speed
+    from dyngs.study.measure import Measurement
     from dyngs.study.runs import write_stored
 
-    speed = Speed(Quartiles(3.0, 2.0, 4.0), Quartiles(1.0, 0.9, 1.1))
-    scores = (3, 30.0, 0.9, 0.1, 29.0, None, 100, 1.5, 20.0, 7, 1.5)
-    point = Measurement("prune=0.5", {"prune": 0.5}, *scores, speed=speed)
+    scores = (3, 30.0, 0.9, 0.1, 29.0, None, 100, 1.5, 7, 1.5)
+    point = Measurement("prune=0.5", *scores, ms=3.0, gain=1.1)
     write_stored(root / "a.json", asdict(point))
 
 
@@ -434,23 +434,6 @@ def write_log(root: Path) -> None:
     """Write the log and the timing of a run."""
     (root / "log.jsonl").write_text('{"step": 1, "loss": 0.5}\n{"step": 2, "loss": 0.4}\n')
     (root / "timing.json").write_text('{"seconds_train": {"7": 1.0}}\n')
-
-
-def write_load(root: Path) -> None:
-    """Write a workload of ``dyngs bench``."""
-    pose = np.eye(4)[None]
-    pose[0, 2, 3] = 3
-    k = np.array([[[20.0, 0, 10], [0, 20, 7], [0, 0, 1]]])
-    points = np.random.default_rng(0).uniform(-1, 1, (9, 3))
-    np.savez(
-        root / "a.npz",
-        means3d=points,
-        colors=np.full((9, 3), 9),
-        viewmats=pose,
-        Ks=k,
-        width=20,
-        height=14,
-    )
 
 
 def _gaussians() -> dict[str, torch.Tensor]:

@@ -163,7 +163,7 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
             )
     opened = _opened(arguments)
     path = choose_path(opened, _path_options(arguments))
-    print_notes((*opened.notes, *path.notes), path.warnings)
+    print_notes((*opened.notes, *path.notes))
     if not arguments.fps:
         output = replace(output, fps=path.fps)
     with ProgressBar() as report:

@@ -5,13 +5,9 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from dyngs.cli.arguments import AXES
 from dyngs.cli.output import print_notes
-
-if TYPE_CHECKING:
-    from dyngs.export.images import Redrawn
 
 SPLAT_FORMATS = ("ply", "compressed-ply", "spz", "splat", "sog", "glb", "usd")
 """Names of ``dyngs.io.formats.formats.FORMATS``; those and ``MOVING`` are so that ``--help`` need not
@@ -31,18 +27,13 @@ def add_axes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--from-up", choices=AXES, metavar="AXIS", help=about)
     about = "degree of the harmonics in the file, 0 to 4: higher ones are left out, missing ones are zero"
     parser.add_argument("--sh-degree", type=int, choices=range(5), metavar="N", help=about)
-    about = ".spz: 4 states which axes the file has, but fewer programs read it (default 3)"
-    parser.add_argument("--spz-version", type=int, choices=(3, 4), help=about)
-    about = ".glb of Gaussians: compress them as .spz, in a draft of glTF that CesiumJS reads"
-    parser.add_argument("--compress", choices=("spz",), help=about)
 
 
-def print_redrawn(notes: tuple[str, ...], found: Sequence[Redrawn]) -> None:
-    """Print what the format could not hold, and how the files differ from the scene: the worst of
-    them."""
-    worst = min(found, key=lambda one: one.psnr)
-    print_notes((*notes, worst.line))
-    if worst.is_faint:
-        print_notes(
-            (), (f"the file shows the scene with visible differences ({worst.psnr:.1f} dB)",)
-        )
+def print_redrawn(notes: tuple[str, ...], found: Sequence[float]) -> None:
+    """Print what the format could not hold, and the worst PSNR, dB, of files drawn again and the
+    scene."""
+    worst = min(found)
+    figure = "the same images" if worst >= 99.9 else f"{worst:.1f} dB (PSNR)"
+    print_notes((*notes, f"drawn again: {figure} compared with the scene"))
+    if worst < 30:
+        print_notes((), (f"the file shows the scene with visible differences ({worst:.1f} dB)",))

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any
@@ -21,22 +22,22 @@ from dyngs.data.times import evenly_spaced
 from dyngs.data.tracks import read_true_tracks
 from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import (
+    POSE_METRICS,
     REGION_METRICS,
     Drawing,
     PoseScores,
     Regions,
     TimeScore,
     ViewScore,
-    flicker_error,
-    flicker_of_split,
     means_of,
     psnr_per_time,
     score_views,
     seconds_in_turn,
+    temporal_scores,
 )
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
-from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, Comparison, fitted_to_images
-from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, fitted_to_images
+from dyngs.human.avatar.scene import avatar_of
 from dyngs.io.write import write_text
 from dyngs.models.checkpoint import OTHER_CONFIG, read_capture_of
 from dyngs.models.kind import Moves, capability
@@ -52,7 +53,7 @@ from dyngs.runs.checkpoint import (
     latest_checkpoint,
     load_run,
 )
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import scene_of_split, split_views
 from dyngs.training.corrections.camera_refinement import (
     CameraCorrections,
@@ -75,58 +76,38 @@ def found_corrections(
     return refinement.corrections
 
 
-MOST_BY_BACKGROUND = 1.0
-"""Largest difference of PSNR between white and black, dB, that is not warned of."""
-
-
-@dataclass(frozen=True)
-class PoseRefinement:
-    """Scores from poses that were fitted to the tested images; None where that was not done."""
-
-    # from cameras, or of a person from body poses, fitted to the whole images
-    psnr: float | None = None
-    to_images: PoseScores | None = None  # of a person, all scores of these
-    # of a person, from poses fitted to the silhouettes alone; None without silhouettes
-    to_silhouettes: PoseScores | None = None
-
-
 def scores_from_own_poses(
     drawing: Drawing, images: ImageLoader, size: float, lpips: Lpips
-) -> PoseRefinement:
-    """Return the scores of images from poses that were fitted to them; the scene stays as it is."""
-    avatar = avatar_of(drawing.scene)
-    if avatar is None:
-        return PoseRefinement(psnr_from_own_poses(drawing, images, size))
-    outlined = all(images[i].alpha is not None for i in range(len(images)))
-    whole = _person_scores(avatar, drawing, images, lpips, IMAGES)
-    outlines = _person_scores(avatar, drawing, images, lpips, SILHOUETTES) if outlined else None
-    return PoseRefinement(whole.psnr, whole, outlines)
+) -> dict[str, Any]:
+    """Return the fields of a report on images from poses that were fitted to them: of a person from
+    body poses, else from cameras; ``size`` of the scene is in world units.
 
-
-def _person_scores(
-    avatar: HumanScene, drawing: Drawing, images: ImageLoader, lpips: Lpips, comparison: Comparison
-) -> PoseScores:
-    fitted = fitted_to_images(avatar, images, drawing.background, comparison)
-    each = (images[i] for i in range(len(images)))
-    views, _ = score_views(fitted.scene, each, drawing.options, drawing.background, lpips)
-    return PoseScores(**means_of(views), updates=fmean(fitted.updates), per_view=tuple(views))
-
-
-def psnr_from_own_poses(drawing: Drawing, images: ImageLoader, size: float) -> float:
-    """Return the mean PSNR, dB, of images from poses fitted to them; ``size`` of the scene is in
-    world units."""
-    scene = require_gaussians(drawing.scene, "what cameras are fitted to")
+    "silhouette_poses" are fitted to the silhouettes alone. The scene stays as it is.
+    """
     background = drawing.background
+    avatar = avatar_of(drawing.scene)
+    if avatar is not None:
+        outlined = all(images[i].alpha is not None for i in range(len(images)))
+        found: dict[str, Any] = {}
+        for name, comparison in (("own_poses", IMAGES), ("silhouette_poses", SILHOUETTES)):
+            if name == "silhouette_poses" and not outlined:
+                continue
+            fitted, updates = fitted_to_images(avatar, images, background, comparison)
+            each = (images[i] for i in range(len(images)))
+            views, _ = score_views(fitted, each, drawing.options, background, lpips)
+            found[name] = PoseScores(
+                **means_of(views), updates=fmean(updates), per_view=tuple(views)
+            )
+        return found | {"psnr_own_poses": found["own_poses"].psnr}
+    scene = require_gaussians(drawing.scene, "what cameras are fitted to")
     options = scene.options
     scores: list[float] = []
     for image in (images[i] for i in range(len(images))):
-        fitted = fitted_to_image(scene, image, background, size, options=options)
+        cameras = fitted_to_image(scene, image, background, size, options=options).cameras
         with torch.no_grad():
-            rendering = scene.render(
-                fitted.cameras, image.time, options=options, background=background
-            )
+            rendering = scene.render(cameras, image.time, options=options, background=background)
         scores.append(psnr(rendering.rgb[0], image.composite(background), image.mask))
-    return fmean(scores)
+    return {"psnr_own_poses": fmean(scores)}
 
 
 def images_of_split(
@@ -145,7 +126,7 @@ def images_of_split(
     return images
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EvalReport:
     """The report that ``dyngs eval`` prints and writes; the fields are the keys of the file, see
     docs/formats.md."""
@@ -163,15 +144,15 @@ class EvalReport:
     flip: float | None
     lpips: float | None
     lpips_net: str
-    num_gaussians: int
-    num_moving: int
-    moving_fraction: float
+    num_gaussians: int = 0
+    num_moving: int = 0
+    moving_fraction: float = 0.0
     # float32 parameters of all Gaussians and of the field in 1e6 bytes; an exported .ply adds 12
     # bytes per Gaussian
     model_mb: float
-    field_mb: float  # of these, the field's
+    field_mb: float = 0.0  # of these, the field's
     # numbers per Gaussian that its colour takes, with its fraction of a network
-    colour_floats: float
+    colour_floats: float = 0.0
     # one over the median time of drawing one view, after a warm-up: deformation and rendering;
     # loading and metrics not counted
     fps: float
@@ -202,8 +183,8 @@ class EvalReport:
     track_motion_px: float | None = None
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None
-    # ``psnr_own_poses, own_poses, silhouette_poses``: see ``PoseRefinement``; None where that was
-    # not requested
+    # ``psnr_own_poses, own_poses, silhouette_poses``: from poses that were fitted to the images;
+    # None where that was not requested
     psnr_own_poses: float | None = None
     # ``psnr_white, psnr_black``: None where images have no alpha
     psnr_white: float | None = None
@@ -219,7 +200,7 @@ class EvalReport:
         if self.psnr_white is None or self.psnr_black is None:
             return ()
         difference = self.psnr_white - self.psnr_black
-        if abs(difference) <= MOST_BY_BACKGROUND:
+        if abs(difference) <= 1.0:
             return ()
         worse, other = ("black", "white") if difference > 0 else ("white", "black")
         return (
@@ -252,7 +233,11 @@ def evaluate_run(
     if it was read already.
     """
     draws_on = device_for(device)
-    _require_possible(run_dir, split, refine_poses)
+    inputs_of(run_dir).require_output(report_path(run_dir, split))
+    if refine_poses and split == "train":
+        raise DyngsError(
+            f"{run_dir}: --refine is for images that were not trained on; name them with --split test, val or pose"
+        )
     run = load_run(run_dir, data_root)
     capture = capture or read_capture_of(run.config.data, run.info)
     views = split_views(capture, split)
@@ -268,66 +253,67 @@ def evaluate_run(
         scores, reasons = score_views(
             scene, images, drawing.options, drawing.background, lpips, regions
         )
-        temporal = {"flicker": flicker_of_split(drawing, loader, views)}
-        temporal["flicker_error"] = flicker_error(drawing, loader, views)
+        temporal = temporal_scores(drawing, loader, views)
         tracks = _track_scores(run, capture, scene, views)
-        asked = split != "train" and (refine_poses or run.config.camera.refine == "always")
-        fitted = (
-            scores_from_own_poses(drawing, loader, run.info.extent, lpips)
-            if asked
-            else PoseRefinement()
+        fitted = {}
+        if split != "train" and (refine_poses or run.config.camera.refine == "always"):
+            fitted = scores_from_own_poses(drawing, loader, run.info.extent, lpips)
+    means = means_of(scores, MEAN_METRICS)
+    reasons |= {name: metric.reason for name, metric in temporal.items() if metric.reason}
+    reasons |= {name: regions.reason(name) for name in REGION_METRICS if means[name] is None}
+    if means["psnr_right"] is None:
+        reasons |= dict.fromkeys(
+            ("psnr_right", "psnr_right_fitted"), "half a view has no pixel that counts"
         )
+    if tracks.reason is not None:
+        reasons["track_error_px"] = tracks.reason
     report = EvalReport(
         split=split,
+        num_views=len(scores),
+        width=scores[0].width,
+        height=scores[0].height,
         background=background,
         lpips_net=lpips_net,
-        moving_from=regions.moving_from,
+        fps=1 / median(score.render_seconds for score in scores),
+        deform_fraction=median(score.deform_seconds / score.render_seconds for score in scores),
+        seconds_train=run.seconds_train,
+        step=run.step,
+        psnr_per_time=psnr_per_time((score.time, score.psnr) for score in scores),
+        reasons=reasons,
         notes=_notes(run, scores),
-        psnr_own_poses=fitted.psnr,
-        own_poses=fitted.to_images,
-        silhouette_poses=fitted.to_silhouettes,
-        **{name: metric.value for name, metric in temporal.items()},
+        per_view=tuple(scores),
+        stored_mb=_stored_mb(run_dir),
+        psnr_things=_means_of_things(scores),
+        moving_from=regions.moving_from,
         track_error_px=tracks.error_px,
         track_within_5px=tracks.within_5px,
         track_motion_px=tracks.motion_px,
-        **_of_views(scores),
-        **_facts(run_dir, run, scene),
+        **means,
+        **{name: metric.value for name, metric in temporal.items()},
+        **fitted,
+        **_sizes(scene),
     )
-    reasons |= {
-        name: metric.reason for name, metric in temporal.items() if metric.reason is not None
-    }
-    report = replace(report, reasons=reasons | _reasons(report, regions, tracks))
     write_text(report_path(run_dir, split), report.to_json())
     return report
 
 
-def _require_possible(run_dir: Path, split: str, refine_poses: bool) -> None:
-    inputs_of(run_dir).require_output(report_path(run_dir, split))
-    if refine_poses and split == "train":
-        raise DyngsError(
-            f"{run_dir}: --refine is for images that were not trained on; name them with --split test, val or pose"
-        )
+MEAN_METRICS = (*POSE_METRICS, "flip", "psnr_right", "psnr_right_fitted", "psnr_white")
+MEAN_METRICS += REGION_METRICS
 
 
-def _facts(run_dir: Path, run: LoadedRun, scene: Renderable) -> dict[str, Any]:
-    facts = {
-        "seconds_train": run.seconds_train,
-        "step": run.step,
-        "stored_mb": 1e-6 * (run_dir / SCENE_FILE).stat().st_size
-        if has_only_scene_file(run_dir)
-        else None,
-    }
+def _means_of_things(scores: Sequence[ViewScore]) -> dict[int, float]:
+    found: defaultdict[int, list[float]] = defaultdict(list)
+    for score in scores:
+        for label, value in score.psnr_things.items():
+            found[label].append(value)
+    return {label: fmean(found[label]) for label in sorted(found)}
+
+
+def _sizes(scene: Renderable) -> dict[str, Any]:
     if not isinstance(scene, GaussianScene):
         values = sum(x.tensor.numel() for x in scene.drawing_state().values())
-        none = {
-            "num_gaussians": 0,
-            "num_moving": 0,
-            "moving_fraction": 0.0,
-            "field_mb": 0.0,
-            "colour_floats": 0.0,
-        }
-        return facts | none | {"model_mb": 4e-6 * values}
-    return facts | {
+        return {"model_mb": 4e-6 * values}
+    return {
         "num_gaussians": len(scene),
         "num_moving": 0 if scene.is_static else scene.num_moving,
         "moving_fraction": scene.moving_fraction,
@@ -337,46 +323,8 @@ def _facts(run_dir: Path, run: LoadedRun, scene: Renderable) -> dict[str, Any]:
     }
 
 
-def _of_views(scores: Sequence[ViewScore]) -> dict[str, Any]:
-    """Return the fields of a report on views; means of regions are over the views that have one,
-    others over all."""
-    means: dict[str, Any] = {
-        "num_views": len(scores),
-        "width": scores[0].width,
-        "height": scores[0].height,
-        "fps": 1 / median(score.render_seconds for score in scores),
-        "deform_fraction": median(score.deform_seconds / score.render_seconds for score in scores),
-        "psnr_per_time": psnr_per_time((score.time, score.psnr) for score in scores),
-        "per_view": tuple(scores),
-    }
-    means |= means_of(scores) | means_of(
-        scores, ("flip", "psnr_right", "psnr_right_fitted", "psnr_white")
-    )
-    for metric in REGION_METRICS:
-        known = [
-            value for value in (getattr(score, metric) for score in scores) if value is not None
-        ]
-        means[metric] = fmean(known) if known else None
-    labels = sorted({label for score in scores for label in score.psnr_things})
-    shown = {
-        i: [score.psnr_things[i] for score in scores if i in score.psnr_things] for i in labels
-    }
-    return means | {"psnr_things": {label: fmean(known) for label, known in shown.items()}}
-
-
-def _reasons(report: EvalReport, regions: Regions, tracks: TrackScores) -> dict[str, str]:
-    """Return why there are no values of parts of the images, and no errors of tracks, by the
-    metric."""
-    reasons = {
-        metric: regions.reason(metric)
-        for metric in REGION_METRICS
-        if getattr(report, metric) is None
-    }
-    if report.psnr_right is None:
-        reasons |= dict.fromkeys(
-            ("psnr_right", "psnr_right_fitted"), "half a view has no pixel that counts"
-        )
-    return reasons if tracks.reason is None else reasons | {"track_error_px": tracks.reason}
+def _stored_mb(folder: Path) -> float | None:
+    return 1e-6 * (folder / SCENE_FILE).stat().st_size if has_only_scene_file(folder) else None
 
 
 def report_path(run_dir: Path, split: str) -> Path:
@@ -387,12 +335,14 @@ def report_path(run_dir: Path, split: str) -> Path:
 def _track_scores(
     run: LoadedRun, capture: Capture, scene: Renderable, views: Sequence[View]
 ) -> TrackScores:
-    tracks = read_true_tracks(capture)
-    cameras = training_cameras(views, run.config.data)
     if not isinstance(scene, GaussianScene):
         return TrackScores(reason="it is not made of Gaussians, whose tracks could be compared")
+    cameras = training_cameras(views, run.config.data)
     return track_scores(
-        scene, tracks, list(zip(views, cameras, strict=True)), all_views(capture.splits)
+        scene,
+        read_true_tracks(capture),
+        list(zip(views, cameras, strict=True)),
+        all_views(capture.splits),
     )
 
 
@@ -462,48 +412,37 @@ def compared(
     """Return the costs of runs on the capture of the first; drawn in turn, so that load affects all
     alike."""
     runs = [load_run(folder, data_root) for folder in folders]
-    capture = read_capture_of(runs[0].config.data, runs[0].info)
-    has_test = bool(capture.splits.get("test"))
+    data = runs[0].config.data
+    capture = read_capture_of(data, runs[0].info)
+    background = evaluation_background(data.background, capture.has_alpha)[1].to(device)
+    psnrs: dict[str, list[float]] = {}
+    seconds = np.zeros(0)
     with kernel_threads(threads), torch.no_grad():
-        splits = ("train", "test") if has_test else ("train",)
-        shown = {split: _views(runs, capture, split, device) for split in splits}
-        psnrs = {split: _psnrs(*views) for split, views in shown.items()}
-        seconds = seconds_in_turn(*shown[splits[-1]], ROUNDS)
+        for split in ("train", "test") if capture.splits.get("test") else ("train",):
+            loader = ImageLoader(split_views(capture, split), data)
+            loader.device = device
+            images = [loader[i] for i in evenly_spaced(len(loader), COMPARED_VIEWS)]
+            drawings = []
+            for run in runs:
+                scene = scene_of_split(run, capture, split).to(device)
+                drawings.append(Drawing(scene, scene.options, background))
+            psnrs[split] = [
+                fmean(_psnr(drawing, image) for image in images) for drawing in drawings
+            ]
+            seconds = seconds_in_turn(drawings, images, ROUNDS)
     return [
         Cost(
             num_gaussians=len(run.scene),
             psnr_train=psnrs["train"][i],
-            psnr_test=psnrs["test"][i] if has_test else None,
+            psnr_test=psnrs["test"][i] if "test" in psnrs else None,
             fps=1 / float(np.median(seconds[i])),
             megabytes=parameter_megabytes(run.scene),
-            stored=_stored(folders[i]),
+            stored=_stored_mb(folders[i]),
         )
         for i, run in enumerate(runs)
     ]
 
 
-def _stored(folder: Path) -> float | None:
-    return 1e-6 * (folder / SCENE_FILE).stat().st_size if has_only_scene_file(folder) else None
-
-
-def _psnrs(drawings: Sequence[Drawing], images: Sequence[Image]) -> list[float]:
-    truths = [(image, image.composite(drawings[0].background)) for image in images]
-    return [
-        fmean(
-            psnr(drawing.image(image.cameras, image.time), truth, image.mask)
-            for image, truth in truths
-        )
-        for drawing in drawings
-    ]
-
-
-def _views(
-    runs: Sequence[LoadedRun], capture: Capture, split: str, device: torch.device
-) -> tuple[list[Drawing], list[Image]]:
-    config = runs[0].config
-    loader = ImageLoader(split_views(capture, split), config.data)
-    loader.device = device
-    background = evaluation_background(config.data.background, capture.has_alpha)[1].to(device)
-    scenes = [scene_of_split(run, capture, split).to(device) for run in runs]
-    drawings = [Drawing(scene, scene.options, background) for scene in scenes]
-    return drawings, [loader[i] for i in evenly_spaced(len(loader), COMPARED_VIEWS)]
+def _psnr(drawing: Drawing, image: Image) -> float:
+    truth = image.composite(drawing.background)
+    return psnr(drawing.image(image.cameras, image.time), truth, image.mask)

@@ -5,13 +5,14 @@ Local letters: P true points, N Gaussians, K Gaussians that carry a point.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 import torch
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
@@ -60,189 +61,135 @@ def track_scores(
     if tracks is None:
         return TrackScores(reason=NO_TRACKS)
     scene = scene.unmasked()
-    if not bool((_opacities(scene, None) > MIN_OPACITY).any()):
+    num_opaque = int((torch.sigmoid(scene.gaussians.logit_opacities) > MIN_OPACITY).sum())
+    if not num_opaque:
         return TrackScores(reason=NONE_OPAQUE)
-    bound = _bind(scene, tracks, _times_of(tracks, views))
     rows = {name: row for row, name in enumerate(tracks.views.tolist())}
-    moved = _handed_on(
-        scene, bound, sorted({view.time for view, _ in split if view.time is not None})
-    )
+    shown = [x for x in split if x[0].time is not None and x[0].name in rows]
+    points, bound_at = _binding(tracks, views)
+    times = sorted({view.time for view, _ in shown if view.time is not None})
+    carried = _carried_to(times, scene, points, bound_at, min(CARRIERS, num_opaque))
     errors = []
     motions = []
-    for view, cameras in split:
-        if view.time is None or view.name not in rows:
-            continue
-        truth = tracks.points[tracks.moments[rows[view.name]]]
-        shown = tracks.visible[rows[view.name]] & (np.abs(bound.times - view.time) > SAME_TIME)
-        if not shown.any():
-            continue
-        if view.time not in moved:
-            moved = {view.time: bound.carried(scene, view.time)}
+    for view, cameras in shown:
+        row = rows[view.name]
+        is_shown = tracks.visible[row] & (np.abs(bound_at - view.time) > SAME_TIME)
         limit = float(np.hypot(cameras.width, cameras.height))
-        true = _pixels(truth[shown], cameras)
-        for found, kept in ((moved[view.time], errors), (bound.points, motions)):
-            distance = np.linalg.norm(_pixels(found[shown], cameras) - true, axis=1)
-            kept.append(np.minimum(np.nan_to_num(distance, nan=limit), limit))
+        true = _pixels(tracks.points[tracks.moments[row]][is_shown], cameras)
+        for found, kept in ((carried[view.time], errors), (points, motions)):
+            distance = np.linalg.norm(_pixels(found[is_shown], cameras) - true, axis=1)
+            kept.extend(np.minimum(np.nan_to_num(distance, nan=limit), limit).tolist())
     if not errors:
         return TrackScores(reason=NONE_SEEN)
-    error = np.concatenate(errors)
+    error = np.array(errors)
     return TrackScores(
-        float(error.mean()), float((error < CLOSE_PX).mean()), float(np.concatenate(motions).mean())
+        float(error.mean()), float((error < CLOSE_PX).mean()), float(np.mean(motions))
     )
 
 
-@dataclass(frozen=True)
-class _Bound:
-    """Points and the Gaussians that carry them."""
-
-    points: np.ndarray  # (P, 3) where they were bound, NaN where they were not
-    times: np.ndarray  # (P,) when they were bound, NaN where they were not
-    carriers: np.ndarray  # (P, K) rows of Gaussians
-    weights: np.ndarray  # (P, K), each row sums to 1
-    poses: _Poses  # (P, K) of the carriers when they were bound
-
-    def carried(self, scene: GaussianScene, time: float) -> np.ndarray:
-        """Return the (P, 3) points at ``time``."""
-        return _carried(
-            self.points, self.poses, _poses(scene, time).of(self.carriers), self.weights
-        )
-
-
-@dataclass(frozen=True)
-class _Poses:
-    """Where Gaussians are, and how they are turned."""
-
-    means: np.ndarray  # (..., 3)
-    quats: np.ndarray  # (..., 4) unit, wxyz
-
-    def of(self, rows: np.ndarray) -> _Poses:
-        return _Poses(self.means[rows], self.quats[rows])
-
-
-def _poses(scene: GaussianScene, time: float) -> _Poses:
-    gaussians = scene.at(time)
-    return _Poses(
-        *(x.detach().cpu().double().numpy() for x in (gaussians.means, unit_quats(gaussians.quats)))
-    )
-
-
-def _carried(points: np.ndarray, before: _Poses, after: _Poses, weights: np.ndarray) -> np.ndarray:
-    """Return ``points`` (P, 3) as (P, K) Gaussians carry them, which move and turn, with
-    ``weights`` (P, K).
-
-    What lies beside the centre of a Gaussian turns about it: on a ball that rolls, its shift alone
-    would not do.
-    """
-    from scipy.spatial.transform import Rotation
-
-    there = np.isfinite(points).all(1)
-    found = np.full(points.shape, np.nan)
-    arms = points[there, None] - before.means[there]
-    first, last = (
-        Rotation.from_quat(x.quats[there].reshape(-1, 4)[:, [1, 2, 3, 0]]) for x in (before, after)
-    )
-    arms = (last * first.inv()).apply(arms.reshape(-1, 3)).reshape(arms.shape)
-    found[there] = (weights[there, :, None] * (after.means[there] + arms)).sum(axis=1)
-    return found
-
-
-def _handed_on(
-    scene: GaussianScene, bound: _Bound, times: Sequence[float]
-) -> dict[float, np.ndarray]:
-    """Return where points are at ``times``, each carried from one time to the next by the Gaussians
-    that are opaque.
-
-    Empty where the same Gaussians are there at all times.
-    """
-    moved = field_scene_of(scene)
-    if moved is None or moved.field is None or not moved.field.momentary:
-        return {}
-    steps = sorted({*scene.times, *times, *bound.times[np.isfinite(bound.times)].tolist()})
-    poses = {time: _poses(scene, time) for time in steps}
-    found = {time: np.where((bound.times == time)[:, None], bound.points, np.nan) for time in steps}
-    for order in (steps, steps[::-1]):
-        for now, then in pairwise(order):
-            rows = np.flatnonzero(np.isfinite(found[now]).all(1) & ~np.isfinite(found[then]).all(1))
-            if len(rows):
-                carriers, weights = _nearest(
-                    scene, now, poses[now].means, found[now][rows], bound.weights.shape[1]
-                )
-                before = poses[now].of(carriers)
-                after = poses[then].of(carriers)
-                found[then][rows] = _carried(found[now][rows], before, after, weights)
-    return found
-
-
-def _nearest(
-    scene: GaussianScene, time: float, means: np.ndarray, points: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return (P, K) rows of the ``count`` Gaussians nearest to ``points`` (P, 3), and their
-    weights, by opacity."""
-    from scipy.spatial import KDTree
-
-    opacities = _opacities(scene, time)
-    # A field may fade Gaussians: of those that are too faint now, the least faint fill up.
-    opaque = np.argsort(-opacities, kind="stable")[
-        : max(count, int((opacities > MIN_OPACITY).sum()))
-    ]
-    _, nearest = KDTree(means[opaque]).query(points, k=count)
-    chosen = opaque[np.reshape(nearest, (len(points), count))]
-    return chosen, opacities[chosen] / opacities[chosen].sum(axis=1, keepdims=True)
-
-
-def _times_of(tracks: TrueTracks, views: Sequence[View]) -> np.ndarray:
-    """Return the (T,) times of the tracks as the capture has them, by its views; NaN of those that
-    no view shows."""
+def _binding(tracks: TrueTracks, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points (P, 3) and times (P,) at which they are bound: nearest to the middle of
+    when they are seen; NaN of points that are never seen."""
     times = np.full(len(tracks.points), np.nan)
     known = {view.name: view.time for view in views if view.time is not None}
     for name, row in zip(tracks.views.tolist(), tracks.moments.tolist(), strict=True):
         times[row] = known.get(name, times[row])
-    return times
-
-
-def _bind(scene: GaussianScene, tracks: TrueTracks, times: np.ndarray) -> _Bound:
-    """Return the points bound to the nearest Gaussians, each at its own one of the (T,) times."""
-    count = tracks.points.shape[1]
-    carriers_each = min(CARRIERS, int((_opacities(scene, None) > MIN_OPACITY).sum()))
-    bound = _Bound(
-        np.full((count, 3), np.nan),
-        np.full(count, np.nan),
-        np.zeros((count, carriers_each), np.int64),
-        np.full((count, carriers_each), 1.0 / carriers_each),
-        _Poses(np.zeros((count, carriers_each, 3)), np.ones((count, carriers_each, 4))),
-    )
-    for row, members in _binding_rows(tracks, times).items():
-        time = float(times[row])
-        poses = _poses(scene, time)
-        points = tracks.points[row, members].astype(np.float64)
-        chosen, weights = _nearest(scene, time, poses.means, points, carriers_each)
-        bound.points[members], bound.times[members], bound.carriers[members] = points, time, chosen
-        bound.poses.means[members] = poses.means[chosen]
-        bound.poses.quats[members] = poses.quats[chosen]
-        bound.weights[members] = weights
-    return bound
-
-
-def _binding_rows(tracks: TrueTracks, times: np.ndarray) -> dict[int, list[int]]:
-    """Return, by row of ``times``, the points bound then: nearest to the middle of when they are
-    seen."""
     seen = np.zeros(tracks.points.shape[:2], bool)
     np.logical_or.at(seen, tracks.moments, tracks.visible)
     seen &= np.isfinite(tracks.points).all(axis=2) & np.isfinite(times)[:, None]
-    if not seen.any():
-        return {}
-    middle = 0.5 * (np.nanmin(times) + np.nanmax(times))
-    distance = np.where(seen, np.abs(times - middle)[:, None], np.inf)
-    rows: defaultdict[int, list[int]] = defaultdict(list)
-    for point in np.flatnonzero(seen.any(axis=0)).tolist():
-        rows[int(distance[:, point].argmin())].append(point)
-    return rows
+    finite = times[np.isfinite(times)]
+    middle = 0.5 * (finite.min(initial=1.0) + finite.max(initial=0.0))
+    rows = np.where(seen, np.abs(times - middle)[:, None], np.inf).argmin(axis=0)
+    is_seen = seen.any(axis=0)
+    points = tracks.points[rows, np.arange(len(rows))].astype(np.float64)
+    points[~is_seen] = np.nan
+    return points, np.where(is_seen, times[rows], np.nan)
 
 
-def _opacities(scene: GaussianScene, time: float | None) -> np.ndarray:
-    """Return the (N,) opacities at ``time``; None: canonical ones."""
-    gaussians = scene.gaussians if time is None else scene.at(time)
-    return torch.sigmoid(gaussians.logit_opacities.detach()).cpu().double().numpy()
+@dataclass(frozen=True)
+class _Moment:
+    """The Gaussians at one time."""
+
+    means: np.ndarray  # (N, 3)
+    quats: np.ndarray  # (N, 4) unit, xyzw
+    opacities: np.ndarray  # (N,)
+
+
+def _moment(scene: GaussianScene, time: float) -> _Moment:
+    gaussians = scene.at(time)
+    means, quats, opacities = (
+        x.detach().cpu().double().numpy()
+        for x in (
+            gaussians.means,
+            unit_quats(gaussians.quats),
+            gaussians.logit_opacities.sigmoid(),
+        )
+    )
+    return _Moment(means, quats[:, [1, 2, 3, 0]], opacities)
+
+
+def _carried_to(
+    times: Sequence[float],
+    scene: GaussianScene,
+    points: np.ndarray,
+    bound_at: np.ndarray,
+    count: int,
+) -> dict[float, np.ndarray]:
+    """Return where ``points`` (P, 3) are at ``times``, each carried by ``count`` Gaussians from
+    where it was bound; or, where Gaussians come and go, from one time to the next."""
+    starts = np.unique(bound_at[np.isfinite(bound_at)]).tolist()
+    moved = field_scene_of(scene)
+    if moved is None or moved.field is None or not moved.field.momentary:
+        found = {time: np.full_like(points, np.nan) for time in times}
+        bound = []
+        for start in starts:
+            rows = np.flatnonzero(bound_at == start)
+            bound.append((rows, _bind(_moment(scene, start), points[rows], count)))
+        for time in times:
+            moment = _moment(scene, time)
+            for rows, binding in bound:
+                found[time][rows] = _carried(moment, *binding)
+        return found
+    steps = sorted({*scene.times, *times, *starts})
+    moments = {time: _moment(scene, time) for time in steps}
+    found = {time: np.where((bound_at == time)[:, None], points, np.nan) for time in steps}
+    for order in (steps, steps[::-1]):
+        for now, then in pairwise(order):
+            rows = np.flatnonzero(np.isfinite(found[now]).all(1) & ~np.isfinite(found[then]).all(1))
+            if len(rows):
+                binding = _bind(moments[now], found[now][rows], count)
+                found[then][rows] = _carried(moments[then], *binding)
+    return found
+
+
+def _bind(
+    moment: _Moment, points: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the rows (P, K) of the ``count`` Gaussians nearest to ``points`` (P, 3), their weights
+    (P, K) by opacity, and the points in their axes (P, K, 3)."""
+    # A field may fade Gaussians: of those that are too faint now, the least faint fill up.
+    num_opaque = max(count, int((moment.opacities > MIN_OPACITY).sum()))
+    opaque = np.argsort(-moment.opacities, kind="stable")[:num_opaque]
+    _, nearest = KDTree(moment.means[opaque]).query(points, k=count)
+    rows = opaque[np.reshape(nearest, (len(points), count))]
+    weights = moment.opacities[rows]
+    arms = points[:, None] - moment.means[rows]
+    inverse = Rotation.from_quat(moment.quats[rows.ravel()]).inv()
+    arms = inverse.apply(arms.reshape(-1, 3)).reshape(arms.shape)
+    return rows, weights / weights.sum(axis=1, keepdims=True), arms
+
+
+def _carried(
+    moment: _Moment, rows: np.ndarray, weights: np.ndarray, arms: np.ndarray
+) -> np.ndarray:
+    """Return points (P, 3) as the Gaussians carry them, which move and turn.
+
+    What lies beside the centre of a Gaussian turns about it: on a ball that rolls, its shift alone
+    would not do.
+    """
+    rotations = Rotation.from_quat(moment.quats[rows.ravel()])
+    turned = rotations.apply(arms.reshape(-1, 3)).reshape(arms.shape)
+    return (weights[..., None] * (moment.means[rows] + turned)).sum(axis=1)
 
 
 def _pixels(points: np.ndarray, cameras: Cameras) -> np.ndarray:

@@ -15,9 +15,9 @@ import math
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from statistics import fmean
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,8 +36,7 @@ from dyngs.models.renderable import DrawOptions, Renderable, Rendering
 from dyngs.models.views import background_colour
 from dyngs.ops.device import finish
 
-RegionMetric = Literal["psnr_foreground", "psnr_moving", "psnr_static"]
-REGION_METRICS: tuple[RegionMetric, ...] = ("psnr_foreground", "psnr_moving", "psnr_static")
+REGION_METRICS = ("psnr_foreground", "psnr_moving", "psnr_static")
 
 # a region of fewer pixels in a view is not measured there: a few pixels of an outline say nothing
 FEWEST_PIXELS = 25
@@ -45,7 +44,6 @@ CHANGE = 0.05
 """Mean difference of the channels from the camera's median, in [0, 1], from which a pixel counts as
 moving."""
 MEDIAN_IMAGES = 31  # number of images, spread over the clip, from which a camera's median is taken
-FEWEST_IMAGES = 3
 
 NO_ALPHA = "the images have no alpha and no silhouettes"
 NO_TIMES = "the images have no times"
@@ -70,7 +68,7 @@ class Regions:
         self._cameras = {
             views[i].name: indices
             for indices in static_cameras(views)
-            if len(indices) >= FEWEST_IMAGES
+            if len(indices) >= 3
             for i in indices
         }
         self._medians: dict[tuple[int, ...], Tensor] = {}
@@ -84,17 +82,11 @@ class Regions:
         moves = self.moving(image)
         foreground = None if image.alpha is None else image.alpha > 0
         self._has_alpha |= foreground is not None
-        inside = (
-            torch.ones_like(truth[..., 0], dtype=torch.bool) if foreground is None else foreground
-        )
-        parts = {
-            "psnr_foreground": foreground,
-            "psnr_moving": None if moves is None else moves & inside,
-            "psnr_static": None if moves is None else ~moves & inside,
-        }
-        return {
-            metric: _psnr_inside(part, image, rendered, truth) for metric, part in parts.items()
-        }
+        parts: list[Tensor | None] = [foreground, None, None]
+        if moves is not None:
+            parts[1:] = [x if foreground is None else x & foreground for x in (moves, ~moves)]
+        found = [_psnr_inside(part, image, rendered, truth) for part in parts]
+        return dict(zip(REGION_METRICS, found, strict=True))
 
     def scores_of_things(self, image: Image, rendered: Tensor, truth: Tensor) -> dict[int, float]:
         """Return the PSNR of a view, dB, on each thing that its motion mask tells apart and that it
@@ -123,7 +115,7 @@ class Regions:
         """How it was found what moves in the images so far; None where it was not."""
         return " and ".join(sorted(self._moving_from)) or None
 
-    def reason(self, metric: RegionMetric) -> str:
+    def reason(self, metric: str) -> str:
         """Return why no image so far has a score of this region."""
         if metric == "psnr_foreground":
             return TOO_SMALL if self._has_alpha else NO_ALPHA
@@ -167,23 +159,14 @@ class Drawing:
     scene: Renderable
     options: DrawOptions  # as in training, without depth
     background: Tensor  # (3,) colour
-    scale: float = 1.0  # width and height drawn, relative to those of the image
 
     @torch.no_grad()
     def image(self, cameras: Cameras, time: float | None) -> Tensor:
-        """Return the image (H, W, 3) of the one camera at ``time``; upscaled bilinearly if
-        ``scale`` < 1."""
-        small = cameras.scaled(self.scale)
-        rgb = self.scene.render(small, time, options=self.options, background=self.background).rgb[
-            0
-        ]
-        size = (cameras.height, cameras.width)
-        if rgb.shape[:2] == size:
-            return rgb
-        upscaled = torch.nn.functional.interpolate(
-            rgb.permute(2, 0, 1)[None], size=size, mode="bilinear"
+        """Return the image (H, W, 3) of the one camera at ``time``."""
+        rendering = self.scene.render(
+            cameras, time, options=self.options, background=self.background
         )
-        return upscaled[0].permute(1, 2, 0)
+        return rendering.rgb[0]
 
 
 def seconds_in_turn(
@@ -281,32 +264,36 @@ def score_views(
             raise DyngsError(f"view {image.name!r}: the render holds NaN or Inf")
         truth = image.composite(background)
         mask = image.mask
-        people = (
-            {} if avatar_of(scene) is None else person_scores(image, rendering, background, lpips)
-        )
-        parts = right_half_scores(image, rendering, background)
-        parts |= background_scores(image, rendering, background)
-        parts |= {} if regions is None else regions.scores(image, rendered, truth)
-        optional = {"flip": flip(rendered, truth, mask), "lpips": lpips(rendered, truth, mask)}
-        for name, metric in optional.items():
-            if metric.reason is not None:
-                reasons.setdefault(name, metric.reason)
+        values: dict[str, Any] = {
+            "psnr": psnr(rendered, truth, mask),
+            "ssim": ssim(rendered, truth, mask),
+        }
+        for name, metric in (("flip", flip), ("lpips", lpips)):
+            found = metric(rendered, truth, mask)
+            values[name] = found.value
+            if found.reason is not None:
+                reasons.setdefault(name, found.reason)
+        for name, value in values.items():
+            if value is not None and not math.isfinite(value):
+                empty = mask is not None and not bool((mask > 0).any())
+                why = "its mask ignores every pixel" if empty else "the image holds NaN or Inf"
+                raise DyngsError(f"view {image.name!r}: {name} is not finite, {why}")
+        if avatar_of(scene) is not None:
+            values |= person_scores(image, rendering, background, lpips)
+        values |= right_half_scores(image, rendering, background)
+        values |= background_scores(image, rendering, background)
+        if regions is not None:
+            values |= regions.scores(image, rendered, truth)
+            values["psnr_things"] = regions.scores_of_things(image, rendered, truth)
         score = ViewScore(
             name=image.name,
             width=image.cameras.width,
             height=image.cameras.height,
-            psnr=psnr(rendered, truth, mask),
-            ssim=ssim(rendered, truth, mask),
-            flip=optional["flip"].value,
-            lpips=optional["lpips"].value,
             render_seconds=seconds,
             deform_seconds=deform_seconds,
             time=image.time,
-            psnr_things={} if regions is None else regions.scores_of_things(image, rendered, truth),
-            **parts,
-            **people,
+            **values,
         )
-        _require_finite(score, mask)
         scores.append(score)
     return scores, reasons
 
@@ -331,25 +318,19 @@ def person_scores(
     }
 
 
-def background_scores(
-    image: Image, rendering: Rendering, background: Tensor
-) -> dict[str, float | None]:
-    """Return ``psnr_white`` and ``psnr_black``, dB, from one rendering on ``background`` (3,); None
+def background_scores(image: Image, rendering: Rendering, background: Tensor) -> dict[str, float]:
+    """Return ``psnr_white`` and ``psnr_black``, dB, from one rendering on ``background`` (3,); none
     without alpha."""
-    scores: dict[str, float | None] = {"psnr_white": None, "psnr_black": None}
-    if image.alpha is None:
-        return scores
-    for name in ("white", "black"):
+    scores: dict[str, float] = {}
+    for name in ("white", "black") if image.alpha is not None else ():
         colour = background_colour(name).to(background)
         shown = rendering.rgb[0] + rendering.transmittance[0][..., None] * (colour - background)
         scores[f"psnr_{name}"] = psnr(shown, image.composite(colour), image.mask)
     return scores
 
 
-def right_half_scores(
-    image: Image, rendering: Rendering, background: Tensor
-) -> dict[str, float | None]:
-    """Return ``psnr_right`` and ``psnr_right_fitted``, dB; None where a half of the image has no
+def right_half_scores(image: Image, rendering: Rendering, background: Tensor) -> dict[str, float]:
+    """Return ``psnr_right`` and ``psnr_right_fitted``, dB; none where a half of the image has no
     pixel that counts.
 
     That is the PSNR of the right half as the scene shows it, and after an affine colour fitted on
@@ -359,40 +340,31 @@ def right_half_scores(
     left = torch.zeros_like(truth[..., 0])
     middle = left.shape[1] // 2
     left[:, :middle] = 1
+    mask = None if image.mask is None else image.mask[:, middle:]
     counts = left + 1 if image.mask is None else image.mask
     if not all(bool((half > 0).any()) for half in (counts[:, :middle], counts[:, middle:])):
-        return {"psnr_right": None, "psnr_right_fitted": None}
+        return {}
     affine = fitted_affine([(image, rendering)], background, left)
     fitted = recoloured(affine, image, rendering, background)
-    mask = None if image.mask is None else image.mask[:, middle:]
     return {
         "psnr_right": psnr(rendering.rgb[0][:, middle:], truth[:, middle:], mask),
         "psnr_right_fitted": psnr(fitted[:, middle:], truth[:, middle:], mask),
     }
 
 
-_OF_POSES = (
-    "psnr",
-    "ssim",
-    "lpips",
-    "psnr_person",
-    "ssim_person",
-    "psnr_black",
-    "ssim_black",
-    "lpips_black",
-)
+POSE_METRICS = tuple(x.name for x in fields(PoseScores) if x.name not in ("updates", "per_view"))
 
 
-def means_of(scores: Sequence[ViewScore], names: Sequence[str] = _OF_POSES) -> dict[str, Any]:
-    """Return the means of metrics; by default those that exist for poses of the capture and for
-    fitted ones."""
-    return {name: mean_of([getattr(score, name) for score in scores]) for name in names}
-
-
-def mean_of(values: Sequence[float | None]) -> float | None:
-    """Return the mean of at least one value, None where one is None."""
-    known = [value for value in values if value is not None]
-    return fmean(known) if len(known) == len(values) else None
+def means_of(scores: Sequence[ViewScore], names: Sequence[str] = POSE_METRICS) -> dict[str, Any]:
+    """Return the means of metrics over at least one view; None where a view has none, but for
+    regions: these are over the views that have one."""
+    means = {}
+    for name in names:
+        values = [getattr(score, name) for score in scores]
+        known = [value for value in values if value is not None]
+        counts = name in REGION_METRICS or len(known) == len(values)
+        means[name] = fmean(known) if known and counts else None
+    return means
 
 
 def _timed_render(
@@ -412,20 +384,6 @@ def _timed_render(
     return rendering, end - start, deformed - start
 
 
-def _require_finite(score: ViewScore, mask: Tensor | None) -> None:
-    for name in ("psnr", "ssim", "flip", "lpips"):
-        value = getattr(score, name)
-        if value is not None and not math.isfinite(value):
-            empty = mask is not None and not bool((mask > 0).any())
-            why = "its mask ignores every pixel" if empty else "the image holds NaN or Inf"
-            raise DyngsError(f"view {score.name!r}: {name} is not finite, {why}")
-
-
-MAX_MOMENTS = 60  # number of training times up to which flicker is measured at all of them
-
-_SAMPLED_TRIPLES = MAX_MOMENTS // 3
-
-
 @dataclass(frozen=True)
 class TimeScore:
     """PSNR (dB) at one time step: the mean of the views taken then."""
@@ -433,19 +391,6 @@ class TimeScore:
     time: float
     psnr: float
     num_views: int
-
-
-def clamped_times(times: Sequence[float]) -> tuple[tuple[float, ...], tuple[str, ...]]:
-    """Return ``times`` within [0, 1], and a line of warning where one was not."""
-    if not all(math.isfinite(t) for t in times):
-        raise DyngsError(
-            f"times must be finite numbers in [0, 1], got {', '.join(f'{t:g}' for t in times)}"
-        )
-    inside = tuple(min(max(float(t), 0.0), 1.0) for t in times)
-    count = sum(a != b for a, b in zip(times, inside, strict=True))
-    if not count:
-        return inside, ()
-    return inside, (f"{count} of {len(times)} times lie outside [0, 1] and were clamped to it",)
 
 
 def psnr_per_time(scores: Iterable[tuple[float | None, float]]) -> tuple[TimeScore, ...]:
@@ -476,8 +421,8 @@ def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> Metri
     seen: dict[int, Tensor] = {}
     values = []
     last = len(times) - 1
-    sampled = np.linspace(1, last - 1, _SAMPLED_TRIPLES).round().astype(int).tolist()
-    for k in range(1, last) if last < MAX_MOMENTS else sampled:
+    num_triples = last - 1 if last < 60 else 20
+    for k in np.linspace(1, last - 1, num_triples).round().astype(int).tolist():
         seen = {
             i: seen[i] if i in seen else drawing.image(cameras, times[i]).clamp(0, 1)
             for i in (k - 1, k, k + 1)
@@ -496,9 +441,7 @@ def flicker_error(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) 
     count in one of the two. Something that should move but does not has it, as has everything that
     flickers.
     """
-    if all(view.time is None for view in views):
-        return MetricValue(None, NO_TIMES)
-    total, weight = 0.0, 0.0
+    total = weight = 0.0
     for indices in static_cameras(views):
         errors = (_signed_error(drawing, loader[i]) for i in indices)
         before, counted = next(errors)
@@ -512,11 +455,17 @@ def flicker_error(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) 
     return MetricValue(255 * total / weight)
 
 
-def flicker_of_split(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) -> MetricValue:
-    """Return ``flicker`` before the first camera of the split, at the training times."""
+def temporal_scores(
+    drawing: Drawing, loader: ImageLoader, views: Sequence[View]
+) -> dict[str, MetricValue]:
+    """Return ``flicker`` before the first camera of a split, at the training times, and
+    ``flicker_error``."""
     if all(view.time is None for view in views):
-        return MetricValue(None, NO_TIMES)
-    return flicker(drawing, loader[0].cameras, drawing.scene.times)
+        return dict.fromkeys(("flicker", "flicker_error"), MetricValue(None, NO_TIMES))
+    return {
+        "flicker": flicker(drawing, loader[0].cameras, drawing.scene.times),
+        "flicker_error": flicker_error(drawing, loader, views),
+    }
 
 
 def _signed_error(drawing: Drawing, image: Image) -> tuple[Tensor, Tensor]:

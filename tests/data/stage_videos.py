@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.export.video import VideoWriter
+from dyngs.export.video import video_writer
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 260.0
 
@@ -75,9 +75,9 @@ def write_videos(
     folder.mkdir(parents=True)
     for number, (name, azimuth) in enumerate(azimuths.items()):
         pose = camera(azimuth, 0.9 + 0.15 * (number % 2))
-        with VideoWriter(folder / f"{name}.mp4", fps=rate, quality=8) as video:
+        with video_writer(folder / f"{name}.mp4", fps=rate, quality=8) as add:
             for frame in range(count):
-                video.add(corner(pose, starts[name] + frame / rate))
+                add(corner(pose, starts[name] + frame / rate))
 
 
 def _spots(u: np.ndarray, v: np.ndarray, seed: int) -> np.ndarray:

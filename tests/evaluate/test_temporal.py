@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from moving_scene import (
     TEST_TIMES,
     Blinking,
@@ -19,17 +17,15 @@ from moving_scene import (
 )
 
 from dyngs.config import DataConfig
-from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.evaluate.view_scores import (
     Drawing,
     TimeScore,
-    clamped_times,
     flicker,
     flicker_error,
-    flicker_of_split,
     psnr_per_time,
+    temporal_scores,
 )
 from dyngs.gaussians.rendering import RenderOptions
 
@@ -133,20 +129,6 @@ def test_reasons_where_there_is_nothing_to_measure(split) -> None:
     loader, views = split
     scene = drawing(moving_scene(Sliding()))
     untimed = [replace(v, time=None) for v in views]
-    for found in (flicker_error(scene, loader, untimed), flicker_of_split(scene, loader, untimed)):
+    for found in temporal_scores(scene, loader, untimed).values():
         assert (found.value, found.reason) == (None, "the images have no times")
     assert "stands still" in (flicker_error(scene, loader, views[:1]).reason or "")
-
-
-@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=8))
-def test_clamping_changes_only_what_lies_outside_and_says_so(times: list[float]) -> None:
-    inside, warnings = clamped_times(times)
-    assert all(0 <= t <= 1 for t in inside)
-    assert all(a == b for a, b in zip(times, inside, strict=True) if 0 <= a <= 1)
-    assert bool(warnings) == any(not 0 <= t <= 1 for t in times)
-
-
-@pytest.mark.parametrize("time", [float("nan"), float("inf")])
-def test_times_that_are_not_finite_are_refused(time: float) -> None:
-    with pytest.raises(DyngsError, match="finite"):
-        clamped_times((0.5, time))

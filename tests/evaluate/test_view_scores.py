@@ -12,7 +12,6 @@ import pytest
 import torch
 from flat_wall import BLACK, cameras_before_wall, seen_from
 from moving_scene import Sliding, moving_scene, still_scene
-from moving_scene import camera as one_camera
 
 import dyngs
 from dyngs.cli import main
@@ -23,7 +22,6 @@ from dyngs.data.loader import Image
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import scene_of_split
 from dyngs.evaluate.view_scores import (
-    Drawing,
     background_scores,
     person_scores,
     right_half_scores,
@@ -89,7 +87,7 @@ def test_a_hole_in_a_white_object_shows_on_black_alone(background: float) -> Non
     without = background_scores(
         image(alpha[..., None].expand(-1, -1, 3), cameras), nothing, torch.zeros(3)
     )
-    assert without == {"psnr_white": None, "psnr_black": None}
+    assert without == {}
 
 
 def test_scores_are_those_of_the_images() -> None:
@@ -172,8 +170,6 @@ def test_exposure_does_not_count() -> None:
     image, rendering = image_and_rendering()
     brighter = replace(image, rgb_premultiplied=1.4 * image.rgb_premultiplied + 0.02)
     found = right_half_scores(brighter, rendering, BLACK)
-    assert found["psnr_right"] is not None
-    assert found["psnr_right_fitted"] is not None
     assert found["psnr_right"] < 20
     assert found["psnr_right_fitted"] > 50
 
@@ -183,7 +179,6 @@ def test_errors_in_the_right_half_count_though_the_left_half_is_perfect() -> Non
     wrong = image.rgb_premultiplied.clone()
     wrong[:, 40:] = 1.4 * wrong[:, 40:]
     found = right_half_scores(replace(image, rgb_premultiplied=wrong), rendering, BLACK)
-    assert found["psnr_right_fitted"] is not None
     assert found["psnr_right_fitted"] < 25
 
 
@@ -191,8 +186,7 @@ def test_a_half_without_pixels_has_no_score() -> None:
     image, rendering = image_and_rendering()
     mask = torch.ones(60, 80)
     mask[:, :40] = 0
-    found = right_half_scores(replace(image, mask=mask), rendering, BLACK)
-    assert (found["psnr_right"], found["psnr_right_fitted"]) == (None, None)
+    assert right_half_scores(replace(image, mask=mask), rendering, BLACK) == {}
 
 
 CAMERA = Cameras(torch.eye(4)[None], torch.tensor([[[20.0, 0, 10], [0, 20, 6], [0, 0, 1]]]), 20, 12)
@@ -304,14 +298,3 @@ def test_poses_that_were_trained_on_are_not_refined(
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-def test_a_small_drawing_comes_out_at_full_size_and_in_its_place() -> None:
-    drawings = [
-        Drawing(still_scene(1), RenderOptions(), torch.ones(3), scale) for scale in (1.0, 0.5)
-    ]
-    images = [1 - drawing.image(one_camera(40, 28), None).mean(2) for drawing in drawings]
-    assert [tuple(x.shape) for x in images] == [(28, 40), (28, 40)]
-    assert not torch.equal(*images)
-    across = [float((x.sum(0) * torch.arange(40)).sum() / x.sum()) for x in images]
-    assert across[0] == pytest.approx(across[1], abs=0.3)  # px; half a pixel's shift would be seen

@@ -3,6 +3,7 @@ cameras."""
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,6 @@ from dyngs.config import Config, DataConfig, RunConfig, TrainConfig
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import ImageLoader
-from dyngs.export.camera_paths import CameraPath, write_path
 from dyngs.export.choose_path import PathOptions, choose_path, orbit_around, view_to_show
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.static_scene import StaticScene
@@ -63,7 +63,12 @@ def test_time_runs_along_a_path_unless_told_otherwise(
 def test_times_of_a_file_are_overridden(moving_run: Opened, tmp_path: Path) -> None:
     cameras = cameras_for_paths(moving_run.capture.splits["train"], moving_run.config.data)
     file = tmp_path / "path.json"
-    write_path(file, CameraPath(cameras, 12.0, (0.1, 0.2, 0.3, 0.4, 0.5)))
+    frames = [
+        {"cam_from_world": pose, "time": 0.1 * i}
+        for i, pose in enumerate(cameras.cam_from_world.tolist(), start=1)
+    ]
+    document = {"width": 16, "height": 16, "fps": 12, "fl_x": 16, "frames": frames}
+    file.write_text(json.dumps(document))
     own = choose_path(moving_run, PathOptions(str(file)))
     assert own.times == pytest.approx((0.1, 0.2, 0.3, 0.4, 0.5))
     assert (own.fps, own.notes) == (12.0, ())

@@ -33,7 +33,6 @@ from dyngs.data.read import read_capture
 from dyngs.deform.bodies.field import BodyField, BodyRest
 from dyngs.deform.fields import WindowedField
 from dyngs.deform.scene import DynamicScene
-from dyngs.export import splat_files
 from dyngs.export.cameras import NAME, write_cameras
 from dyngs.export.images import compare_run, compare_splats
 from dyngs.export.splat_files import (
@@ -123,29 +122,8 @@ def test_a_sequence_of_the_same_length_is_replaced_and_others_are_refused(
     with pytest.raises(DyngsError, match=r"holds other \.ply files \(frame_0002\.ply\)"):
         write_run_sequence(moving, folder, (0.0, 0.5))
     assert {p: p.read_bytes() for p in folder.iterdir()} == before
-    with pytest.raises(DyngsError, match="is a file, but a sequence needs a folder"):
+    with pytest.raises(DyngsError, match=r"notes\.txt"):
         write_run_sequence(moving, folder / "notes.txt", (0.0, 0.5))
-
-
-@pytest.mark.parametrize("exists", [False, True])
-def test_a_sequence_that_fails_leaves_nothing(
-    moving: Opened, exists: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "seq"
-    if exists:
-        folder.mkdir()
-        (folder / "notes.txt").write_text("mine")
-    real = splat_files.write_splats
-
-    def failing(path: Path, *arguments: object, **options: object) -> object:
-        if path.name == "frame_0002.ply":
-            raise OSError(28, "No space left on device")
-        return real(path, *arguments, **options)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(splat_files, "write_splats", failing)
-    with pytest.raises(DyngsError, match="No space left"):
-        write_run_sequence(moving, folder, (0.0, 0.25, 0.5, 0.75))
-    assert [p.name for p in tmp_path.rglob("*")] == (["seq", "notes.txt"] if exists else [])
 
 
 def test_up_is_what_the_cameras_or_the_user_say(near: Opened) -> None:
@@ -185,13 +163,13 @@ def test_a_file_drawn_again_is_compared_with_its_run(near: Opened, tmp_path: Pat
     for how in (Writing(), Writing(turn_between(AXES["z"], AXES["-y"]), "-y")):
         written = write_run_splats(near, tmp_path / "a.ply", 0.7, how=how)
         read = read_splats(written.path)
-        assert compare_run(near, near.scene, 0.7, written.splat, read).psnr > 80
+        assert compare_run(near, near.scene, 0.7, written.splat, read) > 80
         # another time is seen as such
-        assert compare_run(near, near.scene, 0.0, written.splat, read).psnr < 40
+        assert compare_run(near, near.scene, 0.0, written.splat, read) < 40
     splat = SplatFile(cloud(300), up="z")
     exact = write_splats(tmp_path / "a.ply", upright(splat, None, tmp_path / "a.ply"))
-    assert compare_splats(splat, exact).psnr > 80
-    assert compare_splats(splat, write_splats(tmp_path / "a.splat", splat)).psnr < 30
+    assert compare_splats(splat, exact) > 80
+    assert compare_splats(splat, write_splats(tmp_path / "a.splat", splat)) < 30
 
 
 def expected(times: tuple[float, ...], speed: float = 1.0) -> np.ndarray:
@@ -243,10 +221,10 @@ def test_a_file_of_tracks_holds_arrays_without_pickle(tmp_path: Path) -> None:
 def test_moving_files(tmp_path: Path, near: Opened, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("fourdgs")
     times = [i / 9 for i in range(10)]  # more than one group of key frame and deltas
-    written = write_moving(near, tmp_path / "a.4dgs", times)
+    splats, _ = write_moving(near, tmp_path / "a.4dgs", times)
     for i in (0, 3, 8, 9):
-        read = read_moment(written.path, i).gaussians
-        meant = written.splats[i].gaussians
+        read = read_moment(tmp_path / "a.4dgs", i).gaussians
+        meant = splats[i].gaussians
         torch.testing.assert_close(read.means[:, 0], moved_x(ALL, times[i]), rtol=0, atol=0.01)
         torch.testing.assert_close(read.base_rgb, meant.base_rgb.clamp(0, 1), rtol=0, atol=0.01)
         torch.testing.assert_close(read.scales, meant.scales, rtol=0.02, atol=0)
@@ -254,7 +232,7 @@ def test_moving_files(tmp_path: Path, near: Opened, capsys: pytest.CaptureFixtur
     assert main(["export", run, "--times", "0:1:3", "--out", str(tmp_path / "b.4dgs")]) == 0
     told = capsys.readouterr().out
     assert "3 times, each shown for 1/30 s" in told
-    assert "drawn again from 4 cameras" in told
+    assert "drawn again" in told
     assert main(["export", run, "--sh-degree", "3", "--out", str(tmp_path / "c.4dgs")]) == 2
 
 
@@ -286,20 +264,20 @@ def test_the_animation_of_bodies_shows_the_scene_at_all_times(
         torch.testing.assert_close(x, wanted, atol=1e-5, rtol=0)
     assert any("bodies: 1" in note for note in written.notes)
     file = GltfFile(written.path)
-    rest, body = file.document.nodes
-    assert (rest.name, body.name) == ("rest", "body 0")
-    animation = file.document.animations[0]
+    rest, body = file.nodes
+    assert (rest["name"], body["name"]) == ("rest", "body 0")
+    animation = file.json["animations"][0]
     samples = {}
-    for channel in animation.channels:
-        assert channel.target.node == 1
-        sampler = animation.samplers[channel.sampler]
-        kind = {"translation": "VEC3", "rotation": "VEC4"}[channel.target.path]
-        seconds = file.numbers(sampler.input, "SCALAR", np.float64)[:, 0]
-        samples[channel.target.path] = file.numbers(sampler.output, kind, np.float64)
+    for channel in animation["channels"]:
+        assert channel["target"]["node"] == 1
+        sampler = animation["samplers"][channel["sampler"]]
+        kind = {"translation": "VEC3", "rotation": "VEC4"}[channel["target"]["path"]]
+        seconds = file.numbers(sampler["input"], "SCALAR", np.float64)[:, 0]
+        samples[channel["target"]["path"]] = file.numbers(sampler["output"], kind, np.float64)
     assert seconds[-1] == pytest.approx(rolling.seconds)
     assert (samples["rotation"][1:] * samples["rotation"][:-1]).sum(1).min() > 0
     turns = Slerp(seconds, Rotation.from_quat(samples["rotation"]))
-    local = found.means[:2].numpy() - body.translation
+    local = found.means[:2].numpy() - np.array(body["translation"])
     for time in (0.0, 0.25, 0.3, 0.875):
         now = time * rolling.seconds
         place = np.array([np.interp(now, seconds, samples["translation"][:, k]) for k in range(3)])
@@ -316,7 +294,7 @@ def far_capture(still: Path) -> Capture:
         Lens(),
         Lens("opencv", (0.1, -0.02, 0.001, 0.002)),
         Lens("opencv", (0.1,) * 8),
-        Lens("fisheye", (0.01,) * 4, 1.5),
+        Lens("fisheye", (0.01,) * 4),
     ]
     found = read_capture(still)
     views = []
@@ -348,7 +326,6 @@ def test_a_written_capture_is_read_as_it_was(far_capture: Capture, tmp_path: Pat
         shift[:3, 3] = capture.world_offset
         found = same.cam_from_world @ shift
         np.testing.assert_allclose(found, view.cam_from_world, atol=1e-9)
-        matrix = view.intrinsics @ np.diag([view.lens.focal_ratio] * 2 + [1.0])
-        np.testing.assert_allclose(same.intrinsics, matrix)
-        assert (same.lens, same.camera_id) == (replace(view.lens, focal_ratio=1.0), view.camera_id)
+        np.testing.assert_allclose(same.intrinsics, view.intrinsics)
+        assert (same.lens, same.camera_id) == (view.lens, view.camera_id)
         assert (same.mask_path is None) == (view.mask_path is None)

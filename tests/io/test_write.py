@@ -19,7 +19,7 @@ from splat_scenes import cloud
 from dyngs.cli import main
 from dyngs.core.errors import DyngsError
 from dyngs.data.images.images import read_image
-from dyngs.export.video import VideoWriter
+from dyngs.export.video import video_writer
 from dyngs.io.formats.formats import write_splats
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.outputs import Inputs
@@ -69,8 +69,8 @@ def test_full_disk_is_one_line(tmp_path: Path) -> None:
 
 
 def _video(path: Path) -> None:
-    with VideoWriter(path, 10.0) as video:
-        video.add(np.zeros((16, 16, 3), np.uint8))
+    with video_writer(path, 10.0) as add:
+        add(np.zeros((16, 16, 3), np.uint8))
 
 
 def _by_command(path: Path) -> None:

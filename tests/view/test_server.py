@@ -39,7 +39,7 @@ from dyngs.view.server import (
     link_to,
     quiet,
 )
-from dyngs.view.session import Keyframe, Pace, Recording
+from dyngs.view.session import Keyframe, Recording
 from dyngs.view.source import open_source
 
 pytest.importorskip("viser", reason="viser is not installed (pip install 'dyngs[view]')")
@@ -133,7 +133,7 @@ def test_impossible_cameras_are_ignored_and_said_once() -> None:
         atomic=nullcontext,
         add_notification=lambda title, body, **_: told.append(title),
     )
-    browsing = Browsing(client, balls(), Pace(1 / 14))
+    browsing = Browsing(client, balls(), 1 / 14)
     browsing.go_to(None)  # a window without a size
     before = browsing.session.eye
     assert before is not None
@@ -240,7 +240,7 @@ def test_texts_of_strangers_are_shown_and_never_run(browser: Browser, tmp_path: 
             until(lambda viewer=viewer: any(one.num_sent for one in viewer.browsing), page)
             (browsing,) = viewer.browsing
             if folder == run:
-                browsing.session.change(view=0, comparing=True)
+                browsing.session.change(comparing=True)
                 browsing.notify(SCRIPT, FRAME)
             else:
                 page.click("text=Help")
@@ -300,7 +300,7 @@ def test_only_a_server_for_others_has_a_token() -> None:
 def test_a_free_port_is_found_and_a_taken_one_refused() -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         taken = other.getsockname()[1]
-        with pytest.raises(DyngsError, match=f"--port {taken}: taken"):
+        with pytest.raises(DyngsError, match=f"--port {taken}: cannot listen"):
             free_port("127.0.0.1", taken)
         assert free_port("127.0.0.1", None) != taken
     assert free_port("127.0.0.1", taken) == taken

@@ -28,7 +28,6 @@ from dyngs.view.session import (
     Drawer,
     Eye,
     Keyframe,
-    Pace,
     Recording,
     Sent,
     Session,
@@ -68,21 +67,6 @@ class Looked:
             self.clock.now += 0.05
 
 
-@pytest.mark.parametrize(
-    ("fixed", "per_pixel", "area"),
-    [(0.01, 1e-6, 60_000 / 0.7), (1e-4, 1e-9, 480_000), (0.0, 1.0, 320 * 240)],
-)
-def test_images_take_as_long_as_they_may(fixed: float, per_pixel: float, area: float) -> None:
-    pace = Pace(0.07 if area < 320 * 240 else fixed + per_pixel * area, longest=1.0)
-    for _ in range(40):
-        pixels = min(pace.area, 480_000)
-        pace.observe(pixels, fixed + per_pixel * pixels)
-    assert min(pace.area, 480_000) == pytest.approx(area, rel=0.05)
-    assert pace.largest == pytest.approx(
-        max(pixels / (fixed + per_pixel * pixels), pace.area), rel=0.05
-    )
-
-
 def test_small_while_moving_then_whole_and_then_nothing_until_something_changes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -105,9 +89,6 @@ def test_small_while_moving_then_whole_and_then_nothing_until_something_changes(
     looked.after(0.1)
     assert looked.sent[-1].is_refined
     assert looked.sent[-1].image.shape == (900, 1200, 3)
-    refined = [sent.image.size for sent in looked.sent if sent.is_refined]
-    assert refined == sorted(set(refined))
-    assert len(refined) > 1, "in steps"
     assert [shot.is_moving for shot in shots] == [not sent.is_refined for sent in looked.sent]
     assert looked.session.due() is None
     looked.session.move(eye(size=(1200, 900)))  # the same
@@ -181,14 +162,13 @@ def test_jobs_and_who_has_gone() -> None:
     looked = Looked()
     done = list[int]()
     looked.session.move(eye())
-    for number in (1, 2, 3):  # of jobs of a kind the newest is done
-        looked.session.ask(lambda number=number: done.append(number), "pose")
-    looked.session.ask(lambda: done.append(4))
+    for number in (1, 2):
+        looked.session.ask(lambda number=number: done.append(number))
     looked.after(1)
-    assert done == [3, 4]
+    assert done == [1, 2]
     count = len(looked.sent)
     looked.session.ask(lambda: pytest.fail("asked"))
-    looked.session.close()
+    looked.session.closed = True
     assert looked.session.due() is None
     looked.session.draw_next()
     assert len(looked.sent) == count
@@ -276,7 +256,7 @@ def test_a_path_through_a_moved_still_scene(tmp_path: Path) -> None:
 
 def test_each_gets_a_turn_and_the_thread_ends() -> None:
     before = threading.active_count()
-    drawer = Drawer(lambda session, message: None)
+    drawer = Drawer()
     browsers = [looking_at_balls() for _ in range(3)]
     drawer.start()
     for one, _ in browsers:
@@ -296,13 +276,14 @@ def test_each_gets_a_turn_and_the_thread_ends() -> None:
 
 def test_a_fault_of_one_is_told_once_and_the_others_go_on() -> None:
     told: list[tuple[Session, str]] = []
-    drawer = Drawer(lambda session, message: told.append((session, message)))
+    drawer = Drawer()
     (bad, _), (worse, _), (good, sent) = (looking_at_balls() for _ in range(3))
 
     def fail(error: Exception) -> None:
         raise error
 
     for one in (bad, worse, good):
+        one.on_error = lambda message, one=one: told.append((one, message))
         drawer.add(one)
     for _ in range(20):
         bad.ask(lambda: fail(DyngsError("no such file")))

@@ -16,7 +16,7 @@ from dyngs.cli import main
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import save_config
 from dyngs.core.errors import DyngsError
-from dyngs.export.video import VideoWriter
+from dyngs.export.video import video_writer
 from dyngs.io.outputs import SOURCES_NAME
 from dyngs.io.write import cache_folder, write_image
 
@@ -74,8 +74,8 @@ def test_no_output_replaces_the_video_that_a_run_is_made_of(
 ) -> None:
     """The run knows only the folder in the cache, which names the video."""
     video = tmp_path / "clip.mp4"
-    with VideoWriter(video, fps=10) as writer:
-        writer.add(np.zeros((16, 16, 3), np.uint8))
+    with video_writer(video, fps=10) as add:
+        add(np.zeros((16, 16, 3), np.uint8))
     before = video.read_bytes()
     for _ in ("estimated", "of before"):
         data = with_poses(DataConfig(root=video), say=lambda _: None)
@@ -83,7 +83,7 @@ def test_no_output_replaces_the_video_that_a_run_is_made_of(
         assert (
             main(["render", str(tmp_path / "run"), "--path", "along", "--video", str(video)]) == 2
         )
-        assert "clip.mp4: is the file that is read" in capsys.readouterr().err
+        assert "clip.mp4: exists, which is read" in capsys.readouterr().err
         (data.root / SOURCES_NAME).unlink()  # as a run killed at just that moment leaves it
     assert video.read_bytes() == before
 

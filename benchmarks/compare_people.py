@@ -1,8 +1,15 @@
-"""Networks that predict people, given the same few views of people that they were not trained
-on."""
+"""Networks that predict people, given the same few views of people that they were not trained on.
+
+    python benchmarks/compare_people.py PEOPLE NETWORK... --counts 2 3 4 [--spread] [--minutes M] --out FOLDER
+
+``--minutes``: an avatar is trained on the same images alone for so long, too. Times are CPU seconds
+of one thread. Writes the scores as .csv, the table as .md and pictures of truth, prediction and
+error.
+"""
 
 from __future__ import annotations
 
+import argparse
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -18,6 +25,7 @@ from torch import Tensor
 
 from dyngs.api.predict import require_network, trained_network
 from dyngs.api.train import train
+from dyngs.cli.output import numbers_table, print_messages, print_tables
 from dyngs.config import DataConfig
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.conventions import report_nothing
@@ -31,6 +39,7 @@ from dyngs.io.outputs import new_folder
 from dyngs.io.write import write_image, write_text
 from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable
+from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import load_run
 from dyngs.runs.folder import require_empty
 from dyngs.study.measure import state_megabytes
@@ -260,3 +269,29 @@ def _table(found: Sequence[Score], counts: Sequence[int]) -> Table:
             ]
         )
     return Table("box of the person on white", head, cells)
+
+
+def main() -> None:
+    """Compare, and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("people", type=Path)
+    parser.add_argument("networks", type=Path, nargs="+")
+    parser.add_argument("--counts", type=int, nargs="+", default=[2, 3, 4])
+    parser.add_argument("--spread", action="store_true")
+    parser.add_argument("--minutes", type=float)
+    parser.add_argument("--data", nargs="*", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--out", type=Path, required=True)
+    given = parser.parse_args()
+    print_messages()
+    bench = PeopleBench(
+        given.people, given.networks, given.counts, given.spread, given.minutes, given.data
+    )
+    with kernel_threads(1):
+        table = compare_people(bench, given.out)
+    print_tables(numbers_table(table.title, table.head, table.cells))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,7 +1,13 @@
-"""Benchmark of the rasterizer, next to a matrix product on the same machine."""
+"""Speed of the rasterizer on this machine, next to a matrix product.
+
+    python benchmarks/rasterize.py [--points NPZ] [--threads N ..] [--repeats N] [--device cuda]
+
+``--points``: points and cameras of gsplat's benchmark; otherwise random points.
+"""
 
 from __future__ import annotations
 
+import argparse
 import statistics
 import time
 from collections.abc import Callable
@@ -14,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.cli.output import numbers_table, print_tables
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import counted, reading
 from dyngs.core.state import fields_moved_to
@@ -211,3 +218,24 @@ def report_cells(report: dict[str, Any]) -> tuple[str, list[str], list[list[str]
     rates = (2e-6 * SGEMM_SIZE**3 / run["milliseconds"]["sgemm"] for run in runs)
     cells.append(["sgemm, GFLOP/s", *(f"{rate:.0f}" for rate in rates)])
     return title, head, cells
+
+
+def main() -> None:
+    """Measure the rasterizer and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--points", type=Path)
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, torch.get_num_threads()])
+    parser.add_argument("--repeats", type=int, default=30)
+    parser.add_argument("--device", default="cpu")
+    arguments = parser.parse_args()
+    device = torch.device(arguments.device)
+    threads = sorted(set(arguments.threads)) if device.type == "cpu" else [1]
+    workload = garden_workload(arguments.points) if arguments.points else random_workload()
+    report = bench_rasterize(workload.to(device), threads, arguments.repeats)
+    print_tables(numbers_table(*report_cells(report)))
+
+
+if __name__ == "__main__":
+    main()

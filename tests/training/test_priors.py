@@ -1,27 +1,57 @@
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, Literal, cast
 
 import pytest
 import torch
 from moving_scene import MOVING_ROWS, SETUP, Sliding, camera, row_of_balls
+from tiny_priors import with_priors
 
+from dyngs.config.io import load_config
 from dyngs.data.loader import Image
+from dyngs.data.read import read_capture
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.models.model import Drawn, Look, Model
-from dyngs.training.priors.used import (
-    DepthForm,
-    Glance,
+from dyngs.training.priors import (
     PointTracks,
+    TimedCamera,
     UsedPriors,
     depth_error,
     displacements,
     track_error,
+    used_priors,
 )
 
 HERE = camera(32, 24)
 GENERATOR = torch.Generator().manual_seed(0)
+
+
+def found(root: Path, *changes: str, moves: bool = True) -> UsedPriors:
+    config = load_config("dynamic", [f"data.root={root}", "data.test_every=0", *changes])
+    capture = read_capture(config.data)
+    return used_priors(config, capture, capture.splits["train"], moves=moves)
+
+
+def test_priors_of_a_capture_are_used(tmp_path: Path) -> None:
+    priors = found(with_priors(tmp_path))
+    assert priors.depth
+    assert priors.masks
+    assert set(priors.flow_to) == {1, 2}
+    assert priors.tracks is not None
+    assert priors.message.endswith("depth maps, optical flow, tracks, motion masks")
+
+
+def test_priors_that_are_not_requested_are_not_read(tmp_path: Path) -> None:
+    with_priors(tmp_path)
+    (tmp_path / "tracks.npz").write_bytes(b"")
+    assert found(tmp_path, "train.priors=[]") == UsedPriors()
+    assert found(tmp_path, "train.priors=[depth]").message.endswith(": depth maps")
+
+
+def test_still_scenes_use_depth_alone(tmp_path: Path) -> None:
+    assert found(with_priors(tmp_path), moves=False).message.endswith(": depth maps")
 
 
 def scene(speed: float) -> DynamicScene:
@@ -47,47 +77,39 @@ class Seen:
         return 0.0, self._until
 
 
-def look(
-    priors: UsedPriors, of: DynamicScene, own: Image, index: int = 0, until: float = 1.0
-) -> Look:
+def terms(
+    priors: UsedPriors, own: Image, *, until: float = 1.0, speed: float = 0.5
+) -> dict[str, float]:
+    of = scene(speed)
     depth: Literal["none", "expected"] = "expected" if priors.needs_depth(own) else "none"
     rendering = of.render(HERE, 0.0, options=RenderOptions(nonfinite="trust", depth=depth))
     rgb = rendering.rgb[0]
     model = cast(Model[Any], Seen(of, until))
-    return Look(index, 1, own, Drawn(rendering), rgb, rgb, model, GENERATOR)
-
-
-def terms(
-    priors: UsedPriors, own: Image, *, index: int = 0, until: float = 1.0, speed: float = 0.5
-) -> dict[str, float]:
-    found = priors(look(priors, scene(speed), own, index, until))
-    return {name: float(x.detach()) for name, x in found.items()}
-
-
-def still_flow() -> UsedPriors:
-    return UsedPriors(flow_to={0: Glance(HERE, 0.5)})
+    look = Look(0, 1, own, Drawn(rendering), rgb, rgb, model, GENERATOR)
+    return {name: float(x.detach()) for name, x in priors(look).items()}
 
 
 def test_flow_of_a_motion_that_is_not_there_costs() -> None:
     """Flow says that nothing moves: right at speed 0, wrong at another."""
     own = image(flow=torch.zeros(24, 32, 2))
-    assert terms(still_flow(), own, speed=0.0)["flow"] < 1e-6
-    wrong = terms(still_flow(), own)["flow"]
-    assert wrong > 0.001
+    priors = UsedPriors(flow_to={0: TimedCamera(HERE, 0.5)})
+    assert terms(priors, own, speed=0.0)["flow"] < 1e-6
+    assert terms(priors, own)["flow"] > 0.001
+    assert terms(priors, own, until=0.4) == {}
 
 
 def test_depth_is_drawn_only_where_it_is_needed() -> None:
     own = image(depth=torch.ones(24, 32))
     assert not UsedPriors().needs_depth(own)
-    assert not UsedPriors(depth="depth").needs_depth(image())
-    assert UsedPriors(depth="depth").needs_depth(own)
+    assert not UsedPriors(depth=True).needs_depth(image())
+    assert UsedPriors(depth=True).needs_depth(own)
 
 
 def test_tracks_pair_views_of_other_times_that_share_points() -> None:
     xy = torch.zeros(4, 5, 2)
     visible = torch.ones(4, 5, dtype=torch.bool)
     visible[1, :3] = False
-    tracks = PointTracks(xy, visible, [Glance(HERE, time) for time in (0.0, 0.25, 0.5, 0.0)])
+    tracks = PointTracks(xy, visible, [TimedCamera(HERE, time) for time in (0.0, 0.25, 0.5, 0.0)])
     found = [tracks.pair(0, lambda _: True, GENERATOR) for _ in range(8)]
     assert {None if pair is None else pair[0].time for pair in found} == {0.5}
     assert tracks.pair(0, lambda time: time < 0.4, GENERATOR) is None
@@ -98,12 +120,12 @@ def true_depth() -> torch.Tensor:
     return 2 + x + 0.5 * y + (x > 0.5)
 
 
-@pytest.mark.parametrize("kind", ["depth", "inverse"])
-def test_scale_and_shift_do_not_count(kind: DepthForm) -> None:
-    """A map that is affine in the true depth, or in its inverse, has no error."""
+@pytest.mark.parametrize("kind", ["sensor", "network"])
+def test_maps_are_aligned_with_the_drawn_depth(kind: str) -> None:
+    """A map of another unit, or affine in the true inverse depth, has no error."""
     depth = true_depth()
-    given = 0.3 * depth + 0.2 if kind == "depth" else 1 / (0.5 / depth + 0.1)
-    error = depth_error(depth, torch.ones_like(depth), given, kind)
+    given = 0.3 * depth if kind == "sensor" else 1 / (0.5 / depth + 0.1)
+    error = depth_error(depth, torch.ones_like(depth), given)
     assert error is not None
     assert float(error) < 1e-5
 
@@ -113,7 +135,7 @@ def test_a_step_against_the_gradient_brings_a_wrong_depth_nearer() -> None:
     drawn = truth.clone()
     drawn[3:6, 3:6] += 0.5
     drawn.requires_grad_()
-    error = depth_error(drawn, torch.ones_like(drawn), 0.3 * truth, "depth")
+    error = depth_error(drawn, torch.ones_like(drawn), 0.3 * truth)
     assert error is not None
     (slope,) = torch.autograd.grad(error, drawn)
     assert bool((slope[3:6, 3:6] > 0).all())
@@ -128,13 +150,10 @@ def test_unknown_transparent_and_masked_pixels_do_not_count() -> None:
     spoiled = depth.clone()
     spoiled[:3] = 90
     alpha[1], mask[2] = 0.2, 0
-    error = depth_error(spoiled, alpha, given, "depth", mask)
+    error = depth_error(spoiled, alpha, given, mask)
     assert error is not None
     assert float(error) < 1e-5
-    assert depth_error(depth, torch.zeros(12, 16), given, "depth") is None
-
-
-OPTIONS = RenderOptions()
+    assert depth_error(depth, torch.zeros(12, 16), given) is None
 
 
 def test_what_is_drawn_is_the_displacement_of_the_gaussian_that_shows() -> None:
@@ -142,7 +161,7 @@ def test_what_is_drawn_is_the_displacement_of_the_gaussian_that_shows() -> None:
     here = camera(32, 24)
     start = row_of_balls(1)
     moved = start.replace(means=start.means + torch.tensor([0.1, 0.0, 0.0]))
-    drawn = displacements(start, moved, here, here, OPTIONS)
+    drawn = displacements(start, moved, here, here, RenderOptions())
     pose = here.cam_from_world[0]
     before, after = (x.means[0] @ pose[:3, :3].T + pose[:3, 3] for x in (start, moved))
     focal = here.intrinsics[0].diagonal()[:2]

@@ -23,7 +23,9 @@ from torch.nn.functional import adaptive_avg_pool2d
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.models.renderable import Rendering
-from dyngs.training.other_views import FEWEST, OtherViews, grid_of, log_gains
+from dyngs.training.corrections.cells import cell_camera
+from dyngs.training.corrections.exposure import log_gains
+from dyngs.training.corrections.robust import FEWEST, OtherViews
 
 
 def asked(
@@ -37,7 +39,8 @@ def asked(
     more = torch.stack(
         [torch.full_like(rgb[..., 0], distance), torch.full_like(rgb[..., 0], alpha)], -1
     )
-    grid = grid_of(rgb.shape[1], rgb.shape[0])
+    cells = cell_camera(cameras[1])
+    grid = (cells.height, cells.width)
     drawn = adaptive_avg_pool2d(torch.cat([rgb, more], -1).permute(2, 0, 1), grid)
     return others.difference(1, torch.ones(grid, dtype=torch.bool), drawn, BLACK).view(grid)
 
@@ -83,12 +86,15 @@ def test_places_are_found_by_cameras_as_they_are_by_now() -> None:
         wrong.append(replace(camera, cam_from_world=pose))
     rgb = wall(right[1])
     more = torch.stack([torch.full_like(rgb[..., 0], DISTANCE), torch.ones_like(rgb[..., 0])], -1)
-    grid = grid_of(rgb.shape[1], rgb.shape[0])
+    cells = cell_camera(right[1])
+    grid = (cells.height, cells.width)
     drawn = adaptive_avg_pool2d(torch.cat([rgb, more], -1).permute(2, 0, 1), grid)
     which = torch.ones(grid, dtype=torch.bool)
     images = seen_from(right)
     given = OtherViews(images, right).difference(1, which, drawn, BLACK)  # type: ignore[arg-type]
-    found = OtherViews(images, wrong, lambda i, _: right[i]).difference(1, which, drawn, BLACK)  # type: ignore[arg-type]
+    found = OtherViews(images, wrong, lambda i, _: cell_camera(right[i])).difference(
+        1, which, drawn, BLACK
+    )  # type: ignore[arg-type]
     assert torch.equal(found, given)
 
 
