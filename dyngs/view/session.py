@@ -19,7 +19,8 @@ import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.export.camera_paths import Keyframes, interpolate_keyframes, resize_cameras, world_pose
+from dyngs.data.geometry import checked_pose
+from dyngs.export.camera_paths import Keyframes, interpolate_keyframes, resize_cameras
 from dyngs.runs.opened import Opened
 from dyngs.view.layers import Layer, Part, Shot, draw
 from dyngs.view.views import camera_at, nearest_view, views_of
@@ -143,10 +144,12 @@ class Recording:
         cameras = opened.frame.cameras(resize_cameras(self.cameras, *size))
         keys: list[dict[str, Any]] = []
         for i, (key, start) in enumerate(zip(self.keyframes, self.starts.tolist(), strict=True)):
-            pose = cameras.cam_from_world[i].double().cpu().numpy()
+            # rotations as readers repair them, which must not move a far camera
+            pose, _ = checked_pose(cameras.cam_from_world[i].double().cpu().numpy(), "camera")
+            pose[:3, 3] -= pose[:3, :3] @ opened.world_offset
             focal = float(cameras.intrinsics[i, 1, 1])
             entry: dict[str, Any] = {"at": start, "fl_x": focal}
-            entry["cam_from_world"] = world_pose(pose, opened.world_offset).tolist()
+            entry["cam_from_world"] = pose.tolist()
             keys.append(entry if key.time is None else entry | {"time": key.time})
         document = {"width": size[0], "height": size[1], "fps": fps, "loop": self.loops}
         if self.loops:
