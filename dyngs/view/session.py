@@ -44,13 +44,6 @@ class Eye:
     fov: float
     size: tuple[int, int]
 
-    @property
-    def is_possible(self) -> bool:
-        """Whether there is such a camera: browsers may send anything."""
-        numbers = (*self.wxyz, *self.position, self.fov)
-        has_direction = all(map(math.isfinite, numbers)) and math.hypot(*self.wxyz) > 1e-6
-        return has_direction and self.fov > 0 and min(self.size) > 0
-
     def camera(self, size: tuple[int, int] | None = None) -> Cameras:
         """Return the camera for images of ``size``; None: that of the window."""
         return camera_at(self.wxyz, self.position, self.fov, size or self.size)
@@ -60,14 +53,12 @@ class Eye:
 class Timeline:
     """The time that is shown: ``time`` in [0, 1] when the clock read ``since``.
 
-    Where it is ``playing``, it takes ``seconds`` / ``speed`` from 0 to 1, where it begins again or
-    stops.
+    Where it is ``playing``, it takes ``seconds`` / ``speed`` from 0 to 1, where it begins again.
     """
 
     time: float = 0.0
     since: float = 0.0
     playing: bool = False
-    loops: bool = True
     speed: float = 1.0
     seconds: float = 4.0
 
@@ -75,15 +66,12 @@ class Timeline:
         """Return the time in [0, 1] when the clock reads ``clock``."""
         if not self.playing:
             return self.time
-        passed = self.time + max(clock - self.since, 0.0) * self.speed / max(self.seconds, 1e-6)
-        return passed % 1.0 if self.loops and passed > 1 else min(passed, 1.0)
+        passed = max(clock - self.since, 0.0) * self.speed / max(self.seconds, 1e-6)
+        return (self.time + passed) % 1.0 if passed else self.time
 
     def changed(self, clock: float, **changes: bool | float) -> Timeline:
-        """Return the timeline with other attributes; the time does not jump, but who plays from the
-        end begins at 0."""
-        now = self.at(clock)
-        now = 0.0 if changes.get("playing") and now >= 1.0 else now
-        return replace(self, **{"time": now, "since": clock, **changes})  # type: ignore[arg-type]
+        """Return the timeline with other attributes; the time does not jump."""
+        return replace(self, **{"time": self.at(clock), "since": clock, **changes})  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -218,15 +206,11 @@ class Session:
         self.closed = False
         self.failure: str | None = None
 
-    def move(self, eye: Eye) -> bool:
-        """Look from ``eye`` from now on; return False, and go on as before, where there is no such
-        camera."""
-        if not eye.is_possible:
-            return False
+    def move(self, eye: Eye) -> None:
+        """Look from ``eye`` from now on."""
         if eye != self.eye:
             self.eye = eye
             self._note_change()
-        return True
 
     def change(self, **changes: Any) -> None:
         """Show something else: attributes of ``Display``."""
@@ -238,7 +222,7 @@ class Session:
         self.change_timeline(time=min(max(time, 0.0), 1.0))
 
     def change_timeline(self, **changes: bool | float) -> None:
-        """Play, pause, loop or change the speed: attributes of ``Timeline``."""
+        """Play, pause or change the speed: attributes of ``Timeline``."""
         with self._lock:
             self.timeline = self.timeline.changed(self._clock(), **changes)
         self.on_play(self.timeline.playing)
@@ -317,10 +301,7 @@ class Session:
             factor = min(max(self._target / max(now - start, 1e-9), 0.5), 2.0)
             self._area = max(math.prod(size) * math.sqrt(factor), _SMALLEST_AREA)
         self._is_refined = not is_moving and version == self._changed_at
-        timeline = self.timeline
         preview = self._preview
-        if timeline.playing and not timeline.loops and timeline.at(now) >= 1.0:
-            self.change_timeline(playing=False)
         if preview is not None and now - preview[1] > preview[0].duration:
             self.preview(Recording())
 
