@@ -186,11 +186,9 @@ class Controls:
 
         def add(_: Any) -> None:
             if session.eye is not None:
-                known = recording.keyframes
-                size = (known[0].camera.width, known[0].camera.height) if known else None
                 time = None if session.opened.renderable.is_static else session.time
-                keyframe = Keyframe(session.eye.camera(size), time, float(seconds.value))
-                record(keyframes=(*known, keyframe))
+                keyframe = Keyframe(session.eye.camera(), time, float(seconds.value))
+                record(keyframes=(*recording.keyframes, keyframe))
 
         def save(_: Any) -> None:
             if len(recording):
@@ -205,7 +203,6 @@ class Controls:
         remove.on_click(lambda _: record(keyframes=recording.keyframes[:-1]))
         loop = gui.add_checkbox("Back to the first", False)
         loop.on_update(lambda _: record(loops=bool(loop.value)))
-        gui.add_button("Preview").on_click(lambda _: session.preview(recording))
         hint = f"{FILE_NAME}, for: dyngs render RUN --path {FILE_NAME}"
         gui.add_button("Save path", hint=hint).on_click(save)
 

@@ -15,12 +15,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.geometry import checked_pose
-from dyngs.export.camera_paths import Keyframes, interpolate_keyframes, resize_cameras
+from dyngs.export.camera_paths import resize_cameras
 from dyngs.runs.opened import Opened
 from dyngs.view.layers import Layer, Part, Shot, draw
 from dyngs.view.views import camera_at, nearest_view, views_of
@@ -100,8 +99,8 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class Recording:
-    """Keyframes of a camera path in their order, of one image size; ``loops``: the camera returns
-    to the first one at the end."""
+    """Keyframes of a camera path in their order; ``loops``: the camera returns to the first one at
+    the end."""
 
     keyframes: tuple[Keyframe, ...] = ()
     loops: bool = False
@@ -114,52 +113,24 @@ class Recording:
         """Seconds of the path; those after the last keyframe count only in a loop."""
         return sum(key.seconds for key in self.keyframes[: None if self.loops else -1])
 
-    @property
-    def cameras(self) -> Cameras:
-        """The cameras of at least one keyframe."""
-        each = [key.camera for key in self.keyframes]
-        poses = torch.cat([camera.cam_from_world for camera in each])
-        matrices = torch.cat([camera.intrinsics for camera in each])
-        return replace(each[0], cam_from_world=poses, intrinsics=matrices)
-
-    @property
-    def starts(self) -> np.ndarray:
-        return np.cumsum([0.0, *(key.seconds for key in self.keyframes[:-1])])
-
     def document(self, size: tuple[int, int], fps: float, opened: Opened) -> str:
         """Return the path as JSON that ``dyngs render --path`` reads (docs/camera_paths.md), in the
         coordinates of the capture; ``size`` of its images, px."""
-        cameras = opened.frame.cameras(resize_cameras(self.cameras, *size))
         keys: list[dict[str, Any]] = []
-        for i, (key, start) in enumerate(zip(self.keyframes, self.starts.tolist(), strict=True)):
+        start = 0.0
+        for key in self.keyframes:
+            camera = opened.frame.cameras(resize_cameras(key.camera, *size))
             # rotations as readers repair them, which must not move a far camera
-            pose, _ = checked_pose(cameras.cam_from_world[i].double().cpu().numpy(), "camera")
+            pose, _ = checked_pose(camera.cam_from_world[0].double().cpu().numpy(), "camera")
             pose[:3, 3] -= pose[:3, :3] @ opened.world_offset
-            focal = float(cameras.intrinsics[i, 1, 1])
-            entry: dict[str, Any] = {"at": start, "fl_x": focal}
+            entry: dict[str, Any] = {"at": start, "fl_x": float(camera.intrinsics[0, 1, 1])}
             entry["cam_from_world"] = pose.tolist()
             keys.append(entry if key.time is None else entry | {"time": key.time})
+            start += key.seconds
         document = {"width": size[0], "height": size[1], "fps": fps, "loop": self.loops}
         if self.loops:
             document["seconds"] = self.duration
         return json.dumps({**document, "keyframes": keys}, indent=1) + "\n"
-
-    def at(self, seconds: float) -> tuple[Cameras, float | None]:
-        """Return the camera and the time of the scene after ``seconds`` of the path, of at least
-        one keyframe."""
-        cameras = self.cameras
-        poses = cameras.cam_from_world.double().cpu().numpy()
-        matrices = cameras.intrinsics.double().cpu().numpy()
-        times = [key.time for key in self.keyframes if key.time is not None]
-        known = np.array(times) if len(times) == len(self) else None
-        period = self.duration if self.loops and len(self) > 1 else None
-        keys = Keyframes(poses, matrices, self.starts, known, period)
-        made = interpolate_keyframes(keys, np.array([seconds]))
-        pose, matrix = (
-            cameras.intrinsics.new_tensor(x) for x in (made.cam_from_world, made.intrinsics)
-        )
-        camera = replace(cameras, cam_from_world=pose, intrinsics=matrix)
-        return camera, None if made.times is None else float(made.times[0])
 
 
 @dataclass(frozen=True)
@@ -196,7 +167,6 @@ class Session:
         self._is_refined = (
             False  # whether the image that is shown is full, and of what is there now
         )
-        self._preview: tuple[Recording, float] | None = None
         self.on_change: Callable[[], None] = lambda: None
         self.on_play: Callable[[bool], None] = lambda playing: None
         self.on_error: Callable[[str], None] = lambda message: None
@@ -232,10 +202,6 @@ class Session:
         """Look at another scene, at the same time."""
         self.opened = opened
         self.change_timeline(seconds=opened.seconds)
-
-    def preview(self, recording: Recording) -> None:
-        self._preview = (recording, self._clock()) if len(recording) else None
-        self._note_change()
 
     def take(self, opened: Opened, *, refreshes: bool) -> None:
         """Look at a newer state of the scene; ``refreshes``: draw it, as large, even if nothing
@@ -293,7 +259,7 @@ class Session:
         size = _scaled(full, math.sqrt(self._area / math.prod(full))) if is_moving else full
         self._is_stale = False
         self._is_refined = True  # if it fails, it is not tried again
-        image = draw(self.opened, replace(self.shot(size), is_moving=is_moving))
+        image = draw(self.opened, self.shot(size))
         if not self.closed:
             self._send(Sent(image, not is_moving, self._clock() - start))
         now = self._clock()
@@ -301,35 +267,21 @@ class Session:
             factor = min(max(self._target / max(now - start, 1e-9), 0.5), 2.0)
             self._area = max(math.prod(size) * math.sqrt(factor), _SMALLEST_AREA)
         self._is_refined = not is_moving and version == self._changed_at
-        preview = self._preview
-        if preview is not None and now - preview[1] > preview[0].duration:
-            self.preview(Recording())
 
     def shot(self, size: tuple[int, int] | None = None) -> Shot:
         """Return what is shown now as an image of ``size``; None: that of the window."""
         if self.eye is None:
             raise ValueError("there is no camera yet")
-        size = size or self._full_size
-        time: float | None = self.time
-        preview = self._preview
-        if preview is None:
-            camera = self.eye.camera(size)
-            view = self.shown_view
-        else:
-            camera, recorded = preview[0].at(self._clock() - preview[1])
-            camera = resize_cameras(camera, *size)
-            view = None
-            time = time if recorded is None else recorded
-        if self.opened.renderable.is_static:
-            time = None
         look = self.look
+        view = self.shown_view
+        time = None if self.opened.renderable.is_static else self.time
         layer = "colour" if look.layer == "error" and view is None else look.layer
+        camera = self.eye.camera(size or self._full_size)
         return Shot(camera, time, layer, look.part, view, look.divide if look.comparing else 1.0)
 
     @property
     def _is_moving(self) -> bool:
-        is_playing = self.timeline.playing and not self.opened.renderable.is_static
-        return is_playing or self._preview is not None
+        return self.timeline.playing and not self.opened.renderable.is_static
 
     @property
     def _full_size(self) -> tuple[int, int]:
