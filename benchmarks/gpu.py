@@ -26,10 +26,10 @@ from statistics import median
 from typing import Any
 
 import torch
+from rasterize import Workload, garden_workload, random_workload
 from torch import Tensor
 
 from dyngs.api.compat import rasterization
-from dyngs.cli.kernel_bench import Workload, garden_workload, random_workload
 from dyngs.core.camera import Cameras
 from dyngs.export.orbits import frame_orbit_for_points
 from dyngs.io.formats.formats import read_splats

@@ -1,7 +1,7 @@
 """What a forward and a backward pass of the rasterizer cost as the scene and the image grow: time
 and peak memory.
 
-Each size in a process of its own, by random points as ``dyngs bench rasterize`` has them (scales up
+Each size in a process of its own, by random points as ``benchmarks/rasterize.py`` has them (scales up
 to 0.02):
 
     python benchmarks/growth.py [--threads N] [--repeats N]
@@ -25,7 +25,7 @@ SIZES = (
 
 def measure(count: int, side: int, threads: int, repeats: int) -> str:
     """Return a line of the table."""
-    from dyngs.cli.kernel_bench import bench_rasterize, random_workload
+    from rasterize import bench_rasterize, random_workload
 
     load = random_workload(count)
     focal = 480 * side / 648
@@ -34,10 +34,11 @@ def measure(count: int, side: int, threads: int, repeats: int) -> str:
     )
     cameras = replace(load.cameras, intrinsics=intrinsics, width=side, height=side)
     report = bench_rasterize(replace(load, cameras=cameras), [threads], repeats)
-    times = report.runs[0].milliseconds
+    times = report["runs"][0]["milliseconds"]
+    del times["sgemm"]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
     stages = " | ".join(f"{times[name]:.0f}" for name in times)
-    return f"| {count:,} | {side} | {report.pairs / 1e6:.0f} | {stages} | {report.runs[0].total:.0f} | {peak:.2f} |"
+    return f"| {count:,} | {side} | {report['pairs'] / 1e6:.0f} | {stages} | {sum(times.values()):.0f} | {peak:.2f} |"
 
 
 def main() -> None:

@@ -15,13 +15,13 @@ import numpy as np
 
 from dyngs.data.synthetic.captures import (
     DISTANCE,
-    Box,
     Paint,
+    PaintedBall,
+    PaintedBox,
     Primitive,
     Scene,
-    Shot,
-    Sphere,
     StillOptions,
+    SyntheticShot,
     f32,
     hemisphere_cameras,
     nearest_things,
@@ -37,7 +37,7 @@ _FACES = 64  # More than any primitive has, for numbers of faces
 
 
 @dataclass(frozen=True)
-class Solid(Sphere):
+class Solid(PaintedBall):
     """A convex polyhedron around a ball: the points p with <n, p - center> <= radius * reach for
     each of its faces.
 
@@ -129,7 +129,7 @@ def _letter(name: str, x: float, y: float, colour: Rgb) -> list[Primitive]:
     for left, bottom, right, top in _STROKES[name]:
         middle = (x + unit * (left + right) / 2, y, _FLOOR + unit * (bottom + top) / 2)
         half = (unit * (right - left) / 2, 0.06, unit * (top - bottom) / 2)
-        boxes.append(Box(middle, half, _per_side(_BLACK, colour, _CREAM), gloss=0.0))
+        boxes.append(PaintedBox(middle, half, _per_side(_BLACK, colour, _CREAM), gloss=0.0))
     return boxes
 
 
@@ -143,7 +143,7 @@ def polyhedra() -> Scene:
         [(1, 0, 0.3536), (-0.5, 0.866, 0.3536), (-0.5, -0.866, 0.3536), (0, 0, -1.0606)]
     )
     things: list[Primitive] = [
-        Box(
+        PaintedBox(
             (0, 0, _FLOOR - 0.06), (0.98, 0.98, 0.06), _per_side(_BLUE, _PURPLE, _CREAM), gloss=0.0
         ),
         solid(
@@ -168,7 +168,7 @@ def polyhedra() -> Scene:
             (_ORANGE, _GREEN, _PURPLE, _CREAM),
             reach=1.6,
         ),
-        Box(
+        PaintedBox(
             (0.20, -0.05, _FLOOR + 0.10),
             (0.12, 0.10, 0.10),
             _per_side(_YELLOW, _RED, _BLUE),
@@ -186,7 +186,7 @@ def face_ids(scene: Scene, world_from_cam: np.ndarray, size: int, samples: int) 
     none."""
     origin = world_from_cam[:3, 3].astype(np.float32)
     found = []
-    for _, directions in sampled_rays(world_from_cam, size, samples):
+    for directions in sampled_rays(world_from_cam, size, samples):
         nearest, distance = nearest_things(scene, origin, directions)
         ids = np.full(len(directions), -1, np.int64)
         for index, primitive in enumerate(scene.primitives):
@@ -236,7 +236,7 @@ def write_polyhedra_capture(out: Path, options: StillOptions) -> Path:
     }
     with new_folder(out) as started:
         for split, poses in splits.items():
-            shots = [Shot(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
+            shots = [SyntheticShot(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
             write_split(started, split, shots, lambda _: scene, options)
             for shot in shots if split != "train" else ():
                 edges = true_edges(scene, shot.world_from_cam, options.size, options.samples)

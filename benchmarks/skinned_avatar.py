@@ -158,22 +158,23 @@ def _texture(document: dict, binary: bytes, material: int) -> np.ndarray:
 
 def _node_matrices(file: GltfFile) -> list[np.ndarray]:
     """Return world_from_node (4, 4) of each node at rest."""
-    nodes = file.document.nodes
+    nodes = file.nodes
     local = []
     for node in nodes:
         matrix = np.eye(4)
-        if node.matrix is not None:
-            matrix = np.array(node.matrix).reshape(4, 4).T
+        if "matrix" in node:
+            matrix = np.array(node["matrix"]).reshape(4, 4).T
         else:
-            matrix[:3, :3] = Rotation.from_quat(node.rotation).as_matrix() * np.array(node.scale)
-            matrix[:3, 3] = node.translation
+            rotation = Rotation.from_quat(node.get("rotation", (0, 0, 0, 1)))
+            matrix[:3, :3] = rotation.as_matrix() * np.array(node.get("scale", 1))
+            matrix[:3, 3] = node.get("translation", 0)
         local.append(matrix)
     world = list(local)
-    children = {child for node in nodes for child in node.children}
+    children = {child for node in nodes for child in node.get("children", ())}
     waiting = [i for i in range(len(nodes)) if i not in children]
     while waiting:
         i = waiting.pop()
-        for child in nodes[i].children:
+        for child in nodes[i].get("children", ()):
             world[child] = world[i] @ local[child]
             waiting.append(child)
     return world
@@ -185,7 +186,7 @@ def _tree(file: GltfFile, node_ids: list[int]) -> tuple[np.ndarray, tuple[int, .
     row = {node: i for i, node in enumerate(node_ids)}
     parents = np.full(len(node_ids), -1)
     for node, i in row.items():
-        for child in file.document.nodes[node].children:
+        for child in file.nodes[node].get("children", ()):
             if child in row:
                 parents[row[child]] = i
     order = [i for i in range(len(parents)) if parents[i] < 0]

@@ -38,7 +38,7 @@ def true_points(opened: Opened) -> np.ndarray:
         pose = inverse_rigid(view.cam_from_world).astype(np.float32)
         pose[:3, 1:3] *= -1  # axes of cameras as the ray tracer has them: y up, looking along -z
         origin = pose[:3, 3]
-        for _, directions in sampled_rays(pose, SIDE, 1):
+        for directions in sampled_rays(pose, SIDE, 1):
             _, distance = nearest_things(scene, origin, directions)
             hit = np.isfinite(distance)
             found.append(origin + distance[hit, None] * directions[hit])

@@ -70,7 +70,7 @@ class Reader:
 def read_whole_capture(root: Path) -> object:
     """Read as ``dyngs data inspect --deep`` and ``dyngs train`` do: report, views, points, body,
     images."""
-    from dyngs.capture.inspection.report import format_report, inspect_capture
+    from dyngs.capture.inspection import format_report, inspect_capture
     from dyngs.config import DataConfig
     from dyngs.core.errors import DyngsError
     from dyngs.data.loader import ImageLoader
@@ -291,7 +291,7 @@ def read_a_path(root: Path) -> object:
 def read_a_point(root: Path) -> object:
     """The measurement and its row of the report."""
     from dyngs.study.measure import read_measurement
-    from dyngs.study.sweep import table_rows
+    from dyngs.study.tradeoff import table_rows
 
     measurement = read_measurement(only(root))
     return table_rows([measurement]), measurement
@@ -301,13 +301,12 @@ def read_option_values(root: Path) -> object:
     """Parse values of options of the command line."""
     from dyngs.data.times import parse_frames
     from dyngs.export.camera_paths import parse_times
-    from dyngs.study.sweep import parse_requirements
-    from dyngs.study.variants import parse_variations
+    from dyngs.study.tradeoff import parse_requirements, parse_variations
 
     parsers: tuple[Callable[[str], object], ...]
     parsers = (
         parse_requirements,
-        lambda word: parse_variations([word], trains=True),
+        lambda word: parse_variations([word]),
         parse_frames,
         parse_times,
     )
@@ -323,13 +322,6 @@ def read_a_log(root: Path) -> object:
     seconds = seconds_at(root, 7)
     with RunLog(root / LOG_NAME, 2):
         return seconds
-
-
-def read_a_load(root: Path) -> object:
-    """Read the workload of a benchmark."""
-    from dyngs.cli.kernel_bench import garden_workload
-
-    return garden_workload(only(root))
 
 
 def only(root: Path) -> Path:
@@ -451,6 +443,5 @@ READERS: dict[str, Reader] = {
     "points": Reader({"point": files.write_measurement}, read_a_point),
     "options": Reader({"words": files.write_words}, read_option_values, names_file=False),
     "logs": Reader({"log": files.write_log}, read_a_log, writes=True),
-    "bench": Reader({"load": files.write_load}, read_a_load),
 }
 """Readers by their names on the command line."""

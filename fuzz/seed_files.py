@@ -416,12 +416,11 @@ def write_measurement(root: Path) -> None:
     """Write a measured point of ``dyngs tradeoff``."""
     from dataclasses import asdict
 
-    from dyngs.study.measure import Measurement, Quartiles, Speed
+    from dyngs.study.measure import Measurement
     from dyngs.study.runs import write_stored
 
-    speed = Speed(Quartiles(3.0, 2.0, 4.0), Quartiles(1.0, 0.9, 1.1))
-    scores = (3, 30.0, 0.9, 0.1, 29.0, None, 100, 1.5, 20.0, 7, 1.5)
-    point = Measurement("prune=0.5", {"prune": 0.5}, *scores, speed=speed)
+    scores = (3, 30.0, 0.9, 0.1, 29.0, None, 100, 1.5, 7, 1.5)
+    point = Measurement("prune=0.5", *scores, ms=3.0, gain=1.1)
     write_stored(root / "a.json", asdict(point))
 
 
@@ -435,23 +434,6 @@ def write_log(root: Path) -> None:
     """Write the log and the timing of a run."""
     (root / "log.jsonl").write_text('{"step": 1, "loss": 0.5}\n{"step": 2, "loss": 0.4}\n')
     (root / "timing.json").write_text('{"seconds_train": {"7": 1.0}}\n')
-
-
-def write_load(root: Path) -> None:
-    """Write a workload of ``dyngs bench``."""
-    pose = np.eye(4)[None]
-    pose[0, 2, 3] = 3
-    k = np.array([[[20.0, 0, 10], [0, 20, 7], [0, 0, 1]]])
-    points = np.random.default_rng(0).uniform(-1, 1, (9, 3))
-    np.savez(
-        root / "a.npz",
-        means3d=points,
-        colors=np.full((9, 3), 9),
-        viewmats=pose,
-        Ks=k,
-        width=20,
-        height=14,
-    )
 
 
 def _gaussians() -> dict[str, torch.Tensor]:

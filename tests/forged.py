@@ -3,7 +3,6 @@ knows them."""
 
 from __future__ import annotations
 
-import hashlib
 import random
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -24,15 +23,9 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.stored_file import (
-    _DTYPES,
-    MAGIC,
-    MAX_HEADER,
     Coding,
-    TensorKind,
-    _Header,
-    _Info,
-    _stored,
-    compressed,
+    stored_tensor,
+    with_header,
 )
 
 Tensors = dict[str, Tensor]
@@ -141,16 +134,9 @@ def stored_as_they_are(tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -
     Raises:
         ValueError: the format cannot say that.
     """
-    kept = {
-        name: x for name, x in tensors.items() if str(x.dtype).removeprefix("torch.") in _DTYPES
-    }
-    stored = [_stored(name, x, Coding(TensorKind.EXACT), None) for name, x in sorted(kept.items())]
-    header = _Header(info=_Info(**info), tensors=tuple(entry for entry, _ in stored))
-    packed = compressed(header.model_dump_json().encode(), room=MAX_HEADER)
-    body = b"".join(
-        [MAGIC, len(packed).to_bytes(4, "little"), packed, *(block for _, block in stored)]
-    )
-    return body + hashlib.sha256(body).digest()
+    kept = {name: x for name, x in tensors.items() if x.dtype != torch.bfloat16}
+    stored = [stored_tensor(name, x, Coding("exact")) for name, x in sorted(kept.items())]
+    return with_header(dict(info), [entry for entry, _ in stored], [block for _, block in stored])
 
 
 def require_drawable(scene: GaussianScene) -> None:

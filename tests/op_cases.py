@@ -30,7 +30,7 @@ from dyngs.ops.projection import project
 from dyngs.ops.rasterization import Tally, tally
 from dyngs.ops.rays import Rays, Space, Steps, composite, march, reached
 from dyngs.ops.registration import count_nonfinite_op
-from dyngs.ops.shading import Sight, shading_inputs
+from dyngs.ops.shading import shading_inputs
 from dyngs.ops.skinning import add_offsets_, blend_skinning, offset_gradients
 
 
@@ -178,11 +178,11 @@ def shading_case(count: int, dtype: torch.dtype) -> Case:
     rows = (3 * torch.arange(count)) % (count + 10)
     numbers = [[0.0, 0.1, 0.2], [1.0, 2.0, 3.0], [0.0, 0.0, -4.0]]
     *box, eye = torch.tensor(numbers, dtype=dtype)
-    rest = (scene.means.flip(0), torch.eye(3, dtype=dtype).roll(1, 0))
+    rest = scene.means.flip(0), torch.eye(3, dtype=dtype).roll(1, 0)
     seen = scene.means, scene.quats, scene.scales.log(), rows, eye, torch.stack(box)
-    sights = Sight(*seen, rest, time=0.3), Sight(*seen, normals=False)
+    sights = (*seen, *rest, 0.3, True), (*seen, None, None, None, False)
     base = leaf(Numbers(dtype).uniform(count, 3))
-    return Case(lambda base: [shading_inputs(sight, base) for sight in sights], (base,))
+    return Case(lambda base: [shading_inputs(base, *sight) for sight in sights], (base,))
 
 
 def planes_case(count: int, dtype: torch.dtype) -> Case:

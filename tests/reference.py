@@ -11,6 +11,8 @@ few pixels. Gradients come from autograd. Sources: Zwicker et al. 2001, Kerbl et
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -19,7 +21,6 @@ from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.projection import Projection, ProjectionOptions
 from dyngs.ops.quaternions import rotation_matrices
 from dyngs.ops.rasterization import Blended, BlendOptions
-from dyngs.ops.shading import Sight
 
 
 def covariances2d(
@@ -195,22 +196,37 @@ def _rasterize(
     return Blended(torch.stack(images), torch.stack(remains))
 
 
-def shading_inputs(sight: Sight, base: Tensor) -> Tensor:
+class Sight(NamedTuple):
+    """Arguments of ``shading_inputs`` of dyngs after ``base``."""
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    rows: Tensor
+    eye: Tensor
+    box: Tensor
+    rest: Tensor | None = None
+    turn: Tensor | None = None
+    time: float | None = None
+    normals: bool = True
+
+
+def shading_inputs(base: Tensor, *arguments: Any) -> Tensor:
     """As ``dyngs.ops.shading.shading_inputs``.
 
     Place in the box (contracted), direction from the eye, |cosine| between the shortest axis and
     the direction, the direction mirrored at that axis, base colour less 1/2, time in [-1, 1]. A
     body at rest knows places, directions and normals as they are there.
     """
+    sight = Sight(*arguments)
     means = sight.means[sight.rows]
     directions = torch.nn.functional.normalize(means - sight.eye, dim=1)
     normals = shortest_axes(sight.quats[sight.rows], sight.log_scales[sight.rows])
     places = means
-    if sight.rest is not None:
-        at_rest, turn = sight.rest
-        places = at_rest[sight.rows]
-        directions = directions @ turn
-        normals = normals @ turn
+    if sight.rest is not None and sight.turn is not None:
+        places = sight.rest[sight.rows]
+        directions = directions @ sight.turn
+        normals = normals @ sight.turn
     center, half_size = sight.box
     inputs = [contracted((places - center) / half_size), directions]
     if sight.normals:

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.data.synthetic.captures import (
     CAMERA_ANGLE_X,
+    PaintedBall,
     Scene,
-    Sphere,
     hemisphere_cameras,
     render_scene,
     scene_at,
@@ -32,8 +32,10 @@ def rolling(
     balls = []
     for time in np.linspace(0.0, 1.0, count):
         _, ball = scene_at("roll", 0.45 * time).primitives
-        assert isinstance(ball, Sphere)
-        balls.append(ball if turns else Sphere(ball.center, ball.radius, ball.paint, ball.gloss))
+        assert isinstance(ball, PaintedBall)
+        balls.append(
+            ball if turns else PaintedBall(ball.center, ball.radius, ball.paint, ball.gloss)
+        )
     return seen(balls, size)
 
 
@@ -44,7 +46,7 @@ def hopping(count: int = 48, size: int = 64) -> tuple[FrameStack, np.ndarray, np
     balls = []
     for time in np.linspace(0.0, 1.0, count):
         _, ball = scene_at("roll", 0.0).primitives
-        assert isinstance(ball, Sphere)
+        assert isinstance(ball, PaintedBall)
         center = np.array(
             [0.8 * time - 0.4, 0.1, ball.center[2] + 0.7 * abs(np.sin(4 * np.pi * time))]
         )
@@ -54,7 +56,7 @@ def hopping(count: int = 48, size: int = 64) -> tuple[FrameStack, np.ndarray, np
     return seen(balls, size)
 
 
-def seen(balls: Sequence[Sphere], size: int) -> tuple[FrameStack, np.ndarray, np.ndarray]:
+def seen(balls: Sequence[PaintedBall], size: int) -> tuple[FrameStack, np.ndarray, np.ndarray]:
     """The images of ``balls``, one at each time, and their centres and rotations."""
     count = len(balls)
     times = np.linspace(0.0, 1.0, count)

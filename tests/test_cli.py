@@ -35,7 +35,6 @@ VERBS = (
     "convert",
     "edit",
     "data",
-    "bench",
     "doctor",
     "predict",
     "tradeoff",

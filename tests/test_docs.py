@@ -51,7 +51,6 @@ SHORTER = {
 """Appended where a command is run."""
 NOT_RUN = {
     "demo": "trains 3,000 steps; tests/test_demo.py runs it with fewer",
-    "bench": "takes half a minute; tests/bench runs it on less",
     "data sfm": "needs photos with something to match; tests/capture/test_sfm.py has some",
     "view": "serves a page until it is stopped; tests/view opens it in a browser",
     "predict": "needs a trained network; tests/cli/test_predict.py has one",
@@ -102,7 +101,7 @@ class Command:
 
     @property
     def verb(self) -> str:
-        return " ".join(self.words[: 2 if self.words[0] in ("data", "bench") else 1])
+        return " ".join(self.words[: 2 if self.words[0] == "data" else 1])
 
 
 def blocks(page: Path, languages: tuple[str, ...]) -> Iterator[str]:
@@ -185,8 +184,7 @@ def require_sound(command: Command, arguments: argparse.Namespace) -> None:
     """Nothing, if what a parsed command names besides its options can be: keys, variations, times,
     presets."""
     from dyngs.export.camera_paths import parse_times, path_file
-    from dyngs.study.sweep import parse_goal, parse_requirements
-    from dyngs.study.variants import parse_variations
+    from dyngs.study.tradeoff import parse_goal, parse_requirements, parse_variations
 
     for word in command.words:
         if word.startswith(("configs/", "benchmarks/", "examples/")):
@@ -198,14 +196,11 @@ def require_sound(command: Command, arguments: argparse.Namespace) -> None:
     if command.verb == "train" and arguments.resume is None:
         parse_config(arguments.overrides, None, arguments.begun)
     elif command.verb == "tradeoff":
-        is_config = arguments.target.startswith("configs/")
-        parse_variations(arguments.vary, trains=arguments.train or is_config)
+        parse_variations(arguments.vary)
         parse_requirements(arguments.require or "psnr>=1")
         parse_goal(
             arguments.minimize or arguments.maximize or "psnr", smallest=bool(arguments.minimize)
         )
-        if is_config:
-            load_config(Path(arguments.target), overrides)
     elif overrides:
         require_overrides(*overrides)
     if getattr(arguments, "times", None) is not None:

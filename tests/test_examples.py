@@ -17,9 +17,7 @@ from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the capture and the run that the examples name."""
     here = tmp_path_factory.mktemp("examples")
-    write_still_capture(
-        here / "lego", StillOptions(size=16, num_train=3, num_val=1, num_test=1, samples=1)
-    )
+    write_still_capture(here / "lego", StillOptions(size=16, num_train=3, num_test=1, samples=1))
     overrides = [
         f"data.root={here / 'lego'}",
         f"run.dir={here / 'runs/lego'}",

@@ -131,7 +131,7 @@ def test_opacity_counts_less_before_motion_is_followed_unless_things_are_white(
 
 def test_points_are_triangulated_where_several_cameras_show_a_moment(tmp_path: Path) -> None:
     """As many Gaussians as points, of the room and not of a cube; without, random ones."""
-    options = DynamicOptions(size=96, num_times=2, num_cameras=8, num_val=0, num_test=0, samples=1)
+    options = DynamicOptions(size=96, num_times=2, num_cameras=8, num_test=0, samples=1)
     root = write_dynamic_capture("room", tmp_path / "room", options)
     config = _dynamic(root, init=PointsInit(num_random=7))
     found = with_points(read_capture(config.data), config).points

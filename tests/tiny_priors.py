@@ -1,5 +1,4 @@
-"""A tiny capture with every kind of prior; its images are noise, so that nothing agrees with
-them."""
+"""A tiny capture with every kind of prior; its images are noise."""
 
 from __future__ import annotations
 

@@ -40,15 +40,13 @@ def run(arguments: argparse.Namespace) -> int:
 
     from dyngs.export.images import compare_splats
     from dyngs.io.formats.formats import (
-        chosen_variant,
         format_of,
         read_splats,
         upright,
         write_splats,
     )
 
-    # before a large file is read
-    own = chosen_variant(format_of(arguments.target), arguments.spz_version, arguments.compress)
+    format_of(arguments.target)  # before a large file is read
     splat = read_splats(arguments.source, nonfinite="skip")
     if arguments.from_up is not None:
         splat = replace(splat, up=arguments.from_up)
@@ -57,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
         f", it was {splat.up}" if rotated.up != splat.up else ", as it was"
     )
     print_notes((*splat.notes, f"{counted(len(splat.gaussians), 'Gaussian')}; {said}"))
-    written = write_splats(arguments.target, rotated, sh_degree=arguments.sh_degree, own=own)
+    written = write_splats(arguments.target, rotated, sh_degree=arguments.sh_degree)
     print_redrawn(written.notes, [compare_splats(splat, written)])
     print_written(written.path)
     return 0

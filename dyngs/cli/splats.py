@@ -27,10 +27,6 @@ def add_axes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--from-up", choices=AXES, metavar="AXIS", help=about)
     about = "degree of the harmonics in the file, 0 to 4: higher ones are left out, missing ones are zero"
     parser.add_argument("--sh-degree", type=int, choices=range(5), metavar="N", help=about)
-    about = ".spz: 4 states which axes the file has, but fewer programs read it (default 3)"
-    parser.add_argument("--spz-version", type=int, choices=(3, 4), help=about)
-    about = ".glb of Gaussians: compress them as .spz, in a draft of glTF that CesiumJS reads"
-    parser.add_argument("--compress", choices=("spz",), help=about)
 
 
 def print_redrawn(notes: tuple[str, ...], found: Sequence[float]) -> None:

@@ -46,6 +46,9 @@ RESOLVED_NAME = "config.yaml"
 REMOVED_KEYS: dict[str, object] = {
     "budget.min_fps": None,
     "colour.lr": 0.01,
+    "data.frame_cache_mb": 4096,
+    "data.max_megapixels": 150,
+    "data.undistort": "same_focal",
     "model.cells": None,
     "model.features": None,
     "model.finest": None,

@@ -67,6 +67,10 @@ class Cameras:
         if factor == 1:
             return self
         width, height = (max(1, round(factor * side)) for side in (self.width, self.height))
+        return self.resized(width, height)
+
+    def resized(self, width: int, height: int) -> Cameras:
+        """Return the same cameras with images of another size."""
         factors = self.intrinsics.new_tensor([width / self.width, height / self.height, 1.0])
         return Cameras(self.cam_from_world, factors[:, None] * self.intrinsics, width, height)
 

@@ -28,13 +28,10 @@ class Lens:
         model: "none", "opencv" (k1 k2 p1 p2 [k3 k4 k5 k6]) or "fisheye" (OpenCV equidistant
             k1..k4).
         params: the coefficients, in OpenCV's order.
-        focal_ratio: focal length of the lens over that of the pinhole, which the view's intrinsics
-            have.
     """
 
     model: Literal["none", "opencv", "fisheye"] = "none"
     params: tuple[float, ...] = ()
-    focal_ratio: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -69,7 +66,7 @@ class View:
     Attributes:
         name: unique within the capture (usually the path below the root, without extension).
         image_path: image file; for a frame of a ``video`` the file it is decoded to, see
-            ``images.frame_cache``.
+            ``images.video``.
         cam_from_world: (4, 4) float64, OpenCV axes, in scene coordinates (see
             ``Capture.world_scale``).
         intrinsics: (3, 3) float64 in pixels of the *stored* image size.
@@ -84,7 +81,7 @@ class View:
         depth_scale: scene units in the unit of the files, which that of the depth map may be.
         motion_mask_path: white = moves; if ``motion_mask_labels``, all but 0 does.
         flow_path: optical flow to the view ``flow_to``, the next one of this camera in its file.
-        exposure: light let in by the EXIF tags, see ``images.exif``: comparable among views of one
+        exposure: light let in by the EXIF tags, by ``ImageHeader``: comparable among views of one
             capture.
         shrunk: how many times smaller the file is than the image that it is a copy of.
     """

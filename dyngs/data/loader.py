@@ -6,11 +6,10 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextvars import copy_context
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
-from typing import Generic, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -32,88 +31,18 @@ from dyngs.data.images.images import (
 )
 from dyngs.data.images.lens import LensMap, is_pinhole, undistort, undistort_map
 from dyngs.data.read import view_size
-from dyngs.io.containment import images_up_to
-from dyngs.ops.device import CPU, Upload, gpu_memory, sent
+from dyngs.ops.device import CPU, gpu_memory, sent
 
+# mean of the mask over a shrunk pixel from which the whole pixel is kept; allows for rounding
+FULLY_KEPT = 1 - 1e-4
 
-@dataclass(frozen=True)
-class Decoded:
-    """Pixels (H, W, 3 or 4) uint8, straight alpha, mask (H, W) bool, and maps as those of
-    ``Image``."""
+GPU_FRACTION = 0.25
+"""Fraction of the free memory of a GPU that images may take: the rest is for the scene and what is
+drawn."""
 
-    pixels: Tensor
-    mask: Tensor | None
-    moves: Tensor | None = None
-    labels: Tensor | None = None
-    depth: Tensor | None = None
-    flow: Tensor | None = None
-
-    @property
-    def num_bytes(self) -> int:
-        return sum(x.nbytes for x in self._there().values())
-
-    def upload(self, device: torch.device) -> Callable[[], Decoded]:
-        """Begin to copy everything to ``device``; the result returns the image there."""
-        arrays = self._there()
-        upload = Upload(list(arrays.values()), device)
-        return lambda: replace(self, **dict(zip(arrays, upload.arrays(), strict=True)))
-
-    def _there(self) -> dict[str, Tensor]:
-        return {name: x for name, x in vars(self).items() if x is not None}
-
-
-Item = TypeVar("Item")
-
-
-class Ahead(Generic[Item]):
-    """Results that ``threads`` work on in the background, 0: none; none of them depends on when
-    that is done."""
-
-    def __init__(self, work: Callable[[int], Item], threads: int) -> None:
-        self._work, self._threads = work, threads
-        self._pool: ThreadPoolExecutor | None = None
-        self._pending: dict[int, Future[Item]] = {}
-        self._process = os.getpid()
-
-    @property
-    def most(self) -> int:
-        """Most items that are worked on, or wait to be taken: twice the number of threads."""
-        return 2 * self._threads
-
-    def expect(self, indices: Sequence[int]) -> None:
-        """Begin to work on the first of ``indices``; what is no longer expected is dropped."""
-        if not self._threads:
-            return
-        if self._process != os.getpid():  # threads do not survive a fork
-            self._pool, self._pending, self._process = None, {}, os.getpid()
-        expected = list(dict.fromkeys(indices))[: self.most]
-        for index in set(self._pending) - set(expected):
-            dropped = self._pending.pop(index, None)
-            if dropped is not None:
-                dropped.cancel()
-        for index in expected:
-            if index not in self._pending:
-                if self._pool is None:
-                    self._pool = ThreadPoolExecutor(
-                        self._threads, thread_name_prefix="dyngs-images"
-                    )
-                # the context holds which files may be opened, and how large images may be
-                self._pending[index] = self._pool.submit(copy_context().run, self._work, index)
-
-    def rest(self) -> None:
-        """End the threads, and drop what they have done; they begin anew when something is
-        expected."""
-        pool = self._pool
-        self._pool = None
-        self._pending = {}
-        if pool is not None and self._process == os.getpid():
-            pool.shutdown(wait=True, cancel_futures=True)
-
-    def take(self, index: int) -> Item | None:
-        """Return the item of ``index`` when it is ready, or raise what the work raised; None where
-        not expected."""
-        found = self._pending.pop(index, None)
-        return None if found is None or self._process != os.getpid() else found.result()
+Decoded = dict[str, Tensor]
+"""``pixels`` (H, W, 3 or 4) uint8, straight alpha; ``mask`` (H, W) bool and the maps of ``Image``
+where a view has them."""
 
 
 def usual_threads() -> int:
@@ -123,18 +52,6 @@ def usual_threads() -> int:
     except AttributeError:  # not on Linux
         cores = os.cpu_count() or 1
     return min(max(cores // 2, 1), 4)
-
-
-# mean of the mask over a shrunk pixel from which the whole pixel is kept; allows for rounding
-FULLY_KEPT = 1 - 1e-4
-
-GPU_FRACTION = 0.25
-"""Fraction of the free memory of a GPU that images may take: the rest is for the scene and what is
-drawn."""
-
-_SMALL_BYTES = 4
-"""Bytes of a shrunk image, whose values are float32, per byte of the whole one and fraction of its
-pixels."""
 
 
 @dataclass(frozen=True)
@@ -179,14 +96,11 @@ class Image:
 
     def to(self, device: torch.device | str) -> Image:
         """Return the same image, with its camera, on another device."""
-        tensors: dict[str, Tensor] = {name: sent(x, device) for name, x in self._tensors().items()}
+        tensors: Any = {name: sent(x, device) for name, x in self.tensors().items()}
         return replace(self, cameras=self.cameras.to(device=device), **tensors)
 
-    @property
-    def num_bytes(self) -> int:
-        return sum(x.nbytes for x in self._tensors().values())
-
-    def _tensors(self) -> dict[str, Tensor]:
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the tensors that are there, by name."""
         return {name: x for name, x in vars(self).items() if isinstance(x, Tensor)}
 
     def shrunk(self, factor: int) -> Image:
@@ -195,43 +109,66 @@ class Image:
         if factor == 1:
             return self
         cameras = self.cameras.scaled(1 / factor)
-        width, height = cameras.width, cameras.height
+        size = cameras.width, cameras.height
+        small: Any = {}
+        for name, values in self.tensors().items():
+            if name == "flow":
+                small[name] = image_maps.resized(values, *size)
+            elif name in ("depth", "labels"):
+                small[name] = _nearest(values, image_maps.nearest_positions(*size))
+            elif name == "rgb_premultiplied":
+                small[name] = area_downscale(values, *size)
+            else:
+                small[name] = area_downscale(values[..., None], *size)[..., 0]
+        if self.mask is not None:
+            small["mask"] = (small["mask"] > FULLY_KEPT).float()
+        return replace(self, cameras=cameras, **small)
 
-        def mean(values: Tensor | None) -> Tensor | None:
-            if values is None:
-                return None
-            return area_downscale(values[..., None], width, height)[..., 0]
 
-        def nearest(values: Tensor | None) -> Tensor | None:
-            if values is None:
-                return None
-            return _nearest(values, image_maps.nearest_positions(width, height))
+class _ImageCache:
+    """Images in memory by the index of their view and the factor by which they are shrunk, of at
+    most ``room`` bytes.
 
-        mask = mean(self.mask)
-        return replace(
-            self,
-            cameras=cameras,
-            rgb_premultiplied=area_downscale(self.rgb_premultiplied, width, height),
-            alpha=mean(self.alpha),
-            mask=None if mask is None else (mask > FULLY_KEPT).float(),
-            moves=mean(self.moves),
-            depth=nearest(self.depth),
-            labels=nearest(self.labels),
-            flow=None if self.flow is None else image_maps.resized(self.flow, width, height),
-        )
+    Once it is full, what is in it stays: where every image is requested once per epoch, in a new
+    order each time, the one used last is the one needed last.
+    """
+
+    def __init__(self, room: float) -> None:
+        self.room = room
+        self.images: dict[tuple[int, int], Any] = {}
+        self.num_bytes = 0
+
+    def keep(self, key: tuple[int, int], image: Decoded | Image, reserved: float) -> bool:
+        """Return whether the image is kept: it fits, and ``reserved`` bytes beside it."""
+        size = _num_bytes(image)
+        fits = self.num_bytes + size + reserved <= self.room
+        if fits and key not in self.images:
+            self.images[key] = image
+            self.num_bytes += size
+        return fits
+
+    def drop(self, key: tuple[int, int]) -> None:
+        """Remove an image, if it is there."""
+        if key in self.images:
+            self.num_bytes -= _num_bytes(self.images.pop(key))
+
+
+def _num_bytes(image: Decoded | Image) -> int:
+    tensors = image.tensors() if isinstance(image, Image) else image
+    return sum(x.nbytes for x in tensors.values())
 
 
 class ImageLoader:
     """A sequence of images, decoded on demand or ahead of it; the first ones are cached up to
     ``options.cache_mb``.
 
-    Once the cache is full, what is in it stays: where every image is requested once per epoch, in a
-    new order each time, the one used last is the one needed last. The same index always gives the
-    same bytes, cached or not, decoded ahead or not. Safe to use from several threads. Images are
-    decoded on the CPU. Those given out on a GPU are kept there as far as a quarter of its free
-    memory goes; the others are copied next to its work.
+    The same index always gives the same bytes, cached or not, decoded ahead or not. Safe to use
+    from several threads. Images are decoded on the CPU. Those given out on a GPU are kept there as
+    far as a quarter of its free memory goes.
 
     Attributes:
+        views: the views, in the order of the images.
+        times: times of the views in [0, 1], None where a view has none.
         corrected: returns the camera of an image, given the index of its view and its camera by the
             capture; None: the latter.
     """
@@ -249,33 +186,30 @@ class ImageLoader:
 
         Args:
             views: one split of a capture.
-            options: ``downscale``, ``longest_side``, ``cache_mb`` and ``max_megapixels`` count;
-                None: the defaults.
+            options: ``downscale``, ``longest_side`` and ``cache_mb`` count; None: the defaults.
             with_maps: read depth maps and flow, too.
             decoding_threads: decode what is to be expected in so many threads; none if ``cache_mb``
                 is 0.
         """
-        self._views = tuple(views)
-        self._times = tuple(view.time for view in self._views)
+        self.views = tuple(views)
+        self.times = tuple(view.time for view in self.views)
+        self.corrected: Callable[[int, Cameras], Cameras] | None = None
         self._options = options = options or DataConfig(root=Path())
         self._with_maps = with_maps
-        self._device, self._gpu_room = CPU, 0.0
-        self._cache: dict[int, Decoded] = {}
-        self._on_gpu: dict[int, Decoded] = {}
-        self._cached_bytes = self._gpu_bytes = 0
+        self._device = CPU
+        self._on_cpu = _ImageCache(options.cache_mb * 1e6)
+        # where images are given out
+        self._cache = self._on_cpu
+        self._factor = 1
         self._threads = decoding_threads if options.cache_mb > 0 else 0
-        self._ahead = Ahead(self._made_ready, self._threads)
-        self._small: dict[int, Image] = {}
-        self._small_by, self._small_bytes = 1, 0
+        self._pool: ThreadPoolExecutor | None = None
+        self._pending: dict[int, Future[Decoded]] = {}
         self._last_map: tuple[object, LensMap] | None = None
-        self._cameras: dict[tuple[int, int, torch.device], Cameras] = {}
-        self.corrected: Callable[[int, Cameras], Cameras] | None = None
         self._lock = Lock()
-        with images_up_to(options.max_megapixels):
-            check_files(self._views)
+        check_files(self.views)
 
     def __len__(self) -> int:
-        return len(self._views)
+        return len(self.views)
 
     @property
     def device(self) -> torch.device:
@@ -288,117 +222,92 @@ class ImageLoader:
             return
         self.rest()
         memory = gpu_memory(device)
-        with self._lock:
-            self._on_gpu = {}
-            self._gpu_bytes = 0
-            self._small = {}
-            self._small_bytes = 0
-            self._device = device
-            self._gpu_room = math.inf if memory is None else GPU_FRACTION * memory[0]
-
-    @property
-    def times(self) -> tuple[float | None, ...]:
-        """Times of the views in [0, 1], None where a view has none."""
-        return self._times
-
-    @property
-    def views(self) -> tuple[View, ...]:
-        """The views, in the order of the images."""
-        return self._views
+        self._device = device
+        self._cache = self._on_cpu
+        if device != CPU:
+            self._cache = _ImageCache(math.inf if memory is None else GPU_FRACTION * memory[0])
 
     def __getitem__(self, index: int) -> Image:
-        return self._with_camera(index, self._as_stored(index))
-
-    def _with_camera(self, index: int, image: Image) -> Image:
-        index %= len(self._views)
-        if self.corrected is not None:
-            image = replace(image, cameras=self.corrected(index, image.cameras))
-        if self._device == CPU:
-            return image
-        if self.corrected is None:
-            key = (index, image.cameras.width, self._device)  # sent once
-            if key not in self._cameras:
-                self._cameras[key] = image.cameras.to(device=self._device)
-            image = replace(image, cameras=self._cameras[key])
-        return image.to(self._device)
-
-    def _as_stored(self, index: int) -> Image:
-        view = self._views[index]
-        decoded = self._decoded(index % len(self._views))
-        height, width = decoded.pixels.shape[:2]
-        pixels = premultiplied(decoded.pixels)
-        return Image(
-            name=view.name,
-            cameras=self._camera(index % len(self._views), width, height),
-            rgb_premultiplied=pixels[..., :3].contiguous(),
-            alpha=pixels[..., 3].contiguous() if pixels.shape[-1] == 4 else None,
-            mask=None if decoded.mask is None else decoded.mask.float(),
-            time=view.time,
-            frame=view.frame,
-            moves=decoded.moves,
-            labels=decoded.labels,
-            depth=decoded.depth,
-            flow=decoded.flow,
-        )
-
-    def _camera(self, index: int, width: int, height: int) -> Cameras:
-        """Return the camera of a view, on the CPU; it is made once."""
-        key = (index, width, CPU)
-        if key not in self._cameras:
-            self._cameras[key] = _camera_of(self._views[index], width, height)
-        return self._cameras[key]
-
-    def cameras(self) -> list[Cameras]:
-        """Return the cameras of all images as they are by now, one each; no image is read."""
-        found = [
-            _camera_of(view, *size) for view, size in zip(self._views, self.sizes, strict=True)
-        ]
-        if self.corrected is not None:
-            found = [self.corrected(i, cameras) for i, cameras in enumerate(found)]
-        return [cameras.to(device=self.device) for cameras in found]
+        index = range(len(self))[index]
+        return self._given_out(index, self._as_stored(index))
 
     def shrunk(self, index: int, factor: int) -> Image:
         """Return ``self[index].shrunk(factor)``; cached for the last factor, where memory is
         left."""
+        key = (range(len(self))[index], factor)
         with self._lock:
-            if factor != self._small_by:
-                self._small = {}
-                self._small_by = factor
-                self._small_bytes = 0
-        if factor == 1:
-            return self[index]
-        index %= len(self._views)
-        with self._lock:
-            if index in self._small:
-                return self._with_camera(index, self._small[index])
-        image = self._as_stored(index).shrunk(factor)
-        with self._lock:
-            is_new = index not in self._small and factor == self._small_by
-            if is_new and self._taken + image.num_bytes <= self._room:
-                self._small[index] = image
-                self._small_bytes += image.num_bytes
-        return self._with_camera(index, image)
+            if factor != self._factor:
+                for old in [key for key in self._cache.images if key[1] > 1]:
+                    self._cache.drop(old)
+                self._factor = factor
+            small = self._cache.images.get(key) if factor > 1 else None
+        if small is None:
+            small = self._as_stored(key[0]).shrunk(factor)
+            if factor > 1:
+                with self._lock:
+                    self._cache.keep(key, small, 0)
+        return self._given_out(key[0], small)
+
+    def _given_out(self, index: int, image: Image) -> Image:
+        if self.corrected is not None:
+            image = replace(image, cameras=self.corrected(index, image.cameras))
+        return image if self._device == CPU else image.to(self._device)
+
+    def _as_stored(self, index: int) -> Image:
+        view = self.views[index]
+        decoded = dict(self._decoded(index))
+        pixels = premultiplied(decoded.pop("pixels"))
+        height, width = pixels.shape[:2]
+        mask = decoded.pop("mask", None)
+        return Image(
+            name=view.name,
+            cameras=_camera_of(view, width, height),
+            rgb_premultiplied=pixels[..., :3].contiguous(),
+            alpha=pixels[..., 3].contiguous() if pixels.shape[-1] == 4 else None,
+            mask=None if mask is None else mask.float(),
+            time=view.time,
+            frame=view.frame,
+            **decoded,
+        )
+
+    def cameras(self) -> list[Cameras]:
+        """Return the cameras of all images as they are by now, one each; no image is read."""
+        found = [_camera_of(view, *size) for view, size in zip(self.views, self.sizes, strict=True)]
+        if self.corrected is not None:
+            found = [self.corrected(i, cameras) for i, cameras in enumerate(found)]
+        return [cameras.to(device=self.device) for cameras in found]
 
     def expect(self, indices: Sequence[int]) -> None:
         """Begin to decode the images that are requested next, in this order, as far as they are not
         cached."""
+        if not self._threads:
+            return
         with self._lock:
+            images = self._cache.images
             missing = [
                 i
-                for i in indices
-                if i not in self._kept and not (self._small_by > 1 and i in self._small)
-            ]
-        self._ahead.expect(missing)
+                for i in dict.fromkeys(indices)
+                if (i, 1) not in images and (i, self._factor) not in images
+            ][: 2 * self._threads]
+            for index in self._pending.keys() - set(missing):
+                self._pending.pop(index).cancel()
+            if self._pool is None:
+                self._pool = ThreadPoolExecutor(self._threads, "dyngs-images")
+            for index in missing:
+                if index not in self._pending:
+                    self._pending[index] = self._pool.submit(self._on_demand, index)
 
     def rest(self) -> None:
         """End the threads that decode ahead; they begin anew with the next ``expect``."""
-        self._ahead.rest()
+        pool = self._pool
+        self._pool = None
+        self._pending = {}
+        if pool is not None:
+            pool.shutdown(wait=True, cancel_futures=True)
 
     def without_motion_masks(self) -> ImageLoader:
         """Return a loader of the same images that reads no motion masks."""
-        if all(view.motion_mask_path is None for view in self._views):
-            return self
-        views = [replace(view, motion_mask_path=None) for view in self._views]
+        views = [replace(view, motion_mask_path=None) for view in self.views]
         return ImageLoader(
             views, self._options, with_maps=self._with_maps, decoding_threads=self._threads
         )
@@ -406,102 +315,59 @@ class ImageLoader:
     @property
     def decoded_ahead(self) -> int:
         """Number of images that ``expect`` decodes ahead; 0 where all are cached."""
-        return 0 if len(self._kept) == len(self._views) else self._ahead.most
+        is_whole = all((i, 1) in self._cache.images for i in range(len(self)))
+        return 0 if is_whole else 2 * self._threads
 
     @property
     def sizes(self) -> list[tuple[int, int]]:
         """Width and height of the images, in px, without decoding any."""
-        return [view_size(view, self._options) for view in self._views]
+        return [view_size(view, self._options) for view in self.views]
 
     @property
     def bytes_to_come(self) -> int:
         """Bytes that images will take, in the cache or decoded ahead, next to those that they take
         now."""
-        every = min(self._bytes_of_all() - self.bytes_on_gpu, round(self._options.cache_mb * 1e6))
-        return max(every - self.cached_bytes, 0)
+        every = min(self._bytes_of_all() - self.bytes_on_gpu, round(self._on_cpu.room))
+        return max(every - self._on_cpu.num_bytes, 0)
 
     @property
     def bytes_on_gpu(self) -> int:
         """Bytes that images will take of the memory of a GPU."""
-        return 0 if self._device == CPU else int(min(self._bytes_of_all(), self._gpu_room))
+        return 0 if self._device == CPU else int(min(self._bytes_of_all(), self._cache.room))
 
     def _bytes_of_all(self) -> int:
         """Return the bytes of all images once decoded; whether a file has alpha is not known, and
         taken as no."""
-        sizes = zip(self._views, self.sizes, strict=True)
+        sizes = zip(self.views, self.sizes, strict=True)
         return sum(
             width * height * (3 + (view.mask_path is not None)) for view, (width, height) in sizes
         )
 
-    @property
-    def cached_bytes(self) -> int:
-        """Bytes of the CPU's memory that cached images take."""
-        return self._cached_bytes + (self._small_bytes if self._device == CPU else 0)
-
-    @property
-    def _kept(self) -> dict[int, Decoded]:
-        return self._cache if self._device == CPU else self._on_gpu
-
-    @property
-    def _taken(self) -> int:
-        """Bytes that are taken where images are given out, of ``_room``."""
-        return self.cached_bytes if self._device == CPU else self._gpu_bytes + self._small_bytes
-
-    @property
-    def _room(self) -> float:
-        return self._options.cache_mb * 1e6 if self._device == CPU else self._gpu_room
-
     def _decoded(self, index: int) -> Decoded:
         with self._lock:
-            if index in self._kept:
-                return self._kept[index]
-        decoded, upload = self._ahead.take(index) or self._made_ready(index)
-        there = decoded if upload is None else upload()
+            found = self._cache.images.get((index, 1))
+            pending = self._pending.pop(index, None)
+        if found is not None:
+            return found
+        image = self._on_demand(index) if pending is None else pending.result()
+        found = {name: sent(x, self._device) for name, x in image.items()}
+        size = _num_bytes(found)
+        left = sum((i, 1) not in self._cache.images for i in range(len(self))) - 1
+        waiting = min(2 * self._threads, left) * size
+        # While images are shrunk, the small ones are what is requested; their values are floats.
+        both = len(self) * size * (1 + 4 / self._factor**2)
+        is_short = self._factor > 1 and both > self._cache.room
         with self._lock:
-            self._keep(index, decoded, there)
-        return there
+            if self._cache.keep((index, 1), found, math.inf if is_short else waiting):
+                if self._cache is not self._on_cpu:
+                    self._on_cpu.drop((index, 1))
+            elif self._cache is not self._on_cpu:
+                self._on_cpu.keep((index, 1), image, waiting)
+        return found
 
-    def _made_ready(self, index: int) -> tuple[Decoded, Callable[[], Decoded] | None]:
-        """Return the decoded image ``index``, and its copy that is on its way to a GPU, if there is
-        one."""
-        with self._lock:
-            decoded = self._cache.get(index)
-        if decoded is None:
-            with images_up_to(self._options.max_megapixels):
-                decoded = self._decode(self._views[index])
-        return decoded, None if self._device == CPU else decoded.upload(self._device)
-
-    def _keep(self, index: int, decoded: Decoded, there: Decoded) -> None:
-        """Keep an image where it is given out, if there is room; else, if that is a GPU, on the
-        CPU."""
-        if index not in self._kept and self._has_room(there.num_bytes):
-            self._kept[index] = there
-            if self._device == CPU:
-                self._cached_bytes += there.num_bytes
-                return
-            self._gpu_bytes += there.num_bytes
-            if self._cache.pop(index, None) is not None:
-                self._cached_bytes -= decoded.num_bytes
-        elif self._device != CPU and index not in self._on_gpu and index not in self._cache:
-            waiting = (self._ahead.most + 1) * decoded.num_bytes
-            if self._cached_bytes + waiting <= self._options.cache_mb * 1e6:
-                self._cache[index] = decoded
-                self._cached_bytes += decoded.num_bytes
-
-    def _has_room(self, size: int) -> bool:
-        """Return whether an image of ``size`` bytes is to be kept where it is given out.
-
-        While images are shrunk, only where small and large ones fit together: the small ones are
-        what is requested.
-        """
-        left = len(self._views) - len(self._kept) - 1
-        if (
-            self._small_by > 1
-            and len(self._views) * size * (1 + _SMALL_BYTES / self._small_by**2) > self._room
-        ):
-            return False
-        waiting = min(self._ahead.most, left) * size
-        return self._taken + size + waiting <= self._room
+    def _on_demand(self, index: int) -> Decoded:
+        found = self._on_cpu.images.get((index, 1))
+        return self._decode(self.views[index]) if found is None else found
 
     def _decode(self, view: View) -> Decoded:
         pixels = read_image(view.image_path, (view.width, view.height))
@@ -512,52 +378,44 @@ class ImageLoader:
             mask = read_mask(view.mask_path)
             _require_size(view, view.mask_path, mask.shape, "mask")
         size = view_size(view, self._options)
-        maps = self._maps(view, size)
-        if is_pinhole(view.lens) and size == (view.width, view.height):
-            return Decoded(pixels, mask, **maps)
-        if is_pinhole(view.lens):
-            small = area_downscale_uint8(pixels, *size)
-        else:
-            lens_map = self._lens_map(view)
-            small = straight_uint8(
-                area_downscale(undistort(premultiplied(pixels), lens_map), *size)
-            )
+        lens_map = None if is_pinhole(view.lens) else self._lens_map(view)
+        if lens_map is not None:
+            small = area_downscale(undistort(premultiplied(pixels), lens_map), *size)
+            pixels = straight_uint8(small)
             mask = _undistorted_mask(mask, lens_map)
+        elif size != (view.width, view.height):
+            pixels = area_downscale_uint8(pixels, *size)
+        decoded = {"pixels": pixels, **self._maps(view, size, lens_map)}
         if mask is not None:
             # A pixel counts only if all that it covers is kept: otherwise masked colours would
             # bleed in.
-            mask = area_downscale(mask.float()[..., None], *size)[..., 0] > FULLY_KEPT
-        return Decoded(small, mask, **maps)
+            decoded["mask"] = area_downscale(mask.float()[..., None], *size)[..., 0] > FULLY_KEPT
+        return decoded
 
-    def _maps(self, view: View, size: tuple[int, int]) -> dict[str, Tensor]:
+    def _maps(self, view: View, size: tuple[int, int], lens_map: LensMap | None) -> Decoded:
         """Return motion mask, depth and flow of a view, as far as it has them, for the image of
         ``size``."""
-        maps: dict[str, Tensor] = {}
-        lens_map = None if is_pinhole(view.lens) else self._lens_map(view)
+        maps: Decoded = {}
+
+        def at_pixels(values: Tensor) -> Tensor:
+            grid = None if lens_map is None else lens_map.grid
+            return _nearest(values, image_maps.nearest_positions(*size, grid))
+
         if view.motion_mask_path is not None:
             read = image_maps.read_labels if view.motion_mask_labels else read_mask
             found = read(view.motion_mask_path)
             _require_size(view, view.motion_mask_path, found.shape, "motion mask")
             if view.motion_mask_labels:
-                positions = image_maps.nearest_positions(
-                    *size, None if lens_map is None else lens_map.grid
-                )
-                maps["labels"] = _nearest(found, positions)
-            moves = (found != 0).float()
+                maps["labels"] = at_pixels(found)
+            moves = (found != 0).float()[..., None]
             if lens_map is not None:
-                moves = undistort(moves[..., None], lens_map)[..., 0]
-            maps["moves"] = area_downscale(moves[..., None], *size)[..., 0]
+                moves = undistort(moves, lens_map)
+            maps["moves"] = area_downscale(moves, *size)[..., 0]
         if self._with_maps and view.depth_path is not None:
-            positions = image_maps.nearest_positions(
-                *size, None if lens_map is None else lens_map.grid
-            )
-            maps["depth"] = view.depth_scale * _nearest(
-                image_maps.read_depth(view.depth_path), positions
-            )
+            maps["depth"] = view.depth_scale * at_pixels(image_maps.read_depth(view.depth_path))
             if lens_map is not None:
-                maps["depth"] *= _nearest(
-                    lens_map.valid.float(), image_maps.nearest_positions(*size)
-                )
+                positions = image_maps.nearest_positions(*size)
+                maps["depth"] *= _nearest(lens_map.valid.float(), positions)
         if self._with_maps and view.flow_path is not None:
             flow = image_maps.read_flow(view.flow_path)
             _require_size(view, view.flow_path, flow.shape, "flow field")
@@ -588,22 +446,18 @@ def _camera_of(view: View, width: int, height: int) -> Cameras:
 def check_files(views: Sequence[View]) -> None:
     """Check that all images and masks of ``views`` exist, look complete and have the size of their
     view."""
-    silhouettes = [view.silhouette.path for view in views if view.silhouette]
-    paths = [
-        path for view in views for path in (view.image_path, view.mask_path) if path is not None
-    ] + silhouettes
-    missing = next((path for path in paths if not path.is_file()), None)
-    if missing is not None:
-        is_image = any(view.image_path == missing for view in views)
-        more = ", or leave out views without images (data.skip_missing=true)" if is_image else ""
-        raise DyngsError(f"{missing}: no such file; restore it{more}")
+    for view in views:
+        silhouette = view.silhouette and view.silhouette.path
+        for path in (view.image_path, view.mask_path, silhouette):
+            if path is not None and not path.is_file():
+                more = ", or leave out views without images (data.skip_missing=true)"
+                more = more if path == view.image_path else ""
+                raise DyngsError(f"{path}: no such file; restore it{more}")
     for view in views:
         header = check_image(view.image_path)
-        if header.size_for((view.width, view.height)) != (view.width, view.height):
-            raise DyngsError(
-                f"{view.image_path}: the image is {header.width}x{header.height}, but {view.width}x{view.height} was "
-                f"expected; restore the original or correct its intrinsics"
-            )
+        _require_size(
+            view, view.image_path, header.size_for((view.width, view.height))[::-1], "image"
+        )
         if view.mask_path is not None:
             mask = check_image(view.mask_path)
             _require_size(view, view.mask_path, (mask.height, mask.width), "mask")
@@ -613,8 +467,8 @@ def _require_size(view: View, path: Path, shape: Sequence[int], what: str) -> No
     height, width = shape[:2]
     if (width, height) != (view.width, view.height):
         raise DyngsError(
-            f"{path}: the {what} is {width}x{height} but its image is {view.width}x{view.height}; make them the same "
-            "size"
+            f"{path}: the {what} is {width}x{height}, but its camera says {view.width}x{view.height}; make them the "
+            "same size"
         )
 
 

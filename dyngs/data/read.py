@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Hashable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from dyngs.data.body_frames import with_fitted_body
 from dyngs.data.capture import (
     Capture,
     CaptureFormat,
-    Lens,
     PointCloud,
     Splits,
     View,
@@ -24,9 +22,8 @@ from dyngs.data.capture import (
     each_view,
 )
 from dyngs.data.geometry import match_size
-from dyngs.data.images.frame_cache import decode_frames
 from dyngs.data.images.images import header_if_readable, read_header, target_size
-from dyngs.data.images.lens import wide_pinhole
+from dyngs.data.images.video import decode_frames
 from dyngs.data.readers import (
     blender,
     camera_folders,
@@ -40,7 +37,7 @@ from dyngs.data.readers import (
 )
 from dyngs.data.scene_space import normalise_capture
 from dyngs.io.archive import is_archive, unpacked
-from dyngs.io.containment import images_up_to, inside, staying_within
+from dyngs.io.containment import inside, staying_within
 from dyngs.io.find import FileFinder, shrunk_folders
 from dyngs.io.outputs import command_for
 
@@ -93,19 +90,16 @@ def with_smaller_images(
     if not copies or not views:
         return splits, []
     factor = min(max(view.width, view.height) / max(view_size(view, options)) for view in views)
-    number = max((number for number in copies if number <= factor), default=min(copies))
+    number = max((number for number in copies if number <= factor), default=0)
+    if not number:
+        return splits, []
     finder = FileFinder(copies[number])
     small: dict[str, View] = {}
-    for view in views if number <= factor else ():
+    for view in views:
         copy = _shrunk(view, finder.find(os.path.relpath(view.image_path, images)), number)
-        if copy is not None:
-            small[view.name] = copy
-    if len(small) < len(views):
-        names = ", ".join(copies[key].name for key in sorted(copies))
-        conditions = "if each image has its copy, and none a mask or a depth map"
-        return splits, [
-            f"{names}: not read; data.downscale={number} reads {copies[number].name} {conditions}"
-        ]
+        if copy is None:
+            return splits, []
+        small[view.name] = copy
     line = f"{copies[number].name} is read in place of images: training takes images of that size or smaller ones"
     return each_view(splits, lambda view: small.get(view.name, view)), [line]
 
@@ -182,7 +176,7 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
     Args:
         source: the folder or .zip, or a ``dyngs.config.DataConfig`` with it as ``root`` and options
             such as ``frames``.
-        decode_videos: write the chosen frames of videos as image files, see ``images.frame_cache``;
+        decode_videos: write the chosen frames of videos as image files, see ``images.video``;
             otherwise views may name files that do not exist yet.
 
     Raises:
@@ -198,7 +192,6 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
     chosen = _chosen_format(options, found)
     with (
         staying_within(root, options.follow_links),
-        images_up_to(options.max_megapixels),
         reading(
             root,
             "one of its files is not as it should be (`dyngs --debug` shows where); export it again",
@@ -275,7 +268,6 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         capture = _without_missing(capture)
     capture, notes = _with_splits(capture, options)
     splits, copies = with_smaller_images(capture.root, capture.splits, options)
-    splits = _wide(splits) if options.undistort == "wide" else splits
     for view in all_views(splits):
         _check_places(view)
     splits, tracks, absent = _present_priors(splits, capture.tracks_path)
@@ -283,7 +275,7 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         frames = {
             view.image_path: view.video for view in all_views(splits) if view.video is not None
         }
-        decode_frames(capture.root, frames, options.frame_cache_mb)
+        decode_frames(capture.root, frames)
     lacking = _missing(splits)
     has_alpha, layers = _first_image(splits["train"])
     points, more = _finite_points(capture.points)
@@ -349,11 +341,11 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
         # people are drawn in the poses of their frames, which are found by their times
         splits = times.times_of_frames(splits)
     new_poses = splits.pop("pose", None)
-    by_name: list[str] = []
+    notes: list[str] = []
     rate = options.frames_per_second
     if options.times == "order":
-        splits, line = times.times_by_name(capture.root, splits, rate)
-        by_name = [line]
+        splits, line = times.times_by_name(splits, rate)
+        notes.append(line)
         capture = replace(capture, in_seconds=rate is not None, fps=rate or capture.fps)
     elif rate is not None:
         raise DyngsError(
@@ -366,64 +358,49 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
         capture = replace(capture, warnings=said)
     written = splits
     # People move by frame number: of their captures, times within [0, 1] are left as they are.
-    splits, notes = times.unit_times(capture.root, splits, stretch=capture.body is None)
+    splits, scaled = times.unit_times(capture.root, splits, stretch=capture.body is None)
     if options.frames is not None:
-        splits = times.select_frames(capture.root, splits, options.frames)
-    splits, constant = times.still_if_constant(splits)
-    notes += [*constant, *times.sequence_warnings(splits)]
+        splits, _ = times.split_by_frames(capture.root, splits, options.frames)
+    splits, constant = times.static_if_constant(splits)
+    notes += [*scaled, *constant, *times.frame_count_warnings(splits)]
     if options.pose_frames is not None:
         capture, splits, new_poses = _with_poses_held_out(
             capture, splits, new_poses, options.pose_frames
         )
     span = times.span_in_files(written, splits)
-    seconds = (
-        span[1] - span[0]
-        if capture.in_seconds and span
-        else times.clip_seconds(splits, capture.fps)
-    )
+    seconds = times.clip_seconds(splits, capture.fps)
+    if capture.in_seconds and span:
+        seconds = span[1] - span[0]
     if "test" not in splits:
         views = splits["train"]
         every = options.test_every
         splits["test"] = views[::every] if every else ()
         splits["train"] = tuple(view for i, view in enumerate(views) if not every or i % every)
-        if not splits["train"]:
-            raise DyngsError(
-                f"{capture.root}: data.test_every={options.test_every} leaves no training views; raise it"
-            )
+    if not splits["train"]:
+        raise DyngsError(
+            f"{capture.root}: no training views are left; change data.frames, data.pose_frames or data.test_every"
+        )
     splits.setdefault("val", ())
     if new_poses is not None:
         splits["pose"] = new_poses
-    return replace(capture, splits=splits, span=span, seconds=seconds), [*by_name, *notes]
-
-
-def _wide(splits: Splits) -> Splits:
-    """Return views whose pinholes show all that their lenses saw."""
-    known: dict[Hashable, tuple[Lens, np.ndarray]] = {}
-
-    def wide(view: View) -> View:
-        key = (view.lens, view.intrinsics.tobytes(), view.width, view.height)
-        if key not in known:
-            known[key] = wide_pinhole(view.lens, view.intrinsics, view.width, view.height)
-        return replace(view, lens=known[key][0], intrinsics=known[key][1])
-
-    return each_view(splits, wide)
+    return replace(capture, splits=splits, span=span, seconds=seconds), notes
 
 
 def _with_poses_held_out(
     capture: Capture, splits: Splits, new_poses: tuple[View, ...] | None, frames: str
 ) -> tuple[Capture, Splits, tuple[View, ...]]:
     """Return the capture and its splits without the times that ``frames`` selects, and the views of
-    split pose."""
-    if capture.body is None:
+    split pose: those of cameras that only have test views, if there are any."""
+    if capture.body is None or new_poses is not None:
         raise DyngsError(
-            f"{capture.root}: data.pose_frames={frames} is for people; here are no body parameters"
+            f"{capture.root}: data.pose_frames={frames} is for people without a clip of new poses of their own"
         )
-    if new_poses is not None:
-        raise DyngsError(
-            f"{capture.root}: has a clip of new poses of its own; remove data.pose_frames={frames}, or the files of it"
-        )
-    splits, held = times.hold_out_frames(capture.root, splits, frames)
-    return capture.replace(body={**capture.body, "pose": capture.body["train"]}), splits, held
+    held, kept = times.split_by_frames(capture.root, splits, frames, "data.pose_frames")
+    views = all_views(held)
+    trained = {view.camera_id for view in splits["train"]}
+    others = {view.camera_id for view in splits.get("test", ())} - trained
+    views = tuple(view for view in views if not others or view.camera_id in others)
+    return capture.replace(body={**capture.body, "pose": capture.body["train"]}), kept, views
 
 
 def _check_places(view: View) -> None:
@@ -458,7 +435,7 @@ def _first_image(views: tuple[View, ...]) -> tuple[bool, list[str]]:
             header = read_header(view.image_path)
         except DyngsError:
             continue
-        return header.has_alpha, [
+        return header.alpha is not None, [
             f"the layer {header.layer} of EXR images is read"
         ] if header.layer else []
     return False, []

@@ -15,10 +15,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, printable
+from dyngs.core.errors import DyngsError, printable, reading
 from dyngs.data.capture import Splits, View, all_views, each_view
 from dyngs.data.geometry import inverse_rigid
 from dyngs.io.fields import is_number, read_json_object
@@ -59,63 +60,41 @@ def read_seconds(root: Path) -> dict[str, float]:
     path = root / SECONDS_FILE
     if not path.is_file():
         return {}
-    seconds = read_json_object(path).get("seconds")
-    if not isinstance(seconds, dict):
-        raise DyngsError(
-            f"{path}: needs an object 'seconds' of image names and seconds; see docs/formats.md"
-        )
-    for name, second in seconds.items():
-        if not is_number(second):
-            raise DyngsError(
-                f"{path}: the second of {name:.60} must be a number, got {second!r:.40}"
-            )
-    return {str(name): float(second) for name, second in seconds.items()}
+    with reading(
+        path, "it needs an object 'seconds' of image names and seconds; see docs/formats.md"
+    ):
+        seconds: Any = read_json_object(path)["seconds"]
+        return {name: float(second) for name, second in seconds.items()}
 
 
-def times_by_name(
-    root: Path, splits: Splits, per_second: float | None = None
-) -> tuple[Splits, str]:
+def times_by_name(splits: Splits, per_second: float | None = None) -> tuple[Splits, str]:
     """Return the views with times by their names, and a line that says how.
 
     Where the name of every image ends in a number, and no two of a folder in the same, that number
     is the time: frames that are missing leave gaps. Otherwise times are positions in the order of
     the names, numbers in them read as numbers. Each folder is a camera; the same numbers, or
     positions, in another one are the same times. With ``per_second``, so many of them are a second.
-    Raises DyngsError: fewer than two images, or folders with different numbers of images and names
-    without numbers.
     """
-    views = all_views(splits)
-    if len(views) < 2:
-        raise DyngsError(
-            f"{root}: data.times=order needs two images or more, there is {len(views)}"
-        )
     folders: dict[Path, list[View]] = defaultdict(list)
-    for view in views:
+    for view in all_views(splits):
         folders[view.image_path.parent].append(view)
-    numbers = {view.name: re.search(r"\d{1,15}$", view.image_path.stem) for view in views}
-    known = {name: float(found[0]) for name, found in numbers.items() if found}
-    if all(
-        len({known.get(view.name) for view in seen} - {None}) == len(seen)
-        for seen in folders.values()
-    ):
-        times = known
-        line = f"times are the numbers in the names of the images, from {min(times.values()):g} to "
-        line += f"{max(times.values()):g} (data.times=order"
-    else:
-        lengths = {len(seen) for seen in folders.values()}
-        if len(lengths) > 1:
-            counts = f"{min(lengths)} to {max(lengths)}"
-            raise DyngsError(
-                f"{root}: data.times=order: folders hold {counts} images; end the names in the numbers of the frames"
-            )
-        orders = [
-            sorted(seen, key=lambda view: natural_order(view.image_path.name))
-            for seen in folders.values()
-        ]
-        times = {
-            view.name: float(position) for order in orders for position, view in enumerate(order)
+    times: dict[str, float] = {}
+    for seen in folders.values():
+        numbers = [re.search(r"\d{1,15}$", view.image_path.stem) for view in seen]
+        found = {
+            float(number[0]): view.name
+            for number, view in zip(numbers, seen, strict=True)
+            if number
         }
-        line = f"times are the order of the names, {orders[0][0].name} first (data.times=order"
+        times |= {name: time for time, name in found.items()}
+    line = f"from {min(times.values(), default=0):g} to {max(times.values(), default=0):g}"
+    line = f"times are the numbers in the names of the images, {line} (data.times=order"
+    if len(times) < len(all_views(splits)):
+        for seen in folders.values():
+            seen.sort(key=lambda view: natural_order(view.image_path.name))
+            times |= {view.name: float(position) for position, view in enumerate(seen)}
+        first = next(iter(folders.values()))[0].name
+        line = f"times are the order of the names, {first} first (data.times=order"
     if per_second is not None:
         length = (max(times.values()) - min(times.values())) / per_second
         line += f" at {per_second:g} per second: {length:.4g} s"
@@ -159,30 +138,23 @@ def unit_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Spl
     """Return the splits with the first time at 0 and the last one at 1, and warnings; one scale for
     all splits.
 
-    Times that are all equal are left as they are, see ``still_if_constant``; without ``stretch``
-    all within [0, 1] are. Raises DyngsError: a time that is no finite number, or some views with
-    and some without a time; names the view.
+    Times that are all equal are left as they are, see ``static_if_constant``; without ``stretch``
+    all within [0, 1] are. Raises DyngsError: some views have a time, and one has none, or one that
+    is no finite number; names the view.
     """
     views = all_views(splits)
-    for view in views:
-        if view.time is not None and not (is_number(view.time) and math.isfinite(view.time)):
-            raise DyngsError(
-                f"{root}: the time of {view.name} must be a finite number, got {view.time!r:.40}"
-            )
-    timed = [view.time for view in views if view.time is not None]
-    if not timed:
+    times = [view.time for view in views if view.time is not None]
+    if not times:
         return splits, []
-    if len(timed) < len(views):
-        untimed = next(view.name for view in views if view.time is None)
-        raise DyngsError(
-            f"{root}: {untimed} has no time although other images have; give time for all or none"
-        )
-    first = min(timed)
-    last = max(timed)
+    for view in views:
+        if not (is_number(view.time) and math.isfinite(view.time)):
+            raise DyngsError(
+                f"{root}: the time of {view.name} must be a finite number, as of other images, got {view.time!r:.40}"
+            )
+    first = min(times)
+    last = max(times)
     within = first >= 0 and last <= 1
-    if first == last or (
-        within and (not stretch or (first, last) == (0, 1) or last - first <= SAME_TIME)
-    ):
+    if first == last or (within and (not stretch or last - first <= SAME_TIME)):
         return splits, []
     scaled = each_view(
         splits, lambda view: replace(view, time=((view.time or 0.0) - first) / (last - first))
@@ -192,18 +164,13 @@ def unit_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Spl
     return scaled, [f"times run from {first:g} to {last:g} and were scaled to [0, 1]"]
 
 
-def still_if_constant(splits: Splits) -> tuple[Splits, list[str]]:
-    """Return the splits without times, and a warning, if all of several images have the same
-    time."""
-    views = all_views(splits)
-    times = {view.time for view in views}
+def static_if_constant(splits: Splits) -> tuple[Splits, list[str]]:
+    """Return the splits without times, and a warning, if all images have the same time."""
+    times = {view.time for view in all_views(splits)}
     if len(times) != 1 or times == {None}:
         return splits, []
-    only = times.pop() or 0.0
-    if len(views) > 1:
-        line = f"all images have time {only:g}: treated as a static scene"
-        return each_view(splits, lambda view: replace(view, time=None)), [line]
-    return each_view(splits, lambda view: replace(view, time=only if 0 <= only <= 1 else 0.0)), []
+    line = f"all images have time {times.pop():g}: treated as a static scene"
+    return each_view(splits, lambda view: replace(view, time=None)), [line]
 
 
 def span_in_files(written: Splits, kept: Splits) -> tuple[float, float] | None:
@@ -251,54 +218,41 @@ def distinct_times(views: Iterable[View]) -> dict[float, float]:
 def parse_frames(text: str, key: str = "data.frames") -> slice:
     """Parse ``start:stop`` or ``start:stop:step``: whole numbers, each optional, as written at
     ``key``."""
-    shown = printable(repr(text), 60)
-    if not re.fullmatch(
-        r"\s*([-+]?\d+)?\s*:\s*([-+]?\d+)?\s*(:\s*([-+]?\d+)?\s*)?", text, re.ASCII
-    ):
+    is_slice = re.fullmatch(r"(\s*([-+]?\d+)?\s*:){1,2}\s*([-+]?\d+)?\s*", text, re.ASCII)
+    parts = [int(part) if part.strip() else None for part in text.split(":")] if is_slice else []
+    if not is_slice or parts[2:] == [0]:
         raise DyngsError(
-            f"{key}={shown}: write start:stop or start:stop:step in whole numbers, such as 0:100:2"
+            f"{key}={printable(repr(text), 60)}: write start:stop or start:stop:step in whole numbers, such as "
+            "0:100:2, and a step that is not 0"
         )
-    numbers = [int(part) if part.strip() else None for part in text.split(":")]
-    if len(numbers) == 3 and numbers[2] == 0:
-        raise DyngsError(f"{key}={shown}: the step must not be 0")
-    return slice(*numbers)
+    return slice(*parts)
 
 
-def select_frames(root: Path, splits: Splits, frames: str) -> Splits:
+def split_by_frames(
+    root: Path, splits: Splits, frames: str, key: str = "data.frames"
+) -> tuple[Splits, Splits]:
     """Return the views at the times that the slice ``frames`` selects from the sorted distinct
-    times of all splits.
+    times of all splits, and those at other times.
 
-    The first selected time becomes 0 and the last one 1; a single one becomes 0. Raises DyngsError:
-    a bad slice, one that selects no time or no training view, or views without times.
+    Of both, the first time becomes 0 and the last one 1; a single one becomes 0. Raises DyngsError:
+    a bad slice, or one that selects no time, as of views without times.
     """
-    distinct, picked = _picked_times(root, splits, frames, "data.frames")
-    selected = _at_times(splits, distinct, picked)
-    if splits.get("train") and not selected["train"]:
-        raise DyngsError(
-            f"{root}: data.frames={frames} picks {len(picked)} of {len(set(distinct.values()))} times, none of them "
-            "with training views"
-        )
-    return selected
+    distinct = distinct_times(all_views(splits))
+    times = sorted(set(distinct.values()))
+    picked = sorted(times[parse_frames(frames, key)])
+    if not picked:
+        raise DyngsError(f"{root}: {key}={frames} picks none of the capture's {len(times)} times")
 
+    def at(chosen: Sequence[float]) -> Splits:
+        span = (chosen[-1] - chosen[0] if chosen else 0.0) or 1.0
+        new = {time: (time - chosen[0]) / span for time in chosen}
+        unit = {written: new[time] for written, time in distinct.items() if time in new}
+        return {
+            name: tuple(replace(v, time=unit[v.time]) for v in kept if v.time in unit)
+            for name, kept in splits.items()
+        }
 
-def hold_out_frames(root: Path, splits: Splits, frames: str) -> tuple[Splits, tuple[View, ...]]:
-    """Return the splits without the times that the slice ``frames`` selects, and the views at these
-    times.
-
-    Where some cameras only have test views, the second are those of these cameras; otherwise those
-    of all splits. Times of both parts are scaled to [0, 1], as two clips. Raises DyngsError: a bad
-    slice, one that selects no time or all times with training views, or views without times.
-    """
-    distinct, picked = _picked_times(root, splits, frames, "data.pose_frames")
-    kept = _at_times(splits, distinct, sorted(set(distinct.values()) - set(picked)))
-    if not kept["train"]:
-        raise DyngsError(
-            f"{root}: data.pose_frames={frames} leaves no training views; hold out fewer frames"
-        )
-    trained = {view.camera_id for view in splits["train"]}
-    others = {view.camera_id for view in splits.get("test", ())} - trained
-    held = all_views(_at_times(splits, distinct, picked))
-    return kept, tuple(view for view in held if not others or view.camera_id in others)
+    return at(picked), at(sorted(set(times) - set(picked)))
 
 
 def split_by_camera(root: Path, splits: Splits, cameras: Sequence[int]) -> Splits:
@@ -306,49 +260,14 @@ def split_by_camera(root: Path, splits: Splits, cameras: Sequence[int]) -> Split
     for testing."""
     views = all_views(splits)
     known = sorted({view.camera_id for view in views})
-    unknown = sorted(set(cameras) - set(known))
-    shown = ", ".join(map(str, cameras))
-    if unknown:
+    if not set(cameras) < set(known):
         raise DyngsError(
-            f"{root}: data.train_cameras=[{shown}]: no camera {unknown[0]}; there are {len(known)}, from {known[0]} to "
-            f"{known[-1]}"
-        )
-    if set(known) == set(cameras):
-        raise DyngsError(
-            f"{root}: data.train_cameras=[{shown}] are all cameras of the capture; leave one for testing"
+            f"{root}: data.train_cameras=[{', '.join(map(str, cameras))}] must name some of the {len(known)} cameras, "
+            f"from {known[0]} to {known[-1]}, and leave one for testing"
         )
     return {
         "train": tuple(view for view in views if view.camera_id in cameras),
         "test": tuple(view for view in views if view.camera_id not in cameras),
-    }
-
-
-def _picked_times(
-    root: Path, splits: Splits, frames: str, key: str
-) -> tuple[dict[float, float], list[float]]:
-    part = parse_frames(frames, key)
-    views = all_views(splits)
-    if any(view.time is None for view in views):
-        raise DyngsError(
-            f"{root}: {key}={frames} picks times, but the capture has none; remove {key}"
-        )
-    distinct = distinct_times(views)
-    times = sorted(set(distinct.values()))
-    picked = sorted(times[part])
-    if not picked:
-        raise DyngsError(f"{root}: {key}={frames} picks none of the capture's {len(times)} times")
-    return distinct, picked
-
-
-def _at_times(splits: Splits, distinct: Mapping[float, float], picked: Sequence[float]) -> Splits:
-    """Return the views at the ``picked`` times, ascending, of which the first becomes 0 and the
-    last one 1."""
-    span = picked[-1] - picked[0] if picked else 0.0
-    new = {time: (time - picked[0]) / span if span else 0.0 for time in picked}
-    unit = {written: new[time] for written, time in distinct.items() if time in new}
-    return {
-        name: tuple(replace(v, time=unit[v.time]) for v in kept if v.time in unit)
-        for name, kept in splits.items()
     }
 
 
@@ -380,21 +299,14 @@ def number_cameras(splits: Splits) -> Splits:
 
 
 def _first_of_pose(views: Sequence[View]) -> list[int]:
-    """Return for each view the index of the first one with its pose; only up to a pose for every
-    two views."""
+    """Return for each view the index of the first one with its pose."""
+    from scipy.spatial import KDTree
+
     poses = np.stack([inverse_rigid(view.cam_from_world)[:3] for view in views])
     centers = poses[:, :, 3] - poses[:, :, 3].mean(axis=0)
     poses[:, :, 3] = centers / (np.linalg.norm(centers, axis=1).max() or 1.0)
     rows = poses.reshape(len(views), -1)
-    firsts = np.arange(len(views))
-    left = np.arange(len(views))
-    for _ in range(len(views) // 2):
-        is_same = np.abs(rows[left] - rows[left[0]]).max(axis=1) < SAME_POSE
-        firsts[left[is_same]] = left[0]
-        left = left[~is_same]
-        if not len(left):
-            break
-    return firsts.tolist()
+    return [min(same) for same in KDTree(rows).query_ball_point(rows, SAME_POSE, p=np.inf)]
 
 
 def static_cameras(views: Sequence[View]) -> list[list[int]]:
@@ -414,14 +326,6 @@ def static_cameras(views: Sequence[View]) -> list[list[int]]:
     return [[at[t] for t in sorted(at)] for at in cameras.values() if len(at) > 1]
 
 
-def are_scattered(views: Sequence[View]) -> bool:
-    """Whether views in order of time jump about as if they were in any order."""
-    centers = np.stack([inverse_rigid(view.cam_from_world)[:3, 3] for view in views])
-    apart = np.linalg.norm(centers[:, None] - centers, axis=2)
-    usual = float(np.median(apart[np.triu_indices(len(views), 1)]))
-    return float(np.median(np.linalg.norm(np.diff(centers, axis=0), axis=1))) > SCATTERED * usual
-
-
 def videos(views: Sequence[View]) -> list[list[int]]:
     """Return indices of views, in order of time, for each video: of a fixed camera, or of the one
     that moves.
@@ -429,40 +333,24 @@ def videos(views: Sequence[View]) -> list[list[int]]:
     No video where views without a common camera jump about in time.
     """
     fixed = static_cameras(views)
-    if fixed:
-        return fixed
-    times = [view.time for view in views if view.time is not None]
     order = sorted(range(len(views)), key=lambda i: views[i].time or 0.0)
-    is_one = (
-        len(views) > 2
-        and len(set(times)) == len(views)
-        and not are_scattered([views[i] for i in order])
-    )
-    return [order] if is_one else []
+    if fixed or len(views) < 3 or len({view.time for view in views} - {None}) < len(views):
+        return fixed
+    centers = np.stack([inverse_rigid(views[i].cam_from_world)[:3, 3] for i in order])
+    apart = np.linalg.norm(centers[:, None] - centers, axis=2)
+    usual = float(np.median(apart[np.triu_indices(len(views), 1)]))
+    is_scattered = float(np.median(np.diagonal(apart, 1))) > SCATTERED * usual
+    return [] if is_scattered else [order]
 
 
-def sequence_warnings(splits: Splits) -> list[str]:
-    """Return warnings of images with one camera, pose and time, and of cameras with different
-    numbers of frames."""
+def frame_count_warnings(splits: Splits) -> list[str]:
+    """Return a warning of cameras with different numbers of frames."""
     views = [view for view in all_views(splits) if view.time is not None]
-    images: defaultdict[tuple[int, float | None, bytes], dict[Path, View]] = defaultdict(dict)
-    frames: defaultdict[int, set[Path]] = defaultdict(set)
-    for view in views:
-        frames[view.camera_id].add(view.image_path)
-        key = (view.camera_id, view.time, view.cam_from_world.round(9).tobytes())
-        images[key].setdefault(view.image_path, view)
-    warnings = []
-    doubled = [list(same.values()) for same in images.values() if len(same) > 1]
-    if doubled:
-        first, second = doubled[0][:2]
-        warnings.append(
-            f"{sum(map(len, doubled))} images share camera, pose and time with another one, first {first.name} and "
-            f"{second.name} at time {first.time:g}; are their times right?"
-        )
-    counts = {camera: len(paths) for camera, paths in frames.items()}
-    if len(set(counts.values())) > 1:
-        few = min(counts, key=lambda camera: counts[camera])
-        warnings.append(
-            f"cameras have different numbers of frames, from {counts[few]} (camera {few}) to {max(counts.values())}"
-        )
-    return warnings
+    paths = {(view.camera_id, view.image_path) for view in views}
+    counts = Counter(camera for camera, _ in paths)
+    if len(set(counts.values())) < 2:
+        return []
+    few = min(counts, key=lambda camera: counts[camera])
+    return [
+        f"cameras have different numbers of frames, from {counts[few]} (camera {few}) to {max(counts.values())}"
+    ]

@@ -143,10 +143,6 @@ def _tree(points: Tensor) -> KDTree:
     return KDTree(points.double().cpu().numpy())
 
 
-# Places per piece at which two splines are compared; a cubic is determined by four
-_SAMPLES_PER_PIECE = 8
-
-
 def spline_basis(places: Tensor, pieces: int) -> Tensor:
     """Return (K, pieces + 3) float64 weights of the control points of a uniform cubic B-spline at
     ``places`` (K,).
@@ -160,26 +156,7 @@ def spline_basis(places: Tensor, pieces: int) -> Tensor:
     return basis.scatter_(1, piece[:, None] + torch.arange(SPAN, device=places.device), weights)
 
 
-def refitted(points: Tensor, pieces: int) -> Tensor:
-    """Return (S, pieces + 3, D) control points of the splines nearest to those of ``points`` (S, P,
-    D).
-
-    Nearest in the mean square over time, sampled evenly: A' x' = A x by least squares in float64
-    with the bases A' and A. Exact where the splines have such pieces; always if every piece is
-    divided into equal ones.
-    """
-    old = points.shape[1] - SPAN + 1
-    if pieces == old:
-        return points.clone()
-    count = _SAMPLES_PER_PIECE * max(pieces, old)
-    count = math.ceil(count / pieces) * pieces
-    places = (torch.arange(count, dtype=torch.float64, device=points.device) + 0.5) / count
-    fit = torch.linalg.lstsq(spline_basis(places, pieces), spline_basis(places, old)).solution
-    return torch.einsum("qp,spd->sqd", fit, points.double()).to(points)
-
-
 NOTHING = torch.zeros(0, 3, device="cpu")
-COMPARED_TIMES = 16  # Times at which the paths of nodes are compared where some of them are to go
 LR = {"quats": 6e-3, "log_scales": 1e-3, "logit_opacities": 1e-2, "colors": 2e-3}
 """Learning rates of the nodes' attributes other than positions."""
 LR_DECAY = 0.2  # Ratio of the last to the first learning rate
@@ -256,37 +233,6 @@ class ControlNodes(DeformationField):
         field = super().to(device)
         field.buffers = moved_to(self.buffers, device)
         return field
-
-    @torch.no_grad()
-    def reduced(self, nodes: int, pieces: int, means: Tensor) -> ControlNodes:
-        """Return a field of at most ``nodes`` of these nodes with ``pieces`` pieces each, for all
-        of ``means`` (M, 3).
-
-        Splines are fitted to the present ones. The nodes that stay are the farthest from each other
-        in the root mean square of their distances over time: what moves alike keeps fewer. With
-        other pieces Adam's moments begin anew.
-        """
-        self.nodes_for(means)
-        old = self.buffers["positions"]
-        times = torch.linspace(0, 1, COMPARED_TIMES, device="cpu").tolist()
-        paths = torch.cat([old + self.at(time).means.detach() for time in times], dim=1)
-        kept = (
-            spread_out(paths, nodes, paths[:0]).sort().values
-            if nodes < len(old)
-            else torch.arange(len(old), device=old.device)
-        )
-        options = self.options.model_copy(update={"nodes": nodes, "pieces": pieces})
-        field = ControlNodes(options, self.setup, torch.Generator())
-        splines = {name: refitted(x.detach()[kept], pieces) for name, x in self._splines().items()}
-        is_new = torch.full((len(kept),), pieces != self.num_pieces, device=kept.device)
-        like = field._untrained(0) if pieces != self.num_pieces else self.parameters
-        field.parameters = like.rearranged(splines, kept, is_new)
-        field._assign(old[kept], means)
-        return field
-
-    @property
-    def num_nodes(self) -> int:
-        return len(self.buffers["positions"])
 
     @property
     def num_points(self) -> int:

@@ -223,15 +223,6 @@ def innermost(field: DeformationField) -> DeformationField:
     return innermost(field.others) if isinstance(field, OuterField) else field
 
 
-def with_innermost(field: DeformationField, inner: DeformationField) -> DeformationField:
-    """Return ``field`` with ``inner`` within all others that change its offsets."""
-    return (
-        field.around(with_innermost(field.others, inner))
-        if isinstance(field, OuterField)
-        else inner
-    )
-
-
 def deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None = None) -> Gaussians:
     """Return ``gaussians`` with ``offsets`` applied to ``rows`` ((M,) long; None = all, in order);
     differentiable.

@@ -22,8 +22,7 @@ from dyngs.deform.bodies.start import Bodies, found_bodies
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, deformed, innermost
 from dyngs.deform.fields import WindowedField, new_field
-from dyngs.deform.fixed_cameras.hulls import Footage
-from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
+from dyngs.deform.fixed_cameras import FixedCameraClip, TimedGaussians, first_motion
 from dyngs.deform.free import FreePrimitives, FreeStart, free_start
 from dyngs.deform.keys import DynamicModel, FreeField
 from dyngs.deform.random_gaussians import box_of, random_gaussians, with_gaussians
@@ -130,7 +129,7 @@ class TrainingViews:
     # how far its images disagree with what is still, where N Gaussians are seen
     still_errors: Callable[[Callable[[float], Gaussians]], StillErrors]
     cameras_stay: bool = False  # in place, so that images show what is still exactly alike
-    standing: Callable[[], Sequence[Footage]] = tuple  # returns what those cameras show
+    standing: Callable[[], Sequence[FixedCameraClip]] = tuple  # returns what those cameras show
     # what one moving camera shows, against N Gaussians that stand still; None where there is no
     # such camera
     shots: Callable[[Gaussians], FrameStack | None] = lambda _: None
@@ -213,11 +212,11 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         threshold = min(max(two_group_threshold(found.usual), floor), SURELY_MOVING * floor)
         rows = torch.nonzero(found.usual > threshold)[:, 0]
         first = self._first_motion(now.detach())
-        if not errs and not first.moments:
+        if not errs and not first:
             return None
         bodies = self._first_bodies(now.detach())
         added, start = self._begun(now.detach(), rows, first, bodies)
-        finding = first.finding if bodies is None else bodies.finding
+        finding = _finding(first) if bodies is None else bodies.finding
         result = replace(with_gaussians(now.detach(), added), finding=finding)
         if start is not None:
             result.changes["logit_opacities"][rows] = start.logits.to(rows.device)
@@ -271,30 +270,26 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         )
 
     def _begun(
-        self, now: Gaussians, rows: Tensor, first: FirstMotion, bodies: Bodies | None
+        self, now: Gaussians, rows: Tensor, first: Sequence[TimedGaussians], bodies: Bodies | None
     ) -> tuple[Sequence[Gaussians], FreeStart | None]:
         """Return the Gaussians to add when motion begins, and the windows of all that move where
         these have some."""
-        count = (
-            0
-            if first.moments or (bodies and bodies.explain_all)
-            else self.options.num_random_moving
-        )
+        count = 0 if first or (bodies and bodies.explain_all) else self.options.num_random_moving
         added = random_gaussians(now, count, self.capture.extent, self._generator)
         if not isinstance(self.options.deform, FreeField):
             return [added, *(bodies.seeds if bodies else ())], None
         start = free_start(
             now.select(rows).to(device="cpu"),
-            first.moments,
+            first,
             added.to(device="cpu"),
             len(self.times),
         )
         return start.added, start
 
-    def _first_motion(self, still: Gaussians) -> FirstMotion:
+    def _first_motion(self, still: Gaussians) -> list[TimedGaussians]:
         """Return what changes before fixed cameras, for a field that can begin there."""
         if not isinstance(self.options.deform, FreeField):
-            return FirstMotion()
+            return []
         standing = self.capture.standing()
         limit = self.options.num_random_moving
         return first_motion(
@@ -344,6 +339,11 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         tiny = 1e-6 * self.capture.extent
         length = (offsets.means.square().sum(1) + tiny**2).sqrt().mean()
         return {"motion sparsity": length * (self.options.motion_sparsity / self.capture.extent)}
+
+
+def _finding(first: Sequence[TimedGaussians]) -> str | None:
+    count = sum(len(one.gaussians) for one in first)
+    return f"changes before the fixed cameras: {count:,} Gaussians begin there" if first else None
 
 
 def _with_frozen(scene: DynamicScene, mean: Offsets, stays: Tensor) -> DynamicScene:

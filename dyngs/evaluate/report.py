@@ -52,7 +52,7 @@ from dyngs.runs.checkpoint import (
     latest_checkpoint,
     load_run,
 )
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import scene_of_split, split_views
 from dyngs.training.corrections.camera_refinement import (
     CameraCorrections,
@@ -91,11 +91,11 @@ def scores_from_own_poses(
         for name, comparison in (("own_poses", IMAGES), ("silhouette_poses", SILHOUETTES)):
             if name == "silhouette_poses" and not outlined:
                 continue
-            fitted = fitted_to_images(avatar, images, background, comparison)
+            fitted, updates = fitted_to_images(avatar, images, background, comparison)
             each = (images[i] for i in range(len(images)))
-            views, _ = score_views(fitted.scene, each, drawing.options, background, lpips)
+            views, _ = score_views(fitted, each, drawing.options, background, lpips)
             found[name] = PoseScores(
-                **means_of(views), updates=fmean(fitted.updates), per_view=tuple(views)
+                **means_of(views), updates=fmean(updates), per_view=tuple(views)
             )
         return found | {"psnr_own_poses": found["own_poses"].psnr}
     scene = require_gaussians(drawing.scene, "what cameras are fitted to")

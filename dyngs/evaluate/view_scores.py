@@ -159,23 +159,14 @@ class Drawing:
     scene: Renderable
     options: DrawOptions  # as in training, without depth
     background: Tensor  # (3,) colour
-    scale: float = 1.0  # width and height drawn, relative to those of the image
 
     @torch.no_grad()
     def image(self, cameras: Cameras, time: float | None) -> Tensor:
-        """Return the image (H, W, 3) of the one camera at ``time``; upscaled bilinearly if
-        ``scale`` < 1."""
-        small = cameras.scaled(self.scale)
-        rgb = self.scene.render(small, time, options=self.options, background=self.background).rgb[
-            0
-        ]
-        size = (cameras.height, cameras.width)
-        if rgb.shape[:2] == size:
-            return rgb
-        upscaled = torch.nn.functional.interpolate(
-            rgb.permute(2, 0, 1)[None], size=size, mode="bilinear"
+        """Return the image (H, W, 3) of the one camera at ``time``."""
+        rendering = self.scene.render(
+            cameras, time, options=self.options, background=self.background
         )
-        return upscaled[0].permute(1, 2, 0)
+        return rendering.rgb[0]
 
 
 def seconds_in_turn(

@@ -8,14 +8,12 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from dyngs.data.capture import Capture, Split, View
 from dyngs.data.geometry import opengl_from_cam
 from dyngs.io.formats.ply import double_ply
 from dyngs.io.formats.similarity import Similarity
 from dyngs.io.write import atomic_file, write_text
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 
 NAME, POINTS_NAME = "transforms.json", "points.ply"
 _OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -63,7 +61,7 @@ def _frame(view: View, folder: Path, capture: Capture, world: Similarity) -> dic
     pose[:3, 3] = world.points(pose[:3, 3])
     first, last = capture.span or (0.0, 1.0)
     lens = view.lens
-    matrix = view.intrinsics @ np.diag([lens.focal_ratio, lens.focal_ratio, 1])
+    matrix = view.intrinsics
     model, names = {
         "none": ("PINHOLE", ()),
         "opencv": ("FULL_OPENCV" if len(lens.params) > 5 else "OPENCV", _OPENCV_NAMES),

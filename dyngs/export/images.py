@@ -28,7 +28,7 @@ from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.write import to_uint8, write_image
 from dyngs.models.renderable import DrawOptions, Renderable, TimeStep
 from dyngs.ops.device import CPU
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import Opened, split_views
 
 

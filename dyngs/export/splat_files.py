@@ -23,7 +23,6 @@ from dyngs.gaussians.levels import MERGED, levels_of
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
     SOG_INDEX,
-    Format,
     Written,
     fitted,
     format_named,
@@ -45,7 +44,6 @@ from dyngs.io.formats.splat_file import (
     SplatFile,
     drawable,
     from_linear,
-    geo_comment,
     header_comments,
     offset_notes,
     require_writable,
@@ -56,7 +54,7 @@ from dyngs.io.gltf import GlbDocument
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import atomic_file
 from dyngs.ops.quaternions import rotation_matrices, shorter_ways, unit_quats
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import Opened
 
 PER_LEAF = MERGED**7  # Gaussians of a leaf at level 0
@@ -144,7 +142,6 @@ class Writing:
     # degree of the harmonics in the file; None: as they are, up to what the format holds
     sh_degree: int | None = None
     edit: Similarity = UNMOVED  # made after ``turn``, and stored so that it can be undone
-    own: Format | None = None  # a variant of the format that the suffix names; None: the usual one
 
 
 AS_THEY_ARE = Writing()
@@ -294,8 +291,6 @@ def splats_at(
     splat = SplatFile(gaussians, model.rasterize_mode, model.eps2d, (x, y, z), tuple(comments))
     if opened.edited is not None:
         splat = moved_file(splat, opened.frame.after(opened.file_unit.inverse()), opened.edited.up)
-        if any(opened.edited.offset):
-            splat = replace(splat, comments=(*splat.comments, geo_comment(opened.edited.offset)))
     splat = turned_file(splat, how.turn, how.up)
     return splat if how.edit == UNMOVED else moved_file(splat, how.edit, how.up)
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dyngs.baselines.fields.keys import NgpModel
+from dyngs.baselines.fields.kind import NgpModel
 from dyngs.baselines.fields.scene import space_of
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
@@ -21,7 +21,7 @@ from dyngs.io.formats.similarity import Similarity, far_offset
 from dyngs.io.write import atomic_file
 from dyngs.models.renderable import Surface, SurfaceOptions
 from dyngs.models.views import training_cameras
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import Opened
 
 SUFFIXES = ".ply", ".glb", ".obj"

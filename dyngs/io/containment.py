@@ -8,44 +8,26 @@ every image before it is decoded.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from dyngs.core.errors import DyngsError, require_regular
 
-MAX_MEGAPIXELS = 150.0
-"""Default of ``data.max_megapixels``: 1e6 pixels that an image may have."""
+LIMITS_VARIABLE = "DYNGS_LIMITS"
+"""Environment variable that multiplies all limits: 4 allows four times as much of everything."""
+MAX_PIXELS = 150_000_000
+"""Pixels of an image; decoding takes some 30 bytes of memory for each."""
 _MAX_LISTED = 100_000
 """Entries of a capture that are searched for links."""
 
 
-@dataclass(frozen=True)
-class _Boundary:
-    """The folder that files must lie in: ``root``, and ``real`` with links resolved; ``folders`` is
-    a cache."""
-
-    root: Path
-    real: str
-    folders: dict[str, str] = field(default_factory=dict)
-
-    def resolved(self, path: Path) -> str:
-        """Resolve links in the path; each folder is resolved once."""
-        folder, name = os.path.split(path)
-        if name in ("", ".", "..") or os.path.islink(path):
-            return os.path.realpath(path)
-        if folder not in self.folders:
-            self.folders[folder] = os.path.realpath(folder)
-        return os.path.join(self.folders[folder], name)
-
-
-_boundary: ContextVar[_Boundary | None] = ContextVar("boundary", default=None)
+_boundary: ContextVar[tuple[Path, str] | None] = ContextVar("boundary", default=None)
 _links_of_runs: ContextVar[bool] = ContextVar("links_of_runs", default=False)
-_max_megapixels: ContextVar[float] = ContextVar("max_megapixels", default=MAX_MEGAPIXELS)
 
 
 @contextmanager
@@ -60,7 +42,7 @@ def _set(variable: ContextVar[Any], value: object) -> Iterator[None]:
 def staying_within(root: Path, follow_links: bool = False) -> AbstractContextManager[None]:
     """Make ``inside`` refuse paths outside ``root`` in the block; nothing is refused if
     ``follow_links``."""
-    return _set(_boundary, None if follow_links else _Boundary(root, os.path.realpath(root)))
+    return _set(_boundary, None if follow_links else (root, os.path.realpath(root)))
 
 
 def following_links_of_runs(allowed: bool) -> AbstractContextManager[None]:
@@ -71,11 +53,6 @@ def following_links_of_runs(allowed: bool) -> AbstractContextManager[None]:
     return _set(_links_of_runs, allowed)
 
 
-def images_up_to(megapixels: float) -> AbstractContextManager[None]:
-    """Set how many 1e6 pixels an image may have in the block, instead of ``MAX_MEGAPIXELS``."""
-    return _set(_max_megapixels, megapixels)
-
-
 def follows_links_of_runs() -> bool:
     """Return whether the innermost block of ``following_links_of_runs`` allows it."""
     return _links_of_runs.get()
@@ -84,32 +61,51 @@ def follows_links_of_runs() -> bool:
 def inside(path: Path) -> Path:
     """Return ``path`` if it may be opened; outside a block of ``staying_within`` any path may."""
     boundary = _boundary.get()
-    if boundary is not None and not _is_below(real := boundary.resolved(path), boundary.real):
-        leads = "" if real == str(path) else f" leads to {real}, which"
+    if boundary is not None and not _is_below(real := os.path.realpath(path), boundary[1]):
         raise DyngsError(
-            f"{path}:{leads} lies outside the capture {boundary.root}; copy the file into the capture, or, if you "
-            "trust it to name files of yours, set data.follow_links=true"
+            f"{path}: leads to {real}, which lies outside the capture {boundary[0]}; "
+            "copy the file into the capture, or, if you trust it to name files of yours, set data.follow_links=true"
         )
     require_regular(path)
     return path
 
 
+def allowed(most: int) -> int:
+    """Return ``most`` times the value of the environment variable ``DYNGS_LIMITS``, 1 if it is not
+    set."""
+    text = os.environ.get(LIMITS_VARIABLE, "1")
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = 0.0
+    if not 1 <= factor <= 1e6:
+        raise DyngsError(
+            f"{LIMITS_VARIABLE}={text:.20} must be a number from 1 to 1e6: how many times the usual limits hold"
+        )
+    return int(most * factor)
+
+
+def require_at_most(where: Path | str, amount: int, most: int, what: str) -> None:
+    """Check that a file asks for at most ``most`` of ``what`` (plural), a limit that
+    ``DYNGS_LIMITS`` may raise."""
+    if amount > most and amount > allowed(most):
+        shown = f"{amount:,}" if amount < 10**18 else "over 10^18"
+        factor = math.ceil(amount / most) if amount < 10**18 else "N"
+        raise DyngsError(
+            f"{where}: asks for {shown} {what}, of which {allowed(most):,} are read at most; if you trust the file, "
+            f"set the environment variable {LIMITS_VARIABLE}={factor}"
+        )
+
+
 def check_size(path: Path, width: int, height: int, channels: int = 4) -> None:
     """Check that an image is not too large to be decoded; more than four channels count in
     proportion."""
-    megapixels = width * height * max(channels / 4, 1) / 1e6
-    limit = _max_megapixels.get()
-    if megapixels > limit:
-        many = f" of {channels} channels" if channels > 4 else ""
-        raise DyngsError(
-            f"{path}: {width}x{height} pixels{many} are {megapixels:.5g} megapixels, but data.max_megapixels is "
-            f"{limit:g}; shrink the image, or raise it if there is memory for that (some 30 MB per megapixel)"
-        )
+    require_at_most(path, width * height * max(channels, 4) // 4, MAX_PIXELS, "pixels")
 
 
 def max_decoded_mb() -> int:
     """Return the 2^20 bytes that the largest allowed image takes with four channels of floats."""
-    return max(1, round(_max_megapixels.get() * 16e6 / 2**20))
+    return allowed(MAX_PIXELS) * 16 // 2**20
 
 
 def leaving_links(root: Path) -> list[tuple[Path, str]]:

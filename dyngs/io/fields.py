@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any, TextIO, TypeGuard
@@ -13,39 +12,10 @@ from typing import Any, TextIO, TypeGuard
 import numpy as np
 
 from dyngs.core.errors import DyngsError, reading, require_regular
-from dyngs.io.containment import inside
+from dyngs.io.containment import inside, require_at_most
 
-VARIABLE = "DYNGS_LIMITS"
-"""Environment variable that multiplies all limits: 4 allows four times as much of everything."""
 MOST_TEXT_BYTES = 1 << 26
 """Largest JSON or text file: 64 MiB hold the cameras of 100,000 images."""
-
-
-def allowed(most: int) -> int:
-    """Return ``most`` times the value of the environment variable ``DYNGS_LIMITS``, 1 if it is not
-    set."""
-    text = os.environ.get(VARIABLE, "1")
-    try:
-        factor = float(text)
-    except ValueError:
-        factor = 0.0
-    if not 1 <= factor <= 1e6:
-        raise DyngsError(
-            f"{VARIABLE}={text:.20} must be a number from 1 to 1e6: how many times the usual limits hold"
-        )
-    return int(most * factor)
-
-
-def require_at_most(where: Path | str, amount: int, most: int, what: str) -> None:
-    """Check that a file asks for at most ``most`` of ``what`` (plural), a limit that
-    ``DYNGS_LIMITS`` may raise."""
-    if amount > most and amount > allowed(most):
-        shown = f"{amount:,}" if amount < 10**18 else "over 10^18"
-        factor = math.ceil(amount / most) if amount < 10**18 else "N"
-        raise DyngsError(
-            f"{where}: asks for {shown} {what}, of which {allowed(most):,} are read at most; if you trust the file, "
-            f"set the environment variable {VARIABLE}={factor}"
-        )
 
 
 def read_limited(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
@@ -64,24 +34,19 @@ LARGEST = 1e30
 """Magnitude up to which numbers are taken: in float32 they, and sums of a few, are finite."""
 
 
-def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict[str, object]:
+def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict[str, Any]:
     """Read the JSON object in ``path``, UTF-8, 16 or 32. ``what``: the error for anything else."""
-    fields = read_json(path)
-    if not isinstance(fields, dict):
-        raise DyngsError(f"{path}: {what}")
-    return fields
-
-
-def read_json(path: Path) -> object:
-    """Read the JSON in ``path``: UTF-8, 16 or 32."""
     with reading(path, "it must be a JSON file; copy or export it again"):
         try:
-            return json.loads(read_limited(inside(path)))
+            fields = json.loads(read_limited(inside(path)))
         except json.JSONDecodeError as error:
             where = f"{path}, line {error.lineno} column {error.colno}"
             raise DyngsError(
                 f"{where}: broken JSON ({error.msg}); copy or export it again"
             ) from error
+    if not isinstance(fields, dict):
+        raise DyngsError(f"{path}: {what}")
+    return fields
 
 
 def read_text(path: Path) -> str:
@@ -106,10 +71,10 @@ def is_number(value: object) -> TypeGuard[int | float]:
 def matrix_of(where: str, key: str, value: object) -> np.ndarray:
     """Return the numbers of a 4x4 matrix in a JSON file as float64; shape and values are not
     checked."""
-    try:
-        return np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise DyngsError(f"{where}: {key} must hold 4x4 numbers; export it again") from None
+    array = float_array(value)
+    if array is None:
+        raise DyngsError(f"{where}: {key} must hold 4x4 numbers; export it again")
+    return array
 
 
 def entry(where: object, fields: object, key: str) -> Any:
@@ -142,18 +107,6 @@ def first_few(items: Collection[object]) -> str:
 def float_array(value: object) -> np.ndarray | None:
     """Return ``value`` as a float64 array, None where it holds anything but numbers."""
     try:
-        array = np.asarray(value) if _is_numeric(value) else None
-        return (
-            array.astype(np.float64) if array is not None and array.dtype.kind in "biuf" else None
-        )
+        return np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         return None
-
-
-def _is_numeric(value: object) -> bool:
-    """Whether it holds only numbers: NumPy would pad every text among them to the longest."""
-    if isinstance(value, (list, tuple)):
-        return all(_is_numeric(part) for part in value)
-    if isinstance(value, np.ndarray):
-        return value.dtype.kind in "biuf"
-    return isinstance(value, (int, float, np.generic)) and not isinstance(value, (str, bytes))

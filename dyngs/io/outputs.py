@@ -1,16 +1,23 @@
-"""Checks of output paths, and advice on paths that were given in the wrong place."""
+"""Checks of output paths, advice on paths given in the wrong place, new folders, and locks.
+
+A lock is for one writer at a time in a folder, and released by the system when its process ends,
+however it ends.
+"""
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import platform
+import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from functools import cached_property
-from itertools import islice
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dyngs.core.errors import DyngsError, as_word
+from dyngs.core.errors import DyngsError, as_word, require_regular, warn
+from dyngs.io.containment import leaving_links
 from dyngs.io.fields import read_limited
 from dyngs.io.write import remove_quietly, require_replaceable, temporary_folder_beside, write_text
 
@@ -18,7 +25,6 @@ PHOTO_SUFFIXES = frozenset(
     {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".gif", ".heic", ".heif", ".hif"}
 )
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
-_MOST_ENTRIES = 2000
 _CAPTURE = (
     "transforms.json",
     "transforms_train.json",
@@ -36,115 +42,70 @@ def command_for(path: Path, *, captures: bool = True) -> str | None:
     Only names are looked at, those directly in a folder and in ``images`` below it.
     """
     where = as_word(path)
-    static, dynamic = (
-        f"`dyngs train {preset} data.root={where}`" for preset in ("static", "dynamic")
-    )
+    static = f"`dyngs train static data.root={where}`"
+    dynamic = f"`dyngs train dynamic data.root={where}`"
+    either = f"make a scene of it with {static}, or {dynamic} if things move"
+    if path.is_file():
+        return f"it is a video, {either}" if path.suffix.lower() in VIDEO_SUFFIXES else None
+    if not path.is_dir():
+        return None
+    if (path / "config.yaml").is_file():
+        return f"it is a run, for `dyngs eval {where}`, `dyngs render {where}` or `dyngs train --resume {where}`"
+    if captures and any((path / name).exists() for name in _CAPTURE):
+        return f"it is a capture, {either}"
     try:
-        if path.is_file():
-            if path.suffix.lower() not in VIDEO_SUFFIXES:
-                return None
-            return f"it is a video, make a scene of it with {static}, or {dynamic} if things move"
-        if not path.is_dir():
-            return None
-        if (path / "config.yaml").is_file():
-            return f"it is a run, for `dyngs eval {where}`, `dyngs render {where}` or `dyngs train --resume {where}`"
-        if captures and any((path / name).exists() for name in _CAPTURE):
-            return f"it is a capture, make a scene of it with {static}, or {dynamic} if things move"
-        suffixes = [
-            _suffix(entry) for folder in (path, path / "images") for entry in _entries(folder)
-        ]
+        found = [*path.glob("[!.]*.*"), *path.glob("images/[!.]*.*")]
     except OSError:
         return None
-    photos = sum(x in PHOTO_SUFFIXES for x in suffixes)
+    suffixes = [one.suffix.lower() for one in found]
     videos = sum(x in VIDEO_SUFFIXES for x in suffixes)
-    if photos >= 3:
+    if sum(x in PHOTO_SUFFIXES for x in suffixes) >= 3:
         return f"it holds photos, make a scene of them with {static}"
     if videos > 1:
         return f"it holds {videos} videos, make a scene of them with {dynamic}"
     return "it holds one video; give that" if videos else None
 
 
-def _entries(folder: Path) -> list[Path]:
-    return list(islice(folder.iterdir(), _MOST_ENTRIES)) if folder.is_dir() else []
-
-
-def _suffix(path: Path) -> str:
-    return "" if path.name.startswith(".") else path.suffix.lower()
-
-
 SOURCES_NAME = "sources.json"
-"""In a capture made of photos or videos: where these lie."""
+"""In a capture made of photos or a video: where these lie."""
 _RUN_MARK = "config.yaml"
 """In a run folder, which is no part of the capture that it lies in."""
 _OF_RUNS = ("checkpoints", "scene.dyngs")
-_MAX_SOURCES_BYTES = 2**20
-_Identity = tuple[int | str, int | str]
 
 
 class Inputs:
     """Files and folders that are read; a folder stands for all that lies in it.
 
-    Args:
-        paths: of what is read; what is None or does not exist counts for nothing.
-        elsewhere: yields more files where they are costly to find; only called for outputs that
-            exist.
+    A link in a folder stands for the file or folder that it leads to, a capture that dyngs made
+    also for its photos or video. What is None counts for
+    nothing.
     """
 
-    def __init__(
-        self, paths: Iterable[Path | None], elsewhere: Callable[[], Iterable[Path]] = tuple
-    ) -> None:
-        self.paths = tuple(path for path in paths if path is not None)
-        self.elsewhere = elsewhere
+    def __init__(self, paths: Iterable[Path | None]) -> None:
+        self.paths = {path.resolve() for path in paths if path is not None}
+        for folder in [path for path in self.paths if path.is_dir()]:
+            self.paths |= {path.resolve() for path in folder.iterdir() if path.is_symlink()}
+            self.paths |= _sources(folder)
 
     def require_output(self, out: Path) -> None:
         """Check that ``out`` may be written: it does not exist, or is none of the inputs.
 
-        Raises DyngsError: ``out`` is an input, or a link to one, by whatever spelling; it exists in
-        a folder that is read; it is a folder that holds a link to an input; a link leads it out of
-        its run folder; or it is a device, a pipe or the like. A run folder in a capture, an empty
-        folder, and a folder around a capture may be written to.
+        Raises DyngsError: ``out`` is an input, or leads to one; it exists in a folder that is read;
+        a link leads it out of its run folder; or it is a device, a pipe or the like. A run folder
+        in a capture, an empty folder, and a folder around a capture may be written to. A link that
+        is a file is replaced itself.
         """
         require_within_run(out)
         require_replaceable(out)
-        if not os.path.lexists(out):
+        if not os.path.lexists(out) or (out.is_dir() and not any(out.iterdir())):
             return
-        for folder in self._folders:
-            _require_outside(out, folder)
-        own = _identity(out)
-        if own is not None and own in self._files:
-            source = self._files[own]
-            as_what = "" if os.path.abspath(out) == os.path.abspath(source) else f", as {source}"
-            raise DyngsError(f"{out}: is the file that is read{as_what}; give another output")
-        if out.is_dir():
-            self._require_no_links(out)
-
-    def _require_no_links(self, out: Path) -> None:
-        for name in sorted(os.listdir(out)):
-            path = out / name
-            source = self._files.get(_identity(path) or ("", ""))
-            if source is not None and os.path.abspath(source) != os.path.abspath(path):
-                raise DyngsError(
-                    f"{out}: holds {name}, a link to {source}, which is read; give another folder"
-                )
-
-    @cached_property
-    def _folders(self) -> tuple[Path, ...]:
-        return tuple(path for path in (*self.paths, *_sources(self.paths)) if path.is_dir())
-
-    @cached_property
-    def _files(self) -> dict[_Identity, Path]:
-        """All files that are read, also below folders and through links, by what tells them from
-        others."""
-        single = (
-            path
-            for path in (*self.paths, *_sources(self.paths), *self.elsewhere())
-            if not path.is_dir()
-        )
-        paths = (
-            *single,
-            *(path for folder in self._folders for path in _files_below(folder, set())),
-        )
-        return {identity: path for path in paths if (identity := _identity(path)) is not None}
+        for place in (out.resolve(), out.parent.resolve() / out.name):
+            for folder in (place, *place.parents):
+                if folder in self.paths:
+                    where = "" if folder == place else f" in {folder}"
+                    raise DyngsError(f"{out}: exists{where}, which is read; give another output")
+                if (folder / _RUN_MARK).is_file():
+                    break
 
 
 def require_within_run(out: Path) -> None:
@@ -188,81 +149,186 @@ def new_folder(out: Path, require: Callable[[Path], None] = require_new_folder) 
         remove_quietly(started)
 
 
-def note_sources(capture: Path, *sources: Path) -> None:
-    """Write into a made capture where its photos or videos lie, next to those noted before; no
-    output replaces them."""
-    known = _read_sources(capture)
-    names = list(dict.fromkeys([*known, *(os.path.abspath(source) for source in sources)]))
-    if names != known:
-        write_text(capture / SOURCES_NAME, json.dumps({"sources": names}, indent=1) + "\n")
+def note_source(capture: Path, source: Path) -> None:
+    """Write into a made capture where its photos or video lie; no output replaces them."""
+    names = {"sources": [os.path.abspath(source)]}
+    write_text(capture / SOURCES_NAME, json.dumps(names, indent=1) + "\n")
 
 
-def _require_outside(out: Path, folder: Path) -> None:
-    """Check that an existing ``out`` is not ``folder`` and does not lie in it; it may hold it."""
-    own = _identity(out)
-    root = _identity(folder)
-    if own == root:
-        raise DyngsError(f"{out}: is the folder that is read; give another output")
-    if out.is_dir() and not any(out.iterdir()):
-        return
-    for way in _ways(out):
-        above = [_identity(path) for path in (way, *way.parents)]
-        below = (way, *way.parents)[: above.index(root)] if root in above else ()
-        if below and not any((path / _RUN_MARK).is_file() for path in below):
-            raise DyngsError(
-                f"{out}: exists and lies in {folder}, which is read; give another output, or remove it first if it is "
-                "no part of that"
-            )
-
-
-def _sources(paths: Iterable[Path]) -> list[Path]:
-    return [Path(name) for path in paths for name in _read_sources(path)]
-
-
-def _read_sources(capture: Path) -> list[str]:
+def _sources(capture: Path) -> set[Path]:
     try:
-        names = json.loads(read_limited(capture / SOURCES_NAME, _MAX_SOURCES_BYTES))["sources"]
-        return [name for name in names if isinstance(name, str) and "\0" not in name]
-    except (DyngsError, OSError, ValueError, KeyError, TypeError, RecursionError):
-        # costs no more than this protection
-        return []
+        names = json.loads(read_limited(capture / SOURCES_NAME))["sources"]
+        return {Path(name) for name in names}
+    except Exception:  # a missing or damaged file costs no more than this protection
+        return set()
 
 
-def _files_below(folder: Path, seen: set[_Identity]) -> Iterator[Path]:
-    """Yield all files below a folder, also through links to folders, each folder once; those of
-    runs are left out."""
-    identity = _identity(folder)
-    if identity is None or identity in seen:
-        return
-    seen.add(identity)
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
+LOCK_NAME = "run.lock"
+"""File that exists while a process writes into the folder; one left by a killed process has no
+effect."""
+
+_HELD = (errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK, errno.EDEADLK)
+_WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
+_WAIT = 1.0  # seconds between two looks at a folder that another process makes
+_FAR = 2**30
+"""Offset of the locked byte on Windows, past the end of the file: a locked byte cannot be read by
+others."""
+
+
+class InUseError(DyngsError):
+    """Another process writes into the folder."""
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[bool]:
+    """Yield whether no other process writes into the folder in the block, which is not known where
+    its file system has no locks.
+
+    The folder is made where it is missing, and removed where nothing came of it. The file
+    ``run.lock`` says who writes. A file system that has no locks (some network file systems) is
+    told of in a line on stderr.
+
+    Raises:
+        InUseError: another process writes there.
+        DyngsError: nobody can; a link leads out of the folder.
+    """
+    require_within_run(folder)
+    links = leaving_links(folder)
+    if links:
+        raise DyngsError(
+            f"{links[0][0]}: is a link to {links[0][1]}, out of {folder}, which is written to; remove it"
+        )
+    made = _made(folder)
     try:
-        entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
-    except OSError:  # what cannot be listed is not read either
-        return
-    for entry in entries:
-        if entry.is_dir():
-            if not (Path(entry.path) / _RUN_MARK).is_file():
-                yield from _files_below(Path(entry.path), seen)
-        else:
-            yield Path(entry.path)
+        file, is_locked = _locked(folder / LOCK_NAME)
+        try:
+            yield is_locked
+        finally:
+            _freed(folder / LOCK_NAME, file)
+    finally:
+        for path in made:
+            with suppress(OSError):
+                path.rmdir()  # only succeeds if nothing came of it
 
 
-def _ways(path: Path) -> tuple[Path, Path]:
-    """Return where a path lies, and where a link of that name leads to; with no links above
-    either."""
-    real = Path(os.path.realpath(path))
-    return (
-        real if path.name in ("", "..") else Path(os.path.realpath(path.parent), path.name)
-    ), real
+def make_once(
+    folder: Path, make: Callable[[], None], say: Callable[[str], None], found: str
+) -> None:
+    """Create a folder of the cache by calling ``make``, or print ``found`` if it exists.
+
+    One of several processes creates it, the others wait for it. Without file locks each of them
+    calls ``make``, and the first result is kept. Raises DyngsError: as ``make`` does, or the cache
+    cannot be written.
+    """
+    path = folder.with_name(f".{folder.name}.lock")
+    _made(folder.parent)
+    is_told = False
+    while not folder.is_dir():
+        try:
+            file, _ = _locked(path)
+        except InUseError:
+            if not is_told:
+                say(f"{folder}: {_owner(path)}; its result is waited for")
+            is_told = True
+            time.sleep(_WAIT)
+            continue
+        try:
+            if not folder.is_dir():
+                make()
+                return
+        except DyngsError:
+            if not folder.is_dir():
+                raise
+        finally:
+            _freed(path, file)
+    say(found)
 
 
-def _identity(path: Path) -> _Identity | None:
-    """Return what two names of one file have in common; None where there is no file."""
+def _made(folder: Path) -> list[Path]:
+    """Return the folders that had to be made, innermost first."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
-        status = os.stat(path)
-    except (OSError, ValueError):
-        return None
-    if status.st_ino:
-        return status.st_dev, status.st_ino
-    # a file system without such numbers; they mostly ignore case
-    return "", os.path.realpath(path).casefold()
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise DyngsError(f"{folder}: is not a folder; give another one") from None
+    except OSError as error:
+        raise DyngsError(f"cannot write {folder}: {error.strerror or error}") from error
+    return missing
+
+
+def _locked(path: Path) -> tuple[int, bool]:
+    """Return the lock file ``path``, open, and whether it is locked."""
+    folder = path.parent
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+    while True:
+        require_regular(path)
+        try:
+            file = os.open(path, flags, 0o666)
+        except OSError as error:
+            raise DyngsError(f"cannot write {path}: {error.strerror or error}") from error
+        try:
+            _lock(file)
+        except OSError as error:
+            if error.errno in _WITHOUT_LOCKS:
+                warn(
+                    f"{folder}: this file system has no locks ({error.strerror}); "
+                    "see to it that no two commands write into that folder at once"
+                )
+                return file, False
+            os.close(file)
+            if error.errno not in _HELD:
+                raise DyngsError(f"cannot lock {path}: {error.strerror or error}") from error
+            raise InUseError(
+                f"{folder}: {_owner(path)}; wait until it has ended, or give another folder"
+            ) from None
+        if _is_the_same(file, path):  # its last owner may have removed it after we had opened it
+            break
+        os.close(file)
+    owner = {"pid": os.getpid(), "host": platform.node(), "since": time.strftime("%F %T")}
+    with suppress(OSError):  # without room on the disk nobody is told
+        os.ftruncate(file, 0)
+        os.lseek(file, 0, os.SEEK_SET)
+        os.write(file, (json.dumps(owner) + "\n").encode())
+    return file, True
+
+
+def _lock(file: int) -> None:
+    if sys.platform == "win32":
+        os.lseek(file, _FAR, os.SEEK_SET)
+        msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
+    else:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _freed(path: Path, file: int) -> None:
+    """Remove and close the lock file; others that wait to lock it notice that it is gone."""
+    with suppress(OSError):
+        if sys.platform != "win32" and _is_the_same(file, path):
+            path.unlink()
+    with suppress(OSError):
+        os.close(file)
+    if sys.platform == "win32":
+        with suppress(OSError):
+            path.unlink()  # fails if somebody has it by now
+
+
+def _is_the_same(file: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file), os.stat(path))
+    except OSError:
+        return False
+
+
+def _owner(path: Path) -> str:
+    """Return the process that writes there, as far as the lock file says."""
+    try:
+        with path.open("rb") as file:
+            known = json.loads(file.read(4096))
+        return "process {pid} on {host} has been writing there since {since}".format(**known)
+    except (OSError, ValueError, KeyError, TypeError):
+        return "another process is writing there"

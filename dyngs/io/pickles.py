@@ -2,19 +2,18 @@
 chumpy.
 
 Captures of people and body templates are distributed as pickles of Python 2 and 3, of
-``numpy.save`` and of joblib. ``pickletools`` decodes the opcodes; the interpreter here knows those
-for such values and none that could execute anything. A class or function named in a pickle becomes
-a ``_Name``, which is only text. Time and memory are linear in the size of the file.
+``numpy.save`` and of joblib. Python's own unpickler reads them here with those instructions only
+that make such values, and a class or function named in a pickle becomes a ``_Name``, which is only
+text. Time and memory are linear in the size of the file.
 """
 
 from __future__ import annotations
 
-import codecs
 import io
 import math
-import pickletools
+import pickle
 import re
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,9 @@ from dyngs.io.numpy_files import array_header, require_text
 
 _MOST_ENTRIES = 1 << 20
 """Entries, shared ones counted at each occurrence, next to two per byte of the file and those of
-sparse matrices. It limits containers and memo entries, too."""
+sparse matrices."""
+_MOST_CONTAINERS = 1 << 22
+"""Limit on containers, their marks, and remembered values."""
 _MOST_SPARSE_ENTRIES = 1 << 24
 """Entries of all sparse matrices of a file, zeros included; joint regressors of bodies have half a
 million."""
@@ -36,12 +37,23 @@ _LARGEST_KEY = 1 << 31  # a file can choose larger numbers whose hashes collide
 _BYTES_PER_BYTE = 16
 """Bytes of copies per byte of the file: a reference to an object takes 8, and 2 in a pickle."""
 
-_OPCODES = {opcode.code.encode("latin-1"): opcode for opcode in pickletools.opcodes}
+_VALUES = (
+    "NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT STRING "
+    "BINSTRING SHORT_BINSTRING BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8 UNICODE BINUNICODE "
+    "SHORT_BINUNICODE BINUNICODE8 EMPTY_TUPLE APPEND APPENDS SETITEM SETITEMS POP POP_MARK DUP GET "
+    "BINGET LONG_BINGET GLOBAL STACK_GLOBAL BUILD PROTO FRAME STOP"
+)
+_CONTAINERS = (
+    "EMPTY_LIST EMPTY_DICT LIST DICT TUPLE TUPLE1 TUPLE2 TUPLE3 MARK PUT BINPUT LONG_BINPUT MEMOIZE "
+    "REDUCE NEWOBJ"
+)
+"""Names of the instructions that are read; these are counted."""
 _LAYOUTS = {
     "numpy.ndarray": "plain",
     "joblib.numpy_pickle.NumpyArrayWrapper": "plain",
     **{f"scipy.sparse.csc_{kind}": "columns" for kind in ("matrix", "array")},
     **{f"scipy.sparse.csr_{kind}": "rows" for kind in ("matrix", "array")},
+    "chumpy": "chumpy",
 }
 """Classes of arrays, and how their state holds the numbers."""
 _OTHER_NAMES = {
@@ -60,6 +72,7 @@ _OLD_NAMES = (
     (r"scipy\.sparse\..*\.(cs[cr]_)", r"scipy.sparse.\1"),
     (r"__builtin__\.", "builtins."),
     (r"copy_reg\.", "copyreg."),
+    (r"chumpy\..*", "chumpy"),
 )
 """Patterns of module names to the name used here: modules moved between versions."""
 
@@ -68,7 +81,7 @@ def read_pickle(path: Path) -> object:
     """Read a pickle of numbers, text, containers and arrays; nothing in the file is executed.
 
     Pickles of Python 2 and uncompressed ones of joblib are read, too. Sparse matrices of SciPy and
-    arrays of chumpy become plain arrays; neither package is needed. The result never contains
+    arrays of chumpy become plain arrays; chumpy is not needed. The result never contains
     itself and is at most 100 containers deep. With shared parts counted at each occurrence, it has
     at most two entries per byte of the file and a million more, next to those of sparse matrices.
 
@@ -100,16 +113,8 @@ def _unpickled(path: Path, is_array: bool) -> object:
         return _Unpickler(path, file, len(content)).load()
 
 
-@dataclass(frozen=True)
-class _Name:
+class _Name(str):
     """A class or function named in a pickle, by its current name."""
-
-    text: str
-
-    @property
-    def layout(self) -> str | None:
-        """How the state of such an object holds an array; None if it is no array."""
-        return "chumpy" if self.text.startswith("chumpy.") else _LAYOUTS.get(self.text)
 
 
 class _Dtype:
@@ -128,168 +133,93 @@ class _Array(np.ndarray):
     layout: str | None = None
 
 
-def _unfilled(layout: str) -> _Array:
+def _unfilled(layout: str | None = None) -> _Array:
     array = _Array((0,), np.uint8)
     array.layout = layout
     return array
 
 
-class _Unpickler:
+# The unpickler in Python: that in C cannot be kept from instructions.
+_PythonUnpickler: Any = pickle._Unpickler  # type: ignore[attr-defined]
+
+
+class _Unpickler(_PythonUnpickler):
     """State of reading one pickle of ``size`` bytes from the position of ``file``."""
 
     def __init__(self, path: Path, file: io.BytesIO, size: int) -> None:
+        super().__init__(file, encoding="latin-1")  # in which Python 2 wrote bytes
         self._path, self._file, self._size = path, file, size
         self._bytes_left = _BYTES_PER_BYTE * size + (1 << 16)
         self._sparse_entries = 0
-        self._stack: list[Any] = []
-        self._marks: list[int] = []
-        self._memo: dict[int, Any] = {}
         self._containers = 0
 
     def load(self) -> object:
         """Return the contents of the pickle: a tree that may share parts but never contains
         itself."""
-        while True:
-            code = self._file.read(1)
-            opcode = _OPCODES.get(code)
-            if opcode is None:
-                raise ValueError(
-                    f"its instruction {code!r} is unknown" if code else "it is cut off"
-                )
-            if opcode.name == "STOP":
-                break
-            argument: Any = None
-            if opcode.name == "STRING":
-                raw: Any = pickletools.read_stringnl(self._file, decode=False)
-                argument = codecs.escape_decode(raw)[0].decode("latin-1")  # type: ignore[attr-defined]
-            elif opcode.arg is not None:
-                argument = opcode.arg.reader(self._file)
-            pushed = opcode.stack_after
-            is_value = not opcode.stack_before and pushed not in ([], [pickletools.anyobject])
-            if opcode.arg is not None and is_value:
-                self._stack.append(argument)
-            else:
-                self._step(opcode.name, argument)
-        found = self._pop()
+        found = super().load()
         self._require_tree(found)
         return found
 
-    def _step(self, name: str, argument: Any) -> None:
-        match name:
-            case "NONE" | "NEWTRUE" | "NEWFALSE":
-                self._stack.append({"NONE": None, "NEWTRUE": True, "NEWFALSE": False}[name])
-            case "EMPTY_LIST":
-                self._push_container([])
-            case "EMPTY_TUPLE":
-                self._push_container(())
-            case "EMPTY_DICT":
-                self._push_container({})
-            case "LIST":
-                self._push_container(self._above_mark())
-            case "TUPLE":
-                self._push_container(tuple(self._above_mark()))
-            case "TUPLE1" | "TUPLE2" | "TUPLE3":
-                items = [self._pop() for _ in range(int(name[-1]))]
-                self._push_container(tuple(items[::-1]))
-            case "DICT":
-                items = self._above_mark()
-                self._push_container({})
-                self._set_items(items)
-            case "APPEND":
-                self._extend([self._pop()])
-            case "APPENDS":
-                self._extend(self._above_mark())
-            case "SETITEM":
-                value = self._pop()
-                self._set_items([self._pop(), value])
-            case "SETITEMS":
-                self._set_items(self._above_mark())
-            case "MARK":
-                self._marks.append(len(self._stack))
-            case "POP_MARK":
-                self._above_mark()
-            case "POP" if self._marks and self._marks[-1] == len(self._stack):
-                self._marks.pop()
-            case "POP":
-                self._pop()
-            case "DUP":
-                self._stack.append(self._top())
-            case "PUT" | "BINPUT" | "LONG_BINPUT" | "MEMOIZE":
-                index = len(self._memo) if argument is None else argument
-                if not 0 <= index < 2 * _LARGEST_KEY:
-                    raise ValueError("it remembers a value under a number that is too large")
-                self._memo[index] = self._top()
-                require_at_most(self._path, len(self._memo), _MOST_ENTRIES, "remembered values")
-            case "GET" | "BINGET" | "LONG_BINGET":
-                self._stack.append(self._memo[argument])
-            case "GLOBAL":
-                self._stack.append(_known_name(*argument.split(" ", 1)))
-            case "STACK_GLOBAL":
-                name = self._pop()
-                self._stack.append(_known_name(self._pop(), name))
-            case "REDUCE" | "NEWOBJ":
-                arguments = self._pop()
-                self._push_container(self._called(self._pop(), arguments))
-            case "BUILD":
-                state = self._pop()
-                self._build(self._top(), state)
-            case "FRAME":
-                pass
-            case "PROTO" if argument <= 5:
-                pass
-            case _:
-                raise ValueError(f"its instruction {name} is not one of numbers, text and arrays")
-
-    def _top(self) -> Any:
-        if len(self._stack) <= (self._marks[-1] if self._marks else 0):
-            raise ValueError("it takes from an empty stack")
-        return self._stack[-1]
-
-    def _pop(self) -> Any:
-        """Pop the topmost value, which must lie above the last mark."""
-        self._top()
-        return self._stack.pop()
-
-    def _above_mark(self) -> list[Any]:
-        """Pop all values above the last mark."""
-        start = self._marks.pop()
-        items = self._stack[start:]
-        del self._stack[start:]
-        return items
-
-    def _push_container(self, value: Any) -> None:
+    def count(self) -> None:
         self._containers += 1
-        require_at_most(self._path, self._containers, _MOST_ENTRIES, "containers")
-        self._stack.append(value)
+        require_at_most(self._path, self._containers, _MOST_CONTAINERS, "containers")
 
-    def _extend(self, items: list[Any]) -> None:
-        target = self._top()
-        if type(target) is not list:
-            raise ValueError("it appends to what is no list")
-        target += items
+    def find_class(self, module: str, name: str) -> _Name:
+        key = f"{module[:200]}.{name[:200]}"
+        for old, new in _OLD_NAMES:
+            key = re.sub(rf"\A{old}", new, key)
+        if key not in _LAYOUTS and key not in _OTHER_NAMES:
+            raise ValueError(f"it holds {key!r:.80}, but only numbers, text and arrays are read")
+        return _Name(key)
+
+    def load_put(self) -> None:
+        index = int(self.readline())
+        if not 0 <= index < 2 * _LARGEST_KEY:
+            raise ValueError("it remembers a value under a number that is too large")
+        self.memo[index] = self.stack[-1]
+
+    def load_dict(self) -> None:
+        items = self.pop_mark()
+        self.append({})
+        self._set_items(items)
+
+    def load_setitem(self) -> None:
+        value = self.stack.pop()
+        self._set_items([self.stack.pop(), value])
+
+    def load_setitems(self) -> None:
+        self._set_items(self.pop_mark())
 
     def _set_items(self, items: list[Any]) -> None:
         """Put keys and values in turn into the dictionary on top."""
-        target = self._top()
-        if type(target) is not dict or len(items) % 2:
+        target = self.stack[-1]
+        if type(target) is not dict:
             raise ValueError("it sets items of what is no dictionary")
         for key, value in zip(items[::2], items[1::2], strict=True):
             target[_checked_key(key)] = value
+
+    def load_reduce(self) -> None:
+        arguments = self.stack.pop()
+        self.append(self._called(self.stack.pop(), arguments))
+
+    def load_build(self) -> None:
+        state = self.stack.pop()
+        self._build(self.stack[-1], state)
 
     def _called(self, name: object, arguments: object) -> object:
         """Return the object that a call stands for."""
         if not isinstance(name, _Name) or not isinstance(arguments, tuple):
             raise ValueError("it calls what is no function")
-        if name.layout is not None:
-            return _unfilled(name.layout)
-        match name.text, arguments:
+        if name in _LAYOUTS:
+            return _unfilled(_LAYOUTS[name])
+        match name, arguments:
             case "numpy.dtype", (text, *_):
                 return _Dtype(text)
             case (
                 "numpy.core.multiarray._reconstruct" | "copyreg._reconstructor",
-                (_Name(layout=str() as layout), *_),
-            ):
-                return _unfilled(layout)
+                (_Name() as kind, *_),
+            ) if kind in _LAYOUTS:
+                return _unfilled(_LAYOUTS[kind])
             case "numpy.core.multiarray.scalar", (dtype, raw):
                 return self._from_bytes(raw, dtype, (), "C")[()]
             case "numpy.core.numeric._frombuffer", (raw, dtype, shape, order):
@@ -306,7 +236,7 @@ class _Unpickler:
             case "collections.OrderedDict", (list() as pairs,):
                 return {_checked_key(key): value for key, value in pairs}
         raise ValueError(
-            f"it makes a {name.text!r:.40}, but only numbers, text and arrays are read"
+            f"it makes a {str(name)!r:.40}, but only numbers, text and arrays are read"
         )
 
     def _build(self, target: object, state: Any) -> None:
@@ -324,13 +254,10 @@ class _Unpickler:
         target.layout = None
         if layout == "plain":
             self._fill(target, *(self._following(state) if isinstance(state, dict) else state)[1:])
-        elif layout == "chumpy":  # empty where it has no numbers
-            if isinstance(state["x"], np.ndarray):
-                self._become(target, _numbers(state["x"]))
-        else:
-            height, width = state["_shape"] if layout == "columns" else reversed(state["_shape"])
-            dense = self._dense(state, height, width)
-            self._become(target, dense if layout == "columns" else np.ascontiguousarray(dense.T))
+        elif layout != "chumpy":
+            self._become(target, self._dense(state, layout))
+        elif isinstance(state["x"], np.ndarray):  # else it is empty
+            self._become(target, _numbers(state["x"]))
 
     def _charge(self, count: int) -> None:
         """Count bytes that are copied; raises ValueError: too many for the size of the file."""
@@ -341,21 +268,17 @@ class _Unpickler:
     def _fill(self, target: _Array, shape: Any, dtype: object, fortran: object, raw: Any) -> None:
         if not isinstance(dtype, _Dtype):
             raise ValueError("an array in it has no proper type and shape")
-        count = _count(shape)
         is_list = dtype.value.kind == "O"
+        wanted = _count(shape) * (1 if is_list else dtype.value.itemsize)
         raw = raw.encode("latin-1") if isinstance(raw, str) else raw  # bytes of Python 2
-        wanted = count if is_list else count * dtype.value.itemsize
-        if not isinstance(raw, list if is_list else (bytes, bytearray)) or len(raw) != wanted:
+        if not isinstance(raw, list if is_list else bytes) or len(raw) != wanted:
             raise ValueError("an array in it is shorter or longer than its shape")
-        self._charge(8 * count if is_list else wanted)
-        if is_list:
-            # NumPy frees arrays of objects in each other by recursion.
-            inner = [item for item in raw if isinstance(item, _Array)]
-            if any(item.layout is not None or item.dtype.kind == "O" for item in inner):
-                raise ValueError("arrays in it lie too deep in each other")
-        else:
-            raw = bytes(raw)
+        self._charge(8 * wanted if is_list else wanted)
+        if not is_list:
             require_text(raw, dtype.value)
+        # NumPy frees arrays of objects in each other by recursion.
+        elif any(isinstance(x, _Array) and (x.layout or x.dtype.kind == "O") for x in raw):
+            raise ValueError("arrays in it lie too deep in each other")
         target.__setstate__((1, tuple(shape), dtype.value, bool(fortran), raw))  # type: ignore[arg-type]
 
     def _become(self, target: _Array, array: np.ndarray) -> None:
@@ -374,33 +297,27 @@ class _Unpickler:
         raw = self._file.read(min(_count(shape) * dtype.value.itemsize, self._size))
         return 1, shape, dtype, state["order"] == "F", raw
 
-    def _dense(self, state: dict[str, Any], height: Any, width: Any) -> np.ndarray:
-        """Return the dense (height, width) array of a matrix of compressed columns."""
-        data, row, pointers = (_numbers(state[name]) for name in ("data", "indices", "indptr"))
-        entries = _count((height, width))
+    def _dense(self, state: dict[str, Any], layout: str) -> np.ndarray:
+        """Return the array of a matrix of compressed columns or rows."""
+        import scipy.sparse
+
+        shape = state["_shape"]
+        entries = _count(shape)
         self._sparse_entries += entries
         require_at_most(
             self._path, self._sparse_entries, _MOST_SPARSE_ENTRIES, "entries of sparse matrices"
         )
-        counts = np.diff(pointers.astype(np.int64))
-        fits = data.ndim == row.ndim == pointers.ndim == 1 and len(pointers) == width + 1
-        if (
-            not fits
-            or not len(data) == len(row) == counts.sum()
-            or row.dtype.kind not in "iu"
-            or counts.min(initial=0) < 0
-            or ((row < 0) | (row >= height)).any()
-        ):
-            raise ValueError("a sparse matrix in it is damaged")
         self._bytes_left += 8 * entries  # which are counted above
-        dense = np.zeros((height, width))
-        np.add.at(dense, (row, np.repeat(np.arange(width), counts)), data)
-        return dense
+        parts = tuple(_numbers(state[name]) for name in ("data", "indices", "indptr"))
+        make = scipy.sparse.csc_array if layout == "columns" else scipy.sparse.csr_array
+        matrix = make(parts, shape=shape)
+        matrix.check_format(full_check=True)
+        return matrix.toarray().astype(np.float64)
 
     def _from_bytes(self, raw: object, dtype: object, shape: object, order: object) -> np.ndarray:
         if not isinstance(dtype, _Dtype) or dtype.value.kind == "O":
             raise ValueError("an array in it does not hold numbers")
-        array = _Array((0,), np.uint8)
+        array = _unfilled()
         self._fill(array, shape, dtype, order == "F", raw)
         return array
 
@@ -437,17 +354,27 @@ class _Unpickler:
         weight(found, 0)
 
 
-def _known_name(module: object, name: object) -> _Name:
-    """Return the name ``module.name``; raises ValueError for unknown ones."""
-    if not isinstance(module, str) or not isinstance(name, str):
-        raise ValueError("a class in it has no proper name")
-    key = f"{module[:200]}.{name[:200]}"
-    for old, new in _OLD_NAMES:
-        key = re.sub(rf"\A{old}", new, key)
-    found = _Name(key)
-    if found.layout is None and key not in _OTHER_NAMES:
-        raise ValueError(f"it holds {key!r:.80}, but only numbers, text and arrays are read")
-    return found
+def _counted(load: Callable[[Any], None]) -> Callable[[Any], None]:
+    def counting(unpickler: _Unpickler) -> None:
+        unpickler.count()
+        load(unpickler)
+
+    return counting
+
+
+def _loader(name: str) -> tuple[int, Callable[[Any], None]]:
+    """Return the code and the method of an instruction."""
+    code: int = getattr(pickle, name)[0]
+    usual = _PythonUnpickler.dispatch[code]
+    # NEWOBJ is a call, too, and a bytearray would be allocated before it is read
+    special = {"NEWOBJ": "load_reduce", "BYTEARRAY8": "load_binbytes8"}
+    method = special.get(name, usual.__name__)
+    return code, getattr(_Unpickler, method)
+
+
+_Unpickler.dispatch = dict(_loader(name) for name in _VALUES.split())
+for _code, _load in map(_loader, _CONTAINERS.split()):
+    _Unpickler.dispatch[_code] = _counted(_load)
 
 
 def _checked_key(key: object) -> Any:

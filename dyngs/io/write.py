@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 
@@ -191,7 +191,7 @@ def write_text(path: Path, text: str, *, durable: bool = False) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def write_image(path: Path, pixels: np.ndarray) -> None:
+def write_image(path: Path, pixels: np.ndarray, png_level: int = 6) -> None:
     """Write an image, atomically; the suffix names the format.
 
     Args:
@@ -199,6 +199,7 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
         pixels: (H, W) or (H, W, C); uint8 and uint16 as they are, or floats, which are clamped to
             [0, 1] for 8-bit formats. A fourth channel is alpha: straight for PNG, premultiplied for
             EXR, as these formats want it.
+        png_level: compression of PNG, 0 to 9.
     """
     import OpenImageIO as oiio
 
@@ -216,6 +217,7 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, kind)
     spec.attribute("oiio:UnassociatedAlpha", 1)
+    spec.attribute("png:compressionLevel", png_level)
     with atomic_file(path) as temporary:
         output = oiio.ImageOutput.create(str(temporary))
         if output is None:
@@ -241,14 +243,9 @@ def to_uint8(pixels: np.ndarray) -> np.ndarray:
     return (np.clip(clean, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
-class _HasErrors(Protocol):
-    """OpenImageIO itself, or one of its readers and writers."""
-
-    def geterror(self) -> str: ...
-
-
-def image_error(source: _HasErrors) -> str:
-    """Return the last error of OpenImageIO as one short line, "" if there is none."""
+def image_error(source: Any) -> str:
+    """Return the last error of OpenImageIO, or of one of its readers and writers, as one short
+    line, "" if there is none."""
     text = any_text(source.geterror).strip()
     return printable(text.splitlines()[0], 100) if text else ""
 

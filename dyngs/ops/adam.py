@@ -1,25 +1,26 @@
 """Adam in place on arrays of rows, for all rows or only some: in float32 on the CPU one native pass
 over the memory."""
 
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false
+# The stubs of torch leave parts of these functions untyped.
+
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeAlias
+from typing import Any, TypeAlias, cast
 
 import torch
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError
 from dyngs.ops.device import sent
-from dyngs.ops.native import num_threads
 from dyngs.ops.registration import InPlace, has_kernel, launch, register
 
 # a number, or a tensor () of one that may still be on a GPU, where int waits for it
 Count: TypeAlias = int | Tensor
-_ARRAYS = "param", "grad", "exp_avg", "exp_avg_sq"
 
 
 def _adam_steps(
@@ -40,7 +41,7 @@ def _adam_steps(
             params, grads, exp_avgs, exp_avg_sqs, rates, rows, strict=True
         )
     ]
-    launch(params[0], "adam_steps", arrays, skipped, (betas[0], betas[1], eps, step), num_threads())
+    launch(params[0], "adam_steps", arrays, skipped, (*betas, eps, step))
     return skipped[0].long()
 
 
@@ -51,7 +52,7 @@ rows skipped."""
 
 def _seen_rows(grads: Tensor) -> Tensor:
     seen = grads.new_empty(grads.shape[0], dtype=torch.bool)
-    launch(grads, "seen_rows", grads, seen, num_threads())
+    launch(grads, "seen_rows", grads, seen)
     return seen
 
 
@@ -106,38 +107,21 @@ def adam_steps_(
     Kingma and Ba 2015, equal to ``torch.optim.Adam``; the bias correction follows the global
     ``step`` (from 1) also for rows skipped before. A gradient is bad if it is NaN, infinite, or so
     large that its square is not safely finite (2^63 in float32, 2^511 in float64). At least one
-    update. Raises DyngsError: shapes or dtypes that do not fit, or constants out of range; then
-    nothing is updated.
+    update.
     """
     like = updates[0].param
-    for update in updates:
-        _check(update, like)
-    if step < 1:
-        raise DyngsError(f"Adam: step counts from 1, got {step}")
-    if not torch.finfo(like.dtype).tiny <= eps < math.inf:
-        raise DyngsError(
-            f"Adam: eps must be at least {torch.finfo(like.dtype).tiny:.3g} and finite, got {eps}"
-        )
-    if not all(0 <= beta < 1 for beta in betas):
-        raise DyngsError(f"Adam: betas must lie in [0, 1), got {betas[0]} and {betas[1]}")
-    chosen = [x for x in updates if x.param.numel()]
-    rates = [_column_rates(x.lr, x.param.numel() // len(x.param), x.param) for x in chosen]
-    if not chosen:
+    wanted = [x for x in updates if x.param.numel()]
+    if not wanted:
         return torch.zeros((), dtype=torch.int64, device=like.device)
-    params, grads, exp_avgs, exp_avg_sqs = (
-        [getattr(x, n).detach() for x in chosen] for n in _ARRAYS
-    )
-    rows = [x.rows for x in chosen]
-    if like.dtype == torch.float32 and has_kernel("adam_steps_", like.device):
-        return adam_steps_op(
-            params, grads, exp_avgs, exp_avg_sqs, rates, rows, list(betas), eps, step
-        )
-    skipped = torch.zeros((), dtype=torch.int64, device=like.device)
-    for p, g, m, v, rate, row in zip(
-        params, grads, exp_avgs, exp_avg_sqs, rates, rows, strict=True
-    ):
-        skipped += _torch_adam_step(p, g, m, v, rate, row, betas, eps, step)
-    return skipped
+    names = "param", "grad", "exp_avg", "exp_avg_sq"
+    arrays = [[getattr(x, name).detach() for x in wanted] for name in names]
+    rates = [_column_rates(x.lr, x.param) for x in wanted]
+    rows = [x.rows for x in wanted]
+    if like.dtype == torch.float32 and has_kernel(like.device):
+        return cast(Any, adam_steps_op)(*arrays, rates, rows, list(betas), eps, step)
+    each: list[Any] = list(zip(*arrays, rates, rows, strict=True))
+    update: Any = _torch_adam_step
+    return torch.stack([update(*one, betas, eps, step) for one in each]).sum()
 
 
 @torch.no_grad()
@@ -147,7 +131,7 @@ def seen_rows(grads: Tensor) -> Tensor:
     if grads.numel() == 0:
         return torch.zeros(len(grads), dtype=torch.bool, device=grads.device)
     flat = grads.detach().reshape(len(grads), -1)
-    native = flat.dtype == torch.float32 and has_kernel("seen_rows", flat.device)
+    native = flat.dtype == torch.float32 and has_kernel(flat.device)
     return seen_rows_op(flat) if native else (flat != 0).any(dim=1)
 
 
@@ -180,48 +164,15 @@ def _torch_adam_step(
     return (wanted & ~usable).sum()
 
 
-def _column_rates(lr: float | Tensor, row_size: int, param: Tensor) -> Tensor:
+def _column_rates(lr: float | Tensor, param: Tensor) -> Tensor:
     """(C,) learning rates in the dtype and on the device of ``param``."""
-    if not isinstance(lr, Tensor):
-        return _rates((lr,), row_size, param.dtype, param.device)
-    if lr.ndim > 0 and lr.shape != (row_size,):
-        raise DyngsError(
-            f"Adam: lr must be a number or ({row_size},), one rate per column, got {tuple(lr.shape)}"
-        )
-    return _rates(
-        tuple(lr.detach().reshape(-1).cpu().numpy().tolist()), row_size, param.dtype, param.device
-    )
+    values = tuple(lr.detach().reshape(-1).tolist()) if isinstance(lr, Tensor) else (lr,)
+    return _rates(values, param.numel() // len(param), param.dtype, param.device)
 
 
 @lru_cache(maxsize=256)  # most rates are those of the last step, and lie on the GPU by then
 def _rates(
     values: tuple[float, ...], row_size: int, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    if not all(map(math.isfinite, values)):
-        raise DyngsError("Adam: lr must be finite")
-    return (
-        sent(torch.tensor(values, dtype=dtype, device="cpu"), device).expand(row_size).contiguous()
-    )
-
-
-def _check(update: AdamUpdate, like: Tensor) -> None:
-    param = update.param
-    rows = update.rows
-    if param.ndim == 0:
-        raise DyngsError("Adam: the parameter must have at least one dimension, got a scalar")
-    shape = param.shape
-    dtype = like.dtype
-    for name in _ARRAYS:
-        x: Tensor = getattr(update, name)
-        if x.shape != shape or x.dtype != dtype:
-            raise DyngsError(
-                f"Adam: {name} is {tuple(x.shape)} {x.dtype}, but the parameter {tuple(shape)} {dtype}"
-            )
-        if name != "grad" and not x.is_contiguous():
-            raise DyngsError(
-                f"Adam: {name} must be contiguous, as it is updated in place; call .contiguous() first"
-            )
-    if rows is not None and (rows.shape != shape[:1] or rows.dtype != torch.bool):
-        raise DyngsError(
-            f"Adam: rows must be ({len(param)},) bool, got {tuple(rows.shape)} {rows.dtype}"
-        )
+    rates = sent(torch.tensor(values, dtype=dtype, device="cpu"), device)
+    return rates.expand(row_size).contiguous()

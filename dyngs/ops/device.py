@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -196,38 +196,3 @@ class ReadBack:
         if self._ready is not None:
             self._ready.synchronize()
         return self._numbers
-
-
-class Upload:
-    """Arrays of the CPU that are copied to a GPU next to its work: by a stream of their own, from
-    pinned memory.
-
-    May be made in any thread. What has no such streams gets them when they are asked for.
-    """
-
-    def __init__(self, arrays: Sequence[Tensor], device: torch.device) -> None:
-        self._device, self._arrays = device, list(arrays)
-        self._done: torch.cuda.Event | None = None
-        if device.type != "cuda":
-            return
-        stream = _upload_stream(device)
-        with torch.cuda.stream(stream):
-            self._arrays = [x.pin_memory().to(device, non_blocking=True) for x in arrays]
-            self._done = torch.cuda.Event()
-            self._done.record(stream)
-
-    def arrays(self) -> list[Tensor]:
-        """Return them on the GPU; what is queued after this in the current stream finds them
-        there."""
-        if self._done is None:
-            return [sent(x, self._device) for x in self._arrays]
-        current = torch.cuda.current_stream(self._device)
-        current.wait_event(self._done)
-        for x in self._arrays:
-            x.record_stream(current)  # not lent anew before that stream is done with it
-        return self._arrays
-
-
-@cache
-def _upload_stream(device: torch.device) -> torch.cuda.Stream:
-    return torch.cuda.Stream(device)

@@ -10,13 +10,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dyngs.core.conventions import SH_C0
-from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Backward, differentiable, empty_like, launch
+from dyngs.ops.registration import Backward, empty_like, launch, register
 
 
 def _harmonics(means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree: int) -> Tensor:
     colors = means.new_empty(centers.shape[0], means.shape[0], 3)
-    launch(means, "harmonics_forward", means, centers, sh, radii, colors, degree, num_threads())
+    launch(means, "harmonics_forward", means, centers, sh, radii, colors, degree)
     return colors
 
 
@@ -26,25 +25,19 @@ def _harmonics_backward(x: Backward) -> Sequence[Tensor]:
     by_means, by_centers, by_sh = results
     given = means, centers, sh, radii, (*x.outputs, *x.grads)
     wanted = by_means, by_sh, by_centers if x.needs[1] else None
-    launch(means, "harmonics_backward", *given, wanted, degree, num_threads())
+    launch(means, "harmonics_backward", *given, wanted, degree)
     return results
 
 
-harmonics_op = differentiable(
+evaluate_harmonics = register(
     "harmonics", _harmonics, _harmonics_backward, "means centers sh", keeps=[0]
 )
+"""Return (V, N, 3) colours ``max(0, sum_k sh_k Y_k(dir) + 0.5)`` seen from ``centers`` (V, 3), zero
+where culled.
 
-
-def evaluate_harmonics(
-    means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree: int
-) -> Tensor:
-    """Return (V, N, 3) colours ``max(0, sum_k sh_k Y_k(dir) + 0.5)`` seen from ``centers`` (V, 3),
-    zero where culled.
-
-    Differentiable in means, centers and sh (N, K, 3); ``radii`` (V, N, 2) int32; ``degree`` 0 to 4,
-    at most that of ``sh``.
-    """
-    return harmonics_op(means, centers, sh, radii, degree)
+Differentiable in means, centers and sh (N, K, 3); ``radii`` (V, N, 2) int32; ``degree`` 0 to 4, at
+most that of ``sh``.
+"""
 
 
 class _Dimmed(torch.autograd.Function):

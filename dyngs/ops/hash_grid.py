@@ -12,14 +12,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError
-from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Backward, check_tensors, differentiable, empty_like, launch
-
-WIDTHS = 1, 2, 4, 8  # Features of a level that there are kernels for
+from dyngs.ops.registration import Backward, empty_like, launch, register
 
 
 @dataclass(frozen=True)
@@ -57,15 +52,8 @@ def _hash_grid(
     coords: Tensor, table: Tensor, scales: list[float], sizes: list[int], rows: list[int]
 ) -> Tensor:
     features = table.new_empty(coords.shape[0], len(rows) * table.shape[1])
-    launch(
-        coords,
-        "hash_grid_forward",
-        coords,
-        table,
-        _sizes(scales, sizes, rows),
-        features,
-        num_threads(),
-    )
+    levels = _sizes(scales, sizes, rows)
+    launch(coords, "hash_grid_forward", coords, table, levels, features)
     return features
 
 
@@ -73,11 +61,11 @@ def _hash_grid_backward(x: Backward) -> Sequence[Tensor]:
     coords, table, scales, sizes, rows = x.inputs
     by_table = empty_like(table)
     levels = _sizes(scales, sizes, rows)
-    launch(coords, "hash_grid_backward", coords, levels, *x.grads, by_table, num_threads())
+    launch(coords, "hash_grid_backward", coords, levels, *x.grads, by_table)
     return [by_table]
 
 
-hash_grid_op = differentiable("hash_grid", _hash_grid, _hash_grid_backward, "table")
+hash_grid_op = register("hash_grid", _hash_grid, _hash_grid_backward, "table")
 """Features (M, L * F)."""
 
 
@@ -89,14 +77,6 @@ def hash_features(coords: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
     coordinate that is no finite number gives features of NaN. The same bits on any number of
     threads. Raises DyngsError: shapes or dtypes that do not fit.
     """
-    features = table.shape[1] if table.ndim == 2 else 0
-    if features not in WIDTHS:
-        raise DyngsError(f"hash grid: 1, 2, 4 or 8 features of a row, got {tuple(table.shape)}")
-    points = coords, (len(coords), 3)
-    wanted = {"table": (table, (levels.num_rows, features)), "points": points}
-    check_tensors("hash grid", wanted, table.dtype)
-    if coords.requires_grad and torch.is_grad_enabled():
-        raise DyngsError("hash grid: there is no gradient by the points; detach them")
     return hash_grid_op(
         coords.contiguous(), table, list(levels.scales), list(levels.sizes), list(levels.rows)
     )
@@ -118,7 +98,7 @@ def _known_backward(x: Backward) -> Sequence[Tensor]:
     return _hash_grid_backward(x._replace(inputs=x.inputs[2:]))
 
 
-known_features_op = differentiable("known_features", _known, _known_backward, "table")
+known_features_op = register("known_features", _known, _known_backward, "table")
 
 
 def known_features(

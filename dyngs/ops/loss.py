@@ -6,16 +6,15 @@ without an implementation, from the plain torch formula, which is also the refer
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import reduce
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
 from dyngs.core.errors import DyngsError
-from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Gradient, has_kernel, launch, register
+from dyngs.ops.registration import Backward, has_kernel, launch, register
 
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
@@ -28,24 +27,15 @@ def _l1_ssim(
 ) -> tuple[Tensor, Tensor]:
     gradient = torch.empty_like(rendered) if with_gradient else None
     loss = rendered.new_empty(1, dtype=torch.float64)
-    launch(rendered, "l1_ssim", rendered, target, mask, gradient, loss, ssim_weight, num_threads())
+    launch(rendered, "l1_ssim", rendered, target, mask, gradient, loss, ssim_weight)
     return loss[0].to(rendered.dtype), rendered.new_empty(0) if gradient is None else gradient
 
 
-def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-    _, gradient = output
-    ctx.mark_non_differentiable(gradient)
-    ctx.save_for_backward(gradient)
+def _backward(x: Backward) -> Sequence[Tensor]:
+    return [x.grads[0] * x.outputs[0]]
 
 
-def _backward(ctx: Any, grad_loss: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
-    (gradient,) = ctx.saved_tensors
-    if gradient.numel() == 0:
-        raise RuntimeError("dyngs::l1_ssim was called without with_gradient, so it has no gradient")
-    return grad_loss * gradient, None, None, None, None
-
-
-l1_ssim_op = register("l1_ssim", _l1_ssim, gradient=Gradient(_save, _backward))
+l1_ssim_op = register("l1_ssim", _l1_ssim, _backward, "rendered", keeps=[1], constant=[1])
 """The loss () and its gradient by ``rendered`` (H, W, 3), which is empty if not asked for; float32,
 contiguous."""
 
@@ -64,9 +54,14 @@ def l1_ssim_loss(
     (H, W, 3), any strides; half precision is computed in float32. Raises DyngsError: shapes that do
     not fit, an empty image, or integer images.
     """
-    _check(rendered, target, mask)
-    x, y, m = _in_common_precision(rendered, target, mask)
-    if x.dtype != torch.float32 or not has_kernel("l1_ssim", x.device):
+    if rendered.ndim != 3 or not rendered.numel() or target.shape != rendered.shape:
+        shapes = f"{tuple(rendered.shape)} and {tuple(target.shape)}"
+        raise DyngsError(f"loss: images must be (H, W, 3), of one size and not empty, got {shapes}")
+    dtype = reduce(torch.promote_types, [rendered.dtype, target.dtype, torch.float32])
+    x = rendered.to(dtype).contiguous()
+    y, m = (None if t is None else t.detach().to(dtype).contiguous() for t in (target, mask))
+    assert y is not None
+    if x.dtype != torch.float32 or not has_kernel(x.device):
         return reference_l1_ssim(x, y, ssim_weight, m)
     with_gradient = torch.is_grad_enabled() and x.requires_grad
     return l1_ssim_op(x, y, m, ssim_weight, with_gradient)[0]
@@ -117,34 +112,3 @@ def _ssim_map(x: Tensor, y: Tensor) -> Tensor:
     return (luminance * (2 * (product - mean_x * mean_y) + SSIM_C2) / (variances + SSIM_C2)).to(
         dtype
     )
-
-
-def _check(rendered: Tensor, target: Tensor, mask: Tensor | None) -> None:
-    if rendered.ndim != 3 or rendered.shape[2] != 3 or rendered.numel() == 0:
-        raise DyngsError(
-            f"loss: the rendered image must be (H, W, 3) and not empty, got {tuple(rendered.shape)}"
-        )
-    if target.shape != rendered.shape:
-        raise DyngsError(
-            f"loss: the target is {tuple(target.shape)}, but the image {tuple(rendered.shape)}"
-        )
-    if mask is not None and mask.shape != rendered.shape[:2]:
-        raise DyngsError(
-            f"loss: the mask must be (H, W) = {tuple(rendered.shape[:2])}, got {tuple(mask.shape)}"
-        )
-    if not (rendered.is_floating_point() and target.is_floating_point()):
-        raise DyngsError(
-            f"loss: images must be floating point, got {rendered.dtype} and {target.dtype}"
-        )
-
-
-def _in_common_precision(
-    rendered: Tensor, target: Tensor, mask: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Return the inputs contiguous and in one dtype, at least float32; target and mask cut off from
-    autograd."""
-    given = [rendered.dtype, target.dtype, torch.float32]
-    dtype = reduce(torch.promote_types, given)
-    constants = [None if x is None else x.detach().to(dtype).contiguous() for x in (target, mask)]
-    assert constants[0] is not None
-    return rendered.to(dtype).contiguous(), constants[0], constants[1]

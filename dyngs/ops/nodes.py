@@ -11,8 +11,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Backward, differentiable, empty_like, launch
+from dyngs.ops.registration import Backward, empty_like, launch, register
 
 T = TypeVar("T", float, Tensor)
 
@@ -54,7 +53,7 @@ def _nodes_at(
     width = sum(x.shape[2] for x in heads[1:] if x is not None)
     motion = means.new_empty(means.shape[0], 7)
     values = means.new_empty(means.shape[0], width)
-    launch(means, "nodes_at", heads, _place(means.shape[1], time), motion, values, num_threads())
+    launch(means, "nodes_at", heads, _place(means.shape[1], time), motion, values)
     return motion, values
 
 
@@ -62,11 +61,11 @@ def _nodes_at_backward(x: Backward) -> Sequence[Tensor | None]:
     *heads, time = x.inputs
     results = [None if head is None else empty_like(head) for head in heads]
     place = _place(heads[0].shape[1], time)
-    launch(heads[0], "nodes_at_backward", heads, place, *x.grads, results, num_threads())
+    launch(heads[0], "nodes_at_backward", heads, place, *x.grads, results)
     return results
 
 
-nodes_at_op = differentiable(
+nodes_at_op = register(
     "nodes_at", _nodes_at, _nodes_at_backward, "means quats log_scales logit_opacities colors"
 )
 
@@ -99,7 +98,6 @@ def _node_penalties(
         motion,
         paths,
         results,
-        num_threads(),
     )
     return penalties.to(motion.dtype), by_motion, by_paths
 
@@ -110,7 +108,7 @@ def _penalties_backward(x: Backward) -> Sequence[Tensor]:
     return by_strain * by_motion, by_acceleration * by_paths
 
 
-node_penalties_op = differentiable(
+node_penalties_op = register(
     "node_penalties",
     _node_penalties,
     _penalties_backward,

@@ -12,32 +12,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError
-from dyngs.ops.native import num_threads
-from dyngs.ops.registration import (
-    Backward,
-    check_number,
-    check_size,
-    check_tensors,
-    differentiable,
-    empty_like,
-    launch,
-    register,
-)
+from dyngs.ops.registration import Backward, check_size, empty_like, launch, register
 
 NUM_POINTS = 6  # of a quadratic patch
 SEGMENTS = 6  # Of an edge: 36 flat faces (Wu et al. 2025)
 MOST_SEGMENTS = 64
 NO_CROSSING = 0.5  # Between pixels neither of which covers any of the other
-
-Along = Literal["u", "v"]
-_BASES: dict[Along | None, int] = {None: 0, "u": -1, "v": -2}
 
 
 def lattice_size(segments: int) -> int:
@@ -69,7 +54,7 @@ def lattice(segments: int) -> tuple[Tensor, Tensor]:
 
 def _values(values: Tensor, ids: Tensor, uv: Tensor, basis: int) -> Tensor:
     out = values.new_empty(ids.shape[0], values.shape[2])
-    launch(values, "patch_values_forward", uv, ids, values, basis, out, num_threads())
+    launch(values, "patch_values_forward", uv, ids, values, basis, out)
     return out
 
 
@@ -77,43 +62,25 @@ def _values_backward(x: Backward) -> Sequence[Tensor]:
     values, ids, uv, basis = x.inputs
     (grad,) = x.grads
     by_values = empty_like(values)
-    launch(grad, "patch_values_backward", uv, ids, grad, basis, by_values, num_threads())
+    launch(grad, "patch_values_backward", uv, ids, grad, basis, by_values)
     return [by_values]
 
 
-patch_values_op = differentiable("patch_values", _values, _values_backward, "values")
+patch_values_op = register("patch_values", _values, _values_backward, "values")
 
 
-def patch_values(values: Tensor, ids: Tensor, uv: Tensor, along: Along | None = None) -> Tensor:
+def patch_values(values: Tensor, ids: Tensor, uv: Tensor, segments: int = 0) -> Tensor:
     """Return (N, C) values of patches at places on them, differentiable in ``values``; the same on
     any threads.
 
     Args:
-        values: (P, 6, C) of control points.
+        values: (P, K, C) of control points; with ``segments`` at the points of a lattice, linear
+            between them.
         ids: (N,) int32 patch of each place.
         uv: (N, 2) places.
-        along: None: the value; else its derivative along u or v, at the other held constant.
     """
-    return _looked_up(values, ids, uv, NUM_POINTS, _BASES[along])
-
-
-def lattice_values(values: Tensor, ids: Tensor, uv: Tensor, segments: int) -> Tensor:
-    """Return (N, C): as ``patch_values`` of values (P, K, C) at the points of a lattice, linear
-    between them."""
-    if not 1 <= segments <= MOST_SEGMENTS:
-        raise DyngsError(f"patches: a lattice has 1 to {MOST_SEGMENTS} segments, got {segments}")
-    return _looked_up(values, ids, uv, lattice_size(segments), segments)
-
-
-def _looked_up(values: Tensor, ids: Tensor, uv: Tensor, count: int, basis: int) -> Tensor:
-    patches, _, channels = values.shape
-    check_tensors(
-        "patches", {"values": (values, (patches, count, channels)), "uv": (uv, (len(ids), 2))}
-    )
-    if ids.dtype != torch.int32:
-        raise DyngsError(f"patches: ids must be int32, got {ids.dtype}")
     return patch_values_op(
-        values.contiguous(), ids.contiguous(), uv.contiguous().to(values.dtype), basis
+        values.contiguous(), ids.contiguous(), uv.contiguous().to(values.dtype), segments
     )
 
 
@@ -132,30 +99,18 @@ def visible_patches(
         points: (P, 6, 3) control points, world.
         segments: of an edge; a patch is ``segments``^2 faces.
     """
-    check_number("near", near, 1e-9)
-    check_tensors("patches", {"points": (points, (len(points), NUM_POINTS, 3))})
     check_size(cameras.width, cameras.height)
-    if not 1 <= segments <= MOST_SEGMENTS:
-        raise DyngsError(f"patches: an edge has 1 to {MOST_SEGMENTS} segments, got {segments}")
     cameras = cameras.to(dtype=points.dtype)
     shape = len(cameras), cameras.height, cameras.width
     ids = torch.empty(shape, dtype=torch.int32, device=points.device)
     uv = points.new_empty(*shape, 2)
-    pose = cameras.cam_from_world.contiguous()
-    intrinsics = cameras.intrinsics.contiguous()
-    launch(
-        points,
-        "visible_patches",
-        points.contiguous(),
-        pose,
-        intrinsics,
-        segments,
-        near,
-        ids,
-        uv,
-        num_threads(),
-    )
+    given = points.contiguous(), *_arrays(cameras), segments, near
+    launch(points, "visible_patches", *given, ids, uv)
     return ids, uv
+
+
+def _arrays(cameras: Cameras) -> list[Tensor]:
+    return [cameras.cam_from_world.contiguous(), cameras.intrinsics.contiguous()]
 
 
 def _ends(
@@ -168,17 +123,7 @@ def _ends(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     found = torch.empty(ids.shape, dtype=torch.bool, device=ids.device)
     out = uv.new_empty(ids.shape), torch.empty_like(uv), torch.empty_like(uv)
-    launch(
-        points,
-        "patch_ends",
-        points,
-        *cameras,
-        uv,
-        (views, ids, directions),
-        found,
-        out,
-        num_threads(),
-    )
+    launch(points, "patch_ends", points, *cameras, uv, (views, ids, directions), found, out)
     return found, *out
 
 
@@ -191,7 +136,7 @@ def _blend(
     means: Tensor, colours: Tensor, crossings: Tensor, rows: Tensor, ids: Tensor
 ) -> tuple[Tensor, Tensor]:
     out = colours.new_empty(*rows.shape, colours.shape[1]), colours.new_empty(rows.shape)
-    launch(colours, "blend_patches_forward", colours, crossings, rows, ids, out, num_threads())
+    launch(colours, "blend_patches_forward", colours, crossings, rows, ids, out)
     return out
 
 
@@ -199,13 +144,11 @@ def _blend_backward(x: Backward) -> Sequence[Tensor]:
     _, colours, crossings, *pixels = x.inputs
     out = colours.new_empty(len(colours), 2), empty_like(colours), empty_like(crossings)
     given = colours, crossings, *pixels, tuple(x.grads)
-    launch(colours, "blend_patches_backward", *given, out, num_threads())
+    launch(colours, "blend_patches_backward", *given, out)
     return out
 
 
-blend_patches_op = differentiable(
-    "blend_patches", _blend, _blend_backward, "means colours crossings"
-)
+blend_patches_op = register("blend_patches", _blend, _blend_backward, "means colours crossings")
 
 
 @dataclass(frozen=True)
@@ -301,7 +244,7 @@ def _ends_between(
     views = (pixels // places.rows[0].numel()).to(torch.int32)
     found, steps, uv, slopes = patch_ends_op(
         points.detach().contiguous(),
-        [cameras.cam_from_world.contiguous(), cameras.intrinsics.contiguous()],
+        _arrays(cameras),
         views,
         ids,
         places.uv[rows.clamp_min(0)].contiguous(),
@@ -332,10 +275,6 @@ def blend_patches(
         colours: (N, C).
         crossings: (V, 2, H, W), see ``outline_crossings``.
     """
-    count, (views, height, width) = len(places.ids), places.rows.shape
-    checked = {"means": (means, (count, 2)), "colours": (colours, (count, colours.shape[-1]))}
-    checked |= {"crossings": (crossings, (views, 2, height, width))}
-    check_tensors("patches", checked, means.dtype)
     return blend_patches_op(
         means.contiguous(), colours.contiguous(), crossings.contiguous(), places.rows, places.ids
     )

@@ -15,16 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear
 
-from dyngs.core.errors import DyngsError
-from dyngs.ops.native import core_for, num_threads
-from dyngs.ops.registration import (
-    Backward,
-    check_tensors,
-    differentiable,
-    empty_like,
-    has_kernel,
-    launch,
-)
+from dyngs.ops.native import core_for
+from dyngs.ops.registration import Backward, empty_like, has_kernel, launch, register
 
 KEPT_BYTES = 2**30
 """The backward pass computes activations again where keeping them would take more memory than this,
@@ -56,7 +48,7 @@ def _perceptron(
 ) -> tuple[Tensor, Tensor]:
     y = x.new_empty(x.shape[0], widths[-1])
     kept = _empty_kept(x, widths, skip, keep)
-    launch(x, "perceptron_forward", x, params, y, _or_none(kept), widths, skip, num_threads())
+    launch(x, "perceptron_forward", x, params, y, _or_none(kept), widths, skip)
     return y, kept
 
 
@@ -65,7 +57,7 @@ def _perceptron_backward(given: Backward) -> Sequence[Tensor | None]:
     (kept,) = given.outputs
     results = empty_like(x) if given.needs[0] else None, empty_like(params)
     arrays = x, params, given.grads[0], _or_none(kept), *results
-    launch(x, "perceptron_backward", *arrays, widths, skip, num_threads())
+    launch(x, "perceptron_backward", *arrays, widths, skip)
     return results
 
 
@@ -73,7 +65,7 @@ def _or_none(kept: Tensor) -> Tensor | None:
     return kept if kept.numel() else None
 
 
-perceptron_op = differentiable(
+perceptron_op = register(
     "perceptron", _perceptron, _perceptron_backward, "x params", keeps=[1], constant=[1]
 )
 """Outputs (M, out), and the activations between the layers in the kernel's layout or an empty
@@ -90,23 +82,16 @@ def perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -
     is (out, width + K) (Mildenhall et al. 2020, figure 7). Raises DyngsError: no layer, shapes that
     do not fit, integer tensors, or tensors on different devices.
     """
-    widths = _checked_widths(x, layers, skip)
-    dtype = reduce(
-        torch.promote_types,
-        (t.dtype for layer in layers for t in (layer.weight, layer.bias)),
-        x.dtype,
-    )
-    dtype = torch.promote_types(dtype, torch.float32)
+    widths = [x.shape[1], *(len(layer.bias) for layer in layers)]
     too_large = x.device.type != "cpu" and (len(layers) > GPU_LAYERS or max(widths) > GPU_WIDTH)
-    if too_large or not has_kernel("perceptron", x.device):
+    if too_large or not has_kernel(x.device):
         return reference_perceptron(x, layers, skip=skip)
-    params = torch.cat(
-        [t.to(dtype).reshape(-1) for layer in layers for t in (layer.weight, layer.bias)]
-    )
+    tensors = [t for layer in layers for t in (layer.weight, layer.bias)]
+    dtype = reduce(torch.promote_types, (t.dtype for t in (x, *tensors)), torch.float32)
+    params = torch.cat([t.to(dtype).reshape(-1) for t in tensors])
     x = x.to(dtype)
-    at = 0 if skip is None else skip
     with_gradient = torch.is_grad_enabled() and (x.requires_grad or params.requires_grad)
-    return perceptron_op(x, params, widths, at, with_gradient)[0]
+    return perceptron_op(x, params, widths, skip or 0, with_gradient)[0]
 
 
 def reference_perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -> Tensor:
@@ -118,26 +103,3 @@ def reference_perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None
         if i + 1 < len(layers):
             h = h.relu()
     return h
-
-
-def _checked_widths(x: Tensor, layers: Sequence[Layer], skip: int | None) -> list[int]:
-    if x.ndim != 2 or x.shape[1] == 0:
-        raise DyngsError(
-            f"perceptron: the inputs must be (M, K) with K at least 1, got {tuple(x.shape)}"
-        )
-    if not layers:
-        raise DyngsError("perceptron: no layers; give at least one")
-    if skip is not None and not 1 <= skip < len(layers):
-        raise DyngsError(
-            f"perceptron: skip={skip} must name one of the layers 1 to {len(layers) - 1}, or be None"
-        )
-    widths = [x.shape[1]]
-    wanted = {"inputs": (x, tuple(x.shape))}
-    for i, layer in enumerate(layers):
-        features = widths[-1] + (widths[0] if i == skip else 0)
-        width = max(len(layer.weight), 1)
-        wanted[f"weight of layer {i}"] = layer.weight, (width, features)
-        wanted[f"bias of layer {i}"] = layer.bias, (width,)
-        widths.append(width)
-    check_tensors("perceptron", wanted)
-    return widths

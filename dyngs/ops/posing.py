@@ -13,9 +13,7 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError
-from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Backward, check_tensors, differentiable, launch
+from dyngs.ops.registration import Backward, launch, register
 
 _KEPT = 12  # numbers per Gaussian that the forward pass keeps for the backward pass
 
@@ -34,7 +32,7 @@ def _posing(
     blended = transforms.new_empty(means.shape[0], 3, 4)
     kept = means.new_empty(means.shape[0], _KEPT)
     rest = means, quats, log_scales
-    launch(means, "pose_forward", rest, weights, transforms, moved, blended, kept, num_threads())
+    launch(means, "pose_forward", rest, weights, transforms, moved, blended, kept)
     return *moved, blended, kept
 
 
@@ -46,11 +44,11 @@ def _posing_backward(x: Backward) -> Sequence[Tensor | None]:
     by_transforms = transforms.new_empty(transforms.shape)
     posed = x.outputs[:3], *x.outputs[3:]
     given = rest, weights, transforms, posed, by_moved, by_blended
-    launch(weights, "pose_backward", *given, by_rest, by_weights, by_transforms, num_threads())
+    launch(weights, "pose_backward", *given, by_rest, by_weights, by_transforms)
     return *by_rest, by_weights, by_transforms
 
 
-posing_op = differentiable(
+posing_op = register(
     "posing",
     _posing,
     _posing_backward,
@@ -86,30 +84,6 @@ def pose_by_joints(
     rest; half precision is computed in float32. Raises DyngsError: shapes that do not fit,
     integers, or other devices.
     """
-    inputs = {
-        "means": means,
-        "quats": quats,
-        "log_scales": log_scales,
-        "weights": weights,
-        "transforms": transforms,
-    }
-    _check(inputs)
-    dtype = reduce(torch.promote_types, (x.dtype for x in inputs.values()), torch.float32)
-    return Posed(*posing_op(*(x.to(dtype) for x in inputs.values()))[:4])
-
-
-def _check(inputs: dict[str, Tensor]) -> None:
-    weights = inputs["weights"]
-    if weights.ndim != 2:
-        raise DyngsError(f"pose_by_joints: weights must be (N, J), got {tuple(weights.shape)}")
-    count, joints = weights.shape
-    wanted = {
-        "means": (count, 3),
-        "quats": (count, 4),
-        "log_scales": (count, 3),
-        "transforms": (joints, 3, 4),
-    }
-    check_tensors(
-        "pose_by_joints",
-        {name: (x, wanted.get(name, tuple(x.shape))) for name, x in inputs.items()},
-    )
+    inputs = means, quats, log_scales, weights, transforms
+    dtype = reduce(torch.promote_types, (x.dtype for x in inputs), torch.float32)
+    return Posed(*posing_op(*(x.to(dtype) for x in inputs))[:4])

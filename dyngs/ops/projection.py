@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,13 +14,12 @@ from dyngs.ops.native import num_threads
 from dyngs.ops.registration import (
     Backward,
     Struct,
+    call_core,
     check_memory,
-    check_near_and_far,
     check_number,
     check_size,
-    differentiable,
     empty_like,
-    launch,
+    register,
 )
 
 
@@ -37,7 +37,8 @@ class ProjectionOptions:
 
     def __post_init__(self) -> None:
         check_number("eps2d", self.eps2d, 0)
-        check_near_and_far(self.near, self.far)
+        check_number("near", self.near, 0)
+        check_number("far", self.far, self.near, math.inf)
         check_number("alpha_min", self.alpha_min, 0, 1)
         check_number("radius_clip", self.radius_clip, 0)
 
@@ -92,7 +93,7 @@ def _project(
     compensations = means.new_empty(rows)
     splats = means2d, depths, factors, compensations, means.new_empty(*rows, 2, dtype=torch.int32)
     arrays = _arrays(means, quats, scales, opacities, viewmats, intrinsics)
-    launch(means, "project_forward", arrays, settings, *splats)
+    call_core(means, "project_forward", arrays, settings, *splats)
     return splats
 
 
@@ -105,11 +106,11 @@ def _project_backward(x: Backward) -> Sequence[Tensor | None]:
     results = *by_gaussians, *by_cameras
     settings = _settings(size, limits, antialiased)
     given = _arrays(*gaussians), settings, *x.outputs, tuple(x.grads), results
-    launch(means, "project_backward", *given)
+    call_core(means, "project_backward", *given)
     return results
 
 
-project_op = differentiable(
+project_op = register(
     "project",
     _project,
     _project_backward,

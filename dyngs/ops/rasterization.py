@@ -6,8 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -21,12 +20,11 @@ from dyngs.ops.registration import (
     REMEDY,
     Backward,
     Struct,
+    call_core,
     check_memory,
     check_number,
     check_size,
-    differentiable,
     empty_like,
-    launch,
     register,
     shapes_only,
 )
@@ -49,15 +47,11 @@ class BlendOptions:
     alpha_max: float = 0.99  # alpha is clamped here, and the clamp stops the gradient
     transmittance_min: float = 1e-4  # a pixel stops before the Gaussian that would take it below
     absgrad: bool = False  # also sum the absolute gradients of the 2D means into the probe
-    # refuse renders with more (Gaussian, tile) pairs, before allocating them; also refused are more
-    # than memory holds, at 20 bytes each
-    max_entries: int = MAX_ENTRIES
 
     def __post_init__(self) -> None:
         check_number("alpha_min", self.alpha_min, 0, 1)
         check_number("alpha_max", self.alpha_max, 0, LARGEST_ALPHA)
         check_number("transmittance_min", self.transmittance_min, 0, 1)
-        check_number("max_entries", self.max_entries, 0)
 
     @property
     def thresholds(self) -> list[float]:
@@ -76,17 +70,6 @@ class TileEntries:
 
     def tensors(self) -> list[Tensor]:
         return [self.tile_offsets, self.slot_ranges, self.gaussians, self.slots]
-
-    def check(self, device: torch.device) -> None:
-        """Raise an error unless the tensors are what the kernels take; those check lengths and
-        indices themselves."""
-        for name, x in vars(self).items():
-            dtype = torch.int64 if name == "tile_offsets" else torch.int32
-            if x.dtype != dtype or x.ndim != 1 or x.device != device:
-                got = f"{x.dtype} {tuple(x.shape)} on {x.device}"
-                raise DyngsError(
-                    f"rasterize: entries.{name} must be {dtype} with one axis on {device}, got {got}"
-                )
 
     @property
     def tiles_per_gaussian(self) -> Tensor:
@@ -115,24 +98,15 @@ def _arrays(*splats: Tensor) -> Struct:
     )
 
 
-@contextmanager
-def _refusals(kernel: str) -> Generator[None]:
-    try:
-        yield
-    except ValueError as error:
-        raise DyngsError(f"{kernel}: {error}") from None
-
-
 def _bin_tiles(
-    splats: list[Tensor], depths: Tensor, size: list[int], thresholds: list[float], max_entries: int
+    splats: list[Tensor], depths: Tensor, size: list[int], thresholds: list[float]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     if shapes_only():
         return _unknown_entries(depths, size)
     settings = _settings(size, thresholds)
-    most = min(max_entries, MAX_ENTRIES)
     try:
-        entries = launch(depths, "bin_tiles", _arrays(*splats), depths, settings, most)
-    except ValueError as error:  # std::length_error
+        entries = call_core(depths, "bin_tiles", _arrays(*splats), depths, settings, MAX_ENTRIES)
+    except DyngsError as error:
         raise DyngsError(f"render refused: {error}; {REMEDY}") from None
     tile_offsets, slot_ranges, gaussians, slots = (
         x if isinstance(x, Tensor) else torch.from_numpy(x) for x in entries
@@ -189,19 +163,9 @@ def _blend(
     image = _image(colors, size)
     splats = _arrays(means2d, factors, opacities, radii)
     entries = (tile_offsets, slot_ranges, gaussians, slots)
-    with _refusals("rasterize"):
-        settings = _settings(size, thresholds)
-        launch(
-            colors,
-            "rasterize_forward",
-            splats,
-            colors,
-            background,
-            entries,
-            settings,
-            (*image, None),
-            0,
-        )
+    settings = _settings(size, thresholds)
+    given = splats, colors, background, entries, settings, (*image, None), 0
+    call_core(colors, "rasterize_forward", *given)
     return image
 
 
@@ -220,17 +184,17 @@ def _blend_backward(x: Backward) -> Sequence[Tensor | None]:
     out = [empty_like(y) for y in (means2d, factors, opacities, colors)]
     by_probe = means2d.new_empty(*opacities.shape, 4) if x.needs[5] else None
     given = _arrays(means2d, factors, opacities, radii), colors, background, tuple(entries)
-    with _refusals("rasterize, backward"):
-        settings = _settings(size, thresholds)
-        images = by_color, by_transmittance, transmittance, stop
-        launch(colors, "rasterize_backward", *given, settings, images, (*out, by_probe), absgrad)
+    settings = _settings(size, thresholds)
+    images = by_color, by_transmittance, transmittance, stop
+    results = (*out, by_probe), absgrad
+    call_core(colors, "rasterize_backward", *given, settings, images, *results)
     by_background = None
     if x.needs[4]:
         by_background = torch.einsum("vhw,vhwd->vd", transmittance, by_color)
     return *out, by_background, by_probe
 
 
-blend_op = differentiable(
+blend_op = register(
     "blend",
     _blend,
     _blend_backward,
@@ -251,19 +215,9 @@ def _tally(
 ) -> tuple[Tensor, Tensor, Tensor]:
     sums = empty_like(splats[2])
     image = *_image(colors, size), sums
-    with _refusals("tally"):
-        settings = _settings(size, thresholds)
-        launch(
-            colors,
-            "rasterize_forward",
-            _arrays(*splats),
-            colors,
-            background,
-            tuple(entries),
-            settings,
-            image,
-            kind,
-        )
+    settings = _settings(size, thresholds)
+    given = _arrays(*splats), colors, background, tuple(entries), settings, image, kind
+    call_core(colors, "rasterize_forward", *given)
     return sums, image[0], image[1]
 
 
@@ -280,10 +234,7 @@ def bin_tiles(
     check_size(*size)  # before torch, which takes no integers from 2^63 on
     with torch.no_grad():
         splats = [projection.means2d, projection.factors, opacities, projection.radii]
-        thresholds = options.thresholds
-        return TileEntries(
-            *bin_tiles_op(splats, projection.depths, list(size), thresholds, options.max_entries)
-        )
+        return TileEntries(*bin_tiles_op(splats, projection.depths, list(size), options.thresholds))
 
 
 def rasterize(
@@ -304,8 +255,7 @@ def rasterize(
     black; ``probe`` (V, N, 4) zeros, whose gradient is that of the 2D means in px, then (with
     ``absgrad``) the sum over pixels of its absolute values; ``entries``: what ``bin_tiles``
     returned for the same. Raises DyngsError: too many channels, sides above 2^23 px, more
-    (Gaussian, tile) pairs than ``options.max_entries`` or than memory holds, or ``entries`` that do
-    not fit.
+    (Gaussian, tile) pairs than memory holds, or ``entries`` that do not fit.
     """
     if not 1 <= colors.shape[-1] <= MAX_CHANNELS:
         raise DyngsError(
@@ -314,7 +264,6 @@ def rasterize(
     check_size(*size)
     if entries is None:
         entries = bin_tiles(projection, opacities, size, options)
-    entries.check(opacities.device)
     color, transmittance, _ = blend_op(
         projection.means2d,
         projection.factors,

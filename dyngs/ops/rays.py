@@ -14,16 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError
-from dyngs.ops.native import num_threads
-from dyngs.ops.registration import (
-    Backward,
-    check_tensors,
-    differentiable,
-    empty_like,
-    launch,
-    register,
-)
+from dyngs.ops.registration import Backward, empty_like, launch, register
 
 TRANSMITTANCE_MIN = 1e-4  # A ray ends when less than this is left (Müller et al. 2022)
 
@@ -129,13 +120,8 @@ def _march_counts(
     rays: list[Tensor], occupied: Tensor, space: list[float], steps: list[float]
 ) -> Tensor:
     counts = rays[2].new_empty(rays[2].shape, dtype=torch.int64)
-    launch(
-        rays[2],
-        "march_count",
-        *_march_arguments(rays, occupied, space, steps),
-        counts,
-        num_threads(),
-    )
+    given = _march_arguments(rays, occupied, space, steps)
+    launch(rays[2], "march_count", *given, counts)
     return counts
 
 
@@ -155,7 +141,7 @@ def _march_samples(
     which = like.new_empty(count, dtype=torch.int32)
     samples = which, like.new_empty(count), like.new_empty(count), like.new_empty(count, 3)
     given = _march_arguments(rays, occupied, space, steps)
-    launch(like, "march_samples", *given, offsets, samples, num_threads())
+    launch(like, "march_samples", *given, offsets, samples)
     return samples
 
 
@@ -172,10 +158,6 @@ def march(rays: Rays, shifts: Tensor, space: Space, occupied: Tensor, steps: Ste
     those of each ray are shifted. ``occupied``: bool of ``space.shape``. The same samples on any
     number of threads. The host waits for the number of samples.
     """
-    if occupied.shape != space.shape or occupied.dtype != torch.bool:
-        raise DyngsError(
-            f"march: cells must be bool {space.shape}, got {occupied.dtype} {tuple(occupied.shape)}"
-        )
     given = (
         [rays.origins.contiguous(), rays.directions.contiguous(), shifts.contiguous()],
         occupied,
@@ -192,7 +174,7 @@ def _reached(
     which = densities.new_empty(densities.shape, dtype=torch.bool)
     counts = offsets.new_empty(offsets.shape[0] - 1)
     given = densities, starts, ends, offsets, transmittance_min
-    launch(densities, "reached_samples", *given, which, counts, num_threads())
+    launch(densities, "reached_samples", *given, which, counts)
     return which, counts
 
 
@@ -237,18 +219,8 @@ def _composite(
         densities.new_empty(rays),
         empty_like(densities),
     )
-    launch(
-        densities,
-        "composite_forward",
-        densities,
-        colours,
-        starts,
-        ends,
-        offsets,
-        transmittance_min,
-        out,
-        num_threads(),
-    )
+    given = densities, colours, starts, ends, offsets, transmittance_min
+    launch(densities, "composite_forward", *given, out)
     return out
 
 
@@ -257,11 +229,11 @@ def _composite_backward(x: Backward) -> Sequence[Tensor]:
     densities, colours, *_ = samples
     results = empty_like(densities), empty_like(colours)
     given = *samples, transmittance_min, tuple(x.grads)
-    launch(densities, "composite_backward", *given, *results, num_threads())
+    launch(densities, "composite_backward", *given, *results)
     return results
 
 
-composite_op = differentiable(
+composite_op = register(
     "composite", _composite, _composite_backward, "densities colours", constant=[3]
 )
 """Colour (R, 3), transmittance (R,), sum of weight times distance (R,), and weights (M,)."""
@@ -290,9 +262,6 @@ def composite(
     when less than ``transmittance_min`` is left. The same bits on any number of threads. Raises
     DyngsError: shapes or dtypes that do not fit.
     """
-    count = len(samples)
-    wanted = {"densities": (densities, (count,)), "colours": (colours, (count, 3))}
-    check_tensors("composite", wanted, samples.starts.dtype)
     given = (
         densities.contiguous(),
         colours.contiguous(),

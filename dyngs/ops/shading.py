@@ -11,29 +11,10 @@ narrow arrays.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from torch import Tensor
 
-from dyngs.ops.native import num_threads
-from dyngs.ops.registration import Backward, differentiable, launch
-
-
-@dataclass(frozen=True)
-class Sight:
-    """N Gaussians and a camera centre; no gradient reaches any of them."""
-
-    means: Tensor  # (N, 3) world units
-    quats: Tensor  # (N, 4) rotations wxyz, of any length
-    log_scales: Tensor  # (N, 3)
-    rows: Tensor  # (M,) int64, the Gaussians that are seen
-    eye: Tensor  # (3,) camera centre, world units
-    box: Tensor  # (2, 3) centre and half sides of the scene
-    # (N, 3) means at rest and the (3, 3) rotation from rest to the world; None: ``means``, no
-    # rotation
-    rest: tuple[Tensor, Tensor] | None = None
-    time: float | None = None  # in [0, 1]; None: not an input
-    normals: bool = True  # whether the shortest axis of each Gaussian is an input
+from dyngs.ops.registration import Backward, launch, register
 
 
 def num_inputs(*, sees_time: bool, sees_normals: bool) -> int:
@@ -68,7 +49,7 @@ def _shading(
         at_rest,
         None if time is None else 2 * time - 1,
     )
-    launch(base, "shading_inputs", *seen, normals, out, num_threads())
+    launch(base, "shading_inputs", *seen, normals, out)
     return out
 
 
@@ -77,24 +58,17 @@ def _shading_backward(x: Backward) -> Sequence[Tensor]:
     return [x.grads[0][:, begin : begin + 3].clone()]
 
 
-shading_op = differentiable("shading_inputs", _shading, _shading_backward, "base")
-"""Inputs (M, K) of a colour network; ``rest`` and ``turn`` are both there or both None."""
+shading_inputs = register("shading_inputs", _shading, _shading_backward, "base")
+"""Return (M, K) inputs of a colour network, differentiable in ``base`` (M, 3), colours of the seen
+rows, alone.
 
+Position in the box (contracted, Barron et al. 2022), direction from the eye, |cosine| between the
+shortest axis and the direction, the direction mirrored at that axis, base colour less 1/2, time in
+[-1, 1]. A body at rest knows positions, directions and normals as they are there.
 
-def shading_inputs(sight: Sight, base: Tensor) -> Tensor:
-    """Return (M, K) inputs of a colour network, differentiable in ``base`` (M, 3), colours of the
-    seen rows, alone.
-
-    Position in the box (contracted, Barron et al. 2022), direction from the eye, |cosine| between
-    the shortest axis and the direction, the direction mirrored at that axis, base colour less 1/2,
-    time in [-1, 1]. A body at rest knows positions, directions and normals as they are there.
-    Raises IndexError: a row that does not exist.
-    """
-    rest, turn = (None, None) if sight.rest is None else (x.detach() for x in sight.rest)
-    means, quats, log_scales, eye, box = (
-        x.detach() for x in (sight.means, sight.quats, sight.log_scales, sight.eye, sight.box)
-    )
-    rows = sight.rows
-    time = sight.time
-    normals = sight.normals
-    return shading_op(base, means, quats, log_scales, rows, eye, box, rest, turn, time, normals)
+``means`` (N, 3), ``quats`` (N, 4) of any length, ``log_scales`` (N, 3) of N Gaussians; ``rows``
+(M,) int64, those that are seen; ``eye`` (3,) camera centre; ``box`` (2, 3) centre and half sides of
+the scene; ``rest`` (N, 3) means at rest and ``turn`` (3, 3), the rotation from rest to the world,
+or both None; ``time`` in [0, 1], None: not an input; ``normals``: whether the shortest axis of each
+Gaussian is an input. Raises DyngsError: a row that does not exist.
+"""

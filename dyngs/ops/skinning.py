@@ -8,20 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import reduce
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError
-from dyngs.ops.native import num_threads
-from dyngs.ops.registration import (
-    Backward,
-    InPlace,
-    check_tensors,
-    differentiable,
-    launch,
-    register,
-)
+from dyngs.ops.registration import Backward, InPlace, launch, register
 
 
 def _skinning(
@@ -39,13 +31,7 @@ def _skinning(
         points.new_empty(count, values.shape[1]),
         points.new_empty(followed.shape),
     )
-    try:
-        launch(points, "skinning_forward", nodes, (points, followed), *results, num_threads())
-    except IndexError:
-        raise DyngsError(
-            f"blend_skinning: followed must be in [0, {len(positions)}), the nodes there are, "
-            f"got {int(followed.min())} to {int(followed.max())}"
-        ) from None
+    launch(points, "skinning_forward", nodes, (points, followed), *results)
     return results
 
 
@@ -55,11 +41,11 @@ def _skinning_backward(x: Backward) -> Sequence[Tensor | None]:
     results = by_points, points.new_empty(motion.shape), points.new_empty(values.shape)
     nodes = positions, radii, motion, values
     given = nodes, (points, followed), (*x.grads, *x.outputs)
-    launch(points, "skinning_backward", *given, *results, num_threads())
+    launch(points, "skinning_backward", *given, *results)
     return results
 
 
-skinning_op = differentiable(
+skinning_op = register(
     "skinning", _skinning, _skinning_backward, "points motion values", keeps=[2], constant=[2]
 )
 """Offsets (M, 3), blended values (M, D), and the weights (M, B) of the nodes."""
@@ -84,7 +70,6 @@ def blend_skinning(
     any length; ``values`` (S, D). Half precision is computed in float32. Raises DyngsError: shapes,
     types or devices that do not fit, or a node that does not exist.
     """
-    _check(points, positions, radii, followed, motion, values)
     floats = (points, positions, radii, motion, values)
     dtype = reduce(torch.promote_types, (x.dtype for x in floats), torch.float32)
     points, positions, radii, motion, values = (x.to(dtype) for x in floats)
@@ -92,34 +77,6 @@ def blend_skinning(
         points, positions.detach(), radii.detach(), followed, motion, values
     )
     return offset, blended
-
-
-def _check(
-    points: Tensor,
-    positions: Tensor,
-    radii: Tensor,
-    followed: Tensor,
-    motion: Tensor,
-    values: Tensor,
-) -> None:
-    nodes = len(positions) if positions.ndim else 0
-    expected = {
-        "points": (points, (len(points) if points.ndim else 0, 3)),
-        "positions": (positions, (nodes, 3)),
-        "radii": (radii, (nodes,)),
-        "motion": (motion, (nodes, 7)),
-        "values": (values, (nodes, *values.shape[1:2]))
-        if values.ndim == 2
-        else (values, (nodes, -1)),
-    }
-    check_tensors("blend_skinning", expected)
-    count = len(points)
-    shape = tuple(followed.shape)
-    fits = followed.dtype == torch.int64 and followed.device == points.device
-    if not fits or len(shape) != 2 or shape[0] != count or shape[1] == 0:
-        wanted = f"({count}, B) int64 on {points.device} with B at least 1"
-        got = f"{shape} {followed.dtype} on {followed.device}"
-        raise DyngsError(f"blend_skinning: followed must be {wanted}, got {got}")
 
 
 def _add_offsets(
@@ -137,7 +94,7 @@ def _add_offsets(
 ) -> None:
     gaussians = [InPlace(x) for x in (means, quats, log_scales, logit_opacities, sh)]
     offsets = (by_means, by_quats, by_log_scales, by_logit_opacities, by_colors)
-    launch(means, "add_offsets", gaussians, rows, offsets, num_threads())
+    launch(means, "add_offsets", gaussians, rows, offsets)
 
 
 add_offsets_op = register(
@@ -153,32 +110,16 @@ def add_offsets_(
     ``gaussians``: means, quats, log scales, opacity logits, harmonics (N, K, 3); contiguous where
     there are offsets. ``rows`` (M,) int64 without repetition; None: the first M. ``offsets`` (M,
     ...) of each in this order, of the base colour in place of
-    harmonics; None but for the first: none. Raises IndexError: no such row; DyngsError: not
-    contiguous.
+    harmonics; None but for the first: none. Raises DyngsError: no such row, or not contiguous.
     """
-    by_means, by_quats, by_log_scales, by_logits, by_colors = (
-        None if x is None else x.detach().to(gaussians[0].dtype) for x in offsets
-    )
-    assert by_means is not None
+    changes = [None if x is None else x.detach().to(gaussians[0].dtype) for x in offsets]
     # .data where nothing is added: a tensor that stays as it is must not count as changed for
     # autograd
-    means, quats, log_scales, logits, sh = (
+    own = [
         x.data.contiguous() if offset is None else x.detach()
         for x, offset in zip(gaussians, offsets, strict=True)
-    )
-    add_offsets_op(
-        means,
-        quats,
-        log_scales,
-        logits,
-        sh,
-        rows,
-        by_means,
-        by_quats,
-        by_log_scales,
-        by_logits,
-        by_colors,
-    )
+    ]
+    cast(Any, add_offsets_op)(*own, rows, *changes)
 
 
 def _add_offsets_backward(
@@ -197,9 +138,7 @@ def _add_offsets_backward(
     before = None if turned is None else turned.clone(memory_format=torch.contiguous_format)
     own = (None,) * 3 if before is None else (quats, offset, InPlace(before))
     given = (means, log_scales, logits, sh)
-    launch(
-        like, "add_offsets_backward", given, rows, own, results, count, like.shape[0], num_threads()
-    )
+    launch(like, "add_offsets_backward", given, rows, own, results, count, like.shape[0])
     return [x for x in (*results, before) if x is not None]
 
 

@@ -11,7 +11,7 @@ import json
 import math
 import os
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
@@ -127,7 +127,9 @@ def load_run(run_dir: Path, data_root: Path | None = None) -> LoadedRun:
             f"{run_dir}: a network, not a scene; `dyngs predict {as_word(run_dir)} CAPTURE --out RUN` makes one"
         )
     checkpoint = (
-        _scene_checkpoint(run_dir) if has_only_scene_file(run_dir) else latest_checkpoint(run_dir)
+        replace(read_scene(run_dir / SCENE_FILE), path=run_dir / SCENE_FILE)
+        if has_only_scene_file(run_dir)
+        else latest_checkpoint(run_dir)
     )
     checkpoint.require_settings(config)
     scene = restored_model(checkpoint, config.model)
@@ -139,14 +141,6 @@ def has_only_scene_file(run_dir: Path) -> bool:
     """Return whether the run is only there as the file that ``dyngs export --format dyngs``
     writes."""
     return (run_dir / SCENE_FILE).is_file() and not checkpoint_paths(run_dir)
-
-
-def _scene_checkpoint(run_dir: Path) -> Checkpoint:
-    """Return a checkpoint for drawing only, from a .dyngs file."""
-    path = run_dir / SCENE_FILE
-    stored = read_scene(path)
-    with reading(path):
-        return Checkpoint(info_of(asdict(stored.info)), stored.tensors, path)
 
 
 def last_good(run_dir: Path) -> str:

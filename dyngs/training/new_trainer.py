@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from dyngs.capture.initial_points import with_first_points
-from dyngs.capture.inspection.problems import before_training
+from dyngs.capture.inspection import before_training
 from dyngs.config import Config, PointsInit, RandomInit
 from dyngs.core.errors import warn
 from dyngs.data.capture import Capture
@@ -32,8 +32,7 @@ from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.loop import Trainable
 from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
 from dyngs.training.prediction import network_trainer
-from dyngs.training.priors.find import used_priors
-from dyngs.training.priors.used import UsedPriors
+from dyngs.training.priors import UsedPriors, used_priors
 from dyngs.training.trainer import Parts, Trainer
 
 GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
@@ -137,7 +136,7 @@ def assemble(
         background=background,
         extent=extent,
         generator=generator,
-        findings=[*([] if restored else findings), *priors.lines],
+        findings=[*([] if restored else findings), priors.message],
         held_out=held_out,
         device=device_for(config.run.device),
     )
@@ -181,7 +180,7 @@ def _priors(config: Config, capture: Capture, images: ImageLoader) -> UsedPriors
     if "train.priors" not in kind_of(config.model).uses:
         return UsedPriors()
     moves = capability(config.model, Moves) is not None and len(set(training_times(capture))) > 1
-    return used_priors(config, capture, images, moves=moves)
+    return used_priors(config, capture, images.views, moves=moves)
 
 
 def _robust(config: Config, capture: Capture, images: ImageLoader) -> RobustMasks | None:

@@ -45,7 +45,6 @@ def few_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
     few = {
         "LEFT_GAUSSIANS": (0.5,),
         "CUT_OFFS": (0.02,),
-        "FIELD_LOSSES": (0.1,),
         "HARMONIC_LOSSES": (0.03,),
     }
     for name, candidates in few.items():
@@ -116,7 +115,6 @@ def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
     assert after.num_gaussians < before.num_gaussians
     assert after.stored is not None
     assert after.stored < before.megabytes
-    assert str(first).count("limit:") == len(first.limits) >= 4
 
 
 def test_what_cannot_be_done_is_refused(tmp_path: Path) -> None:

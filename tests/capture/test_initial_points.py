@@ -53,7 +53,7 @@ RNG = np.random.default_rng(1)
 def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[View], PointCloud]:
     """A corner that eight cameras see, and points on its surfaces: of random ones, those nearest to
     them."""
-    options = DynamicOptions(size=96, num_times=1, num_cameras=8, num_val=0, num_test=0, samples=1)
+    options = DynamicOptions(size=96, num_times=1, num_cameras=8, num_test=0, samples=1)
     folder = tmp_path_factory.mktemp("room") / "capture"
     views = list(dyngs.read_capture(write_dynamic_capture("room", folder, options)).splits["train"])
     xyz = RNG.uniform((-1.5, -1.5, 0), (1.5, 1.5, 2), (6000, 3))
@@ -69,7 +69,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[View], PointClo
 def furnished(tmp_path_factory: pytest.TempPathFactory) -> DataConfig:
     """A furnished corner, a moment from eight cameras."""
     folder = tmp_path_factory.mktemp("room") / "capture"
-    options = DynamicOptions(size=160, num_times=1, num_cameras=8, num_val=0, num_test=0, samples=1)
+    options = DynamicOptions(size=160, num_times=1, num_cameras=8, num_test=0, samples=1)
     return DataConfig(root=write_dynamic_capture("room", folder, options))
 
 

@@ -3,7 +3,6 @@ lost."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import pytest
@@ -50,10 +49,10 @@ def test_a_file_is_converted_there_and_back(tmp_path: Path, capsys: Capture) -> 
 
 def test_what_convert_refuses(tmp_path: Path, capsys: Capture) -> None:
     plain = write_splats(tmp_path / "a.ply", SplatFile(cloud(5))).path
-    assert "names no format of Gaussians; use one of" in refused(
+    assert "no suffix of a file of Gaussians; use one of" in refused(
         capsys, "convert", plain, tmp_path / "b.xyz"
     )
-    assert "is the file that is read" in refused(capsys, "convert", plain, plain)
+    assert "exists, which is read" in refused(capsys, "convert", plain, plain)
     assert "no such file" in refused(capsys, "convert", tmp_path / "no.ply", tmp_path / "b.ply")
     assert "at most degree 0" in refused(
         capsys, "convert", plain, tmp_path / "b.splat", "--sh-degree", 3
@@ -73,12 +72,10 @@ def test_the_suffix_decides_what_export_writes(tmp_path: Path, capsys: Capture) 
             "which format? Give --format, or a name that ends in one of .compressed.ply, .ply, .spz"
             in said
         )
-    assert "which is that of ply" in refused(
-        capsys, "export", run, "--format", "spz", "--out", tmp_path / "a.ply"
-    )
-    assert "do not know this suffix as spz" in refused(
-        capsys, "export", run, "--format", "spz", "--out", tmp_path / "a.xyz"
-    )
+    for name in ("a.ply", "a.xyz"):
+        words = ["--format", "spz", "--out", tmp_path / name]
+        said = refused(capsys, "export", run, *words)
+        assert "--format spz does not write files of that suffix" in said
     assert (
         main(
             [
@@ -122,38 +119,3 @@ def test_a_scene_file_is_drawn(tmp_path: Path, capsys: Capture) -> None:
     other.write_bytes((tmp_path / "small" / "scene.dyngs").read_bytes())
     capsys.readouterr()
     assert "must be called scene.dyngs" in refused(capsys, "render", other, *words)
-
-
-def test_versions_of_spz_and_compressed_glb(tmp_path: Path, capsys: Capture) -> None:
-    """Of a file and of a run; an option of another format is refused before anything is written."""
-    pytest.importorskip("zstandard")
-    plain = write_splats(tmp_path / "a.ply", SplatFile(cloud(60), up="-y")).path
-    run = write_moving_run(tmp_path, moves=False)
-    for command in (["convert", str(plain)], ["export", str(run), "--from-up", "z", "--out"]):
-        for name, option, start in (
-            ("b.spz", "--spz-version=4", b"NGSP"),
-            ("b.glb", "--compress=spz", b"glTF"),
-        ):
-            out = tmp_path / name
-            for up in ("y", "-y"):
-                assert main([*command, str(out), option, f"--up={up}"]) == 0
-                figure = re.findall(
-                    r"drawn again: (the same images|[\d.]+)", capsys.readouterr().out
-                )
-                assert figure == ["the same images"] or float(figure[0]) > 25
-            assert out.read_bytes()[:4] == start
-            out.unlink()
-    assert "--spz-version goes with .spz files" in refused(
-        capsys, "convert", plain, tmp_path / "c.ply", "--spz-version=4"
-    )
-    assert "--compress goes with .glb files" in refused(
-        capsys, "convert", plain, tmp_path / "c.spz", "--compress=spz"
-    )
-    for options in (
-        ["--spz-version=4", "--out", tmp_path / "c.ply"],
-        ["--compress=spz", "--bodies"],
-    ):
-        assert refused(capsys, "export", run, *options).startswith(
-            f"dyngs: error: {options[0].split('=')[0]} "
-        )
-    assert not list(tmp_path.glob("c.*"))

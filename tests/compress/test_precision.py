@@ -22,7 +22,6 @@ from dyngs.gaussians.rendering import render
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.runs.stored_file import (
     MAX_COARSENESS,
-    TensorKind,
     coding_of,
     completed,
     drawable,
@@ -116,4 +115,4 @@ def test_what_no_step_is_fine_enough_for_is_stored_as_it_is() -> None:
     assert precision.change is not None
     assert precision.change <= 0.01
     means = drawable(scene_of(far))["gaussians.means"]
-    assert coding_of("gaussians.means", means, precision.steps).kind is TensorKind.EXACT
+    assert coding_of("gaussians.means", means, precision.steps).kind == "exact"

@@ -1,5 +1,4 @@
-"""Bisection keeps the most that it may, says what limits it, and holds out what nothing is trained
-on."""
+"""Bisection keeps the most that it may, and holds out what nothing is trained on."""
 
 from __future__ import annotations
 
@@ -10,9 +9,8 @@ from tiny_fields import busy_config
 
 from dyngs.compress.search import (
     Candidate,
-    Cut,
+    PruneChoice,
     Search,
-    SearchLimit,
     evenly_held_out,
 )
 from dyngs.config import PruneConfig
@@ -45,27 +43,21 @@ def test_views_held_out_are_spread_and_few() -> None:
 def test_the_last_step_that_keeps_the_promise(
     trainer: Trainer, allowed: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of twelve, in at most four trials; and the first that does not is named."""
+    """Of twelve, in at most four trials."""
     search = Search(trainer, trainer.checkpoint(), lambda text: None)
     tried: list[float] = []
 
-    def loss_of(cut: Cut) -> Candidate:
-        tried.append(cut.fraction)
-        return Candidate(cut, trainer.config, search.start, 10, 30.0, cut.fraction - 0.05)
+    def loss_of(choice: PruneChoice) -> Candidate:
+        tried.append(choice.fraction)
+        loss = choice.fraction - 0.05
+        return Candidate(choice, trainer.config, search.start, 10, 30.0, loss)
 
     monkeypatch.setattr(search, "_tried", loss_of)
-    levels = [(f"{k}", Cut(fraction=k / 12)) for k in range(1, 13)]
-    found, limit = search._bisected("Gaussians", levels, allowed)
+    found = search._bisected([PruneChoice(fraction=k / 12) for k in range(1, 13)], allowed)
     fits = [k for k in range(1, 13) if k / 12 - 0.05 <= allowed]
-    assert (None if found is None else found.cut) == (Cut(fraction=fits[-1] / 12) if fits else None)
+    wanted = PruneChoice(fraction=fits[-1] / 12) if fits else None
+    assert (None if found is None else found.choice) == wanted
     assert len(tried) <= 4
-    if len(fits) == 12:
-        assert limit == SearchLimit("Gaussians", "12", None)
-        assert str(limit) == "Gaussians: 12; there was no more to try"
-    else:
-        assert limit.refused is not None
-        assert limit.refused[0] == f"{len(fits) + 1}"
-        assert limit.refused[1] > allowed
 
 
 def test_nothing_is_trained_on_what_is_held_out(trainer: Trainer) -> None:
@@ -83,8 +75,8 @@ def test_views_that_are_new_leave_all_others_to_training(trainer: Trainer) -> No
     search = Search(trainer, trainer.checkpoint(), lambda text: None, [trainer.images[0]])
     assert (search.held_out, trainer.held_out) == ((), frozenset())
     assert search.views == "1 view never trained on"
-    whole = search.accepted(-100.0)[0]
-    assert [candidate.cut for candidate in whole] == [Cut()]
+    whole = search.accepted(-100.0)
+    assert [candidate.choice for candidate in whole] == [PruneChoice()]
     assert whole[0].psnr == search._reference
 
 
@@ -96,10 +88,8 @@ def test_what_views_trained_on_lose_counts_too(
     monkeypatch.setattr(
         search,
         "_tried",
-        lambda cut: Candidate(cut, trainer.config, search.start, 10, 30.0, -0.1, cut.fraction),
+        lambda x: Candidate(x, trainer.config, search.start, 10, 30.0, -0.1, x.fraction),
     )
-    found, _ = search._bisected(
-        "Gaussians", [(f"{k}", Cut(fraction=k / 12)) for k in range(1, 13)], 0.5
-    )
+    found = search._bisected([PruneChoice(fraction=k / 12) for k in range(1, 13)], 0.5)
     assert found is not None
-    assert found.cut == Cut(fraction=0.5)
+    assert found.choice == PruneChoice(fraction=0.5)

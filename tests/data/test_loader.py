@@ -3,6 +3,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from threading import enumerate as enumerate_threads
 
 import numpy as np
 import pytest
@@ -94,7 +95,7 @@ def test_shrunk_images_are_the_same_cached_or_not(cache_mb: float, tmp_path: Pat
             assert found.name == wanted.name
             assert torch.equal(found.rgb_premultiplied, wanted.rgb_premultiplied)
             assert torch.equal(found.cameras.intrinsics, wanted.cameras.intrinsics)
-            assert images.cached_bytes <= cache_mb * 1e6
+            assert images._on_cpu.num_bytes <= cache_mb * 1e6
     for i in range(4):
         (tmp_path / f"{i}.png").unlink()
     if cache_mb == 1:
@@ -108,14 +109,12 @@ def test_same_bytes_cached_or_not_and_from_threads(tmp_path: Path) -> None:
     views = tuple(replace(view, lens=Lens("opencv", (0.1, 0.0, 0.0, 0.0))) for view in views)
     cached = loader(views, downscale=1.5)
     uncached = loader(views, downscale=1.5, cache_mb=0)
-    assert uncached.cached_bytes == 0
     with ThreadPoolExecutor(4) as pool:
         images = list(pool.map(lambda i: cached[i % 4], range(16)))
     for i, image in enumerate(images):
         torch.testing.assert_close(
             image.rgb_premultiplied, uncached[i % 4].rgb_premultiplied, rtol=0, atol=0
         )
-    assert uncached.cached_bytes == 0
 
 
 def test_cache_keeps_to_its_limit_and_what_is_in_it(tmp_path: Path) -> None:
@@ -123,7 +122,7 @@ def test_cache_keeps_to_its_limit_and_what_is_in_it(tmp_path: Path) -> None:
     images = loader(views_of(tmp_path, 4), cache_mb=2.5 * one / 1e6)
     for i in (0, 1, 0, 2):
         images[i]
-        assert images.cached_bytes <= 2.5 * one
+        assert images._on_cpu.num_bytes <= 2.5 * one
     for i in range(4):
         (tmp_path / f"{i}.png").unlink()
     images[0], images[1]
@@ -148,8 +147,10 @@ def test_images_decoded_ahead_are_the_same(cache_mb: float, tmp_path: Path) -> N
             wanted = plain.shrunk(index, factor)
             assert torch.equal(found.rgb_premultiplied, wanted.rgb_premultiplied)
             ahead.expect((*order[position + 1 : position + 4], 0))
-            assert ahead.cached_bytes <= cache_mb * 1e6
+            assert ahead._on_cpu.num_bytes <= cache_mb * 1e6
     assert ahead.decoded_ahead == (0 if cache_mb == 1 else 4)
+    ahead.rest()
+    assert not [x for x in enumerate_threads() if x.name.startswith("dyngs-images")]
 
 
 @pytest.mark.parametrize("free", [None, 4 * 2.5 * 8 * 12 * 4, 0])
@@ -183,8 +184,8 @@ def test_images_given_out_on_a_gpu_are_the_same(
                 assert found.rgb_premultiplied.device == found.cameras.intrinsics.device == GPU
                 assert torch.equal(found.rgb_premultiplied.cpu(), wanted.rgb_premultiplied)
                 there.expect((*order[position + 1 : position + 4], 0))
-                assert there.cached_bytes <= cache_mb * 1e6
-                assert there._taken <= there._room
+                assert there._on_cpu.num_bytes <= cache_mb * 1e6
+                assert there._cache.num_bytes <= there._cache.room
         assert there.decoded_ahead == (0 if free is None else 2 * threads)
         assert there.bytes_on_gpu == {None: 6 * 8 * 12 * 3, 0: 0}.get(free, int(2.5 * 8 * 12 * 4))
 
@@ -217,7 +218,7 @@ def test_missing_images_are_found_at_once(tmp_path: Path) -> None:
 
 def test_sizes_that_disagree(tmp_path: Path) -> None:
     views = views_of(tmp_path, 1)
-    with pytest.raises(DyngsError, match=r"0\.png: the image is 12x8, but 12x9"):
+    with pytest.raises(DyngsError, match=r"0\.png: the image is 12x8, but its camera says 12x9"):
         loader((replace(views[0], height=9),))
     write_image(tmp_path / "mask.png", np.full((4, 4, 1), 255, np.uint8))
     with pytest.raises(DyngsError, match=r"mask\.png: the mask is 4x4"):

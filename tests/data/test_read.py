@@ -20,14 +20,13 @@ from tiny_captures import (
 from tiny_priors import with_priors
 
 from dyngs.api.load import read_capture
-from dyngs.capture.inspection.report import report_on
+from dyngs.capture.inspection import report_on
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data import readers
 from dyngs.data.capture import Capture, CaptureFormat
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import FORMATS, require_images
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 
 CAMERAS = ("cam00", "cam01", "cam02")
 
@@ -193,36 +192,6 @@ def test_real_captures(
     for views in capture.splits.values():
         assert [view.name for view in views] == sorted(view.name for view in views)
         ImageLoader(views, DataConfig.model_validate({"root": shared / name}))
-
-
-def test_a_fisheye_is_undistorted_to_the_pinhole_that_is_asked_for(tmp_path: Path) -> None:
-    """A wide one shows more of what the lens saw, and leaves out of the loss what it did not
-    see."""
-    root = write_still_capture(
-        tmp_path / "still", StillOptions(size=16, num_train=3, num_test=1, samples=1)
-    )
-    for split in ("train", "test"):
-        edit_json(
-            root / f"transforms_{split}.json",
-            lambda content: content.update(is_fisheye=True, camera_angle_x=1.5),
-        )
-    same, wide = (read(root, undistort=how) for how in ("same_focal", "wide"))
-    for view, before in zip(wide.splits["train"], same.splits["train"], strict=True):
-        assert before.lens.focal_ratio == 1
-        assert view.lens.focal_ratio > 1.1
-        np.testing.assert_allclose(
-            view.intrinsics[0, 0] * view.lens.focal_ratio, before.intrinsics[0, 0]
-        )
-    said = [dict(report_on(capture).facts)["lens"] for capture in (same, wide)]
-    assert "data.undistort=wide keeps more" in said[0]
-    assert "of the focal length, which keeps 9" in said[1]
-    masks = [
-        ImageLoader(capture.splits["train"], DataConfig(root=root))[0].mask
-        for capture in (same, wide)
-    ]
-    assert masks[0] is None
-    assert masks[1] is not None
-    assert 0.5 < float(masks[1].mean()) < 1
 
 
 def loaded(root: Path, **options: object) -> ImageLoader:

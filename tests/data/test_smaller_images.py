@@ -70,13 +70,8 @@ def test_smallest_copy_that_is_large_enough(
     np.testing.assert_allclose(image.cameras.intrinsics[0], expected, rtol=1e-6)
     names = [view.name for view in capture.splits["train"]]
     assert names == [f"images/{i}" for i in range(COUNT)]
-    (line,) = capture.warnings
-    wanted = (
-        "data.downscale=2 reads images_2"
-        if factor == 1
-        else f"images_{factor} is read in place of images"
-    )
-    assert wanted in line
+    lines = [f"images_{factor} is read in place of images"] if factor > 1 else []
+    assert [line.partition(":")[0] for line in capture.warnings] == lines
 
 
 @pytest.mark.parametrize("is_absent", [False, True])

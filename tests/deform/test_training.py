@@ -346,7 +346,7 @@ def test_motion_begins_where_fixed_cameras_see_changes() -> None:
     result = run.grow(FINE)
     assert result is not None
     assert result.finding is not None
-    assert "found at 8 of 8 times" in result.finding
+    assert "changes before the fixed cameras" in result.finding
     assert run.training.trains_on(0.0, FINE + 1)
     copies = 3 * len(times)  # of the static Gaussians that move: one for each time
     assert copies < run.scene.num_moving <= copies + 2 * 800
@@ -354,6 +354,6 @@ def test_motion_begins_where_fixed_cameras_see_changes() -> None:
         now = run.drawn_at(time).select(run.scene.moving[copies:])
         ball = now.means[now.opacities > 0.5]
         assert len(ball) > 50
-        assert (ball.median(0).values - torch.tensor([0.0, 0.1, 1.6 * time - 0.8])).norm() < 0.1
+        assert (ball.median(0).values - torch.tensor([0.0, 0.1, 1.6 * time - 0.8])).norm() < 0.15
     scene = begin().training.restored(run.scene.gaussians, run.model_state)
     torch.testing.assert_close(scene.at(0.3).means, run.scene.at(0.3).means)

@@ -27,7 +27,7 @@ from dyngs.export.camera_paths import (
     resize_cameras,
     with_times,
 )
-from dyngs.io.fields import VARIABLE
+from dyngs.io.containment import LIMITS_VARIABLE
 
 
 def written(folder: Path, document: object) -> Path:
@@ -133,7 +133,7 @@ def test_what_cannot_be_read_is_refused(document: Any, problem: str, tmp_path: P
 
 
 def test_paths_have_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.delenv(LIMITS_VARIABLE, raising=False)
     with pytest.raises(DyngsError, match=r"asks for 100,001 cameras"):
         read_path(written(tmp_path, GOOD | {"frames": [0] * 100_001}))
     file = tmp_path / "large.json"

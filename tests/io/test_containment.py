@@ -27,7 +27,7 @@ from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
-from dyngs.io.containment import check_size, images_up_to, inside, leaving_links, staying_within
+from dyngs.io.containment import check_size, inside, leaving_links, staying_within
 
 PLY = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 1\n"  # noqa: E501
 
@@ -130,7 +130,7 @@ def test_paths_that_leave_the_capture(key: str, written: str, tmp_path: Path) ->
     write_image(tmp_path / "own.png", random_pixels(8, 12, 3))
     name = written.format(tmp=tmp_path)
     edit_json(root / "transforms.json", lambda content: content["frames"][1].update({key: name}))
-    with pytest.raises(DyngsError, match=r"own(\.png)?: lies outside the capture"):
+    with pytest.raises(DyngsError, match=r"own(\.png)?, which lies outside the capture"):
         read(root)
     assert len(read(root, follow_links=True).splits["train"]) == 3
 
@@ -173,10 +173,8 @@ def test_a_folder_whose_name_begins_the_same_is_outside(tmp_path: Path) -> None:
 def test_sizes() -> None:
     check_size(Path("a.png"), 10_000, 10_000)
     with pytest.raises(
-        DyngsError, match=r"a\.png: 20000x20000 .*are 400 megapixels.*max_megapixels is 150;"
+        DyngsError, match=r"a\.png: asks for 400,000,000 pixels, of which 150,000,000 .*LIMITS=3"
     ):
         check_size(Path("a.png"), 20_000, 20_000)
-    with pytest.raises(DyngsError, match=r"of 1000 channels are 250 megapixels"):
+    with pytest.raises(DyngsError, match=r"asks for 250,000,000 pixels"):
         check_size(Path("a.exr"), 1000, 1000, 1000)
-    with images_up_to(400):
-        check_size(Path("a.png"), 20_000, 20_000)

@@ -7,17 +7,18 @@ from pathlib import Path
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.io.fields import VARIABLE, allowed, read_limited, require_at_most
+from dyngs.io.containment import LIMITS_VARIABLE, allowed, require_at_most
+from dyngs.io.fields import read_limited
 
 
 def test_what_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.delenv(LIMITS_VARIABLE, raising=False)
     assert allowed(100) == 100
     require_at_most(Path("a.x"), 100, 100, "things")
     line = r"a\.x: asks for 1,001 things, of which 100 are read at most; .* DYNGS_LIMITS=11$"
     with pytest.raises(DyngsError, match=line):
         require_at_most(Path("a.x"), 1001, 100, "things")
-    monkeypatch.setenv(VARIABLE, "11")
+    monkeypatch.setenv(LIMITS_VARIABLE, "11")
     require_at_most(Path("a.x"), 1001, 100, "things")
     with pytest.raises(DyngsError, match=r"over 10\^18 things, of which 1,100 .*=N"):
         require_at_most(Path("a.x"), 10**5000, 100, "things")
@@ -25,7 +26,7 @@ def test_what_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("text", ["", "x", "nan", "0", "-1", "0.5", "inf", "1e300"])
 def test_a_variable_that_means_nothing(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
-    monkeypatch.setenv(VARIABLE, text)
+    monkeypatch.setenv(LIMITS_VARIABLE, text)
     with pytest.raises(DyngsError, match=r"DYNGS_LIMITS=.* must be a number from 1 to 1e6"):
         allowed(1)
 
@@ -38,5 +39,5 @@ def test_a_file_is_read_up_to_its_limit(tmp_path: Path, monkeypatch: pytest.Monk
         DyngsError, match=r"a\.txt: asks for 5 bytes, of which 4 are read at most; .*DYNGS_LIMITS=2"
     ):
         read_limited(file, 4)
-    monkeypatch.setenv(VARIABLE, "2")
+    monkeypatch.setenv(LIMITS_VARIABLE, "2")
     assert read_limited(file, 4) == b"12345"

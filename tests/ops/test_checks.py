@@ -35,12 +35,11 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 WRONG: dict[str, list[Any]] = {
     "eps2d": [-0.1, math.nan, math.inf, "0.3", None],
     "near": [-0.1, math.nan, math.inf, None],
-    "far": [-1.0, 0.1, 0.2, math.nan, None],
+    "far": [-1.0, 0.1, math.nan, None],
     "alpha_min": [-0.1, 1.1, math.nan, None],
     "alpha_max": [-0.1, 1.0, 1 - 1e-9, math.nan],
     "transmittance_min": [-0.1, 1.1, math.nan],
     "radius_clip": [-0.1, math.nan, math.inf],
-    "max_entries": [-1, math.nan],
     "sh_degree": [-1, 5, 1.5, True],
     "mode": ["mip", None, 3],
     "depth": ["metric", None],

@@ -11,6 +11,7 @@ from scenes import Scene, random_scene, weights
 from torch import Tensor
 
 from dyngs.core.conventions import SH_C0
+from dyngs.core.errors import DyngsError
 from dyngs.ops.harmonics import (
     dimmed,
     evaluate_harmonics,
@@ -86,7 +87,7 @@ def test_camera_in_the_centre_of_a_gaussian_gives_finite_numbers() -> None:
 
 @pytest.mark.parametrize("degree", [-1, 2, 5])
 def test_degree_must_be_stored(degree: int) -> None:
-    with pytest.raises(ValueError, match="degree"):
+    with pytest.raises(DyngsError, match="degree"):
         colours(random_scene(degree=1), degree)
 
 

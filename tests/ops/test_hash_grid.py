@@ -11,7 +11,6 @@ from field_reference import reference_features
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.core.errors import DyngsError
 from dyngs.ops.hash_grid import (
     HashLevels,
     hash_features,
@@ -86,17 +85,3 @@ def test_a_coordinate_that_is_no_number_shows(bad: float) -> None:
     coords[2, 1] = bad
     found = hash_features(coords, table_of(LEVELS, 2), LEVELS)
     assert found.isfinite().all(1).tolist() == [True, True, False, True, True]
-
-
-def test_what_does_not_fit_is_refused() -> None:
-    coords = some(4)
-    table = table_of(LEVELS, 2)
-    for points, rows, message in (
-        (coords[:, :2], table, r"points must be \(4, 3\)"),
-        (coords, table[1:], "table must be"),
-        (coords, torch.cat([table, table[:, :1]], 1), "1, 2, 4 or 8"),
-        (coords.float(), table, "float64"),
-        (coords.clone().requires_grad_(), table, "no gradient"),
-    ):
-        with pytest.raises(DyngsError, match=message):
-            hash_features(points, rows, LEVELS)

@@ -104,11 +104,3 @@ def test_penalties_equal_torch(dtype: torch.dtype, tolerance: float) -> None:
         torch.testing.assert_close(
             x.double(), y, rtol=0, atol=tolerance * max(1.0, float(y.abs().max()))
         )
-
-
-def test_a_neighbour_that_does_not_exist_is_refused() -> None:
-    positions, radii, neighbours = graph()
-    with pytest.raises(IndexError, match="no such node"):
-        node_penalties(
-            positions, radii, neighbours + NODES, normal(NODES, 7), normal(NODES, POINTS, 3)
-        )

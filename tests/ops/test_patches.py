@@ -11,13 +11,11 @@ from patch_reference import reference_blend, reference_values, reference_visible
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError
 from dyngs.ops.patches import (
     Places,
     blend_patches,
     lattice,
     lattice_size,
-    lattice_values,
     outline_crossings,
     patch_values,
     project_points,
@@ -75,12 +73,12 @@ def test_a_lattice_is_linear_between_its_points(segments: int) -> None:
     assert faces.shape == (segments**2, 3)
     values = torch.randn(2, len(places), 3, dtype=torch.float64).requires_grad_()
     ids = torch.ones(len(places), dtype=torch.int32)
-    torch.testing.assert_close(lattice_values(values, ids, places, segments), values[1])
+    torch.testing.assert_close(patch_values(values, ids, places, segments), values[1])
     middles = places[faces].mean(1)
-    found = lattice_values(values, torch.zeros(len(faces), dtype=torch.int32), middles, segments)
+    found = patch_values(values, torch.zeros(len(faces), dtype=torch.int32), middles, segments)
     torch.testing.assert_close(found, values[0][faces].mean(1))
     some, uv = random_places(30, 2)
-    assert torch.autograd.gradcheck(lambda x: lattice_values(x, some, uv, segments), values)
+    assert torch.autograd.gradcheck(lambda x: patch_values(x, some, uv, segments), values)
 
 
 def test_faces_of_a_lattice_face_alike_and_fill_it() -> None:
@@ -248,17 +246,3 @@ def test_the_gradient_is_that_of_what_is_drawn(seed: int) -> None:
             slopes[0, i, axis] = (total(points + moved) - total(points - moved)) / (2 * step)
     error = (found - slopes).norm() / slopes.norm()
     assert error < 0.1, (error, found, slopes)
-
-
-def test_what_does_not_fit_is_refused() -> None:
-    values, (ids, uv) = random_patches(2), random_places(5, 2)
-    with pytest.raises(DyngsError, match="values must be"):
-        patch_values(values[:, :5], ids, uv)
-    with pytest.raises(DyngsError, match="ids must be int32"):
-        patch_values(values, ids.long(), uv)
-    with pytest.raises(ValueError, match="no patch has"):
-        patch_values(values, ids + 2, uv)
-    with pytest.raises(DyngsError, match="segments"):
-        lattice_values(values, ids, uv, 0)
-    with pytest.raises(DyngsError, match="near"):
-        visible_patches(values, camera(), 0.0)

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 import dyngs.ops.perceptron as ops
-from dyngs.core.errors import DyngsError
 from dyngs.ops.perceptron import (
     Layer,
     perceptron,
@@ -147,24 +146,3 @@ def bad_input(change: str) -> tuple[Tensor, list[Layer], int | None]:
     elif change == "skip without room":
         skip = 1
     return x, layers, skip
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ("rows", r"inputs must be \(M, K\).*\(5,\)"),
-        ("no columns", r"K at least 1, got \(9, 0\)"),
-        ("no layers", "at least one"),
-        ("weight", r"weight of layer 1 must be \(3, 7\), got \(3, 6\)"),
-        ("bias", r"bias of layer 0 must be \(7,\), got \(1, 7\)"),
-        ("integers", r"floating point .*got torch\.int64"),
-        ("skip 0", "skip=0 must name one of the layers 1 to 1"),
-        ("skip too late", "skip=2 must name"),
-        ("skip without room", r"weight of layer 1 must be \(3, 12\), got \(3, 7\)"),
-    ],
-)
-def test_bad_input_is_one_clear_line(change: str, message: str) -> None:
-    x, layers, skip = bad_input(change)
-    with pytest.raises(DyngsError, match=message) as caught:
-        perceptron(x, layers, skip=skip)
-    assert "\n" not in str(caught.value)

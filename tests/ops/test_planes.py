@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from dyngs.core.errors import DyngsError
 from dyngs.ops.planes import (
     PlaneLevel,
     hexplane_features,
@@ -251,50 +250,3 @@ def test_penalty_can_be_differentiated_again() -> None:
     (first,) = torch.autograd.grad(value, level.space, retain_graph=True)
     (second,) = torch.autograd.grad(3 * value, level.space)
     torch.testing.assert_close(second, 3 * first)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda c, x: (c, 0.5, []), "at least one level"),
-        (lambda c, x: (c[:, :2], 0.5, x), r"coordinates must be \(7, 3\)"),
-        (lambda c, x: (c.double(), 0.5, x), "coordinates must be torch.float32"),
-        (lambda c, x: (c, math.nan, x), "time must be a number"),
-        (
-            lambda c, x: (c, 0.5, [PlaneLevel(x[0].space[:2], x[0].time)]),
-            "space of level 0 must be",
-        ),
-        (
-            lambda c, x: (c, 0.5, [x[0], PlaneLevel(x[1].space, x[0].time)]),
-            "time of level 1 must be",
-        ),
-        (
-            lambda c, x: (c, 0.5, [x[0], PlaneLevel(x[1].space[..., :4], x[1].time[..., :4])]),
-            "space of level 1 must be",
-        ),
-        (
-            lambda c, x: (c, 0.5, [PlaneLevel(x[0].space, x[0].time[:, :0])]),
-            "time of level 0 must be",
-        ),
-        (
-            lambda c, x: (c, 0.5, [PlaneLevel(x[0].space, x[0].time.double())]),
-            "time of level 0 must be torch.float32",
-        ),
-        (
-            lambda c, x: (c, 0.5, [PlaneLevel(x[0].space.half(), x[0].time.half())]),
-            "in float32 or float64",
-        ),
-    ],
-)
-def test_input_that_does_not_fit(
-    change: Callable[[Tensor, list[PlaneLevel]], tuple[Tensor, float, list[PlaneLevel]]],
-    message: str,
-) -> None:
-    levels = make_levels((4, 6), 3, 5, torch.float32)
-    with pytest.raises(DyngsError, match=message):
-        hexplane_features(*change(torch.zeros(7, 3), levels))
-
-
-def test_weights_must_be_finite() -> None:
-    with pytest.raises(DyngsError, match="weights must be finite"):
-        plane_penalty(make_levels((4,), 3, 5), (1.0, math.nan, 0.0))

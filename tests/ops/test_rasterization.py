@@ -297,12 +297,3 @@ def test_equal_depths_are_blended_in_order_of_index() -> None:
     ours = draw(scene).blended
     truth = draw(scene, REFERENCE).blended  # the reference sorts stably
     torch.testing.assert_close(ours.color, truth.color, rtol=1e-9, atol=1e-12)
-
-
-def test_too_many_entries_are_refused_with_the_numbers(scene: Scene) -> None:
-    projection, opacities, colors, _ = with_channels(scene, 3)
-    with pytest.raises(
-        DyngsError,
-        match=r"20 Gaussians in 2 view\(s\) of 37x29 px meet \d+ tiles, more than .* 10;",
-    ):
-        rasterize(projection, opacities, colors, scene.size, options=BlendOptions(max_entries=10))

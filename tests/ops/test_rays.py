@@ -8,7 +8,6 @@ from field_reference import cell_of, reference_composite, reference_march
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.core.errors import DyngsError
 from dyngs.ops.rays import (
     Rays,
     Samples,
@@ -194,19 +193,3 @@ def test_what_is_not_reached_changes_nothing() -> None:
     other = composite(densities[which], colours[which], left, 0.01)
     assert torch.equal(one.colour, other.colour)
     assert torch.equal(one.transmittance, other.transmittance)
-
-
-def test_what_does_not_fit_is_refused() -> None:
-    densities, colours, samples = some_samples([3])
-    with pytest.raises(DyngsError, match="densities must be"):
-        composite(densities[1:], colours, samples)
-    with pytest.raises(DyngsError, match="densities must be torch"):
-        composite(densities.float(), colours.float(), samples)
-    with pytest.raises(DyngsError, match="cells must be"):
-        march(
-            towards(1.0, 0, 0),
-            torch.zeros(1),
-            NESTED,
-            torch.ones(2, 8, 8, 4, dtype=torch.bool),
-            Steps(0.0, 0.1),
-        )

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import reference
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference import Sight
 from torch import Tensor
 
+from dyngs.core.errors import DyngsError
 from dyngs.ops.quaternions import rotation_matrices
-from dyngs.ops.shading import Sight, num_inputs, shading_inputs
+from dyngs.ops.shading import num_inputs, shading_inputs
 
 
 def sight(
@@ -25,7 +25,7 @@ def sight(
         return torch.randn(shape, generator=g, dtype=torch.float64).to(dtype)
 
     box = torch.stack([random(3), 0.1 + random(3).abs()])
-    rest = (random(11, 3), rotation_matrices(random(1, 4))[0]) if on_body else None
+    rest = random(11, 3), rotation_matrices(random(1, 4))[0]
     rows = torch.randperm(11, generator=g)[:7]
     return Sight(
         random(11, 3),
@@ -34,7 +34,7 @@ def sight(
         rows,
         random(3),
         box,
-        rest,
+        *(rest if on_body else (None, None)),
         0.3 if timed else None,
         normals,
     )
@@ -52,11 +52,11 @@ def test_it_is_what_torch_says(
     base = torch.rand(7, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(
         dtype
     )
-    found = shading_inputs(seen, base)
+    found = shading_inputs(base, *seen)
     assert found.shape == (7, num_inputs(sees_time=timed, sees_normals=normals))
     # Numbers of at most 3 that come of some 30 roundings; 1e-5 is 84 units of float32, 1e-7 many of
     # float64.
-    torch.testing.assert_close(found, reference.shading_inputs(seen, base))
+    torch.testing.assert_close(found, reference.shading_inputs(base, *seen))
 
 
 def test_what_is_degenerate_stays_finite() -> None:
@@ -72,19 +72,18 @@ def test_what_is_degenerate_stays_finite() -> None:
         torch.tensor([[0.0] * 3, [1.0] * 3]),
     )
     base = torch.full((1, 3), 0.5)
-    torch.testing.assert_close(shading_inputs(seen, base), reference.shading_inputs(seen, base))
-    assert shading_inputs(seen, base).isfinite().all()
-    assert shading_inputs(replace(seen, rows=torch.zeros(0, dtype=torch.long)), base[:0]).shape == (
-        0,
-        13,
-    )
+    torch.testing.assert_close(shading_inputs(base, *seen), reference.shading_inputs(base, *seen))
+    assert shading_inputs(base, *seen).isfinite().all()
+    nothing = seen._replace(rows=torch.zeros(0, dtype=torch.long))
+    assert shading_inputs(base[:0], *nothing).shape == (0, 13)
 
 
 @pytest.mark.parametrize("row", [-1, 11])
 def test_a_row_that_does_not_exist_is_refused(row: int) -> None:
-    seen = replace(sight(0, normals=True, timed=False, on_body=False), rows=torch.tensor([0, row]))
-    with pytest.raises(IndexError, match="no such Gaussian"):
-        shading_inputs(seen, torch.zeros(2, 3, dtype=torch.float64))
+    seen = sight(0, normals=True, timed=False, on_body=False)
+    seen = seen._replace(rows=torch.tensor([0, row]))
+    with pytest.raises(DyngsError, match="no such Gaussian"):
+        shading_inputs(torch.zeros(2, 3, dtype=torch.float64), *seen)
 
 
 @settings(max_examples=50, deadline=None)

@@ -167,34 +167,6 @@ def test_nan_stays_with_the_point_and_the_followers_of_the_node(dtype: torch.dty
     assert torch.equal(got[1][~lost], expected[1][~lost]), "the values of that node are still known"
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"followed": torch.full((6, 2), 4)}, r"followed must be in \[0, 4\).* 4 to 4"),
-        ({"followed": torch.full((6, 2), -1)}, "followed must be in"),
-        ({"followed": torch.zeros(6, 2)}, "int64"),
-        ({"followed": torch.zeros(5, 2, dtype=torch.int64)}, r"followed must be \(6, B\)"),
-        ({"followed": torch.zeros(6, 0, dtype=torch.int64)}, "B at least 1"),
-        ({"points": torch.zeros(6, 2)}, r"points must be \(6, 3\)"),
-        ({"positions": torch.zeros(3, 3)}, r"radii must be \(3,\)"),
-        ({"motion": torch.zeros(4, 6)}, r"motion must be \(4, 7\)"),
-        ({"values": torch.zeros(4)}, "values must be"),
-        ({"values": torch.zeros(4, 3, dtype=torch.int64)}, "floating point"),
-        (
-            {"points": torch.zeros(6, 3, device="meta")},
-            "positions must be floating point on meta like the points, got .* on cpu",
-        ),
-    ],
-)
-def test_bad_input_is_refused(change: dict[str, Tensor], message: str) -> None:
-    case = random_case(6, 4, 2, 3)
-    for name, tensor in change.items():
-        setattr(case, name, tensor)
-    with pytest.raises(DyngsError, match=message) as caught:
-        blend_skinning(*case.arguments())
-    assert "\n" not in str(caught.value)
-
-
 def test_every_isa_moves_the_rows_and_no_others(isa: str) -> None:
     tensors = [x.clone() for x in cloud().tensors().values()]
     before = [x.clone() for x in tensors]
@@ -213,7 +185,7 @@ def test_every_isa_moves_the_rows_and_no_others(isa: str) -> None:
 
 def test_a_row_that_does_not_exist_is_refused() -> None:
     tensors = [x.clone() for x in cloud().tensors().values()]
-    with pytest.raises(IndexError, match="no such Gaussian"):
+    with pytest.raises(DyngsError, match="no such Gaussian"):
         add_offsets_(tensors, torch.tensor([9]), (torch.zeros(1, 3), None, None, None, None))
 
 

@@ -20,8 +20,7 @@ from dyngs.models.checkpoint import CheckpointInfo, restored_model
 from dyngs.models.renderable import Renderable
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE
-from dyngs.runs.config_file import write_config
-from dyngs.runs.folder import EXPORT_FOLDER
+from dyngs.runs.folder import EXPORT_FOLDER, write_config
 from dyngs.runs.stored_file import decoded, drawable, encoded, step_below, write_scene
 from dyngs.training.trainer import Trainer
 
@@ -95,25 +94,23 @@ def write_within(trainer: Trainer[Any], run_dir: Path, megabytes: float) -> Size
     scene = trainer.model.scene.to(CPU)
     images = probe_images(trainer)  # files are made on the CPU
     before = quality_of(trainer, scene, images)
-    plan = storage_plan(config, full, scene, None)
+    precision, coarseness = storage_plan(config, full, scene, None)
 
-    def stored(kept: GaussianScene | TriangleScene, coarseness: Tensor | None) -> _File | None:
-        found = _fitted(full.info, kept, coarseness, plan.precision.steps, int(1e6 * megabytes))
+    def stored(kept: GaussianScene | TriangleScene, octaves: Tensor | None) -> _File | None:
+        found = _fitted(full.info, kept, octaves, precision.steps, int(1e6 * megabytes))
         if found is None:
             return None
         data, coarser = found
         read = restored_model(decoded(data), config.model)
         return _File(data, quality_of(trainer, read, images), len(kept), coarser)
 
-    chosen = stored(scene, plan.coarseness)
+    chosen = stored(scene, coarseness)
     if isinstance(scene, GaussianScene) and (chosen is None or chosen.coarser > 1):
         scores = scores_of(trainer).cpu()
         fraction = KEPT
         while fraction * len(scene) >= 1:
             kept = highest(scores, 1 - fraction)
-            found = stored(
-                scene.select(kept), None if plan.coarseness is None else plan.coarseness[kept]
-            )
+            found = stored(scene.select(kept), None if coarseness is None else coarseness[kept])
             if chosen is not None and (found is None or found.psnr <= chosen.psnr):
                 break
             chosen = found

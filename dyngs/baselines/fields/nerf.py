@@ -13,14 +13,21 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from dyngs.baselines.fields.field import PUBLISHED_HALF, TIME, Field, Seen, encoded, with_time
-from dyngs.baselines.fields.keys import NerfModel
+from dyngs.baselines.fields.kind import NerfModel
+from dyngs.baselines.fields.scene import (
+    PUBLISHED_HALF,
+    PUBLISHED_PIXELS,
+    TIME,
+    Field,
+    Seen,
+    encoded,
+    restored_parameters,
+)
+from dyngs.baselines.fields.training import FieldTraining
 from dyngs.core.initialisation import glorot
-from dyngs.core.state import Role, State, with_role
-from dyngs.core.tensor_checks import require_tensor
-from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.kind import RunStart
 from dyngs.ops.perceptron import Layer, perceptron
-from dyngs.ops.rays import Composited, Rays, Samples, Space, composite
+from dyngs.ops.rays import Rays, Samples, Space, composite
 
 LAST = 1e10  # Length of the last sample of a ray: whatever is dense there hides the background
 _LEAST = 1e-5  # Weight of an interval that nothing was seen in
@@ -28,6 +35,7 @@ DEPTH, SKIP = 8, 5  # Hidden layers of the trunk; the layer that sees the positi
 POSITION_OCTAVES, DIRECTION_OCTAVES = 10, 4
 POSITION = 3 * (1 + 2 * POSITION_OCTAVES)
 DIRECTION = 3 * (1 + 2 * DIRECTION_OCTAVES)
+LAST_RATE = 0.1  # Learning rate at the end of the run, relative to the first
 
 
 @dataclass(frozen=True)
@@ -48,150 +56,98 @@ SIZES = {
 }
 
 
-@dataclass(frozen=True)
-class NerfNetwork:
-    """Weights and biases of the trunk, whose outputs are density and bottleneck, and of the
-    colours' layers."""
-
-    trunk: tuple[Layer, ...]
-    head: tuple[Layer, ...]
-
-    @staticmethod
-    def shapes(model: NerfModel) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-        """Return (in, out) of the layers of trunk and head."""
-        width = SIZES[model.sizes].width
-        first = POSITION + (TIME if model.time else 0)
-        trunk = [first, *[width] * DEPTH, width + 1]
-        pairs = [(i + (first if n == SKIP else 0), o) for n, (i, o) in enumerate(pairwise(trunk))]
-        return pairs, [(width + DIRECTION, width // 2), (width // 2, 3)]
-
-    @staticmethod
-    def new(model: NerfModel, generator: torch.Generator) -> NerfNetwork:
-        def layer(inputs: int, outputs: int) -> Layer:
-            bias = torch.zeros(outputs, device="cpu").requires_grad_()
-            return Layer(glorot(inputs, outputs, generator).requires_grad_(), bias)
-
-        trunk, head = (
-            tuple(layer(*shape) for shape in shapes) for shapes in NerfNetwork.shapes(model)
-        )
-        return NerfNetwork(trunk, head)
-
-    @staticmethod
-    def restored(model: NerfModel, stored: Mapping[str, Tensor], name: str) -> NerfNetwork:
-        """Return the network ``name`` of a state. Raises KeyError or ValueError."""
-
-        def tensor(key: str, *shape: int) -> Tensor:
-            return require_tensor(key, stored[key], shape).clone()
-
-        trunk, head = (
-            tuple(
-                Layer(
-                    tensor(f"{name}.{part}.{n}.weight", o, i), tensor(f"{name}.{part}.{n}.bias", o)
-                )
-                for n, (i, o) in enumerate(shapes)
-            )
-            for part, shapes in zip(("trunk", "head"), NerfNetwork.shapes(model), strict=True)
-        )
-        return NerfNetwork(trunk, head)
-
-    @property
-    def parameters(self) -> dict[str, Tensor]:
-        parts = {"trunk": self.trunk, "head": self.head}
-        layers = {
-            f"{name}.{n}": layer for name, part in parts.items() for n, layer in enumerate(part)
-        }
-        return {
-            f"{name}.{kind}": getattr(x, kind)
-            for name, x in layers.items()
-            for kind in ("weight", "bias")
-        }
-
-    def outputs(self, places: Tensor) -> Tensor:
-        """Return (M, 1 + width) raw densities and bottlenecks of encoded places."""
-        return perceptron(places, self.trunk, skip=SKIP)
-
-    def colours(self, outputs: Tensor, directions: Tensor) -> Tensor:
-        """Return (M, 3) colours, seen along encoded directions."""
-        return perceptron(torch.cat([outputs[:, 1:], directions], 1), self.head).sigmoid()
+def shapes(model: NerfModel) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the parameters: of each network the trunk, whose outputs are density and
+    bottleneck, and the head, whose outputs are colours."""
+    width = SIZES[model.sizes].width
+    first = POSITION + (TIME if model.time else 0)
+    trunk = [first, *[width] * DEPTH, width + 1]
+    layers = {f"trunk.{n}": (out, before) for n, (before, out) in enumerate(pairwise(trunk))}
+    layers[f"trunk.{SKIP}"] = (width, width + first)
+    layers |= {"head.0": (width // 2, width + DIRECTION), "head.1": (3, width // 2)}
+    found: dict[str, tuple[int, ...]] = {}
+    for network in ("coarse", "fine"):
+        for name, (out, before) in layers.items():
+            found[f"{network}.{name}.weight"] = (out, before)
+            found[f"{network}.{name}.bias"] = (out,)
+    return found
 
 
 @dataclass(frozen=True)
 class NerfField(Field):
     """Two networks: the coarse one says where the fine one looks closer."""
 
-    space: Space
-    coarse: NerfNetwork
-    fine: NerfNetwork
-    num_coarse: int  # samples of a ray
-    num_fine: int  # more of them for the fine network
-    sees_time: bool = False
+    @classmethod
+    def new(
+        cls,
+        model: NerfModel,
+        space: Space,
+        generator: torch.Generator,
+        pixels: int = PUBLISHED_PIXELS,
+    ) -> NerfField:
+        parameters = {
+            name: glorot(shape[1], shape[0], generator)
+            if len(shape) == 2
+            else torch.zeros(shape, device="cpu")
+            for name, shape in shapes(model).items()
+        }
+        return cls(model, space, parameters)
 
-    @staticmethod
-    def new(model: NerfModel, space: Space, generator: torch.Generator) -> NerfField:
-        coarse, fine = (NerfNetwork.new(model, generator) for _ in range(2))
-        sizes = SIZES[model.sizes]
-        return NerfField(space, coarse, fine, sizes.coarse, sizes.fine, model.time)
-
-    @staticmethod
-    def restored(model: NerfModel, space: Space, checkpoint: Checkpoint) -> NerfField:
-        """Return the field of a checkpoint. Raises KeyError or ValueError where its tensors do not
-        fit."""
-        stored = checkpoint.part("field")
-        coarse, fine = (NerfNetwork.restored(model, stored, name) for name in ("coarse", "fine"))
-        sizes = SIZES[model.sizes]
-        return NerfField(space, coarse, fine, sizes.coarse, sizes.fine, model.time)
+    @classmethod
+    def restored(cls, model: NerfModel, space: Space, stored: Mapping[str, Tensor]) -> NerfField:
+        return cls(model, space, restored_parameters(stored, shapes(model)))
 
     @property
     def num_shifts(self) -> int:
-        return self.num_coarse + self.num_fine
-
-    @property
-    def parameters(self) -> Mapping[str, Tensor]:
-        networks = {"coarse": self.coarse, "fine": self.fine}
-        return {
-            f"{name}.{key}": x
-            for name, network in networks.items()
-            for key, x in network.parameters.items()
-        }
-
-    def state(self) -> State:
-        return with_role({name: x.detach() for name, x in self.parameters.items()}, Role.SHARED)
+        sizes = SIZES[self.model.sizes]
+        return sizes.coarse + sizes.fine
 
     def seen(self, rays: Rays, time: float, *, near: float, shifts: Tensor | None = None) -> Seen:
         if shifts is None:
             shifts = rays.origins.new_full((len(rays), self.num_shifts), 0.5)
-        distances = evenly(rays, self.space, near, shifts[:, : self.num_coarse])
-        coarse, weights = self._through(self.coarse, rays, distances, time)
-        distances = by_weights(distances, weights, shifts[:, self.num_coarse :])
-        fine, _ = self._through(self.fine, rays, distances, time)
+        num_coarse = SIZES[self.model.sizes].coarse
+        distances = evenly(rays, self.space, near, shifts[:, :num_coarse])
+        coarse, weights = self._through("coarse", rays, distances, time)
+        distances = by_weights(distances, weights, shifts[:, num_coarse:])
+        fine, _ = self._through("fine", rays, distances, time)
         return replace(fine, num_samples=fine.num_samples + coarse.num_samples, coarse=coarse)
 
     def densities(self, points: Tensor, time: float) -> Tensor:
-        return self._densities(self.fine.outputs(self._places(self.space.unit(points), time)))
+        return self._densities(self._outputs("fine", self.space.unit(points), time))
 
     def colours(self, points: Tensor, directions: Tensor, time: float) -> Tensor:
-        outputs = self.fine.outputs(self._places(self.space.unit(points), time))
-        return self.fine.colours(outputs, encoded(directions, DIRECTION_OCTAVES))
+        outputs = self._outputs("fine", self.space.unit(points), time)
+        return self._colours("fine", outputs, encoded(directions, DIRECTION_OCTAVES))
 
     def _through(
-        self, network: NerfNetwork, rays: Rays, distances: Tensor, time: float
+        self, network: str, rays: Rays, distances: Tensor, time: float
     ) -> tuple[Seen, Tensor]:
         """Return what rays see at distances (R, K), ascending, and the weights (R, K) of these."""
         samples = along(rays, self.space, distances)
-        outputs = network.outputs(self._places(samples.coords, time))
+        outputs = self._outputs(network, samples.coords, time)
         directions = encoded(rays.directions, DIRECTION_OCTAVES)[samples.rays]
-        seen: Composited = composite(
-            self._densities(outputs), network.colours(outputs, directions), samples, 0.0
-        )
+        colours = self._colours(network, outputs, directions)
+        seen = composite(self._densities(outputs), colours, samples, 0.0)
         weights = seen.weights.view(distances.shape)
         # at the sample, as published; the last one has no middle
         depth = (weights * distances).sum(1)
         return Seen(seen.colour, seen.transmittance, depth, len(samples)), weights
 
-    def _places(self, coords: Tensor, time: float) -> Tensor:
-        """Return encoded positions, in the unit of the published scenes, and time."""
+    def _layers(self, name: str, count: int) -> list[Layer]:
+        own = self.parameters
+        return [Layer(own[f"{name}.{n}.weight"], own[f"{name}.{n}.bias"]) for n in range(count)]
+
+    def _outputs(self, network: str, coords: Tensor, time: float) -> Tensor:
+        """Return (M, 1 + width) raw densities and bottlenecks at ``coords`` of the unit cube."""
+        # in the unit of the published scenes
         places = encoded((coords - 0.5) * (2 * PUBLISHED_HALF), POSITION_OCTAVES)
-        return with_time(places, time) if self.sees_time else places
+        trunk = self._layers(f"{network}.trunk", DEPTH + 1)
+        return perceptron(self.with_time(places, time), trunk, skip=SKIP)
+
+    def _colours(self, network: str, outputs: Tensor, directions: Tensor) -> Tensor:
+        """Return (M, 3) colours, seen along encoded directions."""
+        head = self._layers(f"{network}.head", 2)
+        return perceptron(torch.cat([outputs[:, 1:], directions], 1), head).sigmoid()
 
     def _densities(self, outputs: Tensor) -> Tensor:
         return outputs[:, 0].relu() * (PUBLISHED_HALF / self.space.half)
@@ -260,3 +216,19 @@ def along(rays: Rays, space: Space, distances: Tensor) -> Samples:
         ends=ends.flatten(),
         coords=space.unit(points).view(-1, 3),
     )
+
+
+class NerfTraining(FieldTraining):
+    """Training of NeRF: a fixed number of rays, a rate that falls exponentially."""
+
+    def __init__(self, run: RunStart) -> None:
+        super().__init__(run, NerfField, 1, 0)
+        self._sizes = SIZES[self._model.sizes]
+
+    @property
+    def num_rays(self) -> int:
+        return max(1, self._sizes.rays // self._batch)
+
+    def rate(self, step: int) -> float:
+        highest = self._model.lr or self._sizes.lr
+        return highest * LAST_RATE ** (step / self._run.config.train.steps)

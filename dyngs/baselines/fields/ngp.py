@@ -16,21 +16,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.baselines.fields.field import (
+from dyngs.baselines.fields.kind import NgpModel
+from dyngs.baselines.fields.scene import (
     PUBLISHED_HALF,
+    PUBLISHED_PIXELS,
     TIME,
     Field,
     Seen,
     network,
+    restored_parameters,
     truncated_exp,
-    with_time,
 )
-from dyngs.baselines.fields.keys import NgpModel
+from dyngs.baselines.fields.training import FieldTraining
+from dyngs.core.errors import DyngsError
 from dyngs.core.initialisation import glorot
-from dyngs.core.state import Role, State, with_role
+from dyngs.core.state import Role, State, prefixed, with_role
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.models.checkpoint import Checkpoint
+from dyngs.models.kind import RunStart
+from dyngs.models.model import Updated
 from dyngs.models.volume import reached_samples, thinned_samples
 from dyngs.ops.device import sent
 from dyngs.ops.harmonics import harmonics_basis
@@ -44,7 +49,6 @@ DIRECTION_DEGREE, DIRECTION_TERMS = 3, 16
 # Least length of a sample where there are several cubes, in its distance over `across`: 1/256 as
 # published
 CONE = 4.0
-PUBLISHED_PIXELS = 800  # Along a side of the images of published figures
 ACROSS = 1024 / PUBLISHED_PIXELS
 FINEST = 2.56
 """For a CPU, per pixel of an image's longest side: samples along the diagonal of the innermost
@@ -58,6 +62,14 @@ THRESHOLD = 1e-2
 """Opacity above which a cell counts as occupied, or the mean of its cube if that is less: of a
 sample as long as published, a 1,024th of the cube's diagonal."""
 CHUNK = 1 << 17  # Cells looked at together
+LOOKED_AT = 2  # Random cells looked at in an update of the occupied ones, per sample of a step
+RATE = 1e-2
+WEIGHT_DECAY = 1e-6  # L2 penalty of the networks' weights
+FIRST_SAMPLES = 256  # Samples that a ray is taken to need before any was counted
+MOST_RAYS = 1 << 15  # Of an image in a step
+RATE_RISES, FIRST_RATE = 100, 0.01  # Steps in which the rate rises from this fraction of itself
+DROPS = (0.5, 0.75, 0.9)
+DROP = 0.33  # Fractions of the run at which the rate falls by this factor
 
 
 @dataclass(frozen=True)
@@ -72,27 +84,14 @@ class NgpSizes:
     cells: int | None
     # cells of the finest level along an axis; None: by the images, see ``FINEST``
     finest: int | None
-
-    @staticmethod
-    def of(model: NgpModel) -> NgpSizes:
-        return SIZES[model.sizes]
-
-    def levels(self, pixels: int, cascades: int) -> HashLevels:
-        """Return the levels of the hash grid for images with a longest side of ``pixels`` px."""
-        finest = self.finest or min(max(64, round(FINEST * pixels * min(cascades, 2))), 4096)
-        return HashLevels.geometric(self.num_levels, 16, finest, 1 << self.log2_rows)
-
-    def across(self, pixels: int) -> int:
-        """Return the number of samples along the diagonal of the innermost cube."""
-        if self.finest == 4096:
-            return 1024
-        return min(max(128, round(ACROSS * pixels)), 1024)
+    # samples along the diagonal of the innermost cube; None: by the images, see ``ACROSS``
+    across: int | None
 
 
 SIZES = {
-    "tiny": NgpSizes(6, 4, 12, 12, 32, 128),
-    "cpu": NgpSizes(8, 4, 16, 14, None, None),
-    "published": NgpSizes(16, 2, 19, 18, None, 4096),
+    "tiny": NgpSizes(6, 4, 12, 12, 32, 128, None),
+    "cpu": NgpSizes(8, 4, 16, 14, None, None, None),
+    "published": NgpSizes(16, 2, 19, 18, None, 4096, 1024),
 }
 
 
@@ -101,102 +100,62 @@ class NgpField(Field):
     """A hash grid with its two networks, and the cells in which anything is.
 
     Attributes:
-        table: (rows, F) of all levels.
-        density, colour: weights of the networks, (out, in) each.
-        occupied: bool of ``space.shape``.
         pixels: of the longest side of the images that it was made for.
-        across: samples along the diagonal of the innermost cube.
+        occupied: bool of ``space.shape``.
     """
 
-    space: Space
     pixels: int
-    levels: HashLevels
-    table: Tensor
-    density: tuple[Tensor, ...]
-    colour: tuple[Tensor, ...]
     occupied: Tensor
-    across: int
-    sees_time: bool = False
 
-    @staticmethod
+    @classmethod
     def new(
-        model: NgpModel, space: Space, generator: torch.Generator, pixels: int = PUBLISHED_PIXELS
+        cls,
+        model: NgpModel,
+        space: Space,
+        generator: torch.Generator,
+        pixels: int = PUBLISHED_PIXELS,
     ) -> NgpField:
-        """Return a field before the first step: nearly grey, hardly dense, occupied everywhere.
-
-        ``pixels``: of the longest side of the images.
-        """
-        sizes = NgpSizes.of(model)
-        levels = sizes.levels(pixels, space.cascades)
-        rows = torch.rand((levels.num_rows, sizes.features), generator=generator, device="cpu")
-        weights = [
-            tuple(glorot(i, o, generator).requires_grad_() for i, o in pairwise(widths))
-            for widths in _widths(sizes, model.time).values()
-        ]
+        """Return a field that is nearly grey, hardly dense, occupied everywhere."""
+        own = shapes(model, space, pixels)
+        rows = torch.rand(own["table"], generator=generator, device="cpu")
+        parameters = {"table": FIRST * (2 * rows - 1)}
+        for name, (out, before) in own.items():
+            if name != "table":
+                parameters[name] = glorot(before, out, generator)
         occupied = torch.ones(space.shape, dtype=torch.bool, device="cpu")
-        table = (FIRST * (2 * rows - 1)).requires_grad_()
-        return NgpField(
-            space,
-            pixels,
-            levels,
-            table,
-            weights[0],
-            weights[1],
-            occupied,
-            sizes.across(pixels),
-            model.time,
-        )
+        return cls(model, space, parameters, pixels, occupied)
 
-    @staticmethod
-    def restored(model: NgpModel, space: Space, checkpoint: Checkpoint) -> NgpField:
-        """Return the field of a checkpoint. Raises KeyError or ValueError where its tensors do not
-        fit."""
-        stored = checkpoint.part("field")
+    @classmethod
+    def restored(cls, model: NgpModel, space: Space, stored: Mapping[str, Tensor]) -> NgpField:
         pixels = int(require_tensor("pixels", stored["pixels"], (1,), torch.int64))
-        sizes = NgpSizes.of(model)
-        levels = sizes.levels(pixels, space.cascades)
-        table = require_tensor("table", stored["table"], (levels.num_rows, sizes.features)).clone()
-        networks = {
-            name: tuple(
-                require_tensor(f"{name}.{i}", stored[f"{name}.{i}"], (out, before)).clone()
-                for i, (before, out) in enumerate(pairwise(w))
-            )
-            for name, w in _widths(sizes, model.time).items()
-        }
+        parameters = restored_parameters(stored, shapes(model, space, pixels))
         count = math.prod(space.shape)
         bits = require_tensor("occupied", stored["occupied"], (-(-count // 8),), torch.uint8)
-        occupied = _unpacked(bits, space)
-        return NgpField(
-            space,
-            pixels,
-            levels,
-            table,
-            networks["density"],
-            networks["colour"],
-            occupied,
-            sizes.across(pixels),
-            model.time,
-        )
+        flat = np.unpackbits(bits.numpy(), count=count, bitorder="little").astype(bool)
+        occupied = torch.from_numpy(flat).reshape(space.shape)
+        return cls(model, space, parameters, pixels, occupied)
 
     @property
     def num_shifts(self) -> int:
         return 2  # where the samples of a ray lie, and which of those that hardly show are taken
 
-    @property
-    def parameters(self) -> Mapping[str, Tensor]:
-        networks = {"density": self.density, "colour": self.colour}
-        weights = {
-            f"{name}.{i}": x for name, network in networks.items() for i, x in enumerate(network)
-        }
-        return {"table": self.table, **weights}
-
     def state(self) -> State:
-        tensors = {name: x.detach() for name, x in self.parameters.items()}
+        bits = np.packbits(self.occupied.cpu().numpy().ravel(), bitorder="little")
         own = {
-            "occupied": _packed(self.occupied),
+            "occupied": torch.from_numpy(bits),
             "pixels": torch.tensor([self.pixels], device="cpu"),
         }
-        return with_role(tensors | own, Role.SHARED)
+        return super().state() | with_role(own, Role.SHARED)
+
+    @cached_property
+    def levels(self) -> HashLevels:
+        return levels_of(self.model, self.space, self.pixels)
+
+    @cached_property
+    def across(self) -> int:
+        """Number of samples along the diagonal of the innermost cube."""
+        own = SIZES[self.model.sizes].across
+        return own or min(max(128, round(ACROSS * self.pixels)), 1024)
 
     @cached_property
     def step(self) -> float:
@@ -205,22 +164,18 @@ class NgpField(Field):
 
     def seen(self, rays: Rays, time: float, *, near: float, shifts: Tensor | None = None) -> Seen:
         steps = Steps(near, self.step, CONE / self.across if self.space.cascades > 1 else 0.0)
-        shift = (
-            rays.origins.new_full((len(rays),), 0.5)
-            if shifts is None
-            else shifts[:, 0].contiguous()
-        )
-        marched = march(rays, shift, self.space, self.occupied, steps)
+        places = rays.origins.new_full((len(rays), 2), 0.5) if shifts is None else shifts
+        marched = march(rays, places[:, 0].contiguous(), self.space, self.occupied, steps)
+        table = self.parameters["table"]
         with torch.no_grad():  # which samples are worth it takes their densities alone
-            features = hash_features(marched.coords, self.table, self.levels)
+            features = hash_features(marched.coords, table, self.levels)
             densities = self._density(self._geometry(features, time), marched.coords)
             if shifts is None:
                 samples, which = reached_samples(densities, marched)
             else:
                 samples, which = thinned_samples(densities, marched, shifts[:, 1])
-        geometry = self._geometry(
-            known_features(features, which, samples.coords, self.table, self.levels), time
-        )
+        features = known_features(features, which, samples.coords, table, self.levels)
+        geometry = self._geometry(features, time)
         basis = harmonics_basis(rays.directions, DIRECTION_DEGREE)
         colours = self._colours(geometry, basis[samples.rays])
         drawn = composite(self._density(geometry, samples.coords), colours, samples)
@@ -228,9 +183,7 @@ class NgpField(Field):
 
     def densities(self, points: Tensor, time: float) -> Tensor:
         coords = self.space.unit(points)
-        return self._density(
-            self._geometry(hash_features(coords, self.table, self.levels), time), coords
-        )
+        return self._density(self._geometry(self._features(coords), time), coords)
 
     def may_hold(self, points: Tensor) -> Tensor:
         """See ``Field``: what lies in occupied cells, or beyond the innermost cube."""
@@ -241,13 +194,17 @@ class NgpField(Field):
         return self.occupied[0, z, y, x] | ((place < 0) | (place > n)).any(1)
 
     def colours(self, points: Tensor, directions: Tensor, time: float) -> Tensor:
-        geometry = self._geometry(
-            hash_features(self.space.unit(points), self.table, self.levels), time
-        )
+        geometry = self._geometry(self._features(self.space.unit(points)), time)
         return self._colours(geometry, harmonics_basis(directions, DIRECTION_DEGREE))
 
+    def _features(self, coords: Tensor) -> Tensor:
+        return hash_features(coords, self.parameters["table"], self.levels)
+
+    def _network(self, x: Tensor, name: str) -> Tensor:
+        return network(x, [w for key, w in self.parameters.items() if key.startswith(name)])
+
     def _geometry(self, features: Tensor, time: float) -> Tensor:
-        return network(with_time(features, time) if self.sees_time else features, self.density)
+        return self._network(self.with_time(features, time), "density")
 
     def _density(self, geometry: Tensor, coords: Tensor) -> Tensor:
         """Return (M,) densities, per world unit; the published ones are per unit of a cube of half
@@ -262,116 +219,29 @@ class NgpField(Field):
         return found * (2 - 4 * (coords - 0.5).abs().amax(1)).clamp(max=1)  # 1 over the max-norm
 
     def _colours(self, geometry: Tensor, basis: Tensor) -> Tensor:
-        return network(torch.cat([geometry, basis], 1), self.colour).sigmoid()
+        return self._network(torch.cat([geometry, basis], 1), "colour").sigmoid()
 
 
-def _widths(sizes: NgpSizes, sees_time: bool) -> dict[str, tuple[int, ...]]:
-    """Return how many features go into each layer of the networks, and come out of the last."""
-    inputs = sizes.num_levels * sizes.features + (TIME if sees_time else 0)
-    return {
+def levels_of(model: NgpModel, space: Space, pixels: int) -> HashLevels:
+    """Return the levels of the hash grid for images with a longest side of ``pixels`` px."""
+    sizes = SIZES[model.sizes]
+    finest = min(max(64, round(FINEST * pixels * min(space.cascades, 2))), 4096)
+    return HashLevels.geometric(sizes.num_levels, 16, sizes.finest or finest, 1 << sizes.log2_rows)
+
+
+def shapes(model: NgpModel, space: Space, pixels: int) -> dict[str, tuple[int, int]]:
+    """Return the shapes of the parameters: the table of all levels, and the weights (out, in) of
+    the networks."""
+    sizes = SIZES[model.sizes]
+    inputs = sizes.num_levels * sizes.features + (TIME if model.time else 0)
+    widths = {
         "density": (inputs, WIDTH, GEOMETRY),
         "colour": (GEOMETRY + DIRECTION_TERMS, WIDTH, WIDTH, 3),
     }
-
-
-def _packed(occupied: Tensor) -> Tensor:
-    """Return (cells / 8,) uint8, rounded up: bit i % 8 of byte i / 8 is cell i."""
-    flat = occupied.flatten()
-    flat = torch.cat([flat, flat.new_zeros(-len(flat) % 8)]).view(-1, 8)
-    return (flat.to(torch.uint8) << torch.arange(8, dtype=torch.uint8, device=flat.device)).sum(
-        1, dtype=torch.uint8
-    )
-
-
-def _unpacked(bits: Tensor, space: Space) -> Tensor:
-    flat = bits[:, None] >> torch.arange(8, dtype=torch.uint8, device=bits.device) & 1
-    return flat.bool().flatten()[: math.prod(space.shape)].reshape(space.shape)
-
-
-class Occupancy:
-    """The largest opacity of a sample found in each cell, which fades until it is found again.
-
-    Args:
-        seen: bool of ``space.shape``: cells that may be occupied at all, see ``seen_cells``.
-        num_random: random cells of each look after the warm-up; a quarter of all at most.
-    """
-
-    def __init__(self, space: Space, seen: Tensor, num_random: int) -> None:
-        self._space = space
-        self.seen = seen
-        self._cells = seen.flatten().nonzero()[:, 0]
-        self._count = seen.flatten(1).sum(1).clamp_min(1)
-        self._num_random = min(num_random, -(-len(self._cells) // 4))
-        self._values = torch.zeros(math.prod(space.shape), device="cpu")
-
-    def place(self, device: torch.device) -> None:
-        """Go on on ``device``; random numbers stay those of the CPU."""
-        self.seen, self._cells, self._count, self._values = (
-            x.to(device) for x in (self.seen, self._cells, self._count, self._values)
-        )
-
-    def is_due(self, step: int) -> bool:
-        return step > EVERY and step % EVERY == 0
-
-    @torch.no_grad()
-    def updated(
-        self, field: NgpField, step: int, times: tuple[float, ...], generator: torch.Generator
-    ) -> Tensor:
-        """Look at densities at random places of cells, at one of ``times``; return bool of
-        ``space.shape``."""
-        cells = self._chosen(field.occupied, step, generator)
-        found = torch.cat([self._opacities(field, x, times, generator) for x in cells.split(CHUNK)])
-        self._values[cells] = torch.maximum(self._values[cells] * DECAY, found)
-        cubes = self._values.view(len(self._count), -1)
-        levels = (cubes.double().sum(1) / self._count).clamp(max=THRESHOLD)
-        return (cubes > levels[:, None]).view(self._space.shape)
-
-    def state(self) -> dict[str, Tensor]:
-        return {"values": self._values}
-
-    def load_state(self, state: dict[str, Tensor]) -> None:
-        self._values = require_tensor("values", state["values"], tuple(self._values.shape)).clone()
-
-    def _chosen(self, occupied: Tensor, step: int, generator: torch.Generator) -> Tensor:
-        """Return indices of cells: of all ever less often as it warms up, else random and occupied
-        ones.
-
-        At most a quarter of all each.
-        """
-        if step <= WARM_UP and step & (step - 1) == 0:
-            return self._cells
-        drawn = self._cells[self._drawn(len(self._cells), self._num_random, generator)]
-        full = occupied.flatten().nonzero()[:, 0]
-        most = -(-len(self._cells) // 4)
-        if len(full) > most:
-            full = full[self._drawn(len(full), most, generator)]
-        return torch.cat([drawn, full]).unique()
-
-    def _drawn(self, below: int, count: int, generator: torch.Generator) -> Tensor:
-        return sent(
-            torch.randint(below, (count,), generator=generator, device="cpu"), self._values.device
-        )
-
-    def _opacities(
-        self, field: NgpField, cells: Tensor, times: tuple[float, ...], generator: torch.Generator
-    ) -> Tensor:
-        space = self._space
-        n = self._space.cells
-        x = cells % n
-        y = torch.div(cells, n, rounding_mode="floor") % n
-        z = torch.div(cells, n * n, rounding_mode="floor")
-        cascade = torch.div(z, n, rounding_mode="floor")
-        z = z % n
-        half = space.half * 2.0**cascade
-        within = sent(torch.rand((len(cells), 3), generator=generator, device="cpu"), cells.device)
-        places = torch.stack([x, y, z], 1) + within
-        points = (places * (2 / n) - 1) * half[:, None] + within.new_tensor(space.centre)
-        time = (
-            times[int(torch.randint(len(times), (1,), generator=generator, device="cpu"))]
-            if times
-            else 0.0
-        )
-        return field.densities(points, time) * (half * (2 * math.sqrt(3) / 1024))
+    found = {"table": (levels_of(model, space, pixels).num_rows, sizes.features)}
+    for name, layers in widths.items():
+        found |= {f"{name}.{i}": (out, n) for i, (n, out) in enumerate(pairwise(layers))}
+    return found
 
 
 def seen_cells(space: Space, views: Sequence[View]) -> Tensor:
@@ -416,3 +286,143 @@ def _sees(view: View, points: np.ndarray, radius: float) -> np.ndarray:
             # the side of the frustum, a plane
             found &= side * across - edge * z < radius * (1 + edge * edge) ** 0.5
     return found
+
+
+class NgpTraining(FieldTraining):
+    """Training of Instant-NGP: rays per step by the number of samples, and the occupied cells.
+
+    The largest opacity of a sample found in each cell fades until it is found again.
+    """
+
+    betas = (0.9, 0.99)
+
+    def __init__(self, run: RunStart) -> None:
+        sizes = SIZES[run.config.model.sizes]
+        camera = run.images[0].cameras
+        super().__init__(run, NgpField, sizes.cells, max(camera.width, camera.height))
+        num_samples = 1 << sizes.log2_samples
+        self._wanted = max(1, num_samples // self._batch)
+        # rays and samples of this step
+        self._counted = torch.zeros(2, dtype=torch.float64, device="cpu")
+        self._rays = max(1, self._wanted // FIRST_SAMPLES)
+        self._most_random = LOOKED_AT * num_samples
+        self._find_seen_cells()
+        self._field.occupied.copy_(self._cells_of_views)
+
+    @property
+    def _field(self) -> NgpField:
+        field = self._scene.field
+        assert isinstance(field, NgpField)
+        return field
+
+    def _find_seen_cells(self) -> None:
+        """Find the cells that may be occupied at all; nothing was found in any yet."""
+        space = self._field.space
+        seen = seen_cells(space, self._run.capture.splits["train"])
+        if not bool(seen.any()):
+            raise DyngsError(
+                f"{self._run.config.data.root}: no training camera sees anything of the cube that the field lies in: "
+                "give model.half_extent, or model.surroundings=always"
+            )
+        self._cells_of_views = seen
+        self._cells = seen.flatten().nonzero()[:, 0]
+        self._opacities = torch.zeros(seen.numel(), device="cpu")
+
+    def error(self, one: Tensor, other: Tensor) -> Tensor:
+        return torch.nn.functional.smooth_l1_loss(one, other, reduction="none")
+
+    @property
+    def num_rays(self) -> int:
+        return self._rays
+
+    def count(self, num_rays: int, num_samples: int) -> None:
+        self._counted += torch.tensor([num_rays, num_samples], dtype=torch.float64, device="cpu")
+
+    def tallies(self, step: int) -> Sequence[Tensor]:
+        return [self._counted]
+
+    def rate(self, step: int) -> float:
+        rising = min(1.0, FIRST_RATE + (1 - FIRST_RATE) * (step - 1) / RATE_RISES)
+        fallen = sum(step > fraction * self._run.config.train.steps for fraction in DROPS)
+        return (self._model.lr or RATE) * rising * DROP**fallen
+
+    def update(self, step: int) -> Updated:
+        for name, x in self._field.parameters.items():
+            if name != "table" and x.grad is not None:
+                x.grad.add_(x.detach(), alpha=WEIGHT_DECAY)
+        updated = super().update(step)
+        if step > EVERY and step % EVERY == 0:
+            self._look_at_cells(step)
+        rays, samples = self._counted.tolist()
+        self._rays = max(1, min(MOST_RAYS, int(rays * self._wanted / max(samples, 1.0))))
+        self._counted.zero_()
+        return updated
+
+    @torch.no_grad()
+    def _look_at_cells(self, step: int) -> None:
+        """Look at the densities at random places of cells, at a time of training."""
+        cells = self._looked_at(step)
+        found = torch.cat([self._opacities_of(x) for x in cells.split(CHUNK)])
+        self._opacities[cells] = torch.maximum(self._opacities[cells] * DECAY, found)
+        seen = self._cells_of_views.flatten(1)
+        cubes = self._opacities.view(seen.shape)
+        means = cubes.double().sum(1) / seen.sum(1).clamp_min(1)
+        occupied = cubes > means.clamp(max=THRESHOLD)[:, None]
+        self._field.occupied.copy_(occupied.view(self._field.space.shape))
+
+    def _looked_at(self, step: int) -> Tensor:
+        """Return indices of cells: of all ever less often as it warms up, else random and occupied
+        ones.
+
+        At most a quarter of all each.
+        """
+        if step <= WARM_UP and step & (step - 1) == 0:
+            return self._cells
+        most = -(-len(self._cells) // 4)
+        drawn = self._cells[self._drawn(len(self._cells), min(self._most_random, most))]
+        full = self._field.occupied.flatten().nonzero()[:, 0]
+        if len(full) > most:
+            full = full[self._drawn(len(full), most)]
+        return torch.cat([drawn, full]).unique()
+
+    def _drawn(self, below: int, count: int) -> Tensor:
+        drawn = torch.randint(below, (count,), generator=self._run.generator, device="cpu")
+        return sent(drawn, self._cells.device)
+
+    def _opacities_of(self, cells: Tensor) -> Tensor:
+        generator = self._run.generator
+        space = self._field.space
+        n = space.cells
+        x = cells % n
+        y = torch.div(cells, n, rounding_mode="floor") % n
+        z = torch.div(cells, n * n, rounding_mode="floor")
+        half = space.half * 2.0 ** torch.div(z, n, rounding_mode="floor")
+        within = sent(torch.rand((len(cells), 3), generator=generator, device="cpu"), cells.device)
+        places = torch.stack([x, y, z % n], 1) + within
+        points = (places * (2 / n) - 1) * half[:, None] + within.new_tensor(space.centre)
+        times = self._scene.seen_at or (0.0,)
+        which = 0
+        if self._scene.seen_at:
+            which = int(torch.randint(len(times), (1,), generator=generator, device="cpu"))
+        return self._field.densities(points, times[which]) * (half * (2 * math.sqrt(3) / 1024))
+
+    def state(self) -> State:
+        own = {"values": self._opacities, "rays": torch.tensor([self._rays], device="cpu")}
+        return super().state() | prefixed("occupancy", with_role(own, Role.TRAINING))
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        before = self._field.space
+        super().restore(checkpoint)
+        stored = checkpoint.part("occupancy")
+        if self._field.space != before:  # to find what cameras see takes seconds
+            self._find_seen_cells()
+        shape = tuple(self._opacities.shape)
+        self._opacities = require_tensor("values", stored["values"], shape).clone()
+        rays = int(require_tensor("rays", stored["rays"], (1,), torch.int64))
+        self._rays = min(MOST_RAYS, max(1, rays))
+
+    def place(self, device: torch.device) -> None:
+        super().place(device)
+        self._cells_of_views, self._cells, self._opacities = (
+            x.to(device) for x in (self._cells_of_views, self._cells, self._opacities)
+        )

@@ -1,26 +1,28 @@
-"""A radiance field as something to draw: where it lies in a capture, its images, its surface."""
+"""Radiance fields: the interface of a field, how it is drawn, where it lies in a capture, and its
+surface."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.baselines.fields.field import PUBLISHED_HALF, Field
-from dyngs.baselines.fields.keys import FieldModel
+from dyngs.baselines.fields.kind import FieldModel
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import Role, State, StateTensor, prefixed
+from dyngs.core.state import Role, State, prefixed, with_role
 from dyngs.core.tensor_checks import require_moments, require_tensor
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import focus_point, fraction_in_front, inverse_rigid
 from dyngs.data.scene_space import extent_of
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.renderable import (
     DrawOptions,
     Renderable,
@@ -31,9 +33,12 @@ from dyngs.models.renderable import (
     composited,
     fixed_cameras,
 )
+from dyngs.models.views import evaluation_background
 from dyngs.models.volume import rays_of
-from dyngs.ops.rays import Space
+from dyngs.ops.perceptron import Layer, perceptron
+from dyngs.ops.rays import Rays, Space
 
+NEAR = 0.05  # Nearest distance that is drawn, in units of half the side of the innermost cube
 CHUNK = 1 << 13  # Rays drawn together
 MOST_CASCADES = 7  # Cubes of surroundings: the outermost is 64 times the innermost
 # Along an axis of a single cube, and of each of several: looking at all takes a while
@@ -47,6 +52,142 @@ LEVEL = 25.0
 """Density at the surface, unless asked otherwise, per unit of a world whose innermost cube has half
 side 1.5: half of the light is lost in a 36th of a unit."""
 POINTS = 1 << 17  # Points looked at together
+LARGEST_EXPONENT = 15.0
+TIME_OCTAVES = 4
+TIME = 1 + 2 * TIME_OCTAVES
+"""Numbers that a time in [0, 1] is encoded in."""
+PUBLISHED_HALF = 1.5
+"""Half the side of the cube of published figures: densities are per unit of a world in which the
+cube is as large."""
+PUBLISHED_PIXELS = 800  # Along a side of the images of published figures
+
+F = TypeVar("F", bound="Field")
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What R rays see, before black."""
+
+    colour: Tensor  # (R, 3)
+    transmittance: Tensor  # (R,)
+    depth: Tensor  # (R,) sum of weight times the distance along the ray
+    num_samples: int  # that were taken
+    coarse: Seen | None = None  # by the coarse network, where there is one
+
+
+@dataclass(frozen=True)
+class Field(ABC):
+    """A radiance field.
+
+    Attributes:
+        space: where it has a density.
+        parameters: all that is learned, by name; leaves while it is trained.
+    """
+
+    model: Any
+    space: Space
+    parameters: dict[str, Tensor]
+
+    @classmethod
+    @abstractmethod
+    def new(
+        cls: type[F],
+        model: Any,
+        space: Space,
+        generator: torch.Generator,
+        pixels: int = PUBLISHED_PIXELS,
+    ) -> F:
+        """Return a field before the first step; ``pixels``: of the longest side of the images."""
+
+    @classmethod
+    @abstractmethod
+    def restored(cls: type[F], model: Any, space: Space, stored: Mapping[str, Tensor]) -> F:
+        """Return the field in a state. Raises KeyError or ValueError where its tensors do not
+        fit."""
+
+    @property
+    @abstractmethod
+    def num_shifts(self) -> int:
+        """K: random numbers that a ray needs in training."""
+
+    @abstractmethod
+    def seen(self, rays: Rays, time: float, *, near: float, shifts: Tensor | None = None) -> Seen:
+        """Return what rays see at ``time``; differentiable in the parameters.
+
+        Args:
+            near: what is nearer is not drawn, world units.
+            shifts: (R, K) random numbers in [0, 1) that place the samples, see ``num_shifts``;
+                None: evenly.
+        """
+
+    @abstractmethod
+    def densities(self, points: Tensor, time: float) -> Tensor:
+        """Return (M,) densities, per world unit, at points (M, 3) of the world."""
+
+    @abstractmethod
+    def colours(self, points: Tensor, directions: Tensor, time: float) -> Tensor:
+        """Return (M, 3) colours of points (M, 3) of the world, seen along unit directions (M,
+        3)."""
+
+    def may_hold(self, points: Tensor) -> Tensor:
+        """Return (M,) bool: whether there may be anything at points (M, 3) of the world, before
+        looking."""
+        return torch.ones(len(points), dtype=torch.bool, device=points.device)
+
+    def state(self) -> State:
+        """Return its tensors by name, with their role."""
+        return with_role({name: x.detach() for name, x in self.parameters.items()}, Role.SHARED)
+
+    def with_time(self, x: Tensor, time: float) -> Tensor:
+        """Return the inputs (M, K) of a network, followed by the encoded ``time`` where the field
+        moves (T-NeRF)."""
+        if not self.model.time:
+            return x
+        when = encoded(x.new_full((1, 1), time), TIME_OCTAVES)
+        return torch.cat([x, when.expand(len(x), -1)], 1)
+
+
+def restored_parameters(
+    stored: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]]
+) -> dict[str, Tensor]:
+    """Return the parameters in a state. Raises KeyError or ValueError where they do not fit."""
+    return {
+        name: require_tensor(name, stored[name], shape).clone() for name, shape in shapes.items()
+    }
+
+
+class _TruncatedExp(torch.autograd.Function):
+    """exp, whose gradient is that of ``LARGEST_EXPONENT`` beyond it (Instant-NGP)."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        return x.exp()
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        (x,) = ctx.saved_tensors
+        return grad * x.clamp(max=LARGEST_EXPONENT).exp()
+
+
+def truncated_exp(x: Tensor) -> Tensor:
+    """Return exp(x), whose gradient does not grow beyond exp(15)."""
+    result: Tensor = _TruncatedExp.apply(x)  # pyright: ignore[reportAssignmentType]
+    return result
+
+
+def encoded(x: Tensor, octaves: int) -> Tensor:
+    """Return (M, D (1 + 2 octaves)): x, then the sines and cosines of 2^k x of each octave k,
+    without pi (NeRF)."""
+    parts = [x]
+    for k in range(octaves):
+        parts += [(2.0**k * x).sin(), (2.0**k * x).cos()]
+    return torch.cat(parts, 1)
+
+
+def network(x: Tensor, weights: Sequence[Tensor]) -> Tensor:
+    """Return (M, out) outputs of a perceptron without biases."""
+    return perceptron(x, [Layer(weight, weight.new_zeros(len(weight))) for weight in weights])
 
 
 @dataclass(frozen=True)
@@ -68,7 +209,7 @@ class FieldScene(Renderable):
 
     @property
     def is_static(self) -> bool:
-        return not self.field.sees_time
+        return not self.field.model.time
 
     @property
     def bounds(self) -> Tensor:
@@ -82,16 +223,11 @@ class FieldScene(Renderable):
 
     def state(self) -> State:
         space = self.field.space
-        numbers = torch.tensor(
-            [*space.centre, space.half, space.cascades, space.cells],
-            dtype=torch.float64,
-            device="cpu",
-        )
-        times = torch.tensor(self.seen_at, dtype=torch.float64, device="cpu")
-        own = {"space": StateTensor(numbers, Role.SHARED)} | self.field.state()
-        return prefixed(
-            "field", own | ({"times": StateTensor(times, Role.SHARED)} if self.seen_at else {})
-        )
+        numbers = [*space.centre, space.half, space.cascades, space.cells]
+        own = {"space": torch.tensor(numbers, dtype=torch.float64, device="cpu")}
+        if self.seen_at:
+            own["times"] = torch.tensor(self.seen_at, dtype=torch.float64, device="cpu")
+        return prefixed("field", with_role(own, Role.SHARED) | self.field.state())
 
     def render(
         self,
@@ -127,18 +263,21 @@ class FieldScene(Renderable):
         return colour.view(*shape, 3), through.view(shape), depth.view(shape)
 
 
-def stored_space(stored: Mapping[str, Tensor]) -> Space:
-    """Return the space in a state. Raises KeyError or ValueError."""
+def restored_scene(
+    field_class: type[Field], model: FieldModel, checkpoint: Checkpoint
+) -> FieldScene:
+    """Return the scene of a checkpoint. Raises KeyError or ValueError where its tensors do not
+    fit."""
+    stored = checkpoint.part("field")
     numbers = require_tensor("space", stored["space"], (6,), torch.float64).tolist()
     x, y, z, half, cascades, cells = numbers
     if not (half > 0 and cascades in range(1, 17) and cells in range(1, 1025)):
         raise ValueError(f"'space' is no space: {numbers}")
-    return Space((x, y, z), half, int(cascades), int(cells))
-
-
-def stored_times(stored: Mapping[str, Tensor]) -> tuple[float, ...]:
-    """Return the training times in a state; none where there are none. Raises ValueError."""
-    return tuple(require_moments("times", stored["times"]).tolist()) if "times" in stored else ()
+    space = Space((x, y, z), half, int(cascades), int(cells))
+    field = field_class.restored(model, space, stored)
+    times = require_moments("times", stored["times"]).tolist() if "times" in stored else ()
+    behind = evaluation_background(checkpoint.info.background, False)[1]
+    return FieldScene(field, tuple(times), DrawOptions(near=NEAR * half), behind)
 
 
 def space_of(model: FieldModel, cells: int | None, capture: Capture) -> Space:

@@ -15,7 +15,7 @@ from torch import Tensor
 from dyngs.core.conventions import num_sh_terms
 from dyngs.core.state import Role, State, StateTensor, with_role
 from dyngs.core.tensor_checks import require_indices, require_tensor
-from dyngs.ops.patches import NUM_POINTS, lattice, lattice_size, lattice_values, patch_values
+from dyngs.ops.patches import NUM_POINTS, lattice, lattice_size, patch_values
 
 CORNERS = (0, 3, 5)  # control points 200, 020, 002
 _EDGES = ((0, 3), (0, 5), (3, 5))  # corners that the points 110, 101, 011 lie between
@@ -56,9 +56,7 @@ class Patches:
 
     def colours_at(self, ids: Tensor, uv: Tensor) -> Tensor:
         """Return (N, 3) colours without harmonics of places (N, 2) on triangles (N,) int32."""
-        if self.texture == 0:
-            return patch_values(self.colours, ids, uv)
-        return lattice_values(self.colours, ids, uv, self.texture)
+        return patch_values(self.colours, ids, uv, self.texture)
 
     @property
     def areas(self) -> Tensor:

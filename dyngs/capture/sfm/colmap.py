@@ -3,7 +3,7 @@ in."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Literal
 from dyngs.capture.sfm.photos import Photo
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError
-from dyngs.io.containment import MAX_MEGAPIXELS
 from dyngs.io.write import write_text
 
 if TYPE_CHECKING:
@@ -37,21 +36,16 @@ class SfmOptions:
         num_frames: images to take at most from a video, None = 100; of several videos time steps,
             None = ``times.MOST_STEPS``, fewer for many cameras.
         masks: folder of masks of the photos, named as in captures; white = keep. None without.
-        starts: of several videos: camera to the second at which its video begins; None: as in
-            ``videos.json``, else found.
         num_threads: for features and matches, 0 = all cores; mapping has one, so that the result is
             always the same.
         follow_links: photos and videos may be links that lead out of their folder.
-        max_megapixels: larger images and videos are refused.
     """
 
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     num_frames: int | None = None
     masks: Path | None = None
-    starts: Mapping[str, float] | None = None
     num_threads: int = 0
     follow_links: bool = False
-    max_megapixels: float = MAX_MEGAPIXELS
 
 
 @dataclass(frozen=True)
@@ -84,10 +78,7 @@ class SfmTask:
     def has_one_lens(self) -> bool:
         """Whether all images share a lens: of a video, or of the same size, camera model and focal
         length (EXIF)."""
-        kinds = {
-            (p.header.upright_size, p.header.tags.model, p.header.tags.focal_px)
-            for p in self.photos
-        }
+        kinds = {(p.header.upright_size, p.header.camera, p.header.focal_px) for p in self.photos}
         return self.is_video or len(kinds) == 1
 
 

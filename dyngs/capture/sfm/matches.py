@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -69,100 +68,17 @@ def angles_deg(model: pycolmap.Reconstruction) -> np.ndarray:
     return np.array(angles)
 
 
-_MOST_PAIRS, _MOST_MATCHES = 120, 200  # pairs, and matches of each, that are looked at
-_FOCALS = np.geomspace(0.4, 3.0, 13)
-"""Focal lengths that are tried, as fractions of the image's longest side."""
-_FINE = 9  # focal lengths that are tried between the neighbours of the best of these
-_ROUNDS = 3  # how often a turn is found anew from the matches that it explains best
-_WIDEST, _FAR = 90, 75  # percentiles: of the pairs, and of the matches of a pair
-_CELLS = 8  # cells, of which the longest side has so many, in which matches are counted
-
-
-@dataclass(frozen=True)
-class MatchedPair:
-    """Matched places of two images.
-
-    Attributes:
-        first, second: (M, 2) from the middle of the image, as fractions of its longest side.
-        covered: fraction of the first image, as far as it has features, in which some match.
-    """
-
-    first: np.ndarray
-    second: np.ndarray
-    covered: float = 1.0
-
-
-def parallax_of(pairs: list[MatchedPair]) -> tuple[float, float]:
-    """Return the parallax of the pairs that have most of it (90 % have less), as a fraction of the
-    longest side, and ``MatchedPair.covered`` (median over pairs).
-
-    The parallax of a pair is the distance that three quarters of its matches stay below after the
-    turn of the camera that explains them best, with the focal length, common to all, that leaves
-    least. It is that of noise where the camera only rotated, however far, and about the focal
-    length times the shift over the depth where it moved. Without pairs nothing is known, and it is
-    1. Where matches cover less than half of the images, they may be those of a thing that moves.
-    Noise of matches is about half a pixel.
-    """
-    if not pairs:
-        return 1.0, 1.0
-
-    def left_with(focals: np.ndarray) -> np.ndarray:
-        return np.array([[_left(pair, focal) for pair in pairs] for focal in focals])
-
-    best = int(left_with(_FOCALS).mean(1).argmin())
-    low = _FOCALS[max(best - 1, 0)]
-    high = _FOCALS[min(best + 1, len(_FOCALS) - 1)]
-    fine = left_with(np.linspace(low, high, _FINE))
-    fraction = float(np.percentile(fine[fine.mean(1).argmin()], _WIDEST))
-    return fraction, float(np.median([pair.covered for pair in pairs]))
-
-
-def matched_pairs(database: Path) -> list[MatchedPair]:
-    """Return up to 120 well matched pairs of COLMAP's database, evenly chosen."""
+def flat_fraction(database: Path) -> float:
+    """Return the fraction of well matched pairs that a homography explains: all of them where the
+    camera only rotated."""
     import pycolmap
 
     with pycolmap.Database.open(database) as opened:
-        ids, geometries = opened.read_two_view_geometries()
-        found = [(i, np.asarray(g.inlier_matches)) for i, g in zip(ids, geometries, strict=True)]
-        found = [
-            (pycolmap.pair_id_to_image_pair(i), matches)
-            for i, matches in found
-            if len(matches) >= _WELL
-        ]
-        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
-        owners = {image.image_id: cameras[image.camera_id] for image in opened.read_all_images()}
-
-        def places(image: int, rows: np.ndarray) -> np.ndarray:
-            camera = owners[image]
-            xy = np.asarray(opened.read_keypoints(image))[rows, :2].astype(np.float64)
-            return (xy - (camera.width / 2, camera.height / 2)) / max(camera.width, camera.height)
-
-        pairs = []
-        for (a, b), matches in found[:: -(-len(found) // _MOST_PAIRS) or 1]:
-            few = matches[:: -(-len(matches) // _MOST_MATCHES)]
-            every = places(a, np.arange(opened.num_keypoints_for_image(a)))
-            covered = _cells(every[matches[:, 0]]) / _cells(every)
-            pairs.append(MatchedPair(every[few[:, 0]], places(b, few[:, 1]), covered))
-    return pairs
-
-
-def _cells(places: np.ndarray) -> int:
-    return len(np.unique(np.floor(places * _CELLS).astype(int), axis=0))
-
-
-def _left(pair: MatchedPair, focal: float) -> float:
-    """Return the distance that three quarters of the matches stay below after the best turn."""
-    first, second = (np.c_[xy / focal, np.ones(len(xy))] for xy in (pair.first, pair.second))
-    a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (first, second))
-    kept = np.ones(len(a), bool)
-    distances = np.zeros(len(a))
-    for _ in range(_ROUNDS):
-        u, _, vt = np.linalg.svd(b[kept].T @ a[kept])
-        turned = a @ ((u * (1, 1, np.sign(np.linalg.det(u @ vt)))) @ vt).T
-        depth = np.maximum(turned[:, 2], 1e-3)
-        distances = np.linalg.norm(turned[:, :2] / depth[:, None] * focal - pair.second, axis=1)
-        kept = distances <= np.percentile(distances, _FAR)
-    return float(np.percentile(distances, _FAR))
+        _, geometries = opened.read_two_view_geometries()
+    kinds = [x.config for x in geometries if len(x.inlier_matches) >= _WELL]
+    kind = pycolmap.TwoViewGeometryConfiguration
+    flat = [x.value for x in (kind.PLANAR, kind.PANORAMIC, kind.PLANAR_OR_PANORAMIC)]
+    return float(np.isin(kinds, flat).mean()) if kinds else 0.0
 
 
 def _sampson(matrix: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -134,10 +134,7 @@ def lay_out(
     images.mkdir(exist_ok=True)
     for index, photo in enumerate(photos):
         stored = stored_in / photo.name
-        lies = (
-            is_lying(photo.header.tags.orientation)
-            and photo.header.upright_size != photo.header.size
-        )
+        lies = is_lying(photo.header.orientation) and photo.header.upright_size != photo.header.size
         is_written = lies or photo.header.format_name not in _FOR_COLMAP
         name = f"{index:06d}" + (".png" if is_written else _FOR_COLMAP[photo.header.format_name])
         names.append(name)
@@ -195,7 +192,7 @@ def _is_heif(photo: Path) -> bool:
 def _is_converted(photo: Path, header: ImageHeader | None) -> bool:
     if header is None or photo.suffix.lower() not in SUFFIXES:
         return True
-    return header.tags.orientation != 1 and header.upright_size == header.size
+    return header.orientation != 1 and header.upright_size == header.size
 
 
 def _stored_names(converted: dict[Path, bool]) -> dict[Path, Path]:

@@ -16,8 +16,7 @@ from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, as_word, counted, reading, show
 from dyngs.data.images.video import VIDEO_SUFFIXES, videos_in
 from dyngs.data.read import is_capture
-from dyngs.io.lock import make_once
-from dyngs.io.outputs import command_for, note_sources
+from dyngs.io.outputs import command_for, make_once, note_source
 from dyngs.io.write import cache_folder
 
 FEWEST_PHOTOS = 3
@@ -68,16 +67,14 @@ def with_poses(
         say(
             f"{source} has no poses; they are estimated first, as by `dyngs data sfm`, into {folder}"
         )
-        options = SfmOptions(
-            masks=masks, follow_links=data.follow_links, max_megapixels=data.max_megapixels
-        )
+        options = SfmOptions(masks=masks, follow_links=data.follow_links)
         if videos:
             say(poses_of_videos(source, folder, options, report))
         else:
             say(estimate_poses(source, folder, options, report).summary())
 
     make_once(folder, estimate, say, f"{source} has no poses; those of before are in {folder}")
-    note_sources(folder, data.root)
+    note_source(folder, data.root)
     return data.model_copy(update={"root": folder})
 
 

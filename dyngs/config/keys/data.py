@@ -7,8 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from dyngs.core.section import Positive, Section
-from dyngs.io.containment import MAX_MEGAPIXELS
+from dyngs.core.section import Section
 
 
 class DataConfig(Section):
@@ -73,11 +72,6 @@ class DataConfig(Section):
         ge=1,
         description="shrink images so that the longer side has at most this many px; null: do not",
     )
-    undistort: Literal["same_focal", "wide"] = Field(
-        default="same_focal",
-        description="pinhole that images of other lenses are undistorted to; same_focal: of the same focal length, "
-        "what lies beyond its edges is lost; wide: of a shorter one that shows all the lens saw, within 120 degrees",
-    )
     test_every: int = Field(
         default=8,
         ge=0,
@@ -93,13 +87,6 @@ class DataConfig(Section):
         description="folder of a fit by `dyngs data fit`, read in place of the capture's body parameters",
     )
     cache_mb: float = Field(default=4096, ge=0, description="memory for decoded images, MB")
-    frame_cache_mb: float = Field(
-        default=4096, ge=0, description="disk space for decoded video frames, MB"
-    )
     follow_links: bool = Field(
         default=False, description="allow files of the capture that lie outside its folder"
-    )
-    max_megapixels: Positive = Field(
-        default=MAX_MEGAPIXELS,
-        description="images and videos with more megapixels are refused, not decoded",
     )

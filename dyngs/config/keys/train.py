@@ -51,8 +51,8 @@ class TrainConfig(Section):
     )
     priors: tuple[Literal["depth", "flow", "tracks", "motion_masks"], ...] = Field(
         default=("depth", "flow", "tracks", "motion_masks"),
-        description="what is used in addition to images where the capture has it and it agrees with them: depth maps, "
-        "optical flow, 2D tracks, and masks that say what moves (docs/priors.md)",
+        description="what is used in addition to images where the capture has it: depth maps, optical flow, 2D tracks, "
+        "and masks that say what moves (docs/priors.md)",
     )
     robust: Literal["never", "auto", "always"] = Field(
         default="never",

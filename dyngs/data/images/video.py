@@ -1,24 +1,33 @@
-"""Decoding of video files, through PyAV."""
+"""Decoding of video files, through PyAV, and the cache of their frames."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
+import os
+import re
+import shutil
 import struct
+import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import asdict, dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from dyngs.core.errors import DyngsError, counted, reading, reason
+from dyngs.data.capture import VideoFrame
 from dyngs.data.images.colour_space import BT2020, UNSPECIFIED, ColourTags, to_srgb
 from dyngs.data.images.images import files_in, rotated_upright
-from dyngs.io.containment import check_size
+from dyngs.io.containment import allowed, check_size, inside, require_at_most
+from dyngs.io.fields import read_limited
 from dyngs.io.outputs import VIDEO_SUFFIXES as VIDEO_SUFFIXES
+from dyngs.io.write import cache_folder, write_image, write_text
 
 if TYPE_CHECKING:
     import av
@@ -201,7 +210,7 @@ def opened_video(path: Path) -> Iterator[InputContainer]:
     files, are refused.
 
     Raises:
-        DyngsError: no video in it, or one larger than ``data.max_megapixels``.
+        DyngsError: no video in it, or one that is too large.
         FFmpegError: damage.
     """
     import av
@@ -288,3 +297,109 @@ def _rotated_rgb(path: Path, frame: av.VideoFrame, tags: ColourTags) -> np.ndarr
             )
             rgb = to_srgb(wide, tags, white)
         return rotated_upright(rgb, orientation_of(frame))
+
+
+# Cache of frames as image files, found again by the content of the video
+
+MAX_CACHED_BYTES = 4 * 10**9  # of the frames of one capture, times ``DYNGS_LIMITS``
+_KEPT_SECONDS = 3 * 86_400  # frames used since then may be those of a running training
+_WHOLE_BYTES = 2**30  # larger videos are compared by their beginning and modification time only
+_MARK_NAME = "video.json"
+
+
+@dataclass(frozen=True)
+class VideoFrames:
+    """Image files of the frames of the video ``source``, in order; ``decode_frames`` writes those
+    that are missing."""
+
+    info: VideoInfo
+    source: Path
+    paths: tuple[Path, ...]
+
+
+def planned_frames(video: Path) -> VideoFrames:
+    """Return the frames of ``video`` and where they are cached; nothing is written.
+
+    They lie in ``CACHE/frames/NAME.DIGEST/frame_000000.png`` and so on; ``video.json`` next to them
+    holds the ``VideoInfo`` and marks the folder as ours.
+    """
+    with reading(inside(video), "check the path and its permissions"):
+        status = video.stat()
+        digest = _digest(video, status.st_size, status.st_mtime_ns)
+    label = re.sub(r"[^A-Za-z0-9-]", "_", video.stem)[:40]
+    # Two cameras may have filmed the same: the name keeps their frames apart.
+    named = hashlib.sha256(os.fsencode(video.name) + b"\0" + digest + DECODER_VERSION).hexdigest()
+    folder = cache_folder("frames") / f"{label}.{named[:32]}"
+    info = _stored_info(folder) or probe_video(video)
+    numbers = range(info.num_frames)
+    return VideoFrames(info, video, tuple(folder / f"frame_{i:06d}.png" for i in numbers))
+
+
+def decode_frames(root: Path, frames: Mapping[Path, VideoFrame]) -> None:
+    """Decode the frames whose image is missing; every file is written atomically.
+
+    The total size is estimated from the frames written so far, so that too much is refused early.
+    The least recently used frames of other captures are removed to make room. Raises DyngsError: a
+    damaged video (names it and the frame), or more than the limit.
+    """
+    videos = {path.parent: frame.video for path, frame in frames.items()}
+    missing: dict[Path, list[int]] = {folder: [] for folder in videos}
+    for path, frame in frames.items():
+        if not path.is_file():
+            missing[path.parent].append(frame.number)
+    need = sum(map(len, missing.values()))
+    count = written = 0
+    for folder, numbers in missing.items():
+        mark = folder / _MARK_NAME
+        if not _stored_info(folder):
+            write_text(mark, json.dumps(asdict(probe_video(videos[folder]))))
+        with suppress(OSError):  # a read-only cache
+            os.utime(mark)
+        for number, rgb in read_numbered_frames(videos[folder], numbers):
+            path = folder / f"frame_{number:06d}.png"
+            # a third of the time of the usual level, a tenth more bytes
+            write_image(path, rgb, png_level=1)
+            count += 1
+            written += path.stat().st_size
+            if count & (count - 1) == 0:  # 1, 2, 4, 8, ...
+                more = written * (need - count) // count
+                total = sum(map(_num_bytes, videos)) + more
+                require_at_most(root, total, MAX_CACHED_BYTES, "bytes of video frames")
+                _make_room(videos, total)
+
+
+def _make_room(kept: Collection[Path], total: int) -> None:
+    """Remove the least recently used folders while they and ``total`` bytes exceed the limit."""
+    marks = [folder / _MARK_NAME for folder in cache_folder("frames").iterdir()]
+    others = [mark for mark in marks if mark.parent not in kept and _stored_info(mark.parent)]
+    for mark in sorted(others, key=lambda mark: mark.stat().st_mtime, reverse=True):
+        total += _num_bytes(mark.parent)
+        is_old = mark.stat().st_mtime < time.time() - _KEPT_SECONDS
+        if total > allowed(MAX_CACHED_BYTES) and is_old:
+            shutil.rmtree(mark.parent, ignore_errors=True)
+
+
+@lru_cache(maxsize=4096)
+def _digest(video: Path, size: int, changed_ns: int) -> bytes:
+    """SHA-256 of size and bytes; for huge files of size, modification time and the beginning."""
+    digest = hashlib.sha256(str(size).encode())
+    if size > _WHOLE_BYTES:
+        digest.update(str(changed_ns).encode())
+    with video.open("rb") as file:
+        while block := file.read(2**20):
+            digest.update(block)
+            if size > _WHOLE_BYTES:
+                break
+    return digest.digest()
+
+
+def _stored_info(folder: Path) -> VideoInfo | None:
+    """Return what the mark of ``folder`` says about the video, None without a mark of ours."""
+    try:
+        return VideoInfo(**json.loads(read_limited(folder / _MARK_NAME)))
+    except (DyngsError, OSError, ValueError, TypeError):
+        return None
+
+
+def _num_bytes(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.glob("*.png"))

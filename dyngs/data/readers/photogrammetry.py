@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path, PureWindowsPath
 from typing import Any
@@ -23,9 +22,6 @@ from dyngs.io.containment import inside
 from dyngs.io.fields import first_few, numbers_of
 
 _HEAD_BYTES = 4096
-_LENS_ERROR = 1e-4
-"""Largest error of a fitted distortion, in focal lengths: a tenth of a pixel in a photo of 1000
-pixels."""
 _ADVICE = "export it again"
 _Fields = dict[str, Any]
 """Fields of a frame in a transforms file."""
@@ -94,26 +90,14 @@ def _radial(coefficients: Sequence[float]) -> _Fields:
     return {f"k{i}": k for i, k in enumerate(coefficients, start=1)}
 
 
-def _brown(where: str, k: Sequence[float], diagonal: float) -> _Fields:
-    """Return the radial distortion 1 + k1 r^2 + .. + k4 r^8 in OpenCV's terms, which have no such
-    k4.
-
-    OpenCV's rational function is fitted to it, up to the corners of a photo whose ``diagonal`` is
-    in focal lengths.
-    """
-    if k[3] == 0:
-        return _radial(k[:3])
-    # barrel distortion brings more in than half of it
-    radius = np.linspace(0, 0.6 * diagonal, 1000)[:, None]
-    factor = 1 + radius ** [2, 4, 6, 8] @ np.array(k)[:, None]
-    powers = radius ** [2, 4, 6]
-    fitted = np.linalg.lstsq(np.hstack([powers, -factor * powers]), factor - 1, rcond=None)[0]
-    error = radius * ((1 + powers @ fitted[:3]) / (1 + powers @ fitted[3:]) - factor)
-    if not np.abs(error).max() < _LENS_ERROR:
+def _brown(where: str, k: Sequence[float]) -> _Fields:
+    """Return the radial distortion 1 + k1 r^2 + .. + k3 r^6 in OpenCV's terms, which have no term
+    of r^8."""
+    if k[3] != 0:
         raise DyngsError(
             f"{where}: its distortion with k4={k[3]:g} cannot be expressed; export undistorted photos"
         )
-    return {**_radial(fitted[:, 0].tolist()), "camera_model": "FULL_OPENCV"}
+    return _radial(k[:3])
 
 
 def read_metashape(root: Path) -> Capture:
@@ -146,9 +130,7 @@ def read_metashape(root: Path) -> Capture:
                 placed = _placed(placement, np.array(pose.split(), np.float64).reshape(4, 4))
                 fields["transform_matrix"] = (placed @ OPENGL_FROM_OPENCV).tolist()
             cameras.append((camera.attrib["label"], fields))
-        ignored = [line for sensor in sensors.values() for line in _ignored_terms(sensor)]
-    capture = _capture(root, "metashape", path, _Photos(root), cameras)
-    return capture.replace(warnings=(*ignored, *capture.warnings))
+    return _capture(root, "metashape", path, _Photos(root), cameras)
 
 
 def _placed(transform: ElementTree.Element | None, pose: np.ndarray) -> np.ndarray:
@@ -163,14 +145,6 @@ def _placed(transform: ElementTree.Element | None, pose: np.ndarray) -> np.ndarr
     placed[:3, :3] = rotation @ pose[:3, :3]
     placed[:3, 3] = float(transform.findtext("scale", "1")) * rotation @ pose[:3, 3] + shift
     return placed
-
-
-def _ignored_terms(sensor: ElementTree.Element) -> list[str]:
-    """Return a line where a sensor has terms that no lens of ours has: skew, and tangential ones of
-    fisheye lenses."""
-    keys = ("b2", "p1", "p2") if sensor.get("type") == "fisheye" else ("b2",)
-    found = [key for key in keys if any(float(term.text or 0) for term in sensor.iter(key))]
-    return [f"sensor {sensor.get('label')}: {', '.join(found)} are ignored"] if found else []
 
 
 def _metashape_lens(path: Path, sensor: ElementTree.Element) -> _Fields:
@@ -205,7 +179,7 @@ def _metashape_lens(path: Path, sensor: ElementTree.Element) -> _Fields:
     }
     if kind == "fisheye":
         return {**own, **_radial(k), "camera_model": "OPENCV_FISHEYE"}
-    return {**own, **_brown(where, k, math.hypot(width, height) / f), "p1": p2, "p2": p1}
+    return {**own, **_brown(where, k), "p1": p2, "p2": p1}
 
 
 METASHAPE_FORMAT = CaptureFormat(
@@ -267,7 +241,7 @@ def _realitycapture_camera(
         "cx": width / 2 + px * side,
         "cy": height / 2 + py * side,
     }
-    lens = _brown(where, k, math.hypot(width, height) / focal)
+    lens = _brown(where, k)
     return {**own, **lens, "p1": t2, "p2": t1, "transform_matrix": pose.tolist()}
 
 

@@ -35,8 +35,6 @@ _NAMES = (
     ("diffuse_red", "diffuse_green", "diffuse_blue"),
     ("r", "g", "b"),
 )
-_PACKED = ("rgb", "rgba")
-"""The Point Cloud Library packs 0xAARRGGBB into one number, an integer or the bits of a float32."""
 
 
 def point_colours(columns: Mapping[str, np.ndarray], count: int) -> np.ndarray:
@@ -50,9 +48,6 @@ def point_colours(columns: Mapping[str, np.ndarray], count: int) -> np.ndarray:
     for names in _NAMES:
         if known.keys() >= set(names):
             return _as_bytes(np.stack([known[name] for name in names], axis=1))
-    for name in _PACKED:
-        if name in known:
-            return _unpacked(known[name])
     return np.full((count, 3), GREY, np.uint8)
 
 
@@ -60,24 +55,9 @@ def _as_bytes(values: np.ndarray) -> np.ndarray:
     """Return colours as bytes, from the range that their type and their largest value suggest."""
     if values.dtype == np.uint8:
         return values
-    finite = values[np.isfinite(values)]
-    largest = finite.max(initial=0)
-    scale = 1.0
-    if values.dtype.kind == "f" and largest <= 1:
-        scale = 255.0
-    elif largest > 255:
-        scale = 1 / 257  # 16 bits
+    scale = 255.0 if values.dtype.kind == "f" and np.nanmax(values, initial=0) <= 1 else 1.0
     scaled = np.nan_to_num(scale * values.astype(np.float64), nan=GREY)
     return np.clip(scaled + 0.5, 0, 255).astype(np.uint8)
-
-
-def _unpacked(packed: np.ndarray) -> np.ndarray:
-    """Return the red, green and blue bytes of 0xAARRGGBB."""
-    if packed.dtype.kind == "f":
-        bits = np.ascontiguousarray(packed, np.float32).view(np.uint32)
-    else:
-        bits = packed.astype(np.uint32)
-    return np.stack([bits >> 16, bits >> 8, bits], axis=1).astype(np.uint8)
 
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
@@ -176,7 +156,9 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
         header_if_readable(path) if frame.video is None else None
         for frame, path in zip(file.frames, paths, strict=True)
     ]
-    common = _common_size(file, paths, headers)
+    # images without a size of their own share the focal length of the file
+    sizes = (x.upright_size for x in headers if x is not None)
+    common = next(sizes, None)
     repaired: dict[str, float] = {}
     rescaled: list[str] = []
     views = {}
@@ -189,10 +171,8 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
 
 def tracks_path_of(file: FrameFile) -> Path | None:
     """Return the file of 2D tracks that ``tracks_file_path`` names, None without one."""
-    written = file.fields.get("tracks_file_path")
-    if written is not None and not isinstance(written, str):
-        raise DyngsError(f"{file.path}: 'tracks_file_path' must be a string, got {written!r:.40}")
-    return _below(FileFinder(file.path.parent), written, str(file.path)) if written else None
+    frame = FrameEntry(str(file.path), {}, file.fields)
+    return _named_file(FileFinder(file.path.parent), frame, "tracks_file_path")
 
 
 def view_name(path: Path, root: Path) -> str:
@@ -223,7 +203,8 @@ def _view(
         raise DyngsError(f"{frame.where}: the key 'transform_matrix' is missing")
     matrix = matrix_of(frame.where, "transform_matrix", frame.own["transform_matrix"])
     pose, error = checked_pose(matrix, frame.where)
-    masks = [_named_file(files, frame, key) for key in ("motion_mask_path", "instance_mask_path")]
+    motion_mask = _named_file(files, frame, "motion_mask_path")
+    labels = _named_file(files, frame, "instance_mask_path")
     silhouette = _named_file(files, frame, "silhouette_path")
     camera = frame.integer("camera")
     view = View(
@@ -241,10 +222,10 @@ def _view(
         video=frame.video,
         silhouette=None if silhouette is None else Silhouette(silhouette, "white"),
         depth_path=_named_file(files, frame, "depth_file_path"),
-        motion_mask_path=masks[0] or masks[1],
-        motion_mask_labels=masks[0] is None and masks[1] is not None,
+        motion_mask_path=motion_mask or labels,
+        motion_mask_labels=motion_mask is None and labels is not None,
         flow_path=_named_file(files, frame, "flow_file_path"),
-        exposure=header.tags.exposure if header else None,
+        exposure=header.exposure if header else None,
     )
     return view, error, rescaled
 
@@ -312,38 +293,19 @@ def _described_size(frame: FrameEntry) -> tuple[int, int] | None:
     return round(width), round(height)
 
 
-def _common_size(
-    file: FrameFile, paths: list[Path], headers: list[ImageHeader | None]
-) -> tuple[int, int] | None:
-    """(width, height) of the images without a size of their own, which share the file's focal
-    length."""
-    sizes: dict[tuple[int, int], Path] = {}
-    for frame, path, header in zip(file.frames, paths, headers, strict=True):
-        has_own = any(key in frame.own for key in _FOCAL_KEYS)
-        if header and not has_own and _described_size(frame) is None:
-            sizes.setdefault(header.upright_size, path)
-    if len(sizes) > 1:
-        (first, path), (second, other) = list(sizes.items())[:2]
-        raise DyngsError(
-            f"{file.path}: images of different sizes share one focal length ({path} is {first[0]}x{first[1]}, "
-            f"{other} is {second[0]}x{second[1]}); give w, h and fl_x for each frame"
-        )
-    return next(iter(sizes), None)
-
-
 def _intrinsics(frame: FrameEntry, width: int, height: int) -> np.ndarray:
     source = frame.own if any(key in frame.own for key in _FOCAL_KEYS) else frame.shared
     focal_x = _focal(source, "x", width, frame.where)
-    focal_y = _focal(source, "y", height, frame.where)
-    if focal_x is None and focal_y is None:
+    focal_y = _focal(source, "y", height, frame.where) or focal_x
+    if focal_y is None:
         raise DyngsError(
             f"{frame.where}: no focal length; give fl_x (px) or camera_angle_x (radians)"
         )
     cx = frame.number("cx")
     cy = frame.number("cy")
     return pinhole_matrix(
-        focal_x or focal_y or 0.0,
-        focal_y or focal_x or 0.0,
+        focal_x or focal_y,
+        focal_y,
         0.5 * width if cx is None else cx,
         0.5 * height if cy is None else cy,
     )

@@ -26,7 +26,7 @@ from dyngs.io.formats.similarity import AXES
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import write_text
 from dyngs.models.views import training_cameras
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import Opened
 
 

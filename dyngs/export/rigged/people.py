@@ -42,7 +42,7 @@ from dyngs.io.gltf import INDICES, VERTICES, GlbDocument
 from dyngs.io.write import atomic_file
 from dyngs.ops.quaternions import shorter_ways
 from dyngs.runs.checkpoint import LoadedRun
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 
 _MOST_ROWS = 4000  # anchors whose places determine the shape; each gives three equations
 

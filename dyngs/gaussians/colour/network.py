@@ -20,7 +20,7 @@ from dyngs.gaussians.rendering import Shader
 from dyngs.models.renderable import Rendering
 from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.perceptron import Layer, perceptron
-from dyngs.ops.shading import Sight, num_inputs, shading_inputs
+from dyngs.ops.shading import num_inputs, shading_inputs
 
 SATURATED = 254.5 / 255  # A channel this bright may have been any brighter
 GAIN_RIDGE, MIXING_RIDGE = 1e-5, 1e-2
@@ -198,19 +198,21 @@ class ColourNetwork:
         rows = torch.nonzero(drawn)[:, 0]
         dtype = gaussians.means.dtype
         moment = min(max(0.0 if time is None else time, 0.0), 1.0)
-        sight = Sight(
+        base = gaussians.base_rgb.index_select(0, rows)
+        inputs = shading_inputs(
+            base,
             gaussians.means,
             gaussians.quats,
             gaussians.log_scales,
             rows,
             center,
             self.box.to(dtype),
-            None if frame is None else (frame.places.to(dtype), frame.turn.to(dtype)),
+            None if frame is None else frame.places.to(dtype),
+            None if frame is None else frame.turn.to(dtype),
             moment if self.sees_time else None,
             self.sees_normals,
         )
-        base = gaussians.base_rgb.index_select(0, rows)
-        shown = (base + perceptron(shading_inputs(sight, base), self.layers).to(dtype)).clamp_min(0)
+        shown = (base + perceptron(inputs, self.layers).to(dtype)).clamp_min(0)
         return shown.new_zeros(len(gaussians), 3).index_copy(0, rows, shown)
 
 

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0, num_sh_terms
-from dyngs.core.errors import DyngsError
-from dyngs.core.state import Role, fields_moved_to
+from dyngs.core.state import Role
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.human.body.atlas import Texels, atlas_texels
@@ -72,10 +71,6 @@ class Skeleton:
     joints: Tensor
     parents: tuple[int, ...]
 
-    def to(self, *, device: torch.device | str) -> Skeleton:
-        """Return the skeleton on ``device``."""
-        return fields_moved_to(self, device)
-
 
 @dataclass(frozen=True)
 class PoseBlendShapes:
@@ -86,10 +81,6 @@ class PoseBlendShapes:
     # numbers
     directions: Tensor
     faces: Tensor  # (T, 3) int64 vertices of the triangles
-
-    def to(self, *, device: torch.device | str) -> PoseBlendShapes:
-        """Return the blend shapes on ``device``."""
-        return fields_moved_to(self, device)
 
     def offsets(self, anchors: Anchors, rotations: Tensor) -> Tensor:
         """Return offsets (N, 3) at rest, m: interpolated between the vertices of each anchor's
@@ -233,10 +224,6 @@ class Anchors:
         """Return the rows at ``index`` (long or bool)."""
         return Anchors(**{name: x[index] for name, x in self.tensors().items()})
 
-    def to(self, *, device: torch.device | str) -> Anchors:
-        """Return the anchors on ``device``."""
-        return fields_moved_to(self, device)
-
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors by field name."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
@@ -249,13 +236,9 @@ def texel_gaussians(
     opaque at the lowest.
 
     A disc lies in the tangent plane, as wide as its texel. Rows are ordered by height, then by
-    texel. Raises DyngsError: no height, or one that is not finite.
+    texel.
     """
     levels = texels.points.new_tensor(heights)
-    if levels.numel() == 0 or not bool(levels.isfinite().all()):
-        raise DyngsError(
-            f"the heights of scaffolds must be one or more finite numbers of metres, got {list(heights)}"
-        )
     rows = torch.arange(len(texels), device=levels.device).repeat(len(levels))
     height = levels.repeat_interleave(len(texels))
     size = texels.size[rows]
@@ -387,10 +370,6 @@ class SharedCorrection:
 
     turns: Tensor  # (J, 3) axis-angle, rad: rotations of the joints applied before those of a pose
     log_scale: float  # natural logarithm of the factor on the template's size
-
-    def to(self, *, device: torch.device | str) -> SharedCorrection:
-        """Return the correction on ``device``."""
-        return fields_moved_to(self, device)
 
 
 def new_corrections(

@@ -27,8 +27,7 @@ from dyngs.data.images.images import area_downscale_uint8, read_image, target_si
 from dyngs.data.read import is_capture, read_capture
 from dyngs.human.detect.detector import SURE, Detection, Detector, MediaPipe
 from dyngs.human.fit.fitted_capture import FitInputs, FittedCapture, write_fitted_capture
-from dyngs.io.lock import make_once
-from dyngs.io.outputs import note_sources, require_new_folder
+from dyngs.io.outputs import make_once, note_source, require_new_folder
 from dyngs.io.write import cache_folder, temporary_folder_beside, write_image, write_text
 
 REACH = 0.6  # distance between following detections of one person, at most, in heights an image
@@ -346,5 +345,5 @@ def with_found_person(
         say(write_found_person(data, folder, detector, report, say).summary())
 
     make_once(folder, find, say, f"person:  found before, in {folder}")
-    note_sources(folder, data.root)
+    note_source(folder, data.root)
     return data.model_copy(update={"root": folder, "frames": None})

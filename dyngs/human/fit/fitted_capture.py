@@ -53,8 +53,7 @@ from dyngs.human.fit.capture_fit import (
 from dyngs.human.fit.keypoints import read_joints, read_keypoints
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
-from dyngs.io.lock import make_once
-from dyngs.io.outputs import new_folder
+from dyngs.io.outputs import make_once, new_folder
 from dyngs.io.write import atomic_file, cache_folder, write_image, write_text
 
 _BODY, _CONFIG = "body_train.npz", "config.yaml"
@@ -193,7 +192,7 @@ def posed_by_avatar(
 
 def _fitted(player: HumanScene, images: ImageLoader) -> HumanScene:
     nothing = player.gaussians.means.new_zeros(3)
-    return fitted_to_images(player, images, nothing, SILHOUETTES).scene
+    return fitted_to_images(player, images, nothing, SILHOUETTES)[0]
 
 
 def _left_out(views: Sequence[View]) -> tuple[list[View], list[View]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,9 +21,10 @@ from dyngs.human.motion.motion import (
     sample_times,
 )
 from dyngs.io.fields import require_at_most
-from dyngs.io.gltf import MOST_JOINTS, Animation, GltfFile
+from dyngs.io.gltf import MOST_JOINTS, GltfFile
 
 _KINDS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}
+_AT_REST = {"translation": (0, 0, 0), "rotation": (0, 0, 0, 1), "scale": (1, 1, 1)}
 _VRM_THUMBS = {
     f"{side}Thumb{new}": f"{side}Thumb{old}"
     for side in ("left", "right")
@@ -87,16 +89,14 @@ def read_vrm_animation(path: Path, fps: float = 30.0, clip: str | None = None) -
     """
     with reading(path):
         file = GltfFile(path)
-        extension = file.document.extensions.VRMC_vrm_animation
+        extension = file.json.get("extensions", {}).get("VRMC_vrm_animation")
         if extension is None:
             raise file.error("has no VRMC_vrm_animation; a plain glTF animation ends in .glb")
-        bones = extension.humanoid.humanBones
+        bones = extension["humanoid"]["humanBones"]
         rig = _Rig(
-            tuple(bone.node for bone in bones.values()),
+            tuple(bone["node"] for bone in bones.values()),
             tuple(_VRM_THUMBS.get(name, name) for name in bones),
         )
-        if not bones:
-            raise file.error("its humanoid has no bones; export it again")
         chain = _with_ancestors(file, rig.joints)
         moving = _moving(file, chain)
         chosen = moving[0] if moving and clip is None else _chosen(file, chain, clip)
@@ -104,36 +104,34 @@ def read_vrm_animation(path: Path, fps: float = 30.0, clip: str | None = None) -
 
 
 def _skin(file: GltfFile) -> _Rig | None:
-    if not file.document.skins:
+    if not file.json.get("skins"):
         return None
-    largest = max(file.document.skins, key=lambda skin: len(skin.joints))
-    nodes = file.document.nodes
-    names = tuple(nodes[node].name if node < len(nodes) else "" for node in largest.joints)
-    return _Rig(largest.joints, names, largest.inverseBindMatrices)
+    largest = max(file.json["skins"], key=lambda skin: len(skin["joints"]))
+    joints = tuple(largest["joints"])
+    names = tuple(file.nodes[node].get("name", "") for node in joints)
+    return _Rig(joints, names, largest.get("inverseBindMatrices"))
 
 
 def _animated_nodes(file: GltfFile, clip: str | None) -> _Rig:
-    nodes = file.document.nodes
-    channels = _chosen(file, dict.fromkeys(range(len(nodes))), clip).channels
-    moved = {
-        c.target.node for c in channels if c.target.path in _KINDS and c.target.node is not None
-    }
-    waiting = [node for node in moved if node < len(nodes)]
+    nodes = file.nodes
+    channels = _chosen(file, dict.fromkeys(range(len(nodes))), clip)["channels"]
+    targets = [channel["target"] for channel in channels]
+    waiting = [x["node"] for x in targets if x["path"] in _KINDS and "node" in x]
     found: set[int] = set()
     while waiting:
         node = waiting.pop()
         if node not in found and node < len(nodes):
             found.add(node)
-            waiting += nodes[node].children
-    require_at_most(file.path, len(found), MOST_JOINTS, "joints")
+            waiting += nodes[node].get("children", [])
     joints = tuple(sorted(found))
     if not joints:
         raise file.error("its animation moves no node; export it again")
-    return _Rig(joints, tuple(nodes[node].name for node in joints))
+    return _Rig(joints, tuple(nodes[node].get("name", "") for node in joints))
 
 
-def _motion(file: GltfFile, rig: _Rig, fps: float, animation: Animation) -> SkeletonMotion:
+def _motion(file: GltfFile, rig: _Rig, fps: float, animation: dict[str, Any]) -> SkeletonMotion:
     joints = rig.joints
+    require_at_most(file.path, len(joints), MOST_JOINTS, "joints")
     chain = _with_ancestors(file, joints)
     curves = _curves(file, animation, chain)
     start = min(c.times[0] for c in curves.values())
@@ -162,16 +160,16 @@ def _motion(file: GltfFile, rig: _Rig, fps: float, animation: Animation) -> Skel
 
 def _with_ancestors(file: GltfFile, joints: tuple[int, ...]) -> dict[int, int | None]:
     """Return the parent of each joint and of all their ancestors, parents first; None for roots."""
-    nodes = file.document.nodes
+    nodes = file.nodes
     parents: dict[int, int] = {}
     for i, owner in enumerate(nodes):
-        for child in owner.children:
+        for child in owner.get("children", []):
             if child >= len(nodes) or child in parents:
                 raise file.error(f"node {child} is missing or has two parents; export it again")
             parents[child] = i
     chain: dict[int, int | None] = {}
     for joint in joints:
-        if joint >= len(nodes):
+        if not 0 <= joint < len(nodes):
             raise file.error(f"the skin's joint {joint} is missing; export it again")
         above: list[int] = []
         node: int | None = joint
@@ -184,11 +182,11 @@ def _with_ancestors(file: GltfFile, joints: tuple[int, ...]) -> dict[int, int | 
     return chain
 
 
-def _chosen(file: GltfFile, chain: dict[int, int | None], clip: str | None) -> Animation:
+def _chosen(file: GltfFile, chain: dict[int, int | None], clip: str | None) -> dict[str, Any]:
     """Return the animation of that name, or the only one that moves a node of the chain."""
     moving = _moving(file, chain)
-    named = [a for a in moving if clip in (None, a.name)]
-    names = ", ".join(repr(a.name[:30]) for a in moving[:20])
+    named = [a for a in moving if clip in (None, a.get("name", ""))]
+    names = ", ".join(f"{a.get('name', '')!r:.32}" for a in moving[:20])
     if not moving:
         raise file.error("no animation moves its joints; export it with the animation")
     if not named:
@@ -198,37 +196,39 @@ def _chosen(file: GltfFile, chain: dict[int, int | None], clip: str | None) -> A
     return named[0]
 
 
-def _moving(file: GltfFile, chain: dict[int, int | None]) -> list[Animation]:
-    return [a for a in file.document.animations if any(c.target.node in chain for c in a.channels)]
+def _moving(file: GltfFile, chain: dict[int, int | None]) -> list[dict[str, Any]]:
+    return [
+        animation
+        for animation in file.json.get("animations", [])
+        if any(channel["target"].get("node") in chain for channel in animation["channels"])
+    ]
 
 
 def _curves(
-    file: GltfFile, animation: Animation, chain: dict[int, int | None]
+    file: GltfFile, animation: dict[str, Any], chain: dict[int, int | None]
 ) -> dict[tuple[int, str], _Curve]:
     curves: dict[tuple[int, str], _Curve] = {}
-    for channel in animation.channels:
-        node = channel.target.node
-        kind = channel.target.path
-        if node is None or node not in chain or kind not in _KINDS:
+    for channel in animation["channels"]:
+        node = channel["target"].get("node")
+        kind = channel["target"]["path"]
+        if node not in chain or kind not in _KINDS:
             continue
-        if channel.sampler >= len(animation.samplers):
-            raise file.error(
-                f"the animation {animation.name[:30]!r} lacks a sampler; export it again"
-            )
-        if file.document.nodes[node].matrix is not None:
+        if "matrix" in file.nodes[node]:
             raise file.error(f"node {node} is animated but has a matrix; export it again")
-        sampler = animation.samplers[channel.sampler]
-        times = _finite(file, sampler.input, "SCALAR")[:, 0]
-        values = _finite(file, sampler.output, _KINDS[kind])
-        if len(values) != len(times) * (3 if sampler.interpolation == "CUBICSPLINE" else 1):
+        sampler = animation["samplers"][channel["sampler"]]
+        interpolation = sampler.get("interpolation", "LINEAR")
+        per_key = {"LINEAR": 1, "STEP": 1, "CUBICSPLINE": 3}[interpolation]
+        times = _finite(file, sampler["input"], "SCALAR")[:, 0]
+        values = _finite(file, sampler["output"], _KINDS[kind])
+        if len(values) != len(times) * per_key:
             raise file.error(
                 f"a {kind} of node {node} has {len(times)} times but {len(values)} values"
             )
         if (np.diff(times) < 0).any():
             raise file.error(f"the times of a {kind} of node {node} do not ascend; export it again")
-        curves[node, kind] = _Curve(times, values, sampler.interpolation)
+        curves[node, kind] = _Curve(times, values, interpolation)
     if not curves:
-        raise file.error(f"the animation {animation.name[:30]!r} moves no joint; choose another")
+        raise file.error("its animation moves no joint; choose another clip")
     return curves
 
 
@@ -264,17 +264,17 @@ def _local(
     file: GltfFile, index: int, curves: dict[tuple[int, str], _Curve], times: np.ndarray
 ) -> _Transforms:
     """Return the transforms of a node relative to its parent: T R S, or its matrix."""
-    node = file.document.nodes[index]
+    node = file.nodes[index]
     frames = len(times)
-    if node.matrix is not None:
-        matrix = np.array(node.matrix).reshape(4, 4).T
+    if "matrix" in node:
+        matrix = np.array(node["matrix"], np.float64).reshape(4, 4).T
         rotation = _rotation_of(file, matrix[None, :3, :3])
         still = (matrix[:3, :3], rotation[0], matrix[:3, 3])
         return _Transforms(*(np.broadcast_to(x, (frames, *x.shape)) for x in still))
     values: dict[str, np.ndarray] = {}
-    for kind in _KINDS:
+    for kind, still_value in _AT_REST.items():
         curve = curves.get((index, kind))
-        fixed = np.tile(np.array(getattr(node, kind)), (frames, 1))
+        fixed = np.tile(np.array(node.get(kind, still_value), np.float64), (frames, 1))
         values[kind] = fixed if curve is None else _sampled(file, curve, times)
     rotation = _rotations(file, values["rotation"]).as_matrix()
     if (values["scale"].prod(axis=1) < 0).any():

@@ -23,7 +23,7 @@ from dyngs.data.body_frames import about_pelvis, rows_of
 from dyngs.data.capture import BodyFrames, View
 from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.human.body.skinning import axis_angle_to_matrix
-from dyngs.io.fields import VARIABLE, allowed
+from dyngs.io.containment import LIMITS_VARIABLE, allowed
 
 UpAxis = Literal["auto", "y", "z"]
 MAX_JOINT_POSES = 5_000_000
@@ -69,7 +69,7 @@ class Motion:
         if not len(self) * fps <= most * self.fps:
             raise DyngsError(
                 f"cannot resample the motion to {fps:g} frames per second, as it would have more than {most:,.0f} "
-                f"frames; ask for 30 or the like, or set {VARIABLE}=N to allow N times as many"
+                f"frames; ask for 30 or the like, or set {LIMITS_VARIABLE}=N to allow N times as many"
             )
         times = sample_times(len(self) - 1, self.fps, fps)
         if fps == self.fps:
@@ -110,7 +110,7 @@ def require_frame_count(path: Path, frames: float, joints: int) -> None:
         factor = f"{math.ceil(amount / MAX_JOINT_POSES)}" if amount < 1e15 else "N"
         raise DyngsError(
             f"{path}: {frames:.0f} frames of {max(joints, len(JOINT_NAMES))} joints are too many; at most {most:,} "
-            f"poses of joints are read; cut it into shorter pieces, or set the environment variable {VARIABLE}={factor}"
+            f"poses of joints are read; cut it into shorter pieces, or set {LIMITS_VARIABLE}={factor}"
         )
 
 

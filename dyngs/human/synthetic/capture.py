@@ -1,23 +1,22 @@
-"""Synthetic captures of dressed people: key points, clips, clothes, and the captures themselves,
-with exact body parameters.
+"""Synthetic captures of dressed people: clips, clothes, and the captures themselves, with exact body
+parameters.
 
-Rasterized in numpy, independently of the rasterizer of Gaussians. J key points, M vertices, T
-triangles, U vertices of the atlas, P points, H fragments, S texels per side.
+Rasterized in numpy, independently of the rasterizer of Gaussians. M vertices, T triangles, U
+vertices of the atlas, P points, H fragments, S texels per side.
 """
 
 from __future__ import annotations
 
 import colorsys
 import json
-from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cache, cached_property, lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.interpolate import PchipInterpolator
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -26,69 +25,14 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.images.maps import MILLIMETRE
 from dyngs.data.read import PEOPLE_FILE
 from dyngs.data.synthetic.captures import CAMERA_ANGLE_X
-from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.human.body.body import BodyTemplate, apply_shape, posed_vertices
 from dyngs.human.body.body_reader import default_template
-from dyngs.human.body.joints import JOINT_NAMES, JOINT_PARENTS
+from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.body.mesh import Fragments, interpolate, normalized, rasterize, vertex_normals
-from dyngs.human.body.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import write_image, write_text
-
-KEYPOINTS_FILE = "true_keypoints.npz"
-"""In a capture of a synthetic person: ``TrueTracks`` of joints in the frames of training."""
-NUM_KEYPOINTS = 25
-"""Joints that are key points, the first of ``JOINT_NAMES``: body, jaw and eyes."""
-_FACE = 22  # The first of those in the face, which are not seen through the back of the head
-# How deep below its own surface a joint may lie to count as seen, m
-_THICK, _THICK_FACE = 0.25, 0.09
-
-
-def joint_positions(body: BodyTemplate, motion: Motion) -> np.ndarray:
-    """Return the joints (F, J, 3) of ``body`` in the frames of ``motion`` that are key points, m,
-    float64."""
-    joints = body.joints.double()
-    poses = motion.poses.double()
-    posed = apply_transforms(
-        joint_transforms(joints, body.parents, axis_angle_to_matrix(poses)), joints
-    )
-    placed = motion.scale.double()[:, None, None] * posed + motion.trans.double()[:, None]
-    return placed[:, :NUM_KEYPOINTS].cpu().numpy()
-
-
-def joints_of_triangles(body: BodyTemplate) -> np.ndarray:
-    """Return the joint (T,) that moves each triangle most."""
-    return body.weights[body.faces].sum(1).argmax(1).cpu().numpy()
-
-
-def is_seen(depth: np.ndarray, near: np.ndarray, owner: np.ndarray) -> np.ndarray:
-    """Return (J,) bool: key points that a camera sees.
-
-    What the camera sees at a key point must be moved by its joint, or by the joint's parent or
-    child, and lie at most as far before it as limbs are thick.
-
-    Args:
-        depth: (J,) of the key points along the view axis, m.
-        near: (J,) of the surface in their pixels.
-        owner: (J,) joint that moves that surface, -1 where there is none or the key point is not in
-            the image.
-    """
-    thick = np.where(np.arange(NUM_KEYPOINTS) < _FACE, _THICK, _THICK_FACE)
-    return (owner >= 0) & _related()[np.arange(NUM_KEYPOINTS), owner] & (depth - near < thick)
-
-
-@cache
-def _related() -> np.ndarray:
-    """Return (J, 55) bool: which joints are a key point's own, its parent's or its children's."""
-    count = len(JOINT_NAMES)
-    related = np.eye(count, dtype=bool)
-    for child, parent in enumerate(JOINT_PARENTS):
-        if parent >= 0:
-            related[child, parent] = related[parent, child] = True
-    return related[:NUM_KEYPOINTS]
-
 
 FPS = 12.0
 _Rotations = dict[str, np.ndarray]  # axis-angle vectors (F, 3) or (1, 3) by joint, rad
@@ -96,26 +40,17 @@ _SIDES = (("left", 1.0), ("right", -1.0))
 _KEY_POSES = 4  # poses that a random clip passes through
 
 
-def walk(body: BodyTemplate, num_frames: int) -> Motion:
-    """Return three swings of legs and arms in place while the body turns by 50 degrees; soles at y
-    = 0."""
-    return _grounded_motion(body, _walk(np.linspace(0.0, 1.0, num_frames), 1.0, 0.0), num_frames)
-
-
-def squat(body: BodyTemplate, num_frames: int) -> Motion:
-    """Return a motion from standing into a squat while the arms rise sideways; soles at y = 0."""
-    return _grounded_motion(body, _squat(np.linspace(0.0, 1.0, num_frames), 1.0, 0.0), num_frames)
-
-
-def random_clip(body: BodyTemplate, num_frames: int, seed: int) -> Motion:
-    """Return the clip of ``seed``: a walk, a squat or a dance, of random extent and heading; soles
-    at y = 0.
+def _clip(body: BodyTemplate, num_frames: int, seed: int | None, is_new: bool) -> Motion:
+    """Return the clip of ``seed``, or with ``is_new`` another one: a walk, a squat or a dance, of
+    random extent and heading; soles at y = 0.
 
     A dance passes smoothly through random poses: arms from hanging to above the shoulders, legs in
-    steps.
+    steps. None: a walk, the new clip is a squat.
     """
-    make = np.random.default_rng([seed, 2])
     time = np.linspace(0.0, 1.0, num_frames)
+    if seed is None:
+        return _grounded_motion(body, (_squat if is_new else _walk)(time, 1.0, 0.0), num_frames)
+    make = np.random.default_rng([2 * seed + is_new, 2])
     heading = float(make.uniform(-np.pi, np.pi))
     match int(make.integers(4)):
         case 0:
@@ -128,7 +63,8 @@ def random_clip(body: BodyTemplate, num_frames: int, seed: int) -> Motion:
 
 
 def _walk(time: np.ndarray, extent: float, heading: float) -> _Rotations:
-    """Return the rotations of a walk at ``time`` (F,) in [0, 1]; ``heading`` in rad."""
+    """Return three swings of legs and arms in place while the body turns by 50 degrees, at ``time``
+    (F,) in [0, 1]; ``heading`` in rad."""
     swing = extent * np.sin(3 * np.pi * time)
     lift = 0.3 - 0.3 * np.cos(3 * np.pi * time)
     rotations = {
@@ -147,13 +83,13 @@ def _walk(time: np.ndarray, extent: float, heading: float) -> _Rotations:
 
 
 def _squat(time: np.ndarray, extent: float, heading: float) -> _Rotations:
+    """Return a motion from standing into a squat while the arms rise sideways."""
     depth = extent * (0.5 - 0.5 * np.cos(np.pi * time))
     rotations = {
+        "pelvis": _axis_angle(y=heading),
         "spine1": _axis_angle(x=0.35 * depth),
         "head": _axis_angle(x=-0.3 * depth, z=0.2 * depth),
     }
-    if heading:
-        rotations["pelvis"] = _axis_angle(y=heading)
     for side, sign in _SIDES:
         rotations |= {
             f"{side}_hip": _axis_angle(x=-1.3 * depth, z=0.15 * sign * depth),
@@ -200,15 +136,8 @@ def _grounded_motion(body: BodyTemplate, rotations: _Rotations, num_frames: int)
     for name, rotation in rotations.items():
         poses[:, JOINT_NAMES.index(name)] = torch.from_numpy(rotation).to(poses)
     trans = torch.zeros(num_frames, 3, device=device)
-    exact = body.to(dtype=torch.float64)
-    for frame, pose in enumerate(poses.double()):
-        trans[frame, 1] = (
-            -posed_vertices(
-                exact, pose[None], torch.zeros(1, 3, dtype=torch.float64, device=device)
-            )[0, :, 1]
-            .min()
-            .float()
-        )
+    heights = posed_vertices(body.to(dtype=torch.float64), poses.double(), trans.double())[..., 1]
+    trans[:, 1] = -heights.amin(1).float()
     return Motion(
         poses, trans, torch.zeros(10, device=device), FPS, torch.ones(num_frames, device=device)
     )
@@ -295,9 +224,8 @@ def paint_texture(body: BodyTemplate, outfit: Outfit, resolution: int = 512) -> 
 
     Texels that no triangle covers repeat the nearest covered one, so that interpolation at seams is
     correct. The template is in T-pose, with texture coordinates and the 55 joints of SMPL-X;
-    ``resolution`` is S. Raises DyngsError: the template has no texture coordinates.
+    ``resolution`` is S.
     """
-    texture_coordinates(body)  # raises where there are none
     fragments, nearest = _covered(body.uv, body.uv_faces, resolution)
     around = body.faces.cpu().numpy()[fragments.faces]
     points = interpolate(fragments.barycentric, body.vertices.double().cpu().numpy()[around])
@@ -326,14 +254,9 @@ def _covered(uv: Tensor, uv_faces: Tensor, resolution: int) -> tuple[Fragments, 
 
 
 def texture_coordinates(body: BodyTemplate) -> tuple[np.ndarray, np.ndarray]:
-    """Return texture coordinates (U, 2), float64, and the triangles (T, 3) that index them.
-
-    Raises DyngsError: the template has none.
-    """
-    if body.uv is None or body.uv_faces is None:
-        raise DyngsError(
-            f"the body template '{body.name}' has no texture coordinates; give one with a texture atlas"
-        )
+    """Return texture coordinates (U, 2), float64, and the triangles (T, 3) that index them."""
+    assert body.uv is not None
+    assert body.uv_faces is not None
     return body.uv.double().cpu().numpy(), body.uv_faces.cpu().numpy()
 
 
@@ -526,19 +449,14 @@ class HumanOptions:
     body_seed: int | None = None  # of the person's body shape; None: the template's own
     # of the direction, strength and tint of the light; None: always the same
     light_seed: int | None = None
-    # of the clips, see ``dyngs.human.synthetic.capture.random_clip``; None: a walk, then a squat
+    # of the clips, see ``_clip``; None: a walk, then a squat
     clip_seed: int | None = None
     # left mostly as right, back as front and bare hands, instead of clothes that differ everywhere
     usual_clothes: bool = False
     # of radius and height of the ring, whose cameras are nearly level; None: alternately low and
     # high, 3.5 m away
     ring_seed: int | None = None
-    with_truth: bool = False  # depth maps, and key points of the body with the views that see them
-
-
-def varied(options: HumanOptions, seed: int) -> HumanOptions:
-    """Return options of another person for each seed: outfit, body shape, light and clips."""
-    return replace(options, seed=seed, body_seed=seed, light_seed=seed, clip_seed=seed)
+    with_depth: bool = False  # whether there are depth maps
 
 
 @dataclass(frozen=True)
@@ -566,101 +484,29 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     ``body_train.npz`` and ``body_pose.npz``. The split test shows the frames of train from other
     cameras, ``pose`` another motion. Raises DyngsError: options out of range.
     """
-    if min(options.size, options.num_frames, options.num_cameras, options.samples) < 1:
+    least = min(options.size, options.num_frames, options.num_cameras, options.seed + 1)
+    if least < 1:
         raise DyngsError(
-            "a synthetic person needs size, num_frames, num_cameras and samples of at least 1"
+            "a synthetic person needs size, frames and cameras of at least 1, a seed of at least 0"
         )
-    if min(options.num_new, options.num_test, options.seed) < 0:
-        raise DyngsError("a synthetic person needs num_new, num_test and seed of at least 0")
     body, betas = _person(options.body_seed)
     outfit, clothed, texture = _dressed(body, options.seed, options.usual_clothes)
     train, test = _cameras(options)
-    seed = options.clip_seed
-    lengths = {"train": options.num_frames}
+    clips = {"train": (options.num_frames, {"train": train, "test": test})}
     if options.num_new and test:
-        lengths["pose"] = options.num_new
-    if seed is None:
-        clips = {
-            name: (walk if name == "train" else squat)(body, count)
-            for name, count in lengths.items()
-        }
-    else:
-        clips = {
-            name: random_clip(body, n, 2 * seed + (name == "pose")) for name, n in lengths.items()
-        }
+        clips["pose"] = options.num_new, {"pose": test}
     with new_folder(out) as started:
-        for name, clip in clips.items():
+        for name, (num_frames, splits) in clips.items():
+            clip = _clip(body, num_frames, options.clip_seed, name == "pose")
             motion = replace(
                 clip, trans=outfit.size * clip.trans, scale=outfit.size * clip.scale, betas=betas
             )
-            meshes = list(_posed_meshes(clothed, motion, texture))
-            splits = {"train": train, "test": test} if name == "train" else {"pose": test}
-            frames: list[_Frame] = []
+            meshes = _posed_meshes(clothed, motion, texture)
             for split, cameras in splits.items():
-                frames += _write_split(started, split, meshes, cameras, options)
-            if options.with_truth and name == "train":
-                write_true_tracks(
-                    started, _keypoints(body, motion, meshes, frames, options.size), KEYPOINTS_FILE
-                )
-            write_amass(
-                motion,
-                started / f"body_{name}.npz",
-                "smpl" if options.body_seed is None else "anny",
-            )
+                _write_split(started, split, meshes, cameras, options)
+            layout = "smpl" if options.body_seed is None else "anny"
+            write_amass(motion, started / f"body_{name}.npz", layout)
     return out
-
-
-def _keypoints(
-    body: BodyTemplate,
-    motion: Motion,
-    meshes: Sequence[PosedMesh],
-    frames: Sequence[_Frame],
-    size: int,
-) -> TrueTracks:
-    """Return the tracks of the key points of ``body``, and which views of ``size`` pixels see
-    them."""
-    points = joint_positions(body, motion)
-    owners = joints_of_triangles(body)
-    visible = []
-    for frame in frames:
-        surface, near = _surface(meshes[frame.row], frame.world_from_cam, size)
-        owner = np.full(size * size, -1)
-        owner[surface.index] = owners[surface.faces]
-        index, depth = _pixels_of(points[frame.row], frame.world_from_cam, size)
-        visible.append(is_seen(depth, near[index], np.where(index < 0, -1, owner[index])))
-    names = [frame.name.removesuffix(".png") for frame in frames]
-    rows = [frame.row for frame in frames]
-    times = np.linspace(0.0, 1.0, len(points)) if len(points) > 1 else np.zeros(1)
-    return TrueTracks(
-        points.astype(np.float32),
-        times,
-        np.array(names),
-        np.array(rows, np.int64),
-        np.stack(visible),
-    )
-
-
-def _pixels_of(
-    points: np.ndarray, world_from_cam: np.ndarray, size: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixel (P,) of each of the points (P, 3), -1 outside of the image, and their depth
-    (P,), m."""
-    x, y, inverse = _image_of(points, world_from_cam, size).T
-    inside = (x >= 0) & (x < size) & (y >= 0) & (y < size)
-    return np.where(inside, y.astype(int) * size + x.astype(int), -1), 1.0 / inverse
-
-
-def _surface(
-    mesh: PosedMesh, world_from_cam: np.ndarray, size: int
-) -> tuple[Fragments, np.ndarray]:
-    """Return what is seen at pixel centres, and its depth (size^2,) along the view axis, m; 0 where
-    nothing is."""
-    image = _image_of(mesh.vertices, world_from_cam, size) - [0.5, 0.5, 0.0]
-    surface = rasterize(image[mesh.faces], size, size)
-    depth = np.zeros(size * size)
-    corners = 1.0 / image[mesh.faces[surface.faces], 2:]
-    depth[surface.index] = interpolate(surface.barycentric, corners)[:, 0]
-    return surface, depth
 
 
 def _person(seed: int | None) -> tuple[BodyTemplate, Tensor]:
@@ -737,56 +583,34 @@ def _image_of(points: np.ndarray, world_from_cam: np.ndarray, size: int) -> np.n
     )
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """An image to render: its path below the root, what it shows, the OpenGL pose, and further keys
-    of its entry."""
-
-    name: str
-    mesh: PosedMesh
-    world_from_cam: np.ndarray
-    keys: dict[str, object]
-    row: int = 0  # of its mesh among those of the clip
-
-
 def _write_split(
     out: Path,
     split: str,
     meshes: list[PosedMesh],
     cameras: dict[int, np.ndarray],
     options: HumanOptions,
-) -> list[_Frame]:
-    frames = [
-        _Frame(
-            f"images/{split}/f{i:03d}_c{camera:02d}.png",
-            mesh,
-            pose,
-            {"frame": i, "camera": camera, "time": i / max(len(meshes) - 1, 1)},
-            i,
-        )
-        for i, mesh in enumerate(meshes)
-        for camera, pose in cameras.items()
-    ]
-    if frames:
-        _write_frames(out, split, frames, options)
-    return frames
-
-
-def _write_frames(out: Path, split: str, frames: Sequence[_Frame], options: HumanOptions) -> None:
+) -> None:
     entries = []
     light = random_light(options.light_seed)
     size = options.size
-    for frame in frames:
-        image = render_mesh(frame.mesh, frame.world_from_cam, size, options.samples, light)
-        write_image(out / frame.name, image)
-        keys = dict(frame.keys)
-        if options.with_truth:
-            keys["depth_file_path"] = path = f"depth/{frame.name.removeprefix('images/')}"
-            depth = _surface(frame.mesh, frame.world_from_cam, size)[1].reshape(size, size)
-            write_image(out / path, (depth / MILLIMETRE + 0.5).astype(np.uint16))
-        entries.append(
-            {"file_path": frame.name, **keys, "transform_matrix": frame.world_from_cam.tolist()}
-        )
+    for i, mesh in enumerate(meshes):
+        for camera, pose in cameras.items():
+            name = f"{split}/f{i:03d}_c{camera:02d}.png"
+            image = render_mesh(mesh, pose, size, options.samples, light)
+            write_image(out / "images" / name, image)
+            entry: dict[str, object] = {
+                "file_path": f"images/{name}",
+                "frame": i,
+                "camera": camera,
+                "time": i / max(len(meshes) - 1, 1),
+            }
+            if options.with_depth:
+                entry["depth_file_path"] = f"depth/{name}"
+                depth = _depth_map(mesh, pose, size)
+                write_image(out / "depth" / name, (depth / MILLIMETRE + 0.5).astype(np.uint16))
+            entries.append(entry | {"transform_matrix": pose.tolist()})
+    if not entries:
+        return
     focal = _focal(size)
     lens = {"w": size, "h": size, "fl_x": focal, "fl_y": focal, "cx": 0.5 * size, "cy": 0.5 * size}
     write_text(
@@ -794,17 +618,22 @@ def _write_frames(out: Path, split: str, frames: Sequence[_Frame], options: Huma
     )
 
 
-def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> Iterator[PosedMesh]:
+def _depth_map(mesh: PosedMesh, world_from_cam: np.ndarray, size: int) -> np.ndarray:
+    """Return the depth (S, S) along the view axis at pixel centres, m; 0 where nothing is."""
+    image = _image_of(mesh.vertices, world_from_cam, size) - [0.5, 0.5, 0.0]
+    surface = rasterize(image[mesh.faces], size, size)
+    depth = np.zeros(size * size)
+    corners = 1.0 / image[mesh.faces[surface.faces], 2:]
+    depth[surface.index] = interpolate(surface.barycentric, corners)[:, 0]
+    return depth.reshape(size, size)
+
+
+def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> list[PosedMesh]:
     uv, uv_faces = texture_coordinates(body)
-    exact = body.to(dtype=torch.float64)
+    poses, trans, scale = (x.double() for x in (motion.poses, motion.trans, motion.scale))
+    posed = posed_vertices(body.to(dtype=torch.float64), poses, trans, scale=scale).cpu().numpy()
     faces = body.faces.cpu().numpy()
-    for pose, trans, scale in zip(
-        *(x.double() for x in (motion.poses, motion.trans, motion.scale)), strict=True
-    ):
-        vertices = (
-            posed_vertices(exact, pose[None], trans[None], scale=scale[None])[0].cpu().numpy()
-        )
-        yield PosedMesh(vertices, faces, uv, uv_faces, texture)
+    return [PosedMesh(vertices, faces, uv, uv_faces, texture) for vertices in posed]
 
 
 def _cameras(options: HumanOptions) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
@@ -855,17 +684,11 @@ def _shaded(mesh: PosedMesh, fragments: Fragments, light: Lamp) -> np.ndarray:
 def _sampled(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """Return the values (H, 3) of a texture (S, S, 3) at ``uv`` (H, 2), bilinear between texel
     centres."""
-    last = len(texture) - 1
-    column, row = (np.clip(place, 0.0, last) for place in texel_coordinates(uv, len(texture)))
-    left = np.floor(column).astype(np.int64)
-    top = np.floor(row).astype(np.int64)
-    right = np.minimum(left + 1, last)
-    below = np.minimum(top + 1, last)
-    x = (column - left)[:, None]
-    y = (row - top)[:, None]
-    upper = (1 - x) * texture[top, left] + x * texture[top, right]
-    lower = (1 - x) * texture[below, left] + x * texture[below, right]
-    return (1 - y) * upper + y * lower
+    places = texel_coordinates(uv, len(texture))[::-1]
+    channels = [
+        map_coordinates(x, places, order=1, mode="nearest") for x in np.moveaxis(texture, 2, 0)
+    ]
+    return np.stack(channels, axis=-1)
 
 
 SHARD = 100
@@ -887,8 +710,7 @@ class PeopleOptions:
 def write_people(
     out: Path, options: PeopleOptions = PeopleOptions(), report: ReportProgress = report_nothing
 ) -> Path:
-    """Write people as ``out/SHARD/PERSON``, captures of ``write_human_capture`` with depth maps and
-    key points.
+    """Write people as ``out/SHARD/PERSON``, captures of ``write_human_capture`` with depth maps.
 
     Every person has a body, an outfit, a clip, a light and a ring of cameras of their own; every
     other one wears usual clothes. The same options give the same bytes. One person is in memory at
@@ -896,14 +718,11 @@ def write_people(
     set may be written in parts, and trained on meanwhile. Raises DyngsError: options out of range,
     or a folder that holds something else.
     """
-    if not (
-        1 <= options.people <= _MOST and min(options.size, options.cameras, options.frames) >= 1
-    ):
+    least = min(options.people, options.size, options.cameras, options.frames, options.seed + 1)
+    if least < 1 or options.people > _MOST:
         raise DyngsError(
-            f"people need size, cameras and frames of at least 1, and be 1 to {_MOST:,}"
+            f"people need size, cameras and frames of at least 1, a seed of at least 0, and be 1 to {_MOST:,}"
         )
-    if options.seed < 0:
-        raise DyngsError("people need a seed of at least 0")
     _begin(out, {name: value for name, value in asdict(options).items() if name != "people"})
     for number in range(options.people):
         person = out / f"s{number // SHARD:04d}" / f"p{number:06d}"
@@ -929,14 +748,17 @@ def _begin(out: Path, made_with: dict[str, int]) -> None:
 def person_options(options: PeopleOptions, number: int) -> HumanOptions:
     """Return the options of the person ``number``, from 0."""
     seed = options.seed * _MOST + number + 1  # 0 would be the bare template
-    person = HumanOptions(
+    return HumanOptions(
         size=options.size,
         num_frames=options.frames,
         num_new=0,
         num_cameras=options.cameras,
         num_test=0,
+        seed=seed,
+        body_seed=seed,
+        light_seed=seed,
+        clip_seed=seed,
         usual_clothes=number % 2 == 1,
         ring_seed=seed,
-        with_truth=True,
+        with_depth=True,
     )
-    return varied(person, seed)

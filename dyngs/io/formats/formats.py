@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,8 +10,7 @@ import torch
 
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, reading, require_regular
-from dyngs.core.gaussians import Gaussians
-from dyngs.io.formats import gltf, ply
+from dyngs.io.formats import ply
 from dyngs.io.formats.antimatter import read_antimatter, write_antimatter
 from dyngs.io.formats.checkpoint import read_checkpoint
 from dyngs.io.formats.gltf import read_gltf, write_gltf
@@ -24,12 +20,10 @@ from dyngs.io.formats.similarity import (
     UNMOVED,
     Similarity,
     axis_of,
-    similarity_of,
     turn_between,
 )
-from dyngs.io.formats.sog import SOG_META, read_sog, write_sog
+from dyngs.io.formats.sog import read_sog, write_sog
 from dyngs.io.formats.splat_file import (
-    GEO_OFFSET,
     Nonfinite,
     SplatFile,
     drawable,
@@ -39,49 +33,9 @@ from dyngs.io.formats.splat_file import (
     unit_rotations,
     with_degree,
 )
-from dyngs.io.formats.spz import SYSTEM_OF_UP, read_spz, write_spz, write_spz_4
+from dyngs.io.formats.spz import read_spz, write_spz
 from dyngs.io.formats.usd import read_usd, write_usd
-from dyngs.io.write import atomic_file, write_text
-
-_MOST_BYTES = 4096
-
-
-def note_path(path: Path) -> Path:
-    """Return where the note of a file lies."""
-    return path.with_name(f"{path.name}.edit.json")
-
-
-def write_note(path: Path, edited: Similarity) -> None:
-    """Write the note of the file ``path``, which it knows by its digest, atomically."""
-    write_text(
-        note_path(path), json.dumps({"edited": edited.numbers, "sha256": _digest(path)}) + "\n"
-    )
-
-
-def read_note(path: Path) -> Similarity:
-    """Return what the note of the file ``path`` says; no change without one, or where it is about
-    another file.
-
-    Raises DyngsError: it is damaged.
-    """
-    note = note_path(path)
-    if not note.is_file():
-        return UNMOVED
-    try:
-        if note.stat().st_size > _MOST_BYTES:
-            raise ValueError("too large")
-        told = json.loads(note.read_bytes())
-        edited = similarity_of([float(x) for x in told["edited"]])
-        digest = str(told["sha256"])
-    except (ValueError, KeyError, TypeError, RecursionError):
-        raise DyngsError(
-            f"{note}: is no note of `dyngs edit`; remove it, or write {path.name} again"
-        ) from None
-    return edited if digest == _digest(path) else UNMOVED
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+from dyngs.io.write import atomic_file
 
 
 @dataclass(frozen=True)
@@ -95,34 +49,22 @@ class Format:
     read: Callable[[Path], SplatFile]
     write: Callable[[Path, SplatFile], None] | None
     states_mode: bool = True  # whether it can say that the scene is antialiased
-    # whether its files say how they were turned and edited; beside others lies a note about edits
-    holds_comments: bool = True
-    # smallest and largest logarithm of a size that it holds
-    log_scales: tuple[float, float] = (-math.inf, math.inf)
+    holds_comments: bool = True  # whether its files say how they were turned and edited
 
 
-_SPZ = Format("spz", (".spz",), "y", 3, read_spz, write_spz, True, False, (-10.0, 5.9375))
-_GLB = Format("glb", (".glb",), "y", 3, read_gltf, write_gltf, False)
 FORMATS = (
     Format("compressed-ply", (".compressed.ply",), "-y", 3, read_ply, ply.write_compressed),
     Format("ply", (".ply",), "-y", 4, read_ply, write_ply),
-    _SPZ,
+    Format("spz", (".spz",), "y", 3, read_spz, write_spz, True, False),
     Format("splat", (".splat",), "-y", 0, read_antimatter, write_antimatter, False, False),
     Format("sog", (".sog",), "-y", 3, read_sog, write_sog),
-    _GLB,
+    Format("glb", (".glb",), "y", 3, read_gltf, write_gltf, False),
     Format("usd", (".usdc", ".usd", ".usda"), "y", 4, read_usd, write_usd, False),
 )
 """All formats; a suffix that ends another one stands after it."""
-SPZ_4 = replace(_SPZ, max_degree=4, write=write_spz_4)
-GLB_OF_SPZ = replace(
-    _GLB, write=gltf.write_compressed, states_mode=True, log_scales=_SPZ.log_scales
-)
-"""Other ways to write files of a suffix."""
 CHECKPOINT = Format("checkpoint", (".ckpt", ".pt"), "z", 4, read_checkpoint, None, False, False)
 """Read, never written."""
 SOG_INDEX = "lod-meta.json"  # of a .sog in levels of detail
-# fraction of the Gaussians that may be of a size that a format does not hold, without a note
-_MOST_LOST = 0.01
 
 
 @dataclass(frozen=True)
@@ -139,10 +81,7 @@ def format_of(path: Path) -> Format:
     of them."""
     found = known_format(path)
     if found is None:
-        given = f"the suffix {path.suffix!r}" if path.suffix else "a name without a suffix"
-        raise DyngsError(
-            f"{path}: {given} names no format of Gaussians; use one of {all_suffixes()}"
-        )
+        raise DyngsError(f"{path}: no suffix of a file of Gaussians; use one of {all_suffixes()}")
     return found
 
 
@@ -156,31 +95,11 @@ def known_format(path: Path) -> Format | None:
 
 
 def format_to_read(path: Path) -> Format | None:
-    """Return the format that a file is read as: also a checkpoint, and a .sog as a folder; None if
-    it is none.
-
-    A run is none, whatever lies in its folder. Raises DyngsError as of ``sog_meta``.
-    """
-    if (path / "config.yaml").is_file():
-        return None
-    if sog_meta(path) is not None:
-        return format_named("sog")
+    """Return the format that a file is read as, also a checkpoint; None if it is none, or a
+    folder."""
     if path.is_dir():
         return None
     return CHECKPOINT if path.suffix.lower() in CHECKPOINT.suffixes else known_format(path)
-
-
-def sog_meta(path: Path) -> Path | None:
-    """Return the ``meta.json`` that is, or lies in, ``path``; None: it is something else.
-
-    Raises DyngsError: it is the index of a .sog in levels of detail.
-    """
-    if path.name == SOG_INDEX or (path / SOG_INDEX).is_file():
-        raise DyngsError(
-            f"{path}: is a .sog in levels of detail; give the {SOG_META} of one of its folders, such as 0_0"
-        )
-    inner = path if path.name == SOG_META else path / SOG_META
-    return inner if inner is path or inner.is_file() else None
 
 
 def format_named(name: str) -> Format:
@@ -200,7 +119,7 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
     """Read a file of Gaussians; its suffix names the format.
 
     ``nonfinite``: "skip" leaves out Gaussians with NaN or Inf, with a note, "error" refuses the
-    file. Opacities of exactly 0 or 1 and sizes of 0 become finite, with a note. Raises DyngsError:
+    file. Opacities of exactly 0 or 1 and sizes of 0 become finite. Raises DyngsError:
     an unknown suffix, or not such a file, cut off, empty or non-finite; nothing large is allocated
     before the header has been compared with the size of the file.
     """
@@ -209,43 +128,23 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
     if not path.exists():
         raise DyngsError(f"{path}: no such file")
     require_regular(path)
-    path = sog_meta(path) or path
     with reading(path):
         splat = own.read(path)
         if splat.up is None:
             splat = replace(splat, up=own.up)
-        if splat.edited == UNMOVED and not own.holds_comments:
-            splat = replace(splat, edited=read_note(path))
         return drawable(move_to_origin(splat), path, nonfinite)
 
 
-def chosen_variant(usual: Format, spz_version: int | None, compress: str | None) -> Format:
-    """Return the format that ``--spz-version`` or ``--compress`` chooses.
-
-    Raises DyngsError: an option of another format.
-    """
-    if spz_version is not None and usual.name != "spz":
-        raise DyngsError(f"--spz-version goes with .spz files, not with {usual.suffixes[0]}")
-    if compress is not None and usual.name != "glb":
-        raise DyngsError(f"--compress goes with .glb files, not with {usual.suffixes[0]}")
-    if compress is not None:
-        return GLB_OF_SPZ
-    return SPZ_4 if spz_version == 4 else usual
-
-
-def write_splats(
-    path: Path | str, splat: SplatFile, *, sh_degree: int | None = None, own: Format | None = None
-) -> Written:
+def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = None) -> Written:
     """Write a file of Gaussians, into which any 3D filter is fused, atomically; its suffix names
     the format.
 
     ``sh_degree``: of the harmonics in the file: higher ones are left out, missing ones zero; None:
-    up to what the format holds. ``own``: ``SPZ_4`` or ``GLB_OF_SPZ`` instead of the usual format of
-    the suffix. Raises DyngsError: an unknown suffix, no Gaussians, non-finite values, or a degree
+    up to what the format holds. Raises DyngsError: an unknown suffix, no Gaussians, non-finite values, or a degree
     that the format does not hold.
     """
     path = Path(path)
-    own = own or format_of(path)
+    own = format_of(path)
     whole, notes = fitted(path, own, splat, sh_degree)
     with atomic_file(path) as temporary:
         assert own.write is not None
@@ -254,13 +153,6 @@ def write_splats(
         except DyngsError as error:
             reason = str(error).removeprefix(f"{temporary}: ")
             raise DyngsError(f"{path}: not written: {reason}") from error
-    if own is SPZ_4 and whole.up in SYSTEM_OF_UP:
-        whole = upright(whole, own.up, path)  # as its reader turns what states its axes
-    if not own.holds_comments and whole.edited != UNMOVED:
-        write_note(path, whole.edited)
-        notes += (
-            f"{own.name} cannot say how it was edited: {note_path(path).name} beside it does",
-        )
     return Written(path, whole, notes)
 
 
@@ -287,18 +179,13 @@ def fitted(
         notes.append(
             f"the scene is antialiased, which {own.name} cannot say: viewers draw thin parts thicker"
         )
-    smallest, largest = own.log_scales
-    longest = gaussians.log_scales.amax(1)
-    lost = int(((longest < smallest) | (longest > largest)).sum())
-    if lost > _MOST_LOST * len(gaussians):
-        held = f"{own.name} holds sizes from {math.exp(smallest):.2g} to {math.exp(largest):.2g}"
-        notes.append(
-            f"{held}, those of {lost:,} Gaussians are changed: `dyngs edit --scale` gives another unit"
-        )
     notes += offset_notes(
         splat, "the file states it" if own.holds_comments else f"{own.name} cannot state it"
     )
-    return replace(splat, gaussians=_unit(with_degree(gaussians, degree))), tuple(notes)
+    if splat.edited != UNMOVED and not own.holds_comments:
+        notes.append(f"{own.name} cannot state how it was edited: this file cannot be undone")
+    gaussians = with_degree(gaussians.replace(quats=unit_rotations(gaussians.quats)), degree)
+    return replace(splat, gaussians=gaussians), tuple(notes)
 
 
 def upright(splat: SplatFile, up: str | None, path: Path) -> SplatFile:
@@ -329,34 +216,16 @@ def turned_file(
 def moved_file(splat: SplatFile, how: Similarity, up: str | None) -> SplatFile:
     """Return the contents rotated, scaled and shifted, so that it can be undone; ``up`` is what
     then points up."""
-    edited = replace(
-        splat, gaussians=how.gaussians(splat.gaussians), up=up, edited=how.after(splat.edited)
-    )
-    return edited if how == UNMOVED else _without_offset(edited)
+    gaussians = how.gaussians(splat.gaussians)
+    return replace(splat, gaussians=gaussians, up=up, edited=how.after(splat.edited))
 
 
 def undone_file(splat: SplatFile) -> SplatFile:
     """Return the contents as they lay before all of ``moved_file``; up is known where it was an
     axis."""
     back = splat.edited.inverse()
-    before = None if splat.up is None else back.rotation @ axis_of(splat.up)
-    up = next(
-        (name for name, axis in AXES.items() if before is not None and before @ axis > 1 - 1e-6),
-        None,
-    )
-    return _without_offset(
-        replace(splat, gaussians=back.gaussians(splat.gaussians), up=up, edited=UNMOVED)
-    )
-
-
-def _without_offset(splat: SplatFile) -> SplatFile:
-    return replace(
-        splat, comments=tuple(text for text in splat.comments if not text.startswith(GEO_OFFSET))
-    )
-
-
-def _unit(gaussians: Gaussians) -> Gaussians:
-    norms = gaussians.quats.double().norm(dim=1, keepdim=True)
-    if bool(((norms - 1).abs() < 1e-6).all()):
-        return gaussians
-    return gaussians.replace(quats=unit_rotations(gaussians.quats))
+    up = splat.up
+    if up is not None:
+        before = back.rotation @ axis_of(up)
+        up = next((name for name, axis in AXES.items() if before @ axis > 1 - 1e-6), None)
+    return replace(splat, gaussians=back.gaussians(splat.gaussians), up=up, edited=UNMOVED)

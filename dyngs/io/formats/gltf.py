@@ -4,9 +4,6 @@ nothing is lost.
 A primitive of points with the attributes ``KHR_gaussian_splatting:ROTATION`` (xyzw), ``SCALE``
 (linear), ``OPACITY`` and ``SH_DEGREE_l_COEF_n`` up to degree 3, and ``COLOR_0`` (linear RGB) for
 viewers that know only points. y is up.
-
-With ``KHR_gaussian_splatting_compression_spz_2`` (a draft of 2025), all of them are in a .spz
-within the file, whose axes are those of the document, as CesiumJS takes them.
 """
 
 from __future__ import annotations
@@ -17,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.core.conventions import SH_C0, RasterizeMode, num_sh_terms, srgb_decoded
+from dyngs.core.conventions import SH_C0, num_sh_terms, srgb_decoded
 from dyngs.core.gaussians import Gaussians
 from dyngs.io.fields import require_at_most
 from dyngs.io.formats.similarity import joined, similarity_of_matrix
@@ -29,12 +26,9 @@ from dyngs.io.formats.splat_file import (
     header_comments,
     stored_comments,
 )
-from dyngs.io.formats.spz import packed_spz, unpacked_spz
-from dyngs.io.gltf import VERTICES, GlbDocument, GltfFile, Node, Primitive
+from dyngs.io.gltf import VERTICES, GlbDocument, GltfFile
 
 EXTENSION = "KHR_gaussian_splatting"
-# the draft has both names
-_COMPRESSIONS = f"{EXTENSION}_compression_spz_2", f"{EXTENSION}_compression_spz"
 _PROPERTIES = {
     "kernel": "ellipse",
     "colorSpace": "srgb_rec709_display",
@@ -54,72 +48,30 @@ def read_gltf(path: Path) -> SplatFile:
     """
     file = GltfFile(path)
     found: list[Gaussians] = []
-    mode = RasterizeMode.CLASSIC
     for primitive, world in _primitives(file):
-        compressed = _compressed(file, primitive)
-        if compressed is not None:
-            mode = compressed.mode
         place = similarity_of_matrix(world)
         if place is None:
             raise file.error(
                 "a node distorts or mirrors its Gaussians; apply its transform before exporting"
             )
-        own = _gaussians(file, primitive) if compressed is None else compressed.gaussians
+        own = _gaussians(file, primitive)
         found.append(place.gaussians(own.replace(means=own.means.double())))
     if not found:
         raise file.error(f"holds no Gaussians ({EXTENSION})")
-    return described(
-        SplatFile(joined(found), mode, comments=stored_comments(file.document.asset.extras))
-    )
+    comments = stored_comments(file.json["asset"].get("extras"))
+    return described(SplatFile(joined(found), comments=comments))
 
 
 def write_gltf(path: Path, splat: SplatFile) -> None:
     """Write a .glb with one primitive of Gaussians, harmonics up to degree 3."""
     document = GlbDocument()
     document.json["extensionsUsed"] = [EXTENSION]
-    _write_primitive(path, splat, document, add_gaussians(document, splat.gaussians))
-
-
-def write_compressed(path: Path, splat: SplatFile) -> None:
-    """Write a .glb whose Gaussians are compressed as a .spz; readers that do not know that show
-    nothing.
-
-    Raises DyngsError as ``packed_spz`` does.
-    """
-    document = GlbDocument()
-    view = document.add_bytes(packed_spz(splat))
-    gaussians = splat.gaussians
-    # of which only the shapes count
-    arrays = {"POSITION": gaussians.means, "COLOR_0": gaussians.quats}
-    arrays |= {f"{EXTENSION}:SCALE": gaussians.means, f"{EXTENSION}:ROTATION": gaussians.quats}
-    for degree in range(1, gaussians.sh_degree + 1):
-        arrays |= {
-            f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k}": gaussians.means
-            for k in range(2 * degree + 1)
-        }
-    attributes = {
-        name: document.add_placeholder(array.numpy(), limits=name == "POSITION")
-        for name, array in arrays.items()
-    }
-    own = _PROPERTIES | {"extensions": {_COMPRESSIONS[0]: {"bufferView": view}}}
-    document.json["extensionsUsed"] = document.json["extensionsRequired"] = [
-        EXTENSION,
-        _COMPRESSIONS[0],
-    ]
-    primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: own}}
-    _write_primitive(path, splat, document, primitive)
-
-
-def _write_primitive(
-    path: Path, splat: SplatFile, document: GlbDocument, primitive: dict[str, Any]
-) -> None:
-    """Write a document with one mesh in one node."""
     document.json["asset"]["extras"] = header_comments(splat)
     document.json |= {
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
+        "meshes": [{"primitives": [add_gaussians(document, splat.gaussians)]}],
     }
     document.write(path)
 
@@ -149,13 +101,13 @@ def add_gaussians(document: GlbDocument, gaussians: Gaussians) -> dict[str, Any]
     return {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: _PROPERTIES}}
 
 
-def _primitives(file: GltfFile) -> Iterator[tuple[Primitive, np.ndarray]]:
+def _primitives(file: GltfFile) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
     """Yield the primitives of Gaussians, and the matrices (4, 4) by which nodes place them."""
-    document = file.document
-    nodes = document.nodes
-    visited = 0
-    roots = document.scenes[document.scene].nodes if document.scenes else range(len(nodes))
+    nodes = file.nodes
+    scenes = file.json.get("scenes")
+    roots = scenes[file.json.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
     waiting = [(node, np.eye(4), 0) for node in roots]
+    visited = 0
     while waiting:
         index, above, depth = waiting.pop()
         visited += 1
@@ -165,70 +117,56 @@ def _primitives(file: GltfFile) -> Iterator[tuple[Primitive, np.ndarray]]:
             )
         node = nodes[index]
         world = above @ _matrix(node)
-        waiting += [(child, world, depth + 1) for child in node.children]
-        for primitive in () if node.mesh is None else document.meshes[node.mesh].primitives:
-            if EXTENSION in primitive.extensions:
-                yield primitive, world
+        waiting += [(child, world, depth + 1) for child in node.get("children", [])]
+        if "mesh" in node:
+            for primitive in file.json["meshes"][node["mesh"]]["primitives"]:
+                if EXTENSION in primitive.get("extensions", {}):
+                    yield primitive, world
 
 
-def _matrix(node: Node) -> np.ndarray:
+def _matrix(node: dict[str, Any]) -> np.ndarray:
     """Return the transform (4, 4) of a node; a rotation of zeros counts as none."""
     from scipy.spatial.transform import Rotation
 
-    if node.matrix is not None:
-        return np.array(node.matrix).reshape(4, 4).T
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
     matrix = np.eye(4)
-    if np.linalg.norm(node.rotation) > 1e-6:
-        matrix[:3, :3] = Rotation.from_quat(node.rotation).as_matrix()
-    matrix[:3, :3] *= node.scale
-    matrix[:3, 3] = node.translation
+    rotation = node.get("rotation", (0, 0, 0, 1))
+    if np.linalg.norm(rotation) > 1e-6:
+        matrix[:3, :3] = Rotation.from_quat(rotation).as_matrix()
+    matrix[:3, :3] *= node.get("scale", 1)
+    matrix[:3, 3] = node.get("translation", 0)
     return matrix
 
 
-def _compressed(file: GltfFile, primitive: Primitive) -> SplatFile | None:
-    """Return the Gaussians of the .spz that a primitive names; None: they are not compressed.
-
-    Raises DyngsError: compressed in another way, or a kernel or colour space other than those of
-    3DGS.
-    """
-    own = primitive.extensions[EXTENSION]
-    more = own.get("extensions", {}) if isinstance(own, dict) else None
-    if not isinstance(own, dict) or not isinstance(more, dict):
-        raise file.error(f"{EXTENSION} or its extensions are no object; export it again")
-    # The draft of the compression leaves out both, which the base extension requires.
-    is_optional = any(name in more for name in _COMPRESSIONS)
+def _gaussians(file: GltfFile, primitive: dict[str, Any]) -> Gaussians:
+    own = primitive["extensions"][EXTENSION]
+    if own.get("extensions"):
+        raise file.error(
+            f"its Gaussians need {', '.join(own['extensions']):.80}, which is not read"
+        )
     for key in ("kernel", "colorSpace"):
-        known = _PROPERTIES[key]
-        if own.get(key, known if is_optional else None) != known:
-            raise file.error(f"{key} {own.get(key)!r:.40} is not supported, only {known}")
-    for name, value in more.items():
-        if name not in _COMPRESSIONS:
-            raise file.error(f"its Gaussians need {name!r:.80}, which is not supported")
-        view = value.get("bufferView") if isinstance(value, dict) else None
-        return unpacked_spz(file.path, file.view_bytes(view, name))
-    return None
-
-
-def _gaussians(file: GltfFile, primitive: Primitive) -> Gaussians:
-    names = primitive.attributes
+        if own.get(key) != _PROPERTIES[key]:
+            raise file.error(
+                f"{key} {own.get(key)!r:.40} is not supported, only {_PROPERTIES[key]}"
+            )
+    names = primitive["attributes"]
 
     def numbers(name: str, kind: str = "VEC3") -> np.ndarray:
-        if name not in names:
-            raise file.error(f"its Gaussians have no {name:.60}; export it again")
-        found = file.numbers(names[name], kind, np.float32)
+        found = file.numbers(names[f"{EXTENSION}:{name}"], kind, np.float32)
         require_at_most(file.path, len(found), MOST_GAUSSIANS, "Gaussians")
         return found
 
     terms = []
     for degree in range(4):
-        keys = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k}" for k in range(2 * degree + 1)]
-        if degree and keys[0] not in names:
+        keys = [f"SH_DEGREE_{degree}_COEF_{k}" for k in range(2 * degree + 1)]
+        if degree and f"{EXTENSION}:{keys[0]}" not in names:
             break
         terms += [numbers(key) for key in keys]
     return from_linear(
-        numbers("POSITION"),
-        numbers(f"{EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]],
-        numbers(f"{EXTENSION}:SCALE"),
-        numbers(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0],
+        file.numbers(names["POSITION"], "VEC3", np.float32),
+        numbers("ROTATION", "VEC4")[:, [3, 0, 1, 2]],
+        numbers("SCALE"),
+        numbers("OPACITY", "SCALAR")[:, 0],
         np.stack(terms, axis=1),
     )

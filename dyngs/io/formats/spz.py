@@ -1,9 +1,9 @@
 """Niantic's ``.spz``: 20 bytes per Gaussian and one per number of the harmonics, compressed.
 
-Versions 1 to 3 are one gzip stream of a 16-byte header and the attributes one after the other;
-version 4 is a 32-byte header, a table of sizes, and a Zstandard stream per attribute, which needs
-``pip install 'dyngs[zstd]'``. Version 3 is written by default, which most readers of today know. y
-is up: axes are right, up, back, unless an extension of the header states other ones.
+Versions 2 and 3 are one gzip stream of a 16-byte header and the attributes one after the other;
+version 4, which is only read, is a 32-byte header, a table of sizes, and a Zstandard stream per
+attribute, which needs ``pip install 'dyngs[zstd]'``. y is up: axes are right, up, back, unless an
+extension of the header states other ones.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -24,20 +23,15 @@ from dyngs.core.gaussians import Gaussians
 from dyngs.io.fields import require_at_most
 from dyngs.io.formats.packing import largest_and_others, logit, with_largest
 from dyngs.io.formats.similarity import Similarity, mirrored, turn_of
-from dyngs.io.formats.splat_file import MOST_GAUSSIANS, SplatFile, require_count, unit_rotations
+from dyngs.io.formats.splat_file import MOST_GAUSSIANS, SplatFile, unit_rotations
 
 _MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")
 _WHOLE_HEADER = 32  # bytes, of version 4
 _ANTIALIASED, _HAS_EXTENSIONS = 1, 2
 _COORDINATE_SYSTEM = 0xADBE0003  # type of Adobe's extension that states one
-_NUM_SYSTEMS = 16
 _STANDARD = 4  # x points right, y up, z back
 _MOST_EXTENSION_BYTES = 1 << 16
-SYSTEM_OF_UP = {"y": 4, "-y": 6, "z": 12, "-z": 14}
-"""Numbers of the coordinate systems that ``SPZ_4`` states, by the axis that points up; it cannot
-state others."""
-_MOST_RATIO = 1032  # largest compression of deflate
 _MOST_BYTES = 1 << 31
 _COLOUR_SCALE = 0.15
 _FRACTION_BITS, _MOST_FRACTION_BITS = 16, 24
@@ -46,78 +40,73 @@ _TOP = (1 << 9) - 1
 
 
 def read_spz(path: Path) -> SplatFile:
-    """Read a .spz of version 1 to 4, turned to y up where it states other axes.
+    """Read a .spz of version 2 to 4, turned to y up where it states other axes.
 
-    Raises DyngsError if it is damaged or asks for too much memory.
+    Raises DyngsError or ValueError: it is damaged, or asks for too much memory.
     """
-    return unpacked_spz(path, path.read_bytes())
-
-
-def unpacked_spz(path: Path, data: bytes) -> SplatFile:
-    """Return what the bytes of a .spz hold; ``path`` is for messages. Errors as of ``read_spz``."""
-    if data[:4] == _MAGIC:
-        return _read_streams(path, data)
-    if data[:2] != b"\x1f\x8b":
-        raise DyngsError(f"{path}: is not a .spz file (it starts neither with NGSP nor as gzip)")
-    magic, version, count, degree, bits, flags, _ = _HEADER.unpack(_inflated(data, _HEADER.size))
-    if magic != _MAGIC or version not in (1, 2, 3):
-        raise DyngsError(f"{path}: is no .spz of version 1 to 4 ({magic!r}, {version})")
-    sizes = _sizes(version, count, degree)
-    total = _HEADER.size + sum(sizes.values())
-    require_count(path, count, _MOST_RATIO * len(data), total / max(count, 1))
+    data = path.read_bytes()
+    is_gzip = data[:2] == b"\x1f\x8b"
+    head = _inflated(data, _HEADER.size) if is_gzip else data[: _HEADER.size]
+    magic, version, count, degree, bits, flags, streams = _HEADER.unpack(head)
+    if magic != _MAGIC or version not in ((2, 3) if is_gzip else (4,)):
+        raise ValueError("it is no .spz of version 2 to 4")
+    if degree > MAX_SH_DEGREE or bits > _MOST_FRACTION_BITS:
+        raise ValueError(f"it states harmonics of degree {degree}, and {bits} bits after the point")
+    rows = {"means": 9, "alphas": 1, "colours": 3, "scales": 3, "quats": 3 if version < 3 else 4}
+    rows["sh"] = 3 * (num_sh_terms(degree) - 1)
+    total = count * sum(rows.values())
+    require_at_most(path, count, MOST_GAUSSIANS, "Gaussians")
     require_at_most(path, total, _MOST_BYTES, "bytes of Gaussians")
-    more = _MOST_EXTENSION_BYTES if flags & _HAS_EXTENSIONS else 0
-    content = _inflated(data, total + more)
+    if is_gzip:
+        more = _MOST_EXTENSION_BYTES if flags & _HAS_EXTENSIONS else 0
+        content = _inflated(data, _HEADER.size + total + more)[_HEADER.size :]
+        extensions = content[total:]
+    else:
+        start = int.from_bytes(data[16:20], "little")
+        extensions = data[_WHOLE_HEADER:start] if flags & _HAS_EXTENSIONS else b""
+        content = _decoded(path, data[start:], streams, total)
     parts = {}
-    start = _HEADER.size
-    for name, size in sizes.items():
-        parts[name] = np.frombuffer(content, np.uint8, size, start)
-        start += size
-    return _standard_axes(_splat(parts, version, degree, bits, flags), content[start:])
+    begin = 0
+    for name, size in rows.items():
+        parts[name] = np.frombuffer(content, np.uint8, count * size, begin).reshape(count, size)
+        begin += count * size
+    return _standard_axes(_splat(parts, bits, flags), extensions)
+
+
+def _inflated(data: bytes, most: int) -> bytes:
+    """Return at most ``most`` bytes of a gzip stream; where it ends there, its checksum has been
+    compared."""
+    stream = zlib.decompressobj(31)
+    content = stream.decompress(data, most)
+    if not stream.decompress(stream.unconsumed_tail, 1) and not stream.eof:
+        raise ValueError("it is truncated: its gzip stream does not end")
+    return content
+
+
+def _decoded(path: Path, data: bytes, streams: int, most: int) -> bytes:
+    """Return the attributes of version 4, at most ``most`` bytes: a table of sizes comes first."""
+    try:
+        import zstandard
+    except ImportError:
+        raise DyngsError(
+            f"{path}: a .spz of version 4 needs the package zstandard: pip install 'dyngs[zstd]'"
+        ) from None
+    content = b""
+    begin = 16 * streams
+    for packed, size in struct.iter_unpack("<QQ", data[:begin]):
+        part = data[begin : begin + packed]
+        decoder = zstandard.ZstdDecompressor(max_window_size=1 << 27)
+        with decoder.stream_reader(part) as stream:
+            content += stream.read(min(size, most - len(content)))
+        begin += packed
+    return content
 
 
 def write_spz(path: Path, splat: SplatFile) -> None:
-    """Write a .spz of version 3. Raises DyngsError as ``packed_spz`` does."""
-    path.write_bytes(packed_spz(splat))
-
-
-def write_spz_4(path: Path, splat: SplatFile) -> None:
-    """Write a .spz of version 4, which states its coordinate system if up is known.
-
-    Raises DyngsError: as ``packed_spz`` does, or the package zstandard is missing.
-    """
-    head, *parts = _packed_parts(splat)
-    compressor = _zstandard(path).ZstdCompressor(level=12)
-    streams = [compressor.compress(part) for part in parts if part]
-    extensions = b""
-    if splat.up is not None and splat.up in SYSTEM_OF_UP:
-        extensions = struct.pack("<III", _COORDINATE_SYSTEM, 4, SYSTEM_OF_UP[splat.up])
-    _, _, count, degree, fraction_bits, flags, _ = _HEADER.unpack(head)
-    flags |= _HAS_EXTENSIONS if extensions else 0
-    start = _WHOLE_HEADER + len(extensions)
-    head = _HEADER.pack(_MAGIC, 4, count, degree, fraction_bits, flags, len(streams)) + struct.pack(
-        "<I12x", start
-    )
-    sizes = [
-        (len(stream), len(part)) for stream, part in zip(streams, filter(None, parts), strict=True)
-    ]
-    table = b"".join(struct.pack("<QQ", *size) for size in sizes)
-    path.write_bytes(b"".join([head, extensions, table, *streams]))
-
-
-def packed_spz(splat: SplatFile) -> bytes:
-    """Return the bytes of a .spz of version 3.
+    """Write a .spz of version 3.
 
     Raises DyngsError: the scene is so large that no fixed point with 24 bits holds its positions.
     """
-    compressor = zlib.compressobj(6, zlib.DEFLATED, 31)
-    return b"".join(
-        [*(compressor.compress(part) for part in _packed_parts(splat)), compressor.flush()]
-    )
-
-
-def _packed_parts(splat: SplatFile) -> list[bytes]:
-    """Return the header of version 3 and the attributes, in the order of the file."""
     gaussians = splat.gaussians
     means = gaussians.means.double().numpy()
     extent = float(np.abs(means).max())
@@ -138,7 +127,7 @@ def _packed_parts(splat: SplatFile) -> list[bytes]:
     coded_sh = np.clip(np.round(sh * 128 / step) * step + 128, 0, 255).astype(np.uint8)
     colours = gaussians.sh[:, 0].numpy() * (_COLOUR_SCALE * 255) + 0.5 * 255
     flags = _ANTIALIASED if splat.mode is RasterizeMode.ANTIALIASED else 0
-    return [
+    parts = [
         _HEADER.pack(_MAGIC, 3, len(gaussians), gaussians.sh_degree, fraction_bits, flags, 0),
         fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3].tobytes(),
         _as_bytes(gaussians.opacities.numpy() * 255),
@@ -147,55 +136,8 @@ def _packed_parts(splat: SplatFile) -> list[bytes]:
         _packed_rotations(gaussians.quats.numpy()).astype("<u4").tobytes(),
         coded_sh.tobytes(),
     ]
-
-
-def _sizes(version: int, count: int, degree: int) -> dict[str, int]:
-    """Return the bytes of the attributes, in the order of the file."""
-    if degree > MAX_SH_DEGREE:
-        raise ValueError(f"harmonics of degree {degree}, only 0 to {MAX_SH_DEGREE} are known")
-    each = {
-        "means": 6 if version == 1 else 9,
-        "alphas": 1,
-        "colours": 3,
-        "scales": 3,
-        "quats": 3 if version < 3 else 4,
-        "sh": 3 * (num_sh_terms(degree) - 1),
-    }
-    return {name: count * size for name, size in each.items()}
-
-
-def _inflated(data: bytes, most: int) -> bytes:
-    """Return at most ``most`` bytes of a gzip stream; where it ends there, its checksum has been
-    compared."""
-    stream = zlib.decompressobj(31)
-    content = stream.decompress(data, most)
-    if not stream.decompress(stream.unconsumed_tail, 1) and not stream.eof:
-        raise ValueError("it is truncated: its gzip stream does not end")
-    return content
-
-
-def _read_streams(path: Path, data: bytes) -> SplatFile:
-    """Read version 4."""
-    _, version, count, degree, bits, flags, streams = _HEADER.unpack(data[:16])
-    if version != 4:
-        raise DyngsError(f"{path}: is a .spz of version {version}, only 1 to 4 are known")
-    start = int.from_bytes(data[16:20], "little")
-    sizes = _sizes(version, count, degree)
-    require_at_most(path, sum(sizes.values()), _MOST_BYTES, "bytes of Gaussians")
-    require_at_most(path, count, MOST_GAUSSIANS, "Gaussians")
-    table = np.frombuffer(data, "<u8", 2 * streams, start).reshape(-1, 2).tolist()
-    begin = start + 16 * streams
-    parts = {"sh": np.zeros(0, np.uint8)}
-    stored = [name for name, size in sizes.items() if size or name != "sh"]
-    for name, (packed, whole) in zip(stored, table[: len(stored)], strict=True):
-        if begin + packed > len(data) or whole != sizes[name]:
-            raise ValueError(f"it is truncated or damaged in its {name}")
-        parts[name] = np.frombuffer(
-            _unpacked(path, data[begin : begin + packed], whole), np.uint8, whole
-        )
-        begin += packed
-    splat = _splat(parts, version, degree, bits, flags)
-    return _standard_axes(splat, data[_WHOLE_HEADER:start] if flags & _HAS_EXTENSIONS else b"")
+    compressor = zlib.compressobj(6, zlib.DEFLATED, 31)
+    path.write_bytes(b"".join([*map(compressor.compress, parts), compressor.flush()]))
 
 
 def _standard_axes(splat: SplatFile, extensions: bytes) -> SplatFile:
@@ -220,7 +162,7 @@ def _from_system(splat: SplatFile, number: int) -> SplatFile:
     Bits of the number, less one: x points right, y up, z to the front; with the fourth bit z is the
     vertical axis, and the third bit is y to the back.
     """
-    if number > _NUM_SYSTEMS:
+    if number > 16:
         raise ValueError(f"it states coordinate system {number}, but only 1 to 16 exist")
     if number in (0, _STANDARD):
         return splat
@@ -238,51 +180,30 @@ def _from_system(splat: SplatFile, number: int) -> SplatFile:
     )
 
 
-def _zstandard(path: Path) -> Any:
-    try:
-        import zstandard
-    except ImportError:
-        raise DyngsError(
-            f"{path}: a .spz of version 4 needs the package zstandard: pip install 'dyngs[zstd]' (version 3 does not)"
-        ) from None
-    return zstandard
-
-
-def _unpacked(path: Path, data: bytes, size: int) -> bytes:
-    with _zstandard(path).ZstdDecompressor(max_window_size=1 << 27).stream_reader(data) as stream:
-        return stream.read(size)
-
-
-def _splat(
-    parts: Mapping[str, np.ndarray], version: int, degree: int, fraction_bits: int, flags: int
-) -> SplatFile:
+def _splat(parts: Mapping[str, np.ndarray], fraction_bits: int, flags: int) -> SplatFile:
+    """Return the contents, given the bytes (N, D) of the attributes."""
     count = len(parts["alphas"])
-    if fraction_bits > _MOST_FRACTION_BITS:
-        raise ValueError(f"positions with {fraction_bits} bits after the point do not exist")
-    if version == 1:
-        means = parts["means"].view("<f2").astype(np.float32).reshape(count, 3)
-    else:
-        wide = np.zeros((count, 3, 4), np.uint8)
-        wide[:, :, 1:] = parts["means"].reshape(count, 3, 3)
-        means = (wide.view("<i4")[:, :, 0] >> 8).astype(np.float32) / float(1 << fraction_bits)
-    if version < 3:
-        axes = parts["quats"].reshape(count, 3).astype(np.float32) / 127.5 - 1
+    wide = np.zeros((count, 3, 4), np.uint8)
+    wide[:, :, 1:] = parts["means"].reshape(count, 3, 3)
+    means = (wide.view("<i4")[:, :, 0] >> 8).astype(np.float32) / float(1 << fraction_bits)
+    if parts["quats"].shape[1] == 3:  # version 2
+        axes = parts["quats"].astype(np.float32) / 127.5 - 1
         w = np.sqrt(np.maximum(0, 1 - np.square(axes).sum(axis=1, keepdims=True)))
         quats = unit_rotations(torch.from_numpy(np.concatenate([w, axes], axis=1)))
     else:
-        quats = torch.from_numpy(_unpacked_rotations(parts["quats"].view("<u4")))
-    base = (parts["colours"].reshape(count, 1, 3).astype(np.float32) / 255 - 0.5) / _COLOUR_SCALE
-    rest = (parts["sh"].reshape(count, num_sh_terms(degree) - 1, 3).astype(np.float32) - 128) / 128
+        quats = torch.from_numpy(_unpacked_rotations(parts["quats"].ravel().view("<u4")))
+    base = (parts["colours"].astype(np.float32) / 255 - 0.5) / _COLOUR_SCALE
+    sh = np.concatenate([base, (parts["sh"].astype(np.float32) - 128) / 128], axis=1)
     gaussians = Gaussians(
         means=torch.from_numpy(means),
         quats=quats,
-        log_scales=torch.from_numpy(parts["scales"].reshape(count, 3).astype(np.float32) / 16 - 10),
-        logit_opacities=torch.from_numpy(logit(parts["alphas"].astype(np.float32) / 255)),
-        sh=torch.from_numpy(np.concatenate([base, rest], axis=1).astype(np.float32)),
+        log_scales=torch.from_numpy(parts["scales"].astype(np.float32) / 16 - 10),
+        logit_opacities=torch.from_numpy(logit(parts["alphas"][:, 0].astype(np.float32) / 255)),
+        sh=torch.from_numpy(sh.astype(np.float32).reshape(count, -1, 3)),
     )
-    return SplatFile(
-        gaussians, RasterizeMode.ANTIALIASED if flags & _ANTIALIASED else RasterizeMode.CLASSIC
-    )
+    is_antialiased = flags & _ANTIALIASED
+    mode = RasterizeMode.ANTIALIASED if is_antialiased else RasterizeMode.CLASSIC
+    return SplatFile(gaussians, mode)
 
 
 def _packed_rotations(quats: np.ndarray) -> np.ndarray:

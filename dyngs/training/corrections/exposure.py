@@ -9,29 +9,34 @@ Gains of all images are found at once, by the places that they share, as soon as
 depth; then Adam refines them. Adam alone is too slow for a short run, and leaves a scene bright
 where bright images were taken.
 
-Local letters: V views, M (V, 3, 4) deviations from the identity, matrix next to offset.
+Local letters: V views, J of them compared with, P places, C cells of an image, row by row, M
+(V, 3, 4) deviations from the identity, matrix next to offset.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d
 
 from dyngs.config import TrainConfig
+from dyngs.core.camera import Cameras
 from dyngs.core.state import tensors_of
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.times import videos
+from dyngs.data.times import evenly_spaced, videos
 from dyngs.gaussians.colour.network import SATURATED, recoloured
 from dyngs.gaussians.optimizer import AdamState
 from dyngs.models.model import Correction, Look, Loss, RenderedView
+from dyngs.models.renderable import Rendering
 from dyngs.ops.adam import Count
-from dyngs.training.other_views import log_gains
+from dyngs.training.corrections.cells import cell_camera, distances, pixels_of, points_of
 
 WARM_UP = 0.25
 """Fraction of the run in which images are taken as they are: before, the rendering shows too little
@@ -61,7 +66,12 @@ def exposures_of(options: TrainConfig, images: ImageLoader) -> ViewExposures | N
 
 
 class ViewExposures(Loss, Correction):
-    """An affine colour per training image, and their Adam."""
+    """An affine colour per training image, and their Adam.
+
+    Args:
+        neighbours: images before and after each in a video.
+        images: whose gains are found at once; None: Adam finds them.
+    """
 
     name = "exposures"
 
@@ -69,7 +79,7 @@ class ViewExposures(Loss, Correction):
         self, neighbours: Sequence[Sequence[int]], steps: int, images: ImageLoader | None = None
     ) -> None:
         count = len(neighbours)
-        self._neighbours = [list(x) for x in neighbours]
+        self._neighbours = neighbours
         self._steps = steps
         self._begins = round(WARM_UP * steps)
         self._images = images
@@ -82,41 +92,36 @@ class ViewExposures(Loss, Correction):
         self._rates = rate * (MIXING_RATE + (1 - MIXING_RATE) * is_gain)
         self._weights = MIXING_WEIGHT + (GAIN_WEIGHT - MIXING_WEIGHT) * is_gain
 
-    def _find_gains(self, view: RenderedView) -> None:
+    @torch.no_grad()
+    def _find_gains(self, images: ImageLoader, view: RenderedView) -> None:
         """Find the gains of all images at once."""
-        if self._images is None:
-            return
         looked_at = [i for i in range(len(self._visits)) if view.trains_on(i)]
-        gains = log_gains(self._images, looked_at, view.draw).exp()
+        gains = log_gains(images, looked_at, view.draw).exp()
         self._visits[looked_at] = 1
-        with torch.no_grad():
-            self._values.reshape(-1, 3, 4).diagonal(dim1=1, dim2=2).copy_(
-                gains - gains[looked_at].mean(0)
-            )
-            self._values[self._visits == 0] = 0
+        diagonal = self._values.reshape(-1, 3, 4).diagonal(dim1=1, dim2=2)
+        diagonal.copy_(gains - gains[looked_at].mean(0))
+        self._values[self._visits == 0] = 0
 
     def affine(self, index: int) -> Tensor:
         """Return (3, 4) the affine colour of an image: what the camera made of the scene's
         colours."""
-        deviation = self._values[index].reshape(3, 4)
-        return deviation + torch.eye(3, 4, dtype=deviation.dtype, device=deviation.device)
+        return self._values[index].reshape(3, 4) + torch.eye(3, 4, device="cpu")
 
     def after_render(self, view: RenderedView) -> RenderedView:
         """Return the view with the rendering as its camera would have recorded it."""
         if view.step <= self._begins:
             return view
-        if view.step == self._begins + 1:
-            self._find_gains(view)
+        if view.step == self._begins + 1 and self._images is not None:
+            self._find_gains(self._images, view)
         index = view.index
-        image = view.image
-        background = view.background
-        rendering = view.rendering
         beside = self._beside(index)
         if not int(self._visits[index]) and beside:  # was not looked at, but those next to it
             with torch.no_grad():
                 self._values[index] = self._values[beside].mean(0)
-        shown = recoloured(self.affine(index), image, rendering, background)
-        return replace(view, rendered=up_to_white(shown, image.composite(background)))
+        shown = recoloured(self.affine(index), view.image, view.rendering, view.background)
+        # no sensor shows more than white
+        white = view.image.composite(view.background) >= SATURATED
+        return replace(view, rendered=torch.where(white, shown.clamp_max(1.0), shown))
 
     def __call__(self, look: Look) -> dict[str, Tensor]:
         return self.penalties(look.index)
@@ -126,10 +131,8 @@ class ViewExposures(Loss, Correction):
         total = (self._weights * value.square()).mean()
         beside = self._beside(index)
         if beside:
-            total = (
-                total
-                + SMOOTH_WEIGHT * (value - self._values[beside].detach().mean(0)).square().mean()
-            )
+            around = self._values[beside].detach().mean(0)
+            total = total + SMOOTH_WEIGHT * (value - around).square().mean()
         return {"exposure": total}
 
     def _beside(self, index: int) -> list[int]:
@@ -143,13 +146,12 @@ class ViewExposures(Loss, Correction):
         rows = torch.zeros(len(self._visits), dtype=torch.bool, device="cpu")
         rows[index] = True
         rate = self._rates * LAST_RATE ** min(step / self._steps, 1.0)
-        bad = self._adam.step_(
-            "values", self._values, lr=rate, step=int(self._visits[index]), rows=rows
-        )
-        with torch.no_grad():
-            known = self._visits > 0
-            if step > self._begins + len(known):
-                # all are known: what they have in common is the scene's
+        visits = int(self._visits[index])
+        bad = self._adam.step_("values", self._values, lr=rate, step=visits, rows=rows)
+        known = self._visits > 0
+        if step > self._begins + len(known):
+            # all are known: what they have in common is the scene's
+            with torch.no_grad():
                 self._values[known] -= self._values[known].mean(0)
         return bad
 
@@ -164,8 +166,116 @@ class ViewExposures(Loss, Correction):
         self._visits, self._values = visits.clone(), values.clone().requires_grad_()
 
 
-def up_to_white(rendered: Tensor, truth: Tensor) -> Tensor:
-    """Return ``rendered`` (H, W, 3), at most 1 where the image is saturated: no sensor shows
-    more."""
-    white = truth >= SATURATED
-    return torch.where(white, rendered.clamp_max(1.0), rendered) if bool(white.any()) else rendered
+DRAWN_FROM = 100  # Views whose cells are the places of ``log_gains``
+COMPARED = 40  # Nearest views that are compared with each of them
+SAME_DEPTH = 0.05  # Relative difference of depth up to which two views show the same place
+OPAQUE = 0.9  # Alpha from which a cell has a depth
+DARKEST = 0.02  # Mean colour from which a cell has a logarithm worth using
+OUTLIER = 0.1  # Residual, in log colour, at which an observation counts half as much
+ROUNDS = 4
+PRIOR = 0.05  # Weight of the square of a log gain, in observations: decides what no place does
+
+
+class _Cells(NamedTuple):
+    """A view in coarse cells."""
+
+    camera: Cameras
+    colours: Tensor  # (C, 3) logarithms
+    depth: Tensor  # (C,)
+    known: Tensor  # (C,) bool
+
+
+class _Places(NamedTuple):
+    """What J views show of P places."""
+
+    views: Tensor  # (J,)
+    colours: Tensor  # (J, P, 3) logarithms
+    shown: Tensor  # (J, P), 1 where a view shows a place, else 0
+
+
+@torch.no_grad()
+def log_gains(
+    images: ImageLoader, which: Sequence[int], draw: Callable[[Cameras, float | None], Rendering]
+) -> Tensor:
+    """Return (V, 3) log gains of the images ``which``, of mean 0; 0 of all others.
+
+    Each place p that view v shows has log c_vp = g_v + a_p, the log gain of the view and the log
+    colour of the place, for each channel. Whoever follows the rendering view by view finds only
+    what differs between neighbours: a scene that was trained on bright views of one side and dark
+    ones of the other has a bright side. Least squares over all views at once (as panoramas are
+    compensated; Brown and Lowe 2007) has no such error.
+
+    Args:
+        which: indices of those that may be looked at.
+        draw: renders the scene from cameras at a time, with expected depth.
+    """
+    cells = [_cells_of(images, index, draw) for index in which]
+    distance = distances([x.camera for x in cells])
+    places = [
+        _places(cells, i, distance[i].argsort(stable=True)[:COMPARED])
+        for i in evenly_spaced(len(cells), DRAWN_FROM)
+    ]
+    found = torch.zeros(len(cells), 3, dtype=torch.float64, device="cpu")
+    for _ in range(ROUNDS):
+        found = _solved(places, found)
+    gains = torch.zeros(len(images), 3, device="cpu")
+    gains[list(which)] = (found - found.mean(0)).float()
+    return gains
+
+
+def _cells_of(
+    images: ImageLoader, index: int, draw: Callable[[Cameras, float | None], Rendering]
+) -> _Cells:
+    image = images[index]
+    camera = cell_camera(image.cameras)
+    drawn = draw(camera, image.time)
+    assert drawn.depth is not None
+    rgb = image.rgb_premultiplied
+    bad = (rgb >= SATURATED).any(-1)
+    bad = bad if image.alpha is None else bad | (image.alpha < OPAQUE)
+    bad = bad if image.mask is None else bad | (image.mask < 1)
+    pixels = torch.cat([rgb, bad[..., None].float()], -1).permute(2, 0, 1).cpu()
+    pooled = adaptive_avg_pool2d(pixels, (camera.height, camera.width)).flatten(1)
+    colours = pooled[:3].T
+    known = (pooled[3] == 0) & (colours > DARKEST).all(1)
+    known &= drawn.alpha[0].flatten().cpu() > OPAQUE
+    depth = drawn.depth[0].flatten().cpu()
+    return _Cells(camera.to(device="cpu"), colours.clamp_min(DARKEST).log(), depth, known)
+
+
+def _places(cells: Sequence[_Cells], index: int, compared: Tensor) -> _Places:
+    """Return what the views ``compared`` show of the known cells of one view."""
+    own = cells[index]
+    which = own.known.nonzero()[:, 0]
+    world = points_of(own.camera, which, own.depth[which])
+    colours = []
+    shown = []
+    for other in (cells[i] for i in compared.tolist()):
+        at, z = pixels_of(other.camera, world)
+        cell = at.clamp_min(0)
+        same = (other.depth[cell] - z).abs() < SAME_DEPTH * z
+        shown.append((at >= 0) & other.known[cell] & same)
+        colours.append(other.colours[cell])
+    return _Places(compared, torch.stack(colours), torch.stack(shown).float())
+
+
+def _solved(places: Sequence[_Places], gains: Tensor) -> Tensor:
+    """Return (V, 3) the solution of weighted least squares, with weights from the residuals of
+    ``gains``."""
+    count = len(gains)
+    products = PRIOR * torch.eye(count, dtype=torch.float64, device="cpu")
+    sides = torch.zeros(count, 3, dtype=torch.float64, device="cpu")
+    for views, colours, shown in places:
+        weight = shown.double()
+        seen = colours.double()
+        even = seen - gains[views][:, None]
+        middle = (weight[..., None] * even).sum(0) / weight.sum(0).clamp_min(1)[:, None]
+        residual = (even - middle).abs().mean(-1)
+        weight = weight / (1 + (residual / OUTLIER).square())
+        total = weight.sum(0).clamp_min(1e-9)
+        mean = (weight[..., None] * seen).sum(0) / total[:, None]
+        part = torch.diag(weight.sum(1)) - (weight / total) @ weight.T
+        side = (weight[..., None] * (seen - mean)).sum(1)
+        products.index_put_((views[:, None], views[None]), part, accumulate=True)
+        sides.index_put_((views,), side, accumulate=True)
+    return torch.linalg.solve(products, sides)

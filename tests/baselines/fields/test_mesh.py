@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from dyngs.baselines.fields.keys import NgpModel
+from dyngs.baselines.fields.kind import NgpModel
 from dyngs.baselines.fields.ngp import NgpField
 from dyngs.baselines.fields.scene import FieldScene, surface_of
 from dyngs.ops.rays import Space
@@ -32,17 +32,7 @@ class Ball(NgpField):
 def scene() -> FieldScene:
     space = Space((0.1, 0.0, 0.0), 1.0, 2, 8)
     plain = NgpField.new(NgpModel(sizes="tiny"), space, torch.Generator().manual_seed(0))
-    field = Ball(
-        space,
-        plain.pixels,
-        plain.levels,
-        plain.table,
-        plain.density,
-        plain.colour,
-        plain.occupied,
-        plain.across,
-    )
-    return FieldScene(field)
+    return FieldScene(Ball(**vars(plain)))
 
 
 def test_a_ball_is_found_with_faces_outwards_and_colours(scene: FieldScene) -> None:

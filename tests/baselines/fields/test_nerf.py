@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import pytest
 import torch
 
-from dyngs.baselines.fields.keys import NerfModel
+from dyngs.baselines.fields.kind import NerfModel
 from dyngs.baselines.fields.nerf import NerfField
 from dyngs.ops.rays import Rays, Space
 
@@ -22,9 +20,9 @@ def test_rays_see_a_slab_of_even_density() -> None:
     with torch.no_grad():
         for x in field.parameters.values():
             x.zero_()
-        for network in (field.coarse, field.fine):
-            network.trunk[-1].bias[0] = 2.0
-            network.head[-1].bias.copy_(torch.tensor([1.0, 0.0, -1.0]))
+        for network in ("coarse", "fine"):
+            field.parameters[f"{network}.trunk.8.bias"][0] = 2.0
+            field.parameters[f"{network}.head.1.bias"].copy_(torch.tensor([1.0, 0.0, -1.0]))
         rays = Rays(
             torch.tensor([[-4.0, 0, 0], [-4, 9, 0]]), torch.tensor([[1.0, 0, 0], [0, 1, 0]])
         )
@@ -42,6 +40,8 @@ def test_rays_see_a_slab_of_even_density() -> None:
 def test_all_that_is_learned_gets_gradients_and_none_is_of_rounding() -> None:
     """The last sample is 1e10 long: what is left of sums must not be multiplied by that."""
     field = NerfField.new(NerfModel(sizes="tiny"), SPACE, torch.Generator().manual_seed(3))
+    for x in field.parameters.values():
+        x.requires_grad_()
     origins = (
         torch.nn.functional.normalize(
             torch.randn(50, 3, generator=torch.Generator().manual_seed(1))
@@ -54,4 +54,5 @@ def test_all_that_is_learned_gets_gradients_and_none_is_of_rounding() -> None:
     (seen.colour + seen.coarse.colour).mean().backward()
     grads = [x.grad for name, x in field.parameters.items() if "weight" in name]
     assert all(grad is not None and 0 < float(grad.abs().max()) < 10 for grad in grads)
-    assert [n.weight.shape[0] for n, _ in pairwise(field.coarse.trunk)] == [32] * 8
+    hidden = [f"coarse.trunk.{n}.weight" for n in range(8)]
+    assert [len(field.parameters[name]) for name in hidden] == [32] * 8

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dyngs.baselines.fields.keys import NgpModel
+from dyngs.baselines.fields.kind import NgpModel
 from dyngs.baselines.fields.ngp import NgpField
 from dyngs.ops.rays import Rays, Space
 
@@ -16,7 +16,7 @@ SPACE = Space((0.1, 0.0, -0.2), 1.2, 1, 8)
 def field_of(model: NgpModel = SMALL, space: Space = SPACE) -> NgpField:
     field = NgpField.new(model, space, torch.Generator().manual_seed(0))
     with torch.no_grad():
-        field.table.mul_(3e4)  # something is there
+        field.parameters["table"].mul_(3e4)  # something is there
     field.occupied[0, :4] = False
     return field
 

@@ -10,8 +10,7 @@ import pytest
 import torch
 from small_fields import NGP, config_of
 
-from dyngs.baselines.fields.ngp import NgpField, seen_cells
-from dyngs.baselines.fields.training import NgpTraining
+from dyngs.baselines.fields.ngp import NgpField, NgpTraining, seen_cells
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import ImageLoader

@@ -9,7 +9,7 @@ import torch
 from moving_scene import camera
 from small_fields import NERF, NGP, config_of
 
-from dyngs.baselines.fields.keys import NgpModel
+from dyngs.baselines.fields.kind import NgpModel
 from dyngs.baselines.fields.ngp import NgpField
 from dyngs.baselines.fields.scene import FieldScene
 from dyngs.models.checkpoint import restored_model

@@ -10,7 +10,7 @@ import pytest
 import torch
 from small_fields import config_of
 
-from dyngs.baselines.fields.keys import NgpModel
+from dyngs.baselines.fields.kind import NgpModel
 from dyngs.baselines.fields.scene import MOST_CASCADES, space_of
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError

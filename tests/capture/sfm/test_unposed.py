@@ -83,7 +83,7 @@ def test_no_output_replaces_the_video_that_a_run_is_made_of(
         assert (
             main(["render", str(tmp_path / "run"), "--path", "along", "--video", str(video)]) == 2
         )
-        assert "clip.mp4: is the file that is read" in capsys.readouterr().err
+        assert "clip.mp4: exists, which is read" in capsys.readouterr().err
         (data.root / SOURCES_NAME).unlink()  # as a run killed at just that moment leaves it
     assert video.read_bytes() == before
 

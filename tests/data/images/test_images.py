@@ -239,9 +239,7 @@ def test_a_small_file_with_a_huge_image_is_refused_before_it_is_decoded(tmp_path
     assert read_header(path).width == 20_000
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for read in (read_image, read_mask, check_image):
-        with pytest.raises(
-            DyngsError, match=r"20000x20000 .*max_megapixels is 150; shrink .*or raise"
-        ):
+        with pytest.raises(DyngsError, match=r"asks for 400,000,000 pixels"):
             read(path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000
 

@@ -11,7 +11,7 @@ import pytest
 from tiny_captures import random_pixels, write_frames, write_image
 
 from dyngs.api.load import read_capture
-from dyngs.capture.inspection.report import format_report, inspect_capture
+from dyngs.capture.inspection import format_report, inspect_capture
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import ImageLoader

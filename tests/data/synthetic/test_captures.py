@@ -9,21 +9,23 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from dyngs.capture.inspection.report import inspect_capture
+from dyngs.capture.inspection import inspect_capture
 from dyngs.data.synthetic.captures import (
     CAMERA_ANGLE_X,
     POINTS_PER_THING,
     DynamicOptions,
     SceneName,
+    SyntheticShot,
+    nearest_things,
     orbit_cameras,
-    render_things,
+    sampled_rays,
     scene_at,
     true_tracks,
     write_dynamic_capture,
 )
 
 NAMES: tuple[SceneName, ...] = get_args(SceneName)
-TINY = DynamicOptions(size=16, num_times=5, num_test=3, num_val=2, num_cameras=3, samples=1)
+TINY = DynamicOptions(size=16, num_times=5, num_test=3, num_cameras=3, samples=1)
 
 
 def _files(root: Path) -> dict[str, bytes]:
@@ -69,7 +71,7 @@ def test_visible_points_lie_where_something_moving_is_seen(name: SceneName) -> N
     poses = [orbit_cameras(1, 4.0, elevation, azimuth)[0] for elevation, azimuth in CAMERAS]
     times = np.linspace(0, 1, 5)
     shots = [
-        (f"v{i}", float(time), pose)
+        SyntheticShot(f"v{i}", pose, float(time))
         for i, (time, pose) in enumerate(zip(times, poses, strict=True))
     ]
     tracks = true_tracks(lambda time: scene_at(name, time), shots)
@@ -78,12 +80,14 @@ def test_visible_points_lie_where_something_moving_is_seen(name: SceneName) -> N
     assert tracks.views.tolist() == ["v0", "v1", "v2", "v3", "v4"]
     np.testing.assert_array_equal(tracks.times, times)
     np.testing.assert_array_equal(tracks.moments, range(5))
-    for k, (_, time, pose) in enumerate(shots):
+    for k, (time, pose) in enumerate(zip(times, poses, strict=True)):
         seen = tracks.visible[k]
         assert seen.mean() > 0.1
         assert seen.mean() < 0.9, "others are on the far side or hidden"
-        labels = np.pad(render_things(scene_at(name, time), pose, SIZE), 1)
+        rays = sampled_rays(pose, SIZE, 1)[0]
+        nearest, _ = nearest_things(scene_at(name, time), pose[:3, 3], rays)
+        labels = np.pad(nearest.reshape(SIZE, SIZE), 1)
         x, y = projected(tracks.points[k][seen], pose).astype(int).T
-        own = 1 + np.flatnonzero(seen) // POINTS_PER_THING
+        own = scene_at(name, time).movers[0] + np.flatnonzero(seen) // POINTS_PER_THING
         near = np.any([labels[y + dy, x + dx] == own for dy in range(3) for dx in range(3)], axis=0)
         assert near.all(), "where its own thing is or, at an outline, next to it"

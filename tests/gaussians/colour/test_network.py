@@ -19,7 +19,7 @@ from dyngs.gaussians.colour.network import (
 from dyngs.gaussians.rendering import render
 from dyngs.ops.perceptron import Layer, reference_perceptron
 from dyngs.ops.quaternions import rotation_matrices
-from dyngs.ops.shading import Sight, num_inputs
+from dyngs.ops.shading import num_inputs
 
 
 def network(
@@ -63,8 +63,8 @@ def test_each_gaussian_has_the_colour_of_its_own_inputs() -> None:
     for v, i in ((0, 0), (0, 5), (1, 3)):
         one = gaussians.select(torch.tensor([i]))
         geometry = (one.means, one.quats, one.log_scales, torch.tensor([0]))
-        sight = Sight(*geometry, scene.cameras.centers[v], net.box, time=0.7)
-        added = reference_perceptron(reference.shading_inputs(sight, one.base_rgb), net.layers)
+        sight = reference.Sight(*geometry, scene.cameras.centers[v], net.box, time=0.7)
+        added = reference_perceptron(reference.shading_inputs(one.base_rgb, *sight), net.layers)
         torch.testing.assert_close(colors[v, i], (one.base_rgb + added)[0].clamp_min(0))
 
 

@@ -1,5 +1,4 @@
-"""Sets of synthetic people: the same bytes, all different, depth and key points that fit the
-images."""
+"""Sets of synthetic people: the same bytes, and depth that fits the images."""
 
 from __future__ import annotations
 
@@ -13,8 +12,7 @@ from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import captures_in
-from dyngs.data.tracks import read_true_tracks
-from dyngs.human.synthetic.capture import KEYPOINTS_FILE, NUM_KEYPOINTS, PeopleOptions, write_people
+from dyngs.human.synthetic.capture import PeopleOptions, write_people
 
 SMALL = PeopleOptions(people=2, size=64, cameras=3)
 
@@ -71,19 +69,6 @@ def test_depth_and_silhouettes_agree_between_views(root: Path) -> None:
                 column, row = (flat[:, :2] / flat[:, 2:]).long().T
                 wide = torch.nn.functional.max_pool2d(other.alpha[None], 3, 1, 1)[0]
                 assert (wide[row, column] > 0).float().mean() > 0.99
-
-
-def test_key_points_lie_in_the_person(root: Path) -> None:
-    for data in captures_in(DataConfig(root=root, test_every=0)):
-        capture = read_capture(data)
-        found = read_true_tracks(capture, KEYPOINTS_FILE)
-        assert found is not None
-        assert found.points.shape == (1, NUM_KEYPOINTS, 3)
-        assert found.visible.shape == (3, NUM_KEYPOINTS)
-        assert set(found.views.tolist()) == {view.name for view in capture.splits["train"]}
-        assert 0.4 < found.visible.mean() < 1
-        face = found.visible[:, 22:]
-        assert not face.all(), "a ring sees the back of the head, too"
 
 
 def test_what_does_not_fit_is_refused(root: Path, tmp_path: Path) -> None:

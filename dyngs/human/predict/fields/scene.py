@@ -4,7 +4,7 @@ trained."""
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -19,12 +19,13 @@ from dyngs.core.tensor_checks import require_indices, require_positive, require_
 from dyngs.data.loader import Image
 from dyngs.human.predict.fields.eg_human_nerf import EgHumanNerf
 from dyngs.human.predict.fields.keypoint_nerf import AROUND, KeypointNerf
-from dyngs.human.predict.fields.keys import PredictedFieldModel
 from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
-from dyngs.human.predict.fields.people import MULTIPLE, PosedBody, Sources, metric
+from dyngs.human.predict.keys import PredictedFieldModel
+from dyngs.human.predict.people import MULTIPLE, PosedBody, Sources, metric
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Model, Updated
+from dyngs.models.prediction import load_weights
 from dyngs.models.renderable import (
     DrawOptions,
     Renderable,
@@ -40,8 +41,6 @@ NETWORKS: dict[str, Callable[[torch.Generator], FieldNetwork]] = {
     "eg_human_nerf": EgHumanNerf,
 }
 """Untrained networks, by ``model.kind``."""
-_MOST_VIEWS = 1024
-_MOST_PIXELS = 1 << 26  # Of stored images
 
 
 @dataclass(frozen=True)
@@ -112,24 +111,18 @@ class PredictedField(Renderable):
         through = like.new_ones(shape)
         part = around_in(metric(camera, self.scale), self._around)
         if part is not None:
-            seen, (top, left) = self.network.picture(self.known, part.camera), part.corner
-            own = slice(top, top + part.camera.height), slice(left, left + part.camera.width)
+            near, top, left = part
+            seen = self.network.picture(self.known, near)
+            own = slice(top, top + near.height), slice(left, left + near.width)
             colour[own] = seen.colour
             through[own] = seen.transmittance
             depth[own] = self.scale * seen.depth
         return colour, through, depth
 
 
-@dataclass(frozen=True)
-class ImagePart:
-    """A part of a camera's image, with its own camera, and its first row and column."""
-
-    camera: Cameras
-    corner: tuple[int, int]
-
-
-def around_in(camera: Cameras, box: Tensor) -> ImagePart | None:
-    """Return the part of an image that shows a box, of corners (2, 3); None: no part does.
+def around_in(camera: Cameras, box: Tensor) -> tuple[Cameras, int, int] | None:
+    """Return the camera of the part of an image that shows a box, of corners (2, 3), and its first
+    row and column; None: no part does.
 
     Its sides are multiples of ``MULTIPLE`` where the image is as large. All of the image where the
     box reaches behind the camera.
@@ -141,28 +134,20 @@ def around_in(camera: Cameras, box: Tensor) -> ImagePart | None:
     if bool((local[:, 2] <= 0).all()):
         return None
     if bool((local[:, 2] <= 1e-3).any()):
-        return ImagePart(camera, (0, 0))
+        return camera, 0, 0
     pixels = local[:, :2] / local[:, 2:] * torch.stack([k[0, 0], k[1, 1]]) + k[:2, 2]
-    first = pixels.amin(0).floor().tolist()
-    last = pixels.amax(0).ceil().tolist()
-    (left, width), (top, height) = (
-        _within(int(begin), int(end), size)
-        for begin, end, size in zip(first, last, (camera.width, camera.height), strict=True)
-    )
-    if width <= 0 or height <= 0:
+    size = pixels.new_tensor([camera.width, camera.height])
+    first = pixels.amin(0).floor().clamp_min(0)
+    length = pixels.amax(0).ceil().minimum(size) - first
+    if bool((length <= 0).any()):
         return None
+    length = ((length / MULTIPLE).ceil() * MULTIPLE).minimum(size)
+    left, top = (int(x) for x in first.minimum(size - length))
+    width, height = (int(x) for x in length)
     intrinsics = camera.intrinsics.clone()
     intrinsics[:, 0, 2] -= left
     intrinsics[:, 1, 2] -= top
-    return ImagePart(Cameras(camera.cam_from_world, intrinsics, width, height), (top, left))
-
-
-def _within(begin: int, end: int, size: int) -> tuple[int, int]:
-    """Return where a part of an image's side begins, and how long it is."""
-    begin = max(begin, 0)
-    end = min(end, size)
-    length = min(-(-(end - begin) // MULTIPLE) * MULTIPLE, size)
-    return min(begin, size - length), length
+    return Cameras(camera.cam_from_world, intrinsics, width, height), top, left
 
 
 def stored_field(name: str, checkpoint: Checkpoint) -> PredictedField:
@@ -173,48 +158,33 @@ def stored_field(name: str, checkpoint: Checkpoint) -> PredictedField:
     numbers = require_tensor("numbers", stored["numbers"][:1], (1,), torch.float64)
     require_positive("scale", numbers)
     network = NETWORKS[name](torch.Generator())
-    own = network.state_dict()
-    weights = {
-        key: require_tensor(key, stored[f"network.{key}"], tuple(x.shape), x.dtype).clone()
-        for key, x in own.items()
-    }
-    network.load_state_dict(weights)
-    behind = evaluation_background(checkpoint.info.background, False)[1]
-    return PredictedField(
-        network, _sources(stored), _body(stored), float(numbers[0]), background=behind
-    )
-
-
-def _sources(stored: Mapping[str, Tensor]) -> Sources:
+    load_weights(network, checkpoint, "field.network")
     rgba = require_tensor("rgba", stored["sources.rgba"], (None, 4, None, None))
     count, _, height, width = rgba.shape
-    if (
-        not 1 <= count <= _MOST_VIEWS
-        or height % MULTIPLE
-        or width % MULTIPLE
-        or not 0 < height * width <= _MOST_PIXELS
-    ):
+    if not rgba.numel() or height % MULTIPLE or width % MULTIPLE:
         raise ValueError(f"'rgba' is no set of images: {tuple(rgba.shape)}")
     poses = require_tensor("cam_from_world", stored["sources.cam_from_world"], (count, 4, 4))
-    return Sources(
-        rgba, poses, require_tensor("intrinsics", stored["sources.intrinsics"], (count, 3, 3))
-    )
-
-
-def _body(stored: Mapping[str, Tensor]) -> PosedBody:
+    intrinsics = require_tensor("intrinsics", stored["sources.intrinsics"], (count, 3, 3))
     points = require_tensor("key_points", stored["body.key_points"], (None, 3))
     vertices = require_tensor("vertices", stored["body.vertices"], (None, 3))
     faces = require_indices("faces", stored["body.faces"], (None, 3), len(vertices))
-    return PosedBody(points, vertices, faces)
+    return PredictedField(
+        network,
+        Sources(rgba, poses, intrinsics),
+        PosedBody(points, vertices, faces),
+        float(numbers[0]),
+        background=evaluation_background(checkpoint.info.background, False)[1],
+    )
 
 
 class PredictedModel(Model[PredictedField]):
     """What was predicted, in the place of a model in training; to train it is refused."""
 
     def __init__(self, run: RunStart) -> None:
-        self._run, self._scene = run, None
         assert isinstance(run.config.model, PredictedFieldModel)
+        self._run_dir = run.config.run.dir
         self._name = run.config.model.network
+        self._scene: PredictedField | None = None
 
     def begin_with(self, scene: PredictedField) -> None:
         self._scene = scene
@@ -222,11 +192,17 @@ class PredictedModel(Model[PredictedField]):
     @property
     def scene(self) -> PredictedField:
         if self._scene is None:
-            raise _untrained(self._run.config.run.dir)
+            raise self._untrained()
         return self._scene
 
+    def _untrained(self) -> DyngsError:
+        return DyngsError(
+            f"{self._run_dir}: a predicted field is not trained; predict it from other views, or train `ngp` or "
+            "`human` on the capture"
+        )
+
     def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
-        raise _untrained(self._run.config.run.dir)
+        raise self._untrained()
 
     def update(self, step: int) -> Updated:
         return Updated(0)
@@ -243,13 +219,6 @@ class PredictedModel(Model[PredictedField]):
 
     def place(self, device: torch.device) -> None:
         self._scene = None if self._scene is None else self._scene.to(device)
-
-
-def _untrained(where: object) -> DyngsError:
-    return DyngsError(
-        f"{where}: a predicted field is not trained; predict it from other views, or train `ngp` or `human` on the "
-        "capture"
-    )
 
 
 def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedField:

@@ -1,0 +1,78 @@
+"""The kinds of networks that predict people, and of the fields that some predict."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from dyngs.human.keys import HumanPredictorModel
+from dyngs.human.predict.keys import (
+    EgHumanNerfModel,
+    FieldPredictorModel,
+    GpsModel,
+    KeypointNerfModel,
+    PredictedFieldModel,
+)
+from dyngs.models.kind import ModelKind, Predicts
+
+if TYPE_CHECKING:
+    from dyngs.data.capture import Capture
+    from dyngs.models.kind import MakeLearner, MakePredictor, Restore, Start
+
+
+class HumanPredictorKind(Predicts):
+    """See the module."""
+
+    def num_views(self, section: HumanPredictorModel) -> int:
+        return section.source_views
+
+    def networks(self) -> tuple[MakeLearner, MakePredictor]:
+        from dyngs.human.predict.ghg.learner import learner, predictor
+
+        return learner, predictor
+
+
+HUMAN_PREDICTOR = HumanPredictorKind(HumanPredictorModel)
+
+
+class GpsKind(Predicts):
+    """See the module."""
+
+    def num_views(self, section: GpsModel) -> int:
+        return 2
+
+    def networks(self) -> tuple[MakeLearner, MakePredictor]:
+        from dyngs.human.predict.gps.learner import learner, predictor
+
+        return learner, predictor
+
+
+GPS = GpsKind(GpsModel)
+
+
+class FieldPredictorKind(Predicts):
+    """See the module."""
+
+    def num_views(self, section: FieldPredictorModel) -> int:
+        return section.source_views
+
+    def networks(self) -> tuple[MakeLearner, MakePredictor]:
+        from dyngs.human.predict.fields.learner import learner, predictor
+
+        return learner, predictor
+
+
+class PredictedFieldKind(ModelKind):
+    """Fields that these networks predict: rendered, not trained."""
+
+    def refusal(self, capture: Capture) -> str:
+        return "model.kind=predicted_field is what `dyngs predict` writes, and is not trained"
+
+    def functions(self) -> tuple[Start, Restore]:
+        from dyngs.human.predict.fields.scene import PredictedModel, restore
+
+        return PredictedModel, restore
+
+
+KEYPOINT_NERF = FieldPredictorKind(KeypointNerfModel)
+EG_HUMAN_NERF = FieldPredictorKind(EgHumanNerfModel)
+PREDICTED_FIELD = PredictedFieldKind(PredictedFieldModel)

@@ -1,0 +1,55 @@
+"""Coarse cells of images, as pixels of small cameras: the places that they show, and where other
+cameras show these.
+
+Local letters: V views, P places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from dyngs.core.camera import Cameras
+
+CELLS = 40  # Cells along the longest side of an image
+_TINY = 1e-6
+
+
+def cell_camera(cameras: Cameras) -> Cameras:
+    """Return the camera whose pixels are the coarse cells of the images of ``cameras``."""
+    width, height = cameras.width, cameras.height
+    fraction = CELLS / max(width, height)
+    return cameras.resized(max(1, round(fraction * width)), max(1, round(fraction * height)))
+
+
+def points_of(camera: Cameras, which: Tensor, depth: Tensor) -> Tensor:
+    """Return (P, 3) the points of the world that pixels ``which`` (P,), row by row, show at
+    ``depth`` (P,)."""
+    pose = camera.cam_from_world[0]
+    k = camera.intrinsics[0]
+    pixels = torch.stack([which % camera.width, which // camera.width], -1) + 0.5
+    rays = torch.cat([(pixels - k[:2, 2]) / k.diagonal()[:2], torch.ones_like(pixels[:, :1])], 1)
+    return (rays * depth[:, None] - pose[:3, 3]) @ pose[:3, :3]
+
+
+def pixels_of(camera: Cameras, world: Tensor) -> tuple[Tensor, Tensor]:
+    """Return (P,) the pixels, row by row, that show points (P, 3) of the world, -1 beyond the
+    image; and their depths (P,)."""
+    pose = camera.cam_from_world[0]
+    k = camera.intrinsics[0]
+    local = world @ pose[:3, :3].T + pose[:3, 3]
+    z = local[:, 2]
+    at = local[:, :2] / z.clamp_min(_TINY)[:, None] * k.diagonal()[:2] + k[:2, 2]
+    inside = (
+        (z > _TINY) & (at >= 0).all(1) & (at < at.new_tensor([camera.width, camera.height])).all(1)
+    )
+    x, y = at.floor().long().unbind(1)
+    return torch.where(inside, y * camera.width + x, -1), z
+
+
+def distances(cameras: Sequence[Cameras]) -> Tensor:
+    """Return (V, V) the distances of cameras from each other."""
+    centres = torch.cat([camera.centers for camera in cameras]).cpu()
+    return torch.cdist(centres, centres, compute_mode="donot_use_mm_for_euclid_dist")
