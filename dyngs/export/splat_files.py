@@ -208,7 +208,7 @@ def write_run_splats(
     """
     inputs_of(opened).require_output(path)
     splat = splats_at(opened, scene_part(opened.scene, part), time, how)
-    return write_splats(path, splat, sh_degree=how.sh_degree, own=how.own)
+    return write_splats(path, splat, sh_degree=how.sh_degree)
 
 
 def write_run_sequence(
