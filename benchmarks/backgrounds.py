@@ -23,7 +23,7 @@ from statistics import fmean
 import torch
 
 from dyngs.api.train import train
-from dyngs.cli.demo_run import DemoOptions, demo_config
+from dyngs.cli.demo import NUM_TIMES, SIZE, demo_config
 from dyngs.config.io import load_config, packaged_preset, save_config
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import ImageLoader
@@ -101,12 +101,11 @@ def _trained(run: Path, capture: Path, preset: str, keys: list[str]) -> str:
     if capture.name == "demo":
         root = run.parent / "demo"
         if not root.exists():
-            demo = DemoOptions()
             write_dynamic_capture(
-                "spin", root, DynamicOptions(size=demo.size, num_times=demo.num_times, samples=3)
+                "spin", root, DynamicOptions(size=SIZE, num_times=NUM_TIMES, samples=3)
             )
         written = run.parent / "demo.yaml"
-        save_config(demo_config(root, run, DemoOptions()), written)
+        save_config(demo_config(root, run), written)
         config = load_config(written, [f"run.dir={run}", *keys])
     else:
         config = load_config(

@@ -70,7 +70,7 @@ class Reader:
 def read_whole_capture(root: Path) -> object:
     """Read as ``dyngs data inspect --deep`` and ``dyngs train`` do: report, views, points, body,
     images."""
-    from dyngs.capture.inspection.report import format_report, inspect_capture
+    from dyngs.capture.inspection import format_report, inspect_capture
     from dyngs.config import DataConfig
     from dyngs.core.errors import DyngsError
     from dyngs.data.loader import ImageLoader
@@ -194,7 +194,7 @@ def read_a_body(root: Path) -> object:
         uv if uv.is_file() else None,
     )
     poses = torch.full((1, len(body.joints), 3), 0.1)
-    return body, posed_vertices(body, poses, torch.zeros(1, 3), None, None)
+    return body, posed_vertices(body, poses, torch.zeros(1, 3))
 
 
 def read_a_motion(root: Path) -> object:
@@ -210,7 +210,7 @@ def read_given_joints(root: Path) -> object:
     """Read 3D joints, for two images of a capture."""
     from dyngs.human.fit.keypoints import read_joints
 
-    return read_joints(only(root), two_images(root), small_body(24))
+    return read_joints(only(root), two_images(root))
 
 
 def read_2d_key_points(root: Path) -> object:
@@ -291,7 +291,7 @@ def read_a_path(root: Path) -> object:
 def read_a_point(root: Path) -> object:
     """The measurement and its row of the report."""
     from dyngs.study.measure import read_measurement
-    from dyngs.study.sweep import table_rows
+    from dyngs.study.tradeoff import table_rows
 
     measurement = read_measurement(only(root))
     return table_rows([measurement]), measurement
@@ -301,13 +301,12 @@ def read_option_values(root: Path) -> object:
     """Parse values of options of the command line."""
     from dyngs.data.times import parse_frames
     from dyngs.export.camera_paths import parse_times
-    from dyngs.study.sweep import parse_requirements
-    from dyngs.study.variants import parse_variations
+    from dyngs.study.tradeoff import parse_requirements, parse_variations
 
     parsers: tuple[Callable[[str], object], ...]
     parsers = (
         parse_requirements,
-        lambda word: parse_variations([word], trains=True),
+        lambda word: parse_variations([word]),
         parse_frames,
         parse_times,
     )
@@ -385,9 +384,6 @@ _RUNS: dict[str, Seed] = {
 }
 _JOINTS: dict[str, Seed] = {
     "npz": files.write_joints_npz,
-    "json": files.write_joints_json,
-    "vertices": files.write_vertices_npz,
-    "frame_data": files.write_frame_data,
     "sam_3d_body": files.write_sam_3d_body,
 }
 _IMAGES: dict[str, Seed] = {

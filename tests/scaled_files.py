@@ -10,7 +10,7 @@ import numpy as np
 
 from dyngs.gaussians import Gaussians
 from dyngs.io.formats.formats import read_splats, write_splats
-from dyngs.io.formats.ply import header_bytes, read_header, write_ply
+from dyngs.io.formats.ply import header_bytes, read_elements, write_ply
 from dyngs.io.formats.splat_file import SplatFile
 
 FACTORS = (1e-4, 1e-3, 0.05, 1e3)
@@ -38,17 +38,14 @@ def write_far_ply(path: Path, splat: SplatFile, offset: Sequence[float] = FAR) -
     """Write a .ply with doubles, ``offset`` (3,) from where the Gaussians are; return its positions
     (N, 3)."""
     write_ply(path, splat)
-    with path.open("rb") as file:
-        header = read_header(file)
-        rows = header.read(file, "vertex")
+    elements, comments = read_elements(path)
+    rows = elements["vertex"]
     names = rows.dtype.names or ()
     far = np.empty(len(rows), [(name, "<f8") for name in names])
     for name in names:
         far[name] = rows[name]
     for name, shift in zip("xyz", offset, strict=True):
         far[name] += shift
-    head = header_bytes(
-        [("vertex", len(far), [("double", name) for name in names])], header.comments
-    )
+    head = header_bytes([("vertex", len(far), [("double", name) for name in names])], comments)
     path.write_bytes(head + far.tobytes())
     return np.stack([far[name] for name in "xyz"], axis=1)

@@ -11,7 +11,7 @@ import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.deform.fixed_cameras.hulls import Footage, footage_of
+from dyngs.deform.fixed_cameras import FixedCameraClip, fixed_camera_clip
 
 SIZE, FOCAL = 64, 80.0
 BLACK = torch.zeros(3)
@@ -84,10 +84,10 @@ def drawn(
 
 def filmed(
     balls: Balls, times: Sequence[float], count: int = 6, noise: float = 0.01
-) -> list[Footage]:
-    """Return the footage of ``count`` cameras."""
+) -> list[FixedCameraClip]:
+    """Return the clips of ``count`` cameras."""
     return [
-        footage_of(
+        fixed_camera_clip(
             (
                 Image("view", camera, drawn(camera, balls(t), noise, 100 * i + j), None, None, t)
                 for j, t in enumerate(times)

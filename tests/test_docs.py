@@ -184,8 +184,7 @@ def require_sound(command: Command, arguments: argparse.Namespace) -> None:
     """Nothing, if what a parsed command names besides its options can be: keys, variations, times,
     presets."""
     from dyngs.export.camera_paths import parse_times, path_file
-    from dyngs.study.sweep import parse_goal, parse_requirements
-    from dyngs.study.variants import parse_variations
+    from dyngs.study.tradeoff import parse_goal, parse_requirements, parse_variations
 
     for word in command.words:
         if word.startswith(("configs/", "benchmarks/", "examples/")):
@@ -197,14 +196,11 @@ def require_sound(command: Command, arguments: argparse.Namespace) -> None:
     if command.verb == "train" and arguments.resume is None:
         parse_config(arguments.overrides, None, arguments.begun)
     elif command.verb == "tradeoff":
-        is_config = arguments.target.startswith("configs/")
-        parse_variations(arguments.vary, trains=arguments.train or is_config)
+        parse_variations(arguments.vary)
         parse_requirements(arguments.require or "psnr>=1")
         parse_goal(
             arguments.minimize or arguments.maximize or "psnr", smallest=bool(arguments.minimize)
         )
-        if is_config:
-            load_config(Path(arguments.target), overrides)
     elif overrides:
         require_overrides(*overrides)
     if getattr(arguments, "times", None) is not None:

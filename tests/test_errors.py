@@ -99,14 +99,13 @@ def test_no_message_can_steer_a_terminal() -> None:
 def test_what_the_command_line_quotes_is_short(text: str) -> None:
     from dyngs.data.times import parse_frames
     from dyngs.export.camera_paths import parse_times
-    from dyngs.study.sweep import parse_requirements
-    from dyngs.study.variants import parse_variations
+    from dyngs.study.tradeoff import parse_requirements, parse_variations
 
     for parse in (
         parse_frames,
         parse_times,
         parse_requirements,
-        lambda word: parse_variations([word], trains=True),
+        lambda word: parse_variations([word]),
     ):
         with pytest.raises(DyngsError) as caught:
             parse(text)

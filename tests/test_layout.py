@@ -94,7 +94,9 @@ def test_no_code_from_data(nodes: dict[str, list[ast.AST]]) -> None:
                     names = set()  # its unpickler calls nothing but what makes tensors
             else:
                 continue
-            if names & forbidden_modules:
+            # it takes the unpickler in Python apart: see tests/io/test_pickles.py
+            allowed = {"pickle"} if file == "dyngs/io/pickles.py" else set()
+            if names & forbidden_modules - allowed:
                 found.append(f"{file}:{node.lineno}")
     assert found == []
 

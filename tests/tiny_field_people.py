@@ -7,7 +7,7 @@ from pathlib import Path
 from dyngs.config import Config, DataConfig
 from dyngs.data.read import captures_in
 from dyngs.human.body.body_reader import default_template
-from dyngs.human.predict.fields.people import Person, person_of
+from dyngs.human.predict.people import Person, person_of
 from dyngs.human.synthetic.capture import PeopleOptions, write_people
 
 NETWORKS = ("eg_human_nerf", "keypoint_nerf")

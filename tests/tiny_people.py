@@ -10,7 +10,8 @@ from dyngs.config import Config, DataConfig
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.keys import HumanPredictorModel
-from dyngs.human.predict.ghg.learner import TrainingPerson, filmed
+from dyngs.human.predict.ghg.learner import read_person
+from dyngs.human.predict.ghg.network import AtlasPerson
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 
 TINY = HumanOptions(size=32, num_frames=1, num_new=1, num_cameras=8, num_test=1, samples=1)
@@ -34,9 +35,9 @@ def people(folder: Path, seeds: tuple[int, ...], options: HumanOptions = TINY) -
     return folder
 
 
-def person(capture: Path, model: HumanPredictorModel = NET) -> TrainingPerson:
+def person(capture: Path, model: HumanPredictorModel = NET) -> AtlasPerson:
     """The person of one capture."""
-    return filmed(DataConfig.model_validate({"root": capture}), model, body())
+    return read_person(DataConfig.model_validate({"root": capture}), model, body())
 
 
 def config(folder: Path, run: Path, **changes: object) -> Config:

@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from operator import methodcaller
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
@@ -25,12 +26,12 @@ from dyngs.config import BudgetConfig, Config, NetworkColour, PruneConfig, ShCol
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.errors import DyngsError, counted, show
 from dyngs.core.metrics import psnr
-from dyngs.core.section import Section
+from dyngs.core.section import ModelSection, Section
 from dyngs.data.capture import Capture, View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import view_size
 from dyngs.data.times import evenly_spaced
-from dyngs.deform.keys import DynamicModel, FreeField
+from dyngs.deform.keys import FreeField
 from dyngs.deform.still_error import cameras_in_place, differing_fraction
 from dyngs.gaussians.colour.network import fitted_affine, recoloured
 from dyngs.io.write import write_text
@@ -43,7 +44,8 @@ from dyngs.training.corrections.camera_refinement import fitted_to_image
 from dyngs.training.loop import Interrupts
 from dyngs.training.new_trainer import GaussianTrainer, assemble, with_points
 
-PairScore = Callable[[GaussianTrainer, GaussianTrainer, int], tuple[float, float]]
+Pair = tuple[GaussianTrainer, GaussianTrainer]
+Score = Callable[[Pair, int], list[float]]
 """Returns the PSNR, dB, of a training view by two models that were not trained on it."""
 
 
@@ -99,6 +101,9 @@ smaller of two models' errors is smallest."""
 SQUARES = 8  # The halves of an image are the two colours of a chess board of so many squares a side
 
 
+_TOO_SHORT = "not taken: too short a run, or too few views, to compare"
+
+
 @dataclass(frozen=True)
 class Choice:
     """Result of pilot runs about a setting.
@@ -138,8 +143,8 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
     problem = kind_of(config.model).refusal(capture)
     if problem is not None:
         raise DyngsError(f"{config.data.root}: {problem}")
-    model = config.model
-    if not isinstance(model, DynamicModel) or not model.choose:
+    model: Any = config.model
+    if capability(model, Moves) is None or not model.choose:
         return _with_settings(config, capture)
     moves = _motion_of_fixed_cameras(capture, config)
     if moves is False:
@@ -148,13 +153,10 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
     views = capture.splits["train"]
     at_once = len(views) / len({view.time for view in views})
     if moves and at_once >= FILTERED_VIEWS:
-        moving = _before_fixed_cameras(moving, model, at_once)
-    choice = _motion(_resolved(moving), capture)
+        moving = _before_fixed_cameras(moving, at_once)
+    choice = _motion(moving, capture)
     if choice is None:
-        show(
-            "model.kind=dynamic not taken: too short a run, or too few views, to compare it with a static model; "
-            "training a static scene (model.choose=false trains a moving one)"
-        )
+        show(f"model.kind=dynamic {_TOO_SHORT}; model.choose=false trains a moving scene")
         return _with_settings(as_static(config), capture)
     show(f"  {choice}")
     found = moving if choice.taken else as_static(config)
@@ -187,7 +189,7 @@ def _requested(given: Section, usual: Section) -> Section:
     that."""
     keys = given.model_fields_set
     is_other_kind = type(given) is not type(usual) and (not keys or "kind" in keys)
-    if is_other_kind and not isinstance(given, DynamicModel):
+    if is_other_kind and not isinstance(given, ModelSection):
         usual = type(given)()
     known = type(usual).model_fields
     return usual.model_copy(
@@ -195,13 +197,14 @@ def _requested(given: Section, usual: Section) -> Section:
     )
 
 
-def _before_fixed_cameras(config: Config, requested: DynamicModel, views: float) -> Config:
+def _before_fixed_cameras(config: Config, views: float) -> Config:
     """Return the config for a scene before fixed cameras, ``views`` of each time, where nothing
     else was requested.
 
     What is thinner than few cameras show fits these alone. Pilot runs cannot tell: a camera whose
     image is held out is trained on at other times.
     """
+    requested: Any = config.model
     if "filter_3d" not in requested.model_fields_set:
         config = _with(config, "model", filter_3d=True)
     if views >= FREE_VIEWS and not requested.deform.model_fields_set:
@@ -248,82 +251,49 @@ def _motion(config: Config, capture: Capture) -> Choice | None:
     return choice
 
 
-@dataclass(frozen=True)
-class _OpenSetting:
-    """A setting that pilot runs decide about: ``change`` returns its section of the config with
-    it."""
-
-    text: str
-    section: str
-    change: Callable[[Any], Section]
-    score: PairScore
-
-
 def _with_settings(
     config: Config, capture: Capture, *, moving: bool = False
 ) -> tuple[Config, list[Choice], Capture]:
     """Return ``config`` with the settings that win pilot runs, each tried on top of those before it,
-    all results, and the prepared capture."""
-    open_settings = _open_settings(config, moving=moving)
-    config = _resolved(config)
+    all results, and the prepared capture.
+
+    Open are settings that are ``auto``, the most valuable first; where motion was found to pay, also
+    colours.
+    """
+    kind = kind_of(config.model)
+    is_static = capability(config.model, Moves) is None
+    found: list[tuple[str, str, Callable[[Section], Section], Score]] = []
+    for section, key, score in (
+        ("camera", "refine", after_pose_fit),
+        ("train", "exposure", after_colour_fit),
+        ("train", "robust", explained),
+    ):
+        if getattr(getattr(config, section), key) == "auto":
+            config = _with(config, section, **{key: "never"})
+            if f"{section}.{key}" in kind.uses and (is_static or key != "robust"):
+                always = methodcaller("model_copy", update={key: "always"})
+                found.append((f"{section}.{key}=always", section, always, score))
+    if moving and config.colour == ShColour() and not config.colour.model_fields_set:
+        found.append(("colour.kind=network", "colour", lambda _: NetworkColour(), plain))
     capture = with_points(capture, config)
     views = capture.splits["train"]
     folds = _held_out(views)
-    steps, first_side = _affordable(config, views[0], len(open_settings), len(folds))
+    steps, first_side = _affordable(config, views[0], len(found), len(folds))
     choices = list[Choice]()
-    if not open_settings:
+    if found and (not folds or steps < SETTINGS.fewest_steps):
+        show(f"{', '.join(text for text, *_ in found)} {_TOO_SHORT}")
         return config, choices, capture
-    if not folds or steps < SETTINGS.fewest_steps:
-        keys = ", ".join(x.text for x in open_settings)
-        show(f"{keys} not taken: too short a run, or too few views, to compare")
-        return config, choices, capture
-    show(f"pilot runs of {counted(steps, 'step')}, compared on held-out training views:")
-    for setting in open_settings:
-        name = setting.section
-        changed = config.model_copy(update={name: setting.change(getattr(config, name))})
+    if found:
+        show(f"pilot runs of {counted(steps, 'step')}, compared on held-out training views:")
+    for text, section, change, score in found:
+        changed = config.model_copy(update={section: change(getattr(config, section))})
         both = [_small(x, SETTINGS, steps, first_side) for x in (config, changed)]
-        choice = _compared(setting.text, both, capture, folds, setting.score)
-        if choice is None:
-            continue
-        show(f"  {choice}")
-        choices.append(choice)
-        config = changed if choice.taken else config
+        choice = _compared(text, both, capture, folds, score)
+        if choice is not None:
+            show(f"  {choice}")
+            choices.append(choice)
+            config = changed if choice.taken else config
     return config, choices, capture
-
-
-def _open_settings(config: Config, *, moving: bool) -> list[_OpenSetting]:
-    """Return the settings that are ``auto``, by what they were worth in the past, the most first;
-    where motion was found to pay, colours are open, too."""
-    scores: dict[tuple[str, str], PairScore] = {
-        ("camera", "refine"): after_pose_fit,
-        ("train", "exposure"): after_colour_fit,
-    }
-    uses = kind_of(config.model).uses
-    if capability(config.model, Moves) is None:
-        scores["train", "robust"] = explained
-    scores = {key: score for key, score in scores.items() if ".".join(key) in uses}
-
-    def always(key: str) -> Callable[[Any], Section]:
-        return lambda section: section.model_copy(update={key: "always"})
-
-    found = [
-        _OpenSetting(f"{section}.{key}=always", section, always(key), score)
-        for (section, key), score in scores.items()
-        if getattr(getattr(config, section), key) == "auto"
-    ]
-    if moving and config.colour == ShColour() and not config.colour.model_fields_set:
-        found.append(
-            _OpenSetting("colour.kind=network", "colour", lambda _: NetworkColour(), plain)
-        )
-    return found
-
-
-def _resolved(config: Config) -> Config:
-    """Return ``config`` without what is open."""
-    for section, key in (("camera", "refine"), ("train", "exposure"), ("train", "robust")):
-        if getattr(getattr(config, section), key) == "auto":
-            config = _with(config, section, **{key: "never"})
-    return config
 
 
 def _compared(
@@ -331,7 +301,7 @@ def _compared(
     both: Sequence[Config],
     capture: Capture,
     folds: Sequence[frozenset[int]],
-    score: PairScore,
+    score: Score,
     *,
     errors: float = ERRORS,
     deadline: float = math.inf,
@@ -339,13 +309,12 @@ def _compared(
     """Train both configs without each fold of the training views, and compare them on it; None
     where that takes until ``deadline``."""
     begun = time.monotonic()
-    pairs = list[tuple[float, float]]()
+    pairs = list[list[float]]()
     for held_out in folds:
-        trainers = [_trained(config, capture, held_out, deadline) for config in both]
-        one, other = trainers
+        one, other = (_trained(config, capture, held_out, deadline) for config in both)
         if one is None or other is None:
             return None
-        pairs += [score(one, other, index) for index in sorted(held_out)]
+        pairs += [score((one, other), index) for index in sorted(held_out)]
     gains = [after - before for before, after in pairs]
     gain = fmean(gains)
     error = (stdev(gains) if len(gains) > 1 else math.inf) / math.sqrt(len(gains))
@@ -466,22 +435,22 @@ def _motion_of_fixed_cameras(capture: Capture, config: Config) -> bool | None:
     return moves
 
 
-def plain(one: GaussianTrainer, other: GaussianTrainer, index: int) -> tuple[float, float]:
+def plain(pair: Pair, index: int) -> list[float]:
     """Return the PSNR of the view; where either has exposures, after an affine colour fitted to
     it."""
-    truth, mask, first, second = _both(one, other, index)
-    return psnr(first, truth, mask), psnr(second, truth, mask)
+    truth, mask, shown = _shown(pair, index)
+    return [psnr(rgb, truth, mask) for rgb in shown]
 
 
-def explained(one: GaussianTrainer, other: GaussianTrainer, index: int) -> tuple[float, float]:
+def explained(pair: Pair, index: int) -> list[float]:
     """Return the PSNR over the pixels that at least one of the two explains best, the same ones for
     both.
 
     Held-out views show people who walk through, too, whom no model can predict.
     """
-    truth, mask, first, second = _both(one, other, index)
-    counts = explained_pixels(first, second, truth, mask)
-    return psnr(first, truth, counts), psnr(second, truth, counts)
+    truth, mask, (one, other) = _shown(pair, index)
+    counts = explained_pixels(one, other, truth, mask)
+    return [psnr(one, truth, counts), psnr(other, truth, counts)]
 
 
 def explained_pixels(one: Tensor, other: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
@@ -499,31 +468,30 @@ def explained_pixels(one: Tensor, other: Tensor, truth: Tensor, mask: Tensor | N
     return weight * (error <= known.sort().values[rank - 1])
 
 
-def after_pose_fit(one: GaussianTrainer, other: GaussianTrainer, index: int) -> tuple[float, float]:
+def after_pose_fit(pair: Pair, index: int) -> list[float]:
     """Return the PSNR of the right half of the view from the pose in which its left half fits each
     model best.
 
     Held-out views have no refined cameras.
     """
-
-    def score(trainer: GaussianTrainer) -> float:
+    scores = []
+    for trainer in pair:
         image = trainer.images[index]
         background = background_colour(trainer.background)
         left = torch.zeros_like(image.rgb_premultiplied[..., 0])
         left[:, : left.shape[1] // 2] = 1
         right = 1 - left if image.mask is None else (1 - left) * image.mask
+        scene = trainer.model.scene
         options = trainer.model.options
         fitted = fitted_to_image(
-            trainer.model.scene, image, background, trainer.extent, options=options, weights=left
+            scene, image, background, trainer.extent, options=options, weights=left
         )
-        return psnr(_rendered(trainer, fitted).rgb[0], image.composite(background), right)
+        rgb = _rendered(trainer, fitted).rgb[0]
+        scores.append(psnr(rgb, image.composite(background), right))
+    return scores
 
-    return score(one), score(other)
 
-
-def after_colour_fit(
-    one: GaussianTrainer, other: GaussianTrainer, index: int
-) -> tuple[float, float]:
+def after_colour_fit(pair: Pair, index: int) -> list[float]:
     """Return the mean PSNR of the view as it is, and with each half recoloured by a fit on the
     other half.
 
@@ -531,8 +499,8 @@ def after_colour_fit(
     slow walk, colours that depend on the viewpoint explain it: then the scene in one exposure is
     farther from images as they are.
     """
-
-    def score(trainer: GaussianTrainer) -> float:
+    scores = []
+    for trainer in pair:
         image = trainer.images[index]
         background = background_colour(trainer.background)
         rendering = _rendered(trainer, image)
@@ -543,9 +511,8 @@ def after_colour_fit(
         for half in (light, ~light):
             affine = fitted_affine([(image, rendering)], background, half.float())
             fitted[~half] = recoloured(affine, image, rendering, background)[~half]
-        return fmean((psnr(rgb, truth, image.mask), psnr(fitted, truth, image.mask)))
-
-    return score(one), score(other)
+        scores.append(fmean((psnr(rgb, truth, image.mask), psnr(fitted, truth, image.mask))))
+    return scores
 
 
 def _chess_board(height: int, width: int) -> Tensor:
@@ -561,21 +528,20 @@ def _rendered(trainer: GaussianTrainer, image: Image) -> Rendering:
     )
 
 
-def _both(
-    one: GaussianTrainer, other: GaussianTrainer, index: int
-) -> tuple[Tensor, Tensor | None, Tensor, Tensor]:
+def _shown(pair: Pair, index: int) -> tuple[Tensor, Tensor | None, list[Tensor]]:
     """Return the view (H, W, 3), its mask, and the view as both scenes show it.
 
     Where either has exposures, after an affine colour that is fitted to the view.
     """
-    image = one.images[index]
-    background = background_colour(one.background)
+    image = pair[0].images[index]
+    background = background_colour(pair[0].background)
+    has_exposures = any(trainer.config.train.exposure == "always" for trainer in pair)
     shown = []
-    for trainer in (one, other):
+    for trainer in pair:
         rendering = _rendered(trainer, image)
         rgb = rendering.rgb[0]
-        if "always" in (one.config.train.exposure, other.config.train.exposure):
+        if has_exposures:
             affine = fitted_affine([(image, rendering)], background)
             rgb = recoloured(affine, image, rendering, background)
         shown.append(rgb)
-    return image.composite(background), image.mask, shown[0], shown[1]
+    return image.composite(background), image.mask, shown

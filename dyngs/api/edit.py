@@ -29,9 +29,7 @@ from dyngs.export.splat_files import (
     up_of,
     write_moving,
 )
-from dyngs.gaussians.rendering import drawing_options
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import (
     all_suffixes,
     format_of,
@@ -46,6 +44,7 @@ from dyngs.io.formats.formats import (
 from dyngs.io.formats.similarity import UNMOVED, Similarity, axis_of
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.outputs import new_folder
+from dyngs.models.checkpoint import Checkpoint
 from dyngs.ops.device import deterministic, device_for
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import RECORD_NAME
@@ -56,11 +55,15 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
-from dyngs.runs.config_file import write_config
-from dyngs.runs.folder import LOG_NAME, require_empty
-from dyngs.runs.frame import RunFrame, write_frame
-from dyngs.runs.inputs import inputs_of
-from dyngs.runs.opened import Opened, open_scene, opened_scene
+from dyngs.runs.folder import (
+    LOG_NAME,
+    RunFrame,
+    inputs_of,
+    require_empty,
+    write_config,
+    write_frame,
+)
+from dyngs.runs.opened import Opened, open_scene, opened_file
 
 Tell = Callable[[str], None]
 
@@ -91,6 +94,11 @@ class Edits:
     time: float | None = None
     threads: int = 0
 
+    @property
+    def has_frame(self) -> bool:
+        """Whether the scene gets another frame."""
+        return self.geo is not None or self.frame != Frame()
+
 
 @dataclass(frozen=True)
 class EditedFile:
@@ -106,7 +114,7 @@ class EditedFile:
 
 
 @dataclass(frozen=True)
-class _Source:
+class EditSource:
     """What is edited: a scene; of a file also its contents, and what is up in files of its format
     by default.
 
@@ -125,7 +133,7 @@ class _Source:
             return self.splat.up != self.usual
         return self.opened.edited is not None and self.opened.edited.fixed
 
-    def kept(self, rows: torch.Tensor) -> _Source:
+    def kept(self, rows: torch.Tensor) -> EditSource:
         """Return the Gaussians where ``rows`` (N,) is true."""
         scene: GaussianScene = self.opened.scene
         before = torch.arange(len(scene), device="cpu") if self.rows is None else self.rows
@@ -187,25 +195,21 @@ def write_part(
     """
     if opened.path is None:
         raise DyngsError("this scene has no file or run of its own yet, so it cannot be edited")
-    found = _opened(opened.path, None) if opened.captured is None else _Source(opened)
+    found = _opened(opened.path, None) if opened.captured is None else EditSource(opened)
     return _written(found.kept(rows), out, Edits(time=time), lambda _: None)
 
 
-def _opened(source: Path, data_root: Path | None) -> _Source:
+def _opened(source: Path, data_root: Path | None) -> EditSource:
     own = format_to_read(source)
     if own is not None and data_root is None:
         splat = read_splats(source, nonfinite="skip")
-        opened = opened_scene(
-            StaticScene(gaussians=splat.gaussians, options=drawing_options(splat)), source
-        )
+        opened = opened_file(splat, source)
         info = replace(opened.info, world_offset=splat.file_offset)
-        return _Source(
-            replace(opened, info=info, stated_up=splat.up, notes=splat.notes), splat, own.up
-        )
-    return _Source(open_scene(source, data_root=data_root))
+        return EditSource(replace(opened, info=info), splat, own.up)
+    return EditSource(open_scene(source, data_root=data_root))
 
 
-def _cropped(found: _Source, source: Path, edits: Edits, tell: Tell) -> _Source:
+def _cropped(found: EditSource, source: Path, edits: Edits, tell: Tell) -> EditSource:
     if edits.region is None:
         return found
     scene: GaussianScene = found.opened.scene
@@ -223,10 +227,9 @@ def _cropped(found: _Source, source: Path, edits: Edits, tell: Tell) -> _Source:
     return found.kept(rows)
 
 
-def _written(found: _Source, out: Path, edits: Edits, tell: Tell) -> EditedFile:
+def _written(found: EditSource, out: Path, edits: Edits, tell: Tell) -> EditedFile:
     """Write a file of Gaussians, at one time of what moves."""
     moving = not found.opened.scene.is_static
-    direction = _up(found, edits.frame)
     if moving and edits.merge:
         raise DyngsError(
             "--merge adds to still scenes, and this one moves; `dyngs export --time T` makes one of it"
@@ -237,8 +240,7 @@ def _written(found: _Source, out: Path, edits: Edits, tell: Tell) -> EditedFile:
         )
     splat = found.at(edits.time or 0.0)
     if edits.merge:
-        splat = merged(splat, direction, edits.merge, tell)
-    own = format_of(out)
+        splat = merged(splat, _up(found, edits.frame), edits.merge, tell)
     if edits.undo:
         if splat.edited == UNMOVED:
             raise DyngsError(
@@ -247,46 +249,38 @@ def _written(found: _Source, out: Path, edits: Edits, tell: Tell) -> EditedFile:
         edited = undone_file(splat)
         tell("the frame is that of before the first edit")
     else:
-        how, up = _frame(found, edits, direction, own.up)
-        edited = (
-            moved_file(splat, how, up) if _has_frame(edits) else turned_file(splat, how.turn, up)
-        )
-        _tell_frame(edits, up, own.up, tell)
-        if edits.geo is not None and any(edits.geo.offset):
-            edited = replace(edited, comments=(*edited.comments, edits.geo.comment))
+        how, up = _frame(found, edits, format_of(out).up, tell)
+        is_new = edits.has_frame
+        edited = moved_file(splat, how, up) if is_new else turned_file(splat, how.turn, up)
     written = write_splats(out, edited)
     return EditedFile(written.path, compare_splats(splat, written), written.notes)
 
 
-def _written_moving(found: _Source, out: Path, edits: Edits, tell: Tell) -> EditedFile:
+def _written_moving(found: EditSource, out: Path, edits: Edits, tell: Tell) -> EditedFile:
     """Write all training times of a moving scene."""
     scene = found.opened.scene
     if scene.is_static or edits.merge or edits.undo or edits.time is not None:
-        what = (
-            "a scene that moves"
-            if scene.is_static
-            else "all times, without --merge, --undo and --time"
+        raise DyngsError(
+            f"{out}: {SUFFIX} holds a scene that moves, at all times, without --merge, --undo and --time; "
+            f"give a name in {all_suffixes()}"
         )
-        raise DyngsError(f"{out}: {SUFFIX} holds {what}; give a name in {all_suffixes()}")
-    how, up = _frame(found, edits, _up(found, edits.frame), UP)
-    _tell_frame(edits, up, UP, tell)
-    writing = Writing(edit=how, up=up) if _has_frame(edits) else Writing(turn=how.turn, up=up)
-    written = write_moving(found.opened, out, scene.times, how=writing)
-    redrawn = compare_run(
-        found.opened, scene, scene.times[0], written.splats[0], read_moment(out, 0)
-    )
-    return EditedFile(out, redrawn, written.notes)
+    how, up = _frame(found, edits, UP, tell)
+    writing = Writing(edit=how, up=up) if edits.has_frame else Writing(turn=how.turn, up=up)
+    splats, notes = write_moving(found.opened, out, scene.times, how=writing)
+    redrawn = compare_run(found.opened, scene, scene.times[0], splats[0], read_moment(out, 0))
+    return EditedFile(out, redrawn, notes)
 
 
 def _written_run(
-    found: _Source, source: Path, out: Path, edits: Edits, data_root: Path | None, tell: Tell
+    found: EditSource, source: Path, out: Path, edits: Edits, data_root: Path | None, tell: Tell
 ) -> Path:
-    """Write a run, which keeps all that it has learned."""
+    """Write a run as the new folder ``out``, which is drawn, viewed, exported and pruned as any
+    other, and keeps all that it has learned."""
     opened = found.opened
     if opened.captured is None or edits.merge or edits.time is not None:
-        what = "a run of its own, of a run, without --merge and --time"
         raise DyngsError(
-            f"{out}: a name without a suffix is {what}; give a name in {all_suffixes()}"
+            f"{out}: a name without a suffix is a run, made of a run, without --merge and --time; "
+            f"give a name in {all_suffixes()}"
         )
     frame = opened.edited
     if edits.undo:
@@ -294,104 +288,33 @@ def _written_run(
             raise DyngsError("--undo: the frame of this run was not edited")
         frame = None
         tell("the frame is that of before the first edit")
-    elif _has_frame(edits):
-        how, up = _frame(found, edits, _up(found, edits.frame), "z")
+    elif edits.has_frame:
+        how, up = _frame(found, edits, "z", tell)
         offset = (0.0, 0.0, 0.0) if edits.geo is None else edits.geo.offset
         fixed = edits.geo is not None or (found.fixed and edits.frame.up is None)
         frame = RunFrame(how.after(opened.frame), offset, up, fixed)
-        _tell_frame(edits, up, "z", tell)
-    return write_edited_run(source, out, found.rows, frame, data_root)
-
-
-def _has_frame(edits: Edits) -> bool:
-    return edits.geo is not None or edits.frame != Frame()
-
-
-def _up(found: _Source, frame: Frame) -> tuple[float, ...] | None:
-    """Return the direction (3,) of the source that is up: as told, else as known; None: nothing
-    says."""
-    if isinstance(frame.up, tuple):
-        return frame.up
-    if frame.up is not None:
-        known = None if found.splat is not None else found.opened.up
-        if known is None:
-            raise DyngsError(
-                "--up auto needs the cameras of a run, and there are none; give the direction, as --up=-y"
-            )
-        return tuple((found.opened.frame.rotation @ known[0]).tolist())
-    known_axis = up_of(found.opened)
-    return None if known_axis is None else known_axis[0]
-
-
-def _frame(
-    found: _Source, edits: Edits, direction: tuple[float, ...] | None, wanted: str
-) -> tuple[Similarity, str | None]:
-    """Return the similarity to the frame that is asked for, and what is up there; ``wanted``: up
-    for viewers."""
-    if edits.geo is not None:
-        x, y, z = found.opened.world_offset.tolist()
-        return edits.geo.similarity.after(Similarity(shift=(x, y, z))), "z"
-    x, y, z = (np.array(edits.frame.origin or (0.0, 0.0, 0.0)) - found.opened.world_offset).tolist()
-    frame = edits.frame if edits.frame.origin is None else replace(edits.frame, origin=(x, y, z))
-    if found.fixed and frame.up is None:
-        return frame.similarity(None, ()), found.opened.stated_up
-    return frame.similarity(direction, axis_of(wanted)), None if direction is None else wanted
-
-
-def _tell_frame(edits: Edits, up: str | None, wanted: str, tell: Tell) -> None:
-    if edits.geo is not None:
-        for line in edits.geo.lines:
-            tell(line)
-        if wanted != up:
-            tell(
-                f"axes are those of the control points, with z up; viewers of the format take {wanted} for up"
-            )
-    elif up is None:
-        tell("nothing says which way is up, so nothing is turned; --up tells it")
-    else:
-        tell(f"up is {up} in what is written")
-
-
-def write_edited_run(
-    run_dir: Path,
-    out: Path,
-    rows: Tensor | None,
-    frame: RunFrame | None,
-    data_root: Path | None = None,
-) -> Path:
-    """Write a run as the new folder ``out``, which is drawn, viewed, exported and pruned as any
-    other.
-
-    Args:
-        rows: (N,) indices of the Gaussians that stay; None: all.
-        frame: that it gets; None: that of its capture.
-
-    Raises:
-        DyngsError: the folder is taken, or Gaussians of a run without checkpoints are to go.
-    """
-    config = load_resolved(run_dir, [f"run.dir={out}"], data_root=data_root)
-    if rows is not None and has_only_scene_file(run_dir):
+    config = load_resolved(source, [f"run.dir={out}"], data_root=data_root)
+    stored = has_only_scene_file(source)
+    if found.rows is not None and stored:
         raise DyngsError(
-            f"{run_dir}: holds no checkpoint that a part could be taken of; give --out FILE.ply"
+            f"{source}: holds no checkpoint that a part could be taken of; give --out FILE.ply"
         )
     with new_folder(out, require_empty) as folder:
-        if rows is not None:
-            _write_part(config, run_dir, folder, rows)
-        elif has_only_scene_file(run_dir):
-            shutil.copyfile(run_dir / SCENE_FILE, folder / SCENE_FILE)
-        else:
-            checkpoint = latest_checkpoint(run_dir)
-            save_checkpoint(folder, checkpoint, seconds_at(run_dir, checkpoint.info.step))
-        for name in (LOG_NAME, RECORD_NAME):
-            if (run_dir / name).is_file():
-                shutil.copyfile(run_dir / name, folder / name)
+        for name in (LOG_NAME, RECORD_NAME, *([SCENE_FILE] if stored else [])):
+            if (source / name).is_file():
+                shutil.copyfile(source / name, folder / name)
+        if not stored:
+            whole = latest_checkpoint(source)
+            kept = whole if found.rows is None else _part(config, source, found.rows)
+            save_checkpoint(folder, kept, seconds_at(source, whole.info.step))
         write_config(config, folder)
         if frame is not None:
             write_frame(folder, frame)
     return out
 
 
-def _write_part(config: Config, run_dir: Path, folder: Path, rows: Tensor) -> None:
+def _part(config: Config, run_dir: Path, rows: Tensor) -> Checkpoint:
+    """Return the last checkpoint of a run with the Gaussians ``rows`` (N,) only."""
     with (
         kernel_threads(config.run.threads or num_cores()),
         deterministic(device_for(config.run.device), True),
@@ -400,5 +323,51 @@ def _write_part(config: Config, run_dir: Path, folder: Path, rows: Tensor) -> No
         kept = torch.zeros(trainer.num_gaussians, dtype=torch.bool, device=trainer.device)
         kept[rows.to(trainer.device)] = True
         trainer.model.keep(kept, trainer.done)
-        checkpoint = trainer.checkpoint()
-    save_checkpoint(folder, checkpoint, seconds_at(run_dir, checkpoint.info.step))
+        return trainer.checkpoint()
+
+
+def _up(found: EditSource, frame: Frame) -> tuple[float, ...] | None:
+    """Return the direction (3,) of the source that is up: as told, else as known; None: nothing
+    says."""
+    if isinstance(frame.up, tuple):
+        return frame.up
+    if frame.up is None:
+        known_axis = up_of(found.opened)
+        return None if known_axis is None else known_axis[0]
+    known = None if found.splat is not None else found.opened.up
+    if known is None:
+        raise DyngsError(
+            "--up auto needs the cameras of a run, and there are none; give the direction, as --up=-y"
+        )
+    return tuple((found.opened.frame.rotation @ known[0]).tolist())
+
+
+def _frame(
+    found: EditSource, edits: Edits, wanted: str, tell: Tell
+) -> tuple[Similarity, str | None]:
+    """Return the similarity to the frame that is asked for, and what is up there; ``wanted``: up
+    for viewers."""
+    offset = found.opened.world_offset
+    if edits.geo is not None:
+        for line in edits.geo.lines:
+            tell(line)
+        if wanted != "z":
+            tell(
+                f"axes are those of the control points, with z up; viewers of the format take {wanted} for up"
+            )
+        x, y, z = offset.tolist()
+        return edits.geo.similarity.after(Similarity(shift=(x, y, z))), "z"
+    frame = edits.frame
+    direction = _up(found, frame)
+    if frame.origin is not None:
+        x, y, z = (np.array(frame.origin) - offset).tolist()
+        frame = replace(frame, origin=(x, y, z))
+    if found.fixed and frame.up is None:
+        how = frame.similarity(None, ())
+        up = found.opened.stated_up
+    else:
+        how = frame.similarity(direction, axis_of(wanted))
+        up = None if direction is None else wanted
+    about = "nothing says which way is up, so nothing is turned; --up tells it"
+    tell(about if up is None else f"up is {up} in what is written")
+    return how, up

@@ -19,8 +19,7 @@ from dyngs.models.kind import Predicts, capability
 from dyngs.models.prediction import Predictor, named_views
 from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
-from dyngs.runs.config_file import write_config
-from dyngs.runs.folder import require_empty
+from dyngs.runs.folder import require_empty, write_config
 from dyngs.runs.network_file import published_network, read_network
 from dyngs.training.new_trainer import assemble
 

@@ -28,9 +28,7 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
-from dyngs.runs.config_file import write_config
-from dyngs.runs.folder import EXPORT_FOLDER, LOG_NAME, require_empty
-from dyngs.runs.frame import FRAME_NAME
+from dyngs.runs.folder import EXPORT_FOLDER, FRAME_NAME, LOG_NAME, require_empty, write_config
 from dyngs.runs.stored_file import write_scene
 from dyngs.training.new_trainer import assemble
 
@@ -113,13 +111,13 @@ def prune_within(
     with kernel_threads(config.run.threads or num_cores()), bytewise:
         trainer = assemble(config, read_capture_of(config.data, start.info), restored=True)
         trainer.restore(start)
-        chosen, file, promise = Search(trainer, start, tell, unseen_images(trainer)).run(max_loss)
+        chosen, data, promise = Search(trainer, start, tell, unseen_images(trainer)).run(max_loss)
     with new_folder(out, require_empty) as started:
         _copy_start(run_dir, started)
         seconds = seconds_at(run_dir, start.info.step) + time.perf_counter() - begun
         save_checkpoint(started, chosen.checkpoint, seconds)
         write_config(chosen.config, started)
-        write_scene(started / EXPORT_FOLDER / SCENE_FILE, file.data)
+        write_scene(started / EXPORT_FOLDER / SCENE_FILE, data)
         write_config(chosen.config, started / EXPORT_FOLDER)
     return promise
 

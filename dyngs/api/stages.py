@@ -12,12 +12,12 @@ from dyngs.capture.sfm.unposed import with_poses
 from dyngs.config import AutoColour, FixedStrategy, SceneInit, ShColour
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.core.conventions import ReportProgress
-from dyngs.core.errors import DyngsError, counted, show, warn
+from dyngs.core.errors import DyngsError, counted, show
 from dyngs.data.read import capture_folder, read_capture, require_folder, require_images
 from dyngs.models.checkpoint import Checkpoint, read_capture_of
 from dyngs.models.kind import HasBody, Moves, Predicts, capability, kind_of
 from dyngs.models.views import training_times
-from dyngs.runs.capture_record import changed_files, named
+from dyngs.runs.capture_record import require_same_capture
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.folder import ASKED_NAME, EXPORT_FOLDER
 from dyngs.training.limits import most_gaussians, within_cap
@@ -110,10 +110,7 @@ def read_same_capture(folder: Path, resumed: Checkpoint) -> Stage:
         if capability(plan.resolved.model, Predicts) is not None:
             return plan, None
         capture = read_capture_of(data, resumed.info)
-        changed = changed_files(folder, data, capture)
-        if changed:
-            views = counted(len(changed), "training view")
-            warn(f"files of {views} have changed since the run began: {named(changed)}")
+        require_same_capture(folder, data, capture)
         return replace(plan, capture=capture), None
 
     return stage

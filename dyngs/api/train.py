@@ -33,7 +33,7 @@ from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, as_word, counted, show, warn
 from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.report import evaluate_run
-from dyngs.io.lock import writing
+from dyngs.io.outputs import writing
 from dyngs.models.kind import Predicts, capability
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads, num_cores
@@ -46,20 +46,20 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
-from dyngs.runs.config_file import write_config
 from dyngs.runs.folder import (
     LOG_NAME,
     asked_for,
     begin,
     default_folder,
+    inputs_of,
     is_done,
     note_asked,
     note_root,
     require_startable,
     tidy,
     was_only_begun,
+    write_config,
 )
-from dyngs.runs.inputs import inputs_of
 from dyngs.training.clock import SaveTimer, Stopwatch
 from dyngs.training.events import (
     Evaluated,
@@ -135,8 +135,8 @@ def train(
         latest_checkpoint(folder)  # raises, and says what is there
     keep_freed_memory()
     bytewise = deterministic(device, config.run.deterministic)
-    with writing(folder) as held, kernel_threads(_num_threads(config, processes)), bytewise:
-        tidy(folder, sole_writer=held.alone)
+    with writing(folder) as alone, kernel_threads(_num_threads(config, processes)), bytewise:
+        tidy(folder, sole_writer=alone)
         resumed = None
         if resume_from is None:
             plan = replace(plan, requested=plan.resolved)

@@ -12,7 +12,7 @@ from dyngs.data.capture import Capture, Silhouette, VideoFrame, View
 from dyngs.data.geometry import OPENGL_FROM_OPENCV, pinhole_matrix
 from dyngs.data.images.images import SUFFIXES, files_in, read_header
 from dyngs.data.images.video import colour_notes, decode_frames, planned_frames
-from dyngs.data.readers.colmap import find_masks, mask_of
+from dyngs.data.readers.transforms import find_masks, mask_of
 from dyngs.data.times import evenly_spaced, natural_order, parse_frames
 from dyngs.io.containment import check_size, inside, staying_within
 from dyngs.io.outputs import VIDEO_SUFFIXES
@@ -69,7 +69,7 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
         raise DyngsError(
             f"{paths[other]}: has another size than {paths[numbers[0]].name}; give the frames of one camera"
         )
-    focal = first.tags.focal_px or FOCAL * max(width, height)
+    focal = first.focal_px or FOCAL * max(width, height)
     intrinsics = pinhole_matrix(focal, focal, width / 2, height / 2)
     last = max(len(numbers) - 1, 1)
     views = tuple(
@@ -87,9 +87,9 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
         )
         for row, i in enumerate(numbers)
     )
-    has_alpha = masks is not None or first.has_alpha
+    has_alpha = masks is not None or first.alpha is not None
     note = f"{len(numbers)} of {len(paths)} frames, focal length {focal:.0f} px "
-    note += "by the EXIF tags" if first.tags.focal_px else "guessed"
+    note += "by the EXIF tags" if first.focal_px else "guessed"
     return Capture(
         source, FORMAT, {"train": views}, has_alpha=has_alpha, fps=fps, warnings=(note, *notes)
     )

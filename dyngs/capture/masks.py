@@ -6,7 +6,7 @@ Local letters: F frames of one camera, H height, W width."""
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -256,9 +256,15 @@ class _Camera:
     views: tuple[View, ...]
     size: tuple[int, int]
 
-    def image(self, view: View) -> np.ndarray:
-        """Return the image (H, W, 3) uint8 of a view at that size."""
-        pixels = read_image(view.image_path, (view.width, view.height))[..., :3]
+    def image(self, path: Path) -> np.ndarray:
+        """Return an image (H, W, 3) uint8 of this camera at that size."""
+        first = self.views[0]
+        pixels = read_image(path, (first.width, first.height))[..., :3]
+        if pixels.shape[:2] != (first.height, first.width):
+            raise DyngsError(
+                f"{path}: is {pixels.shape[1]}x{pixels.shape[0]}, images of its camera {first.width}x{first.height}; "
+                "take it with the same camera"
+            )
         return area_downscale_uint8(pixels, *self.size).numpy()
 
 
@@ -278,108 +284,75 @@ def with_background_masks(
     cameras = _fixed_cameras(capture)
     plates = {} if empty is None else _plates(empty, cameras)
     silhouettes: dict[str, Silhouette] = {}
-    worst: Separation | None = None
-    for index, camera in enumerate(cameras):
-        sampled = np.stack(
-            [camera.image(camera.views[i]) for i in evenly_spaced(len(camera.views), SAMPLES)]
-        )
-        background = _background(camera, sampled, plates.get(index))
+    found: list[Separation] = []
+    for number, camera in cameras.items():
+        paths = [view.image_path for view in camera.views]
+        sampled = np.stack([camera.image(paths[i]) for i in evenly_spaced(len(paths), SAMPLES)])
+        if number in plates:
+            colours = camera.image(plates[number]).astype(np.float32)
+            typical = float(np.median(background_of(sampled).noise))
+            background = Background(colours, np.full(colours.shape[:2], typical, np.float32))
+        elif _moves(sampled):
+            raise DyngsError(f"{camera.where}: the camera {_MOVES}")
+        else:
+            background = background_of(sampled)
         masks = np.stack([person_mask(background, image) for image in sampled])
-        found = separation(background, sampled, masks)
-        _require_clear(camera, found, with_plate=index in plates)
-        worst = found if worst is None or found.on_edges < worst.on_edges else worst
-        for view in camera.views:
-            target = (
-                folder / f"{re.sub(r'[^A-Za-z0-9_-]', '_', view.name)}.{len(silhouettes):06d}.png"
+        found.append(separation(background, sampled, masks))
+        with_plate = number in plates and found[-1].area > 0 and found[-1].on_edges > 0.5
+        if not (found[-1].is_clear or with_plate):
+            raise DyngsError(
+                f"{camera.where}: nobody stands out from the background, or the person never leaves their place, so "
+                f"that it is not seen ({found[-1].staying:.0%} of the masks are where somebody is most of the time, "
+                f"{found[-1].on_edges:.0%} of their outlines on edges); {_ADVICE}"
             )
-            write_image(target, at_size(person_mask(background, camera.image(view)), view))
+        for view in camera.views:
+            name = re.sub(r"[^A-Za-z0-9_-]", "_", view.name)
+            target = folder / f"{name}.{len(silhouettes):06d}.png"
+            mask = person_mask(background, camera.image(view.image_path))
+            write_image(target, at_size(mask, view))
             silhouettes[view.name] = Silhouette(target, "white")
-    if worst is not None:
-        say(
-            f"masks by the difference from the background: {worst.on_edges:.0%} of the outlines lie on edges of the "
-            f"images, the person covers {worst.area:.1%} of them"
-        )
+    worst = min(found, key=lambda one: one.on_edges)
+    say(
+        f"masks by the difference from the background: {worst.on_edges:.0%} of the outlines lie on edges of the "
+        f"images, the person covers {worst.area:.1%} of them"
+    )
     splits = each_view(
         capture.splits, lambda view: replace(view, silhouette=silhouettes[view.name])
     )
     return capture.replace(splits=splits, has_alpha=True)
 
 
-def _fixed_cameras(capture: Capture) -> list[_Camera]:
-    """Return the cameras of a capture, all of which stand."""
-    cameras = []
+def _fixed_cameras(capture: Capture) -> dict[int, _Camera]:
+    """Return the cameras of a capture by number, all of which stand."""
+    cameras = {}
     for number, views in by_camera(capture.splits).items():
         where = f"{capture.root}, camera {number}"
         first = views[0]
         poses = np.stack([view.cam_from_world for view in views])
-        if (
-            not np.allclose(poses, poses[0], atol=1e-6)
-            or len({(view.width, view.height) for view in views}) > 1
-        ):
+        sizes = {(view.width, view.height) for view in views}
+        if not np.allclose(poses, poses[0], atol=1e-6) or len(sizes) > 1:
             raise DyngsError(f"{where} {_MOVES}")
         if len(views) < LEAST:
             raise DyngsError(
                 f"{where}: has {len(views)} images, too few for a background; {_ADVICE}"
             )
-        cameras.append(
-            _Camera(where, tuple(views), target_size(first.width, first.height, 1.0, SIDE))
-        )
+        size = target_size(first.width, first.height, 1.0, SIDE)
+        cameras[number] = _Camera(where, tuple(views), size)
     return cameras
 
 
-def _plates(empty: Path, cameras: Sequence[_Camera]) -> Mapping[int, Path]:
-    if empty.is_file():
-        if len(cameras) > 1:
-            raise DyngsError(
-                f"{empty}: is one image for {len(cameras)} cameras; give a folder with one each"
-            )
-        return {0: empty}
-    numbers = {
-        int(found[1]): path
-        for path in files_in(empty, SUFFIXES)
-        if (found := re.search(r"(\d{1,9})\D*$", path.stem))
-    }
-    if not numbers:
-        raise DyngsError(f"{empty}: no image of the background there")
-    plates = {}
-    for index, camera in enumerate(cameras):
-        number = camera.views[0].camera_id
-        if number not in numbers:
-            raise DyngsError(f"{empty}: no background for {camera.where}; call it {number}.png")
-        plates[index] = numbers[number]
+def _plates(empty: Path, cameras: Mapping[int, _Camera]) -> Mapping[int, Path]:
+    """Return the image of the background for each camera, by number."""
+    if empty.is_file() and len(cameras) == 1:
+        return dict.fromkeys(cameras, empty)
+    found = {path: re.search(r"(\d{1,9})\D*$", path.stem) for path in files_in(empty, SUFFIXES)}
+    plates = {int(number[1]): path for path, number in found.items() if number}
+    missing = sorted(cameras.keys() - plates.keys())
+    if missing:
+        raise DyngsError(
+            f"{empty}: no background for camera {missing[0]}; give a folder with {missing[0]}.png"
+        )
     return plates
-
-
-def _background(camera: _Camera, sampled: np.ndarray, plate: Path | None) -> Background:
-    if plate is not None:
-        first = camera.views[0]
-        pixels = read_image(plate, (first.width, first.height))[..., :3]
-        height, width = pixels.shape[:2]
-        if abs(width * first.height - height * first.width) > max(first.width, first.height):
-            raise DyngsError(
-                f"{plate}: is {width}x{height}, images of its camera {first.width}x{first.height}; take it with the "
-                "same camera"
-            )
-        if width < camera.size[0]:
-            raise DyngsError(f"{plate}: is smaller than the images; take it with the same camera")
-        colours = area_downscale_uint8(pixels, *camera.size).numpy().astype(np.float32)
-        spread = background_of(sampled).noise
-        return Background(colours, np.full_like(spread, float(np.median(spread))))
-    if _moves(sampled):
-        raise DyngsError(f"{camera.where}: the camera {_MOVES}")
-    return background_of(sampled)
-
-
-def _require_clear(camera: _Camera, found: Separation, *, with_plate: bool) -> None:
-    if found.is_clear if not with_plate else found.area > 0 and found.on_edges > 0.5:
-        return
-    if found.area < 1e-3:
-        raise DyngsError(f"{camera.where}: nobody stands out from the background; {_ADVICE}")
-    raise DyngsError(
-        f"{camera.where}: the person never leaves their place, so that the background there is not seen "
-        f"({found.staying:.0%} of the masks are where somebody is most of the time, {found.on_edges:.0%} of their "
-        f"outlines on edges); {_ADVICE}"
-    )
 
 
 def at_size(mask: np.ndarray, view: View) -> np.ndarray:

@@ -47,14 +47,13 @@ from dyngs.io.containment import following_links_of_runs
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
-_OUT_OF_MEMORY = (
-    "out of memory; use smaller images (data.longest_side) or a smaller cache (data.cache_mb)"
-)
-_TORCH_OUT_OF_MEMORY = "DefaultCPUAllocator: can't allocate memory"
-_GPU_OUT_OF_MEMORY = "CUDA out of memory"
-_GPU_IS_FULL = "the GPU is out of memory; lower strategy.max_gaussians or data.longest_side, or give --device cpu"
-_OF_DATA = ("inspect", "sfm", "fit", "motion", "synth")
-"""Commands of ``dyngs data``."""
+_ADVICE = {
+    errno.ENOSPC: "; free some space and run the command again, earlier results are untouched",
+    errno.EDQUOT: "; your quota is used up, free some space and run the command again",
+    errno.EPIPE: "; the program that read our output has gone",
+    errno.EACCES: "; choose another folder or change its permissions",
+    errno.EROFS: "; choose a folder that can be written",
+}
 _COMMANDS: dict[str, Callable[[Any], None]] = {
     "demo": demo.add_parser,
     "train": train.add_parser,
@@ -104,17 +103,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         code = _dispatch(words)
         sys.stdout.flush()
         return code
-    except (DyngsError, MemoryError, RuntimeError) as error:
-        full = _GPU_IS_FULL if _GPU_OUT_OF_MEMORY in str(error) else _OUT_OF_MEMORY
-        if (
-            isinstance(error, RuntimeError)
-            and full == _OUT_OF_MEMORY
-            and _TORCH_OUT_OF_MEMORY not in str(error)
-        ):
-            raise
-        if "--debug" in flags:
-            traceback.print_exception(error)
-        return _fail(str(error) if isinstance(error, DyngsError) else full)
     except KeyboardInterrupt as interrupt:
         with suppress(OSError):  # the terminal may be closed
             print(
@@ -123,11 +111,31 @@ def main(argv: Sequence[str] | None = None) -> int:
         _abandon_if_broken(sys.stdout)
         _abandon_if_broken(sys.stderr)
         return EXIT_INTERRUPTED
-    except OSError as error:
+    except (DyngsError, MemoryError, RuntimeError, OSError) as error:
+        message = _message_of(error)
+        if message is None:
+            raise
         _abandon_if_broken(sys.stdout)
         if "--debug" in flags:
             traceback.print_exception(error)
-        return _fail(_describe_os_error(error))
+        with suppress(OSError):  # stderr may lie on a full disk
+            print(f"dyngs: error: {printable(message)}", file=sys.stderr)
+        _abandon_if_broken(sys.stderr)
+        return EXIT_ERROR
+
+
+def _message_of(error: Exception) -> str | None:
+    """Return the line for the user; None of an error that is a bug."""
+    if isinstance(error, DyngsError):
+        return str(error)
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename is not None else ""
+        return f"{where}{error.strerror or error}{_ADVICE.get(error.errno or 0, '')}"
+    if "CUDA out of memory" in str(error):
+        return "the GPU is out of memory; lower strategy.max_gaussians or data.longest_side, or give --device cpu"
+    if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
+        return "out of memory; use smaller images (data.longest_side) or a smaller cache (data.cache_mb)"
+    return None
 
 
 def _without_flags(arguments: list[str]) -> tuple[list[str], set[str]]:
@@ -151,10 +159,6 @@ def _show_any_name() -> None:
 def _dispatch(arguments: list[str]) -> int:
     for word in arguments:
         require_name(word)
-    if arguments and arguments[0] in _OF_DATA:
-        raise DyngsError(
-            f"the command {arguments[0]!r} belongs to data: run `dyngs data {arguments[0]}`"
-        )
     if not arguments:
         print(_NEXT)
         return 0
@@ -171,16 +175,13 @@ def _dispatch(arguments: list[str]) -> int:
             require_outputs_apart(parsed.parser, parsed)
             return parsed.run(parsed)
     except NoCaptureError as error:
-        if not (
-            getattr(parsed, "takes_root", False) or getattr(parsed, "resume", None)
-        ) or _names_root(parsed):
+        names_root = any(
+            word.strip().startswith("data.root") for word in getattr(parsed, "overrides", ())
+        )
+        if not getattr(parsed, "takes_root", False) or names_root:
             raise
         again = " ".join(map(quoted, ["dyngs", *arguments, "data.root=FOLDER"]))
         raise DyngsError(f"{error}; if it was moved: `{again}`") from error
-
-
-def _names_root(parsed: argparse.Namespace) -> bool:
-    return any(word.partition("=")[0].strip() == "data.root" for word in parsed.overrides)
 
 
 def _parsed(parser: argparse.ArgumentParser, arguments: list[str]) -> argparse.Namespace:
@@ -228,13 +229,6 @@ def make_parser(only: str = "") -> argparse.ArgumentParser:
     return parser
 
 
-def _fail(message: str) -> int:
-    with suppress(OSError):  # stderr may lie on a full disk
-        print(f"dyngs: error: {printable(message)}", file=sys.stderr)
-    _abandon_if_broken(sys.stderr)
-    return EXIT_ERROR
-
-
 def _abandon_if_broken(stream: TextIO) -> None:
     """Redirect a broken stream to the null device, because the interpreter would fail to flush it
     at exit."""
@@ -242,15 +236,3 @@ def _abandon_if_broken(stream: TextIO) -> None:
         stream.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-
-
-def _describe_os_error(error: OSError) -> str:
-    where = f"{error.filename}: " if error.filename is not None else ""
-    advice = {
-        errno.ENOSPC: "; free some space and run the command again, earlier results are untouched",
-        errno.EDQUOT: "; your quota is used up, free some space and run the command again",
-        errno.EPIPE: "; the program that read our output has gone",
-        errno.EACCES: "; choose another folder or change its permissions",
-        errno.EROFS: "; choose a folder that can be written",
-    }
-    return f"{where}{error.strerror or error}{advice.get(error.errno or 0, '')}"

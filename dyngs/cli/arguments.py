@@ -240,7 +240,7 @@ def require_outputs_apart(parser: argparse.ArgumentParser, arguments: argparse.N
     existing = [Path(out) for out in outputs if os.path.lexists(out)]
     if not existing:
         return
-    from dyngs.runs.inputs import inputs_of
+    from dyngs.runs.folder import inputs_of
 
     named = (value if equals else key for key, equals, value in words if key != "run.dir")
     read = [
@@ -289,18 +289,13 @@ def is_avatar_file(path: Path) -> bool:
 
 
 def run_of_scene_file(path: Path) -> Path:
-    """Return the run folder of a ``scene.dyngs``, the ``meta.json`` of an unpacked .sog, and any
-    other path as it is.
+    """Return the run folder of a ``scene.dyngs``, and any other path as it is.
 
     A run with checkpoints is drawn from those, which a note says.
 
     Raises:
         DyngsError: the file has another name.
     """
-    if path.is_dir():
-        from dyngs.io.formats.formats import format_to_read, sog_meta
-
-        return path if format_to_read(path) is None else sog_meta(path) or path
     if path.suffix.lower() != ".dyngs" or not path.is_file():
         return path
     from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths

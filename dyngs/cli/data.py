@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dyngs.cli import arguments as args
 from dyngs.cli.output import ProgressBar, print_lines, print_notes
@@ -13,7 +13,6 @@ from dyngs.core.errors import DyngsError, as_word, counted
 
 if TYPE_CHECKING:
     from dyngs.human.fit.fitted_capture import KnownAvatar
-    from dyngs.human.motion.motion import Motion
 
 SYNTHETIC_SCENES = ("still", "spin", "room", "roll", "human", "people")
 """The scenes of ``dyngs data synth``: named here because the parser must not import numpy."""
@@ -26,11 +25,7 @@ _OF_A_FIT = {
     ),
     "joints": (
         "PATH",
-        "a fit of another program: 3D joints (.npz, .json), a folder of SAM 3D Body, or posed vertices",
-    ),
-    "body": (
-        "FILE",
-        "body file (SMPL, ...) that posed vertices belong to, if it is not the one that is fitted",
+        "a fit of another program: 3D joints (.npz), or a folder of SAM 3D Body",
     ),
     "person": (
         "PATH",
@@ -102,9 +97,8 @@ def _add_sfm(verbs: args.Commands) -> None:
         "--masks", type=args.input_path, metavar="DIR", help="masks of the photos, white = keep"
     )
     frames = "frames to take of a video (default 100; of each of several: up to 300)"
-    parser.add_argument("--frames", type=int, metavar="N", help=frames)
-    start = "when a video of several begins; once for each"
-    parser.add_argument("--start", action="append", default=[], metavar="NAME=SECONDS", help=start)
+    kind = args.whole("a number of frames", 2, 10**6)
+    parser.add_argument("--frames", type=kind, metavar="N", help=frames)
     args.add_threads(parser)
     args.add_overrides(parser, "data.key=value", "data.follow_links")
 
@@ -212,7 +206,7 @@ def _add_synth(verbs: args.Commands) -> None:
 
 def run_inspect(arguments: argparse.Namespace) -> int:
     """Print a report on a capture, or on videos without poses."""
-    from dyngs.capture.inspection.report import format_report, inspect_capture
+    from dyngs.capture.inspection import format_report, inspect_capture
     from dyngs.capture.sfm.unposed import is_videos
     from dyngs.data.read import capture_folder
 
@@ -229,7 +223,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
         raise DyngsError(report.problems[0])
     print_lines(format_report(report))
     if arguments.image is not None:
-        from dyngs.capture.inspection.report import draw_cameras
+        from dyngs.capture.inspection import draw_cameras
 
         draw_cameras(report.capture, arguments.image)
         print(f"written: {arguments.image}")
@@ -237,7 +231,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
 
 
 def _inspect_videos(arguments: argparse.Namespace) -> int:
-    from dyngs.capture.inspection.report import video_report
+    from dyngs.capture.inspection import video_report
 
     if arguments.image is not None:
         raise DyngsError(
@@ -259,15 +253,12 @@ def run_sfm(arguments: argparse.Namespace) -> int:
     out = arguments.out
     images = capture_folder(arguments.images)
     several = is_several_videos(images)
-    if several:
-        _require_options_of_videos(arguments)
-    elif arguments.start:
-        raise DyngsError(f"{images}: --start is for a folder of several videos")
+    if several and (arguments.matching != "auto" or arguments.masks is not None):
+        raise DyngsError(f"{images}: --matching and --masks are for photos and one video")
     options = SfmOptions(
         matching=arguments.matching,
         num_frames=arguments.frames,
         masks=arguments.masks,
-        starts=_starts(arguments.start),
         num_threads=arguments.threads,
         follow_links=limits.follow_links,
     )
@@ -279,33 +270,6 @@ def run_sfm(arguments: argparse.Namespace) -> int:
     print_lines(f"{said}\nnext: dyngs data inspect {as_word(out)} --image cameras.png")
     print(f"      dyngs train {'dynamic' if several else 'static'} data.root={as_word(out)}")
     return 0
-
-
-def _require_options_of_videos(arguments: argparse.Namespace) -> None:
-    """Refuse options that several videos do not have."""
-    usual = {"matching": "auto", "masks": None}
-    for option in (name for name, value in usual.items() if getattr(arguments, name) != value):
-        raise DyngsError(
-            f"{arguments.images}: --{option} is for one video or photos; leave it out for several videos"
-        )
-    if arguments.frames is not None and arguments.frames < 2:
-        raise DyngsError("--frames must be at least 2")
-
-
-def _starts(words: list[str]) -> dict[str, float] | None:
-    """Return the seconds of ``NAME=SECONDS``, None without any."""
-    starts: dict[str, float] = {}
-    for word in words:
-        name, _, seconds = word.rpartition("=")
-        try:
-            starts[name] = float(seconds)
-        except ValueError:
-            name = ""
-        if not name:
-            raise DyngsError(
-                f"--start {word!r}: give the name of a video without its suffix and seconds, as cam01=0.5"
-            )
-    return starts or None
 
 
 def run_fit(arguments: argparse.Namespace) -> int:
@@ -325,9 +289,7 @@ def run_fit(arguments: argparse.Namespace) -> int:
         result = write_fitted_capture(options, arguments.out, report, inputs)
     files = {"model.body": result.model.body, "model.uv": result.model.uv}
     keys = "".join(f" {key}={as_word(path)}" for key, path in files.items() if path is not None)
-    print_lines(
-        f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}{keys}"
-    )
+    print_lines(f"{result.summary}\nnext: dyngs train human data.root={as_word(result.root)}{keys}")
     return 0
 
 
@@ -340,7 +302,7 @@ def run_people(arguments: argparse.Namespace) -> int:
     detector = MediaPipe(arguments.mediapipe)
     with ProgressBar() as report:
         result = write_found_person(options, arguments.out, detector, report)
-    print_lines(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
+    print_lines(f"{result.summary}\nnext: dyngs train human data.root={as_word(result.root)}")
     return 0
 
 
@@ -373,19 +335,11 @@ def run_motion(arguments: argparse.Namespace) -> int:
     body = default_template() if arguments.body is None else read_body(arguments.body)
     motion = read_motion(arguments.file, body, arguments.fps, arguments.up, arguments.clip)
     write_amass(motion, out)
-    print(f"written: {out}\n         {_summary(motion)}")
+    count = len(motion.poses)
+    length = f"{counted(count, 'frame')}, {(count - 1) / motion.fps:.2f} s"
+    print(f"written: {out}\n         {length} at {motion.fps:g} frames per second")
     print_notes(motion.notes)
     return 0
-
-
-def _summary(motion: Motion) -> str:
-    """Return frames, seconds, the number of joints that turn, and the largest speed of the root."""
-    count, joints = motion.poses.shape[:2]
-    turning = int(((motion.poses - motion.poses[:1]).norm(dim=-1).amax(0) > 1e-3).sum())
-    speeds = motion.trans.diff(dim=0).norm(dim=-1) * motion.fps
-    speed = speeds.max().item() if count > 1 else 0.0
-    length = f"{counted(count, 'frame')}, {(count - 1) / motion.fps:.2f} s at {motion.fps:g} frames per second"
-    return f"{length}; {turning} of {joints} joints turn, the root moves at up to {speed:.2f} m/s"
 
 
 def run_synth(arguments: argparse.Namespace) -> int:
@@ -400,45 +354,36 @@ def run_synth(arguments: argparse.Namespace) -> int:
     from dyngs.io.outputs import require_new_folder
 
     scene = arguments.scene
-    out = arguments.out
-    is_moving = scene in ("spin", "room", "roll")
-    if arguments.people is not None and scene != "people":
-        raise DyngsError("--people is for the scene people only; leave it out")
-    if arguments.style is not None and not is_moving:
-        raise DyngsError("--style is for scenes that move: spin, room and roll")
-    if arguments.cameras is not None and (
-        scene == "still" or arguments.style not in (None, "fixed")
-    ):
-        raise DyngsError("--cameras is for people, and for fixed cameras of scenes that move")
-    given = {
-        name: getattr(arguments, name)
-        for name in ("size", "cameras", "seed")
-        if getattr(arguments, name) is not None
-    }
-    views = arguments.views
+    out: Path = arguments.out
+    moving = {"views": "num_times", "cameras": "num_cameras", "style": "style"}
+    options, names, preset = {
+        "still": (synthetic.StillOptions, {"views": "num_train"}, "static"),
+        "human": (HumanOptions, {"views": "num_frames", "cameras": "num_cameras"}, "human"),
+        "people": (
+            PeopleOptions,
+            {"views": "frames", "cameras": "cameras", "people": "people"},
+            "gps",
+        ),
+    }.get(scene, (synthetic.DynamicOptions, moving, "dynamic"))
+    names = {"size": "size", "seed": "seed", **names}
+    given: dict[str, Any] = {}
+    for option in ("size", "views", "cameras", "people", "style", "seed"):
+        value = getattr(arguments, option)
+        if value is not None and option not in names:
+            raise DyngsError(f"--{option} is not for the scene {scene}; leave it out")
+        if value is not None:
+            given[names[option]] = value
     if scene == "people":
-        given |= {} if views is None else {"frames": views}
-        given |= {} if arguments.people is None else {"people": arguments.people}
         with ProgressBar() as report:
-            write_people(out, PeopleOptions(**given), report)
-        return _print_synth(out, "gps")
-    require_new_folder(out)
-    cameras = given.pop("cameras", None)
-    if scene == "still":
-        given |= {} if views is None else {"num_train": views}
-        synthetic.write_still_capture(out, synthetic.StillOptions(**given))
-        return _print_synth(out, "static")
-    given |= {} if cameras is None else {"num_cameras": cameras}
-    if scene == "human":
-        given |= {} if views is None else {"num_frames": views}
-        write_human_capture(out, HumanOptions(**given))
-        return _print_synth(out, "human")
-    given |= {} if views is None else {"num_times": views}
-    style = arguments.style or ("fixed" if cameras is not None else None)
-    synthetic.write_dynamic_capture(scene, out, synthetic.DynamicOptions(**given, style=style))
-    return _print_synth(out, "dynamic")
-
-
-def _print_synth(out: Path, preset: str) -> int:
+            write_people(out, options(**given), report)
+    else:
+        require_new_folder(out)
+        if scene == "still":
+            synthetic.write_still_capture(out, options(**given))
+        elif scene == "human":
+            write_human_capture(out, options(**given))
+        else:
+            usual = "fixed" if "num_cameras" in given else None
+            synthetic.write_dynamic_capture(scene, out, options(**{"style": usual} | given))
     print(f"written: {out}\nnext:    dyngs train {preset} data.root={as_word(out)}")
     return 0

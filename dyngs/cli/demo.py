@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dyngs.cli.arguments import Commands, add_command, add_threads, output_path, whole
 from dyngs.cli.output import numbers_table, print_tables
-from dyngs.core.errors import as_word
+from dyngs.core.errors import as_word, counted, show
+
+if TYPE_CHECKING:
+    from dyngs.config import Config
+    from dyngs.training.events import Listener
+
+SIZE, NUM_TIMES, NUM_POINTS = 160, 60, 6000
+"""Width and height of the images in pixels, number of training images, one camera and one time each,
+and of random initial points."""
 
 
 def add_parser(commands: Commands) -> None:
@@ -26,21 +37,86 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the demo and print the results and the paths of the files."""
-    from dyngs.cli.demo_run import DemoOptions, result_table, run_demo
+    """Run the demo in ``--out``, or in ``OUT-2`` and so on if that is not empty."""
     from dyngs.cli.training_progress import TrainingProgress
+    from dyngs.io.outputs import writing
 
-    options = DemoOptions(steps=arguments.steps, threads=arguments.threads)
-    with TrainingProgress() as progress:
-        result = run_demo(arguments.out, options, [progress])
-    print_tables(numbers_table(*result_table(result)))
-    print(f"truth, render, error  {result.images / 'sheet.png'}")
-    print(f"test views            {result.images}")
-    print(f"orbit video           {result.video}")
-    print(f"for other viewers     {result.ply}")
-    print(f"run folder            {result.run_dir}")
-    print(
-        f"to look around        dyngs view {as_word(result.run_dir)}    (pip install 'dyngs[view]')"
-    )
-    print(f"one page to share     dyngs export {as_word(result.run_dir)} --out scene.html")
+    folder: Path = arguments.out
+    numbers = count(2)
+    while not is_unused(folder):
+        folder = arguments.out.with_name(f"{arguments.out.name}-{next(numbers)}")
+    with writing(folder), TrainingProgress() as progress:
+        run_demo(folder, arguments.steps, arguments.threads, [progress])
     return 0
+
+
+def is_unused(folder: Path) -> bool:
+    """Whether ``folder`` can be made, or holds at most a lock file."""
+    from dyngs.io.outputs import LOCK_NAME
+
+    return not folder.exists() or (
+        folder.is_dir() and all(path.name == LOCK_NAME for path in folder.iterdir())
+    )
+
+
+def run_demo(
+    folder: Path, steps: int, threads: int = 0, listeners: Sequence[Listener] = ()
+) -> None:
+    """Run the demo in an empty folder; print the results and the paths of the files."""
+    from dyngs.api.train import train
+    from dyngs.cli.evaluate import report_rows
+    from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
+    from dyngs.evaluate.report import evaluate_run
+    from dyngs.export.choose_path import PathOptions, choose_path
+    from dyngs.export.images import OutputOptions, write_path_images, write_split_images
+    from dyngs.export.splat_files import write_run_splats
+    from dyngs.runs.opened import open_run
+
+    run_dir = folder / "run"
+    images = folder / "images"
+    video = folder / "orbit.mp4"
+    capture = folder / "capture"
+    show(f"[1/4] ray tracing the images of the demo scene into {capture}")
+    write_dynamic_capture(
+        "spin", capture, DynamicOptions(size=SIZE, num_times=NUM_TIMES, samples=3)
+    )
+    show(f"[2/4] training {counted(steps, 'step')} into {run_dir}")
+    train(demo_config(capture, run_dir, steps, threads), listeners=listeners)
+    show("[3/4] evaluating on held-out views")
+    report = evaluate_run(run_dir, threads=threads)
+    show("[4/4] rendering the test views and an orbit around the moving scene")
+    opened = open_run(run_dir)
+    write_split_images(opened, "test", images)
+    path = choose_path(opened, PathOptions("orbit", 90))
+    write_path_images(opened, path, None, OutputOptions(video=video))
+    ply = write_run_splats(opened, folder / "splats.ply").path
+    title = counted(report.num_views, "test view")
+    print_tables(numbers_table(title, ("metric", "value"), report_rows(report)))
+    print(f"truth, render, error  {images / 'sheet.png'}")
+    print(f"orbit video           {video}")
+    print(f"for other viewers     {ply}")
+    print(f"run folder            {run_dir}")
+    print(f"to look around        dyngs view {as_word(run_dir)}    (pip install 'dyngs[view]')")
+    print(f"one page to share     dyngs export {as_word(run_dir)} --out scene.html")
+
+
+def demo_config(capture: Path, run_dir: Path, steps: int = 3000, threads: int = 0) -> Config:
+    """Return the preset ``dynamic`` for the capture and size of the demo."""
+    from dyngs.config.io import load_config, packaged_preset
+
+    overrides = (
+        "data.root=capture",
+        f"init.num_random={NUM_POINTS}",
+        f"model.num_random_moving={NUM_POINTS // 3}",
+        f"train.steps={steps}",
+        "model.choose=false",  # the scene is made to move
+        "train.initial_downscale=2",  # the images are small, and soon as large as they get
+        "train.resolution_grows_from=0.35",
+        "train.resolution_full_at=0.45",
+        "run.name=demo",
+        f"run.threads={threads}",
+    )
+    config = load_config(packaged_preset("dynamic"), overrides)
+    data = config.data.model_copy(update={"root": capture.absolute()})
+    own = config.run.model_copy(update={"dir": run_dir})
+    return config.model_copy(update={"data": data, "run": own})

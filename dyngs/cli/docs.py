@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 import sys
 from difflib import get_close_matches
 from pathlib import Path
@@ -12,7 +11,6 @@ from pathlib import Path
 from dyngs.cli.arguments import Commands, add_command
 from dyngs.core.errors import DyngsError
 
-_LINK = re.compile(r"\[([^]]+)\]\(([^)#\s:]+)(?:#[^)\s]*)?\)")
 _FRONT = "README"
 
 
@@ -41,16 +39,9 @@ def run(arguments: argparse.Namespace) -> int:
         os.environ.setdefault("LESS", "-R")  # otherwise less shows colours as codes
         console = Console()
         with console.pager(styles=True):
-            console.print(Markdown(_with_commands(text, folder)))
+            console.print(Markdown(text))
     else:
         print(text, end="")
-    others = sorted(
-        {Path(match[2]).stem for match in _LINK.finditer(text) if match[2].endswith(".md")}
-        - {path.stem}
-    )
-    known = [name for name in others if (folder / f"{name}.md").is_file()]
-    if known:
-        print(f"pages that this one names: dyngs docs {' | '.join(known)}", file=sys.stderr)
     return 0
 
 
@@ -79,18 +70,3 @@ def page(folder: Path, topic: str) -> Path:
     raise DyngsError(
         f"no page {topic!r}{hint}; there are {', '.join(key for key in pages if key != _FRONT)}"
     )
-
-
-def _with_commands(text: str, folder: Path) -> str:
-    """Return Markdown in which a link to another page is the command that shows it, as a terminal
-    can open no page."""
-
-    def command(match: re.Match[str]) -> str:
-        words = match[1]
-        target = Path(match[2])
-        if target.suffix != ".md" or not (folder / target.name).is_file():
-            return match[0]
-        shown = f"`dyngs docs {target.stem}`"
-        return shown if words == target.name else f"{words} ({shown})"
-
-    return _LINK.sub(command, text)

@@ -6,38 +6,15 @@ import argparse
 import json
 import os
 import platform
+import re
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from importlib import metadata, util
+from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
 from dyngs.cli.arguments import Commands, add_command, add_json
 from dyngs.core.errors import DyngsError
-
-_SAME = (
-    "torch",
-    "numpy",
-    "pydantic",
-    "safetensors",
-    "rich",
-    "pycolmap",
-    "trimesh",
-    "kornia",
-    "OpenImageIO",
-    "scipy",
-)
-_REQUIRED = {name: name for name in (*_SAME, "av", "argcomplete")} | {
-    "pyyaml": "yaml",
-    "scikit-image": "skimage",
-}
-"""Packages, and the modules that they have."""
-_OPTIONAL = {
-    "flip-evaluator": ("flip_evaluator", "the FLIP metric: pip install 'dyngs[metrics]'"),
-    "lpips": ("lpips", "the LPIPS metric: pip install 'dyngs[metrics]'"),
-    "matplotlib": ("matplotlib", "the plot of `dyngs tradeoff`: pip install 'dyngs[plots]'"),
-    "tensorboard": ("tensorboard", "train.tensorboard=true: pip install 'dyngs[tensorboard]'"),
-}
 
 
 @dataclass(frozen=True)
@@ -82,21 +59,24 @@ def examine() -> Iterator[Check]:
     yield Check("dyngs", _version("dyngs") or "not installed (run from a source folder)")
     yield Check("python", f"{platform.python_version()} on {platform.platform()}")
     yield Check("cores", f"{_usable_cores()} usable of {os.cpu_count()}")
-    for name, module in _REQUIRED.items():
-        yield (
-            Check(name, _version(name) or "")
-            if util.find_spec(module)
-            else Check(name, "missing", "broken")
-        )
+    yield from _examine_packages()
     yield from _examine_core()
     yield from _examine_gpu()
-    for name, (module, purpose) in _OPTIONAL.items():
-        found = util.find_spec(module) is not None
-        yield (
-            Check(name, _version(name) or "")
-            if found
-            else Check(name, f"needed for {purpose}", "absent")
-        )
+
+
+def _examine_packages() -> Iterator[Check]:
+    """Yield the versions of the packages that dyngs requires, and of those that its extras do."""
+    requirements = metadata.requires("dyngs") or [] if _version("dyngs") else []
+    for line in requirements:
+        name = re.split(r"[^\w.-]", line, maxsplit=1)[0]
+        extra = re.search(r"extra == ['\"](\w+)", line)
+        version = _version(name)
+        if version is not None:
+            yield Check(name, version)
+        elif extra is None:
+            yield Check(name, "missing", "broken")
+        elif extra[1] not in ("test", "dev"):
+            yield Check(name, f"pip install 'dyngs[{extra[1]}]'", "absent")
 
 
 def _examine_core() -> Iterator[Check]:
@@ -112,10 +92,8 @@ def _examine_core() -> Iterator[Check]:
         value += f"; this processor also runs {newest} ({ISA_NAMES[newest]}): install again on it for more speed"
     yield Check("native core", value)
     runtimes = openmp_runtimes()
-    if runtimes is not None:
-        yield Check(
-            "OpenMP runtimes", f"{len(runtimes)}: {', '.join(path.name for path in runtimes)}"
-        )
+    if runtimes:
+        yield Check("OpenMP runtimes", f"{len(runtimes)}: {', '.join(runtimes)}")
 
 
 def _examine_gpu() -> Iterator[Check]:
@@ -127,23 +105,17 @@ def _examine_gpu() -> Iterator[Check]:
     reason = why_no_gpu()
     for name, value in findings().items():
         yield Check(name, value)
-    yield (
-        Check("device", "cuda")
-        if reason is None
-        else Check("device", f"cpu; for a GPU: {reason}", "absent")
-    )
+    if reason is None:
+        yield Check("device", "cuda")
+    else:
+        yield Check("device", f"cpu; for a GPU: {reason}", "absent")
 
 
-def openmp_runtimes() -> list[Path] | None:
-    """Return the OpenMP runtimes loaded in this process (several compete for the cores); None where
-    unknown."""
+def openmp_runtimes() -> list[str]:
+    """Return the OpenMP runtimes loaded in this process: several compete for the cores."""
     maps = Path("/proc/self/maps")
-    if not maps.is_file():
-        return None
-    paths = {
-        Path(line.split(maxsplit=5)[5]) for line in maps.read_text().splitlines() if line.count("/")
-    }
-    return sorted(path for path in paths if path.name.startswith(("libgomp", "libiomp", "libomp")))
+    text = maps.read_text() if maps.is_file() else ""
+    return sorted(set(re.findall(r"/(lib(?:g|i)?omp[^/\n]*)$", text, re.MULTILINE)))
 
 
 def _version(name: str) -> str | None:

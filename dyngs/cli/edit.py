@@ -62,7 +62,7 @@ def add_parser(commands: args.Commands) -> None:
     frame.add_argument("--geo", type=args.input_path, metavar="FILE|exif", help=about)
     frame.add_argument("--undo", action="store_true", help="the frame from before the first edit")
     part = parser.add_argument_group("Gaussians")
-    about = "what stays: two corners x,y,z x,y,z of a box, centre and radius of a sphere, or the file of a closed mesh"
+    about = "what stays: two corners x,y,z x,y,z of a box, or centre and radius of a sphere"
     part.add_argument("--crop", nargs="+", metavar="REGION", help=about)
     part.add_argument("--outside", action="store_true", help="--crop leaves out what lies inside")
     about = "take away floaters, needles, faint veils, and what no camera ever saw"
@@ -88,11 +88,9 @@ def run(arguments: argparse.Namespace) -> int:
     with heavy_imports():
         from dyngs.api.edit import edit_scene
         from dyngs.cli.splats import print_redrawn
-        from dyngs.export.edit.crop import mesh_path
 
     source = args.run_of_scene_file(arguments.source)
-    mesh = None if arguments.crop is None else mesh_path(arguments.crop)
-    reads = [path for path in (arguments.geo, mesh) if path is not None and path != _EXIF]
+    reads = [] if arguments.geo in (None, _EXIF) else [arguments.geo]
     edits = _edits(arguments)
     written = edit_scene(source, arguments.out, edits, reads, args.data_root(arguments), _note)
     if written.redrawn is None:

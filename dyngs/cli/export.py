@@ -28,27 +28,22 @@ _OTHER_SUFFIXES = {
     ".html": "html",
     ".json": "cameras",
 }
-_WHOLE = "cameras mesh dyngs avatar network"
-_UNFIT = {
-    "time": _WHOLE,
-    "times": f"{_WHOLE} html bodies",
-    "motion": "cameras dyngs avatar network surface bodies",
-    "static": f"{_WHOLE} html surface tracks bodies",
-    "dynamic": f"{_WHOLE} html surface bodies",
-    "up": f"{_WHOLE} html tracks",
-    "from_up": f"{_WHOLE} tracks",
-    "sh_degree": f"{_WHOLE} html surface tracks bodies {MOVING}",
-    "joints": "bodies",
-    "folder": "bodies",
+_SPLATS = "time times motion static dynamic up from_up"
+_TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree") | {
+    "sog": f"{_SPLATS} sh_degree folder",
+    MOVING: _SPLATS,
+    "tracks": "time times motion dynamic",
+    "dyngs": "max_change",
+    "avatar": "",
+    "network": "",
+    "cameras": "",
+    "html": "time motion from_up folder max_gaussians_drawn",
+    "mesh of a person": "motion",
+    "mesh": "time times up from_up level segments cells",
+    "bodies": "time up from_up",
+    "joints": "motion",
 }
-"""Options, and the formats that they do not go with; ``mesh`` is that of a person, ``surface`` of
-anything else."""
-_ONLY = dict.fromkeys(("level", "segments", "cells"), ("surface", "mesh, not of a person"))
-_ONLY |= {"folder": ("html sog", "html or sog"), "max_gaussians_drawn": ("html", "html --folder")}
-_ONLY |= {
-    "max_change": ("dyngs", "dyngs"),
-}
-"""Options, the formats that they go with, and how these are asked for."""
+"""The options that formats take, and exports in another way: ``--bodies`` and ``--joints``."""
 
 _EPILOG = """\
 examples:
@@ -121,9 +116,11 @@ def add_parser(commands: args.Commands) -> None:
     about = "--format mesh of a radiance field: density of the surface (default: 25 per half extent / 1.5)"
     parser.add_argument("--level", type=float, metavar="X", help=about)
     about = "--format mesh of Gaussians or a field: cells along the longest side of the scene (default 192)"
-    parser.add_argument("--cells", type=int, metavar="N", help=about)
+    kind = args.whole("a number of cells", 8, 1024)
+    parser.add_argument("--cells", type=kind, metavar="N", help=about)
     about = "--format mesh of curved triangles: segments of an edge of each (default 6)"
-    parser.add_argument("--segments", type=int, metavar="N", help=about)
+    kind = args.whole("a number of segments", 1, 64)
+    parser.add_argument("--segments", type=kind, metavar="N", help=about)
     about = "--format html, sog: a folder for a web server, of which a page or PlayCanvas fetches what is seen"
     parser.add_argument("--folder", action="store_true", help=about)
     args.add_most_drawn(
@@ -148,26 +145,33 @@ def run(arguments: argparse.Namespace) -> int:
     args.require_motion_for_feet(arguments)
     arguments.run_dir = args.run_of_scene_file(arguments.run_dir)
     kind = _kind(arguments)
-    kind = "surface" if kind == "mesh" and _has_surface(arguments) else kind
-    _require_fitting(arguments, kind)
+    if kind == "mesh" and not _has_surface(arguments):
+        kind = "mesh of a person"
+    elif (arguments.bodies and kind == "glb") or (arguments.joints and kind in ("ply", "glb")):
+        kind = "bodies" if arguments.bodies else "joints"
+    taken = {*_TAKES[kind].split(), kind}
+    for name in (*dict.fromkeys(" ".join(_TAKES.values()).split()), "bodies", "joints"):
+        given = getattr(arguments, name)
+        if name not in taken and given is not None and given is not False:
+            raise DyngsError(f"--{name.replace('_', '-')} does not go with --format {kind}")
+    if args.is_avatar_file(arguments.run_dir) and kind in ("dyngs", "avatar", "network"):
+        raise DyngsError(
+            f"{arguments.run_dir}: an avatar file is exported as Gaussians, mesh, page or tracks"
+        )
     writers = {
         "html": _export_page,
         "cameras": _export_cameras,
         "avatar": _export_avatar,
         "dyngs": _export_dyngs,
+        "mesh": _export_surface,
+        "network": _export_network,
+        "bodies": _export_bodies,
+        "joints": _export_rigged,
+        "mesh of a person": _export_rigged,
     }
-    writers |= {"surface": _export_surface, "network": _export_network}
-    if arguments.bodies:
-        return _export_bodies(arguments)
-    if kind == "mesh" or arguments.joints:
-        return _export_rigged(arguments, kind)
-    is_file = args.is_avatar_file(arguments.run_dir) and kind not in ("html", "cameras")
-    if is_file and (arguments.out is None or kind in ("dyngs", "avatar")):
-        raise DyngsError(
-            f"{arguments.run_dir}: an avatar file is exported as Gaussians or tracks, with --out PATH"
-        )
     if kind in writers:
-        return writers[kind](arguments)
+        writers[kind](arguments)
+        return 0
     times = _times(arguments)
     opened = _moved(arguments, _open(arguments))
     times = opened.scene.times if arguments.motion is not None and times is None else times
@@ -183,22 +187,6 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _require_fitting(arguments: argparse.Namespace, kind: str) -> None:
-    """Raise for the first option that does not go with a format."""
-    unfit, shown = kind, f"format {'mesh' if kind == 'surface' else kind}"
-    if arguments.bodies:
-        unfit = shown = "bodies"
-    elif arguments.joints:
-        unfit, shown = "mesh", "joints"
-    for name, formats in _UNFIT.items():
-        passed = getattr(arguments, name)
-        if unfit in formats.split() and passed is not None and passed is not False:
-            raise DyngsError(f"--{name.replace('_', '-')} does not go with --{shown}")
-    for name, (only, asked) in _ONLY.items():
-        if kind not in only.split() and getattr(arguments, name) not in (None, False):
-            raise DyngsError(f"--{name.replace('_', '-')} goes with --format {asked}")
-
-
 def _kind(arguments: argparse.Namespace) -> str:
     """Return the name of the format: what --format says, else what the suffix of --out names, else
     ply.
@@ -209,30 +197,40 @@ def _kind(arguments: argparse.Namespace) -> str:
 
     out = arguments.out
     stated = arguments.format
+    usual = stated or ("glb" if arguments.bodies else "ply")
     if out is None or out.is_dir():
-        return stated or "ply"
+        return usual
     found = known_format(out)
     named = _OTHER_SUFFIXES.get(out.suffix.lower()) if found is None else found.name
-    if (stated, named) == ("network", "avatar"):
-        return "network"
-    if stated == "mesh" and (named in ("glb", "ply") or out.suffix.lower() == ".obj"):
-        return stated
-    if stated is None and named is None:
-        if _is_sequence(arguments) and not out.suffix:
-            return "ply"
+    if stated is None and (named or (_is_sequence(arguments) and not out.suffix)):
+        return named or "ply"
+    fits = named in (None, stated) and not (
+        out.suffix and named is None and stated in SPLAT_FORMATS
+    )
+    if stated is None or not (
+        fits or (stated, named) in (("network", "avatar"), ("mesh", "glb"), ("mesh", "ply"))
+    ):
         known = f"{all_suffixes()}, {', '.join(_OTHER_SUFFIXES)}"
         raise DyngsError(
             f"{out}: which format? Give --format, or a name that ends in one of {known}"
+            if stated is None
+            else f"{out}: --format {stated} does not write files of that suffix"
         )
-    if stated is not None and named is not None and stated != named:
-        raise DyngsError(
-            f"{out}: --format {stated} does not write files of that suffix, which is that of {named}"
-        )
-    if stated is not None and named is None and out.suffix and stated in SPLAT_FORMATS:
-        raise DyngsError(
-            f"{out}: viewers do not know this suffix as {stated}; use one of {all_suffixes()}"
-        )
-    return stated or named or "ply"
+    return usual
+
+
+def _target(arguments: argparse.Namespace, name: str) -> Path:
+    """Return the file to write: --out, or ``name`` in the folder --out, by default RUN. Raises
+    DyngsError: there is none, or --out has another suffix."""
+    out: Path = arguments.out or arguments.run_dir
+    suffix = Path(name).suffix
+    if out == arguments.run_dir and out.is_file():
+        raise DyngsError(f"{out}: where to? Give --out FILE{suffix}")
+    if out.is_dir():
+        return out / name
+    if out.suffix.lower() != suffix:
+        raise DyngsError(f"{out}: one file is written; give --out {out.stem}{suffix}")
+    return out
 
 
 def _open(arguments: argparse.Namespace) -> Opened:
@@ -246,7 +244,7 @@ def _is_sequence(arguments: argparse.Namespace) -> bool:
 
 
 def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
-    if getattr(opened.scene, "sides", None) is not None:
+    if getattr(opened.renderable, "sides", None) is not None:
         line = "of the sides that it was found from dyngs draws the one nearest to the camera, a file all: less sharply"
         print_notes((line,))
     return args.in_motion(arguments, opened)
@@ -289,26 +287,23 @@ def _export_splats(
     suffix = own.suffixes[0]
     scene = scene_part(opened.scene, part)
     if opened.scene.colour is not None:
-        print_notes(
-            (
-                "the colours of the run are a network; spherical harmonics of degree 3 are fitted to it",
-            )
+        line = (
+            "the colours of the run are a network; spherical harmonics of degree 3 are fitted to it"
         )
+        print_notes((line,))
     how, line = writing_of(opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
     out: Path | None = arguments.out
     is_sequence = _is_sequence(arguments)
     is_file = out is not None and known_format(out) is not None
-    if is_sequence and is_file and not arguments.static:
+    if (arguments.folder and (is_file or is_sequence)) or (
+        is_file and is_sequence and not arguments.static
+    ):
         raise DyngsError(
-            f"{out}: a sequence is a folder of files; give --out DIR, or --time for one file"
+            f"{out}: --times writes a folder of files, --folder one of one time; give --out FOLDER, or --time T"
         )
     print_notes((line,))
     if arguments.folder:
-        if is_file or is_sequence:
-            raise DyngsError(
-                f"{out}: --folder writes a folder of one time; give --out FOLDER, and --time T"
-            )
         path = out or arguments.run_dir / "sog"
         counts, notes = write_run_levels(opened, path, (times or (0.0,))[0], part, how)
         levels = f"levels of {', '.join(f'{count:,}' for count in counts)} Gaussians"
@@ -316,20 +311,17 @@ def _export_splats(
         return [path]
     if is_sequence and not arguments.static:
         moments = times or ()
-        written = write_run_sequence(
-            opened, out or arguments.run_dir / stem, moments, part, how, suffix
-        )
+        folder = out or arguments.run_dir / stem
+        written = write_run_sequence(opened, folder, moments, part, how, suffix)
     else:
-        if out is not None and not is_file and (out.is_dir() or is_sequence):
-            out = out / f"{stem}{suffix}"
         if times is None and not arguments.static and not opened.scene.is_static:
-            print_notes(
-                (
-                    "this is time 0 of a moving scene; --time T gives another, --times 0:1:30 a sequence",
-                )
-            )
+            line = "this is time 0 of a moving scene; --time T gives another, --times 0:1:30 a sequence"
+            print_notes((line,))
         moments = (0.0 if times is None else times[0],)
-        path = out or arguments.run_dir / f"{stem}{suffix}"
+        if out is None or (is_sequence and not is_file and not out.is_dir()):
+            path = (out or arguments.run_dir) / f"{stem}{suffix}"
+        else:
+            path = out / f"{stem}{suffix}" if out.is_dir() else out
         written = [write_run_splats(opened, path, moments[0], part, how)]
     found = [
         compare_run(opened, scene, moments[i], written[i].splat, read_splats(written[i].path))
@@ -361,21 +353,15 @@ def _export_moving(
     how, line = writing_of(opened, UP, arguments.up, arguments.from_up)
     print_notes((line,))
     part = _part(arguments)
-    scene = scene_part(opened.scene, _part(arguments))
-    out = arguments.out or arguments.run_dir
-    if not out.is_dir() and out.suffix.lower() != SUFFIX:
-        raise DyngsError(
-            f"{out}: players know these files by the suffix {SUFFIX}; give --out {out.name}{SUFFIX}"
-        )
-    written = write_moving(
-        opened, out / f"splats{SUFFIX}" if out.is_dir() else out, times, part, how
-    )
+    scene = scene_part(opened.scene, part)
+    path = _target(arguments, f"splats{SUFFIX}")
+    splats, notes = write_moving(opened, path, times, part, how)
     found = [
-        compare_run(opened, scene, times[i], written.splats[i], read_moment(written.path, i))
+        compare_run(opened, scene, times[i], splats[i], read_moment(path, i))
         for i in _shown(len(times))
     ]
-    print_redrawn(written.notes, found)
-    return [written.path]
+    print_redrawn(notes, found)
+    return [path]
 
 
 def _export_tracks(
@@ -388,10 +374,10 @@ def _export_tracks(
     count, moments, _ = tracks.positions.shape
     moving = f"{int(tracks.moving.sum()):,} of them moving"
     print_notes((f"{counted(count, 'Gaussian')}, {moving}, at {counted(moments, 'time')}",))
-    return [write_tracks(arguments.out or arguments.run_dir / "tracks.npz", tracks)]
+    return [write_tracks(_target(arguments, "tracks.npz"), tracks)]
 
 
-def _export_dyngs(arguments: argparse.Namespace) -> int:
+def _export_dyngs(arguments: argparse.Namespace) -> None:
     """Write the run as a .dyngs file and print how much its images change."""
     from dyngs.api.scene_file import write_scene_file
     from dyngs.compress.measure import SMALLEST_CHANGE
@@ -424,44 +410,36 @@ def _export_dyngs(arguments: argparse.Namespace) -> int:
     print(
         f"written: {written.path} ({written.num_bytes / 1e6:.2f} MB, {ratio:.1f} times smaller than before)"
     )
-    return 0
 
 
-def _export_avatar(arguments: argparse.Namespace) -> int:
+def _export_avatar(arguments: argparse.Namespace) -> None:
     from dyngs.human.avatar.avatar_file import write_avatar
-    from dyngs.runs.inputs import inputs_of
+    from dyngs.runs.folder import inputs_of
     from dyngs.runs.opened import open_run
 
-    path = arguments.out or arguments.run_dir / "avatar.safetensors"
+    path = _target(arguments, "avatar.safetensors")
     run = open_run(arguments.run_dir).in_own_frame()
     inputs_of(run).require_output(path)
     print_written(write_avatar(run.renderable, run.config.model, run.info, path))
-    return 0
 
 
-def _export_network(arguments: argparse.Namespace) -> int:
+def _export_network(arguments: argparse.Namespace) -> None:
     from dyngs.api.predict import network_config
     from dyngs.runs.checkpoint import latest_checkpoint
     from dyngs.runs.network_file import SUFFIX, write_network
 
     run: Path = arguments.run_dir
-    out = arguments.out or run / f"network{SUFFIX}"
+    out = _target(arguments, f"network{SUFFIX}")
     print_written(write_network(run, network_config(run), latest_checkpoint(run), out))
-    return 0
 
 
-def _export_bodies(arguments: argparse.Namespace) -> int:
+def _export_bodies(arguments: argparse.Namespace) -> None:
     """Write a moving scene with its bodies as animated nodes."""
     from dyngs.export.images import compare_run
     from dyngs.export.splat_files import write_bodies, writing_of
     from dyngs.io.formats.formats import format_named, read_splats
 
-    if arguments.format not in (None, "glb"):
-        raise DyngsError(f"--bodies goes with --format glb, not with {arguments.format}")
-    out: Path = arguments.out or arguments.run_dir / "bodies.glb"
-    if out.is_dir() or out.suffix.lower() != ".glb":
-        name = out / "bodies.glb" if out.is_dir() else f"{out.stem}.glb"
-        raise DyngsError(f"{out}: --bodies writes one file; give --out {name}")
+    out = _target(arguments, "bodies.glb")
     opened = _open(arguments)
     time = (_times(arguments) or (0.0,))[0]
     how, line = writing_of(opened, format_named("glb").up, arguments.up, arguments.from_up)
@@ -470,38 +448,25 @@ def _export_bodies(arguments: argparse.Namespace) -> int:
     found = compare_run(opened, opened.scene, time, written.splat, read_splats(written.path))
     print_redrawn(written.notes, [found])
     print_written(written.path)
-    return 0
 
 
-def _export_rigged(arguments: argparse.Namespace, kind: str) -> int:
+def _export_rigged(arguments: argparse.Namespace) -> None:
     """Write a person as a skinned mesh, or as Gaussians with joints."""
     from dyngs.export.rigged.people import Played, write_mesh, write_rigged_splats
     from dyngs.runs.opened import FRAME_RATE
 
-    option, stem = ("--joints", "rigged") if arguments.joints else ("--format mesh", "mesh")
-    if arguments.joints and kind not in ("ply", "glb"):
-        raise DyngsError(f"--joints goes with --format ply and glb, not with {kind}")
-    suffix = ".ply" if kind == "ply" else ".glb"
-    source: Path = arguments.run_dir
-    if args.is_avatar_file(source) and arguments.out is None:
-        raise DyngsError(f"{source}: where to? Give --out FILE{suffix}")
-    out: Path = arguments.out or source / f"{stem}{suffix}"
-    if out.is_dir() or out.suffix.lower() != suffix:
-        name = out / f"{stem}{suffix}" if out.is_dir() else f"{out.stem}{suffix}"
-        raise DyngsError(f"{out}: {option} writes one file; give --out {name}")
-    if suffix == ".ply" and arguments.motion is not None:
+    is_ply = arguments.joints and _kind(arguments) == "ply"
+    suffix = ".ply" if is_ply else ".glb"
+    out = _target(arguments, ("rigged" if arguments.joints else "mesh") + suffix)
+    motion = arguments.motion
+    if is_ply and motion is not None:
         raise DyngsError(
             "--motion does not go with --joints in a .ply, which has the rest pose; give --out FILE.glb"
         )
     opened = _moved(arguments, _open(arguments)).in_own_frame()
-    played = (
-        Played(arguments.motion.stem, opened.fps or FRAME_RATE)
-        if arguments.motion is not None
-        else None
-    )
+    played = None if motion is None else Played(motion.stem, opened.fps or FRAME_RATE)
     print_notes((write_rigged_splats if arguments.joints else write_mesh)(opened, out, played))
     print_written(out)
-    return 0
 
 
 def _has_surface(arguments: argparse.Namespace) -> bool:
@@ -519,10 +484,11 @@ def _has_surface(arguments: argparse.Namespace) -> bool:
     return source.is_dir() and capability(load_resolved(source).model, HasBody) is None
 
 
-def _export_surface(arguments: argparse.Namespace) -> int:
+def _export_surface(arguments: argparse.Namespace) -> None:
     """Write the surface of a scene, at several times one file each."""
-    from dyngs.export.surface_file import Cut, upright_surface, write_surface
+    from dyngs.export.surface_file import upright_surface, write_surface
     from dyngs.gaussians.surface import num_holes
+    from dyngs.models.renderable import SurfaceOptions
 
     out: Path = arguments.out or arguments.run_dir / ("mesh" if arguments.times else "mesh.ply")
     if arguments.times and out.suffix:
@@ -530,59 +496,49 @@ def _export_surface(arguments: argparse.Namespace) -> int:
             f"{out}: a sequence is a folder of files; give --out {out.with_suffix('')}, or --time for one"
         )
     opened = _open(arguments)
-    cut = Cut(arguments.level, arguments.cells, arguments.segments)
+    options = SurfaceOptions(arguments.level, arguments.cells, arguments.segments)
     how, line = upright_surface(
         opened, ".ply" if arguments.times else out.suffix, arguments.up, arguments.from_up
     )
     print_notes((line,))
     for i, time in enumerate(_times(arguments) or (0.0,)):
         path = out / f"mesh_{i:04d}.ply" if arguments.times else out
-        surface = write_surface(opened, path, time=time, cut=cut, how=how)
+        surface = write_surface(opened, path, time=time, options=options, how=how)
         holes = num_holes(surface)
         closed = "closed" if holes == 0 else f"open at {counted(holes, 'place')}"
         faces = counted(len(surface.faces), "triangle")
         print_notes((f"{faces} with colours of {len(surface.vertices):,} vertices, {closed}",))
         print_written(path)
-    return 0
 
 
-def _export_page(arguments: argparse.Namespace) -> int:
+def _export_page(arguments: argparse.Namespace) -> None:
     """Write a page that plays in a browser by itself, or a folder whose page fetches a scene as it
     is seen."""
     from dyngs.export.html.page import write_folder, write_page
 
-    source: Path = arguments.run_dir
     most = arguments.max_gaussians_drawn
-    folder = arguments.folder
-    time = arguments.time or 0.0
-    if most is not None and not folder:
+    if most is not None and not arguments.folder:
         raise DyngsError("--max-gaussians-drawn goes with --folder")
-    if arguments.out is None and not source.is_dir():
-        raise DyngsError(f"{source}: where to? Give --out {'FOLDER' if folder else 'FILE.html'}")
-    out: Path = arguments.out or source / ("scene" if folder else "scene.html")
-    is_page = out.suffix.lower() in (".html", ".htm")
-    if folder == is_page or (not folder and out.is_dir()):
-        what, suffix = (
-            ("--folder writes a folder", "")
-            if folder
-            else ("--format html writes one file", ".html")
-        )
-        raise DyngsError(f"{out}: {what}; give --out {out.with_suffix(suffix)}")
+    if arguments.folder:
+        out = arguments.out or arguments.run_dir / "scene"
+        if out.suffix.lower() == ".html":
+            raise DyngsError(f"{out}: --folder writes a folder; give --out {out.with_suffix('')}")
+        where = f"for any web server, such as `python -m http.server -d {as_word(out)}`"
+    else:
+        out = _target(arguments, "scene.html")
+        where = "it plays in any browser with WebGL 2, offline"
     opened = _moved(arguments, _open(arguments))
     opened = opened if arguments.from_up is None else replace(opened, stated_up=arguments.from_up)
-    written = (
-        write_folder(opened, out, most=most, time=time)
-        if folder
-        else write_page(opened, out, time=time)
-    )
-    served = f"for any web server, such as `python -m http.server -d {as_word(out)}`"
+    time = arguments.time or 0.0
+    if arguments.folder:
+        written = write_folder(opened, out, most=most, time=time)
+    else:
+        written = write_page(opened, out, time=time)
     print_notes(written.notes)
-    where = served if folder else "it plays in any browser with WebGL 2, offline"
     print(f"written: {written.path} ({written.num_bytes / 1e6:.1f} MB); {where}")
-    return 0
 
 
-def _export_cameras(arguments: argparse.Namespace) -> int:
+def _export_cameras(arguments: argparse.Namespace) -> None:
     """Write the cameras of a run as a transforms.json, refined where training refined them."""
     from dyngs.data.capture import all_views
     from dyngs.evaluate.report import found_corrections
@@ -590,8 +546,6 @@ def _export_cameras(arguments: argparse.Namespace) -> int:
     from dyngs.runs.opened import open_run
 
     source: Path = arguments.run_dir
-    if args.is_avatar_file(source):
-        raise DyngsError(f"{source}: an avatar file has no cameras; give a run")
     out: Path = arguments.out or source / "cameras"
     path = out if out.suffix.lower() == ".json" else out / NAME
     run = open_run(source, data_root=args.data_root(arguments))
@@ -608,23 +562,15 @@ def _export_cameras(arguments: argparse.Namespace) -> int:
     splits: dict[Split, Sequence[View]] = {
         name: views for name, views in capture.splits.items() if name != "pose"
     }
-    if found is None:
-        print_notes(
-            ("camera.refine was not used in this run: these are the cameras of the capture",)
-        )
-    else:
-        splits = {
-            name: [found.corrected_view(view) for view in views] for name, views in splits.items()
-        }
-        print_notes(
-            (
-                "training cameras as training found them; others have the capture's poses, and known lenses",
-            )
-        )
+    line = "camera.refine was not used in this run: these are the cameras of the capture"
+    if found is not None:
+        line = "training cameras as training found them; others have the capture's poses, and known lenses"
+        for name, views in splits.items():
+            splits[name] = [found.corrected_view(view) for view in views]
+    print_notes((line,))
     written = write_cameras(path, capture, splits, run.world)
     count = counted(len(all_views(capture.splits)), "camera")
     root = as_word(path.parent)
     print(
         f"written: {written} ({count}); `data.root={root} data.follow_links=true` trains with them"
     )
-    return 0

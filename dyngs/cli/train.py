@@ -62,6 +62,7 @@ def add_parser(commands: args.Commands) -> None:
     )
     add_serving_arguments(parser)
     args.add_run_device(parser)
+    parser.set_defaults(takes_root=True)
 
 
 def run(arguments: argparse.Namespace) -> int:

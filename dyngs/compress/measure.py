@@ -4,6 +4,7 @@ that will do."""
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
@@ -241,27 +242,15 @@ LOOKED_AT = 50  # number of training views in which the visibility of each Gauss
 # factors on the usual steps that are tried, by bisection
 FACTORS = tuple(2 ** (k / 2) for k in range(-6, 9))
 
-Images = Callable[[Renderable], list[Tensor]]
-"""Draws a scene, always from the same cameras at the same times: (H, W, 3) each."""
-
-
-@dataclass(frozen=True)
-class StoragePlan:
-    """Precision and coarseness with which a scene is stored."""
-
-    precision: Precision  # steps, and how much the images change
-    coarseness: Tensor | None = None  # (N,) uint8 of the Gaussians, or None
-    images: Images | None = None  # draws what was compared; None where no image can be drawn
-
-
 Shot = tuple[Cameras, float | None]
 """Camera and time of one training image."""
 
 
 def storage_plan(
     config: Config, checkpoint: Checkpoint, scene: Renderable, max_change: float | None
-) -> StoragePlan:
-    """Return how exactly ``scene`` must be stored: measured where the run's capture can be read.
+) -> tuple[Precision, Tensor | None]:
+    """Return how exactly ``scene`` must be stored, and the coarseness (N,) uint8 of its Gaussians,
+    measured where the run's capture can be read.
 
     ``checkpoint``: of ``scene``. ``max_change``: root mean square over all values of some training
     images, grey levels of 255. None: what lowers their PSNR by ``LOSS_DB``, if it is independent of
@@ -270,9 +259,8 @@ def storage_plan(
     try:
         capture = read_capture_of(config.data, checkpoint.info)
     except DyngsError:
-        return StoragePlan(
-            assumed_precision(scene.gaussians) if isinstance(scene, GaussianScene) else _ASSUMED
-        )
+        assumed = isinstance(scene, GaussianScene) and assumed_precision(scene.gaussians)
+        return assumed or _ASSUMED, None
     coarseness = None
     if isinstance(scene, GaussianScene):
         coarseness = coarseness_of(_visibility(scene, _shots(config, capture, scene, LOOKED_AT)))
@@ -302,49 +290,33 @@ def storage_plan(
         ]
         max_change = GREY_LEVELS * math.sqrt((10 ** (LOSS_DB / 10) - 1) * fmean(errors))
     exact = drawable(scene) | ({} if coarseness is None else {COARSENESS: coarseness})
-    return StoragePlan(
-        measured_precision(exact, wanted, redrawn, max(max_change, SMALLEST_CHANGE)),
-        coarseness,
-        images,
-    )
-
-
-@dataclass(frozen=True)
-class CoarseFile:
-    """A file in memory."""
-
-    data: bytes  # its bytes
-    factor: float  # on the usual steps
-    quality: float  # of the scene that is read from it
+    most = max(max_change, SMALLEST_CHANGE)
+    return measured_precision(exact, wanted, redrawn, most), coarseness
 
 
 def coarsest_file(
     config: Config, checkpoint: Checkpoint, quality: Callable[[GaussianScene], float], least: float
-) -> CoarseFile | None:
-    """Return the file with the coarsest steps tried at which ``quality`` is at least ``least``;
-    None: it never is.
+) -> tuple[bytes, float] | None:
+    """Return the bytes of a file with the coarsest steps tried at which ``quality`` is at least
+    ``least``, and that quality; None: it never is.
 
     All steps are those that ``storage_plan`` measures, times one factor. The bytes are read again
     before they count. ``quality``: of a scene, the higher the better.
     """
     scene = restored_scene(checkpoint, config.model)
-    plan = storage_plan(config, checkpoint, scene, None)
+    precision, coarseness = storage_plan(config, checkpoint, scene, None)
     best = None
-    low = 0
-    high = len(FACTORS)
-    while low < high:
-        middle = (low + high) // 2
-        factor = FACTORS[middle]
-        steps = {
-            name: step and step_below(factor * step) for name, step in plan.precision.steps.items()
-        }
-        data = encoded(checkpoint.info, scene, steps, plan.coarseness)
+
+    def is_too_coarse(factor: float) -> bool:
+        nonlocal best
+        steps = {name: step and step_below(factor * step) for name, step in precision.steps.items()}
+        data = encoded(checkpoint.info, scene, steps, coarseness)
         found = quality(restored_scene(decoded(data), config.model))
         if found >= least:
-            best = CoarseFile(data, factor, found)
-            low = middle + 1
-        else:
-            high = middle
+            best = data, found
+        return found < least
+
+    bisect_left(FACTORS, True, key=is_too_coarse)
     return best
 
 

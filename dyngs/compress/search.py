@@ -16,13 +16,14 @@ before.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from dyngs.compress.measure import CoarseFile, coarsest_file
+from dyngs.compress.measure import coarsest_file
 from dyngs.compress.stage import PROBED_VIEWS, probe_images, quality_of, removal, scores_of
 from dyngs.config import AutoColour, Config
 from dyngs.core.errors import DyngsError, counted
@@ -106,6 +107,9 @@ MOST_HELD_OUT = 32
 trained on."""
 LEFT_GAUSSIANS = tuple(2 ** (-step / 2) for step in range(1, 13))
 """Fractions of the Gaussians that are left, tried by bisection."""
+CUT_OFFS = (0.01, 0.02, 0.03)
+# Losses of training images, dB, before fine-tuning, by dropping harmonics
+HARMONIC_LOSSES = (0.01, 0.03, 0.1)
 
 # Least loss of rounding that is allowed, dB: with 0 no file would be good enough
 SMALLEST_FILE_LOSS = 0.01
@@ -237,11 +241,11 @@ class Search:
         alpha_min = self._config.model.alpha_min
         # Fractions of the loss up to which each kind is taken, those before it included (the rest
         # is for rounding), and what goes, the mildest first. A higher cut-off often gains, which
-        # pays for fewer Gaussians. Harmonics by losses of training images before fine-tuning, dB.
+        # pays for fewer Gaussians.
         ladders = (
-            (0.1, [{"alpha_min": x} for x in (0.01, 0.02, 0.03) if x > alpha_min]),
+            (0.1, [{"alpha_min": x} for x in CUT_OFFS if x > alpha_min]),
             (0.65, [{"fraction": 1 - left} for left in LEFT_GAUSSIANS if left * count >= 1]),
-            (0.85, [{"harmonics": x} for x in (0.01, 0.03, 0.1) if has_harmonics]),
+            (0.85, [{"harmonics": x} for x in HARMONIC_LOSSES if has_harmonics]),
         )
         for share, changes in ladders:
             so_far = accepted[-1].choice
@@ -249,7 +253,7 @@ class Search:
             accepted += [] if found is None else [found]
         return accepted
 
-    def run(self, max_loss: float) -> tuple[Candidate, CoarseFile, Promise]:
+    def run(self, max_loss: float) -> tuple[Candidate, bytes, Promise]:
         """Return the smallest accepted candidate whose file keeps the promise, and that file,
         rounded as far as it may.
 
@@ -261,8 +265,9 @@ class Search:
             if file is not None:
                 before = candidate.psnr + candidate.loss
                 choice = candidate.choice
-                promise = Promise(max_loss, before, file.quality, choice, self.views, self.trials)
-                return candidate, file, promise
+                data, after = file
+                promise = Promise(max_loss, before, after, choice, self.views, self.trials)
+                return candidate, data, promise
             self.tell(f"without {candidate.choice}: the file loses more than {max_loss:g} dB")
         raise DyngsError(
             f"no file of it loses less than {max(max_loss, SMALLEST_FILE_LOSS):g} dB; allow more"
@@ -281,22 +286,20 @@ class Search:
     def _bisected(self, levels: Sequence[PruneChoice], allowed: float) -> Candidate | None:
         """Return the last of ``levels`` that loses at most ``allowed``, as if all before it did."""
         found = None
-        low = 0
-        high = len(levels)
-        while low < high:
-            middle = (low + high) // 2
-            tried = self._tried(levels[middle])
+
+        def is_too_much(choice: PruneChoice) -> bool:
+            nonlocal found
+            tried = self._tried(choice)
             keeps = tried.worst <= allowed
             self.tell(
                 f"trial {self.trials}: without {tried.choice}: {counted(tried.num_gaussians, 'Gaussian')}, "
                 f"{-tried.loss:+.2f} dB, {-tried.trained_loss:+.2f} on views trained on, "
                 f"{'kept' if keeps else f'more than {allowed:.2f} dB lost'}"
             )
-            if keeps:
-                found = tried
-                low = middle + 1
-            else:
-                high = middle
+            found = tried if keeps else found
+            return not keeps
+
+        bisect_left(levels, True, key=is_too_much)
         return found
 
     def _tried(self, choice: PruneChoice) -> Candidate:

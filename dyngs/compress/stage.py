@@ -79,18 +79,21 @@ class Importance:
         p is the opacity over its maximum where it
         changes, and otherwise what is seen, C, smoothed by [1 2 1] / 4, over its maximum.
         """
-        return (self._volumes() * self._variation() * self.fractions).sum(0)
-
-    def _volumes(self) -> Tensor:
-        return (VOLUME_POWER * (self.log_volumes - self.log_volumes.mean())).exp()
-
-    def _variation(self) -> Tensor:
-        fades = bool((self.opacities != self.opacities[:1]).any())
-        profile = self.opacities if fades else _smoothed(self.fractions)
+        volumes = (VOLUME_POWER * (self.log_volumes - self.log_volumes.mean())).exp()
+        profile = self.opacities
+        if not bool((profile != profile[:1]).any()):
+            before, after = _neighbours(self.fractions)
+            profile = (before + 2 * self.fractions + after) / 4
         profile = profile / profile.amax(0).clamp_min(torch.finfo(profile.dtype).tiny)
-        padded = torch.cat([profile[:1], profile, profile[-1:]])
-        bend = padded[2:] - 2 * profile + padded[:-2]
-        return 1 / (0.5 * torch.tanh(STEEPNESS * bend.abs()) + 0.5)
+        before, after = _neighbours(profile)
+        bend = after - 2 * profile + before
+        variation = 1 / (0.5 * torch.tanh(STEEPNESS * bend.abs()) + 0.5)
+        return (volumes * variation * self.fractions).sum(0)
+
+
+def _neighbours(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Return (K, N) the rows before and after those of ``x`` (K, N), ends repeated."""
+    return torch.cat([x[:1], x[:-1]]), torch.cat([x[1:], x[-1:]])
 
 
 @torch.no_grad()
@@ -133,12 +136,6 @@ def highest(scores: Tensor, fraction: float) -> Tensor:
     kept = torch.zeros(len(scores), dtype=torch.bool, device=scores.device)
     kept[torch.sort(scores, descending=True, stable=True).indices[:count]] = True
     return kept
-
-
-def _smoothed(x: Tensor) -> Tensor:
-    """Return (K, N) by [1 2 1] / 4 over K, ends repeated."""
-    padded = torch.cat([x[:1], x, x[-1:]])
-    return (padded[:-2] + 2 * x + padded[2:]) / 4
 
 
 # Numbers of training cameras and times whose pairs are scored in dynamic scenes

@@ -81,7 +81,7 @@ class View:
         depth_scale: scene units in the unit of the files, which that of the depth map may be.
         motion_mask_path: white = moves; if ``motion_mask_labels``, all but 0 does.
         flow_path: optical flow to the view ``flow_to``, the next one of this camera in its file.
-        exposure: light let in by the EXIF tags, see ``images.exif``: comparable among views of one
+        exposure: light let in by the EXIF tags, by ``ImageHeader``: comparable among views of one
             capture.
         shrunk: how many times smaller the file is than the image that it is a copy of.
     """

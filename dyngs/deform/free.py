@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dyngs.core.state import Role
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
-from dyngs.deform.fixed_cameras.start import TimedGaussians
+from dyngs.deform.fixed_cameras import TimedGaussians
 from dyngs.deform.keys import COPIES_OF_MOVING, FreeField
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import Parameters
@@ -49,9 +49,8 @@ class FreePrimitives(DeformationField):
         self.options, self.setup = options, setup
         self.gap = 1 / max(setup.num_times - 1, 1)
         centers = torch.rand((setup.num_moving, 1), generator=generator, device="cpu")
-        self.parameters = self._untrained(
-            centers, torch.full_like(centers, 1.0), torch.zeros(len(centers), 3, device="cpu")
-        )
+        velocities = torch.zeros(len(centers), 3, device="cpu")
+        self.parameters = self._untrained(centers, torch.ones_like(centers), velocities)
 
     def started(self, start: FreeStart) -> FreePrimitives:
         """Return an untrained field with the windows and velocities of ``start``."""
@@ -125,29 +124,19 @@ def free_start(
     faint = still.replace(
         logit_opacities=still.logit_opacities.clamp_max(FAINT if moments else math.inf)
     )
-    parts = [
-        TimedGaussians((i + 0.5) / copies, faint, torch.zeros(3, device="cpu"))
-        for i in range(copies)
-    ]
-    rest = torch.linspace(0, 1, len(others), device="cpu")
+    resting = torch.zeros(3, device="cpu")
+    parts = [TimedGaussians((i + 0.5) / copies, faint, resting) for i in range(copies)]
     groups = [*parts, *moments]
     sizes = torch.tensor([len(one.gaussians) for one in groups], device="cpu")
-    spans = [1 / copies] * copies + [FIRST_SPAN / max(num_times - 1, 1)] * len(moments)
+    centers = torch.tensor([one.time for one in groups], device="cpu")
+    spans = torch.full_like(centers, FIRST_SPAN / max(num_times - 1, 1))
+    spans[:copies] = 1 / copies
     velocities = torch.stack([one.velocity for one in groups]).repeat_interleave(sizes, dim=0)
+    rest = torch.linspace(0, 1, len(others), device="cpu")
     return FreeStart(
         faint.logit_opacities,
         (*(one.gaussians for one in groups[1:]), others),
-        torch.cat(
-            [
-                torch.tensor([one.time for one in groups], device="cpu").repeat_interleave(sizes),
-                rest,
-            ]
-        ),
-        torch.cat(
-            [
-                torch.tensor(spans, device="cpu").repeat_interleave(sizes),
-                torch.full_like(rest, OTHERS_SPAN),
-            ]
-        ),
+        torch.cat([centers.repeat_interleave(sizes), rest]),
+        torch.cat([spans.repeat_interleave(sizes), torch.full_like(rest, OTHERS_SPAN)]),
         torch.cat([velocities, torch.zeros(len(others), 3, device="cpu")]),
     )

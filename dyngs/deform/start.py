@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.bodies.paths import FrameStack, frame_stack_of, one_camera
-from dyngs.deform.fixed_cameras.hulls import Footage, footage_of
+from dyngs.deform.fixed_cameras import FixedCameraClip, fixed_camera_clip
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.kind import DYNAMIC
 from dyngs.deform.scene import DynamicScene
@@ -15,7 +15,6 @@ from dyngs.deform.schedule import deform_schedule
 from dyngs.deform.still_error import (
     StillErrors,
     cameras_in_place,
-    moving_fractions,
     still_errors,
     views_to_compare,
 )
@@ -78,19 +77,15 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
 
     def errors_of(gaussians_at: Callable[[float], Gaussians]) -> StillErrors:
         shown = [images.shrunk(i, divisor) for i in looked_at]
-        if any(image.moves is not None for image in shown):
-            return moving_fractions(
-                gaussians_at, shown, options, SURELY_MOVING * model.motion_threshold
-            )
-        return still_errors(gaussians_at, shown, options, background, shader)
+        sure = SURELY_MOVING * model.motion_threshold
+        return still_errors(gaussians_at, shown, options, background, shader, sure)
 
     in_place = cameras_in_place(views)
 
-    def standing() -> list[Footage]:
+    def standing() -> list[FixedCameraClip]:
         used = [in_place[i] for i in evenly_spaced(len(in_place), MAX_STANDING)]
-        return [
-            footage_of((images[i] for i in seen), background, sum(map(len, used))) for seen in used
-        ]
+        total = sum(map(len, used))
+        return [fixed_camera_clip((images[i] for i in seen), background, total) for seen in used]
 
     def shots(still: Gaussians) -> FrameStack | None:
         order = one_camera(views)

@@ -11,11 +11,10 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import SH_C0
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced, static_cameras
-from dyngs.deform.fixed_cameras.hulls import median_image
+from dyngs.deform.fixed_cameras import median_image
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, Shader, render
 
@@ -27,8 +26,6 @@ MIN_SAME = 3  # Fewest images of one camera whose median shows what is still
 USUAL = 0.7
 MOMENTS = 8  # Images of one camera that are compared
 SHOWS = 1e-3  # Sum of weights, in pixels, from which a Gaussian counts as visible in an image
-# Fraction of a Gaussian in motion masks, where it is seen, from which it surely moves
-SURE_FRACTION = 0.5
 
 
 @dataclass(frozen=True)
@@ -45,6 +42,7 @@ def still_errors(
     options: RenderOptions,
     background: Tensor,
     shader_at: Callable[[float], Shader | None] = lambda _: None,
+    sure: float = 1.0,
 ) -> StillErrors:
     """Return the errors of a static scene in the images, where each Gaussian is seen.
 
@@ -54,70 +52,48 @@ def still_errors(
     passes back through the blending of a constant colour. Masked pixels do not count; a Gaussian
     that shows nowhere has 0.
 
-    Where cameras stay in place, what is expected of one with ``MIN_SAME`` images or more is their
-    median, which holds whatever is still exactly as it is; ``most`` is the largest, ``usual`` the
-    ``USUAL`` quantile of e_vi over images in which a Gaussian shows. Else the rendering is
-    expected, and both are the mean, weighted by sum_p w_vip: a still model that is not yet right
-    errs too.
+    Where images have motion masks, the error of a pixel is its mask instead, and images without one
+    do not count; ``sure`` is the error of a Gaussian half of which lies in masks. Where cameras stay
+    in place, what is expected of one with ``MIN_SAME`` images or more is their median, which holds
+    whatever is still exactly as it is. In both cases ``most`` is the largest, ``usual`` the
+    ``USUAL`` quantile of e_vi over images in which a Gaussian shows. Else the rendering is expected,
+    and both are the mean, weighted by sum_p w_vip: a still model that is not yet right errs too.
     """
-    expected = _median_images(images, background)
-    looked_at = [p for p in images if _camera_key(p) in expected] if expected else images
+    masked = [x for x in images if x.moves is not None]
+    expected = {} if masked else _median_images(images, background)
+    looked_at = masked or [x for x in images if _camera_key(x) in expected] or images
     found: list[tuple[Tensor, Tensor]] = []
     for image in looked_at:
-        gaussians = gaussians_at(image.time or 0.0).detach()
-        shown = expected.get(_camera_key(image))
-        if shown is None:
+        time = image.time or 0.0
+        gaussians = gaussians_at(time).detach()
+        truth = image.composite(background)
+        if image.moves is not None:
+            error = (2 * sure * image.moves)[..., None].expand_as(truth)
+        elif expected:
+            error = expected[_camera_key(image)] - truth
+        else:
             with torch.no_grad():
-                shader = shader_at(image.time or 0.0)
-                shown = render(
-                    gaussians, image.cameras, options, background=background, shader=shader
-                ).rgb[0]
+                drawn = render(
+                    gaussians,
+                    image.cameras,
+                    options,
+                    background=background,
+                    shader=shader_at(time),
+                )
+            error = drawn.rgb[0] - truth
         counts = (
-            torch.ones(shown.shape[:2], device=shown.device) if image.mask is None else image.mask
+            torch.ones_like(truth) if image.mask is None else image.mask[..., None].expand_as(truth)
         )
-        error = (shown - image.composite(background)) * counts[..., None]
-        weights = counts[..., None].expand_as(error).contiguous()
-        signed, weight = weighted_sums(gaussians, image.cameras, options, [error, weights])
+        signed, weight = weighted_sums(gaussians, image.cameras, options, [error * counts, counts])
         found.append((signed.abs().mean(1), weight[:, 0]))
-    errors = torch.stack([x for x, _ in found])
-    weights = torch.stack([x for _, x in found])
-    if not expected:
+    errors, weights = (torch.stack(x) for x in zip(*found, strict=True))
+    if not masked and not expected:
         mean = errors.sum(0) / weights.sum(0).clamp_min(1e-6)
         return StillErrors(mean, mean)
     shows = weights > SHOWS
-    return _ranked(torch.where(shows, errors / weights.clamp_min(SHOWS), 0.0), shows)
-
-
-def moving_fractions(
-    gaussians_at: Callable[[float], Gaussians],
-    images: Sequence[Image],
-    options: RenderOptions,
-    sure: float,
-) -> StillErrors:
-    """Return the fraction of each Gaussian that lies in motion masks where it is seen, scaled as
-    ``still_errors``.
-
-    s_vi = sum_p w_vip m_vp / sum_p w_vip with w = alpha T and m the mask of image v. What stands
-    behind is covered in fewer images. Those without a mask do not count; ``sure`` is the error that
-    ``SURE_FRACTION`` stands for.
-    """
-    sums = []
-    weights = []
-    for image in images:
-        if image.moves is None:
-            continue
-        counts = torch.ones_like(image.moves) if image.mask is None else image.mask
-        # One pass sums both weights, each in a channel of its own.
-        both = torch.stack([image.moves * counts, counts, 0 * counts], dim=-1)
-        gaussians = gaussians_at(image.time or 0.0).detach()
-        (found,) = weighted_sums(gaussians, image.cameras, options, [both])
-        sums.append(found[:, 0])
-        weights.append(found[:, 1])
-    weight = torch.stack(weights)
-    seen = SH_C0 * SHOWS  # weights come out times the constant harmonic
-    shows = weight > seen
-    fraction = torch.where(shows, torch.stack(sums) / weight.clamp_min(seen), 0.0)
-    return _ranked(fraction * (sure / SURE_FRACTION), shows)
+    ordered = torch.where(shows, errors / weights.clamp_min(SHOWS), 0.0).sort(0, True).values
+    rank = ((1 - USUAL) * shows.sum(0)).long().clamp_max(len(ordered) - 1)
+    return StillErrors(ordered[0], ordered.gather(0, rank[None])[0])
 
 
 def weighted_sums(
@@ -133,14 +109,6 @@ def weighted_sums(
     return [
         torch.autograd.grad(blended, flat, image, retain_graph=True)[0][:, 0] for image in images
     ]
-
-
-def _ranked(errors: Tensor, shows: Tensor) -> StillErrors:
-    """Return the largest and the ``USUAL`` quantile of ``errors`` (V, N) over the images in which a
-    Gaussian shows."""
-    ordered = errors.sort(dim=0, descending=True).values
-    usual = ((1 - USUAL) * shows.sum(0)).long().clamp_max(len(ordered) - 1)
-    return StillErrors(ordered[0], ordered.gather(0, usual[None])[0])
 
 
 def cameras_in_place(views: Sequence[View]) -> list[list[int]]:

@@ -18,35 +18,29 @@ MOMENTS = "exp_avg", "exp_avg_sq"
 """Prefixes of the moments' names in a state."""
 
 
+@dataclass
 class AdamState:
     """First and second moments of named tensors."""
 
-    def __init__(self, exp_avg: dict[str, Tensor], exp_avg_sq: dict[str, Tensor]) -> None:
-        self.exp_avg, self.exp_avg_sq = exp_avg, exp_avg_sq
+    exp_avg: dict[str, Tensor]
+    exp_avg_sq: dict[str, Tensor]
 
     @staticmethod
     def zero(tensors: Mapping[str, Tensor]) -> AdamState:
         """Return the moments before the first update of ``tensors``."""
-        first, second = (
-            {name: torch.zeros_like(x.detach()) for name, x in tensors.items()} for _ in MOMENTS
+        return AdamState(
+            *({name: torch.zeros_like(x.detach()) for name, x in tensors.items()} for _ in MOMENTS)
         )
-        return AdamState(first, second)
 
     @staticmethod
     def restored(stored: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> AdamState:
         """Return the moments of ``tensors`` from what ``state`` returned."""
-        first, second = (
-            {
-                name: require_tensor(
-                    f"{part}.{name}", stored[f"{part}.{name}"], tuple(x.shape), x.dtype
-                )
-                .to(x.device)
-                .clone()
-                for name, x in tensors.items()
-            }
-            for part in MOMENTS
+        return AdamState(
+            *(
+                {name: _stored(stored, f"{part}.{name}", x) for name, x in tensors.items()}
+                for part in MOMENTS
+            )
         )
-        return AdamState(first, second)
 
     def step_(
         self,
@@ -80,26 +74,28 @@ class AdamState:
         return adam_steps_(wanted, step=step, eps=eps, betas=betas) if wanted else 0
 
     def update(
-        self, name: str, x: Tensor, lr: float | Tensor, rows: Tensor | None = None
+        self,
+        name: str,
+        x: Tensor,
+        lr: float | Tensor,
+        rows: Tensor | None = None,
+        *,
+        along_last_axis: bool = False,
     ) -> AdamUpdate | None:
         """Return the update of the leaf tensor ``x`` (N, ...), and drop its gradient; None where it
-        has none."""
-        grad = x.grad
-        x.grad = None
-        if grad is None:
-            return None
-        return AdamUpdate(x.detach(), grad, self.exp_avg[name], self.exp_avg_sq[name], lr, rows)
+        has none.
 
-    def update_along_last_axis(self, name: str, x: Tensor, lr: float) -> AdamUpdate | None:
-        """As ``update``; only the values along the last axis are a row, so that little is left out
-        of a large array."""
+        With ``along_last_axis`` only the values along the last axis are a row, so that little is
+        left out of a large array.
+        """
         grad = x.grad
         x.grad = None
         if grad is None:
             return None
-        first = _rows(self.exp_avg[name])
-        second = _rows(self.exp_avg_sq[name])
-        return AdamUpdate(_rows(x.detach()), _rows(grad), first, second, lr)
+        arrays = [x.detach(), grad, self.exp_avg[name], self.exp_avg_sq[name]]
+        if along_last_axis and x.ndim > 1:
+            arrays = [one.reshape(-1, x.shape[-1]) for one in arrays]
+        return AdamUpdate(*arrays, lr=lr, rows=rows)
 
     def mapped(
         self, function: Callable[[Tensor], Tensor], names: Iterable[str] | None = None
@@ -107,26 +103,30 @@ class AdamState:
         """Return the moments with ``function`` applied to those of the named tensors; None: of
         all."""
         chosen = set(self.exp_avg if names is None else names)
-        first, second = (
-            {name: function(x) if name in chosen else x for name, x in moments.items()}
-            for moments in (self.exp_avg, self.exp_avg_sq)
+        return AdamState(
+            *(
+                {name: function(x) if name in chosen else x for name, x in moments.items()}
+                for moments in (self.exp_avg, self.exp_avg_sq)
+            )
         )
-        return AdamState(first, second)
 
     def state(self) -> State:
-        parts = zip(MOMENTS, (self.exp_avg, self.exp_avg_sq), strict=True)
-        return {
-            k: x
-            for part, moments in parts
-            for k, x in prefixed(part, with_role(moments, Role.TRAINING)).items()
-        }
+        first, second = (
+            prefixed(part, with_role(getattr(self, part), Role.TRAINING)) for part in MOMENTS
+        )
+        return first | second
 
     def to(self, device: torch.device | str) -> AdamState:
-        return AdamState(moved_to(self.exp_avg, device), moved_to(self.exp_avg_sq, device))
+        return self.mapped(lambda x: x.to(device))
 
 
-def _rows(x: Tensor) -> Tensor:
-    return x.reshape(-1, x.shape[-1]) if x.ndim > 1 else x
+def _stored(
+    tensors: Mapping[str, Tensor], name: str, like: Tensor, rows: int | None = None
+) -> Tensor:
+    """Return a copy of a stored tensor of the shape (but for the number of ``rows``), type and
+    device of ``like``."""
+    shape = like.shape if rows is None else (rows, *like.shape[1:])
+    return require_tensor(name, tensors[name], tuple(shape), like.dtype).to(like.device).clone()
 
 
 Roles = Role | Mapping[str, Role]
@@ -188,7 +188,7 @@ class Parameters:
 
     def _update_of(self, name: str, x: Tensor, lr: float) -> AdamUpdate | None:
         if self._roles[name] is not Role.PER_MOVING:
-            return self._adam.update_along_last_axis(name, x, lr)
+            return self._adam.update(name, x, lr, along_last_axis=True)
         return self._adam.update(name, x, lr, None if x.grad is None else seen_rows(x.grad))
 
     def edited(self, role: Role, edit: TopologyEdit) -> Parameters:
@@ -223,16 +223,12 @@ class Parameters:
             rows: names of the tensors that have another number of rows than now, and what it must
                 be.
         """
+        lengths = rows or {}
         values = {
-            name: require_tensor(
-                name, tensors[name], ((rows or {}).get(name, len(x)), *x.shape[1:]), x.dtype
-            )
-            .to(x.device)
-            .clone()
-            for name, x in self._tensors.items()
+            name: _stored(tensors, name, x, lengths.get(name)) for name, x in self._tensors.items()
         }
         found = Parameters(values, self.rates, self.decay, self._roles)
-        if any(name.startswith(tuple(f"{part}." for part in MOMENTS)) for name in tensors):
+        if any(name.startswith(MOMENTS) for name in tensors):
             found._adam = AdamState.restored(tensors, values)
         return found
 
@@ -280,22 +276,14 @@ class FrozenMask:
         if self.rows is None:
             return result
         old = parameters.tensors()
-        if result.edit is None:
-            shown = {
-                name: self.rows.reshape(-1, *[1] * (x.ndim - 1))
-                for name, x in result.changes.items()
-            }
-            changes = {
-                name: torch.where(shown[name], old[name].detach(), x)
-                for name, x in result.changes.items()
-            }
-            return replace(result, changes=changes)
-        goes = ~self.rows[result.edit.source]
+        edit = result.edit or TopologyEdit.select(torch.ones_like(self.rows))
+        goes = ~self.rows[edit.source]
         stays = torch.nonzero(self.rows)[:, 0]
-        source = torch.cat([result.edit.source[goes], stays])
-        is_new = torch.cat([result.edit.is_new[goes], torch.zeros_like(stays, dtype=torch.bool)])
+        kept = TopologyEdit.select(stays)
+        source = torch.cat([edit.source[goes], stays])
+        is_new = torch.cat([edit.is_new[goes], kept.is_new])
         changes = {
-            name: torch.cat([x[goes], old[name].detach()[stays]])
+            name: torch.cat([x[goes], kept.apply(old[name].detach())])
             for name, x in result.changes.items()
         }
         return replace(result, edit=TopologyEdit(source, is_new), changes=changes)
@@ -332,12 +320,11 @@ class GaussianOptimizer:
                 None: none.
             still: what keeps parameters and moments whatever it receives.
         """
-        rows: Tensor | None = None
+        rows = None if still is None or still.rows is None else ~still.rows
         if resting is not None:
-            rows = torch.ones(len(self.parameters), dtype=torch.bool, device=resting.device)
-            rows[resting] = self._rows_with_gradient()[resting]
-        if still is not None and still.rows is not None:
-            rows = ~still.rows if rows is None else rows & ~still.rows
+            seen = self._rows_with_gradient()[resting]
+            rows = seen.new_ones(len(self.parameters)) if rows is None else rows
+            rows[resting] &= seen
         rates: dict[str, float | Tensor] = {
             "means": lr_means,
             "quats": self.options.lr_quats,
@@ -362,33 +349,28 @@ class GaussianOptimizer:
         All parameters become new leaf tensors; gradients are dropped.
         """
         edit = result.edit
-        moved = {}
+        moved = self.parameters.detach().tensors()
         if edit is not None:
             self._adam = self._adam.mapped(edit.apply_moments)
+            rest = moved.keys() - result.changes.keys()
+            moved |= {name: edit.apply(moved[name]) for name in rest}
         self._adam = self._adam.mapped(torch.zeros_like, result.zero_moments)
-        for name, x in self.parameters.tensors().items():
-            if name in result.changes:
-                moved[name] = result.changes[name]
-            else:
-                moved[name] = x if edit is None else edit.apply(x.detach())
-        self.parameters = _as_leaves(moved)
+        self.parameters = _as_leaves(moved | result.changes)
 
     def drop_rest(self, base: Tensor, frozen_rest: Tensor) -> None:
         """Replace harmonics by a base colour, for good: rest and moments become zero; if they do
         for all, they go."""
-        chosen = frozen_rest[:, None, None]
-        sh = self.parameters.sh.detach()
-        plain = torch.cat([base[:, None], torch.zeros_like(sh[:, 1:])], dim=1)
+        sh = self.parameters.sh.detach().clone()
         count = 1 if bool(frozen_rest.all()) else sh.shape[1]
-        self.parameters = _as_leaves(
-            {**self.parameters.tensors(), "sh": torch.where(chosen, plain, sh)[:, :count]}
-        )
-        self._adam = self._adam.mapped(
-            lambda x: torch.cat([x[:, :1], torch.where(chosen, 0.0, x[:, 1:])], dim=1)[
-                :, :count
-            ].contiguous(),
-            ["sh"],
-        )
+        sh[frozen_rest, 0] = base[frozen_rest]
+        rest = frozen_rest[:, None, None].repeat(1, sh.shape[1], 1)
+        rest[:, 0] = False
+
+        def dropped(x: Tensor) -> Tensor:
+            return x.masked_fill(rest, 0)[:, :count].contiguous()
+
+        self.parameters = _as_leaves({**self.parameters.tensors(), "sh": dropped(sh)})
+        self._adam = self._adam.mapped(dropped, ["sh"])
 
     def to(self, device: torch.device | str) -> GaussianOptimizer:
         moved = GaussianOptimizer(self.parameters.detach().to(device=device), self.options)
@@ -418,14 +400,10 @@ class GaussianOptimizer:
         opacity alone."""
         opacity_grad = self.parameters.logit_opacities.grad
         means_grad = self.parameters.means.grad
-        if opacity_grad is None or means_grad is None:
-            return torch.ones(
-                len(self.parameters), dtype=torch.bool, device=self.parameters.means.device
-            )
+        assert opacity_grad is not None
+        assert means_grad is not None
         return (opacity_grad != 0) | seen_rows(means_grad)
 
 
 def _as_leaves(tensors: dict[str, Tensor]) -> Gaussians:
-    return Gaussians(
-        **{name: x.detach().contiguous().requires_grad_() for name, x in tensors.items()}
-    )
+    return Gaussians(**{name: _leaf(x) for name, x in tensors.items()})

@@ -15,13 +15,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.renderable import Surface
 
-BEHIND = 3.0  # Cells behind a surface that still count as seen
-AT_ONCE = 1 << 21  # Points of the grid that are looked at together
 OPAQUE = 0.5  # Of a pixel that shows a surface
-TRIALS = 10  # Sizes of cells that are tried for a number of triangles
-FINEST = 1024.0  # Cells along the surface, at most
-# Of a vertex towards the mean of those joined, where planes do not say where they meet
-STIFFNESS = 0.02
 
 
 @dataclass(frozen=True)
@@ -57,19 +51,21 @@ def fused(
         unseen_is_solid: what no view sees into counts as inside, which closes the back of things;
             else the surface ends where what is seen does.
     """
+    from scipy.ndimage import minimum_filter
     from skimage.measure import marching_cubes
 
     size = float((high - low).max()) / cells
     counts = ((high - low) / size).ceil().long() + 1
     x, y, z = (low[i] + size * torch.arange(int(counts[i]), device="cpu") for i in range(3))
-    slabs = x.split(max(AT_ONCE // (len(y) * len(z)), 1))
+    # two million points at once, for memory
+    slabs = x.split(max((1 << 21) // (len(y) * len(z)), 1))
     means, known = zip(
         *(_averages(seen, torch.cartesian_prod(slab, y, z), size) for slab in slabs), strict=True
     )
-    shape = tuple(counts.tolist())
-    grid = torch.cat(means).view(shape).numpy()
-    mask = None if unseen_is_solid else _known_cells(torch.cat(known).view(shape).numpy())
-    looked_at = grid if mask is None else grid[mask]
+    grid, is_known = (torch.cat(x).view(*counts.tolist()).numpy() for x in (means, known))
+    # marching cubes asks at the last of the eight corners of a cell
+    mask: np.ndarray = is_known | True if unseen_is_solid else minimum_filter(is_known, 2)
+    looked_at = grid[mask]
     if not looked_at.size or not looked_at.min() < 0 < looked_at.max():
         return None
     vertices, faces, _, _ = marching_cubes(grid, 0.0, mask=mask)
@@ -78,32 +74,21 @@ def fused(
 
 
 def _averages(seen: Sequence[DepthView], points: Tensor, size: float) -> tuple[Tensor, Tensor]:
-    """Return (N,) mean distances of the views that see ``points`` (N, 3), -1 without any, and (N,)
-    bool: there are."""
+    """Return (N,) mean signed distances of ``points`` (N, 3) before what the views show, at most 1,
+    -1 where none sees them, and (N,) bool, where one does.
+
+    A view sees up to three cells behind a surface, which are the unit of distances.
+    """
     total = torch.zeros(len(points), device="cpu")
     weight = torch.zeros(len(points), device="cpu")
     for one in seen:
-        distance, counted = _distances(one, points, size)
+        column, row, z, inside = _pixels(one.camera, points)
+        opaque = one.opacity[row, column] > OPAQUE
+        distance = torch.where(opaque, (one.depth[row, column] - z) / (3 * size), 1.0).clamp(max=1)
+        counted = inside & (distance > -1)
         total += torch.where(counted, distance, 0.0)
         weight += counted
     return torch.where(weight > 0, total / weight.clamp_min(1), -1.0), weight > 0
-
-
-def _known_cells(known: np.ndarray) -> np.ndarray:
-    """Return whether all eight corners of a cell are known, at its last corner, where marching
-    cubes asks."""
-    from scipy.ndimage import minimum_filter
-
-    return minimum_filter(known, 2, mode="nearest")
-
-
-def _distances(one: DepthView, points: Tensor, size: float) -> tuple[Tensor, Tensor]:
-    """Return (N,) signed distances before what a view shows, in cells, at most 1, and (N,) bool,
-    where that counts."""
-    column, row, z, inside = _pixels(one.camera, points)
-    opaque = one.opacity[row, column] > OPAQUE
-    before = torch.where(opaque, (one.depth[row, column] - z) / (BEHIND * size), 1.0).clamp(max=1.0)
-    return before, inside & (before > -1)
 
 
 def _pixels(camera: Cameras, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -140,73 +125,57 @@ def colours_of(seen: Sequence[DepthView], points: Tensor, tolerance: float) -> T
 
 
 def simplified(mesh: Mesh, most: int) -> Mesh:
-    """Return a mesh of about ``most`` faces, no more."""
+    """Return a mesh of about ``most`` faces, no more, whose vertices are joined within cells."""
     if len(mesh.faces) <= most:
         return mesh
     coarse = float(np.ptp(mesh.vertices, axis=0).max())
-    fine = coarse / FINEST
-    for _ in range(TRIALS):
-        middle = (fine * coarse) ** 0.5
-        if len(_joined_faces(mesh, _cells(mesh, middle))) <= most:
-            coarse = middle
+    fine = coarse / 1024
+    for _ in range(10):
+        size = (fine * coarse) ** 0.5
+        if len(_joined(mesh, size)[1]) <= most:
+            coarse = size
         else:
-            fine = middle
-    labels = _cells(mesh, coarse)
-    return Mesh(_meeting_points(mesh, labels, coarse), _joined_faces(mesh, labels))
+            fine = size
+    labels, faces = _joined(mesh, coarse)
+    return Mesh(_meeting_points(mesh, labels, coarse), faces)
 
 
-def _cells(mesh: Mesh, size: float) -> np.ndarray:
-    """Return (V,) number of the cell that each vertex is in, of those that hold any."""
-    cells = np.floor((mesh.vertices - mesh.vertices.min(0)) / size).astype(np.int64)
-    _, labels = np.unique(
-        (cells[:, 0] << 42) + (cells[:, 1] << 21) + cells[:, 2], return_inverse=True
-    )
-    return labels.reshape(-1)
-
-
-def _joined_faces(mesh: Mesh, labels: np.ndarray) -> np.ndarray:
-    """Return (F, 3) faces between joined vertices, each once."""
+def _joined(mesh: Mesh, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return (V,) number of the cell that each vertex is in, and (F, 3) faces between cells, each
+    once."""
+    cells = np.floor((mesh.vertices - mesh.vertices.min(0)) / size)
+    labels = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
     faces = labels[mesh.faces]
-    faces = faces[
-        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    ]
-    a, b, c = np.sort(faces, axis=1).T
-    _, first = np.unique((a << 42) + (b << 21) + c, return_index=True)
-    return faces[np.sort(first)]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return labels, faces[np.sort(first)]
 
 
 def _meeting_points(mesh: Mesh, labels: np.ndarray, size: float) -> np.ndarray:
     """Return (L, 3): per label of vertices where the planes of their faces meet, within ``size`` of
     their mean."""
-    means = _sums(labels, mesh.vertices) / _sums(labels, np.ones((len(labels), 1)))
+    count = int(labels.max()) + 1
+
+    def summed(labels: np.ndarray, values: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(labels, column, count) for column in values.T], 1)
+
+    means = summed(labels, mesh.vertices) / np.bincount(labels)[:, None]
     a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)
     areas = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals / np.maximum(areas, 1e-30)
     squares = (normals[:, :, None] * normals[:, None]).reshape(-1, 9)
-    left = np.zeros((len(means), 9))
-    right = np.zeros((len(means), 3))
-    for corner in range(3):
-        label = labels[mesh.faces[:, corner]]
+    left = np.zeros((count, 9))
+    right = np.zeros((count, 3))
+    for label in labels[mesh.faces].T:
         heights = (normals * (a - means[label])).sum(1, keepdims=True)
-        left += _sums(label, areas * squares, len(means))
-        right += _sums(label, areas * heights * normals, len(means))
+        left += summed(label, areas * squares)
+        right += summed(label, areas * heights * normals)
     planes = left.reshape(-1, 3, 3)
-    stiff = STIFFNESS * np.trace(planes, axis1=1, axis2=2)[:, None, None] + 1e-30
+    # towards the mean where planes do not say where they meet
+    stiff = 0.02 * np.trace(planes, axis1=1, axis2=2)[:, None, None] + 1e-30
     moved = np.linalg.solve(planes + stiff * np.eye(3), right[:, :, None])[:, :, 0]
     return means + moved.clip(-size, size)
-
-
-def _sums(labels: np.ndarray, values: np.ndarray, count: int = 0) -> np.ndarray:
-    """Return (L, C) sums of ``values`` (N, C) by label; L is at least ``count``."""
-    return np.stack([np.bincount(labels, column, count) for column in values.T], 1)
-
-
-CELLS = 192  # Along the longest side of the box, unless asked otherwise
-INNER = 0.005  # Fraction of the Gaussians on either side that does not count for where the scene is
-# Around the centres: of the scene's size, and in standard deviations of a usual Gaussian
-MARGIN, REACH = 0.02, 2.5
-SMALLEST_PIECE = 0.02  # Faces of a piece that is kept, as a fraction of those of the largest
 
 
 @torch.no_grad()
@@ -225,12 +194,12 @@ def surface_of(
     largest are left out.
 
     Args:
-        cells: along the longest side of the box; None: ``CELLS``.
+        cells: along the longest side of the box; None: 192.
 
     Raises:
         DyngsError: no view shows anything solid there.
     """
-    cells = CELLS if cells is None else cells
+    cells = cells or 192
     seen = [seen_by(scene, camera, time) for camera in cameras]
     mesh = fused(seen, *box, cells, unseen_is_solid=False)
     if mesh is None:
@@ -256,47 +225,40 @@ def seen_by(scene: GaussianScene, camera: Cameras, time: float | None = None) ->
 
 
 def opaque_box(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
-    """Return the corners of the box around opaque Gaussians."""
+    """Return the corners of the box around opaque Gaussians, but for half a percent of them on
+    either side."""
     means = gaussians.means.detach()
     opaque = gaussians.logit_opacities.detach() > 0
     opaque = opaque if bool(opaque.any()) else torch.ones_like(opaque)
-    low, high = (_quantile(means[opaque], fraction) for fraction in (INNER, 1 - INNER))
+    # sorted, as quantiles of torch take 16 million numbers at most
+    ordered = means[opaque].sort(dim=0).values
+    last = len(ordered) - 1
+    low, high = (ordered[round(fraction * last)] for fraction in (0.005, 0.995))
     usual = gaussians.log_scales.detach()[opaque].amax(1).median().exp()
-    margin = MARGIN * (high - low).max() + REACH * usual
+    # of the size of the scene, and in standard deviations of a usual Gaussian
+    margin = 0.02 * (high - low).max() + 2.5 * usual
     return low - margin, high + margin
 
 
-def _quantile(values: Tensor, fraction: float) -> Tensor:
-    """Return the (3,) quantile of ``values`` (N, 3), any N >= 1; torch's own takes 16 million at
-    most."""
-    return values.sort(dim=0).values[round(fraction * (len(values) - 1))]
-
-
 def largest_pieces(mesh: Mesh) -> Mesh:
-    """Return the mesh without its small pieces, and without vertices that no face has."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+    """Return the mesh without pieces of less than a fiftieth of the faces of the largest, and
+    without vertices that no face has."""
+    from trimesh.graph import connected_component_labels
 
     faces = mesh.faces
-    ends = np.concatenate([faces[:, :2], faces[:, 1:]]).T
-    links = coo_matrix((np.ones(ends.shape[1], np.int8), ends), shape=(len(mesh.vertices),) * 2)
-    piece = connected_components(links, directed=False)[1][faces[:, 0]]
+    edges = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    piece = connected_component_labels(edges, len(mesh.vertices))[faces[:, 0]]
     counts = np.bincount(piece)
-    faces = faces[counts[piece] >= SMALLEST_PIECE * counts.max()]
+    faces = faces[counts[piece] >= counts.max() / 50]
     used, joined = np.unique(faces, return_inverse=True)
     return Mesh(mesh.vertices[used], joined.reshape(-1, 3))
 
 
 def num_holes(surface: Surface) -> int:
     """Return how many closed lines of edges have a face on one side only."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+    from trimesh import Trimesh
+    from trimesh.graph import connected_components
+    from trimesh.grouping import group_rows
 
-    edges = np.sort(surface.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges, counts = np.unique(edges, axis=0, return_counts=True)
-    rims, ends = np.unique(edges[counts == 1], return_inverse=True)
-    if not len(rims):
-        return 0
-    ends = ends.reshape(-1, 2).T
-    links = coo_matrix((np.ones(ends.shape[1], np.int8), ends), shape=(len(rims),) * 2)
-    return int(connected_components(links, directed=False)[0])
+    edges = Trimesh(surface.vertices, surface.faces, process=False).edges_sorted
+    return len(connected_components(edges[group_rows(edges, require_count=1)]))

@@ -89,15 +89,12 @@ def _checked_members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.
             )
         if name.endswith("/") or any(part.startswith(_JUNK) for part in parts):
             continue
-        problem = ""
-        if stat.S_ISLNK(info.external_attr >> 16):
-            problem = f"holds the link {name!r:.80}; pack the file that it leads to instead"
-        elif info.flag_bits & 1:
-            problem = "is encrypted; unpack it with its password and give the folder"
-        elif info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            problem = "is compressed by another method than deflate; unpack it and give the folder"
-        if problem:
-            raise DyngsError(f"{path}: {problem}")
+        is_link = stat.S_ISLNK(info.external_attr >> 16)
+        is_plain = info.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+        if is_link or not is_plain or info.flag_bits & 1:
+            raise DyngsError(
+                f"{path}: {name!r:.80} is a link, encrypted, or not packed by deflate; unpack it and give the folder"
+            )
         found[name] = info
     total = sum(info.file_size for info in found.values())
     require_at_most(

@@ -13,7 +13,6 @@ import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,26 +26,7 @@ _MAX_LISTED = 100_000
 """Entries of a capture that are searched for links."""
 
 
-@dataclass(frozen=True)
-class _Boundary:
-    """The folder that files must lie in: ``root``, and ``real`` with links resolved; ``folders`` is
-    a cache."""
-
-    root: Path
-    real: str
-    folders: dict[str, str] = field(default_factory=dict)
-
-    def resolved(self, path: Path) -> str:
-        """Resolve links in the path; each folder is resolved once."""
-        folder, name = os.path.split(path)
-        if name in ("", ".", "..") or os.path.islink(path):
-            return os.path.realpath(path)
-        if folder not in self.folders:
-            self.folders[folder] = os.path.realpath(folder)
-        return os.path.join(self.folders[folder], name)
-
-
-_boundary: ContextVar[_Boundary | None] = ContextVar("boundary", default=None)
+_boundary: ContextVar[tuple[Path, str] | None] = ContextVar("boundary", default=None)
 _links_of_runs: ContextVar[bool] = ContextVar("links_of_runs", default=False)
 
 
@@ -62,7 +42,7 @@ def _set(variable: ContextVar[Any], value: object) -> Iterator[None]:
 def staying_within(root: Path, follow_links: bool = False) -> AbstractContextManager[None]:
     """Make ``inside`` refuse paths outside ``root`` in the block; nothing is refused if
     ``follow_links``."""
-    return _set(_boundary, None if follow_links else _Boundary(root, os.path.realpath(root)))
+    return _set(_boundary, None if follow_links else (root, os.path.realpath(root)))
 
 
 def following_links_of_runs(allowed: bool) -> AbstractContextManager[None]:
@@ -81,11 +61,10 @@ def follows_links_of_runs() -> bool:
 def inside(path: Path) -> Path:
     """Return ``path`` if it may be opened; outside a block of ``staying_within`` any path may."""
     boundary = _boundary.get()
-    if boundary is not None and not _is_below(real := boundary.resolved(path), boundary.real):
-        leads = "" if real == str(path) else f" leads to {real}, which"
+    if boundary is not None and not _is_below(real := os.path.realpath(path), boundary[1]):
         raise DyngsError(
-            f"{path}:{leads} lies outside the capture {boundary.root}; copy the file into the capture, or, if you "
-            "trust it to name files of yours, set data.follow_links=true"
+            f"{path}: leads to {real}, which lies outside the capture {boundary[0]}; "
+            "copy the file into the capture, or, if you trust it to name files of yours, set data.follow_links=true"
         )
     require_regular(path)
     return path

@@ -34,24 +34,19 @@ LARGEST = 1e30
 """Magnitude up to which numbers are taken: in float32 they, and sums of a few, are finite."""
 
 
-def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict[str, object]:
+def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict[str, Any]:
     """Read the JSON object in ``path``, UTF-8, 16 or 32. ``what``: the error for anything else."""
-    fields = read_json(path)
-    if not isinstance(fields, dict):
-        raise DyngsError(f"{path}: {what}")
-    return fields
-
-
-def read_json(path: Path) -> object:
-    """Read the JSON in ``path``: UTF-8, 16 or 32."""
     with reading(path, "it must be a JSON file; copy or export it again"):
         try:
-            return json.loads(read_limited(inside(path)))
+            fields = json.loads(read_limited(inside(path)))
         except json.JSONDecodeError as error:
             where = f"{path}, line {error.lineno} column {error.colno}"
             raise DyngsError(
                 f"{where}: broken JSON ({error.msg}); copy or export it again"
             ) from error
+    if not isinstance(fields, dict):
+        raise DyngsError(f"{path}: {what}")
+    return fields
 
 
 def read_text(path: Path) -> str:
@@ -76,10 +71,10 @@ def is_number(value: object) -> TypeGuard[int | float]:
 def matrix_of(where: str, key: str, value: object) -> np.ndarray:
     """Return the numbers of a 4x4 matrix in a JSON file as float64; shape and values are not
     checked."""
-    try:
-        return np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise DyngsError(f"{where}: {key} must hold 4x4 numbers; export it again") from None
+    array = float_array(value)
+    if array is None:
+        raise DyngsError(f"{where}: {key} must hold 4x4 numbers; export it again")
+    return array
 
 
 def entry(where: object, fields: object, key: str) -> Any:
@@ -112,18 +107,6 @@ def first_few(items: Collection[object]) -> str:
 def float_array(value: object) -> np.ndarray | None:
     """Return ``value`` as a float64 array, None where it holds anything but numbers."""
     try:
-        array = np.asarray(value) if _is_numeric(value) else None
-        return (
-            array.astype(np.float64) if array is not None and array.dtype.kind in "biuf" else None
-        )
+        return np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         return None
-
-
-def _is_numeric(value: object) -> bool:
-    """Whether it holds only numbers: NumPy would pad every text among them to the longest."""
-    if isinstance(value, (list, tuple)):
-        return all(_is_numeric(part) for part in value)
-    if isinstance(value, np.ndarray):
-        return value.dtype.kind in "biuf"
-    return isinstance(value, (int, float, np.generic)) and not isinstance(value, (str, bytes))

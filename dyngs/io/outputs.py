@@ -1,15 +1,23 @@
-"""Checks of output paths, and advice on paths that were given in the wrong place."""
+"""Checks of output paths, advice on paths given in the wrong place, new folders, and locks.
+
+A lock is for one writer at a time in a folder, and released by the system when its process ends,
+however it ends.
+"""
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import platform
+import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from itertools import islice
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dyngs.core.errors import DyngsError, as_word
+from dyngs.core.errors import DyngsError, as_word, require_regular, warn
+from dyngs.io.containment import leaving_links
 from dyngs.io.fields import read_limited
 from dyngs.io.write import remove_quietly, require_replaceable, temporary_folder_beside, write_text
 
@@ -17,7 +25,6 @@ PHOTO_SUFFIXES = frozenset(
     {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".gif", ".heic", ".heif", ".hif"}
 )
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
-_MOST_ENTRIES = 2000
 _CAPTURE = (
     "transforms.json",
     "transforms_train.json",
@@ -35,40 +42,28 @@ def command_for(path: Path, *, captures: bool = True) -> str | None:
     Only names are looked at, those directly in a folder and in ``images`` below it.
     """
     where = as_word(path)
-    static, dynamic = (
-        f"`dyngs train {preset} data.root={where}`" for preset in ("static", "dynamic")
-    )
+    static = f"`dyngs train static data.root={where}`"
+    dynamic = f"`dyngs train dynamic data.root={where}`"
+    either = f"make a scene of it with {static}, or {dynamic} if things move"
+    if path.is_file():
+        return f"it is a video, {either}" if path.suffix.lower() in VIDEO_SUFFIXES else None
+    if not path.is_dir():
+        return None
+    if (path / "config.yaml").is_file():
+        return f"it is a run, for `dyngs eval {where}`, `dyngs render {where}` or `dyngs train --resume {where}`"
+    if captures and any((path / name).exists() for name in _CAPTURE):
+        return f"it is a capture, {either}"
     try:
-        if path.is_file():
-            if path.suffix.lower() not in VIDEO_SUFFIXES:
-                return None
-            return f"it is a video, make a scene of it with {static}, or {dynamic} if things move"
-        if not path.is_dir():
-            return None
-        if (path / "config.yaml").is_file():
-            return f"it is a run, for `dyngs eval {where}`, `dyngs render {where}` or `dyngs train --resume {where}`"
-        if captures and any((path / name).exists() for name in _CAPTURE):
-            return f"it is a capture, make a scene of it with {static}, or {dynamic} if things move"
-        suffixes = [
-            _suffix(entry) for folder in (path, path / "images") for entry in _entries(folder)
-        ]
+        found = [*path.glob("[!.]*.*"), *path.glob("images/[!.]*.*")]
     except OSError:
         return None
-    photos = sum(x in PHOTO_SUFFIXES for x in suffixes)
+    suffixes = [one.suffix.lower() for one in found]
     videos = sum(x in VIDEO_SUFFIXES for x in suffixes)
-    if photos >= 3:
+    if sum(x in PHOTO_SUFFIXES for x in suffixes) >= 3:
         return f"it holds photos, make a scene of them with {static}"
     if videos > 1:
         return f"it holds {videos} videos, make a scene of them with {dynamic}"
     return "it holds one video; give that" if videos else None
-
-
-def _entries(folder: Path) -> list[Path]:
-    return list(islice(folder.iterdir(), _MOST_ENTRIES)) if folder.is_dir() else []
-
-
-def _suffix(path: Path) -> str:
-    return "" if path.name.startswith(".") else path.suffix.lower()
 
 
 SOURCES_NAME = "sources.json"
@@ -166,3 +161,174 @@ def _sources(capture: Path) -> set[Path]:
         return {Path(name) for name in names}
     except Exception:  # a missing or damaged file costs no more than this protection
         return set()
+
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
+LOCK_NAME = "run.lock"
+"""File that exists while a process writes into the folder; one left by a killed process has no
+effect."""
+
+_HELD = (errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK, errno.EDEADLK)
+_WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
+_WAIT = 1.0  # seconds between two looks at a folder that another process makes
+_FAR = 2**30
+"""Offset of the locked byte on Windows, past the end of the file: a locked byte cannot be read by
+others."""
+
+
+class InUseError(DyngsError):
+    """Another process writes into the folder."""
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[bool]:
+    """Yield whether no other process writes into the folder in the block, which is not known where
+    its file system has no locks.
+
+    The folder is made where it is missing, and removed where nothing came of it. The file
+    ``run.lock`` says who writes. A file system that has no locks (some network file systems) is
+    told of in a line on stderr.
+
+    Raises:
+        InUseError: another process writes there.
+        DyngsError: nobody can; a link leads out of the folder.
+    """
+    require_within_run(folder)
+    links = leaving_links(folder)
+    if links:
+        raise DyngsError(
+            f"{links[0][0]}: is a link to {links[0][1]}, out of {folder}, which is written to; remove it"
+        )
+    made = _made(folder)
+    try:
+        file, is_locked = _locked(folder / LOCK_NAME)
+        try:
+            yield is_locked
+        finally:
+            _freed(folder / LOCK_NAME, file)
+    finally:
+        for path in made:
+            with suppress(OSError):
+                path.rmdir()  # only succeeds if nothing came of it
+
+
+def make_once(
+    folder: Path, make: Callable[[], None], say: Callable[[str], None], found: str
+) -> None:
+    """Create a folder of the cache by calling ``make``, or print ``found`` if it exists.
+
+    One of several processes creates it, the others wait for it. Without file locks each of them
+    calls ``make``, and the first result is kept. Raises DyngsError: as ``make`` does, or the cache
+    cannot be written.
+    """
+    path = folder.with_name(f".{folder.name}.lock")
+    _made(folder.parent)
+    is_told = False
+    while not folder.is_dir():
+        try:
+            file, _ = _locked(path)
+        except InUseError:
+            if not is_told:
+                say(f"{folder}: {_owner(path)}; its result is waited for")
+            is_told = True
+            time.sleep(_WAIT)
+            continue
+        try:
+            if not folder.is_dir():
+                make()
+                return
+        except DyngsError:
+            if not folder.is_dir():
+                raise
+        finally:
+            _freed(path, file)
+    say(found)
+
+
+def _made(folder: Path) -> list[Path]:
+    """Return the folders that had to be made, innermost first."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise DyngsError(f"{folder}: is not a folder; give another one") from None
+    except OSError as error:
+        raise DyngsError(f"cannot write {folder}: {error.strerror or error}") from error
+    return missing
+
+
+def _locked(path: Path) -> tuple[int, bool]:
+    """Return the lock file ``path``, open, and whether it is locked."""
+    folder = path.parent
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+    while True:
+        require_regular(path)
+        try:
+            file = os.open(path, flags, 0o666)
+        except OSError as error:
+            raise DyngsError(f"cannot write {path}: {error.strerror or error}") from error
+        try:
+            _lock(file)
+        except OSError as error:
+            if error.errno in _WITHOUT_LOCKS:
+                warn(
+                    f"{folder}: this file system has no locks ({error.strerror}); "
+                    "see to it that no two commands write into that folder at once"
+                )
+                return file, False
+            os.close(file)
+            if error.errno not in _HELD:
+                raise DyngsError(f"cannot lock {path}: {error.strerror or error}") from error
+            raise InUseError(
+                f"{folder}: {_owner(path)}; wait until it has ended, or give another folder"
+            ) from None
+        if _is_the_same(file, path):  # its last owner may have removed it after we had opened it
+            break
+        os.close(file)
+    owner = {"pid": os.getpid(), "host": platform.node(), "since": time.strftime("%F %T")}
+    with suppress(OSError):  # without room on the disk nobody is told
+        os.ftruncate(file, 0)
+        os.lseek(file, 0, os.SEEK_SET)
+        os.write(file, (json.dumps(owner) + "\n").encode())
+    return file, True
+
+
+def _lock(file: int) -> None:
+    if sys.platform == "win32":
+        os.lseek(file, _FAR, os.SEEK_SET)
+        msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
+    else:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _freed(path: Path, file: int) -> None:
+    """Remove and close the lock file; others that wait to lock it notice that it is gone."""
+    with suppress(OSError):
+        if sys.platform != "win32" and _is_the_same(file, path):
+            path.unlink()
+    with suppress(OSError):
+        os.close(file)
+    if sys.platform == "win32":
+        with suppress(OSError):
+            path.unlink()  # fails if somebody has it by now
+
+
+def _is_the_same(file: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file), os.stat(path))
+    except OSError:
+        return False
+
+
+def _owner(path: Path) -> str:
+    """Return the process that writes there, as far as the lock file says."""
+    try:
+        with path.open("rb") as file:
+            known = json.loads(file.read(4096))
+        return "process {pid} on {host} has been writing there since {since}".format(**known)
+    except (OSError, ValueError, KeyError, TypeError):
+        return "another process is writing there"

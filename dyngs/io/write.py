@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 
@@ -243,14 +243,9 @@ def to_uint8(pixels: np.ndarray) -> np.ndarray:
     return (np.clip(clean, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
-class _HasErrors(Protocol):
-    """OpenImageIO itself, or one of its readers and writers."""
-
-    def geterror(self) -> str: ...
-
-
-def image_error(source: _HasErrors) -> str:
-    """Return the last error of OpenImageIO as one short line, "" if there is none."""
+def image_error(source: Any) -> str:
+    """Return the last error of OpenImageIO, or of one of its readers and writers, as one short
+    line, "" if there is none."""
     text = any_text(source.geterror).strip()
     return printable(text.splitlines()[0], 100) if text else ""
 

@@ -43,6 +43,30 @@ class ResidualBlock(nn.Module):
         return features + self.layers(features)
 
 
+class Encoder(nn.Module):
+    """Features (B, C, ...) of images at 1/2, 1/4, ... of their resolution."""
+
+    def __init__(self, channels: int, widths: Sequence[int]) -> None:
+        super().__init__()
+        self.down = nn.ModuleList(
+            nn.Sequential(
+                nn.Conv2d(before, width, 5 if i == 0 else 3, 2, 2 if i == 0 else 1),
+                ResidualBlock(width),
+            )
+            for i, (before, width) in enumerate(zip((channels, *widths), widths, strict=False))
+        )
+
+    def levels(self, images: Tensor) -> list[Tensor]:
+        """Return the images, and their features from fine to coarse."""
+        found = [images]
+        for layer in self.down:
+            found.append(layer(found[-1]))
+        return found
+
+    def forward(self, images: Tensor) -> list[Tensor]:
+        return self.levels(images)[1:]
+
+
 def upsampled(features: Tensor) -> Tensor:
     """Return features (B, C, H, W) at twice the resolution, bilinear."""
     return nn.functional.interpolate(features, scale_factor=2, mode="bilinear", align_corners=False)
@@ -74,7 +98,11 @@ class Predictor(ABC, Generic[N]):
     """
 
     def __init__(self, config: Config, network: N, views: Sequence[View], data: DataConfig) -> None:
-        self.config, self.network, self.views, self.data = config, network, tuple(views), data
+        self.config = config
+        self.section: Any = config.model
+        self.network = network
+        self.views = tuple(views)
+        self.data = data
 
     @property
     def name(self) -> str:
@@ -150,11 +178,14 @@ class Learner(ABC, Generic[N]):
         config: Config,
         network: N,
         names: Sequence[str],
-        lr: float,
         device: torch.device = CPU,
     ) -> None:
-        self.config, self.network, self.names, self.device = config, network, names, device
-        self.lr = lr
+        self.config = config
+        self.section: Any = config.model
+        self.network = network
+        self.names = names
+        self.device = device
+        self.lr: float = self.section.lr
         chosen = config.data.background
         self.background = chosen if chosen == "random" else evaluation_background(chosen, True)[0]
 
@@ -194,10 +225,10 @@ def kept_open(
     return opened
 
 
-def load_weights(network: nn.Module, checkpoint: Checkpoint) -> None:
-    """Let ``network`` take the weights of a checkpoint. Raises DyngsError: of another network, or
-    damaged."""
-    weights = checkpoint.part("model.network")
+def load_weights(network: nn.Module, checkpoint: Checkpoint, part: str = "model.network") -> None:
+    """Let ``network`` take the weights in a part of a checkpoint. Raises DyngsError: of another
+    network, or damaged."""
+    weights = checkpoint.part(part)
     own = network.state_dict()
     if {k: x.shape for k, x in weights.items()} != {k: x.shape for k, x in own.items()}:
         raise DyngsError(f"{checkpoint.name} is not of this network; was its config changed?")

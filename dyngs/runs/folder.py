@@ -1,24 +1,109 @@
-"""Contents of a run folder: checks before a new run begins, and removal of unfinished files of
-killed processes."""
+"""Contents of a run folder.
+
+Its configuration with the fitted body that it names, checks before a new run begins, removal of
+unfinished files of killed processes, the files that a command reads, and the frame that `dyngs edit`
+gave it.
+"""
 
 from __future__ import annotations
 
+import json
+import math
 import os
+import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
+
+from pydantic import BaseModel
 
 from dyngs.config import Config, DataConfig, RunConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.core.errors import DyngsError, as_word
+from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
-from dyngs.io.lock import LOCK_NAME, writing
-from dyngs.io.outputs import new_folder
-from dyngs.io.write import remove_leftovers
+from dyngs.io.fields import read_limited
+from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity, similarity_of
+from dyngs.io.outputs import LOCK_NAME, Inputs, new_folder, writing
+from dyngs.io.write import remove_leftovers, remove_quietly, temporary_folder_beside, write_text
 from dyngs.models.kind import Predicts, capability
-from dyngs.runs.capture_record import RECORD_NAME, changed_files
-from dyngs.runs.checkpoint import SCENE_FILE, TIMING_NAME, checkpoint_paths, step_of
-from dyngs.runs.config_file import BODY_FOLDER, with_body_of, write_config
+from dyngs.runs.capture_record import RECORD_NAME, require_same_capture
+from dyngs.runs.checkpoint import (
+    SCENE_FILE,
+    TIMING_NAME,
+    LoadedRun,
+    checkpoint_paths,
+    has_only_scene_file,
+    step_of,
+)
+
+BODY_FOLDER = "body"
+"""In a run folder: the fit that ``data.body`` named when the run began."""
+_PARAMETERS = ("body_train.npz", "body_pose.npz")
+_KEPT = (*_PARAMETERS, "fit_report.json")
+"""Files of a fit that are kept; images are not."""
+
+
+def write_config(config: Config, folder: Path) -> None:
+    """Write the configuration of the run in ``folder``, with a copy of the fit that ``data.body``
+    names.
+
+    The fit is copied once: where the folder has one it is the run's. Where the fit is gone, as that
+    of a run of former versions may be, its path stays as it is.
+    """
+    body = config.data.body
+    own = folder.absolute() / BODY_FOLDER
+    if body is not None and (own.is_dir() or (body / _PARAMETERS[0]).is_file()):
+        if not own.is_dir():
+            _copy_fit(body, own)
+        config = _with_body(config, own)
+    save_config(config, folder / RESOLVED_NAME)
+
+
+def with_body_of(config: Config, stored: Config) -> Config:
+    """Return ``config`` with the path of the fit of ``stored``, where both have the same."""
+    return (
+        _with_body(config, stored.data.body)
+        if is_same_body(config.data.body, stored.data.body)
+        else config
+    )
+
+
+def is_same_body(one: Path | None, other: Path | None) -> bool:
+    """Return whether two values of ``data.body`` give the same body parameters, wherever they
+    lie."""
+    if one == other or one is None or other is None:
+        return one == other
+    return (one / _PARAMETERS[0]).is_file() and all(
+        _content(one / x) == _content(other / x) for x in _PARAMETERS
+    )
+
+
+def _with_body(config: Config, body: Path | None) -> Config:
+    return config.model_copy(update={"data": config.data.model_copy(update={"body": body})})
+
+
+def _copy_fit(body: Path, own: Path) -> None:
+    """Copy a fit to the new folder ``own``, which appears complete or not at all."""
+    started = temporary_folder_beside(own)
+    try:
+        for name in _KEPT:
+            if (body / name).is_file():
+                shutil.copyfile(body / name, started / name)
+        started.rename(own)
+    except OSError as error:
+        raise DyngsError(f"cannot write {own}: {error.strerror or error}") from error
+    finally:
+        remove_quietly(started)
+
+
+def _content(path: Path) -> bytes | None:
+    try:
+        return path.read_bytes()
+    except OSError:
+        return None
+
 
 LOG_NAME = "log.jsonl"
 EXPORT_FOLDER = "export"
@@ -40,23 +125,6 @@ def default_folder(name: str) -> Path:
             f"run.name={name!r}: must name a folder below runs; for another place give run.dir=FOLDER"
         )
     return Path("runs", name)
-
-
-def require_no_run(folder: Path) -> None:
-    """Raise unless a new run can be written to ``folder`` without replacing anything."""
-    found = _found(folder)
-    if checkpoint_paths(folder):
-        raise DyngsError(
-            f"{folder} already holds a run; go on with `dyngs train --resume {as_word(folder)}` or give another folder"
-        )
-    if SCENE_FILE in found:
-        raise DyngsError(
-            f"{folder} already holds a run, as {SCENE_FILE}, which can be drawn but not trained on; give another folder"
-        )
-    if found:
-        raise DyngsError(
-            f"{folder} already holds {found[0]}, which a new run would replace; give another folder"
-        )
 
 
 def require_empty(folder: Path) -> None:
@@ -111,14 +179,22 @@ def require_startable(folder: Path, config: Config) -> None:
     """Raise unless the run of ``config`` would replace nothing in ``folder`` but what the same run
     has only begun."""
     begun = _config_of_begun(folder)
-    if begun is None:
-        if checkpoint_paths(folder):
-            raise DyngsError(_about_other(folder, config))
-        require_no_run(folder)
-    elif not (_is_same_run(begun, config) or _is_as_asked(folder, config)):
+    paths = checkpoint_paths(folder)
+    found = _found(folder)
+    go_on = f"`dyngs train --resume {as_word(folder)}`, or give another run.dir"
+    if paths:
         raise DyngsError(
-            f"{folder} already holds another run, stopped before its first checkpoint; begin that again with `dyngs "
-            f"train --resume {as_word(folder)}`, give another run.dir, or remove the folder"
+            f"{folder} already holds a run, stopped after step {step_of(paths[-1]):,}; go on with {go_on}"
+        )
+    if begun is not None:
+        if not (_is_same_run(begun, config) or _is_as_asked(folder, config)):
+            raise DyngsError(
+                f"{folder} already holds another run, stopped before its first checkpoint; "
+                f"begin that again with {go_on}"
+            )
+    elif found:
+        raise DyngsError(
+            f"{folder} already holds {found[0]}, which a new run would replace; give another run.dir"
         )
 
 
@@ -149,7 +225,7 @@ def note_root(folder: Path, data: DataConfig) -> None:
         if stored is not None and stored.data.root != data.root:
             is_network = capability(stored.model, Predicts) is not None
             capture = None if is_network else read_capture(data)
-            changed_files(folder, data, capture)
+            require_same_capture(folder, data, capture)
             save_config(
                 stored.model_copy(
                     update={"data": stored.data.model_copy(update={"root": data.root})}
@@ -169,27 +245,6 @@ def _is_as_asked(folder: Path, config: Config) -> bool:
         return _is_same_run(asked_for(folder), config)
     except DyngsError:  # a file of that name, but not of a run
         return False
-
-
-def _about_other(folder: Path, config: Config) -> str:
-    """Return why the run of ``config`` cannot begin in ``folder``, which has checkpoints, and what
-    to do."""
-    try:
-        stored = load_resolved(folder)
-        asked = asked_for(folder)
-    except DyngsError:
-        return f"{folder} already holds a run, whose {RESOLVED_NAME} cannot be read; give another run.dir"
-    done = step_of(checkpoint_paths(folder)[-1])
-    if _is_same_run(asked, config):
-        return (
-            f"{folder} already holds a run, this very one, stopped after step {done:,} of {stored.total_steps:,}; go "
-            f"on with `dyngs train --resume {as_word(folder)}`"
-        )
-    train = config.train.model_copy(update={"steps": asked.train.steps})
-    is_longer = config.train.steps > done
-    longer = is_longer and _is_same_run(asked, config.model_copy(update={"train": train}))
-    go_on = f", or go on to that with `dyngs train --resume {as_word(folder)} train.steps={config.train.steps}`"
-    return f"{folder} already holds another run; give another run.dir to keep both{go_on if longer else ''}"
 
 
 def was_only_begun(folder: Path) -> bool:
@@ -253,3 +308,100 @@ def _is_same_run(one: Config, other: Config) -> bool:
 def _what_counts(config: Config) -> Config:
     data = config.data.model_copy(update={"follow_links": False})
     return config.model_copy(update={"run": RunConfig(seed=config.run.seed), "data": data})
+
+
+Read = Path | BaseModel | LoadedRun | Capture | None
+
+
+def inputs_of(*read: Read) -> Inputs:
+    """Return what is read of files, folders, runs, configurations and captures, with all that these
+    name.
+
+    Of a run, its folder or its ``scene.dyngs``, these are its own files and what its configuration
+    names: other files in its folder are outputs.
+    """
+    return Inputs(path for one in read for path in _named_by(one))
+
+
+def _named_by(one: Read) -> Iterator[Path]:
+    match one:
+        case Path() if (one / RESOLVED_NAME).is_file():
+            yield from _files_of_run(one)
+            with suppress(DyngsError):  # the command that reads it refuses it
+                yield from _named_by(load_resolved(one))
+        case Path():
+            yield one
+            if one.name == SCENE_FILE and (one.parent / RESOLVED_NAME).is_file():
+                yield from _named_by(one.parent)
+        case LoadedRun():
+            if one.config.run.dir is not None and (one.config.run.dir / RESOLVED_NAME).is_file():
+                yield from _files_of_run(one.config.run.dir)
+            yield from _named_by(one.config)
+        case Capture():
+            yield one.root
+        case RunConfig():
+            return  # an output
+        case BaseModel():
+            for name in type(one).model_fields:
+                value = getattr(one, name)
+                yield from _named_by(value) if isinstance(value, Path | BaseModel) else ()
+
+
+def _files_of_run(run_dir: Path) -> Iterator[Path]:
+    yield from (
+        run_dir / name for name in (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME, RECORD_NAME)
+    )
+    yield from checkpoint_paths(run_dir)
+    yield from (run_dir / BODY_FOLDER).glob("*")
+    if has_only_scene_file(run_dir):
+        yield run_dir / SCENE_FILE
+
+
+FRAME_NAME = "frame.json"
+_MOST_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class RunFrame:
+    """The frame that people mean when they speak of a run that was edited.
+
+    Attributes:
+        similarity: from the coordinates of training to those of the frame, less ``offset``.
+        offset: (3,) in the frame, for coordinates that are too large for float32.
+        up: axis of the frame that is up, such as "z"; None: nothing says.
+        fixed: exports keep the axes, as those of control points.
+    """
+
+    similarity: Similarity = UNMOVED
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    up: str | None = None
+    fixed: bool = False
+
+
+def write_frame(folder: Path, frame: RunFrame) -> None:
+    """Write the frame of the run in ``folder``, atomically."""
+    write_text(
+        folder / FRAME_NAME,
+        json.dumps(asdict(frame) | {"similarity": frame.similarity.numbers}) + "\n",
+    )
+
+
+def read_frame(folder: Path) -> RunFrame | None:
+    """Return the frame of the run in ``folder``, None where it was not edited. Raises DyngsError:
+    it is damaged."""
+    path = folder / FRAME_NAME
+    if not path.exists():
+        return None
+    try:
+        told = json.loads(read_limited(path, _MOST_BYTES))
+        similarity = similarity_of([float(a) for a in told["similarity"]])
+        x, y, z = map(float, told["offset"])
+        up = told["up"]
+        fixed = told["fixed"]
+        if not math.isfinite(x + y + z) or up not in (None, *AXES) or not isinstance(fixed, bool):
+            raise ValueError("no offset or no axis")
+    except (DyngsError, ValueError, KeyError, TypeError, RecursionError):
+        raise DyngsError(
+            f"{path}: is no frame of `dyngs edit`; edit the original run again"
+        ) from None
+    return RunFrame(similarity, (x, y, z), up, fixed)

@@ -18,7 +18,7 @@ from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import Predicts, capability
 from dyngs.runs.checkpoint import info_of
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 
 SUFFIX = ".safetensors"
 PUBLISHED = "dyngs_people_weights"

@@ -16,14 +16,14 @@ from dyngs.config import Config, DataConfig
 from dyngs.config.kinds import installed_kind
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, counted
-from dyngs.data.aim import up_direction
 from dyngs.data.capture import Capture, Split, View
+from dyngs.data.geometry import up_direction
 from dyngs.gaussians.rendering import drawing_options
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import all_suffixes, format_to_read, read_splats
 from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity
-from dyngs.io.formats.splat_file import Nonfinite
+from dyngs.io.formats.splat_file import Nonfinite, SplatFile
 from dyngs.io.outputs import command_for
 from dyngs.models.checkpoint import CheckpointInfo, read_capture_of
 from dyngs.models.kind import HasBody, capability
@@ -31,7 +31,7 @@ from dyngs.models.renderable import Posable, Renderable
 from dyngs.models.static_section import StaticModel
 from dyngs.models.views import background_colour, training_cameras
 from dyngs.runs.checkpoint import SCENE_FILE, LoadedRun, load_run
-from dyngs.runs.frame import RunFrame, read_frame
+from dyngs.runs.folder import RunFrame, read_frame
 
 FRAME_RATE = 30.0
 """Assumed where a capture does not say."""
@@ -42,7 +42,19 @@ _NO_TURN = (1.0, 0.0, 0.0, 0.0)
 T = TypeVar("T")
 
 
-class Captured:
+class Cache:
+    """Values that are computed once and kept beside an object."""
+
+    _kept: dict[str, Any]
+
+    def once(self, name: str, compute: Callable[[], T]) -> T:
+        """Return what ``compute`` returned when first asked for ``name`` of this object."""
+        if name not in self._kept:
+            self._kept[name] = compute()
+        return self._kept[name]
+
+
+class Captured(Cache):
     """The capture that a scene was trained on, in its coordinates.
 
     Attributes:
@@ -58,16 +70,12 @@ class Captured:
             self.cameras = cameras_for_paths(found.splits["train"], data)
         self._kept: dict[str, Any] = {}
 
-    def once(self, name: str, compute: Callable[[], T]) -> T:
-        """Return what ``compute`` returned when first asked for ``name``."""
-        return _once(self._kept, name, compute)
-
 
 AVATAR_SUFFIX = ".safetensors"
 
 
 @dataclass(frozen=True)
-class Opened(LoadedRun):
+class Opened(LoadedRun, Cache):
     """A scene, and what is known about it.
 
     Attributes:
@@ -189,10 +197,6 @@ class Opened(LoadedRun):
         known = found.seconds if isinstance(found, Capture) else None
         return max(known or frames / FRAME_RATE, SHORTEST)
 
-    def once(self, name: str, compute: Callable[[], T]) -> T:
-        """Return what ``compute`` returned when first asked for ``name`` of this scene."""
-        return _once(self._kept, name, compute)
-
     def showing(self, scene: Renderable) -> Opened:
         """Return the same with another scene."""
         return replace(self, renderable=scene)
@@ -258,12 +262,6 @@ class Opened(LoadedRun):
         )
 
 
-def _once(kept: dict[str, Any], name: str, compute: Callable[[], T]) -> T:
-    if name not in kept:
-        kept[name] = compute()
-    return kept[name]
-
-
 def open_scene(
     path: Path,
     *,
@@ -282,9 +280,7 @@ def open_scene(
     Raises:
         DyngsError: nothing is there, it is damaged, or it is something else.
     """
-    if (path.is_dir() and format_to_read(path) is None) or (
-        path.name == SCENE_FILE and path.exists()
-    ):
+    if path.is_dir() or (path.name == SCENE_FILE and path.exists()):
         folder = path if path.is_dir() else path.parent
         return open_run(folder, data_root=data_root, with_capture=with_capture)
     if not path.exists():
@@ -296,15 +292,13 @@ def open_scene(
     if path.suffix.lower() == AVATAR_SUFFIX:
         return _open_avatar(path)
     if format_to_read(path) is None:
-        known = f"a run folder, a {SCENE_FILE}, an avatar or a file of Gaussians ({all_suffixes()}, .ckpt, .pt)"
         other = command_for(path)
-        raise DyngsError(f"{path}: not a scene; {f'{other}; then ' if other else ''}give {known}")
+        raise DyngsError(
+            f"{path}: not a scene; {f'{other}; then ' if other else ''}give a run folder, a {SCENE_FILE}, an avatar "
+            f"or a file of Gaussians ({all_suffixes()}, .ckpt, .pt)"
+        )
     splat = read_splats(path, nonfinite=nonfinite)
-    opened = opened_scene(
-        StaticScene(gaussians=splat.gaussians, options=drawing_options(splat)), path
-    )
-    scaled = splat.edited.scale != 1
-    opened = replace(opened, stated_up=splat.up, notes=splat.notes, path=path, scaled=scaled)
+    opened = opened_file(splat, path)
     if splat.edited != UNMOVED:  # then its own frame is the one that people mean
         return opened
     info = replace(opened.info, world_offset=splat.world_offset)
@@ -333,6 +327,14 @@ def _open_avatar(path: Path) -> Opened:
     model, person, info = kind.read_person(path)
     config = Config(data=DataConfig(root=path), model=model)
     return Opened(config, person, info.step, 0.0, info, name=path.name, path=path)
+
+
+def opened_file(splat: SplatFile, path: Path) -> Opened:
+    """Return the scene that a file holds, in its own frame."""
+    scene = StaticScene(gaussians=splat.gaussians, options=drawing_options(splat))
+    scaled = splat.edited.scale != 1
+    opened = opened_scene(scene, path)
+    return replace(opened, stated_up=splat.up, notes=splat.notes, path=path, scaled=scaled)
 
 
 def opened_scene(scene: GaussianScene, file: Path = Path("scene")) -> Opened:

@@ -150,7 +150,6 @@ def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 Kind = Literal["exact", "half", "grid", "sparse", "opacity", "rotation"]
 """Ways to convert values to integers."""
 
-FIELD = "model.field.learned."  # prefix of the learned tensors of a deformation field
 TRIANGLES = "triangles.points"  # what a scene of triangles has in place of Gaussians
 # most octaves by which the colour steps of a hardly visible Gaussian exceed those of the others
 MAX_COARSENESS = 6

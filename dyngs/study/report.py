@@ -1,5 +1,5 @@
 """The report of a study: its table as .csv, .json and .md, a page as .html, and, with matplotlib of
-the extra ``plots``, a plot as .svg and .png."""
+the extra ``plots``, a plot as .svg."""
 
 from __future__ import annotations
 
@@ -17,30 +17,16 @@ from typing import TYPE_CHECKING, Any
 
 from dyngs.core.errors import escaped, printable
 from dyngs.export.html.page import filled, script_safe, source_hash
-from dyngs.io.write import atomic_file, write_text
+from dyngs.io.write import write_text
 from dyngs.study.measure import TRUTH, Measurement
-from dyngs.study.sweep import ExchangeRate, Row, pareto_mask
-from dyngs.study.variants import SEVERAL
+from dyngs.study.tradeoff import SEVERAL, Row, pareto_mask
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 MISSING = "the plot needs the package matplotlib; run pip install 'dyngs[plots]'"
-MODEL_COLUMNS = [
-    "psnr",
-    "ssim",
-    "lpips",
-    "psnr_foreground",
-    "psnr_moving",
-    "fps",
-    "mb",
-    "gaussians",
-    "steps",
-    "seconds",
-]
-VARIANT_COLUMNS = ["psnr", "ssim", "lpips", "fps", "gain", "mb", "memory_mb", "gaussians"]
-_LABELS = {
+COLUMNS = {
     "psnr": ("PSNR", ".2f"),
     "ssim": ("SSIM", ".4f"),
     "lpips": ("LPIPS", ".4f"),
@@ -49,10 +35,16 @@ _LABELS = {
     "fps": ("fps", ".1f"),
     "gain": ("speed x", ".2f"),
     "mb": ("MB", ".2f"),
-    "memory_mb": ("RAM MB", ".0f"),
     "gaussians": ("Gaussians", ",.0f"),
     "steps": ("steps", ",.0f"),
     "seconds": ("s", ".0f"),
+}
+"""Heads and formats of the columns of scenes."""
+RATES = {
+    "db_per_speed": ("dB lost per doubled speed", "+.2f"),
+    "db_per_size": ("dB lost per halved size", "+.2f"),
+    "speed": ("most speed, times", ".2f"),
+    "size": ("most size, times", ".2f"),
 }
 _HERE = Path(__file__).parent
 Cells = Sequence[Sequence[str]]
@@ -60,12 +52,11 @@ Cells = Sequence[Sequence[str]]
 
 @dataclass(frozen=True)
 class Table:
-    """A table of texts; ``marked``: which rows stand out."""
+    """A table of texts."""
 
     title: str
     head: Sequence[str]
     cells: Cells
-    marked: Sequence[bool] = ()
 
 
 @dataclass(frozen=True)
@@ -87,57 +78,37 @@ def can_plot() -> bool:
     return find_spec("matplotlib") is not None
 
 
-def scores_table(title: str, rows: Sequence[Row], columns: Sequence[str]) -> Table:
-    """Return a table of scenes, without columns in which none has a figure; the Pareto front is
+def table_of(
+    title: str, rows: Sequence[Row], columns: Mapping[str, tuple[str, str]] = COLUMNS
+) -> Table:
+    """Return a table of rows, without columns in which none has a figure; the Pareto front is
     marked."""
-    shown = [key for key in columns if any(row[key] is not None for row in rows)]
-    cells = [
-        [
-            row["name"],
-            *("-" if row[key] is None else format(row[key], _LABELS[key][1]) for key in shown),
-        ]
-        for row in rows
-    ]
-    head = ["", *(_LABELS[key][0] for key in shown)]
-    title += "; * Pareto front of PSNR, speed and size"
-    return Table(title, head, cells, [row["on_front"] for row in rows])
-
-
-def exchange_table(rates: Sequence[ExchangeRate]) -> Table:
+    shown = [key for key in columns if any(row.get(key) is not None for row in rows)]
     cells = []
-    for rate in rates:
-        costs = (
-            "no gain" if x is None else f"{x:+.2f}" for x in (rate.db_per_speed, rate.db_per_size)
-        )
-        cells.append([rate.setting, *costs, f"{rate.speed:.2f}", f"{rate.size:.2f}"])
-    costs = ("dB lost per doubled speed", "dB lost per halved size")
-    head = ("setting", *costs, "most speed, times", "most size, times")
-    return Table("each setting alone", head, cells)
+    for row in rows:
+        texts = ("-" if row[key] is None else format(row[key], columns[key][1]) for key in shown)
+        cells.append([f"* {row['name']}" if row.get("on_front") else row["name"], *texts])
+    return Table(title, ["", *(columns[key][0] for key in shown)], cells)
 
 
 def shown_views(out: Path, results: Sequence[Measurement]) -> list[dict[str, Any]]:
     """Return the views that a page shows, each with its images: the truth first, then those of the
     models."""
 
-    def image(name: str, index: int) -> str:
-        content = (out / "images" / name / f"{index:02d}.png").read_bytes()
-        return f"data:image/png;base64,{base64.b64encode(content).decode()}"
+    images = out / "images"
+    views = []
+    for index, (name, _) in enumerate(results[0].views):
+        file = f"{index:02d}.png"
+        models = [
+            {"name": x.name, "psnr": x.views[index][1], "image": _address(images / x.name / file)}
+            for x in results
+        ]
+        views.append({"name": name, "truth": _address(images / TRUTH / file), "models": models})
+    return views
 
-    return [
-        {
-            "name": name,
-            "truth": image(TRUTH, index),
-            "models": [
-                {
-                    "name": result.name,
-                    "psnr": result.views[index][1],
-                    "image": image(result.name, index),
-                }
-                for result in results
-            ],
-        }
-        for index, (name, _) in enumerate(results[0].views)
-    ]
+
+def _address(file: Path) -> str:
+    return f"data:image/png;base64,{base64.b64encode(file.read_bytes()).decode()}"
 
 
 def write_report(stem: Path, report: Report) -> list[Path]:
@@ -159,10 +130,6 @@ def write_report(stem: Path, report: Report) -> list[Path]:
     for suffix, text in texts.items():
         paths.append(stem.parent / f"{stem.name}.{suffix}")
         write_text(paths[-1], text)
-    if report.figure is not None:
-        paths.append(stem.parent / f"{stem.name}.png")
-        with atomic_file(paths[-1]) as temporary:
-            report.figure.savefig(temporary, format="png", dpi=200, metadata={"Software": None})
     return paths
 
 
@@ -174,7 +141,7 @@ def page_text(report: Report, svg: str) -> str:
         for name, why in report.left_out.items()
     )
     tables = "".join(
-        f"<h2>{escape(table.title)}</h2>{html_table(table.head, table.cells, table.marked)}"
+        f"<h2>{escape(table.title)}</h2>{html_table(table.head, table.cells)}"
         for table in report.tables
     )
     pieces = {
@@ -217,14 +184,12 @@ def _no_formula(value: object) -> object:
     return escaped(f"'{value}" if value.lstrip()[:1] in ("=", "+", "-", "@") else value)
 
 
-def html_table(head: Sequence[str], cells: Cells, marked: Sequence[bool] = ()) -> str:
-    def line(cell: str, texts: Sequence[str], mark: bool) -> str:
-        inner = "".join(f"<{cell}>{escape(text)}</{cell}>" for text in texts)
-        return f"<tr{' class=marked' if mark else ''}>{inner}</tr>"
-
-    marks = marked or [False] * len(cells)
-    lines = [line("td", row, mark) for row, mark in zip(cells, marks, strict=True)]
-    return "\n".join(["<table>", line("th", head, False), *lines, "</table>"])
+def html_table(head: Sequence[str], cells: Cells) -> str:
+    rows = [
+        "".join(f"<{cell}>{escape(text)}</{cell}>" for text in row)
+        for cell, row in (("th", head), *(("td", row) for row in cells))
+    ]
+    return "\n".join(["<table>", *(f"<tr>{row}</tr>" for row in rows), "</table>"])
 
 
 def markdown_table(head: Sequence[str], cells: Cells) -> str:
@@ -241,19 +206,14 @@ def markdown_text(text: str) -> str:
 
 
 def svg_of(figure: Figure) -> str:
-    """Return a figure as an SVG element, whose points have their labels as tooltips; equal figures
-    give equal text."""
+    """Return a figure as an SVG element; equal figures give equal text."""
     import matplotlib
 
     file = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": "dyngs", "svg.fonttype": "none"}):
         figure.savefig(file, format="svg", metadata={"Date": None})
     text = file.getvalue()
-    text = text[text.index("<svg") :]
-    tips = {line.get_gid() for axes in figure.axes for line in axes.lines if line.get_gid()}
-    for tip in map(str, tips):
-        text = text.replace(f'<g id="{tip}">', f"<g><title>{escape(tip)}</title>")
-    return text
+    return text[text.index("<svg") :]
 
 
 def _logarithmic(axes: Axes, label: str, title: str) -> None:
@@ -269,16 +229,15 @@ def _logarithmic(axes: Axes, label: str, title: str) -> None:
     axes.set_ylabel("dB")
 
 
-def plot_curves(results: Sequence[Measurement]) -> Figure:
-    """Return quality over seconds, a line per model."""
+def plot_curves(curves: Mapping[str, Sequence[tuple[int, float, float]]]) -> Figure:
+    """Return quality over seconds, a line per model; ``curves``: step, seconds and PSNR."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 4.6), layout="constrained")
     axes = figure.subplots()
-    for result in results:
-        points = [point for point in result.curve if point.seconds > 0]
-        seconds = [point.seconds for point in points]
-        axes.plot(seconds, [point.psnr for point in points], "o-", ms=3, label=result.name)
+    for name, points in curves.items():
+        shown = [point for point in points if point[1] > 0]
+        axes.plot([x[1] for x in shown], [x[2] for x in shown], "o-", ms=3, label=name)
     _logarithmic(axes, "seconds of training", "PSNR of some held-out views while training")
     axes.legend(frameon=False)
     return figure
@@ -288,17 +247,11 @@ def plot_variants(rows: Sequence[Row], settings: Sequence[str]) -> Figure:
     """Return two panels, PSNR against speed and against size, and a legend; ``settings``: of each
     row.
 
-    A thin line joins the run with the values of one setting in their order; the thick grey line is
-    the Pareto front of the two axes. Values that are not positive are left out of the logarithmic
-    axes. The run itself comes first.
+    A thin line joins the run, which comes first, with the values of one setting in their order; the
+    thick grey line is the Pareto front of the two axes.
     """
-    from matplotlib import colormaps
     from matplotlib.figure import Figure
 
-    names = sorted(dict.fromkeys(settings), key=lambda name: name == SEVERAL)
-    shades = colormaps["tab20"].resampled(20)
-    colours: dict[str, Any] = {name: shades(i % 20) for i, name in enumerate(names)}
-    colours |= {"": "#222222", SEVERAL: "#888888"}
     figure = Figure(figsize=(10.4, 4.6), layout="constrained")
     speed, size = figure.subplots(1, 2)
     for axes, key, sign, title, label in (
@@ -306,31 +259,17 @@ def plot_variants(rows: Sequence[Row], settings: Sequence[str]) -> Figure:
         (size, "mb", -1, "PSNR and size", "MB on disk (less is better)"),
     ):
         _logarithmic(axes, label, title)
-        axes.margins(0.06)
-        shown = [(row, name) for row, name in zip(rows, settings, strict=True) if row[key] > 0]
-        best = pareto_mask([(row["psnr"], sign * row[key]) for row, _ in shown])
-        front = sorted(
-            (row[key], row["psnr"]) for (row, _), on in zip(shown, best, strict=True) if on
-        )
-        axes.plot([x for x, _ in front], [y for _, y in front], color="#d4d4d4", linewidth=5)
-        for setting in names:
-            if setting not in ("", SEVERAL):
-                joined = [row for row, name in shown if name in ("", setting)]
-                places = [row[key] for row in joined], [row["psnr"] for row in joined]
-                axes.plot(*places, color=colours[setting], linewidth=0.75)
-        for row, name in reversed(shown):  # draws the run itself on top
-            axes.plot(
-                row[key],
-                row["psnr"],
-                "o",
-                color=colours[name],
-                markeredgecolor="white",
-                ms=7 if name else 9,
-                gid=f"{row['name']}: {row['psnr']:.2f} dB, {row['fps']:.1f} fps, {row['mb']:.2f} MB",
-            )
-    handles = [
-        speed.plot([], [], "o", color=colours[name], label=name or "the run itself")[0]
-        for name in names
-    ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
+        best = pareto_mask([(row["psnr"], sign * row[key]) for row in rows])
+        front = sorted((row[key], row["psnr"]) for row, on in zip(rows, best, strict=True) if on)
+        axes.plot(*zip(*front, strict=True), color="#d4d4d4", linewidth=5)
+        for name in reversed(dict.fromkeys(settings)):  # draws the run itself on top
+            alone = name in ("", SEVERAL)
+            shown = [
+                row
+                for row, own in zip(rows, settings, strict=True)
+                if own == name or (own == "" and not alone)
+            ]
+            places = [row[key] for row in shown], [row["psnr"] for row in shown]
+            axes.plot(*places, "o" if alone else "o-", lw=0.75, label=name or "the run itself")
+    figure.legend(*speed.get_legend_handles_labels(), loc="outside lower center", ncols=6)
     return figure

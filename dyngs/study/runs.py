@@ -7,7 +7,7 @@ import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 from pydantic import ConfigDict, TypeAdapter
 
@@ -110,20 +110,14 @@ def require_same_study(out: Path, facts: Mapping[str, object], compared: Sequenc
     if not path.is_file():
         write_stored(path, facts)
         return
-    try:
-        known = cast(object, json.loads(read_limited(path)))
-    except (ValueError, RecursionError):
-        known = None
-    if not isinstance(known, dict):
-        raise DyngsError(
-            f"{path}: cannot be read, so what its folder holds is not known; give another --out"
-        )
     here = json.loads(json.dumps(facts))
-    differing = [
-        f"{key} is {_shown(known.get(key))} there and {_shown(here[key])} here"
-        for key in compared
-        if known.get(key) != here[key]
-    ]
+    with reading(path, "what its folder holds is not known; give another --out"):
+        known = json.loads(read_limited(path))
+        differing = [
+            f"{key} is {_shown(known.get(key))} there and {_shown(here[key])} here"
+            for key in compared
+            if known.get(key) != here[key]
+        ]
     if differing:
         raise DyngsError(f"{out}: holds another study ({'; '.join(differing)}); give another --out")
 

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from dyngs.config import Config
 from dyngs.core.conventions import num_sh_terms
 from dyngs.gaussians.schedule import densify_schedule, growth_per_change
-from dyngs.ops.device import gpu_memory, num_gpus
+from dyngs.ops.device import gpu_memory
 from dyngs.training.trainer import Trainer
 
 # float32 copies of the values of a Gaussian: value, gradient, two moments, and room for three more
@@ -101,7 +103,7 @@ def memory_forecasts(trainer: Trainer[Any], processes: int = 1) -> list[MemoryFo
     scene = (drawing, gaussians, count)
     if gpu is None:
         return [MemoryForecast("memory", program, decoded, *scene, free, processes, largest)]
-    each = -(-processes // num_gpus())
+    each = -(-processes // max(torch.cuda.device_count(), 1))
     shown = images.bytes_on_gpu
     return [
         MemoryForecast("memory of the GPU", 0, shown, *scene, gpu[0], each, largest),

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from dyngs.capture.initial_points import with_first_points
-from dyngs.capture.inspection.problems import before_training
+from dyngs.capture.inspection import before_training
 from dyngs.config import Config, PointsInit, RandomInit
 from dyngs.core.errors import warn
 from dyngs.data.capture import Capture

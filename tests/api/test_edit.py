@@ -42,6 +42,8 @@ def test_a_frame_in_every_format_and_back(kind: Format, plain: Path, tmp_path: P
     written = edit_scene(plain, path, HALF, tell=silent)
     assert written.redrawn > (99 if kind.name in ("ply", "usd", "glb") else 15)
     assert read_splats(path).up == kind.up
+    if not kind.holds_comments:
+        return
     edit_scene(path, tmp_path / "back.ply", Edits(undo=True), tell=silent)
     back = read_splats(tmp_path / "back.ply")
     assert plain.read_bytes() == before
@@ -54,7 +56,6 @@ def test_a_frame_in_every_format_and_back(kind: Format, plain: Path, tmp_path: P
                 rtol=0,
                 atol=2e-5,
             )
-    assert not (tmp_path / "back.ply.edit.json").exists()
 
 
 def test_control_points_far_away(plain: Path, tmp_path: Path) -> None:
@@ -67,8 +68,8 @@ def test_control_points_far_away(plain: Path, tmp_path: Path) -> None:
         plain, tmp_path / "a.ply", Edits(geo=geo_frame(tmp_path / "geo.txt")), tell=told.append
     )
     found = read_splats(tmp_path / "a.ply")
-    comment = next(text for text in found.comments if text.startswith("geo offset"))
-    offset = np.array([float(x) for x in comment.split(": ")[1].split()])
+    line = next(text for text in told if text.startswith("offset, to be added"))
+    offset = np.array([float(x) for x in line.split(": ")[1].split()])
     wanted = 2 * read_splats(plain).gaussians.means.numpy()[:, [1, 2, 0]] + [
         691000.0,
         5334000.0,
@@ -83,10 +84,8 @@ def test_control_points_far_away(plain: Path, tmp_path: Path) -> None:
         tell=silent,
     )
     part = read_splats(tmp_path / "b.ply")
-    assert (part.up, comment in part.comments) == ("z", True)
+    assert part.up == "z"
     torch.testing.assert_close(part.gaussians.means, found.gaussians.means, rtol=0, atol=0)
-    edit_scene(tmp_path / "a.ply", tmp_path / "b.ply", Edits(undo=True), tell=silent)
-    assert comment not in read_splats(tmp_path / "b.ply").comments
 
 
 def test_a_file_far_from_the_origin_is_edited_in_its_own_coordinates(tmp_path: Path) -> None:

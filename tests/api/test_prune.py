@@ -45,7 +45,6 @@ def few_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
     few = {
         "LEFT_GAUSSIANS": (0.5,),
         "CUT_OFFS": (0.02,),
-        "FIELD_LOSSES": (0.1,),
         "HARMONIC_LOSSES": (0.03,),
     }
     for name, candidates in few.items():

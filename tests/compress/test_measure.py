@@ -9,8 +9,7 @@ import torch
 from moving_scene import write_moving_run
 
 from dyngs.compress.measure import (
-    FACTORS,
-    StoragePlan,
+    Precision,
     coarsest_file,
     storage_plan,
 )
@@ -21,7 +20,9 @@ from dyngs.runs.checkpoint import latest_checkpoint, load_run
 from dyngs.runs.stored_file import decoded
 
 
-def plan_of(run_dir: Path, max_change: float | None = None) -> StoragePlan:
+def plan_of(
+    run_dir: Path, max_change: float | None = None
+) -> tuple[Precision, torch.Tensor | None]:
     run = load_run(run_dir)
     assert isinstance(run.config.model, SceneModel)
     return storage_plan(run.config, latest_checkpoint(run_dir), run.scene, max_change)
@@ -30,22 +31,23 @@ def plan_of(run_dir: Path, max_change: float | None = None) -> StoragePlan:
 @pytest.mark.parametrize("moves", [True, False])
 def test_what_is_stored_changes_images_by_what_is_allowed(tmp_path: Path, moves: bool) -> None:
     run_dir = write_moving_run(tmp_path, moves=moves)
-    fine = plan_of(run_dir, 0.1)
-    coarse = plan_of(run_dir, 3.0)
-    for plan, most in ((fine, 0.1), (coarse, 3.0)):
-        assert plan.precision.allowed == pytest.approx(most)
-        assert plan.precision.change is not None
-        assert plan.precision.change <= most
-        assert plan.coarseness is not None
-        assert plan.coarseness.dtype == torch.uint8
-        assert plan.coarseness.shape == (5,)
-    steps = [(step, coarse.precision.steps[name]) for name, step in fine.precision.steps.items()]
+    found = []
+    for most in (0.1, 3.0):
+        precision, coarseness = plan_of(run_dir, most)
+        assert precision.allowed == pytest.approx(most)
+        assert precision.change is not None
+        assert precision.change <= most
+        assert coarseness is not None
+        assert coarseness.dtype == torch.uint8
+        assert coarseness.shape == (5,)
+        found.append(precision.steps)
+    steps = [(step, found[1][name]) for name, step in found[0].items()]
     assert all(a <= b for a, b in steps)
     assert any(a < b for a, b in steps)
 
 
 def test_what_is_not_said_follows_the_errors_of_the_images(tmp_path: Path) -> None:
-    allowed = plan_of(write_moving_run(tmp_path)).precision.allowed
+    allowed = plan_of(write_moving_run(tmp_path))[0].allowed
     assert allowed is not None
     assert 0.1 < allowed < 255 * (10 ** (0.025 / 10) - 1) ** 0.5
 
@@ -66,13 +68,11 @@ def test_the_coarsest_that_is_good_enough(tmp_path: Path) -> None:
 
     every = coarsest_file(config, checkpoint, lambda scene: 1.0, 0.0)
     assert every is not None
-    assert (every.factor, every.refused) == (FACTORS[-1], None)
     some = coarsest_file(config, checkpoint, quality, -1e-3)
     assert some is not None
-    assert some.quality >= -1e-3
-    stored = restored_scene(
-        type(checkpoint)(checkpoint.info, decoded(some.data).tensors), config.model
-    )
-    assert quality(stored) == some.quality
-    assert len(every.data) <= len(some.data)
+    data, reached = some
+    assert reached >= -1e-3
+    stored = restored_scene(type(checkpoint)(checkpoint.info, decoded(data).tensors), config.model)
+    assert quality(stored) == reached
+    assert len(every[0]) <= len(data)
     assert coarsest_file(config, checkpoint, lambda scene: -1.0, 0.0) is None

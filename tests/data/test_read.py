@@ -20,7 +20,7 @@ from tiny_captures import (
 from tiny_priors import with_priors
 
 from dyngs.api.load import read_capture
-from dyngs.capture.inspection.report import report_on
+from dyngs.capture.inspection import report_on
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data import readers

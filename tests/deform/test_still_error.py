@@ -21,7 +21,6 @@ from dyngs.deform.still_error import (
     MIN_SAME,
     cameras_in_place,
     differing_fraction,
-    moving_fractions,
     still_errors,
     two_group_threshold,
     views_to_compare,
@@ -225,7 +224,9 @@ def left() -> torch.Tensor:
 def test_the_fraction_of_each_gaussian_in_the_mask() -> None:
     """The left ball lies in the mask, the right one does not; a fraction of one half counts as
     ``sure``."""
-    found = moving_fractions(lambda _: two_balls(), [masked_image(left())], RenderOptions(), 0.06)
+    found = still_errors(
+        lambda _: two_balls(), [masked_image(left())], RenderOptions(), BLACK, sure=0.06
+    )
     torch.testing.assert_close(found.most, torch.tensor([0.12, 0.0]), rtol=0, atol=2e-3)
     torch.testing.assert_close(found.usual, found.most)
 
@@ -236,6 +237,6 @@ def test_what_is_covered_at_times_only_is_not_usual() -> None:
         + [masked_image(torch.zeros(18, 24)) for _ in range(4)]
         + [masked_image(None)]
     )
-    found = moving_fractions(lambda _: two_balls(), images, RenderOptions(), 0.06)
+    found = still_errors(lambda _: two_balls(), images, RenderOptions(), BLACK, sure=0.06)
     assert float(found.most[0]) > 0.1
     assert float(found.usual.max()) == 0

@@ -12,7 +12,6 @@ import pytest
 import torch
 from flat_wall import BLACK, cameras_before_wall, seen_from
 from moving_scene import Sliding, moving_scene, still_scene
-from moving_scene import camera as one_camera
 
 import dyngs
 from dyngs.cli import main
@@ -23,7 +22,6 @@ from dyngs.data.loader import Image
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import scene_of_split
 from dyngs.evaluate.view_scores import (
-    Drawing,
     background_scores,
     person_scores,
     right_half_scores,
@@ -300,14 +298,3 @@ def test_poses_that_were_trained_on_are_not_refined(
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-def test_a_small_drawing_comes_out_at_full_size_and_in_its_place() -> None:
-    drawings = [
-        Drawing(still_scene(1), RenderOptions(), torch.ones(3), scale) for scale in (1.0, 0.5)
-    ]
-    images = [1 - drawing.image(one_camera(40, 28), None).mean(2) for drawing in drawings]
-    assert [tuple(x.shape) for x in images] == [(28, 40), (28, 40)]
-    assert not torch.equal(*images)
-    across = [float((x.sum(0) * torch.arange(40)).sum() / x.sum()) for x in images]
-    assert across[0] == pytest.approx(across[1], abs=0.3)  # px; half a pixel's shift would be seen

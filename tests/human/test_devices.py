@@ -11,6 +11,7 @@ import torch
 from motion_files import random_motion
 from synthetic_bodies import model, write_npz
 
+from dyngs.core.state import moved_to
 from dyngs.human.avatar.observations import nearest_neighbours
 from dyngs.human.avatar.posing import (
     Skeleton,
@@ -61,9 +62,9 @@ def test_the_parts_of_an_avatar_move_to_a_device(tmp_path: Path) -> None:
     _, anchors = texel_gaussians(atlas_texels(body, 16), (0.0,), 0)
     shapes = pose_blend_shapes(body)
     assert shapes is not None
-    assert body.to(device="meta").weights.device.type == "meta"
-    assert anchors.to(device="meta").points.device.type == "meta"
-    assert shapes.to(device="meta").faces.device.type == "meta"
-    assert Skeleton(body.joints, body.parents).to(device="meta").joints.device.type == "meta"
+    skeleton = Skeleton(body.joints, body.parents)
+    moved = moved_to((body, anchors, shapes, skeleton), "meta")
+    for x in (moved[0].weights, moved[1].points, moved[2].faces, moved[3].joints):
+        assert x.device.type == "meta"
     clip = motion_clip(random_motion(2)).to(device="meta")
     assert (clip.poses.device.type, clip.times.device.type) == ("meta", "cpu")

@@ -130,7 +130,7 @@ def test_paths_that_leave_the_capture(key: str, written: str, tmp_path: Path) ->
     write_image(tmp_path / "own.png", random_pixels(8, 12, 3))
     name = written.format(tmp=tmp_path)
     edit_json(root / "transforms.json", lambda content: content["frames"][1].update({key: name}))
-    with pytest.raises(DyngsError, match=r"own(\.png)?: lies outside the capture"):
+    with pytest.raises(DyngsError, match=r"own(\.png)?, which lies outside the capture"):
         read(root)
     assert len(read(root, follow_links=True).splits["train"]) == 3
 

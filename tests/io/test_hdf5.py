@@ -29,7 +29,7 @@ def test_data_sets_and_their_lengths(hdf5: Path) -> None:
 
 def test_bad_hdf5(hdf5: Path) -> None:
     for key in ("pose", "group"):
-        with pytest.raises(DyngsError, match=f"the data set '{key}' is missing"):
+        with pytest.raises(DyngsError, match=f"'{key}' must be a data set of numbers"):
             read_hdf5(hdf5, key)
     with pytest.raises(DyngsError, match="no such file"):
         read_hdf5(hdf5.with_name("n.hdf5"), "masks")
@@ -53,7 +53,7 @@ def test_hdf5_that_leads_to_another_file(hdf5: Path) -> None:
         file.create_virtual_dataset("virtual", layout)
     hdf5.with_name("m2.hdf5").write_bytes(hdf5.read_bytes())
     for key in ("linked", "soft", "outside", "virtual"):
-        with pytest.raises(DyngsError, match=f"the data set '{key}' is missing"):
+        with pytest.raises(DyngsError, match=f"'{key}' must be a data set of numbers"):
             read_hdf5(hdf5, key)
 
 

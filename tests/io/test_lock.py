@@ -16,12 +16,11 @@ from pathlib import Path
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.io import lock as run_lock
-from dyngs.io.lock import LOCK_NAME, InUseError, make_once, writing
-from dyngs.io.outputs import new_folder
+from dyngs.io import outputs
+from dyngs.io.outputs import LOCK_NAME, InUseError, make_once, new_folder, writing
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-HOLD = "import sys, time; from pathlib import Path; from dyngs.io.lock import writing\n"
+HOLD = "import sys, time; from pathlib import Path; from dyngs.io.outputs import writing\n"
 HOLD += "with writing(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
 
 
@@ -58,8 +57,8 @@ def test_a_killed_owner_frees_it(tmp_path: Path) -> None:
         process.send_signal(signal.SIGKILL)
         process.wait()
         assert json.loads((run / LOCK_NAME).read_text())["pid"] == process.pid
-        with writing(run) as held:
-            assert held.alone
+        with writing(run) as alone:
+            assert alone
             assert json.loads((run / LOCK_NAME).read_text())["pid"] == os.getpid()
     assert not run.exists() or not list(run.iterdir())
 
@@ -137,7 +136,7 @@ def _publish(folder: Path, content: str) -> None:
 
 @pytest.fixture
 def short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_lock, "_WAIT", 0.02)
+    monkeypatch.setattr(outputs, "_WAIT", 0.02)
 
 
 @pytest.mark.usefixtures("short_wait")

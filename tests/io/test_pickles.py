@@ -22,6 +22,7 @@ from measured import cost_of
 from synthetic_bodies import write_python2_pickle
 
 from dyngs.core.errors import DyngsError
+from dyngs.io import pickles
 from dyngs.io.pickles import read_pickle, read_pickled_array
 
 
@@ -230,6 +231,29 @@ def test_sparse_matrices_come_back_whole(
     twice.indices[:] = 1
     found: Any = read_pickle(pickled(tmp_path, pickle.dumps(twice, protocol)))
     np.testing.assert_array_equal(found, twice.toarray())
+
+
+def test_instructions_that_could_run_code_are_unknown() -> None:
+    """Calls and imports go to methods of our own, and all others of that kind are left out."""
+    known = pickles._Unpickler.dispatch
+    for name in [
+        "INST",
+        "OBJ",
+        "NEWOBJ_EX",
+        "EXT1",
+        "EXT2",
+        "EXT4",
+        "PERSID",
+        "BINPERSID",
+        "NEXT_BUFFER",
+        "READONLY_BUFFER",
+    ]:
+        assert getattr(pickle, name)[0] not in known
+    own = vars(pickles._Unpickler)
+    assert {"find_class", "load_reduce", "load_build"} <= own.keys()
+    for name in ("REDUCE", "NEWOBJ", "BUILD"):
+        step = known[getattr(pickle, name)[0]]
+        assert step.__module__ == pickles.__name__
 
 
 def test_a_file_cannot_change_what_the_next_one_sees(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from op_cases import CASES
 from scenes import random_scene
 from torch import Tensor
 
+from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
 from dyngs.ops import native
@@ -108,7 +109,7 @@ def test_the_limits_of_networks_are_those_of_the_kernel(gpu: Callable) -> None:
         assert run(2, GPU_WIDTH, GPU_WIDTH, 1).tolist() == [[0.0]]
         assert run(*[1] * (GPU_LAYERS + 1)).tolist() == [[0.0]]
         for widths in ([2, GPU_WIDTH + 1, 1], [GPU_WIDTH + 1, 1], [1] * (GPU_LAYERS + 2)):
-            with pytest.raises(ValueError, match="up to 16 layers of up to 256 features"):
+            with pytest.raises(DyngsError, match="up to 16 layers of up to 256 features"):
                 run(*widths)
 
 

@@ -17,7 +17,7 @@ from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.data.scene_space import change_coordinates
 from dyngs.io.write import write_image
-from dyngs.runs.capture_record import RECORD_NAME, SAMPLE_BYTES, changed_files, write_record
+from dyngs.runs.capture_record import RECORD_NAME, require_same_capture, write_record
 
 
 @pytest.fixture
@@ -29,27 +29,8 @@ def capture(still: Path, tmp_path: Path) -> Path:
     return root
 
 
-def changes(root: Path, record: Path) -> list[str]:
-    return changed_files(record, DataConfig(root=root), read_capture(root))
-
-
-def test_an_image_that_was_replaced_is_named(capture: Path, tmp_path: Path) -> None:
-    shutil.copyfile(capture / "train" / "r_002.png", capture / "train" / "r_001.png")
-    assert changes(capture, tmp_path) == ["train/r_001"]
-
-
-@pytest.mark.parametrize("at", [0.0, 0.4, 1.0])
-def test_an_edit_of_a_large_file_is_found(at: float, capture: Path, tmp_path: Path) -> None:
-    """Of 200 kB only some blocks are read; a compressed image differs from the edit on, so in its
-    last block."""
-    path = capture / "train" / "r_001.png"
-    data = bytearray(path.read_bytes() + bytes(200_000))
-    path.write_bytes(data)
-    write_record(tmp_path, DataConfig(root=capture), read_capture(capture))
-    first = round(at * (len(data) - SAMPLE_BYTES))
-    data[max(first, 100) :] = bytes(1 for _ in data[max(first, 100) :])
-    path.write_bytes(data)
-    assert changes(capture, tmp_path) == ["train/r_001"]
+def compare(root: Path, record: Path) -> None:
+    require_same_capture(record, DataConfig(root=root), read_capture(root))
 
 
 def resize(root: Path) -> None:
@@ -99,15 +80,15 @@ def add_times(root: Path) -> None:
     [
         (
             resize,
-            r"other sizes, times or cameras of train/r_000, train/r_001, train/r_002 and 1 more\)",
+            r"other sizes, times or cameras of train/r_000, train/r_001, train/r_002, train/r_003\)",
         ),
         (swap_poses, r"other sizes, times or cameras of train/r_000, train/r_001\)"),
-        (scale_world, r"other sizes, times or cameras of train/r_000, .* and 1 more"),
-        (change_angle, r"other sizes, times or cameras of train/r_000, .* and 1 more"),
-        (add_times, r"other sizes, times or cameras of train/r_000, .* and 1 more"),
+        (scale_world, r"other sizes, times or cameras of train/r_000, .*"),
+        (change_angle, r"other sizes, times or cameras of train/r_000, .*"),
+        (add_times, r"other sizes, times or cameras of train/r_000, .*"),
         (
             lambda root: edit_frames(root, lambda frames: frames.pop()),
-            r"\(without training views train/r_003\)",
+            r"\(other training views, such as train/r_003\)",
         ),
     ],
     ids=["resized", "swapped poses", "scaled", "other focal length", "times", "a view fewer"],
@@ -117,23 +98,23 @@ def test_another_capture_is_refused(
 ) -> None:
     change(capture)
     with pytest.raises(DyngsError, match=said) as refused:
-        changes(capture, tmp_path)
+        compare(capture, tmp_path)
     assert "\n" not in str(refused.value)
     assert RECORD_NAME in str(refused.value)
 
 
 def test_where_the_reader_puts_the_origin_does_not_matter(capture: Path, tmp_path: Path) -> None:
     moved = change_coordinates(read_capture(capture), 4.0, np.array([0.3, -7.0, 1e3]))
-    assert changed_files(tmp_path, DataConfig(root=capture), moved) == []
+    require_same_capture(tmp_path, DataConfig(root=capture), moved)
     elsewhere = replace(moved, world_offset=moved.world_offset + np.array([0.0, 0.0, 0.01]))
     with pytest.raises(DyngsError, match="or cameras of"):
-        changed_files(tmp_path, DataConfig(root=capture), elsewhere)
+        require_same_capture(tmp_path, DataConfig(root=capture), elsewhere)
 
 
-@pytest.mark.parametrize("text", [None, "", "[]", "{}", '{"views": {}}'])
+@pytest.mark.parametrize("text", [None, "", "[]", "{}"])
 def test_a_run_without_a_record_goes_on(text: str | None, capture: Path, tmp_path: Path) -> None:
     (tmp_path / RECORD_NAME).unlink()
     if text is not None:
         (tmp_path / RECORD_NAME).write_text(text)
     resize(capture)
-    assert changes(capture, tmp_path) == []
+    compare(capture, tmp_path)

@@ -16,7 +16,7 @@ from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.runs.checkpoint import latest_checkpoint
-from dyngs.runs.config_file import is_same_body, with_body_of
+from dyngs.runs.folder import is_same_body, with_body_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -90,7 +90,7 @@ def test_bodies_are_the_same_by_their_contents(person: Path, tmp_path: Path) -> 
 
 def test_another_fit_is_another_run(person: Path, tmp_path: Path) -> None:
     dyngs.train(config_of(person, fit_of(person, tmp_path / "one"), tmp_path / "run"))
-    with pytest.raises(DyngsError, match="already holds another run"):
+    with pytest.raises(DyngsError, match="already holds a run"):
         dyngs.train(
             config_of(person, fit_of(person, tmp_path / "two", raised=0.02), tmp_path / "run")
         )

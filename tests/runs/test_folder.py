@@ -16,13 +16,12 @@ import pytest
 from dyngs.api.prune import prune_run
 from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import train
-from dyngs.cli.demo_run import is_unused
+from dyngs.cli.demo import is_unused
 from dyngs.config import Config, DataConfig, RandomInit, RunConfig, TrainConfig
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
 from dyngs.export.splat_files import write_run_sequence
-from dyngs.io.lock import LOCK_NAME, InUseError, writing
-from dyngs.io.outputs import require_new_folder
+from dyngs.io.outputs import LOCK_NAME, InUseError, require_new_folder, writing
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import (
     KEEP_CHECKPOINTS,

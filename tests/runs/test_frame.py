@@ -9,7 +9,7 @@ import pytest
 
 from dyngs.core.errors import DyngsError
 from dyngs.io.formats.similarity import Similarity
-from dyngs.runs.frame import FRAME_NAME, RunFrame, read_frame, write_frame
+from dyngs.runs.folder import FRAME_NAME, RunFrame, read_frame, write_frame
 
 FRAME = RunFrame(
     Similarity((0.6, 0.0, 0.8, 0.0), 2.5, (1.0, -2.0, 1 / 3)), (691000.5, 0.0, 0.0), "z", True

@@ -12,7 +12,7 @@ from moving_scene import write_moving_run
 import dyngs
 from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import train
-from dyngs.capture.inspection.report import draw_cameras
+from dyngs.capture.inspection import draw_cameras
 from dyngs.config import RunConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.core.errors import DyngsError
@@ -23,7 +23,7 @@ from dyngs.export.html.page import write_page
 from dyngs.export.images import OutputOptions, write_path_images, write_split_images
 from dyngs.export.splat_files import write_moving, write_run_sequence, write_run_splats
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.runs.inputs import inputs_of
+from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import open_run
 
 PACKAGE = Path(dyngs.__file__).parent

@@ -19,8 +19,7 @@ from dyngs.models.checkpoint import restored_model
 from dyngs.models.kind import HasGaussians, capability
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE
-from dyngs.runs.config_file import write_config
-from dyngs.runs.folder import EXPORT_FOLDER
+from dyngs.runs.folder import EXPORT_FOLDER, write_config
 from dyngs.runs.stored_file import decoded, encoded, step_below, write_scene
 from dyngs.training.trainer import Trainer
 
@@ -79,14 +78,14 @@ def write_within(trainer: Trainer[Any], run_dir: Path, megabytes: float) -> Size
     scene: Any = trainer.model.scene.to(CPU)
     images = probe_images(trainer)  # files are made on the CPU
     before = quality_of(trainer, scene, images)
-    plan = storage_plan(config, full, scene, None)
+    precision, coarseness = storage_plan(config, full, scene, None)
 
-    def stored(kept: Any, coarseness: Tensor | None) -> tuple[float, float, bytes, int] | None:
+    def stored(kept: Any, octaves: Tensor | None) -> tuple[float, float, bytes, int] | None:
         """Return PSNR, the factor on the steps, the file and the number kept; None: none fits."""
 
         def encode(factor: float) -> bytes:
-            steps = {name: step_below(factor * step) for name, step in plan.precision.steps.items()}
-            return encoded(full.info, kept, steps, coarseness)
+            steps = {name: step_below(factor * step) for name, step in precision.steps.items()}
+            return encoded(full.info, kept, steps, octaves)
 
         found = _fitted(encode, int(1e6 * megabytes))
         if found is None:
@@ -95,14 +94,13 @@ def write_within(trainer: Trainer[Any], run_dir: Path, megabytes: float) -> Size
         read = restored_model(decoded(data), config.model)
         return quality_of(trainer, read, images), factor, data, len(kept)
 
-    chosen = stored(scene, plan.coarseness)
+    chosen = stored(scene, coarseness)
     if capability(config.model, HasGaussians) and (chosen is None or chosen[1] > 1):
         scores = scores_of(trainer).cpu()
         fraction = KEPT
         while fraction * len(scene) >= 1:
             kept = highest(scores, 1 - fraction)
-            coarseness = None if plan.coarseness is None else plan.coarseness[kept]
-            found = stored(scene.select(kept), coarseness)
+            found = stored(scene.select(kept), None if coarseness is None else coarseness[kept])
             if chosen is not None and (found is None or found[0] <= chosen[0]):
                 break
             chosen = found

@@ -3,7 +3,7 @@ in."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,8 +36,6 @@ class SfmOptions:
         num_frames: images to take at most from a video, None = 100; of several videos time steps,
             None = ``times.MOST_STEPS``, fewer for many cameras.
         masks: folder of masks of the photos, named as in captures; white = keep. None without.
-        starts: of several videos: camera to the second at which its video begins; None: as in
-            ``videos.json``, else found.
         num_threads: for features and matches, 0 = all cores; mapping has one, so that the result is
             always the same.
         follow_links: photos and videos may be links that lead out of their folder.
@@ -46,7 +44,6 @@ class SfmOptions:
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     num_frames: int | None = None
     masks: Path | None = None
-    starts: Mapping[str, float] | None = None
     num_threads: int = 0
     follow_links: bool = False
 
@@ -81,10 +78,7 @@ class SfmTask:
     def has_one_lens(self) -> bool:
         """Whether all images share a lens: of a video, or of the same size, camera model and focal
         length (EXIF)."""
-        kinds = {
-            (p.header.upright_size, p.header.tags.model, p.header.tags.focal_px)
-            for p in self.photos
-        }
+        kinds = {(p.header.upright_size, p.header.camera, p.header.focal_px) for p in self.photos}
         return self.is_video or len(kinds) == 1
 
 
@@ -157,11 +151,6 @@ def quiet_colmap() -> Iterator[None]:
         yield
     except (RuntimeError, ValueError) as error:
         lines = str(error).strip().splitlines()
-        if "database factory" in str(error):
-            # all that COLMAP says where it cannot open or fill one
-            raise ColmapError(
-                "COLMAP can make no database there: free some space, or check the disk"
-            ) from error
         raise ColmapError(
             f"structure from motion failed: {lines[-1] if lines else error}"
         ) from error

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -102,55 +103,45 @@ def poses_of_videos(
         source: a folder with two videos or more, and ``videos.json`` if something is known.
         out: a folder that does not exist, or is empty.
     """
-    with (
-        new_folder(out) as work,
-        staying_within(source, options.follow_links),
-    ):
-        lines = _write_capture(work, source, options, report)
+    with new_folder(out) as work, staying_within(source, options.follow_links):
+        videos = [open_video(inside(path)) for path in videos_in(source)]
+        names = [video.name for video in videos]
+        if len(videos) < 2:
+            raise DyngsError(
+                f"{source}: holds {len(videos)} videos, two or more are needed; give one video as the file itself"
+            )
+        starts, test = read_given(source, names)
+        lines = colour_notes(video.info for video in videos)
+        images, line = _static_images(source, videos, report)
+        lines.append(line)
+        if starts is None:
+            starts, line = starts_by_sound(videos)
+        else:
+            line = f"offsets between the cameras as given: {_described(starts)}"
+        lines.append(line)
+        model, line = _posed(work, images, options, report)
+        lines.append(line)
+        posed = _posed_images(model)
+        videos = [video for video in videos if video.name in posed]
+        names = [video.name for video in videos]
+        earliest = min(starts[name] for name in names)
+        starts = {name: starts[name] - earliest for name in names}
+        frames, line = frames_at_steps(source, videos, starts, options.num_frames)
+        lines.append(line)
+        seconds = _write_images(work, videos, frames, report)
+        write_seconds(work, seconds)
+        _write_model(work, model, posed, names, list(seconds))
+        if test is None:
+            test = names[: len(names) >= MIN_CAMERAS_TO_HOLD_OUT]
+        test = [name for name in names if name in test]
+        if test:
+            listed = [f"{name}\n" for name in seconds if name.partition("/")[0] in test]
+            write_text(work / "sparse" / "0" / TEST_LIST, "".join(listed))
+            lines.append(f"held out for testing: {first_few(test)}")
+        rounded = {name: round(start, 6) for name, start in starts.items()}
+        known = {"starts": rounded, "test": test}
+        write_text(work / VIDEOS_FILE, json.dumps(known, indent=1) + "\n")
     return "\n".join((*lines, f"written: {out}"))
-
-
-def _write_capture(
-    work: Path, source: Path, options: SfmOptions, report: ReportProgress
-) -> list[str]:
-    videos = [open_video(inside(path)) for path in videos_in(source)]
-    if len(videos) < 2:
-        raise DyngsError(
-            f"{source}: holds {len(videos)} videos, two or more are needed; give one video as the file itself"
-        )
-    starts, held_out = read_given(source, [video.name for video in videos])
-    if options.starts is not None:
-        starts = checked_starts(options.starts, [video.name for video in videos], "--start")
-    lines = colour_notes(video.info for video in videos)
-    images, line = _static_images(source, videos, report)
-    lines.append(line)
-    if starts is None:
-        starts, line = starts_by_sound(videos)
-    else:
-        line = f"offsets between the cameras as given: {_described(starts)}"
-    lines.append(line)
-    model, line = _posed(work, images, options, report)
-    lines.append(line)
-    posed = _posed_images(model)
-    videos = [video for video in videos if video.name in posed]
-    earliest = min(starts[video.name] for video in videos)
-    starts = {video.name: starts[video.name] - earliest for video in videos}
-    frames, line = frames_at_steps(source, videos, starts, options.num_frames)
-    lines.append(line)
-    seconds = _write_images(work, videos, frames, report)
-    write_seconds(work, seconds)
-    _write_model(work, model, posed, [video.name for video in videos], list(seconds))
-    if held_out is not None:
-        test = [video.name for video in videos if video.name in held_out]
-    else:
-        test = [videos[0].name] if len(videos) >= MIN_CAMERAS_TO_HOLD_OUT else []
-    if test:
-        listed = [f"{name}\n" for name in seconds if name.partition("/")[0] in test]
-        write_text(work / "sparse" / "0" / TEST_LIST, "".join(listed))
-        lines.append(f"held out for testing: {first_few(test)}")
-    rounded = {name: round(start, 6) for name, start in starts.items()}
-    write_text(work / VIDEOS_FILE, json.dumps({"starts": rounded, "test": test}, indent=1) + "\n")
-    return lines
 
 
 # What is known beforehand
@@ -158,7 +149,7 @@ def _write_capture(
 
 def read_given(
     folder: Path, names: Sequence[str]
-) -> tuple[dict[str, float] | None, tuple[str, ...] | None]:
+) -> tuple[dict[str, float] | None, list[str] | None]:
     """Return when the videos begin, by camera, in one clock, and the cameras for testing; None: not
     known.
 
@@ -167,56 +158,23 @@ def read_given(
     is not there or missing, or something that is no number.
     """
     path = folder / VIDEOS_FILE
-    if not path.is_file():
-        return None, None
-    fields = read_json_object(path)
-    unknown = sorted(fields.keys() - {"starts", "test"})
-    if unknown:
-        raise DyngsError(f"{path}: unknown key {unknown[0]!r:.60}; there are 'starts' and 'test'")
-    test = fields.get("test")
-    if test is not None and not (isinstance(test, list) and all(name in names for name in test)):
-        raise DyngsError(
-            f"{path}: 'test' must list cameras of {first_few(sorted(names))}, got {test!r:.80}"
-        )
-    if test is not None and set(test) == set(names):
-        raise DyngsError(f"{path}: 'test' names all cameras, which leaves none to train on")
+    fields: dict[str, Any] = read_json_object(path) if path.is_file() else {}
     starts = fields.get("starts")
-    if starts == 0 and is_number(starts):
+    test = fields.get("test")
+    wrong = f"it may hold 'starts', and 'test', a list of some of the cameras {first_few(names)}"
+    with reading(path, wrong):
+        if fields.keys() - {"starts", "test"} or not set(test or ()) < set(names):
+            raise ValueError("an unknown key or camera, or no camera left to train on")
+    if starts is None:
+        return None, test
+    if starts == 0:
         starts = dict.fromkeys(names, 0.0)
-    elif starts is not None and not isinstance(starts, dict):
+    fits = isinstance(starts, dict) and starts.keys() == set(names)
+    if not fits or not all(is_number(x) and abs(x) <= MAX_START for x in starts.values()):
         raise DyngsError(
-            f"{path}: 'starts' must map cameras to seconds, or be 0, got {starts!r:.40}"
+            f"{path}: give the second at which each video begins, for {first_few(names)}, got {starts!r:.80}"
         )
-    seconds = None if starts is None else checked_starts(starts, names, str(path))
-    return seconds, None if test is None else tuple(test)
-
-
-def checked_starts(
-    starts: Mapping[str, object], names: Sequence[str], where: str
-) -> dict[str, float]:
-    """Return the seconds at which the videos begin, for every camera.
-
-    Raises DyngsError: a camera that is not there or missing, or something that is no number of at
-    most a day.
-    """
-    unknown = sorted(starts.keys() - set(names))
-    missing = sorted(set(names) - starts.keys())
-    if unknown:
-        raise DyngsError(
-            f"{where}: no video is called {first_few(unknown)}; there are {first_few(sorted(names))}"
-        )
-    if missing:
-        raise DyngsError(
-            f"{where}: says nothing on {first_few(missing)}; give the second at which every video begins"
-        )
-    seconds: dict[str, float] = {}
-    for name, second in starts.items():
-        if not (is_number(second) and abs(second) <= MAX_START):
-            raise DyngsError(
-                f"{where}: the start of {name} must be a number of seconds, got {second!r:.40}"
-            )
-        seconds[name] = float(second)
-    return seconds
+    return {name: float(second) for name, second in starts.items()}, test
 
 
 def _described(starts: Mapping[str, float]) -> str:
@@ -235,28 +193,12 @@ MIN_OVERLAP = 0.4
 MIN_SAMPLES = 8  # and the least number of samples
 MIN_PEAK = 0.15  # lowest correlation of two signals that count as alike
 RIVAL = 0.8  # a peak is clear if no other one is higher than this times itself
-# Likewise where no third recording can confirm it: 0.7 % of unrelated signals have such a peak,
-# and none stands out by so many standard deviations of the other correlations.
-CERTAIN_PEAK = 0.5
-CERTAIN_RIVAL = 0.6
+# standard deviations of the other correlations that a peak must have where no third recording can
+# confirm it: that of unrelated signals has fewer
 CERTAIN_DEVIATIONS = 6.0
 PEAK_WIDTH = 2  # shifts within so many samples of a peak belong to it
 WHOLE = 0.2  # offsets so near to whole frames, in frames, are taken as whole
 MAX_RATE = 60.0  # frames per second
-
-
-@dataclass(frozen=True)
-class Shift:
-    """Shift of the highest correlation of two signals, in samples: time of the second one plus the
-    shift is time of the first one.
-
-    ``is_clear``: the correlation is high, and alone; ``is_certain``: it needs no confirmation.
-    """
-
-    samples: float
-    peak: float
-    is_clear: bool
-    is_certain: bool
 
 
 def starts_by_sound(videos: Sequence[CameraVideo]) -> tuple[dict[str, float], str]:
@@ -273,33 +215,29 @@ def starts_by_sound(videos: Sequence[CameraVideo]) -> tuple[dict[str, float], st
             raise _unknown(videos, f"{video.name} has no sound")
         sounds.append(sound)
     count = len(videos)
-    pairs: dict[tuple[int, int], Shift] = {}
+    # of the second signal of a pair against the first one
+    samples, peaks, deviations = np.zeros((3, count, count))
     for i, j in combinations(range(count), 2):
-        pairs[i, j] = shift_of(sounds[i], sounds[j])
-        pairs[j, i] = replace(pairs[i, j], samples=-pairs[i, j].samples)
-    likeness = [sum(pairs[i, j].peak for j in range(count) if j != i) for i in range(count)]
-    middle = int(np.argmax(likeness))
-    shifts = np.array([0.0 if i == middle else pairs[middle, i].samples for i in range(count)])
-    agree = {
-        (i, j)
-        for i, j in combinations(range(count), 2)
-        if pairs[i, j].is_clear and abs(pairs[i, j].samples - (shifts[j] - shifts[i])) <= 1
-    }
+        samples[i, j], peaks[i, j], deviations[i, j] = shift_of(sounds[i], sounds[j])
+    samples -= samples.T
+    peaks += peaks.T
+    middle = int(peaks.sum(axis=0).argmax())
+    shifts = samples[middle]
+    pairs = np.triu_indices(count, 1)
+    agree = (peaks > 0) & (np.abs(samples - (shifts - shifts[:, None])) <= 1)
+    agreeing = int(agree[pairs].sum())
     total = count * (count - 1) // 2
-    confirmed = (
-        2 * (len(agree) - (count - 1)) >= total - (count - 1)
-        if count > 2
-        else pairs[0, 1].is_certain
-    )
-    is_linked = all(pairs[middle, i].is_clear for i in range(count) if i != middle)
-    if not (is_linked and confirmed):
-        raise _unknown(videos, f"the sound agrees for {len(agree)} of {total} pairs only")
+    confirmed = 2 * (agreeing - (count - 1)) >= total - (count - 1)
+    if count == 2:
+        confirmed = deviations[0, 1] >= CERTAIN_DEVIATIONS
+    if agree[middle].sum() < count - 1 or not confirmed:
+        raise _unknown(videos, f"the sound agrees for {agreeing} of {total} pairs only")
     rate = min(max(video.rate for video in videos), MAX_RATE)
     frames = (shifts - shifts.min()) / SOUND_RATE * rate
     if np.abs(frames - np.round(frames)).max() <= WHOLE:
         frames = np.round(frames)
     starts = dict(zip([video.name for video in videos], (frames / rate).tolist(), strict=True))
-    sure = f"{len(agree)} of {total} pairs agree"
+    sure = f"{agreeing} of {total} pairs agree"
     return starts, f"offsets between the cameras by the sound ({sure}): {_described(starts)}"
 
 
@@ -311,8 +249,10 @@ def _unknown(videos: Sequence[CameraVideo], reason: str) -> DyngsError:
     )
 
 
-def shift_of(a: np.ndarray, b: np.ndarray) -> Shift:
-    """Return the shift between two signals (T, B) of one rate.
+def shift_of(a: np.ndarray, b: np.ndarray) -> tuple[int, float, float]:
+    """Return the shift of the highest correlation of two signals (T, B) of one rate, in samples:
+    time of ``b`` plus the shift is time of ``a``; that correlation, 0 if it is low or not alone;
+    and its height in standard deviations of the others.
 
     Each column is taken relative to its mean. At every shift the energy of what overlaps is the
     norm.
@@ -335,19 +275,12 @@ def shift_of(a: np.ndarray, b: np.ndarray) -> Shift:
     is_known = (overlap > least - 0.5) & (energies > 1e-6 * energy_a.sum() * energy_b.sum())
     values = np.where(is_known, products / np.sqrt(np.maximum(energies, 1e-12)), 0.0)
     top = int(np.argmax(values))
-    peak = float(values[top])
     others = np.abs(shifts - shifts[top]) > PEAK_WIDTH
     tops, _ = find_peaks(values)
-    rival = float(values[tops[others[tops]]].max(initial=0.0))
-    deviation = float(np.sqrt(np.mean(values[others & is_known] ** 2))) if others.any() else 1.0
-    is_clear = peak >= MIN_PEAK and rival <= RIVAL * peak
-    is_high = peak >= CERTAIN_PEAK and rival <= CERTAIN_RIVAL * peak
-    is_certain = is_clear and (is_high or peak >= CERTAIN_DEVIATIONS * deviation)
-    # between whole shifts by a parabola
-    before, after = values[max(top - 1, 0)], values[min(top + 1, len(values) - 1)]
-    bend = before - 2 * peak + after
-    between = 0.5 * float((before - after) / bend) if bend < 0 else 0.0
-    return Shift(float(shifts[top]) + between, peak, is_clear, is_certain)
+    rival = values[tops[others[tops]]].max(initial=0.0)
+    is_clear = values[top] >= MIN_PEAK and rival <= RIVAL * values[top]
+    deviation = np.sqrt(np.mean(values[others & is_known] ** 2))
+    return int(shifts[top]), float(values[top] * is_clear), float(values[top] / deviation)
 
 
 def onsets(path: Path) -> np.ndarray | None:
@@ -430,12 +363,11 @@ def _static_images(
         frames.sort(axis=0)
         images[video.name] = frames[len(frames) // 2]
         report("what stands, cameras", len(images), len(videos))
-    moving = [f"{name} (up to {x:.1%} of its width)" for name, x in displaced.items() if x > STANDS]
+    moving = [f"{name} (by {x:.1%} of its width)" for name, x in displaced.items() if x > STANDS]
     if moving:
         raise DyngsError(
-            f"{source}: of several videos, cameras must stand still, but {first_few(moving)} "
-            f"{'moves' if len(moving) == 1 else 'move'}; remove {'it' if len(moving) == 1 else 'them'}, stabilise what "
-            "only shakes, or train on one moving camera's video alone"
+            f"{source}: of several videos, cameras must stand still, but these move: {first_few(moving)}; remove them, "
+            "stabilise what only shakes, or train on one moving camera's video alone"
         )
     return images, (
         f"{len(videos)} cameras stand still (images displaced by {max(displaced.values()):.2%} of their width at most, "
@@ -555,9 +487,8 @@ def _refine(model: pycolmap.Reconstruction, num_threads: int) -> None:
     adjustment.ceres.solver_options.num_threads = num_threads or -1
     for _ in range(2):
         problem = pycolmap.BundleAdjustmentConfig()
-        for image in model.images.values():
-            if image.has_pose:
-                problem.add_image(image.image_id)
+        for image in _posed_images(model).values():
+            problem.add_image(image.image_id)
         problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         # Not pycolmap.bundle_adjustment, which turns COLMAP's log on.
         pycolmap.create_default_bundle_adjuster(adjustment, problem, model).solve()
@@ -569,17 +500,14 @@ def _refine(model: pycolmap.Reconstruction, num_threads: int) -> None:
 
 def _drop_pairs(model: pycolmap.Reconstruction) -> None:
     """Remove points of two cameras where each camera has enough others."""
-    counts = dict.fromkeys((image.image_id for image in model.images.values() if image.has_pose), 0)
-    pairs = []
-    for number, point in model.points3D.items():
-        if point.track.length() == 2:
-            pairs.append(number)
-        else:
-            for element in point.track.elements:
-                counts[element.image_id] += 1
-    if min(counts.values(), default=0) >= ENOUGH_TRACKS:
-        for number in pairs:
-            model.delete_point3D(number)
+    pairs = [key for key, point in model.points3D.items() if point.track.length() == 2]
+    others = set(model.points3D) - set(pairs)
+    counts = Counter(
+        element.image_id for key in others for element in model.points3D[key].track.elements
+    )
+    if min((counts[x.image_id] for x in _posed_images(model).values()), default=0) >= ENOUGH_TRACKS:
+        for key in pairs:
+            model.delete_point3D(key)
 
 
 # Frames and the written model

@@ -16,8 +16,7 @@ from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, as_word, counted, reading, show
 from dyngs.data.images.video import VIDEO_SUFFIXES, videos_in
 from dyngs.data.read import is_capture
-from dyngs.io.lock import make_once
-from dyngs.io.outputs import command_for, note_source
+from dyngs.io.outputs import command_for, make_once, note_source
 from dyngs.io.write import cache_folder
 
 FEWEST_PHOTOS = 3

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,7 +34,7 @@ _SHORT = {"red": "r", "green": "g", "blue": "b", "alpha": "a"}
 
 
 @dataclass(frozen=True)
-class Layer:
+class ExrLayer:
     """Channels of one layer: their index by name, in lower case, in the part with this number."""
 
     name: str
@@ -48,29 +48,25 @@ class Layer:
         found = tuple(self.channels[name] for name in names if name in self.channels)
         return found if len(found) == len(names) else ()
 
-    @property
-    def label(self) -> str:
-        return f"{self.name or 'without a name'} ({', '.join(self.channels)})"
 
-
-def layers_of(parts: Sequence[tuple[str, Sequence[str]]]) -> list[Layer]:
+def layers_of(parts: Sequence[tuple[str, Sequence[str]]]) -> list[ExrLayer]:
     """Return the layers of a file by its parts, (name, names of channels such as ``layer.R``)."""
-    layers: dict[tuple[int, str], Layer] = {}
+    layers: dict[tuple[int, str], ExrLayer] = {}
     for number, (part, names) in enumerate(parts):
         for index, name in enumerate(names):
             prefix, _, channel = name.rpartition(".")
             layer = prefix or (part if len(parts) > 1 else "")
-            found = layers.setdefault((number, layer), Layer(layer, number, {}))
+            found = layers.setdefault((number, layer), ExrLayer(layer, number, {}))
             found.channels[_SHORT.get(channel.lower(), channel.lower())] = index
     return list(layers.values())
 
 
-def beauty_pass(layers: Sequence[Layer]) -> Layer | None:
+def beauty_pass(layers: Sequence[ExrLayer]) -> ExrLayer | None:
     """Return the beauty pass; None if no layer has such a name, or several have.
 
     Blender's compositor writes ``Composite.Combined`` beside the ``Combined`` of each view layer.
     """
-    ranked: dict[tuple[int, bool], list[Layer]] = {}
+    ranked: dict[tuple[int, bool], list[ExrLayer]] = {}
     for layer in layers:
         first, _, last = layer.name.lower().rpartition(".")
         if layer.colours and last in BEAUTY_NAMES:
@@ -80,39 +76,9 @@ def beauty_pass(layers: Sequence[Layer]) -> Layer | None:
 
 
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36, 24)
-_MM_PER_UNIT = {2: 25.4, 3: 10.0}
 _FOCAL_RANGE = (0.1, 20.0)
 """Plausible focal lengths in units of the image's longer side; others are taken for mistakes of a
 tag."""
-
-
-@dataclass(frozen=True)
-class PhotoTags:
-    """What the camera wrote into a photo.
-
-    Attributes:
-        orientation: 1 to 8; 1 = upright, 2 to 4 = mirrored or upside down, 5 to 8 = lying.
-        focal_px: focal length in pixels of the stored image.
-        exposure: light let in: seconds of exposure x ISO / 100 / f-number squared, each factor 1
-            where its tag is missing; None without a time of exposure.
-        model: name of the camera.
-    """
-
-    orientation: int = 1
-    focal_px: float | None = None
-    exposure: float | None = None
-    model: str = ""
-
-
-def tags_of(spec: OpenImageIO.ImageSpec) -> PhotoTags:
-    """Return the tags of an opened image; those that make no sense count as missing."""
-    orientation = spec.get_int_attribute("Orientation", 1)
-    return PhotoTags(
-        orientation if 1 <= orientation <= 8 else 1,
-        _focal_px(spec),
-        _exposure(spec),
-        any_text(partial(spec.get_string_attribute, "Model")),
-    )
 
 
 def is_lying(orientation: int) -> bool:
@@ -123,8 +89,6 @@ def is_lying(orientation: int) -> bool:
 
 def rotated_upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Return the (H, W, D) image as the orientation of EXIF says it is to be shown; exact."""
-    if orientation == 1:
-        return pixels
     down = orientation in (3, 4, 6, 7)
     across = orientation in (2, 3, 7, 8)
     rotated = pixels[:: -1 if down else 1, :: -1 if across else 1]
@@ -132,29 +96,17 @@ def rotated_upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def _focal_px(spec: OpenImageIO.ImageSpec) -> float | None:
-    """Focal length from its equivalent for 35 mm film (by the diagonals), else from the resolution
-    of the sensor."""
-    focal = None
+    """Focal length from its equivalent for 35 mm film, by the diagonals."""
     film = spec.get_float_attribute(
         "Exif:FocalLengthIn35mmFilm", spec.get_int_attribute("Exif:FocalLengthIn35mmFilm")
     )
-    millimetres = spec.get_float_attribute("Exif:FocalLength")
-    density = spec.get_float_attribute("Exif:FocalPlaneXResolution")
-    unit = _MM_PER_UNIT.get(spec.get_int_attribute("Exif:FocalPlaneResolutionUnit", 2))
-    if film > 0:
-        focal = film / _FULL_FRAME_DIAGONAL_MM * math.hypot(spec.width, spec.height)
-    elif millimetres > 0 and density > 0 and unit:
-        taken = spec.get_int_attribute("Exif:PixelXDimension")
-        focal = millimetres * density / unit * (spec.width / taken if taken > 0 else 1.0)
+    focal = film / _FULL_FRAME_DIAGONAL_MM * math.hypot(spec.width, spec.height)
     low, high = _FOCAL_RANGE
-    plausible = focal is not None and low <= focal / max(spec.width, spec.height, 1) <= high
-    return focal if plausible else None
+    return focal if low <= focal / max(spec.width, spec.height, 1) <= high else None
 
 
 def _exposure(spec: OpenImageIO.ImageSpec) -> float | None:
     seconds = spec.get_float_attribute("ExposureTime")
-    if not (math.isfinite(seconds) and seconds > 0):
-        return None
     sensitivity = spec.get_int_attribute("Exif:PhotographicSensitivity") or 100
     stop = spec.get_float_attribute("FNumber") or 1.0
     light = seconds * sensitivity / 100 / stop**2
@@ -164,28 +116,42 @@ def _exposure(spec: OpenImageIO.ImageSpec) -> float | None:
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp")
 _TAIL_BYTES = 4096
 _STRIP_PIXELS = 2**18  # pixels of an image that are shrunk at a time
-_PNG_END = b"IEND"
-END_MARKERS = {"png": _PNG_END, "jpeg": b"\xff\xd9"}
-"""What complete files end in, by ``ImageHeader.format_name``."""
+END_MARKERS = {"png": b"IEND", "jpeg": b"\xff\xd9"}
+"""Last bytes of complete files, by ``ImageHeader.format_name``."""
 
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Header of an image file: size and channels as stored, whether one is alpha, the camera's
-    tags.
+    """Header of an image file.
 
     Attributes:
+        width, height: as stored; of an EXR those of the display window.
+        channels: number of channels as stored.
+        colours, alpha: indices of the three colours that are read, and of alpha.
+        is_float: values are linear floats.
+        is_premultiplied: colours are multiplied by alpha.
         format_name: OpenImageIO's name of the format of the content.
         layer: name of the beauty pass that was chosen among the layers of an EXR, else "".
+        orientation: by EXIF: 1 = upright, 2 to 4 = mirrored or upside down, 5 to 8 = lying.
+        focal_px: focal length in pixels of the stored image, None where EXIF does not say.
+        exposure: light let in: seconds of exposure x ISO / 100 / f-number squared, each factor 1
+            where its tag is missing; None without a time of exposure.
+        camera: name of the camera model.
     """
 
     width: int
     height: int
     channels: int
-    has_alpha: bool
-    tags: PhotoTags = field(default_factory=PhotoTags)
-    format_name: str = ""
-    layer: str = ""
+    colours: tuple[int, ...]
+    alpha: int | None
+    is_float: bool
+    is_premultiplied: bool
+    format_name: str
+    layer: str
+    orientation: int
+    focal_px: float | None
+    exposure: float | None
+    camera: str
 
     @property
     def size(self) -> tuple[int, int]:
@@ -195,7 +161,7 @@ class ImageHeader:
     @property
     def upright_size(self) -> tuple[int, int]:
         """(width, height) when it is shown as its EXIF tag says."""
-        return (self.height, self.width) if is_lying(self.tags.orientation) else self.size
+        return (self.height, self.width) if is_lying(self.orientation) else self.size
 
     def size_for(self, described: tuple[int, int] | None) -> tuple[int, int]:
         """Return the stored or the upright (width, height), that which has the shape of a camera's
@@ -225,9 +191,8 @@ def files_in(folder: Path, suffixes: Collection[str]) -> list[Path]:
 def read_header(path: Path) -> ImageHeader:
     """Read size and channels of an image without decoding it."""
     with _reading(path):
-        source = _open(path)
-        header = _header(source)
-        source.reader.close()
+        reader, header = _open(path)
+        reader.close()
         return header
 
 
@@ -262,15 +227,13 @@ def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool
     import OpenImageIO as oiio
 
     with _reading(path):
-        source = _open(path)
-        header = _header(source)
-        is_exact = not _is_float(source.spec) and not source.is_premultiplied
-        pixels = _decoded(
-            path, source.reader, oiio.TypeDesc(oiio.UINT8 if is_exact else oiio.FLOAT)
-        )
+        reader, header = _open(path)
+        is_exact = not header.is_float and not header.is_premultiplied
+        kind = oiio.TypeDesc(oiio.UINT8 if is_exact else oiio.FLOAT)
+        pixels = _decoded(path, reader, kind)
         if upright or (size is not None and header.size_for(size) != header.size):
-            pixels = rotated_upright(pixels, header.tags.orientation)
-        return torch.as_tensor(np.ascontiguousarray(_straight_srgb(pixels, source)), device="cpu")
+            pixels = rotated_upright(pixels, header.orientation)
+        return torch.as_tensor(np.ascontiguousarray(_straight_srgb(pixels, header)), device="cpu")
 
 
 def _reading(path: Path) -> AbstractContextManager[None]:
@@ -297,17 +260,16 @@ def check_image(path: Path) -> ImageHeader:
     decoded."""
     header = read_header(path)
     check_size(path, header.width, header.height, header.channels)
-    marker = END_MARKERS.get(header.format_name)
-    if marker:
-        with _reading(path), path.open("rb") as file:
-            file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
-            complete = marker in file.read()
-        if not complete and marker == _PNG_END:  # not decoded: libpng would print lines of its own
-            raise DyngsError(
-                f"{path}: the image is truncated or damaged (its end is missing); copy it again"
-            )
-        if not complete:
-            read_image(path)
+    marker = END_MARKERS.get(header.format_name, b"")
+    with _reading(path), path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
+        is_complete = marker in file.read()
+    if not is_complete and header.format_name == "jpeg":
+        read_image(path)
+    elif not is_complete:  # not decoded: libpng would print lines of its own
+        raise DyngsError(
+            f"{path}: the image is truncated or damaged (its end is missing); copy it again"
+        )
     return header
 
 
@@ -371,43 +333,36 @@ def straight_uint8(pixels: Tensor) -> Tensor:
     return (pixels.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
-@dataclass(frozen=True)
-class _Source:
-    """An opened image at the part that is read, with the indices of its colours (three) and
-    alpha."""
-
-    reader: OpenImageIO.ImageInput
-    spec: OpenImageIO.ImageSpec
-    colours: list[int]
-    alpha: int | None
-    layer: str = ""
-
-    @property
-    def is_premultiplied(self) -> bool:
-        """Whether colours are multiplied by alpha; formats but TIFF and EXR never are."""
-        is_straight = self.spec.get_int_attribute("oiio:UnassociatedAlpha") == 1
-        return (
-            self.alpha is not None
-            and not is_straight
-            and self.reader.format_name() in ("openexr", "tiff")
-        )
-
-
-def _open(path: Path) -> _Source:
-    """Open an image; of an EXR with several layers the beauty pass."""
+def _open(path: Path) -> tuple[OpenImageIO.ImageInput, ImageHeader]:
+    """Open an image at the part that is read, of an EXR with several layers the beauty pass."""
     reader = _open_reader(path)
-    layer = _exr_layer(path, reader) if reader.format_name() == "openexr" else None
+    name = reader.format_name()
+    layer = _exr_layer(path, reader) if name == "openexr" else None
     spec = reader.spec()
     # OpenImageIO counts alpha from 1 for GIF.
     alpha = min(spec.alpha_channel, spec.nchannels - 1) if spec.alpha_channel >= 0 else None
-    colours = [index for index in range(spec.nchannels) if index != alpha]
+    colours = tuple(index for index in range(spec.nchannels) if index != alpha)
     if layer is not None and layer.colours:
         alpha = layer.channels.get("a")
-        colours = list(layer.colours)
+        colours = layer.colours
     if not colours:
         raise DyngsError(f"{path}: the image has no colour channel; use an RGB or RGBA image")
-    colours = colours[:3] if len(colours) >= 3 else colours[:1] * 3
-    return _Source(reader, spec, colours, alpha, layer.name if layer is not None else "")
+    is_straight = spec.get_int_attribute("oiio:UnassociatedAlpha") == 1
+    orientation = spec.get_int_attribute("Orientation", 1)
+    return reader, ImageHeader(
+        *_shown_size(reader),
+        channels=spec.nchannels,
+        colours=colours[:3] if len(colours) >= 3 else colours[:1] * 3,
+        alpha=alpha,
+        is_float=_is_float(spec),
+        is_premultiplied=alpha is not None and not is_straight and name in ("openexr", "tiff"),
+        format_name=name,
+        layer="" if layer is None else layer.name,
+        orientation=orientation if 1 <= orientation <= 8 else 1,
+        focal_px=_focal_px(spec),
+        exposure=_exposure(spec),
+        camera=any_text(partial(spec.get_string_attribute, "Model")),
+    )
 
 
 def _open_reader(path: Path) -> OpenImageIO.ImageInput:
@@ -426,7 +381,7 @@ def _open_reader(path: Path) -> OpenImageIO.ImageInput:
     return reader
 
 
-def _exr_layer(path: Path, reader: OpenImageIO.ImageInput) -> Layer | None:
+def _exr_layer(path: Path, reader: OpenImageIO.ImageInput) -> ExrLayer | None:
     """Go to the part of the beauty pass and return that layer; None if the file has a single
     layer."""
     parts: list[tuple[str, Sequence[str]]] = []
@@ -442,7 +397,7 @@ def _exr_layer(path: Path, reader: OpenImageIO.ImageInput) -> Layer | None:
     if chosen is None:
         raise DyngsError(
             f"{path}: which layer is the image is not clear; name one rgba, Combined, C or beauty, or save it alone. "
-            f"The file has {first_few([layer.label for layer in layers])}"
+            f"The file has {first_few([layer.name or 'one without a name' for layer in layers])}"
         )
     reader.seek_subimage(chosen.part, 0)
     return chosen if len(layers) > 1 else None
@@ -454,7 +409,7 @@ def _decoded(path: Path, reader: OpenImageIO.ImageInput, kind: OpenImageIO.TypeD
     import OpenImageIO as oiio
 
     spec = reader.spec()
-    width, height = _shown_size(reader, spec)
+    width, height = _shown_size(reader)
     check_size(path, spec.width, spec.height * max(spec.depth, 1), spec.nchannels)
     check_size(path, width, height, spec.nchannels)
     pixels = reader.read_image(kind)
@@ -467,24 +422,20 @@ def _decoded(path: Path, reader: OpenImageIO.ImageInput, kind: OpenImageIO.TypeD
     pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
     left = spec.full_x - spec.x
     top = spec.full_y - spec.y
-    if reader.format_name() == "openexr" and (left, top, width, height) != (
-        0,
-        0,
-        spec.width,
-        spec.height,
-    ):
+    if reader.format_name() == "openexr":
         window = oiio.ROI(left, left + width, top, top + height, 0, 1, 0, spec.nchannels)
-        pixels = np.asarray(oiio.ImageBufAlgo.crop(oiio.ImageBuf(pixels), window).get_pixels(kind))
+        if (left, top, width, height) != (0, 0, spec.width, spec.height):
+            shown = oiio.ImageBufAlgo.crop(oiio.ImageBuf(pixels), window)
+            pixels = np.asarray(shown.get_pixels(kind))
     return pixels
 
 
-def _shown_size(reader: OpenImageIO.ImageInput, spec: OpenImageIO.ImageSpec) -> tuple[int, int]:
+def _shown_size(reader: OpenImageIO.ImageInput) -> tuple[int, int]:
     """(width, height) of the display window of an EXR, of other images as stored."""
-    return (
-        (spec.full_width, spec.full_height)
-        if reader.format_name() == "openexr"
-        else (spec.width, spec.height)
-    )
+    spec = reader.spec()
+    if reader.format_name() == "openexr":
+        return spec.full_width, spec.full_height
+    return spec.width, spec.height
 
 
 def _is_float(spec: OpenImageIO.ImageSpec) -> bool:
@@ -493,28 +444,19 @@ def _is_float(spec: OpenImageIO.ImageSpec) -> bool:
     return spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
 
 
-def _header(source: _Source) -> ImageHeader:
-    width, height = _shown_size(source.reader, source.spec)
-    has_alpha = source.alpha is not None
-    name = source.reader.format_name()
-    return ImageHeader(
-        width, height, source.spec.nchannels, has_alpha, tags_of(source.spec), name, source.layer
-    )
-
-
-def _straight_srgb(pixels: np.ndarray, source: _Source) -> np.ndarray:
+def _straight_srgb(pixels: np.ndarray, header: ImageHeader) -> np.ndarray:
     """Return (H, W, 3 or 4) uint8 sRGB with straight alpha; floats are linear, and encoded."""
-    channels = [*source.colours, *([] if source.alpha is None else [source.alpha])]
+    channels = [*header.colours, *([] if header.alpha is None else [header.alpha])]
     if channels != list(range(pixels.shape[-1])):  # most files need no copy
         pixels = pixels[..., channels]
     if pixels.dtype == np.uint8:
         return pixels
     pixels = np.nan_to_num(pixels, nan=0.0, posinf=1.0, neginf=0.0)
-    if source.is_premultiplied:
+    if header.is_premultiplied:
         alpha = np.clip(pixels[..., 3:], 0, 1)
         pixels[..., :3] = np.where(alpha > 0, pixels[..., :3] / np.maximum(alpha, 1e-6), 0)
     pixels = np.clip(pixels, 0, 1)
-    if _is_float(source.spec):
+    if header.is_float:
         pixels[..., :3] = srgb_encoded(pixels[..., :3])
     return np.round(pixels * 255).astype(np.uint8)
 

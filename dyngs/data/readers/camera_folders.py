@@ -3,7 +3,6 @@ poses_bounds.npy (N3V)."""
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,12 +15,10 @@ from dyngs.data.capture import Capture, CaptureFormat, Splits, VideoFrame, View
 from dyngs.data.geometry import (
     OPENGL_FROM_OPENCV,
     checked_pose,
-    match_size,
     opengl_from_cam,
-    rescale_warning,
 )
 from dyngs.data.images.images import SUFFIXES, files_in
-from dyngs.data.images.video import VideoFrames, VideoInfo, colour_notes, planned_frames, videos_in
+from dyngs.data.images.video import VideoFrames, colour_notes, planned_frames, videos_in
 from dyngs.data.readers.transforms import MAX_FPS, FrameEntry, FrameFile, read_views
 from dyngs.io.fields import first_few, is_number, matrix_of, read_json_object
 from dyngs.io.numpy_files import read_npy
@@ -95,26 +92,25 @@ def sequence_views(
     numbers = sorted({number for camera in cameras for number in camera.images})
     span = max(numbers[-1] - numbers[0], 1)
     views: dict[str, tuple[View, ...]] = {}
-    warnings = _rate_warning(cameras)
-    warnings += colour_notes(camera.video.info for camera in cameras if camera.video is not None)
+    warnings = colour_notes(camera.video.info for camera in cameras if camera.video is not None)
     for index, camera in enumerate(cameras):
-        own = dict(calibrations[camera.name])
+        own = calibrations[camera.name]
         where = f"{path}, camera {camera.name}"
-        if camera.video is not None and ("w" not in own or "h" not in own):
-            own |= {"w": camera.video.info.width, "h": camera.video.info.height}
+        source = camera.video
+        size = None if source is None else (source.info.width, source.info.height)
         frames = []
         for number, image in sorted(camera.images.items()):
             times = {"frame": number, "time": (number - numbers[0]) / span}
             fields = {**own, **times, "file_path": str(image), "camera": index}
-            video = None if camera.video is None else VideoFrame(camera.video.source, number)
-            frames.append(FrameEntry(where, fields, image=image, video=video))
+            video = None if source is None else VideoFrame(source.source, number)
+            frames.append(FrameEntry(where, fields, image=image, video=video, stored=size))
         read, notes = read_views(FrameFile(path, frames))
         views[camera.name] = tuple(read.values())
-        if camera.video is not None:
-            views[camera.name], more = _at_video_size(
-                camera.name, camera.video.info, views[camera.name], where
+        if source is not None:  # named after the video, not after the cache
+            views[camera.name] = tuple(
+                replace(view, name=f"{camera.name}/{view.image_path.stem}")
+                for view in read.values()
             )
-            notes += more
         warnings += notes
     return views, warnings
 
@@ -125,40 +121,6 @@ def video_fps(cameras: Sequence[CameraSource]) -> float | None:
         (camera.video.info.fps for camera in cameras if camera.video and camera.video.info.fps > 0),
         None,
     )
-
-
-def _at_video_size(
-    name: str, video: VideoInfo, views: tuple[View, ...], where: str
-) -> tuple[tuple[View, ...], list[str]]:
-    """Return the views named after the video and with its size: its frames may not be decoded
-    yet."""
-    sized = []
-    rescaled = []
-    for view in views:
-        described = (view.width, view.height)
-        intrinsics, size, changed = match_size(
-            view.intrinsics, described, (video.width, video.height), where
-        )
-        rescaled += [where] if changed else []
-        frame = f"{name}/{view.image_path.stem}"
-        sized.append(
-            replace(view, name=frame, intrinsics=intrinsics, width=size[0], height=size[1])
-        )
-    return tuple(sized), rescale_warning(rescaled)
-
-
-def _rate_warning(cameras: Sequence[CameraSource]) -> list[str]:
-    videos = [
-        (x.name, x.video.info.fps) for x in cameras if x.video is not None and x.video.info.fps > 0
-    ]
-    odd = [(name, fps) for name, fps in videos if not math.isclose(fps, videos[0][1], rel_tol=0.01)]
-    if not odd:
-        return []
-    first, (name, fps) = videos[0], odd[0]
-    return [
-        f"{first[0]} has {first[1]:g} frames per second, {name} {fps:g}: frames of one number are taken for "
-        "simultaneous; convert the videos to one rate"
-    ]
 
 
 CALIBRATION = "cameras.json"
@@ -180,13 +142,14 @@ def read_camera_folders(root: Path) -> Capture:
         raise DyngsError(
             f"{path}: no folder or video is named like its cameras ({first_few(sorted(calibrated))})"
         )
-    warnings = []
-    if len(names) < len(calibrated):
-        absent = sorted(calibrated.keys() - found.keys())
-        warnings.append(f"{path.name}: no folder or video for {first_few(absent)}, left out")
-    unknown = sorted(found.keys() - calibrated.keys())
-    if unknown:
-        warnings.append(f"{path.name}: no calibration for {first_few(unknown)}, left out")
+    warnings = [
+        f"{path.name}: {kind} for {first_few(sorted(some.keys() - others.keys()))}, left out"
+        for kind, some, others in (
+            ("no folder or video", calibrated, found),
+            ("no calibration", found, calibrated),
+        )
+        if some.keys() - others.keys()
+    ]
     cameras = [open_camera(name, found[name]) for name in names]
     own = {name: _calibration(calibrated[name], f"{path}, camera {name}") for name in names}
     views, notes = sequence_views(path, cameras, own)
@@ -240,7 +203,7 @@ def _splits(
     notes = []
     if test is None:
         if len(views) < MIN_CAMERAS_TO_HOLD_OUT:
-            return {"train": tuple(view for kept in views.values() for view in kept)}, []
+            return {"train": _held_out(views, [])["train"]}, []
         test = [min(views)]
         notes = [f"{path.name} names no 'test' cameras: the first one, {test[0]}, is held out"]
     elif not isinstance(test, list) or not all(isinstance(name, str) for name in test):
@@ -254,10 +217,10 @@ def _splits(
 
 
 def _held_out(views: dict[str, tuple[View, ...]], test: Sequence[str]) -> Splits:
-    return {
-        "train": tuple(view for name, kept in views.items() if name not in test for view in kept),
-        "test": tuple(view for name, kept in views.items() if name in test for view in kept),
-    }
+    splits: Splits = {"train": (), "test": ()}
+    for name, kept in views.items():
+        splits["test" if name in test else "train"] += kept
+    return splits
 
 
 FORMAT = CaptureFormat(
@@ -287,22 +250,13 @@ def read_llff(root: Path) -> Capture:
     } or found
     names = list(found)
     if len(names) != len(rows):
-        ends = f" ({names[0]} to {names[-1]})" if names else ""
-        few = (
-            "restore the missing ones" if len(names) < len(rows) else "remove those without a pose"
-        )
         raise DyngsError(
-            f"{path}: has poses of {len(rows)} cameras, but {len(names)} videos or folders of frames are there"
-            f"{ends}{_gaps(names)}; {few}, or remove the rows of cameras that are not there"
+            f"{path}: has poses of {len(rows)} cameras, but {len(names)} videos or folders of frames are there "
+            f"({first_few(names)}); make them the same"
         )
     cameras = [open_camera(name, found[name]) for name in names]
     calibrations = {name: _llff_calibration(row) for name, row in zip(names, rows, strict=True)}
     views, notes = sequence_views(path, cameras, calibrations)
-    numbers = [int(digits) for name in names for digits in re.findall(r"\d+$", name)]
-    if numbers != sorted(numbers):
-        notes.append(
-            f"{path.name}: its rows are matched with cameras in the order {', '.join(names[:4])}, .. by name"
-        )
     splits = _held_out(views, names[:1] if len(names) > 1 else [])
     return Capture(root, "llff", splits, fps=video_fps(cameras), warnings=tuple(notes))
 
@@ -312,12 +266,6 @@ def _read_rows(path: Path) -> np.ndarray:
     if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
         raise DyngsError(
             f"{path}: must have 17 columns, one row per camera; got shape {rows.shape}"
-        )
-    bad = ~np.isfinite(rows[:, :15]).all(axis=1)
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise DyngsError(
-            f"{path}: row {row} holds NaN or infinite numbers; repair it or remove this camera"
         )
     return rows
 
@@ -329,16 +277,6 @@ def _llff_calibration(row: np.ndarray) -> dict[str, object]:
     world_from_cam[:3] = np.stack([right, down, -backward, position], axis=1)
     pose = (world_from_cam @ OPENGL_FROM_OPENCV).tolist()
     return {"fl_x": float(focal), "w": float(width), "h": float(height), "transform_matrix": pose}
-
-
-def _gaps(names: list[str]) -> str:
-    numbers = {int(digits) for name in names for digits in re.findall(r"\d+$", name)}
-    missing = sorted(set(range(min(numbers), max(numbers))) - numbers) if numbers else []
-    return (
-        f", without number {', '.join(map(str, missing[:5]))}"
-        if 0 < len(missing) < len(numbers)
-        else ""
-    )
 
 
 LLFF_FORMAT = CaptureFormat("llff", POSES, lambda root: (root / POSES).is_file(), read_llff)

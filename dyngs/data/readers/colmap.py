@@ -7,7 +7,7 @@ import re
 import struct
 from array import array
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -24,8 +24,8 @@ from dyngs.data.geometry import (
     repair_warning,
     rescale_warning,
 )
-from dyngs.data.images.images import SUFFIXES, header_if_readable
-from dyngs.data.readers.transforms import view_name
+from dyngs.data.images.images import header_if_readable
+from dyngs.data.readers.transforms import find_masks, mask_of, unmasked_warning, view_name
 from dyngs.data.times import read_seconds
 from dyngs.io.containment import inside
 from dyngs.io.fields import open_text, read_text
@@ -38,9 +38,7 @@ NUM_PARAMS = {
     "EUCM": 6, "EQUIRECTANGULAR": 2,
 }  # fmt: skip
 """Number of parameters of each camera model, in the order of COLMAP's model ids."""
-EXTENSIONS = (".bin", ".txt")
 Entry = TypeVar("Entry")
-_NOT_UTF8 = "names of images must be UTF-8; rename the images and export the model again"
 # A line of 2D points: x, y and the id of a 3D point, repeated. A line of a pose ends in a name.
 _POINTS_2D = re.compile(r"(?:[-+.\deEnaif]+\s+[-+.\deEnaif]+\s+-?\d+(?:\s+|$))+")
 
@@ -49,7 +47,6 @@ _POINTS_2D = re.compile(r"(?:[-+.\deEnaif]+\s+[-+.\deEnaif]+\s+-?\d+(?:\s+|$))+"
 class ModelCamera:
     """A camera: COLMAP's model, (width, height) of its images in pixels, parameters of the lens."""
 
-    number: int
     model: str
     size: tuple[int, int]
     params: tuple[float, ...]
@@ -57,7 +54,7 @@ class ModelCamera:
 
 @dataclass(frozen=True)
 class ModelImage:
-    """A registered image: name as written, camera, and its ``cam_from_world``: wxyz,
+    """A registered image: name as written, number of its camera, and its ``cam_from_world``: wxyz,
     translation."""
 
     name: str
@@ -65,85 +62,45 @@ class ModelImage:
     pose: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class ColmapModel:
-    """The content of a model's folder; images are sorted by name."""
+def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], PointCloud]:
+    """Read the cameras, by number, the images, by name, and the points, by id, of the model in a
+    folder.
 
-    cameras: dict[int, ModelCamera]
-    images: list[ModelImage]
-    points: PointCloud
-
-
-def read_model(folder: Path) -> ColmapModel:
-    """Read the model in a folder. Raises DyngsError: a file is missing, truncated or damaged; names
-    it."""
-    extension = _extension(folder)
-    paths = [folder / f"{stem}{extension}" for stem in ("cameras", "images", "points3D")]
+    Raises DyngsError: a file is missing, truncated or damaged; names it.
+    """
+    is_binary = (folder / "cameras.bin").is_file()
+    stems = ("cameras", "images", "points3D")
+    paths = [folder / f"{stem}{'.bin' if is_binary else '.txt'}" for stem in stems]
     for path in paths:
         if not inside(path).is_file():
             raise DyngsError(
                 f"{path}: the COLMAP model lacks this file; export the whole model again"
             )
-    cameras = {camera.number: camera for camera in _read_cameras(paths[0])}
-    images = sorted(_read_images(paths[1]), key=lambda image: image.name)
-    for image in images:
-        if image.camera not in cameras:
-            raise DyngsError(
-                f"{paths[1]}: {image.name} is of camera {image.camera}, which {paths[0].name} lacks"
-            )
-    return ColmapModel(cameras, images, _read_points(paths[2]))
-
-
-def num_images(folder: Path) -> int:
-    """Return how many images the model in a folder has; 0 where they cannot be read."""
-    path = folder / f"images{_extension(folder)}"
-    try:
-        return len(_read_images(path)) if inside(path).is_file() else 0
-    except DyngsError:
-        return 0
-
-
-def _extension(folder: Path) -> str:
-    return next((e for e in EXTENSIONS if (folder / f"cameras{e}").is_file()), EXTENSIONS[0])
-
-
-def _read_cameras(path: Path) -> list[ModelCamera]:
-    if path.suffix == ".txt":
-        cameras = _text_entries(path, _camera_of)
+    if is_binary:
+        cameras, images, points = map(
+            _binary_entries, paths, (_next_camera, _next_image, _next_point)
+        )
     else:
-        cameras = []
-        names = list(NUM_PARAMS)
-        with _Binary(path) as file:
-            for _ in range(file.unpack("<Q")[0]):
-                number, model_id, width, height = file.unpack("<IiQQ")
-                if not 0 <= model_id < len(names):
-                    raise DyngsError(
-                        f"{path}: camera {number} has the unknown model id {model_id}; undistort it"
-                    )
-                model = names[model_id]
-                params = file.unpack(f"<{NUM_PARAMS[model]}d")
-                cameras.append(ModelCamera(number, model, (width, height), params))
-    return cameras
+        cameras, images, points = map(_text_entries, paths, (_camera_of, _image_of, _point_of))
+    known = dict(cameras)
+    lost = next((image for image in images if image.camera not in known), None)
+    if lost is not None:
+        raise DyngsError(
+            f"{paths[1]}: {lost.name} is of camera {lost.camera}, which {paths[0].name} lacks"
+        )
+    table = np.array(points, np.float64).reshape(-1, 7)
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    rgb = np.nan_to_num(table[:, 4:]).clip(0, 255).astype(np.uint8)
+    images.sort(key=lambda image: image.name)
+    return known, images, PointCloud(table[:, 1:4].copy(), rgb)
 
 
-def _camera_of(line: str) -> ModelCamera:
+def _camera_of(line: str) -> tuple[int, ModelCamera]:
     number, model, width, height, *words = line.split()
     params = tuple(map(float, words))
     if len(params) != NUM_PARAMS.get(model, len(params)):
         raise ValueError
-    return ModelCamera(int(number), model, (int(width), int(height)), params)
-
-
-def _read_images(path: Path) -> list[ModelImage]:
-    if path.suffix == ".txt":
-        return _text_entries(path, _image_of)
-    images = []
-    with _Binary(path) as file:
-        for _ in range(file.unpack("<Q")[0]):
-            _, *pose, camera = file.unpack("<I7dI")
-            images.append(ModelImage(file.name(), camera, tuple(pose)))
-            file.skip_list(24)
-    return images
+    return int(number), ModelCamera(model, (int(width), int(height)), params)
 
 
 def _image_of(line: str) -> ModelImage:
@@ -151,23 +108,6 @@ def _image_of(line: str) -> ModelImage:
     if len(pose) != 7 or int(number) < 0:
         raise ValueError
     return ModelImage(name, int(camera), tuple(map(float, pose)))
-
-
-def _read_points(path: Path) -> PointCloud:
-    """Return the points in order of their ids."""
-    if path.suffix == ".txt":
-        rows = _text_entries(path, _point_of)
-    else:
-        rows = []
-        with _Binary(path) as file:
-            for _ in range(file.unpack("<Q")[0]):
-                rows.append(array("d", file.unpack("<Q3d3Bd")[:7]))
-                file.skip_list(8)
-    table = np.array(rows, np.float64).reshape(-1, 7)
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    return PointCloud(
-        table[:, 1:4].copy(), np.nan_to_num(table[:, 4:]).clip(0, 255).astype(np.uint8)
-    )
 
 
 def _point_of(line: str) -> array[float]:
@@ -186,7 +126,7 @@ def _text_entries(path: Path, entry_of: Callable[[str], Entry]) -> list[Entry]:
     entries: list[Entry] = []
     announced = 0
     may_skip = False
-    with reading(path, _NOT_UTF8), open_text(path) as file:
+    with reading(path), open_text(path) as file:
         for number, raw in enumerate(file, start=1):
             line = raw.strip(" \t\r\n")
             if line.startswith("#"):
@@ -210,47 +150,50 @@ def _text_entries(path: Path, entry_of: Callable[[str], Entry]) -> list[Entry]:
     return entries
 
 
+def _binary_entries(path: Path, next_entry: Callable[[_Binary], Entry]) -> list[Entry]:
+    with reading(path):
+        file = _Binary(path.read_bytes())
+        entries = [next_entry(file) for _ in range(file.unpack("<Q")[0])]
+        if file.at != len(file.data):
+            raise ValueError(f"its entries end at byte {file.at}, the file at {len(file.data)}")
+    return entries
+
+
+@dataclass
 class _Binary:
-    """A binary model file, read from its start; the end of the block must be the end of the
-    file."""
+    """The content of a binary model file, and the place of the next byte that is read."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._data = path.read_bytes()
-        self._at = 0
-
-    def __enter__(self) -> _Binary:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        extra = len(self._data) - self._at
-        if kind in (struct.error, ValueError, OverflowError) or (kind is None and extra < 0):
-            raise DyngsError(
-                f"{self._path}: the COLMAP file is truncated ({len(self._data)} bytes); copy or export it again"
-            ) from None
-        if kind is None and extra:
-            raise DyngsError(
-                f"{self._path}: {extra} bytes follow the end of the COLMAP file; copy or export it again"
-            )
+    data: bytes
+    at: int = 0
 
     def unpack(self, layout: str) -> tuple:
         """Return the numbers of the next bytes."""
-        numbers = struct.unpack_from(layout, self._data, self._at)
-        self._at += struct.calcsize(layout)
+        numbers = struct.unpack_from(layout, self.data, self.at)
+        self.at += struct.calcsize(layout)
         return numbers
 
-    def name(self) -> str:
-        """Return the next text, which a zero ends."""
-        begin = self._at
-        end = self._data.index(b"\0", begin)
-        self._at = end + 1
-        with reading(self._path, _NOT_UTF8):
-            return self._data[begin:end].decode()
 
-    def skip_list(self, item_size: int) -> None:
-        """Skip a list: its length, and items of a size in bytes."""
-        (length,) = self.unpack("<Q")
-        self._at += item_size * length
+def _next_camera(file: _Binary) -> tuple[int, ModelCamera]:
+    number, model_id, width, height = file.unpack("<IiQQ")
+    model = dict(enumerate(NUM_PARAMS))[model_id]
+    return number, ModelCamera(model, (width, height), file.unpack(f"<{NUM_PARAMS[model]}d"))
+
+
+def _next_image(file: _Binary) -> ModelImage:
+    _, *pose, camera = file.unpack("<I7dI")
+    end = file.data.index(b"\0", file.at)
+    name = file.data[file.at : end].decode()
+    file.at = end + 1
+    (num_seen,) = file.unpack("<Q")
+    file.at += 24 * num_seen
+    return ModelImage(name, camera, tuple(pose))
+
+
+def _next_point(file: _Binary) -> array[float]:
+    numbers = array("d", file.unpack("<Q3d3Bd")[:7])
+    (length,) = file.unpack("<Q")
+    file.at += 8 * length
+    return numbers
 
 
 TEST_LIST = "test.txt"
@@ -285,19 +228,16 @@ def model_folders(root: Path) -> list[Path]:
 
 
 def find_model(root: Path) -> tuple[Path | None, list[str]]:
-    """Return the folder of the model with the most images, and a warning if there are others."""
+    """Return the folder of the largest model, by its file of images, and a warning if there are others."""
     folders = model_folders(root)
     if len(folders) < 2:
         return (folders or [None])[0], []
-    counts = {folder: num_images(folder) for folder in folders}
-    largest = max(folders, key=lambda folder: counts[folder])
-    others = ", ".join(
-        f"{folder.name} ({counts[folder]})" for folder in folders if folder != largest
+    largest = max(
+        folders, key=lambda folder: max(x.stat().st_size for x in folder.glob("images.*"))
     )
     line = (
-        f"{largest.parent}: of {len(folders)} models that are not connected, {largest.name} is read, "
-        f"which has the most images ({counts[largest]}), not {others}; "
-        "to read another one, move the larger ones out of the capture"
+        f"{largest.parent}: of {len(folders)} models that are not connected, {largest.name} is read, which is the "
+        "largest; to read another one, move it out of the capture"
     )
     return largest, [line]
 
@@ -317,7 +257,7 @@ def _is_chosen(root: Path) -> bool:
 
 
 def _holds_model(folder: Path) -> bool:
-    return any((folder / f"cameras{extension}").is_file() for extension in EXTENSIONS)
+    return any((folder / f"cameras{extension}").is_file() for extension in (".bin", ".txt"))
 
 
 def read_colmap(root: Path) -> Capture:
@@ -330,21 +270,21 @@ def read_colmap(root: Path) -> Capture:
     folder, warnings = find_model(root)
     if folder is None:
         raise DyngsError(f"{root}: holds no COLMAP model ({FILES})")
-    model = read_model(folder)
+    cameras, listed, points = read_model(folder)
     images = _images_of(root, folder)
     finder = FileFinder(images)
-    paths = [finder.find(image.name) for image in model.images]
+    paths = [finder.find(image.name) for image in listed]
     twice = [path for path, count in Counter(paths).items() if count > 1]
     if twice:
         raise DyngsError(f"{folder}: {twice[0]} is listed more than once; export the model again")
     masks = find_masks(root / "masks")
     seconds = read_seconds(root)
-    poses, repaired = _poses(folder, model.images)
+    poses, repaired = _poses(folder, listed)
     rescaled: list[str] = []
     views = []
-    for image, path, pose in zip(model.images, paths, poses, strict=True):
+    for image, path, pose in zip(listed, paths, poses, strict=True):
         where = f"{folder}, image {image.name}"
-        camera = model.cameras[image.camera]
+        camera = cameras[image.camera]
         intrinsics, lens = pinhole_and_lens(camera, where)
         header = header_if_readable(path)
         stored = None if header is None else header.size_for(camera.size)
@@ -352,7 +292,7 @@ def read_colmap(root: Path) -> Capture:
         if changed:
             rescaled.append(where)
         view = View(view_name(path, images), path, pose, intrinsics, *size, lens, image.camera)
-        exposure = None if header is None else header.tags.exposure
+        exposure = None if header is None else header.exposure
         name = Path(os.path.relpath(path, images)).as_posix()
         views.append(
             replace(view, mask_path=mask_of(name, masks), time=seconds.get(name), exposure=exposure)
@@ -362,8 +302,8 @@ def read_colmap(root: Path) -> Capture:
         *rescale_warning(rescaled),
         *unmasked_warning(views, bool(masks)),
     ]
-    splits, notes = _splits(folder, [image.name for image in model.images], views)
-    cloud = model.points if len(model.points.xyz) else None
+    splits, notes = _splits(folder, [image.name for image in listed], views)
+    cloud = points if len(points.xyz) else None
     return Capture(
         root, "colmap", splits, cloud, in_seconds=bool(seconds), warnings=(*warnings, *notes)
     )
@@ -407,16 +347,12 @@ def pinhole_and_lens(camera: ModelCamera, where: str) -> tuple[np.ndarray, Lens]
             f"{where}: camera model {camera.model} is not supported; run `colmap image_undistorter` first"
         )
     values = camera.params
-    if not np.isfinite(values).all():
-        raise DyngsError(
-            f"{where}: the parameters of camera {camera.number} are not finite; export it again"
-        )
     num_focal, kind = _LENSES[camera.model]
     fx = values[0]
     fy = values[num_focal - 1]
-    if fx <= 0 or fy <= 0 or min(camera.size) < 1:
+    if not np.isfinite(values).all() or min(fx, fy) <= 0 or min(camera.size) < 1:
         raise DyngsError(
-            f"{where}: camera {camera.number} has no positive size and focal length; export it again"
+            f"{where}: its camera needs a positive size and focal length, and finite numbers; export it again"
         )
     cx, cy, *coefficients = values[num_focal:]
     if kind == "none" or (kind == "opencv" and not any(coefficients)):
@@ -441,43 +377,10 @@ def _splits(folder: Path, names: list[str], views: list[View]) -> tuple[Splits, 
         if unknown
         else []
     )
-    train, test = (
-        tuple(
-            view
-            for name, view in zip(names, views, strict=True)
-            if (folded(name) in listed) == is_test
-        )
-        for is_test in (False, True)
-    )
-    return ({"train": train, "test": test} if test else {"train": train}), notes
-
-
-def find_masks(folder: Path) -> dict[str, Path]:
-    """Map paths below ``folder``, ``folded``, with and without the last extension, to masks."""
-    found: dict[str, Path] = {}
-    for path in sorted(inside(folder).rglob("*")) if folder.is_dir() else ():
-        if path.suffix.lower() in SUFFIXES:
-            relative = path.relative_to(folder)
-            found[folded(relative.as_posix())] = path
-            found.setdefault(folded(relative.with_suffix("").as_posix()), path)
-    return found
-
-
-def mask_of(image_name: str, masks: Mapping[str, Path]) -> Path | None:
-    """Find the mask of ``a/b.jpg``: ``a/b.jpg.png`` or the like, else ``a/b.jpg``, ``a/b.png`` or
-    ``a/b.mask.png``."""
-    stem = image_name.rpartition(".")[0]
-    names = (f"{image_name}.png", image_name, stem, f"{stem}.mask")
-    return next((masks[key] for name in names if (key := folded(name)) in masks), None)
-
-
-def unmasked_warning(views: list[View], has_masks: bool) -> list[str]:
-    """Return a line about the images that have no mask although others have, none if there are
-    none."""
-    without = [view.name for view in views if view.mask_path is None]
-    return (
-        [f"{len(without)} images have no mask, first {without[0]}"] if has_masks and without else []
-    )
+    splits: Splits = {"train": (), "test": ()}
+    for name, view in zip(names, views, strict=True):
+        splits["test" if folded(name) in listed else "train"] += (view,)
+    return splits if splits["test"] else {"train": splits["train"]}, notes
 
 
 FORMAT = CaptureFormat("colmap", FILES, _is_chosen, read_colmap)

@@ -47,9 +47,7 @@ class PaintedBall:
     radius: float
     paint: Paint
     gloss: float = 0.25
-    turn: np.ndarray = field(
-        default_factory=lambda: np.eye(3, dtype=np.float32), repr=False, compare=False
-    )
+    turn: np.ndarray = field(default_factory=lambda: np.eye(3), compare=False)
 
     def intersect(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """(R,) distances along unit ``directions`` from ``origins`` (R, 3), inf where the ray
@@ -104,8 +102,12 @@ class PaintedBox:
     def intersect(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         start = (origins - f32(self.center)) @ self._axes().T
         towards = directions @ self._axes().T
-        enter, leave = _through_box(start, towards, f32(self.half_extents))
-        return np.where((enter < leave) & (enter > 1e-4), enter, np.float32(np.inf))
+        inverse = 1.0 / np.where(np.abs(towards) < 1e-9, np.float32(1e-9), towards)
+        reach = np.abs(inverse) * f32(self.half_extents)
+        middle = -start * inverse
+        enter = (middle - reach).max(axis=1)
+        hits = (enter < (middle + reach).min(axis=1)) & (enter > 1e-4)
+        return np.where(hits, enter, np.float32(np.inf))
 
     def local(self, points: np.ndarray) -> np.ndarray:
         """(R, 3) surface points in the box's axes, each divided by the half extent."""
@@ -189,31 +191,13 @@ def render_scene(
     return (rgba * 255.0 + 0.5).astype(np.uint8).reshape(size, size, 4)
 
 
-def render_things(
-    scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3
-) -> np.ndarray:
-    """(size, size) uint8: which thing that moves a pixel of ``render_scene`` shows, 1 the first; 0
-    none.
-
-    Of several in one pixel the one that most samples see; light does not count.
-    """
-    directions = sampled_rays(world_from_cam, size, samples).reshape(-1, 3)
-    origin = world_from_cam[:3, 3].astype(np.float32)
-    nearest, distance = nearest_things(scene, origin, directions)
-    things = np.where(np.isfinite(distance), nearest, -1).reshape(samples**2, -1)
-    nothing = np.zeros(size * size, np.int64)
-    counts = [nothing, *((things == index).sum(axis=0) for index in scene.movers)]
-    return np.argmax(counts, axis=0).astype(np.uint8).reshape(size, size)
-
-
 def is_seen(scene: Scene, points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
-    """(R,) bool: points (R, 3) on surfaces that a camera sees, somewhere in its image or not; NaN
-    is never seen."""
+    """(R,) bool: points (R, 3) on surfaces that a camera sees, somewhere in its image or not."""
     origin = world_from_cam[:3, 3]
-    offset = np.nan_to_num(points - origin)
-    distance = np.maximum(np.sqrt(_dot(offset, offset)), 1e-6)
-    _, nearest = nearest_things(scene, f32(origin), (offset / distance[:, None]).astype(np.float32))
-    return np.isfinite(points).all(axis=1) & (nearest > distance - _SURFACE)
+    offset = points - origin
+    distance = np.sqrt(_dot(offset, offset))
+    _, nearest = nearest_things(scene, f32(origin), f32(offset / distance[:, None]))
+    return nearest > distance - _SURFACE
 
 
 def nearest_things(
@@ -235,14 +219,13 @@ def trace(
     """
     nearest, distance = nearest_things(scene, origin, directions)
     hit = np.flatnonzero(np.isfinite(distance))
-    nearest = nearest[hit]
-    directions = directions[hit]
-    points = origin + distance[hit, None] * directions
+    points = origin + distance[hit, None] * directions[hit]
     rgb = np.zeros((len(hit), 3), np.float32)
     for index, primitive in enumerate(scene.primitives):
-        here = np.flatnonzero(nearest == index)
+        here = np.flatnonzero(nearest[hit] == index)
         if len(here):
-            rgb[here] = _shade(scene, primitive, points[here], directions[here], lamps[hit[here]])
+            rays = hit[here]
+            rgb[here] = _shade(scene, primitive, points[here], directions[rays], lamps[rays])
     return hit, srgb_encoded(np.clip(rgb, 0.0, 1.0))
 
 
@@ -262,22 +245,17 @@ def _shade(
     above = points + 2e-3 * normals
     open_sky = np.ones(len(points), np.float32)
     for other in scene.primitives:
-        if other is primitive:
-            continue
-        hidden = np.maximum(other.occlusion(points, normals) - scene.faint, 0.0) / (
-            1.0 - scene.faint
-        )
-        open_sky *= 1.0 - hidden
-        seen = np.flatnonzero(lit)
-        lit[seen] = np.isinf(other.intersect(above[seen], to_lamp[seen]))
+        if other is not primitive:
+            hidden = np.maximum(other.occlusion(points, normals) - scene.faint, 0.0)
+            open_sky *= 1.0 - hidden / (1.0 - scene.faint)
+            seen = np.flatnonzero(lit)
+            lit[seen] = np.isinf(other.intersect(above[seen], to_lamp[seen]))
     upward = (0.5 + 0.5 * normals[:, 2:]).astype(np.float32)
     ambient = upward * f32(_SKY) + (1 - upward) * f32(_GROUND)
-    direct = np.where(lit, 1.0, 0.0)[:, None] * f32(_LAMPLIGHT)
+    direct = lit[:, None] * f32(_LAMPLIGHT)
     rgb = primitive.paint(primitive.local(points)) * (
         ambient * open_sky[:, None] + direct * facing[:, None]
     )
-    if primitive.gloss == 0:
-        return rgb
     shine = np.maximum(_dot(normals, _unit(to_lamp - directions)), 0.0) ** 60 * primitive.gloss
     return rgb + direct * shine[:, None]
 
@@ -293,20 +271,6 @@ def sampled_rays(world_from_cam: np.ndarray, size: int, samples: int) -> np.ndar
         local = np.stack([grid_x, -grid_y, -np.ones_like(grid_x)], axis=-1).reshape(-1, 3)
         found.append(_unit(local @ world_from_cam[:3, :3].T).astype(np.float32))
     return np.stack(found)
-
-
-def _through_box(
-    start: np.ndarray, directions: np.ndarray, bound: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (R,) at which rays enter and leave the box of half extents ``bound`` (3,); enter >
-    leave: a miss."""
-    inverse = 1.0 / np.where(np.abs(directions) < 1e-9, np.float32(1e-9), directions)
-    reach = np.abs(inverse) * bound
-    middle = -start * inverse
-    x, y, z = (middle - reach).T
-    enter = np.maximum(np.maximum(x, y), z)
-    x, y, z = (middle + reach).T
-    return enter, np.minimum(np.minimum(x, y), z)
 
 
 def f32(values: Sequence[float] | np.ndarray) -> np.ndarray:
@@ -708,11 +672,8 @@ def write_dynamic_capture(
     hemisphere, or by one on an arc, which a fixed camera in its middle tests. Fixed cameras each
     take all times: ``camAA/frame_BBBB.png``, frames with ``camera``; test has one of its own.
 
-    ``things/`` holds labels of what moves for each image (``render_things``), and
-    ``true_tracks.npz`` the tracks of points on it (``TrueTracks``). Frames of test name
-    their labels (``instance_mask_path``), those of train do not: training would take them as a
-    prior. Raises DyngsError: no images requested, ``out`` holds something already,
-    or cannot be written.
+    ``true_tracks.npz`` holds the tracks of points on what moves (``TrueTracks``).
+    Raises DyngsError: no images requested, ``out`` holds something already, or cannot be written.
     """
     if min(options.size, options.num_times, options.num_cameras, options.samples) < 1:
         raise DyngsError(
@@ -761,10 +722,6 @@ def write_split(
             frame["camera"] = shot.camera
         if shot.time is not None:
             frame["time"] = shot.time
-            things = render_things(scene, shot.world_from_cam, options.size, options.samples)
-            write_image(out / "things" / f"{shot.name}.png", things)
-            if split != "train":
-                frame["instance_mask_path"] = f"./things/{shot.name}.png"
         frames.append(frame | {"transform_matrix": shot.world_from_cam.tolist()})
     transforms = {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
     write_text(out / f"transforms_{split}.json", json.dumps(transforms, indent=1) + "\n")
@@ -898,7 +855,7 @@ def true_tracks(
 
 
 def is_in_image(points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
-    """(P,) bool: points (P, 3) before the camera and within its square image; NaN is not."""
-    x, y, z = ((np.nan_to_num(points) - world_from_cam[:3, 3]) @ world_from_cam[:3, :3]).T
+    """(P,) bool: points (P, 3) before the camera and within its square image."""
+    x, y, z = ((points - world_from_cam[:3, 3]) @ world_from_cam[:3, :3]).T
     reach = np.tan(0.5 * CAMERA_ANGLE_X) * -z
-    return np.isfinite(points).all(axis=1) & (z < 0) & (np.abs(x) < reach) & (np.abs(y) < reach)
+    return (z < 0) & (np.abs(x) < reach) & (np.abs(y) < reach)

@@ -1,36 +1,21 @@
-"""Parts of a scene: what lies in a box, a sphere or a closed mesh, by the centres of Gaussians."""
+"""Parts of a scene: what lies in a box or a sphere, by the centres of Gaussians."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError, printable, reading, require_regular
+from dyngs.core.errors import DyngsError, printable
 from dyngs.data.times import evenly_spaced
 from dyngs.export.edit.frame import Point, number, point
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.io.fields import require_at_most
 from dyngs.io.formats.similarity import Similarity
 
 _TIMES = 24
-_AT_ONCE = 1_000_000  # pairs of a point and a triangle
-_MOST_BYTES = 1 << 28
-_MESHES = (".obj", ".ply", ".stl", ".off", ".glb")
-
-
-class Region(Protocol):
-    """A part of space."""
-
-    def holds(self, points: np.ndarray) -> np.ndarray:
-        """Return (N,) bool which of the points (N, 3) float64 lie in it."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -55,53 +40,19 @@ class Sphere:
         return np.linalg.norm(points - np.array(self.centre), axis=1) <= self.radius
 
 
-@dataclass(frozen=True)
-class ClosedMesh:
-    """The inside of a closed surface."""
-
-    corners: np.ndarray  # (T, 3, 3) float64, of its triangles
-
-    def holds(self, points: np.ndarray) -> np.ndarray:
-        found = Box(self.corners.min((0, 1)), self.corners.max((0, 1))).holds(points)
-        rows = np.nonzero(found)[0]
-        step = max(1, _AT_ONCE // len(self.corners))
-        for start in range(0, len(rows), step):
-            part = rows[start : start + step]
-            found[part] = np.abs(_windings(points[part], self.corners)) > 0.5
-        return found
-
-
-def _windings(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return how often (P,) a surface winds around points (P, 3): solid angles of its triangles
-    over 4 pi.
-
-    Solid angles as by van Oosterom and Strackee (1983). ``corners``: (T, 3, 3).
-    """
-    a, b, c = (corners[None, :, i] - points[:, None] for i in range(3))
-    la, lb, lc = (np.sqrt(np.einsum("ptk,ptk->pt", x, x)) for x in (a, b, c))
-
-    def dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return np.einsum("ptk,ptk->pt", x, y)
-
-    below = la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb
-    return np.arctan2(dot(a, np.cross(b, c)), below).sum(1) / (2 * math.pi)
+Region = Box | Sphere
 
 
 def region_of(words: Sequence[str]) -> Region:
-    """Return what ``--crop`` names: "x,y,z x,y,z" (box), "x,y,z RADIUS" (sphere), or the file of a
-    closed mesh.
+    """Return what ``--crop`` names: "x,y,z x,y,z" (box), or "x,y,z RADIUS" (sphere).
 
     Raises DyngsError: none of these.
     """
     text = " ".join(words)
     parts = text.split()
-    if not parts or "," not in parts[0] or mesh_path(words) is not None:
-        return read_mesh(Path(text))
     if len(parts) != 2:
         shown = printable(repr(text), 60)
-        raise DyngsError(
-            f"--crop: {shown}: give two corners x,y,z x,y,z, a centre and a radius, or a file of a mesh"
-        )
+        raise DyngsError(f"--crop: {shown}: give two corners x,y,z x,y,z, or a centre and a radius")
     first = point(parts[0], "--crop")
     if "," in parts[1]:
         corners = np.array([first, point(parts[1], "--crop")])
@@ -116,40 +67,6 @@ def region_of(words: Sequence[str]) -> Region:
     if not radius > 0:
         raise DyngsError(f"--crop: a radius of {radius:g}? Give a positive one")
     return Sphere(first, radius)
-
-
-def mesh_path(words: Sequence[str]) -> Path | None:
-    """Return the file that ``--crop`` names, None where it names none."""
-    path = Path(" ".join(words))
-    return path if path.suffix.lower() in _MESHES else None
-
-
-def read_mesh(path: Path) -> ClosedMesh:
-    """Read a closed mesh. Raises DyngsError: no such file, no mesh, or it has holes."""
-    import trimesh
-
-    if path.suffix.lower() not in _MESHES:
-        wanted = f"a closed mesh is one of {', '.join(_MESHES)}; a box is x,y,z x,y,z and a sphere x,y,z RADIUS"
-        raise DyngsError(f"--crop {printable(str(path), 80)}: {wanted}")
-    if not path.exists():
-        raise DyngsError(f"{path}: no such file; --crop takes points, or the file of a closed mesh")
-    require_regular(path)
-    require_at_most(path, path.stat().st_size, _MOST_BYTES, "bytes of a mesh")
-    # From an open file: given a path, trimesh would look for textures next to it.
-    with reading(path, "it must be a mesh of triangles; export it again"), path.open("rb") as file:
-        mesh: Any = trimesh.load(
-            file, file_type=path.suffix.lower()[1:], force="mesh", skip_materials=True
-        )
-        corners = np.asarray(mesh.triangles, np.float64).reshape(-1, 3, 3)
-        closed = (
-            bool(len(corners)) and bool(mesh.is_watertight) and bool(mesh.is_winding_consistent)
-        )
-    if not closed or not np.isfinite(corners).all():
-        what = f"{len(corners):,} triangles" if len(corners) else "no triangles"
-        raise DyngsError(
-            f"{path}: the mesh is not closed ({what}), so nothing is inside; fill its holes"
-        )
-    return ClosedMesh(corners)
 
 
 def held_by(region: Region, scene: GaussianScene, world: Similarity) -> Tensor:

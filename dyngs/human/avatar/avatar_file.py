@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,14 +17,13 @@ from torch import Tensor
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, printable
 from dyngs.core.section import ModelSection
-from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
+from dyngs.core.state import part_of
+from dyngs.core.tensor_checks import require_tensor
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import render_options
-from dyngs.human.avatar.posing import TERMS, Anchors, PoseBlendShapes, Skeleton, new_corrections
-from dyngs.human.avatar.scene import HumanScene, avatar_of, require_body, require_shapes
+from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.body.body_reader import template_path
 from dyngs.human.keys import HumanModel
-from dyngs.human.motion.motion import MotionClip
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.models.checkpoint import CheckpointInfo, info_of
 from dyngs.models.renderable import Renderable
@@ -37,21 +35,6 @@ _KIND = FileKind("dyngs avatar", "an avatar", 1)
 _ADVICE = "; export it again with `dyngs export RUN --format avatar`"
 _LONGEST_NAME = 200
 """Characters of the name of a file, which must have its place in every file system."""
-_WEIGHT_SUM = 1e-3
-"""Tolerance of the sum of skinning weights; rounding errors in float32 are below 1e-6."""
-
-
-@dataclass(frozen=True)
-class TemplateRef:
-    """File and SHA-256 of the body template of an avatar, and whether it is the free one that comes
-    with dyngs.
-
-    It is needed only to retarget motions of other skeletons.
-    """
-
-    file: str
-    sha256: str
-    packaged: bool
 
 
 def write_avatar(person: Renderable, model: ModelSection, info: CheckpointInfo, path: Path) -> Path:
@@ -100,13 +83,10 @@ def write_avatar(person: Renderable, model: ModelSection, info: CheckpointInfo, 
     if scene.light is not None:
         tensors |= {"light": scene.light.factors, "normals": scene.light.normals}
     file = template_path(model)
-    template = TemplateRef(file.name, _sha256(file), model.body is None)
-    header = {
-        **asdict(info),
-        "near": model.near,
-        "eps2d": model.eps2d,
-        "template": asdict(template),
-    }
+    # file and SHA-256 of the body template, which motions of other skeletons are retargeted with, and
+    # whether it is the free one that comes with dyngs
+    template = {"file": file.name, "sha256": _sha256(file), "packaged": model.body is None}
+    header = {**asdict(info), "near": model.near, "eps2d": model.eps2d, "template": template}
     write_tensors(
         path, _KIND, {name: x.detach().contiguous() for name, x in tensors.items()}, header
     )
@@ -124,11 +104,10 @@ def read_avatar(path: Path) -> tuple[HumanModel, HumanScene, CheckpointInfo]:
     """
     header, tensors = read_tensors(path, _KIND, _ADVICE)
     try:
-        _check(tensors)
         scene = _scene(tensors)
         info = info_of(header)
         model = HumanModel(
-            body=_template_beside(path, TemplateRef(**header["template"])),
+            body=_template_beside(path, **header["template"]),
             near=header["near"],
             eps2d=header["eps2d"],
             rasterize_mode=RasterizeMode(info.rasterize_mode),
@@ -146,17 +125,18 @@ def read_avatar(path: Path) -> tuple[HumanModel, HumanScene, CheckpointInfo]:
     return model, scene, info
 
 
-def _template_beside(path: Path, ref: TemplateRef) -> Path | None:
+def _template_beside(path: Path, file: str, sha256: str, packaged: bool) -> Path | None:
     """Return where the template of an avatar in ``path`` is or should be; None: the free one."""
-    if len(Path(ref.file).name) > _LONGEST_NAME:
+    name = Path(file).name
+    if len(name) > _LONGEST_NAME:
         raise ValueError("the name of its template is too long")
-    file = template_path(HumanModel()) if ref.packaged else path.parent / Path(ref.file).name
-    if file.is_file() and _sha256(file) != ref.sha256:
-        whose = "that of this version of dyngs" if ref.packaged else f"{file}"
+    template = template_path(HumanModel()) if packaged else path.parent / name
+    if template.is_file() and _sha256(template) != sha256:
+        whose = "that of this version of dyngs" if packaged else f"{template}"
         raise DyngsError(
-            f"{path}: needs its own template '{ref.file}', not {whose}; put that file beside it"
+            f"{path}: needs its own template '{file}', not {whose}; put that file beside it"
         )
-    return None if ref.packaged else file
+    return None if packaged else template
 
 
 def _sha256(file: Path) -> str:
@@ -168,91 +148,27 @@ def _sha256(file: Path) -> str:
         ) from None
 
 
-def _check(tensors: Mapping[str, Tensor]) -> None:
-    """Raises KeyError for a missing tensor, ValueError for a wrong type, shape or range."""
-    n = len(tensors["gaussians.means"])
-    j = len(tensors["skeleton.joints"])
-    terms = tensors["gaussians.sh"].shape[1]
-    k = tensors["anchors.joints"].shape[1]
-    count = 2**31 - 1  # the faces of a template without shapes are not there
-    gaussians = {
-        "means": (n, 3),
-        "quats": (n, 4),
-        "log_scales": (n, 3),
-        "logit_opacities": (n,),
-        "sh": (n, terms, 3),
-    }
-    shapes: dict[str, tuple[int, ...]] = {
-        f"gaussians.{name}": shape for name, shape in gaussians.items()
-    }
-    anchors = {
-        "points": (n, 3),
-        "size": (n,),
-        "barycentric": (n, 3),
-        "uv": (n, 2),
-        "height": (n,),
-        "weights": (n, k),
-    }
-    shapes |= {f"anchors.{name}": shape for name, shape in anchors.items()}
-    shapes |= dict.fromkeys(
-        ("skeleton.joints", "skeleton.template_joints", "fit.turns", "reference.poses"), (j, 3)
-    )
-    shapes |= {"fit.log_scale": (1,), "reference.trans": (3,), "reference.scale": (1,)}
-    if "light" in tensors:
-        shapes |= {"light": (TERMS, 3), "normals": (n, 3)}
-    if not n:
-        raise ValueError("there are no Gaussians")
-    for name, shape in shapes.items():
-        require_tensor(name, tensors[name], shape)
-    require_body(n, terms, tensors["skeleton.parents"], j)
-    if "shapes.directions" in tensors:
-        count = len(tensors["shapes.faces"])
-        require_shapes(tensors["shapes.directions"], tensors["shapes.faces"], j)
-    require_indices("anchors.face", tensors["anchors.face"], (n,), count, torch.int32)
-    require_indices("anchors.joints", tensors["anchors.joints"], (n, k), j, torch.uint8)
-    require_positive("reference.scale", tensors["reference.scale"])
-    weights = tensors["anchors.weights"]
-    if bool((weights < 0).any()) or bool(((weights.sum(1) - 1).abs() > _WEIGHT_SUM).any()):
-        raise ValueError("the skinning weights of a Gaussian are negative or do not sum to 1")
-
-
 def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
-
-    def part(prefix: str) -> dict[str, Any]:
-        return {
-            name.removeprefix(prefix): x for name, x in tensors.items() if name.startswith(prefix)
-        }
-
-    own = part("anchors.")
-    anchors = Anchors(**{**own, "face": own["face"].long(), "joints": own["joints"].long()})
-    parents = tuple(tensors["skeleton.parents"].tolist())
-    reference = MotionClip(
-        times=torch.zeros(1, dtype=torch.float64, device="cpu"),
-        poses=tensors["reference.poses"][None],
-        trans=tensors["reference.trans"][None],
-        scale=tensors["reference.scale"],
-    )
-    shapes = part("shapes.")
-    given = tensors["skeleton.template_joints"]
-    skeleton = Skeleton(given, parents)
-    values = {
-        "poses": torch.zeros_like(reference.poses),
-        "trans": torch.zeros_like(reference.trans),
-        "turns": tensors["fit.turns"],
-        "joints": tensors["skeleton.joints"] - given,
-        "log_scale": tensors["fit.log_scale"],
-        "weights": torch.zeros_like(anchors.weights),
+    """Raises KeyError for a missing tensor, ValueError for a wrong type, shape or range."""
+    joints = tensors["skeleton.template_joints"]
+    poses = tensors["reference.poses"][None]
+    trans = tensors["reference.trans"][None]
+    stored = {
+        **{f"anchors.{name}": x for name, x in part_of(tensors, "anchors").items()},
+        **{f"shapes.{name}": x for name, x in part_of(tensors, "shapes").items()},
+        "joints": joints,
+        "parents": tensors["skeleton.parents"],
+        "clip.times": torch.zeros(1, dtype=torch.float64, device="cpu"),
+        "clip.poses": poses,
+        "clip.trans": trans,
+        "clip.scale": tensors["reference.scale"],
+        "learned.poses": torch.zeros_like(poses),
+        "learned.trans": torch.zeros_like(trans),
+        "learned.turns": tensors["fit.turns"],
+        "learned.joints": tensors["skeleton.joints"] - joints,
+        "learned.log_scale": tensors["fit.log_scale"],
     }
-    values |= {name: tensors[name] for name in ("light", "normals") if name in tensors}
-    return HumanScene(
-        gaussians=Gaussians.stored(Gaussians(**part("gaussians.")).tensors()),  # and nothing else
-        anchors=anchors,
-        skeleton=skeleton,
-        clip=reference,
-        learned=new_corrections(reference, skeleton, anchors, tensors.get("normals")).restored(
-            values
-        ),
-        shapes=PoseBlendShapes(shapes["directions"].float(), shapes["faces"].long())
-        if shapes
-        else None,
-    )
+    stored |= {f"learned.{name}": tensors[name] for name in ("light", "normals") if name in tensors}
+    for name, dtype in (("anchors.face", torch.int32), ("anchors.joints", torch.uint8)):
+        stored[name] = require_tensor(name, stored[name], stored[name].shape, dtype).long()
+    return HumanScene.restored(Gaussians.stored(part_of(tensors, "gaussians")), stored)

@@ -1,10 +1,10 @@
-"""The captured person, and the first Gaussians on its template, in the colours of images. Local
-letter: N points."""
+"""Neighbours on a body, and what images show of it: colours of the first Gaussians, and how much of
+each is seen. Local letter: N points."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -12,21 +12,18 @@ from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0
-from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, contributions
 from dyngs.human.avatar.posing import (
     Anchors,
     BodyPose,
-    PoseBlendShapes,
     Skeleton,
     frame_pose,
     rest_offsets,
-    skinning_weights,
 )
+from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.skinning import apply_transforms, blend_transforms, joint_transforms
-from dyngs.human.motion.motion import CapturedMotion
 
 # least cosine between the skinning weights of points that belong to the same part of the body
 _SAME_JOINTS = 0.5
@@ -37,8 +34,7 @@ def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
     """Return the rows (Q, count) int64 of the nearest other points of each of ``points`` (Q, 3),
     nearest first.
 
-    Points may coincide; none is its own neighbour. There are at most Q - 1 columns. Raises
-    DyngsError: a point that is not finite.
+    Points may coincide; none is its own neighbour. There are at most Q - 1 columns.
     """
     from scipy.spatial import KDTree
 
@@ -47,8 +43,6 @@ def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
     if count < 1:
         return torch.zeros(num_points, 0, dtype=torch.long, device=points.device)
     positions = points.detach().double().cpu().numpy()
-    if not np.isfinite(positions).all():
-        raise DyngsError("neighbours: a point is not finite; check the positions for NaN")
     found = np.asarray(KDTree(positions).query(positions, k=count + 1)[1])
     own = found == np.arange(num_points)[:, None]
     own[~own.any(1), -1] = True  # more than ``count`` points coincide: drop the last one
@@ -65,12 +59,10 @@ def linked_neighbours(points: Tensor, weights: Tensor, count: int = 5) -> Tensor
     """
     near = nearest_neighbours(points, _LOOKED_AT * count)
     unit = torch.nn.functional.normalize(weights, dim=1)
-    alike = [
-        (unit * unit.index_select(0, column)).sum(1) > _SAME_JOINTS for column in near.unbind(1)
-    ]
-    if not alike:
+    if not near.shape[1]:
         return near
-    others = ~torch.stack(alike, dim=1)
+    cosines = [(unit * unit.index_select(0, column)).sum(1) for column in near.unbind(1)]
+    others = torch.stack(cosines, dim=1) <= _SAME_JOINTS
     own = torch.arange(len(points), device=near.device)[:, None]
     order = others.int().sort(dim=1, stable=True).indices[:, :count]
     return torch.where(others, own, near).gather(1, order)
@@ -136,7 +128,7 @@ def sightings(
     return total
 
 
-def trust_in(seen: Tensor) -> Tensor:
+def visibility_confidence(seen: Tensor) -> Tensor:
     """Return the trust (N,) in [0, 1] in values learned from so many sightings (N,)."""
     return 1 - ENOUGH / (seen + ENOUGH)
 
@@ -255,18 +247,20 @@ def observed_colours(
         )
         world = pose.scale * apply_transforms(transforms, points) + pose.trans
         turned = (transforms[..., :3] * normals[:, None]).sum(-1)
-        column, row, in_frame = _nearest_pixels(world, image.cameras)
+        pixels, _, in_frame = project_points(world, image.cameras)
+        last = pixels.new_tensor([image.cameras.width, image.cameras.height]) - 1
+        column, row = (
+            pixels.floor().nan_to_num().clamp(torch.zeros_like(last), last).long().unbind(1)
+        )
         covered = in_frame.float() if image.alpha is None else image.alpha[row, column] * in_frame
         towards = torch.nn.functional.normalize(image.cameras.centers[0] - world, dim=1)
-        facing = (towards * torch.nn.functional.normalize(turned, dim=1)).sum(1).clamp_min(
-            0
-        ) ** FACING_EXPONENT
+        turned = torch.nn.functional.normalize(turned, dim=1)
+        facing = (towards * turned).sum(1).clamp_min(0) ** FACING_EXPONENT
         colour += facing[:, None] * in_frame[:, None] * image.rgb_premultiplied[row, column]
         weight += facing * covered
     seen = weight > 1e-3
-    return torch.where(seen[:, None], colour / weight.clamp_min(1e-3)[:, None], 0.5).clamp(
-        0, 1
-    ), weight
+    mean = torch.where(seen[:, None], colour / weight.clamp_min(1e-3)[:, None], 0.5)
+    return mean.clamp(0, 1), weight
 
 
 def project_points(world: Tensor, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
@@ -281,54 +275,27 @@ def project_points(world: Tensor, camera: Cameras) -> tuple[Tensor, Tensor, Tens
     return pixels, depth, (depth > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
 
 
-def _nearest_pixels(world: Tensor, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
-    """Return column and row (N,) of the pixel of each point, clamped, and whether it is in the
-    frame."""
-    pixels, _, in_frame = project_points(world, camera)
-    size = pixels.new_tensor([camera.width, camera.height])
-    column, row = pixels.floor().nan_to_num().clamp(pixels.new_zeros(2), size - 1).long().unbind(1)
-    return column, row, in_frame
-
-
-@dataclass(frozen=True)
-class Subject:
-    """A person in a capture: the template's skeleton, the anchors of the first N Gaussians, the
-    poses of the images.
-
-    ``shapes`` are the template's pose blend shapes, None where it has none.
-    """
-
-    skeleton: Skeleton
-    anchors: Anchors
-    motion: CapturedMotion
-    shapes: PoseBlendShapes | None = None
-
-
 def in_colours_of(
-    gaussians: Gaussians, normals: Tensor, subject: Subject, images: Iterable[Image]
-) -> Gaussians:
-    """Return the first Gaussians, on the texels of ``subject``, in the colours of some images.
+    scene: HumanScene, rows: Mapping[int, int], normals: Tensor, images: Iterable[Image]
+) -> HumanScene:
+    """Return a person whose Gaussians are in the colours of some images.
 
-    What these do not face gets colours of the other side of the body and from around it.
-    ``normals`` (N, 3) are those of the surface at rest.
+    What these do not face gets colours of the other side of the body and from around it. ``rows``
+    are those of the clip by frame; ``normals`` (N, 3) are those of the surface at rest.
     """
-    anchors = subject.anchors
-    rows = subject.motion.rows
+    anchors = scene.anchors
 
     def shown() -> Iterator[tuple[Image, BodyPose, Tensor]]:
         for image in images:
-            pose = frame_pose(subject.motion.clip, rows[image.frame or 0])
-            offsets = rest_offsets(anchors, pose, subject.shapes)
+            pose = frame_pose(scene.clip, rows[image.frame or 0])
+            offsets = rest_offsets(anchors, pose, scene.shapes)
             yield image, pose, anchors.points if offsets is None else anchors.points + offsets
 
-    sh = gaussians.sh.clone()
-    weights = skinning_weights(anchors, len(subject.skeleton.joints))
-    colours, seen = observed_colours(normals, weights, subject.skeleton, shown())
-    middle = float(subject.skeleton.joints[0, 0])
-    trust = trust_in(seen)
-    other, fraction, known = mirrored_trust(anchors, middle, trust)
-    colours = smoothed(
-        torch.lerp(colours, colours[other], fraction[:, None]), known, anchors, weights
-    )
-    sh[:, 0] = (colours - 0.5) / SH_C0
-    return gaussians.replace(sh=sh)
+    sh = scene.gaussians.sh.clone()
+    weights = scene.given_weights()
+    colours, seen = observed_colours(normals, weights, scene.skeleton, shown())
+    middle = float(scene.skeleton.joints[0, 0])
+    other, fraction, known = mirrored_trust(anchors, middle, visibility_confidence(seen))
+    colours = torch.lerp(colours, colours[other], fraction[:, None])
+    sh[:, 0] = (smoothed(colours, known, anchors, weights) - 0.5) / SH_C0
+    return replace(scene, gaussians=scene.gaussians.replace(sh=sh))

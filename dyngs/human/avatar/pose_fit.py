@@ -41,7 +41,7 @@ SSIM_WEIGHT, ALPHA_WEIGHT = 0.2, 0.1
 
 
 @dataclass(frozen=True)
-class Comparison:
+class PoseComparison:
     """How renders of a person are compared with images, and what keeps the pose near that given."""
 
     # the loss () between a rendering and an image on a background (3,), with sides divided by a
@@ -58,39 +58,32 @@ def difference_of_images(drawn: Rendering, image: Image, background: Tensor, shr
     """Return 0.8 L1 + 0.2 (1 - SSIM) + 0.1 of the mean error of alpha ()."""
     rendered = drawn.rgb[0]
     truth = image.composite(background)
+    alpha = drawn.alpha[0]
+    error = alpha - (alpha if image.alpha is None else image.alpha)
     mask = image.mask
-    error = None if image.alpha is None else (drawn.alpha[0] - image.alpha)[..., None]
     if mask is not None:
         rendered = rendered * mask[..., None]
         truth = truth * mask[..., None]
-        error = None if error is None else error * mask[..., None]
+        error = error * mask
         mask = shrunk(mask[..., None], shrink)[..., 0]
     loss = l1_ssim_loss(shrunk(rendered, shrink), shrunk(truth, shrink), SSIM_WEIGHT, mask)
-    return loss if error is None else loss + ALPHA_WEIGHT * shrunk(error, shrink).abs().mean()
+    return loss + ALPHA_WEIGHT * shrunk(error[..., None], shrink).abs().mean()
 
 
 def difference_of_silhouettes(
     drawn: Rendering, image: Image, background: Tensor, shrink: int
 ) -> Tensor:
     """Return the squared error of alpha, over the area of the silhouette (); nothing else of the
-    image is looked at.
-
-    Raises ValueError: an image without alpha.
-    """
-    if image.alpha is None:
-        raise ValueError(f"{image.name}: has no silhouette")
-    error = drawn.alpha[0] - image.alpha
-    truth = image.alpha
-    if image.mask is not None:
-        error = error * image.mask
-        truth = truth * image.mask
-    return shrunk(error[..., None], shrink).square().sum() / shrunk(
-        truth[..., None], shrink
-    ).sum().clamp_min(1)
+    image is looked at."""
+    assert image.alpha is not None
+    mask = 1.0 if image.mask is None else image.mask
+    error = (drawn.alpha[0] - image.alpha) * mask
+    area = shrunk((image.alpha * mask)[..., None], shrink).sum().clamp_min(1)
+    return shrunk(error[..., None], shrink).square().sum() / area
 
 
-IMAGES = Comparison(difference_of_images, turn_weight=POSE_WEIGHT / POSE_CM**2)
-SILHOUETTES = Comparison(
+IMAGES = PoseComparison(difference_of_images, turn_weight=POSE_WEIGHT / POSE_CM**2)
+SILHOUETTES = PoseComparison(
     difference_of_silhouettes, turn_weight=1.0, shift_weight=10.0, views_to_turn=2
 )
 """One view hides how far limbs reach towards the camera: rotations fitted to it look wrong from
@@ -117,36 +110,15 @@ WINDOW, LEAST_GAIN, MOST_WINDOWS = 8, 0.02, 12
 by that share; a round ends below the last rate, or after so many windows."""
 
 
-@dataclass(frozen=True)
-class Correction:
-    """Of one pose: rotations ``turns`` (J, 3) axis-angle applied before the given ones, rad;
-    ``shift`` (3,) m."""
-
-    turns: Tensor
-    shift: Tensor
-
-    def leaves(self) -> Correction:
-        """Return the same values as leaf tensors that receive gradients."""
-        return Correction(self.turns.clone().requires_grad_(), self.shift.clone().requires_grad_())
-
-
-@dataclass(frozen=True)
-class FittedPoses:
-    """Poses fitted to images."""
-
-    scene: HumanScene  # the same person, playing them
-    updates: tuple[int, ...]  # number of updates at each of the F time steps
-
-
 def fitted_to_images(
     scene: HumanScene,
     images: ImageLoader,
     background: Tensor,
-    comparison: Comparison = IMAGES,
+    comparison: PoseComparison = IMAGES,
     which: Collection[int] | None = None,
-) -> FittedPoses:
-    """Return the person in the poses in which it looks most like ``images``: rotations of joints
-    and translation.
+) -> tuple[HumanScene, list[int]]:
+    """Return the person in the poses in which it looks most like ``images``, rotations of joints
+    and translation, and the number of updates at each of the F time steps.
 
     All images of a time step decide its pose. The fit begins with the pose that is played, or with
     that corrected as the one before was, whichever looks more alike. ``scene`` plays the clip to
@@ -160,24 +132,23 @@ def fitted_to_images(
         torch.cat([getattr(x, name) for x in parts]) for name in ("poses", "trans", "scale")
     )
     starts = MotionClip(torch.tensor(times, dtype=torch.float64, device="cpu"), poses, trans, scale)
-    found: list[Correction] = []
+    found: list[Tensor] = []
     counts: list[int] = []
     for row, time in enumerate(times):
-        start = starts.select(torch.tensor([row], device="cpu"))
-        fit = _Fit(
-            scene, start, time, background, tuple(images[i] for i in groups[time]), comparison
-        )
-        correction, count = fit.fitted(found[-1] if found else None)
+        start = frame_pose(starts.select(torch.tensor([row], device="cpu")), 0)
+        shown = [images[i] for i in groups[time]]
+        guess = found[-1] if found else None
+        correction, count = _fit_pose(scene, start, time, background, shown, comparison, guess)
         found.append(correction)
         counts.append(count)
     fit = scene.fit
-    none = SharedCorrection(torch.zeros_like(scene.fit.turns), 0.0)
-    turns = torch.stack([x.turns for x in found])
-    shifts = torch.stack([x.shift for x in found])
-    clip = corrected_clip(none, starts, turns, shifts * starts.scale[:, None])
+    none = SharedCorrection(torch.zeros_like(fit.turns), 0.0)
+    corrections = torch.stack(found)
+    shifts = corrections[:, -1] * starts.scale[:, None]
+    clip = corrected_clip(none, starts, corrections[:, :-1], shifts)
     # ``playing`` applies both again
     exactly = corrected_clip(SharedCorrection(-fit.turns, -fit.log_scale), clip)
-    return FittedPoses(scene.playing(exactly), tuple(counts))
+    return scene.playing(exactly), counts
 
 
 def by_time(images: ImageLoader, which: Collection[int] | None = None) -> dict[float, list[int]]:
@@ -190,101 +161,87 @@ def by_time(images: ImageLoader, which: Collection[int] | None = None) -> dict[f
     return groups
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """The fit of one pose."""
+def _fit_pose(
+    scene: HumanScene,
+    start: BodyPose,
+    time: float,
+    background: Tensor,
+    images: Sequence[Image],
+    comparison: PoseComparison,
+    guess: Tensor | None,
+) -> tuple[Tensor, int]:
+    """Return the correction (J + 1, 3) of one pose, and the number of updates it took.
 
-    scene: HumanScene  # the person
-    start: MotionClip  # the pose to begin with, a clip of one frame
-    time: float  # of the images
-    background: Tensor
-    images: tuple[Image, ...]  # V
-    comparison: Comparison  # what of these counts
+    Rotations of the J joints, axis-angle, applied before those of ``start``, rad; last the
+    translation, m. The fit begins with no correction or with ``guess``, whichever looks more alike.
+    Each update is for one image, in turn.
+    """
 
-    def fitted(self, guess: Correction | None) -> tuple[Correction, int]:
-        """Return the correction of the pose, and the number of updates it took.
+    def loss_of(correction: Tensor, shown: Sequence[Image], shrink: int) -> Tensor:
+        turns = correction[:-1]
+        shift = correction[-1]
+        posing = BodyPose(
+            start.rotations @ axis_angle_to_matrix(turns),
+            start.trans + shift * start.scale,
+            start.scale,
+        )
+        moment = scene.in_pose(posing, time)
+        losses = []
+        for image in shown:
+            drawn = scene.render(
+                image.cameras, moment, options=scene.options, background=background
+            )
+            losses.append(comparison.difference(drawn, image, background, shrink))
+        size = comparison.turn_weight * turns.square().mean()
+        size = size + comparison.shift_weight * shift.square().mean()
+        return torch.stack(losses).mean() + size
 
-        ``guess`` is another correction to begin with than none.
-        """
-        joints = self.scene.skeleton.joints
-        none = Correction(torch.zeros_like(joints), torch.zeros_like(joints[0]))
-        heights = [
-            int((x.alpha > 0).any(1).sum()) if x.alpha is not None else x.cameras.height
-            for x in self.images
-        ]
-        coarse = max(1, round(max(heights) / COARSE_PX))
-        shrinks = coarse, round(math.sqrt(coarse)), 1
-        found = none if guess is None else self._better(none, guess, shrinks[0])
-        count = 0
-        for shrink, first, last in zip(shrinks, FIRST_RATES, LAST_RATES, strict=True):
-            found, updates = self._round(found, shrink, first, last)
-            count += updates
-        return self._better(none, found, 1), count
+    @torch.no_grad()
+    def better(a: Tensor, b: Tensor, shrink: int) -> Tensor:
+        return b if loss_of(b, images, shrink) < loss_of(a, images, shrink) else a
 
-    def _better(self, a: Correction, b: Correction, shrink: int) -> Correction:
-        """Return the one that looks more like the images, ``a`` if neither does."""
-        with torch.no_grad():
-            losses = [float(self._loss(x, self.images, shrink)) for x in (a, b)]
-        return b if losses[1] < losses[0] else a
-
-    def _round(
-        self, start: Correction, shrink: int, rate: float, last: float
-    ) -> tuple[Correction, int]:
-        """Return the correction after one round, and its number of updates; each is for one image,
-        in turn."""
-        now = Correction(start.turns.clone(), start.shift.clone())
-        moments = [torch.zeros_like(x) for x in (now.turns, now.turns, now.shift, now.shift)]
-        window = len(self.images) * math.ceil(WINDOW / len(self.images))
+    none = start.trans.new_zeros(len(start.rotations) + 1, 3)
+    heights = [
+        x.cameras.height if x.alpha is None else int((x.alpha > 0).any(1).sum()) for x in images
+    ]
+    coarse = max(1, round(max(heights) / COARSE_PX))
+    found = none if guess is None else better(none, guess, coarse)
+    factors = [(slice(-1, None), SHIFT_RATE)]
+    if len(images) >= comparison.views_to_turn:
+        factors.append((slice(-1), 1.0))
+    window = len(images) * math.ceil(WINDOW / len(images))
+    count = 0
+    shrinks = coarse, round(math.sqrt(coarse)), 1
+    for shrink, rate, last in zip(shrinks, FIRST_RATES, LAST_RATES, strict=True):
+        found = found.clone()
+        moments = torch.zeros_like(found), torch.zeros_like(found)
         before = math.inf
         update = 0
-        for _ in range(self.comparison.most_windows or MOST_WINDOWS):
+        for _ in range(comparison.most_windows or MOST_WINDOWS):
             total = 0.0
             for _ in range(window):
                 update += 1
-                leaves = now.leaves()
+                leaf = found.clone().requires_grad_()
                 with torch.enable_grad():
-                    loss = self._loss(leaves, (self.images[update % len(self.images)],), shrink)
-                    by_turns, by_shift = torch.autograd.grad(loss, [leaves.turns, leaves.shift])
+                    loss = loss_of(leaf, (images[update % len(images)],), shrink)
+                    gradient = torch.autograd.grad(loss, leaf)[0]
                 total += float(loss.detach())
-                if len(self.images) >= self.comparison.views_to_turn:
-                    adam_step_(now.turns, by_turns, *moments[:2], lr=rate, step=update, betas=BETAS)
-                adam_step_(
-                    now.shift,
-                    by_shift,
-                    *moments[2:],
-                    lr=SHIFT_RATE * rate,
-                    step=update,
-                    betas=BETAS,
-                )
+                for rows, factor in factors:
+                    adam_step_(
+                        found[rows],
+                        gradient[rows],
+                        *(x[rows] for x in moments),
+                        lr=factor * rate,
+                        step=update,
+                        betas=BETAS,
+                    )
             if total > (1 - LEAST_GAIN) * before:
                 rate /= 2
                 if rate < last:
                     break
             before = total
-        return now, update
-
-    def _loss(self, correction: Correction, images: Sequence[Image], shrink: int) -> Tensor:
-        """Return the loss () of a correction: the mean over ``images``, compared after shrinking,
-        and its size."""
-        start = self.start
-        how = self.comparison
-        posing = BodyPose(
-            start.rotations[0] @ axis_angle_to_matrix(correction.turns),
-            start.trans[0] + correction.shift * start.scale[0],
-            start.scale[0],
-        )
-        moment = self.scene.in_pose(posing, self.time)
-        losses = []
-        for image in images:
-            drawn = self.scene.render(
-                image.cameras, moment, options=self.scene.options, background=self.background
-            )
-            losses.append(how.difference(drawn, image, self.background, shrink))
-        size = (
-            how.turn_weight * correction.turns.square().mean()
-            + how.shift_weight * correction.shift.square().mean()
-        )
-        return torch.stack(losses).mean() + size
+        count += update
+    return better(none, found, 1), count
 
 
 TRIED = 3  # time steps at which a view is left out
@@ -328,7 +285,7 @@ class PoseRefit:
             map(self._is_fitted, range(len(scene.clip)))
         )
 
-    def revised(self, scene: HumanScene, step: int) -> tuple[HumanScene, str] | None:
+    def edit_scene(self, scene: HumanScene, step: int) -> tuple[HumanScene, str] | None:
         """Return the scene as it is after ``step``, and a line if that was decided; None: nothing
         is to do."""
         since = [step - start for start in self._starts if start <= step]
@@ -371,24 +328,19 @@ class PoseRefit:
         found = self._fitted(scene, self._groups[row]).played if self._is_fitted(row) else None
         if found is None:
             return scene
-        clip = scene.clip
-        poses = clip.poses.clone()
-        trans = clip.trans.clone()
-        poses[row] = found.poses[0]
-        trans[row] = found.trans[0]
+        clip = {"poses": scene.clip.poses.clone(), "trans": scene.clip.trans.clone()}
         with torch.no_grad():
-            for name in ("poses", "trans"):
+            for name, x in clip.items():
+                x[row] = getattr(found, name)[0]
                 scene.learned[name][row] = 0
-        return replace(scene, clip=replace(clip, poses=poses, trans=trans))
+        return replace(scene, clip=replace(scene.clip, **clip))
 
     def _is_fitted(self, row: int) -> bool:
         return len(self._groups[row]) > 1
 
     def _fitted(self, scene: HumanScene, which: list[int]) -> HumanScene:
         still = replace(scene, gaussians=scene.gaussians.detach())
-        return fitted_to_images(
-            still, self._images, self._background, self._comparison, which
-        ).scene
+        return fitted_to_images(still, self._images, self._background, self._comparison, which)[0]
 
     @torch.no_grad()
     def _psnr(self, scene: HumanScene, index: int) -> float:
@@ -396,10 +348,9 @@ class PoseRefit:
         drawn = scene.render(
             image.cameras, image.time, options=scene.options, background=self._background
         ).rgb[0]
-        box = (None if image.alpha is None else silhouette_box(image.alpha)) or (
-            slice(None),
-            slice(None),
-        )
+        box = None if image.alpha is None else silhouette_box(image.alpha)
+        if box is None:
+            box = slice(None), slice(None)
         mask = None if image.mask is None else image.mask[box]
         return psnr(drawn[box], image.composite(self._background)[box], mask)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -22,10 +22,8 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
-from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import (
     LEFT_OUT,
-    TERMS,
     Anchors,
     BodyPose,
     Light,
@@ -73,28 +71,23 @@ class HumanScene(GaussianScene, Posable):
             "learned.weights", torch.zeros_like(tensors["anchors.weights"])
         )  # files hold the sum of both
         require_avatar(gaussians, tensors)
-        anchors = Anchors(
-            **{field.name: tensors[f"anchors.{field.name}"] for field in fields(Anchors)}
-        )
-        given = (tensors[f"clip.{name}"] for name in ("times", "poses", "trans", "scale"))
-        clip = MotionClip(*given)
+        anchors = Anchors(**part_of(tensors, "anchors"))
+        clip = MotionClip(**part_of(tensors, "clip"))
         skeleton = Skeleton(tensors["joints"], tuple(tensors["parents"].tolist()))
-        own = part_of(tensors, "learned")
+        learned = part_of(tensors, "learned")
         shapes = None
         if "shapes.directions" in tensors:
-            require_shapes(
-                tensors["shapes.directions"], tensors["shapes.faces"], len(tensors["joints"])
-            )
             shapes = PoseBlendShapes(
                 tensors["shapes.directions"].float(), tensors["shapes.faces"].long()
             )
-        learned = new_corrections(clip, skeleton, anchors, own.get("normals")).restored(own)
         return HumanScene(
             gaussians=gaussians,
             anchors=anchors,
             skeleton=skeleton,
             clip=clip,
-            learned=learned,
+            learned=new_corrections(clip, skeleton, anchors, learned.get("normals")).restored(
+                learned
+            ),
             shapes=shapes,
             seen=tensors.get("seen"),
         )
@@ -151,15 +144,6 @@ class HumanScene(GaussianScene, Posable):
         )
 
     @property
-    def up(self) -> Tensor:
-        """The up direction (3,) of the world, as training saw it."""
-        from dyngs.human.motion.placement import up_direction
-
-        if "up" not in self._derived:
-            self._derived["up"] = up_direction(self.clip)
-        return self._derived["up"]
-
-    @property
     def left_out(self) -> tuple[str, ...]:
         """Notes about what files without learned light leave out."""
         return () if self.light is None else (LEFT_OUT,)
@@ -182,26 +166,27 @@ class HumanScene(GaussianScene, Posable):
 
         Who keeps one pose is posed once, but for gradients.
         """
-        if not self.is_static or torch.is_grad_enabled():
-            return self._posed(time)
-        if "posed" not in self._derived:
-            self._derived["posed"] = self._posed(None)
-        return replace(self._derived["posed"], time=clamped_time(time))
-
-    def _posed(self, time: float | None) -> GaussianTimeStep:
         now = clamped_time(time)
-        return self.in_pose(frame_pose(self.moves_as.at(now), 0), now)
+        kept = self._derived.get("posed")
+        if kept is not None and not torch.is_grad_enabled():
+            return replace(kept, time=now)
+        posed = self.in_pose(frame_pose(self.moves_as.at(now), 0), now)
+        if self.is_static and not torch.is_grad_enabled():
+            self._derived["posed"] = posed
+        return posed
 
     def in_pose(self, posing: BodyPose, time: float) -> GaussianTimeStep:
         """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable
         in the pose."""
+        gaussians = self._posed(posing, self.weights, self.learned_skeleton, self.light)
+        frame = RestFrame(self.gaussians.means, posing.rotations[0])
+        return GaussianTimeStep(gaussians, time, frame)
+
+    def _posed(
+        self, posing: BodyPose, weights: Tensor, skeleton: Skeleton, light: Light | None
+    ) -> Gaussians:
         offsets = rest_offsets(self.anchors, posing, self.shapes)
-        gaussians = pose_gaussians(
-            self.gaussians, self.weights, self.learned_skeleton, posing, offsets, self.light
-        )
-        return GaussianTimeStep(
-            gaussians, time, RestFrame(self.gaussians.means, posing.rotations[0])
-        )
+        return pose_gaussians(self.gaussians, weights, skeleton, posing, offsets, light)
 
     def in_frame(self, row: int, given_weights: Tensor | None = None) -> tuple[Gaussians, BodyPose]:
         """Return the Gaussians in frame ``row`` of the clip of training; differentiable in all that
@@ -209,19 +194,13 @@ class HumanScene(GaussianScene, Posable):
 
         With ``given_weights`` (N, J) nothing that was learned about the body is applied.
         """
-        skeleton = self.skeleton
-        light = None
-        if given_weights is None:
-            posing = corrected_pose(self.learned, self.clip, row)
-            skeleton = corrected_skeleton(self.learned, skeleton)
-            weights = skinning_weights(self.anchors, len(skeleton.joints), self.learned["weights"])
-            light = learned_light(self.learned)
-        else:
+        if given_weights is not None:
             posing = frame_pose(self.clip, row)
-            weights = given_weights
-        offsets = rest_offsets(self.anchors, posing, self.shapes)
-        gaussians = pose_gaussians(self.gaussians, weights, skeleton, posing, offsets, light)
-        return gaussians, posing
+            return self._posed(posing, given_weights, self.skeleton, None), posing
+        posing = corrected_pose(self.learned, self.clip, row)
+        skeleton = corrected_skeleton(self.learned, self.skeleton)
+        weights = skinning_weights(self.anchors, len(skeleton.joints), self.learned["weights"])
+        return self._posed(posing, weights, skeleton, learned_light(self.learned)), posing
 
     def given_weights(self) -> Tensor:
         """Return (N, J) skinning weights of the template."""
@@ -308,9 +287,10 @@ class HumanScene(GaussianScene, Posable):
         if self.seen is not None:
             state["seen"] = StateTensor(self.seen, Role.PER_GAUSSIAN)
         given = {
-            f"clip.{name}": getattr(clip, name) for name in ("times", "poses", "trans", "scale")
-        }
-        given |= {
+            "clip.times": clip.times,
+            "clip.poses": clip.poses,
+            "clip.trans": clip.trans,
+            "clip.scale": clip.scale,
             "joints": skeleton.joints,
             "parents": torch.tensor(skeleton.parents, device="cpu"),
         }
@@ -323,18 +303,20 @@ class HumanScene(GaussianScene, Posable):
 
 
 def first_scene(
-    gaussians: Gaussians, subject: Subject, normals: Tensor | None = None
+    gaussians: Gaussians,
+    anchors: Anchors,
+    skeleton: Skeleton,
+    clip: MotionClip,
+    shapes: PoseBlendShapes | None = None,
 ) -> HumanScene:
-    """Return the scene of the first Gaussians: nothing is learned yet; light only with their
-    ``normals`` (N, 3)."""
-    clip = subject.motion.clip
+    """Return the scene of the first Gaussians, on their ``anchors``: nothing is learned yet."""
     return HumanScene(
         gaussians=gaussians,
-        anchors=subject.anchors,
-        skeleton=subject.skeleton,
+        anchors=anchors,
+        skeleton=skeleton,
         clip=clip,
-        learned=new_corrections(clip, subject.skeleton, subject.anchors, normals),
-        shapes=subject.shapes,
+        learned=new_corrections(clip, skeleton, anchors),
+        shapes=shapes,
     )
 
 
@@ -343,60 +325,52 @@ def avatar_of(scene: Renderable) -> HumanScene | None:
     return scene if isinstance(scene, HumanScene) else None
 
 
-_MOST_FACES = 2**31
-
-
 def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
     """Check the state of an avatar against its Gaussians. Raises KeyError or ValueError."""
     n = len(gaussians)
     j = len(state["joints"])
     f = len(state["clip.times"])
-    require_body(n, gaussians.sh.shape[1], state["parents"], j)
-    require_moments("clip.times", state["clip.times"])
+    terms = gaussians.sh.shape[1]
+    parents = state["parents"]
     k = state["anchors.weights"].shape[-1]
-    shapes = dict.fromkeys(("joints", "learned.joints", "learned.turns"), (j, 3))
-    shapes |= dict.fromkeys(("clip.poses", "learned.poses"), (f, j, 3))
-    shapes |= dict.fromkeys(("clip.trans", "learned.trans"), (f, 3))
-    shapes |= dict.fromkeys(("anchors.weights", "learned.weights"), (n, k))
-    shapes |= dict.fromkeys(("anchors.points", "anchors.barycentric"), (n, 3))
-    shapes |= dict.fromkeys(("anchors.size", "anchors.height"), (n,))
-    shapes |= {"clip.scale": (f,), "learned.log_scale": (1,), "anchors.uv": (n, 2)}
-    if "learned.light" in state:
-        shapes |= {"learned.light": (TERMS, 3), "learned.normals": (n, 3)}
+    if not n or not f or j not in SMPLX_ROWS or terms not in (1, 4):
+        raise ValueError(f"{n} Gaussians of {terms} harmonics on {j} joints in {f} frames")
+    if parents.is_floating_point() or tuple(parents.shape) != (j,):
+        raise ValueError(
+            f"'parents' is {parents.dtype} {tuple(parents.shape)}, not whole numbers ({j},)"
+        )
+    check_tree(tuple(parents.tolist()))
+    require_moments("clip.times", state["clip.times"])
+    shapes = {
+        "joints": (j, 3),
+        "clip.poses": (f, j, 3),
+        "clip.trans": (f, 3),
+        "clip.scale": (f,),
+        "anchors.weights": (n, k),
+        "anchors.points": (n, 3),
+        "anchors.barycentric": (n, 3),
+        "anchors.size": (n,),
+        "anchors.height": (n,),
+        "anchors.uv": (n, 2),
+    }
+    if "learned.normals" in state:
+        shapes["learned.normals"] = (n, 3)
     if "seen" in state:
         shapes["seen"] = (n,)
     for name, shape in shapes.items():
         require_tensor(name, state[name], shape)
     require_positive("clip.scale", state["clip.scale"])
-    if not f:
-        raise ValueError("the clip has no frame")
     weights = state["anchors.weights"]
     if bool((weights < 0).any()) or not bool((weights.sum(1) > 0).all()):
         raise ValueError("the skinning weights of a Gaussian are negative or sum to 0")
-    faces = len(state["shapes.faces"]) if "shapes.directions" in state else _MOST_FACES
+    faces = 2**31  # those of a template without shapes are not there
+    if "shapes.directions" in state:
+        directions = state["shapes.directions"]
+        require_tensor("shapes.directions", directions, (9 * (j - 1), None), torch.float16)
+        vertices, rest = divmod(directions.shape[1], 3)
+        if rest:
+            raise ValueError("'shapes.directions' has not three columns for each vertex")
+        faces = len(state["shapes.faces"])
+        require_indices("shapes.faces", state["shapes.faces"], (None, 3), vertices, torch.int32)
     require_indices("anchors.joints", state["anchors.joints"], (n, k), j)
     require_indices("anchors.face", state["anchors.face"], (n,), faces)
-    if "near" in state:
-        require_indices("near", state["near"], (n, None), n)
-
-
-def require_body(num_gaussians: int, terms: int, parents: Tensor, num_joints: int) -> None:
-    """Check that the Gaussians have 1 or 4 harmonics and the skeleton is of a known family. Raises
-    ValueError."""
-    if num_joints not in SMPLX_ROWS or terms not in (1, 4):
-        raise ValueError(f"{num_gaussians} Gaussians of {terms} harmonics on {num_joints} joints")
-    if parents.is_floating_point() or tuple(parents.shape) != (num_joints,):
-        raise ValueError(
-            f"'parents' is {parents.dtype} {tuple(parents.shape)}, not whole numbers ({num_joints},)"
-        )
-    check_tree(tuple(parents.tolist()))
-
-
-def require_shapes(directions: Tensor, faces: Tensor, num_joints: int) -> None:
-    """Check the pose blend shapes of a template with J joints. Raises ValueError."""
-    require_tensor("shapes.directions", directions, (9 * (num_joints - 1), None), torch.float16)
-    require_indices("shapes.faces", faces, (None, 3), directions.shape[1] // 3, torch.int32)
-    if directions.shape[1] % 3:
-        raise ValueError(
-            f"'shapes.directions' has {directions.shape[1]} columns, not three for each vertex"
-        )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from dyngs.config import Config
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture
@@ -12,10 +14,11 @@ from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.scene import drawn_as_trained
 from dyngs.gaussians.schedule import rates_of
 from dyngs.gaussians.start import colours_of, densifier_of
-from dyngs.human.avatar.observations import Subject, in_colours_of
+from dyngs.human.avatar.observations import in_colours_of
 from dyngs.human.avatar.pose_fit import PoseRefit
 from dyngs.human.avatar.posing import (
     Skeleton,
+    new_corrections,
     pixel_size,
     pose_blend_shapes,
     rest_normals,
@@ -26,7 +29,7 @@ from dyngs.human.avatar.scene import HumanScene, first_scene
 from dyngs.human.avatar.training import HumanTraining, outline_loss
 from dyngs.human.body.body_reader import load_template, rest_shape
 from dyngs.human.keys import NO_BODY, HumanModel
-from dyngs.human.motion.motion import captured_motion
+from dyngs.human.motion.motion import CapturedMotion, captured_motion
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.views import evaluation_background, training_cameras
@@ -40,11 +43,10 @@ def start(run: RunStart) -> GaussianModel:
     Raises DyngsError: a capture without body parameters, or a template that cannot be read.
     """
     config = run.config
-    model = run.config.model
-    if not isinstance(model, HumanModel):
-        raise TypeError(f"not a person: {model!r}")
-    gaussians, subject = human_start(config, model, run.capture, run.images)
-    colours = colours_of(run, gaussians, sees_time=False)
+    model = config.model
+    assert isinstance(model, HumanModel)
+    scene, motion = human_start(config, model, run.capture, run.images)
+    colours = colours_of(run, scene.gaussians, sees_time=False)
     filmed = run.capture.splits["train"]
     cameras = training_cameras(filmed, config.data)
     views = [(camera, view.frame or 0) for camera, view in zip(cameras, filmed, strict=True)]
@@ -55,9 +57,11 @@ def start(run: RunStart) -> GaussianModel:
         if model.refine and config.train.minutes is None
         else None
     )
-    training = HumanTraining(model, subject.motion.frames, rates_of(config), views, outlines, refit)
-    lit = model.light and model.refine and colours.network is None
-    scene = first_scene(gaussians, subject, rest_normals(gaussians) if lit else None)
+    training = HumanTraining(model, motion.frames, rates_of(config), views, outlines, refit)
+    if model.light and model.refine and colours.network is None:
+        normals = rest_normals(scene.gaussians)
+        learned = new_corrections(scene.clip, scene.skeleton, scene.anchors, normals)
+        scene = replace(scene, learned=learned)
     return GaussianModel(run, scene, training, densifier_of(run), colours)
 
 
@@ -71,8 +75,8 @@ def restore(model: HumanModel, checkpoint: Checkpoint) -> HumanScene:
 
 def human_start(
     config: Config, model: HumanModel, capture: Capture, images: ImageLoader
-) -> tuple[Gaussians, Subject]:
-    """Return the first Gaussians of a person, and the person.
+) -> tuple[HumanScene, CapturedMotion]:
+    """Return a person before the first step, and the clip of training.
 
     Raises DyngsError: a capture without body parameters, or a template that cannot be read.
     """
@@ -92,6 +96,7 @@ def human_start(
         body, model.resolution, vertices, pixel_size(cameras, filmed.clip, joints[0])
     )
     gaussians, anchors, normals = surface_gaussians(parts, sh_degree)
-    subject = Subject(Skeleton(joints, body.parents), anchors, filmed, pose_blend_shapes(body))
+    skeleton = Skeleton(joints, body.parents)
+    scene = first_scene(gaussians, anchors, skeleton, filmed.clip, pose_blend_shapes(body))
     shown = (images[i] for i in evenly_spaced(len(images), FIRST_VIEWS))
-    return in_colours_of(gaussians, normals, subject, shown), subject
+    return in_colours_of(scene, filmed.rows, normals, shown), filmed

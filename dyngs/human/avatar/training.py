@@ -29,7 +29,7 @@ from dyngs.human.avatar.observations import (
     mirror_images,
     sightings,
     strains,
-    trust_in,
+    visibility_confidence,
 )
 from dyngs.human.avatar.pose_fit import PoseRefit
 from dyngs.human.avatar.posing import (
@@ -58,14 +58,6 @@ WORTH_TELLING = 0.01
 _STRIP = 32  # rows whose median is taken at once
 
 
-@dataclass(frozen=True)
-class Plate:
-    """What stands behind the person before one camera."""
-
-    colours: Tensor  # (H, W, 3)
-    known: Tensor  # (H, W) bool: seen without the person often enough
-
-
 class OutlineLoss(Loss):
     """L1 and D-SSIM of the image; in masks and up to ``REACH`` px around them, before the plate
     where that is known.
@@ -76,7 +68,7 @@ class OutlineLoss(Loss):
     def __init__(
         self,
         photos: ImageLoader,
-        plates: Mapping[int, Plate],
+        plates: Mapping[int, tuple[Tensor, Tensor]],
         behind: Tensor,
         ssim_weight: float,
         known: float,
@@ -85,16 +77,15 @@ class OutlineLoss(Loss):
 
         Args:
             photos: the training images as they were taken.
-            plates: by the number of the camera.
+            plates: colours (H, W, 3) behind the person by the number of the camera, and where (H,
+                W) they are known: seen without the person often enough.
             behind: (3,) colour of the run's background.
             known: fraction of the pixels near outlines where a plate is known, for people.
         """
-        self._photos, self._plates, self._behind, self._ssim_weight = (
-            photos,
-            plates,
-            behind,
-            ssim_weight,
-        )
+        self._photos = photos
+        self._plates = plates
+        self._behind = behind
+        self._ssim_weight = ssim_weight
         self.finding = (
             f"masks are found ones: {known:.0%} of the pixels at their outlines are compared before what other frames "
             "show behind the person"
@@ -105,10 +96,10 @@ class OutlineLoss(Loss):
         truth = look.truth
         plate = self._plates.get(self._photos.views[look.index].camera_id)
         alpha = look.image.alpha
-        if plate is not None and alpha is not None and truth.shape == plate.colours.shape:
+        if plate is not None and alpha is not None and truth.shape == plate[0].shape:
             photo = self._photos[look.index].rgb_premultiplied
             colours, known, photo, behind = (
-                sent(x, rendered.device) for x in (plate.colours, plate.known, photo, self._behind)
+                sent(x, rendered.device) for x in (*plate, photo, self._behind)
             )
             use = (known & _near(alpha))[..., None]
             seen = look.drawn.rendering.transmittance[0][..., None]
@@ -133,20 +124,20 @@ def outline_loss(run: RunStart) -> OutlineLoss | None:
     photos = ImageLoader([replace(view, silhouette=None) for view in views], config.data)
     if photos[0].alpha is not None:
         return None
-    plates: dict[int, Plate] = {}
+    plates: dict[int, tuple[Tensor, Tensor]] = {}
     known = total = 0.0
     for camera, rows in _standing(views).items():
         shown = [rows[i] for i in evenly_spaced(len(rows), FRAMES)]
-        near = torch.stack([_near(x) for i in shown if (x := run.images[i].alpha) is not None])
-        plate = _plate(torch.stack([_bytes(photos[i].rgb_premultiplied) for i in shown]), near)
+        alphas = torch.stack([x for i in shown if (x := run.images[i].alpha) is not None])
+        near = _near(alphas)
+        bare = [(255 * photos[i].rgb_premultiplied).round().byte() for i in shown]
+        plate = _plate(torch.stack(bare), near)
         if plate is None:
             continue
         plates[camera] = plate
-        rims = near & ~torch.stack(
-            [x > 1 - OUTSIDE for i in shown if (x := run.images[i].alpha) is not None]
-        )
-        known = known + float((rims & plate.known).sum())
-        total = total + float(rims.sum())
+        rims = near & (alphas <= 1 - OUTSIDE)
+        known += float((rims & plate[1]).sum())
+        total += float(rims.sum())
     if not plates or known < WORTH_TELLING * total:
         return None
     return OutlineLoss(
@@ -170,17 +161,15 @@ def _standing(views: Sequence[View]) -> dict[int, list[int]]:
 
 
 def _near(alpha: Tensor) -> Tensor:
-    """Return where (H, W) the mask is, and up to ``REACH`` px around it."""
+    """Return where (..., H, W) the mask is, and up to ``REACH`` px around it."""
     size = 2 * REACH + 1
-    return torch.nn.functional.max_pool2d(alpha[None, None], size, 1, REACH)[0, 0] > OUTSIDE
+    grown = torch.nn.functional.max_pool2d(alpha[..., None, :, :], size, 1, REACH)
+    return grown[..., 0, :, :] > OUTSIDE
 
 
-def _bytes(rgb: Tensor) -> Tensor:
-    return (255 * rgb).round().byte()
-
-
-def _plate(photos: Tensor, near: Tensor) -> Plate | None:
-    """Return the median of photos (F, H, W, 3) uint8 over those that show no person at a pixel.
+def _plate(photos: Tensor, near: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Return the median of photos (F, H, W, 3) uint8 over those that show no person at a pixel, and
+    where it is known.
 
     ``near`` (F, H, W) says where the person may be. None: it is not one thing, or never seen.
     """
@@ -196,7 +185,7 @@ def _plate(photos: Tensor, near: Tensor) -> Plate | None:
     differences = differences[~differences.isnan()]
     if not len(differences) or float(differences.median()) > STANDS:
         return None
-    return Plate(colours, known)
+    return colours, known
 
 
 @dataclass(frozen=True)
@@ -242,13 +231,15 @@ class HumanTraining(SceneTraining[HumanScene]):
         outlines: OutlineLoss | None = None,
         refit: PoseRefit | None = None,
     ) -> None:
-        self.options, self.rates, self.views, self.colour_loss = options, rates, views, outlines
+        self.options = options
+        self.rates = rates
+        self.views = views
+        self.colour_loss = outlines
         self._finding = None if outlines is None else outlines.finding
         self.refines_from = round(PARAMS.refine_from * rates.steps)
         self.frames_from = round(PARAMS.frames_from * rates.steps)
         self._rows = {frame: row for row, frame in enumerate(frames)}
         self._has_refined = False
-        self._given_weights: Tensor | None = None
         self._near: Tensor | None = None
         self._images: tuple[Tensor, Tensor] | None = None
         self._refit = refit
@@ -258,21 +249,38 @@ class HumanTraining(SceneTraining[HumanScene]):
 
         Raises DyngsError: the image's frame has no pose.
         """
-        row = self._rows.get(-1 if image.frame is None else image.frame)
-        if row is None:
+        if image.frame not in self._rows:
             raise DyngsError(f"view {image.name!r}: no body parameters for frame {image.frame}")
-        penalties = self._penalties(scene)
-        row = min(row, len(scene.clip) - 1)  # who never moves has one row
-        gaussians, posing = self._in_frame(scene, row, step)
+        row = self._row(scene, image.frame)
+        rest = scene.gaussians
+        anchors = scene.anchors
+        away = (rest.means - anchors.points) / CENTIMETRE
+        longer = (rest.log_scales - anchors.size.log()[:, None]).clamp_min(0)
+        penalties = {
+            "offset": PARAMS.offset_weight * away.square().sum() / len(away),
+            "scale": PARAMS.scale_weight * longer.square().sum() / len(longer),
+        }
+        moved, posing = self._in_frame(scene, row, step)
         if self._refines(step):
             penalties |= correction_penalties(scene.learned)
             if scene.light is not None:
-                penalties["sides"] = PARAMS.sides_weight * difference_of_sides(
-                    scene.gaussians, *self._images_in(scene)
-                )
-        penalties |= self._between_neighbours(scene, gaussians, scene.clip.scale[row], step)
-        frame = RestFrame(scene.gaussians.means, posing.rotations[0])
-        return GaussianTimeStep(gaussians, image.time, frame, penalties)
+                if self._images is None:
+                    self._images = mirror_images(anchors, float(scene.skeleton.joints[0, 0]))
+                unlike = difference_of_sides(rest, *self._images)
+                penalties["sides"] = PARAMS.sides_weight * unlike
+        if self._near is None:
+            weights = scene.given_weights()
+            self._near = linked_neighbours(anchors.points, weights, PARAMS.neighbours)
+        if self._near.shape[1]:
+            # in each step between neighbours of one of the five columns, in cm^2: distances do not
+            # change, and offsets from the scaffold are alike
+            near = self._near[:, step % self._near.shape[1]]
+            scale = scene.clip.scale[row]
+            strain, uneven = strains(rest.means, moved.means, anchors.points, near, scale)
+            penalties["rigidity"] = PARAMS.rigidity * strain / CENTIMETRE**2
+            penalties["smoothness"] = PARAMS.smoothness * uneven / CENTIMETRE**2
+        frame = RestFrame(rest.means, posing.rotations[0])
+        return GaussianTimeStep(moved, image.time, frame, penalties)
 
     def optimize(self, scene: HumanScene, step: int) -> Count:
         """Update the corrections."""
@@ -299,45 +307,36 @@ class HumanTraining(SceneTraining[HumanScene]):
         if step == 1 and self._finding is not None:
             return scene, EditResult(None, finding=self._finding)
         if step == self.rates.steps:
-            return (
-                self._filled(scene, step)
-                if self.options.fill_unseen and self.views and len(scene)
-                else None
-            )
-        found = None if self._refit is None else self._refit.revised(scene, step)
+            has_views = self.options.fill_unseen and self.views and len(scene)
+            return self._filled(scene, step) if has_views else None
+        found = None if self._refit is None else self._refit.edit_scene(scene, step)
         return None if found is None else (found[0], EditResult(None, finding=found[1] or None))
 
     def _filled(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult]:
         shown = [self.views[i] for i in evenly_spaced(len(self.views), PARAMS.views)]
-        last = len(scene.clip) - 1
+        device = scene.skeleton.joints.device
         with torch.no_grad():
             drawn = (
-                (
-                    self._in_frame(scene, min(self._rows[frame], last), step)[0],
-                    camera.to(device=scene.skeleton.joints.device),
-                )
+                (self._in_frame(scene, self._row(scene, frame), step)[0], camera.to(device=device))
                 for camera, frame in shown
             )
-            seen = sightings(
-                drawn, scene.anchors.size, float(scene.clip.scale.mean()), scene.options
-            )
-            trust = trust_in(seen * (len(self.views) / len(shown)))
+            size = scene.anchors.size
+            seen = sightings(drawn, size, float(scene.clip.scale.mean()), scene.options)
+            trust = visibility_confidence(seen * (len(self.views) / len(shown)))
             middle = float(scene.skeleton.joints[0, 0])
-            changes = filled(
-                scene.gaussians.detach(), scene.anchors, scene.given_weights(), middle, trust
-            )
+            gaussians = scene.gaussians.detach()
+            changes = filled(gaussians, scene.anchors, scene.given_weights(), middle, trust)
         hardly = float((trust < HARDLY).float().mean())
         line = f"{hardly:.0%} of the surface is hardly seen: filled from the other side of the body and from around it"
         finding = line if hardly >= PARAMS.worth_telling else None
         return replace(scene, seen=trust), EditResult(None, changes, finding=finding)
 
     def follow(self, edit: TopologyEdit | None = None) -> None:
-        """Find out anew who the neighbours are, and what they weigh."""
-        self._given_weights = self._near = self._images = None
+        """Find out anew who the neighbours are."""
+        self._near = self._images = None
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
         self.follow()
-        self._near = tensors.get("near")
         if "refines_from" in tensors:  # the run may have become longer since
             self._has_refined = True
             self.refines_from = min(self.refines_from, int(tensors["refines_from"]))
@@ -346,57 +345,20 @@ class HumanTraining(SceneTraining[HumanScene]):
         return HumanScene.restored(gaussians, tensors)
 
     def state(self) -> State:
-        kept = {} if self._near is None else {"near": self._near}
+        kept = {}
         if self._refit is not None and not self._refit.goes_on:
             kept["poses_stay"] = torch.ones(1, device="cpu")
         if self._has_refined:
             kept["refines_from"] = torch.tensor(self.refines_from, device="cpu")
         return with_role(kept, Role.TRAINING)
 
+    def _row(self, scene: HumanScene, frame: int) -> int:
+        """Return the row of ``frame`` in the clip; who never moves has one row."""
+        return min(self._rows[frame], len(scene.clip) - 1)
+
     def _in_frame(self, scene: HumanScene, row: int, step: int) -> tuple[Gaussians, BodyPose]:
         """Return the Gaussians in row ``row`` of the clip as ``step`` draws them, and the pose."""
-        if self._refines(step):
-            return scene.in_frame(row)
-        if self._given_weights is None:
-            self._given_weights = scene.given_weights()
-        return scene.in_frame(row, self._given_weights)
-
-    def _images_in(self, scene: HumanScene) -> tuple[Tensor, Tensor]:
-        if self._images is None:
-            self._images = mirror_images(scene.anchors, float(scene.skeleton.joints[0, 0]))
-        return self._images
+        return scene.in_frame(row, None if self._refines(step) else scene.given_weights())
 
     def _refines(self, step: int) -> bool:
         return self.options.refine and step > self.refines_from
-
-    def _penalties(self, scene: HumanScene) -> dict[str, Tensor]:
-        """Return penalties for Gaussians far from their scaffolds, or larger than their texels."""
-        now = scene.gaussians
-        away = (now.means - scene.anchors.points) / CENTIMETRE
-        longer = now.log_scales - scene.anchors.size.log()[:, None]
-        return {
-            "offset": PARAMS.offset_weight * away.square().sum() / len(away),
-            "scale": PARAMS.scale_weight * longer.clamp_min(0).square().sum() / len(longer),
-        }
-
-    def _between_neighbours(
-        self, scene: HumanScene, moved: Gaussians, scale: Tensor, step: int
-    ) -> dict[str, Tensor]:
-        """Return penalties between neighbours at rest, in cm^2; in each step for one of the five
-        neighbours.
-
-        Rigidity: distances do not change. Smoothness: offsets from the scaffold are alike.
-        """
-        means = scene.gaussians.means
-        if self._near is None:
-            self._near = linked_neighbours(
-                scene.anchors.points, scene.given_weights(), PARAMS.neighbours
-            )
-        if not self._near.shape[1]:
-            return {}
-        near = self._near[:, step % self._near.shape[1]]
-        strain, uneven = strains(means, moved.means, scene.anchors.points, near, scale)
-        return {
-            "rigidity": PARAMS.rigidity * strain / CENTIMETRE**2,
-            "smoothness": PARAMS.smoothness * uneven / CENTIMETRE**2,
-        }

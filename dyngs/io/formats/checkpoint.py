@@ -7,7 +7,6 @@ import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,32 +31,22 @@ def read_checkpoint(path: Path) -> SplatFile:
         raise DyngsError(
             f"{path}: holds no Gaussians as nerfstudio's splatfacto and gsplat store them; {_HINT}"
         )
-    count = found["means"].shape[0] if found["means"].shape else 0
+    count = len(found["means"])
     require_at_most(path, count, MOST_GAUSSIANS, "Gaussians")
-
-    def numbers(name: str, width: int) -> np.ndarray:
-        tensor = found[name]
-        if tensor.numel() != count * width or not tensor.is_floating_point():
-            raise DyngsError(f"{path}: {name} should hold {count:,} x {width} floats; {_HINT}")
-        return tensor.detach().float().reshape(count, width).numpy()
-
-    values = {name: torch.from_numpy(numbers(name, width)) for name, width in _SHAPES.items()}
-    base = numbers(names[0], 3)
-    shape = found[names[1]].shape
-    terms = 1 + (shape[1] if len(shape) == 3 else 0)
-    if terms not in [num_sh_terms(degree) for degree in range(MAX_SH_DEGREE + 1)]:
-        raise DyngsError(
-            f"{path}: {terms} harmonics for each Gaussian are of no degree that is known; {_HINT}"
-        )
-    if terms == 1 and names == _NERFSTUDIO:  # then splatfacto stores logits of colours
-        base = (1 / (1 + np.exp(-base)) - 0.5) / SH_C0
-    rest = numbers(names[1], 3 * (terms - 1)).reshape(count, terms - 1, 3)
+    means, scales, quats, opacities = (
+        found[name].detach().float().reshape(count, width) for name, width in _SHAPES.items()
+    )
+    base, rest = (found[name].detach().float().reshape(count, -1, 3) for name in names)
+    if rest.shape[1] + 1 not in [num_sh_terms(degree) for degree in range(MAX_SH_DEGREE + 1)]:
+        raise ValueError(f"{rest.shape[1] + 1} harmonics are of no degree that is known")
+    if not rest.shape[1] and names == _NERFSTUDIO:  # then splatfacto stores logits of colours
+        base = (base.sigmoid() - 0.5) / SH_C0
     gaussians = Gaussians(
-        means=values["means"],
-        quats=unit_rotations(values["quats"]),
-        log_scales=values["scales"],
-        logit_opacities=values["opacities"][:, 0],
-        sh=torch.from_numpy(np.concatenate([base[:, None], rest], axis=1).astype(np.float32)),
+        means=means,
+        quats=unit_rotations(quats),
+        log_scales=scales,
+        logit_opacities=opacities[:, 0],
+        sh=torch.cat([base, rest], dim=1),
     )
     note = "in the frame of its training, which the program may have turned and scaled; z is taken for up"
     return SplatFile(gaussians, notes=(note,))

@@ -22,9 +22,8 @@ from dyngs.io.formats.similarity import (
     axis_of,
     turn_between,
 )
-from dyngs.io.formats.sog import SOG_META, read_sog, write_sog
+from dyngs.io.formats.sog import read_sog, write_sog
 from dyngs.io.formats.splat_file import (
-    GEO_OFFSET,
     Nonfinite,
     SplatFile,
     drawable,
@@ -96,24 +95,11 @@ def known_format(path: Path) -> Format | None:
 
 
 def format_to_read(path: Path) -> Format | None:
-    """Return the format that a file is read as: also a checkpoint, and a .sog as a folder; None if
-    it is none.
-
-    A run is none, whatever lies in its folder.
-    """
-    if (path / "config.yaml").is_file():
-        return None
-    if sog_meta(path) is not None:
-        return format_named("sog")
+    """Return the format that a file is read as, also a checkpoint; None if it is none, or a
+    folder."""
     if path.is_dir():
         return None
     return CHECKPOINT if path.suffix.lower() in CHECKPOINT.suffixes else known_format(path)
-
-
-def sog_meta(path: Path) -> Path | None:
-    """Return the ``meta.json`` that is, or lies in, ``path``; None: it is something else."""
-    inner = path if path.name == SOG_META else path / SOG_META
-    return inner if inner.is_file() else None
 
 
 def format_named(name: str) -> Format:
@@ -133,7 +119,7 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
     """Read a file of Gaussians; its suffix names the format.
 
     ``nonfinite``: "skip" leaves out Gaussians with NaN or Inf, with a note, "error" refuses the
-    file. Opacities of exactly 0 or 1 and sizes of 0 become finite, with a note. Raises DyngsError:
+    file. Opacities of exactly 0 or 1 and sizes of 0 become finite. Raises DyngsError:
     an unknown suffix, or not such a file, cut off, empty or non-finite; nothing large is allocated
     before the header has been compared with the size of the file.
     """
@@ -142,7 +128,6 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
     if not path.exists():
         raise DyngsError(f"{path}: no such file")
     require_regular(path)
-    path = sog_meta(path) or path
     with reading(path):
         splat = own.read(path)
         if splat.up is None:
@@ -231,10 +216,8 @@ def turned_file(
 def moved_file(splat: SplatFile, how: Similarity, up: str | None) -> SplatFile:
     """Return the contents rotated, scaled and shifted, so that it can be undone; ``up`` is what
     then points up."""
-    edited = replace(
-        splat, gaussians=how.gaussians(splat.gaussians), up=up, edited=how.after(splat.edited)
-    )
-    return edited if how == UNMOVED else _without_offset(edited)
+    gaussians = how.gaussians(splat.gaussians)
+    return replace(splat, gaussians=gaussians, up=up, edited=how.after(splat.edited))
 
 
 def undone_file(splat: SplatFile) -> SplatFile:
@@ -245,12 +228,4 @@ def undone_file(splat: SplatFile) -> SplatFile:
     if up is not None:
         before = back.rotation @ axis_of(up)
         up = next((name for name, axis in AXES.items() if before @ axis > 1 - 1e-6), None)
-    return _without_offset(
-        replace(splat, gaussians=back.gaussians(splat.gaussians), up=up, edited=UNMOVED)
-    )
-
-
-def _without_offset(splat: SplatFile) -> SplatFile:
-    return replace(
-        splat, comments=tuple(text for text in splat.comments if not text.startswith(GEO_OFFSET))
-    )
+    return replace(splat, gaussians=back.gaussians(splat.gaussians), up=up, edited=UNMOVED)

@@ -17,15 +17,14 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import torch
 
 from dyngs.core.conventions import MAX_SH_DEGREE, SH_C0, num_sh_terms
 from dyngs.core.gaussians import Gaussians, morton_order
+from dyngs.io.fields import require_at_most
 from dyngs.io.formats.packing import (
     logit,
     pack_fractions,
@@ -34,11 +33,11 @@ from dyngs.io.formats.packing import (
     whole_rotations,
 )
 from dyngs.io.formats.splat_file import (
+    MOST_GAUSSIANS,
     MOST_LOG_SCALE,
     SplatFile,
     described,
     header_comments,
-    require_count,
     unit_rotations,
 )
 
@@ -46,13 +45,13 @@ _DEGREE_OF_REST = {3 * (num_sh_terms(degree) - 1): degree for degree in range(MA
 _DC = tuple(f"f_dc_{i}" for i in range(3))
 _SCALE = tuple(f"scale_{i}" for i in range(3))
 _ROT = tuple(f"rot_{i}" for i in range(4))
-_REQUIRED = ("x", "y", "z", *_DC, "opacity", *_SCALE, *_ROT)
+_POSITION = ("x", "y", "z")
+_REQUIRED = (*_POSITION, *_DC, "opacity", *_SCALE, *_ROT)
 # SuperSplat's compressed .ply takes 16 bytes per Gaussian, in chunks of 256 that share their
 # ranges. Elements: chunk (smallest and largest position, logarithm of the scale and colour), vertex
 # (four packed uint32) and, with harmonics, sh (a byte per number, channel-major, from -4 to 4).
 _PER_CHUNK = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-_POSITION = ("x", "y", "z")
 _SIZE = ("scale_x", "scale_y", "scale_z")
 _COLOUR = ("r", "g", "b")
 _BITS_3 = (11, 10, 11)
@@ -62,19 +61,20 @@ _MOST_LOG = 20.0
 
 
 def read_ply(path: Path) -> SplatFile:
-    """Read a .ply, plain or compressed, binary or ascii, whatever its values are; properties may
-    have any order.
+    """Read a binary little-endian .ply, plain or compressed, whatever its values are; properties
+    may have any order.
 
     Means of a plain .ply are float64. Scalar types other than float32 are converted; other
     properties, and elements other than ``vertex``, are skipped.
     """
-    with open(path, "rb") as file:
-        header = read_header(file)
-        if "packed_position" in dict(header.elements["vertex"][1]):
-            gaussians = _read_compressed(header, file, path)
-        else:
-            gaussians = _gaussians(header.read(file, "vertex"))
-    return described(SplatFile(gaussians, comments=header.comments))
+    elements, comments = read_elements(path)
+    if "vertex" not in elements:
+        raise ValueError("it has no vertices, or list properties in or before them")
+    vertices = elements["vertex"]
+    require_at_most(path, len(vertices), MOST_GAUSSIANS, "Gaussians")
+    is_compressed = "packed_position" in (vertices.dtype.names or ())
+    gaussians = _unpacked(elements) if is_compressed else _gaussians(vertices)
+    return described(SplatFile(gaussians, comments=comments))
 
 
 def write_ply(
@@ -105,52 +105,44 @@ def write_ply(
 
 
 def _gaussians(rows: np.ndarray) -> Gaussians:
+    from numpy.lib.recfunctions import structured_to_unstructured
+
     present = rows.dtype.names or ()
+    count = sum(name.startswith("f_rest_") for name in present)
     missing = [name for name in _REQUIRED if name not in present]
-    rest_names = [name for name in present if name.startswith("f_rest_")]
-    if missing or len(rest_names) not in _DEGREE_OF_REST:
+    if missing or count not in _DEGREE_OF_REST:
         raise ValueError(
             f"it is no 3DGS .ply: its vertices have no {' '.join(missing[:6])}"
             if missing
-            else f"{len(rest_names)} f_rest properties are of no degree that is known"
+            else f"{count} f_rest properties are of no degree that is known"
         )
-
-    def columns(names: Sequence[str], dtype: type[np.floating] = np.float32) -> torch.Tensor:
-        out = np.empty((len(rows), len(names)), dtype=dtype)
-        with np.errstate(over="ignore"):
-            # doubles beyond float32 become Inf and are reported as such
-            for i, name in enumerate(names):
-                out[:, i] = rows[name]
-        return torch.from_numpy(out)
-
-    terms = len(rest_names) // 3
-    rest = columns([f"f_rest_{i}" for i in range(3 * terms)])
-    sh = [columns(_DC)[:, None], rest.reshape(len(rows), 3, terms).transpose(1, 2)]
+    names = ["opacity", *_SCALE, *_ROT, *_DC, *(f"f_rest_{i}" for i in range(count))]
+    with np.errstate(over="ignore"):
+        # doubles beyond float32 become Inf and are reported as such
+        table = structured_to_unstructured(rows[names], np.float32)
+        means = structured_to_unstructured(rows[list(_POSITION)], np.float64)
+    columns = torch.from_numpy(np.ascontiguousarray(table))
+    rest = columns[:, 11:].reshape(len(rows), 3, count // 3).transpose(1, 2)
     return Gaussians(
-        means=columns(("x", "y", "z"), np.float64),
-        quats=unit_rotations(columns(_ROT)),
-        log_scales=columns(_SCALE),
-        logit_opacities=columns(("opacity",))[:, 0],
-        sh=torch.cat(sh, dim=1).contiguous(),
+        means=torch.from_numpy(np.ascontiguousarray(means)),
+        quats=unit_rotations(columns[:, 4:8]),
+        log_scales=columns[:, 1:4].contiguous(),
+        logit_opacities=columns[:, 0].contiguous(),
+        sh=torch.cat([columns[:, None, 8:11], rest], dim=1).contiguous(),
     )
 
 
-def _read_compressed(header: PlyHeader, file: BinaryIO, path: Path) -> Gaussians:
+def _unpacked(elements: Mapping[str, np.ndarray]) -> Gaussians:
     """Return the Gaussians of a compressed .ply; colours and logits may be infinite."""
-    if "chunk" not in header.elements:
-        raise ValueError("it is a compressed .ply without chunks")
-    chunks = header.read(file, "chunk")
-    vertices = header.read(file, "vertex")
-    count = len(vertices)
-    require_count(path, count, 16 * count, 16)
-
-    def columns(axes: tuple[str, ...], end: str) -> np.ndarray:
-        found = np.stack([chunks[f"{end}_{axis}"].astype(np.float32) for axis in axes], axis=1)
-        return found[np.arange(count) // _PER_CHUNK]
+    chunks = elements["chunk"]
+    vertices = elements["vertex"]
+    chunk_of = np.arange(len(vertices)) // _PER_CHUNK
 
     def ranged(fractions: np.ndarray, axes: tuple[str, ...]) -> np.ndarray:
-        low = columns(axes, "min")
-        high = columns(axes, "max")
+        low, high = (
+            np.stack([chunks[f"{end}_{axis}"] for axis in axes], axis=1)[chunk_of]
+            for end in ("min", "max")
+        )
         with np.errstate(all="ignore"):  # ranges of others may be NaN or infinite
             return (low + fractions * (high - low)).astype(np.float32)
 
@@ -159,8 +151,8 @@ def _read_compressed(header: PlyHeader, file: BinaryIO, path: Path) -> Gaussians
     has_ranges = "min_r" in (chunks.dtype.names or ())
     rgb = ranged(rgba[:, :3], _COLOUR) if has_ranges else rgba[:, :3]
     sh = ((rgb - 0.5) / SH_C0).astype(np.float32)[:, None]
-    if "sh" in header.elements:
-        sh = np.concatenate([sh, _rest(header.read(file, "sh"))], axis=1)
+    if "sh" in elements:
+        sh = np.concatenate([sh, _rest(elements["sh"])], axis=1)
     return Gaussians(
         means=torch.from_numpy(ranged(unpack_fractions(position, _BITS_3), _POSITION)),
         quats=torch.from_numpy(whole_rotations(rotation)),
@@ -236,94 +228,52 @@ _SCALARS = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
-_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _MOST_HEADER_BYTES = 1 << 20
 
 
-@dataclass(frozen=True)
-class PlyHeader:
-    """The header of a .ply."""
+def read_elements(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+    """Return the elements of a binary little-endian .ply as structured arrays (N,), and its
+    comments.
 
-    byte_order: str  # "<", ">" or, for ascii, ""
-    # of all elements in file order: their number, and names and types of the properties; a list
-    # property has no type
-    elements: dict[str, tuple[int, list[tuple[str, str]]]]
-    comments: tuple[str, ...]
-    data_start: int  # offset of the first byte after the header
-
-    def read(self, file: BinaryIO, name: str) -> np.ndarray:
-        """Read an element as a structured array (N,).
-
-        Raises ValueError: the file is truncated, or list properties hide where the element is.
-        """
-        count, properties = self.elements[name]
-        order = list(self.elements)
-        before = order[: order.index(name)]
-        if any(not kind for own in (*before, name) for _, kind in self.elements[own][1]):
-            raise ValueError(f"it has list properties in or before its {name}: no 3DGS .ply")
-        # The shortest possible row of text is one character and one separator per value.
-        skipped = sum(self.elements[own][0] * self._row(own).itemsize for own in before)
-        wanted = skipped + count * self._row(name).itemsize
-        available = file.seek(0, os.SEEK_END) - self.data_start
-        if available < (wanted if self.byte_order else wanted - 1):
-            raise ValueError(f"it is truncated: {wanted} bytes needed, {available} found")
-        if self.byte_order:
-            file.seek(self.data_start + skipped)
-            return np.fromfile(file, self._row(name), count)
-        file.seek(self.data_start)
-        for _ in range(sum(self.elements[own][0] for own in before)):
-            file.readline()
-        table = np.loadtxt(file, np.float64, max_rows=count, ndmin=2)
-        if table.shape != (count, len(properties)):
-            raise ValueError(f"its {name} should be {count} rows of {len(properties)} numbers")
-        return table.view([(key, "f8") for key, _ in properties])[:, 0]
-
-    def _row(self, name: str) -> np.dtype:
-        """Return the type of a row of an element; of text, of its shortest one."""
-        return np.dtype(
-            [
-                (key, self.byte_order + kind if self.byte_order else "S2")
-                for key, kind in self.elements[name][1]
-            ]
-        )
-
-
-def read_header(file: BinaryIO) -> PlyHeader:
-    """Read the header of a .ply opened at its start. Raises ValueError with the wrong line."""
-    if file.readline(16).rstrip(b"\r\n") != b"ply":
-        raise ValueError("it does not start with 'ply'")
-    byte_order: str | None = None
-    elements: dict[str, tuple[int, list[tuple[str, str]]]] = {}
-    properties: list[tuple[str, str]] | None = None
+    An element with list properties, and those behind it, are left out. Raises ValueError: a header
+    that is wrong, or the file is truncated.
+    """
+    elements: list[tuple[str, int, list[tuple[str, str]]]] = []
     comments: list[str] = []
-    while True:
-        raw = file.readline(_MOST_HEADER_BYTES)
-        if not raw.endswith(b"\n") or file.tell() > _MOST_HEADER_BYTES:
-            raise ValueError("its header has no end_header, or is longer than 1 MB")
-        line = raw.decode("utf-8", errors="replace").strip()
-        match line.split():
-            case ["end_header"]:
+    found: dict[str, np.ndarray] = {}
+    with open(path, "rb") as file:
+        if file.readline(16).rstrip(b"\r\n") != b"ply":
+            raise ValueError("it does not start with 'ply'")
+        while True:
+            raw = file.readline(_MOST_HEADER_BYTES)
+            if not raw.endswith(b"\n") or file.tell() > _MOST_HEADER_BYTES:
+                raise ValueError("its header has no end_header, or is longer than 1 MB")
+            line = raw.decode("utf-8", errors="replace").strip()
+            match line.split():
+                case ["end_header"]:
+                    break
+                case ["comment" | "obj_info" as word, *_]:
+                    comments.append(line[len(word) :].strip())
+                case ["element", name, count] if re.fullmatch("[0-9]{1,18}", count):
+                    elements.append((name, int(count), []))
+                case ["property", "list", *_, name] if elements:
+                    elements[-1][2].append((name, "O"))
+                case ["property", kind, name] if elements and kind in _SCALARS:
+                    elements[-1][2].append((name, f"<{_SCALARS[kind]}"))
+                case ["format", "binary_little_endian", _] | []:
+                    pass
+                case _:
+                    raise ValueError(f"its header line {line!r:.60} is not read")
+        size = os.fstat(file.fileno()).st_size
+        for name, count, properties in elements:
+            row = np.dtype(properties)
+            if row.hasobject:
                 break
-            case ["comment" | "obj_info" as word, *_]:
-                comments.append(line[len(word) :].strip())
-            case ["format", word, _] if word in _BYTE_ORDERS and byte_order is None:
-                byte_order = _BYTE_ORDERS[word]
-            case ["element", name, count] if re.fullmatch("[0-9]{1,18}", count):
-                properties = []
-                elements[name] = int(count), properties
-            case ["property", "list", _, _, name] if properties is not None:
-                properties.append((name, ""))
-            case ["property", kind, name] if properties is not None and kind in _SCALARS:
-                properties.append((name, _SCALARS[kind]))
-            case []:
-                pass
-            case _:
-                raise ValueError(f"bad .ply header line {line!r:.60}")
-    if byte_order is None:
-        raise ValueError("its header names no format")
-    if "vertex" not in elements:
-        raise ValueError("it has no vertices")
-    return PlyHeader(byte_order, elements, tuple(comments), file.tell())
+            wanted = file.tell() + count * row.itemsize
+            if wanted > size:
+                raise ValueError(f"it is truncated: {wanted} bytes needed, {size} found")
+            found[name] = np.fromfile(file, row, count)
+    return found, tuple(comments)
 
 
 def header_bytes(

@@ -182,14 +182,7 @@ def mirrored(gaussians: Gaussians) -> Gaussians:
     """Return the mirror image of Gaussians, x becoming -x."""
     flip = torch.tensor([-1.0, 1.0, 1.0], dtype=gaussians.means.dtype, device="cpu")
     turn = torch.tensor([1.0, 1.0, -1.0, -1.0], dtype=gaussians.quats.dtype, device="cpu")
-    # Of degree l and order m, a harmonic with a cosine of m times the azimuth changes its sign for
-    # odd m, one with a sine for even m.
-    signs = [
-        (-1.0) ** order if order >= 0 else -((-1.0) ** order)
-        for degree in range(gaussians.sh_degree + 1)
-        for order in range(-degree, degree + 1)
-    ]
-    sh = gaussians.sh * torch.tensor(signs, dtype=gaussians.sh.dtype, device="cpu")[:, None]
+    sh = turned_harmonics(gaussians.sh, flip.double().diag())
     return gaussians.replace(means=gaussians.means * flip, quats=gaussians.quats * turn, sh=sh)
 
 
@@ -197,8 +190,8 @@ def turned_harmonics(sh: Tensor, matrix: Tensor) -> Tensor:
     """Return harmonics (N, K, 3) whose colour towards ``matrix @ d`` is that of ``sh`` towards d.
 
     A rotation mixes the harmonics of one degree only among themselves; how, is solved for from
-    their values in many directions. ``sh``: (N, K, 3), degree 0 to 4. ``matrix``: (3, 3) rotation,
-    float64.
+    their values in many directions. ``sh``: (N, K, 3), degree 0 to 4. ``matrix``: (3, 3) rotation or
+    reflection, float64.
     """
     degree = round(sh.shape[1] ** 0.5) - 1
     if degree == 0:

@@ -3,7 +3,7 @@ version 2.
 
 Positions take 16 bits per axis on a logarithmic scale, rotations 26 bits, scales and colours index
 a table of 256 values, and harmonics above degree 0 a palette of up to 65,536 rows of such indices.
-Axes are those of the .ply. The same files may lie in a folder, unpacked.
+Axes are those of the .ply.
 """
 
 from __future__ import annotations
@@ -11,17 +11,16 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from dyngs.core.conventions import RasterizeMode
-from dyngs.core.errors import DyngsError
 from dyngs.core.gaussians import Gaussians, morton_order
-from dyngs.io.fields import read_limited, require_at_most
+from dyngs.io.fields import require_at_most
 from dyngs.io.formats.packing import (
     codebook,
     largest_and_others,
@@ -38,27 +37,19 @@ from dyngs.io.formats.splat_file import (
     stored_comments,
 )
 
-SOG_META = "meta.json"  # of a .sog, which may lie in a folder
+_META = "meta.json"
 _PER_ROW = 64
 _MOST_META_BYTES = 1 << 20
 _MOST_PIXELS = 1 << 27
 _MODE = 252  # alpha of a rotation: this plus the index of its largest entry
 _HALF_ROOT = float(np.sqrt(0.5))
 
-_Members = Callable[[str, int, str], bytes]
-"""Returns the bytes of a file of the given name, whose size is at most so many of what the last
-argument says."""
-
 
 def read_sog(path: Path) -> SplatFile:
-    """Read a .sog of version 2, or the ``meta.json`` of an unpacked one.
-
-    Raises DyngsError if it is damaged or asks for too much memory.
-    """
-    if path.name == SOG_META:
-        return _read(path, _in_folder(path))
+    """Read a .sog of version 2. Raises ValueError: it is damaged; DyngsError: it asks for too much
+    memory."""
     with zipfile.ZipFile(path) as archive:
-        return _read(path, _in_archive(path, archive))
+        return _read(path, archive)
 
 
 def write_sog(path: Path, splat: SplatFile) -> None:
@@ -135,7 +126,7 @@ def sog_parts(splat: SplatFile) -> Iterator[tuple[str, bytes]]:
             "codebook": values.tolist(),
             "files": files,
         }
-    yield SOG_META, json.dumps(meta).encode()
+    yield _META, json.dumps(meta).encode()
     for name, image in images.items():
         yield name, _encoded(image)
 
@@ -150,27 +141,14 @@ def _encoded(image: np.ndarray) -> bytes:
     return out.getvalue()
 
 
-def _in_archive(path: Path, archive: zipfile.ZipFile) -> _Members:
-    def member(name: str, most: int, what: str) -> bytes:
-        info = archive.getinfo(name)
-        require_at_most(path, info.file_size, most, what)
-        return archive.read(info)
-
-    return member
+def _member(path: Path, archive: zipfile.ZipFile, name: str, most: int) -> bytes:
+    info = archive.getinfo(name)
+    require_at_most(path, info.file_size, most, "bytes")
+    return archive.read(info)
 
 
-def _in_folder(path: Path) -> _Members:
-    def member(name: str, most: int, what: str) -> bytes:
-        file = path.parent / name
-        if PureWindowsPath(name).name != name or file.resolve().parent != path.parent.resolve():
-            raise DyngsError(f"{path}: {name!r:.60} lies outside of its folder; put the file there")
-        return read_limited(file, most)
-
-    return member
-
-
-def _read(path: Path, member: _Members) -> SplatFile:
-    meta = json.loads(member(SOG_META, _MOST_META_BYTES, f"bytes of {SOG_META}"))
+def _read(path: Path, archive: zipfile.ZipFile) -> SplatFile:
+    meta = json.loads(_member(path, archive, _META, _MOST_META_BYTES))
     if meta.get("version", 1) != 2:
         raise ValueError(f"it is a .sog of version {meta.get('version', 1)!r:.20}, only 2 is known")
     n = meta["count"]
@@ -179,7 +157,7 @@ def _read(path: Path, member: _Members) -> SplatFile:
     require_at_most(path, n, MOST_GAUSSIANS, "Gaussians")
 
     def pixels(part: str, index: int = 0) -> np.ndarray:
-        found = _image(path, member, meta[part]["files"][index]).reshape(-1, 4)
+        found = _image(path, archive, meta[part]["files"][index]).reshape(-1, 4)
         if len(found) < n:
             raise ValueError(f"its {part} has {len(found):,} pixels for {n:,} Gaussians")
         return found[:n]
@@ -204,7 +182,7 @@ def _read(path: Path, member: _Members) -> SplatFile:
     if meta.get("shN") is not None:
         bands = meta["shN"]["bands"]
         terms = {1: 3, 2: 8, 3: 15}[bands]
-        image = _image(path, member, meta["shN"]["files"][0])
+        image = _image(path, archive, meta["shN"]["files"][0])
         labels = pixels("shN", 1).astype(np.int64)
         if image.shape[1] != _PER_ROW * terms:
             raise ValueError(f"its harmonics are not {_PER_ROW} rows of {terms} terms side by side")
@@ -223,10 +201,10 @@ def _read(path: Path, member: _Members) -> SplatFile:
     return described(SplatFile(gaussians, mode, comments=comments))
 
 
-def _image(path: Path, member: _Members, name: str) -> np.ndarray:
+def _image(path: Path, archive: zipfile.ZipFile, name: str) -> np.ndarray:
     from PIL import Image
 
-    data = member(name, 8 * _MOST_PIXELS, "bytes of an image")
+    data = _member(path, archive, name, 8 * _MOST_PIXELS)
     with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
         require_at_most(path, image.width * image.height, _MOST_PIXELS, "pixels of an image")
         return np.asarray(image.convert("RGBA"))

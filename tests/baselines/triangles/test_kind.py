@@ -3,7 +3,6 @@ refused, in a line."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ import trimesh
 from small_triangles import config_of
 
 import dyngs
-from dyngs.baselines.triangles.kind import BgTriangleModel
 from dyngs.baselines.triangles.scene import TriangleScene
 from dyngs.baselines.triangles.training import most_pixels
 from dyngs.cli import main
@@ -24,7 +22,6 @@ from dyngs.evaluate.report import evaluate_run
 from dyngs.models.views import training_cameras
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.runs.opened import open_run
-from dyngs.study.variants import Variant, VariantRuns
 
 STEPS = ["train.steps=120", "train.save_every=60"]
 
@@ -91,40 +88,6 @@ def test_it_is_a_mesh_with_colours(run: Path, tmp_path: Path, suffix: str) -> No
     assert len(mesh.faces) == 4 * len(scene.patches)
     visual: Any = mesh.visual
     assert np.ptp(np.asarray(visual.vertex_colors)[:, :3]) > 0
-
-
-def test_its_settings_are_traded(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("dyngs.study.measure.peak_megabytes", lambda *_: None)
-    out = tmp_path / "tradeoff"
-    settings = ("sh_degree=0", "storage=2", "supersampling=1", "scale=0.5", "prune")
-    vary = [word for setting in settings for word in ("--vary", setting)]
-    words = ["tradeoff", str(run), "--out", str(out), *vary, "--rounds", "1", "--combine", "1"]
-    assert main([*words, "--require", "mb<=1", "--minimize", "mb"]) == 0
-    points = {row["name"]: row for row in json.loads((out / "tradeoff.json").read_text())["rows"]}
-    base = points["as it is"]
-    assert base["psnr"] == pytest.approx(evaluate_run(run).psnr)
-    assert base["gaussians"] == len(open_run(run).renderable.state()["triangles.points"].tensor)
-    # and a few bytes
-    assert points["sh_degree=0"]["mb"] == pytest.approx(base["mb"] * 48 / 72, rel=1e-3)
-    assert points["storage=2"]["mb"] < base["mb"] / 2
-    assert all(
-        points[name]["psnr"] != base["psnr"]
-        for name in ("sh_degree=0", "supersampling=1", "scale=0.5")
-    )
-    assert not any("prune" in name for name in points)
-    chosen = next((out / "chosen").iterdir())
-    assert len(open_run(chosen).renderable.state()["triangles.points"].tensor) == base["gaussians"]
-
-
-def test_fewer_triangles_are_trained_for_a_trade(capture: Path, tmp_path: Path) -> None:
-    run = dyngs.train(config_of(capture, "train.steps=60", f"run.dir={tmp_path / 'run'}"))
-    half = VariantRuns(run, tmp_path / "out", 1).folder(Variant(triangles=0.5))
-    model = load_resolved(half).model
-    assert isinstance(model, BgTriangleModel)
-    assert model.max_triangles == 150
-    assert 10 < len(open_run(half).renderable.state()["triangles.points"].tensor) <= 150
 
 
 @pytest.mark.parametrize(

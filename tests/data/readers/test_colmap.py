@@ -49,7 +49,7 @@ def test_lens_images_points_where_colmap_does(model: str) -> None:
         height=8,
         params=list(MODELS[model]),
     )
-    intrinsics, lens = pinhole_and_lens(ModelCamera(1, model, (12, 8), MODELS[model]), "here")
+    intrinsics, lens = pinhole_and_lens(ModelCamera(model, (12, 8), MODELS[model]), "here")
     rays = np.random.default_rng(1).uniform(-0.6, 0.6, (50, 2))
     rays[0] = 0
     wanted = camera.img_from_cam(np.column_stack([rays, np.ones(50)]))
@@ -113,9 +113,7 @@ def numbered_models(root: Path, *counts: int) -> None:
         (part / "images.txt").write_text("\n".join(lines[: 2 * count]) + "\n")
 
 
-@pytest.mark.parametrize(
-    ("counts", "read"), [((2, 6, 3), 1), ((6, 2), 0), ((2, 2), 0), ((0, 1), 1)]
-)
+@pytest.mark.parametrize(("counts", "read"), [((2, 6, 3), 1), ((6, 2), 0), ((2, 2), 0)])
 def test_largest_of_several_models_is_read(
     tmp_path: Path, counts: tuple[int, ...], read: int
 ) -> None:
@@ -125,7 +123,6 @@ def test_largest_of_several_models_is_read(
     assert len(capture.splits["train"]) == max(counts)
     (line,) = (line for line in capture.warnings if "not connected" in line)
     assert f"of {len(counts)} models that are not connected, {read} is read" in line
-    assert all(f"{i} ({count})" in line for i, count in enumerate(counts) if i != read)
 
 
 def test_largest_of_several_binary_models(tmp_path: Path) -> None:

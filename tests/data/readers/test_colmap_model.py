@@ -13,12 +13,12 @@ from tiny_captures import write_colmap
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
-from dyngs.data.readers.colmap import EXTENSIONS, NUM_PARAMS, num_images, read_colmap, read_model
+from dyngs.data.readers.colmap import NUM_PARAMS, read_colmap, read_model
 
 POINTS_2D = "1.5 2.5 -1 3 4 17"
 
 
-@pytest.mark.parametrize("extension", EXTENSIONS)
+@pytest.mark.parametrize("extension", [".bin", ".txt"])
 def test_every_camera_model_that_pycolmap_writes(tmp_path: Path, extension: str) -> None:
     import pycolmap
 
@@ -32,7 +32,7 @@ def test_every_camera_model_that_pycolmap_writes(tmp_path: Path, extension: str)
         scene.add_camera_with_trivial_rig(camera)
         expected[number] = (model.name, (12, 8), tuple(camera.params))
     (scene.write_binary if extension == ".bin" else scene.write_text)(str(tmp_path))
-    found = read_model(tmp_path).cameras
+    found, _, _ = read_model(tmp_path)
     assert {
         number: (camera.model, camera.size, camera.params) for number, camera in found.items()
     } == expected
@@ -75,7 +75,7 @@ def test_truncated_text_file_is_one_line_that_names_it(tmp_path: Path, name: str
 def test_trailing_bytes_are_refused(colmap_root: Path) -> None:
     with (colmap_root / "sparse/0/points3D.bin").open("ab") as file:
         file.write(b"xyz")
-    with pytest.raises(DyngsError, match=r"points3D\.bin: 3 bytes follow"):
+    with pytest.raises(DyngsError, match=r"points3D\.bin: cannot be read"):
         read_colmap(colmap_root)
 
 
@@ -110,7 +110,7 @@ def test_counts_that_no_file_has(colmap_root: Path, name: str) -> None:
     data = path.read_bytes()
     for count in (2**63, 2**64 - 1, 2**31):
         path.write_bytes(struct.pack("<Q", count) + data[8:])
-        with pytest.raises(DyngsError, match=rf"{name}\.bin: the COLMAP file is truncated"):
+        with pytest.raises(DyngsError, match=rf"{name}\.bin: cannot be read"):
             read_colmap(colmap_root)
 
 
@@ -170,14 +170,11 @@ def lines_of(*seconds: str | None) -> list[str]:
 def test_second_lines_of_images_may_be_missing(
     tmp_path: Path, seconds: tuple[str | None, ...], header: str, encode: Callable[[str], bytes]
 ) -> None:
-    model = read_model(
+    _, images, _points = read_model(
         write_text_model(tmp_path, encode(header + "\n".join(lines_of(*seconds)) + "\n"))
     )
-    assert [image.name for image in model.images] == ["1.png", "2.png", "3.png"]
-    assert [image.pose[4:] for image in model.images] == [
-        (number + 0.5, -0.2, 3) for number in (1, 2, 3)
-    ]
-    assert num_images(tmp_path) == 3
+    assert [image.name for image in images] == ["1.png", "2.png", "3.png"]
+    assert [image.pose[4:] for image in images] == [(number + 0.5, -0.2, 3) for number in (1, 2, 3)]
 
 
 @pytest.mark.parametrize("second", [None, "", POINTS_2D])
@@ -186,8 +183,8 @@ def test_names_are_the_rest_of_the_line(tmp_path: Path, second: str | None) -> N
     lines = []
     for number, name in enumerate(names, start=1):
         lines += [pose_line(number, name)] if second is None else [pose_line(number, name), second]
-    model = read_model(write_text_model(tmp_path, "\n".join(lines).encode()))
-    assert [image.name for image in model.images] == sorted(names)
+    _, images, _points = read_model(write_text_model(tmp_path, "\n".join(lines).encode()))
+    assert [image.name for image in images] == sorted(names)
 
 
 @pytest.mark.parametrize(
@@ -206,16 +203,15 @@ def test_lines_that_fit_no_image_are_refused(tmp_path: Path, lines: list[str], l
         DyngsError, match=rf"images\.txt, line {line}: the line is truncated or damaged"
     ):
         read_model(tmp_path)
-    assert num_images(tmp_path) == 0
 
 
 def test_tracks_of_points_do_not_count(tmp_path: Path) -> None:
     """Photos of a track may be absent, and their points, too."""
-    points = "7 1.5 2 -3 10 20 255 0.5 99 0 1 12\n3 4e+000 5 6 1.0 2.0 3.0 0.1\n"
-    model = read_model(write_text_model(tmp_path, pose_line(1).encode(), points))
+    text = "7 1.5 2 -3 10 20 255 0.5 99 0 1 12\n3 4e+000 5 6 1.0 2.0 3.0 0.1\n"
+    _, _images, points = read_model(write_text_model(tmp_path, pose_line(1).encode(), text))
     # in order of their ids
-    np.testing.assert_array_equal(model.points.xyz, [[4, 5, 6], [1.5, 2, -3]])
-    np.testing.assert_array_equal(model.points.rgb, [[1, 2, 3], [10, 20, 255]])
+    np.testing.assert_array_equal(points.xyz, [[4, 5, 6], [1.5, 2, -3]])
+    np.testing.assert_array_equal(points.rgb, [[1, 2, 3], [10, 20, 255]])
 
 
 def test_tracks_of_absent_images_in_binary_files(colmap_root: Path) -> None:

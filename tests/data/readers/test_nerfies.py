@@ -93,14 +93,13 @@ def test_lens_and_aspect(root: Path) -> None:
     change = {"radial_distortion": [0.1, 0.02, 0.003], "tangential_distortion": [0.01, -0.02]}
     edit_json(
         root / "camera" / "000000.json",
-        lambda c: c.update(change, pixel_aspect_ratio=1.5, skew=0.5),
+        lambda c: c.update(change, pixel_aspect_ratio=1.5),
     )
     capture = read(root)
     view = capture.splits["train"][0]
     assert view.lens.model == "opencv"
     assert view.lens.params == (0.1, 0.02, 0.01, -0.02, 0.003)
     assert view.intrinsics[1, 1] == pytest.approx(30)
-    assert "1 cameras have skew" in capture.warnings[0]
     x = 0.3
     y = -0.2  # Nerfies' formula, written out
     r2 = x * x + y * y
@@ -129,7 +128,7 @@ def test_time_id_and_no_times(root: Path) -> None:
     edit_json(root / "metadata.json", lambda c: [m.pop("time_id") for m in c.values()])
     assert {view.time for view in read(root).splits["train"]} == {None}
     edit_json(root / "metadata.json", lambda c: c["000001"].update(warp_id=3))
-    with pytest.raises(DyngsError, match="time of .* must be a finite number"):
+    with pytest.raises(DyngsError, match=r"time of .* must be a finite number"):
         read(root)
 
 
@@ -157,7 +156,7 @@ def test_frames_are_chosen(root: Path) -> None:
         ("dataset.json", {"train_ids": "a"}, "'train_ids' must be a list"),
         ("dataset.json", {"train_ids": ["../../etc/x"]}, "'train_ids' must be a list"),
         ("dataset.json", {"ids": [], "train_ids": [], "val_ids": []}, "nothing to read"),
-        ("dataset.json", {"train_ids": ["000009"]}, "no entry for '000009'"),
+        ("dataset.json", {"train_ids": ["000009"]}, "the key '000009' is missing"),
         ("metadata.json", {"000002": {"warp_id": -1}}, "'000002': warp_id must be a whole number"),
         ("metadata.json", {"000002": {"warp_id": 0.5}}, "'000002': warp_id must be a whole number"),
         (
@@ -165,7 +164,7 @@ def test_frames_are_chosen(root: Path) -> None:
             {"000002": {"warp_id": float("nan")}},
             "'000002': warp_id must be a whole number",
         ),
-        ("metadata.json", {"000002": 1}, "no entry for '000002'"),
+        ("metadata.json", {"000002": 1}, "'000002': cannot be read"),
         ("scene.json", {"scale": 0}, "'scale' must be positive"),
         ("scene.json", {"center": [1, 2]}, "'center' must hold 3 finite numbers"),
         (
@@ -207,7 +206,7 @@ def test_missing_files(root: Path) -> None:
     (root / "rgb/1x/000002.png").unlink()
     assert "1 of 6 images are missing" in read(root).warnings[0]
     (root / "camera" / "000002.json").unlink()
-    with pytest.raises(DyngsError, match=r"000002\.json: no such camera file"):
+    with pytest.raises(DyngsError, match=r"000002\.json: cannot be read"):
         read_nerfies(root)
     for path in (root / "rgb/1x").iterdir():
         path.unlink()

@@ -10,7 +10,6 @@ import pytest
 from dyngs.data.readers.transforms import GREY, point_colours, read_points
 
 COLOURS = np.array([[255, 0, 51], [0, 204, 102], [12, 34, 56]], np.uint8)
-PACKED = COLOURS.astype(np.uint32) @ np.array([2**16, 2**8, 1], np.uint32)
 KINDS = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort", "u4": "uint", "i4": "int"}
 
 
@@ -50,11 +49,7 @@ CASES = {
     "short names": three("r g b", COLOURS),
     "short names, floats to 1": three("r g b", (COLOURS / 255).astype(np.float32)),
     "capitals": three("Red Green Blue", COLOURS),
-    "16 bits": three("red green blue", COLOURS.astype(np.uint16) * 257),
     "bytes in 16 bits": three("red green blue", COLOURS.astype(np.uint16)),
-    "packed integers": {"rgb": PACKED},
-    "packed with alpha": {"rgba": PACKED | np.uint32(0x7F000000)},
-    "packed bits of floats": {"rgb": PACKED.view(np.float32)},
 }
 
 
@@ -64,12 +59,6 @@ def test_colours_have_their_values(tmp_path: Path, case: str, byte_order: str | 
     points = read_points(write_ply(tmp_path / "points.ply", CASES[case], byte_order))
     np.testing.assert_array_equal(points.rgb, COLOURS)
     np.testing.assert_array_equal(points.xyz[:, 1], [0, 1, 2])
-
-
-def test_alpha_of_packed_floats_does_not_change_their_colours(tmp_path: Path) -> None:
-    opaque = (PACKED | np.uint32(0xFF000000)).view(np.float32)  # a NaN where red is over 127
-    points = read_points(write_ply(tmp_path / "points.ply", {"rgb": opaque}, "<"))
-    np.testing.assert_array_equal(points.rgb, COLOURS)
 
 
 @pytest.mark.parametrize(

@@ -11,12 +11,17 @@ import pytest
 from tiny_captures import random_pixels, write_frames, write_image
 
 from dyngs.api.load import read_capture
-from dyngs.capture.inspection.report import format_report, inspect_capture
+from dyngs.capture.inspection import format_report, inspect_capture
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import ImageLoader
-from dyngs.data.readers.blender import read_blender, read_nerfstudio
-from dyngs.data.readers.transforms import FrameFile, find_points, read_points
+from dyngs.data.readers.transforms import (
+    FrameFile,
+    find_points,
+    read_blender,
+    read_nerfstudio,
+    read_points,
+)
 from dyngs.io.containment import staying_within
 
 ODD = (

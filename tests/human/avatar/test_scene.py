@@ -14,7 +14,6 @@ from dyngs.core.camera import Cameras
 from dyngs.core.state import part_of, tensors_of
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
-from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import (
     SharedCorrection,
     Skeleton,
@@ -26,7 +25,7 @@ from dyngs.human.avatar.scene import HumanScene, first_scene
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.skinning import axis_angle_to_matrix
-from dyngs.human.motion.motion import CapturedMotion, MotionClip
+from dyngs.human.motion.motion import MotionClip
 
 
 def random_clip(frames: int, seed: int = 0) -> MotionClip:
@@ -48,10 +47,8 @@ def stirred() -> HumanScene:
     gaussians = gaussians.replace(
         sh=torch.randn(gaussians.sh.shape, generator=torch.Generator().manual_seed(1))
     )
-    subject = Subject(
-        Skeleton(body.joints, body.parents), anchors, CapturedMotion(random_clip(4), (0, 1, 2, 3))
-    )
-    scene = first_scene(gaussians, subject)
+    skeleton = Skeleton(body.joints, body.parents)
+    scene = first_scene(gaussians, anchors, skeleton, random_clip(4))
     generator = torch.Generator().manual_seed(2)
     for x in scene.learned.values().values():
         x += 0.05 * torch.randn(x.shape, generator=generator)

@@ -46,22 +46,16 @@ def assert_same(a: Gaussians, b: Gaussians) -> None:
         torch.testing.assert_close(b.tensors()[name], x, rtol=0, atol=0)
 
 
-def write_vertices(
-    path: Path, columns: dict[str, np.ndarray], fmt: str = "binary_little_endian"
-) -> Path:
+def write_vertices(path: Path, columns: dict[str, np.ndarray]) -> Path:
     """A .ply written by hand from named columns, each of its own dtype."""
     kinds = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
     count = len(next(iter(columns.values())))
-    lines = ["ply", f"format {fmt} 1.0", f"element vertex {count}"]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     lines += [f"property {kinds[x.dtype.str[1:]]} {name}" for name, x in columns.items()]
-    order = ">" if fmt == "binary_big_endian" else "<"
-    rows = np.empty(count, dtype=[(name, order + x.dtype.str[1:]) for name, x in columns.items()])
+    rows = np.empty(count, dtype=[(name, "<" + x.dtype.str[1:]) for name, x in columns.items()])
     for name, x in columns.items():
         rows[name] = x
-    text = "".join(" ".join(repr(v.item()) for v in row) + "\n" for row in rows).encode()
-    path.write_bytes(
-        "\n".join([*lines, "end_header\n"]).encode() + (text if fmt == "ascii" else rows.tobytes())
-    )
+    path.write_bytes("\n".join([*lines, "end_header\n"]).encode() + rows.tobytes())
     return path
 
 
@@ -135,8 +129,8 @@ def test_file_of_another_program() -> None:
 
 
 @settings(max_examples=20, deadline=None)
-@given(data=st.data(), fmt=st.sampled_from(["binary_little_endian", "binary_big_endian", "ascii"]))
-def test_any_property_order_type_and_extras(tmp_path_factory, data, fmt) -> None:
+@given(data=st.data())
+def test_any_property_order_type_and_extras(tmp_path_factory, data) -> None:
     gaussians = make_gaussians(4, data.draw(st.integers(0, 4)))
     columns = plain_columns(gaussians) | {
         "label": np.arange(4, dtype="u1"),
@@ -147,7 +141,7 @@ def test_any_property_order_type_and_extras(tmp_path_factory, data, fmt) -> None
     mixed = {
         name: columns[name].astype("f8") if name in doubles else columns[name] for name in names
     }
-    path = write_vertices(tmp_path_factory.mktemp("ply") / "a.ply", mixed, fmt)
+    path = write_vertices(tmp_path_factory.mktemp("ply") / "a.ply", mixed)
     assert_same(gaussians, read_splats(path).gaussians)
 
 
@@ -172,18 +166,13 @@ def test_non_finite_values_are_refused_or_skipped(tmp_path) -> None:
 
 
 @settings(max_examples=25, deadline=None)
-@given(
-    fraction=st.floats(0, 1, exclude_max=True),
-    fmt=st.sampled_from(["binary_little_endian", "ascii"]),
-)
-def test_every_truncation_is_an_error(tmp_path_factory, fraction, fmt) -> None:
+@given(fraction=st.floats(0, 1, exclude_max=True))
+def test_every_truncation_is_an_error(tmp_path_factory, fraction) -> None:
     path = write_vertices(
-        tmp_path_factory.mktemp("ply") / "a.ply", plain_columns(make_gaussians(3, 1)), fmt
+        tmp_path_factory.mktemp("ply") / "a.ply", plain_columns(make_gaussians(3, 1))
     )
-    whole = path.read_bytes().rstrip(b"\n") if fmt == "ascii" else path.read_bytes()
-    # cutting digits off the last number cannot be noticed
-    last = whole.rfind(b" ") if fmt == "ascii" else len(whole)
-    path.write_bytes(whole[: int(fraction * last)])
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(fraction * len(whole))])
     with pytest.raises(DyngsError, match=r"a\.ply"):
         read_splats(path)
 
@@ -202,7 +191,7 @@ HOSTILE = {
     ),
     "lists": (
         ["element vertex 1", *_NEEDED, *["property list int int a"] * 40_000],
-        "list properties",
+        "cannot be read",
     ),
     "elements": ([f"element {i:x} 0" for i in range(60_000)], "no vertices"),
     "a comment": (
@@ -233,28 +222,28 @@ def test_headers_of_a_megabyte_cost_little(tmp_path, case) -> None:
         (b"", "does not start with"),
         (b"\x89PNG\r\n\x1a\n" + bytes(100), "does not start with"),
         (b"ply\n", "no end_header"),
-        (b"ply\n" + b"a" * 3_000_000, "no end_header|bad .ply header"),
+        (b"ply\n" + b"a" * 3_000_000, "no end_header|is not read"),
         (b"ply\n" + b"comment x\n" * 200_000, "longer than"),
-        (b"ply\nend_header\n", "names no format"),
-        (b"ply\nformat binary_middle_endian 1.0\n", "bad .ply header line 'format"),
-        (header_of("element vertex -1", *_NEEDED), "bad .ply header line 'element vertex -1'"),
-        (header_of("element vertex " + "9" * 5000, *_NEEDED), "bad .ply header line"),
+        (b"ply\nend_header\n", "no vertices"),
+        (b"ply\nformat binary_middle_endian 1.0\n", "header line 'format.*is not read"),
+        (header_of("element vertex -1", *_NEEDED), "header line 'element vertex -1' is not read"),
+        (header_of("element vertex " + "9" * 5000, *_NEEDED), "header line .* is not read"),
         (header_of("element vertex 0", *_NEEDED), "holds no Gaussians"),
-        (header_of("element vertex 1", *_NEEDED, _NEEDED[0]), "more than once"),
+        (header_of("element vertex 1", *_NEEDED, _NEEDED[0]), "cannot be read"),
         (
             header_of("element vertex 1", "property half x"),
-            "bad .ply header line 'property half x'",
+            "header line 'property half x' is not read",
         ),
         (header_of("element vertex 1", *_NEEDED, "property list uchar int i"), "list properties"),
         (header_of("element vertex 1", *_NEEDED[:-2]) + bytes(99), "have no rot_2 rot_3"),
-        (header_of("element vertex 1", "property uint packed_position"), "compressed"),
+        (header_of("element vertex 1", "property uint packed_position") + bytes(4), "chunk"),
         (
             header_of("element vertex 1", *_NEEDED, "property float f_rest_0") + bytes(99),
             "f_rest properties",
         ),
         (
             header_of("element vertex 3", *_NEEDED) + bytes(100),
-            "168 bytes needed, 100 found",
+            "is truncated: .* bytes needed",
         ),
         (header_of("element vertex 999999999999999999", *_NEEDED) + bytes(56), "is truncated"),
         (

@@ -24,7 +24,6 @@ from torch.nn.functional import interpolate, pad
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.human.predict.fields.network import (
-    CHUNK,
     FINE,
     NEAR,
     EncodedPerson,
@@ -38,8 +37,10 @@ from dyngs.human.predict.fields.network import (
     between,
     blended,
     mean_and_variance,
+    ray_pieces,
+    sample_shifts,
 )
-from dyngs.human.predict.fields.people import OUTWARDS, Boundaries, PosedBody
+from dyngs.human.predict.people import OUTWARDS, Boundaries, PosedBody
 from dyngs.models.volume import rays_of
 from dyngs.ops.rays import Rays
 
@@ -66,35 +67,6 @@ HINTS = 8  # What is known of a sample and its ray from the body and the silhoue
 _FAR = 1e3  # Stands for no depth, m
 
 
-@dataclass(frozen=True)
-class GuidedSamples:
-    """Samples of R rays with their signed ray distances, of both stages."""
-
-    rays: Tensor  # (R,) index of the pixel
-    at: Tensor  # (R, K) distances along the ray, m
-    signed: Tensor  # (R, K) m
-
-
-@dataclass(frozen=True)
-class RayContext:
-    """What is known of R rays, (R, 1) each, lengths in m."""
-
-    begin: Tensor  # where they are looked at from
-    end: Tensor  # to where
-    body: Tensor  # where they meet the body
-    closest: Tensor  # least height above the body, which says whether clothes are met beside it
-    # largest alpha that all images show of a sample: how far they are within the visual hull
-    held: Tensor
-
-
-@dataclass(frozen=True)
-class BodyDepths:
-    """A body, and its depths (V, 1, H, W) in the images, m."""
-
-    boundaries: Boundaries
-    depths: Tensor
-
-
 class EgHumanNerf(FieldNetwork):
     """See the module."""
 
@@ -116,53 +88,40 @@ class EgHumanNerf(FieldNetwork):
 
     needs_depth = True
 
-    def prepared(self, seen: SourceFeatures, body: PosedBody) -> BodyDepths:
+    def prepared(self, seen: SourceFeatures, body: PosedBody) -> tuple[Boundaries, Tensor]:
+        """Return the boundaries of the body, and its depths (V, 1, H, W) in the images, m."""
         boundaries = Boundaries(body)
         sources = seen.sources
         depths = torch.stack([boundaries.depth(sources.camera(i)) for i in range(len(sources))])
-        return BodyDepths(boundaries, depths[:, None].clamp(max=_FAR).to(sources.rgba))
+        return boundaries, depths[:, None].clamp(max=_FAR).to(sources.rgba)
 
     def picture(
         self, known: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
     ) -> FieldPicture:
         rays, z = rays_of(camera)
-        begin_at, end, body = self._limits(known, camera, rays, z)
-        which = (end > begin_at).nonzero()[:, 0]
+        boundaries, _ = known.own
+        first, last, body = (
+            (x.flatten() / z).clamp(max=_FAR)[:, None] for x in boundaries.interval(camera)
+        )
+        last = torch.where(first < _FAR, last, 0.0)
+        first = first.clamp_min(NEAR)
+        which = (last > first).nonzero()[:, 0]
         found = []
-        for some in [which] if torch.is_grad_enabled() else which.split(CHUNK):
-            found.append(
-                self._along(known, rays[some], (begin_at[some], end[some], body[some]), generator)
-            )
-        shape = (camera.height, camera.width)
-        like = rays.origins
-        colour = like.new_zeros(*shape, 3)
-        depth = like.new_zeros(shape)
-        through = like.new_ones(shape)
-        if not len(which):
-            return FieldPicture(colour, through, depth)
-        parts = [torch.cat(x) for x in zip(*(part[:3] for part in found), strict=True)]
+        for some in ray_pieces(which):
+            limits = first[some], last[some], body[some]
+            found.append(self._along(known, rays[some], limits, generator))
+        canvas = [
+            rays.origins.new_full((len(rays), size), own) for size, own in ((3, 0), (1, 1), (1, 0))
+        ]
         colour, through, depth = (
-            whole.flatten(0, 1).index_copy(0, which, own).view(whole.shape)
-            for whole, own in zip((colour, through, depth), parts, strict=True)
+            whole.index_copy(0, which, torch.cat(parts)).view(camera.height, camera.width, -1)
+            for whole, *parts in zip(canvas, *(piece[:3] for piece in found), strict=True)
         )
-        guided = (
-            [GuidedSamples(which, at, signed) for at, signed in found[0][3]]
-            if torch.is_grad_enabled()
-            else []
-        )
+        through = through[..., 0]
+        depth = depth[..., 0]
+        samples = [(which, *pair) for pair in found[0][3]] if torch.is_grad_enabled() else []
         middle = float((known.body.key_points.mean(0) - rays.origins[0]).norm())
-        return FieldPicture(self.refine(colour, through, depth, middle), through, depth, guided)
-
-    def _limits(
-        self, known: EncodedPerson, camera: Cameras, rays: Rays, z: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return where rays are looked at from (R,), to (R,), and where they meet the body (R,),
-        distances in m."""
-        interval = known.own.boundaries.interval(camera)
-        begin_at, end, body = (
-            (x.flatten() / z).clamp(max=_FAR) for x in (interval.begin, interval.end, interval.body)
-        )
-        return begin_at.clamp_min(NEAR), torch.where(begin_at < _FAR, end, 0.0), body
+        return FieldPicture(self.refine(colour, through, depth, middle), through, depth, samples)
 
     def _along(
         self,
@@ -171,117 +130,95 @@ class EgHumanNerf(FieldNetwork):
         limits: tuple[Tensor, Tensor, Tensor],
         generator: torch.Generator | None,
     ) -> tuple[Tensor, Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
-        """Return colours before black (R, 3), transmittance (R,), sums of weight times distance
-        (R,), and samples."""
-        first, last, body = (x[:, None] for x in limits)
+        """Return colours before black (R, 3), transmittance (R, 1), sums of weight times distance
+        (R, 1), and the samples of both stages: distances (R, K) along the rays, and signed ray
+        distances (R, K), m.
+
+        ``limits`` (R, 1) are where rays are looked at from, to where, and where they meet the body.
+        """
+        seen = known.seen
+        boundaries, depths = known.own
+        first, last, body = limits
+
+        def look(at: Tensor) -> tuple[Tensor, PointFeatures, Tensor]:
+            """Return samples (R K, 3), what images show of them, and the signed ray distances
+            (R, K) that learning begins with: their heights above the body."""
+            points = rays.origins[:, None] + rays.directions[:, None] * at[..., None]
+            points = points.flatten(0, 1)
+            height = boundaries.height(points).view(at.shape)
+            return points, seen.look(points), height.clamp(-PARAMS.limit, PARAMS.limit)
+
+        def hints(looked: PointFeatures, prior: Tensor, at: Tensor) -> Tensor:
+            """Return (R K, HINTS): the distance to the body in any direction and along the ray,
+            where in its interval a sample is, how near the ray comes to the body, which says
+            whether clothes are met beside it, and if silhouettes hold the sample, and any of the
+            ray."""
+            along = (body - at).clamp(-OUTWARDS, OUTWARDS) / OUTWARDS
+            place = (at - first) / (last - first)
+            limit = PARAMS.limit
+            parts = [prior / limit, prior.abs() / limit, along, place, closest / limit, held]
+            rows = torch.stack([x.expand_as(at) for x in parts], -1).flatten(0, 1)
+            alpha = torch.stack([looked.alpha.amin(0), looked.alpha.mean(0)], -1)
+            return torch.cat([rows, alpha], -1)
+
         count = PARAMS.samples
-        shifts = torch.full((len(rays), count), 0.5, device="cpu")
-        if generator is not None:
-            shifts = torch.rand(shifts.shape, generator=generator, device="cpu")
+        shifts = sample_shifts(len(rays), count, generator=generator)
         at = first + (last - first) * (torch.arange(count, device="cpu") + shifts).to(first) / count
-        points = (rays.origins[:, None] + rays.directions[:, None] * at[..., None]).flatten(0, 1)
-        looked = known.seen.look(points)
-        prior = _heights(known, points, at)
+        _, looked, prior = look(at)
         closest = prior.amin(1, keepdim=True)
         held = looked.alpha.amin(0).view(at.shape).amax(1, keepdim=True)
-        whole = RayContext(first, last, body, closest, held)
-        hints = self._hints(looked, prior, at, whole)
-        guide = self.guide(torch.cat([mean_and_variance(looked.features), hints], -1))
-        signed = prior + PARAMS.limit * guide.view(at.shape)
-        near = expected_surface(at.detach(), signed.detach())[:, None] + at.new_tensor(
-            PARAMS.offsets
-        )
-        closer, colours = self._surface(known, rays, near, (at, signed), whole)
+        facts = torch.cat([mean_and_variance(looked.features), hints(looked, prior, at)], -1)
+        signed = prior + PARAMS.limit * self.guide(facts).view(at.shape)
+
+        near = expected_surface(at.detach(), signed.detach())[:, None]
+        near = near + at.new_tensor(PARAMS.offsets)
+        points, looked, prior = look(near)
+        grid, depth = seen.projected(points)
+        surface = at_pixels(depths, grid, "nearest")[..., 0].where(looked.alpha > 0, _FAR)
+        hidden = depth > surface + PARAMS.hidden_by
+        # images that do not count where another does
+        excluded = 1e4 * (hidden & ~hidden.all(0))
+        directions = rays.directions.repeat_interleave(near.shape[1], 0)
+        apart = between(directions, points, seen.sources.centers)
+        facts = torch.cat([hidden[..., None].to(apart), apart], -1)
+        logits = self.attention(torch.cat([looked.features, facts], -1))[..., 0]
+        weights = (logits - excluded).softmax(0)
+        known_here = [mean_and_variance(looked.features, weights), hints(looked, prior, near)]
+        found = self.surface(torch.cat(known_here, -1))
+        closer = interpolated(at, signed, near) + PARAMS.limit * found[:, 0].view(near.shape)
+        own = torch.cat([looked.rgb, looked.features[..., -FINE:]], -1)
+        both = torch.cat([mean_and_variance(own, weights), found[:, 1:]], -1)
+        both = both.expand(len(own), -1, -1)
+        logits = self.blend(torch.cat([own, both, facts], -1))[..., 0]
+        colours = blended(logits - excluded, looked.rgb).view(*near.shape, 3)
+
         opacity = opacities(near, closer, self.sharpness.exp())
         through = torch.cumprod(torch.cat([torch.ones_like(opacity[:, :1]), 1 - opacity], 1), 1)
         weights = opacity * through[:, :-1]
         colour = (weights[..., None] * colours).sum(1)
-        return colour, through[:, -1], (weights * near).sum(1), [(at, signed), (near, closer)]
-
-    def _surface(
-        self,
-        known: EncodedPerson,
-        rays: Rays,
-        at: Tensor,
-        guide: tuple[Tensor, Tensor],
-        whole: RayContext,
-    ) -> tuple[Tensor, Tensor]:
-        """Return signed ray distances (R, K), m, and colours (R, K, 3) of samples at distances (R,
-        K)."""
-        seen = known.seen
-        centers = known.seen.sources.centers
-        points = (rays.origins[:, None] + rays.directions[:, None] * at[..., None]).flatten(0, 1)
-        looked = seen.look(points)
-        grid, depth = seen.projected(points)
-        hidden = (
-            depth
-            > at_pixels(known.own.depths, grid, "nearest")[..., 0].where(looked.alpha > 0, _FAR)
-            + PARAMS.hidden_by
-        )
-        apart = between(rays.directions.repeat_interleave(at.shape[1], 0), points, centers)
-        facts = torch.cat([hidden[..., None].to(apart), apart], -1)
-        logits = self.attention(torch.cat([looked.features, facts], -1))[..., 0]
-        weights = (logits - 1e4 * (hidden & ~hidden.all(0))).softmax(0)
-        hints = self._hints(looked, _heights(known, points, at), at, whole)
-        found = self.surface(torch.cat([mean_and_variance(looked.features, weights), hints], -1))
-        signed = interpolated(*guide, at) + PARAMS.limit * found[:, 0].view(at.shape)
-        own = torch.cat([looked.rgb, looked.features[..., -FINE:]], -1)
-        both = torch.cat([mean_and_variance(own, weights), found[:, 1:]], -1).expand(
-            len(own), -1, -1
-        )
-        colours = blended(self.blend(torch.cat([own, both, facts], -1))[..., 0], looked.rgb, hidden)
-        return signed, colours.view(*at.shape, 3)
-
-    def _hints(self, looked: PointFeatures, prior: Tensor, at: Tensor, ray: RayContext) -> Tensor:
-        """Return (R K, HINTS): the distance to the body in any direction and along the ray, where
-        in its interval a sample is, how near the ray comes to the body, and if silhouettes hold the
-        sample, and any of the ray."""
-        along = (ray.body - at).clamp(-OUTWARDS, OUTWARDS) / OUTWARDS
-        place = (at - ray.begin) / (ray.end - ray.begin)
-        parts = [
-            prior / PARAMS.limit,
-            prior.abs() / PARAMS.limit,
-            along,
-            place,
-            ray.closest / PARAMS.limit,
-            ray.held,
-        ]
-        known = torch.stack([x.expand_as(at) for x in parts], -1).flatten(0, 1)
-        return torch.cat([known, looked.alpha.amin(0)[:, None], looked.alpha.mean(0)[:, None]], -1)
+        distance = (weights * near).sum(1, keepdim=True)
+        return colour, through[:, -1:], distance, [(at, signed), (near, closer)]
 
     def penalty(self, picture: FieldPicture, image: Image, scale: float) -> Tensor:
         """Return the mean error of signed ray distances; rays meet the person where alpha is above
         a half."""
-        if not picture.samples:
-            return picture.colour.new_zeros(())
+        total = picture.colour.new_zeros(())
         assert image.depth is not None
         assert image.alpha is not None
         _, z = rays_of(image.cameras)
-        total = picture.colour.new_zeros(())
-        for samples in picture.samples:
-            truth, alpha = (x.flatten()[samples.rays][:, None] for x in (image.depth, image.alpha))
-            surface = truth / (scale * z[samples.rays][:, None])
+        limit = PARAMS.limit
+        for rays, at, signed in picture.samples:
+            truth, alpha = (x.flatten()[rays][:, None] for x in (image.depth, image.alpha))
+            surface = truth / (scale * z[rays][:, None])
             meets = alpha > 0.5
-            off = (samples.signed - (surface - samples.at).clamp(-PARAMS.limit, PARAMS.limit)).abs()
+            off = (signed - (surface - at).clamp(-limit, limit)).abs()
             # a ray that misses has no distance: one that is large would outweigh those of rays that
             # just meet a limb
-            error = torch.where(meets, off, (PARAMS.clear - samples.signed).relu())
+            error = torch.where(meets, off, (PARAMS.clear - signed).relu())
             counts = ~meets | (truth > 0)
             error = torch.where(counts, error, 0.0)
-            total = total + error.sum() / (
-                PARAMS.limit * samples.at.shape[1] * counts.sum().clamp_min(1)
-            )
+            total = total + error.sum() / (limit * at.shape[1] * counts.sum().clamp_min(1))
         return PARAMS.srdf_weight * total
-
-
-def _heights(known: EncodedPerson, points: Tensor, at: Tensor) -> Tensor:
-    """Return the signed ray distances (R, K) that learning begins with, of points (R K, 3) at
-    distances (R, K).
-
-    Their heights above the body, which also say something where a ray passes beside it.
-    """
-    height = known.own.boundaries.height(points).view(at.shape)
-    return height.clamp(-PARAMS.limit, PARAMS.limit)
 
 
 def expected_surface(at: Tensor, signed: Tensor) -> Tensor:

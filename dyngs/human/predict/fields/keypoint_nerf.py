@@ -21,7 +21,6 @@ from torch.nn.functional import grid_sample, max_pool2d, softplus
 from dyngs.core.camera import Cameras
 from dyngs.human.body.joints import JOINT_PARENTS
 from dyngs.human.predict.fields.network import (
-    CHUNK,
     FINE,
     NEAR,
     EncodedPerson,
@@ -33,8 +32,10 @@ from dyngs.human.predict.fields.network import (
     between,
     blended,
     mean_and_variance,
+    ray_pieces,
+    sample_shifts,
 )
-from dyngs.human.predict.fields.people import KEY_POINTS, PosedBody, Sources
+from dyngs.human.predict.people import KEY_POINTS, PosedBody, Sources
 from dyngs.models.volume import kept_samples, rays_of, reached_samples, thinned_samples
 from dyngs.ops.rays import Rays, Samples, Space, Steps, composite, march
 
@@ -63,14 +64,6 @@ CODE = KEY_POINTS * (1 + 2 * PARAMS.octaves)
 HINTS = 4  # What is known of a sample from the bones and the silhouettes
 
 
-@dataclass(frozen=True)
-class Hull:
-    """The cells of a cube that all images show in the silhouette."""
-
-    space: Space
-    occupied: Tensor  # bool of ``space.shape``
-
-
 class KeypointNerf(FieldNetwork):
     """See the module."""
 
@@ -83,24 +76,16 @@ class KeypointNerf(FieldNetwork):
         self.blend = Perceptron(3 * colours + 4, width, width // 2, 1)
         begin(self, generator)
 
-    def prepared(self, seen: SourceFeatures, body: PosedBody) -> Hull:
+    def prepared(self, seen: SourceFeatures, body: PosedBody) -> tuple[Space, Tensor]:
         return hull(seen, body.key_points)
 
     def picture(
         self, known: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
     ) -> FieldPicture:
         rays, _ = rays_of(camera)
-        if generator is None:
-            shifts = rays.origins.new_full((len(rays),), 0.5)
-        else:
-            shifts = torch.rand(len(rays), generator=generator, device="cpu").to(rays.origins)
-        pieces = [len(rays)] if torch.is_grad_enabled() else [CHUNK] * -(-len(rays) // CHUNK)
-        found = []
-        first = 0
-        for size in pieces:
-            some = slice(first, first + size)
-            found.append(self._along(known, rays[some], shifts[some]))
-            first += size
+        shifts = sample_shifts(len(rays), generator=generator).to(rays.origins)
+        pieces = ray_pieces(torch.arange(len(rays), device=shifts.device))
+        found = [self._along(known, rays[some], shifts[some]) for some in pieces]
         colour, through, depth = (torch.cat(x) for x in zip(*found, strict=True))
         shape = camera.height, camera.width
         return FieldPicture(colour.view(*shape, 3), through.view(shape), depth.view(shape))
@@ -111,14 +96,13 @@ class KeypointNerf(FieldNetwork):
         """Return colours before black (R, 3), transmittance (R,), and sums of weight times distance
         (R,)."""
         seen = known.seen
-        own = known.own
-        samples = march(rays, shifts, own.space, own.occupied, Steps(NEAR, PARAMS.step))
+        space, occupied = known.own
+        samples = march(rays, shifts, space, occupied, Steps(NEAR, PARAMS.step))
         learns = torch.is_grad_enabled()
         with torch.no_grad():  # which samples are worth it takes their densities alone
-            samples = kept_samples(
-                samples, (seen.alpha(places(samples, own.space)) > PARAMS.visible).all(0)
-            )[0]
-            points = places(samples, own.space)
+            shown = seen.alpha(places(samples, space)) > PARAMS.visible
+            samples = kept_samples(samples, shown.all(0))[0]
+            points = places(samples, space)
             code = spatial_code(points, known.body.key_points, seen.sources)
             geometry = self._geometry(known, points, code)
             if learns:
@@ -191,8 +175,8 @@ def spatial_code(points: Tensor, key_points: Tensor, sources: Sources) -> Tensor
 
 
 @torch.no_grad()
-def hull(seen: SourceFeatures, key_points: Tensor) -> Hull:
-    """Return the cells of a cube that hold a place which all images show as the person.
+def hull(seen: SourceFeatures, key_points: Tensor) -> tuple[Space, Tensor]:
+    """Return a cube, and which of its cells hold a place that all images show as the person.
 
     They are no further than ``AROUND`` from the bones between the key points (J, 3).
     """
@@ -214,13 +198,12 @@ def hull(seen: SourceFeatures, key_points: Tensor) -> Hull:
         pixels = math.ceil(reach * float(sources.intrinsics[i, 0, 0]) / nearest) + 1
         alpha = max_pool2d(sources.rgba[i : i + 1, 3:], (2 * pixels + 1, 1), 1, (pixels, 0))
         alpha = max_pool2d(alpha, (1, 2 * pixels + 1), 1, (0, pixels))
-        occupied &= (
-            grid_sample(alpha, grid[i][None, None], mode="nearest", align_corners=False)[0, 0, 0]
-            > PARAMS.visible
-        )
+        places_in = grid[i][None, None]
+        found = grid_sample(alpha, places_in, mode="nearest", align_corners=False)[0, 0, 0]
+        occupied &= found > PARAMS.visible
     where = occupied.nonzero()[:, 0]
     occupied[where] = from_bones(middles[where], key_points) < AROUND
-    return Hull(space, occupied.view(space.shape))
+    return space, occupied.view(space.shape)
 
 
 def from_bones(points: Tensor, key_points: Tensor) -> Tensor:

@@ -18,19 +18,17 @@ from dyngs.data.times import distinct_times
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template, read_body
 from dyngs.human.fit.fitted_capture import with_fitted_body
-from dyngs.human.predict.fields.keys import FieldPredictorModel, PredictedFieldModel
 from dyngs.human.predict.fields.network import FieldNetwork
-from dyngs.human.predict.fields.people import (
+from dyngs.human.predict.fields.scene import NETWORKS, PredictedField
+from dyngs.human.predict.gps.rectification import MIN_ANGLE, angle, moments, spread, well_spread
+from dyngs.human.predict.keys import FieldPredictorModel, PredictedFieldModel
+from dyngs.human.predict.people import (
     Person,
     metric,
     person_of,
-    require_shown,
     sources_of,
-    spread,
     window,
 )
-from dyngs.human.predict.fields.scene import NETWORKS, PredictedField
-from dyngs.human.predict.gps.rectification import MIN_ANGLE, angle, moments
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.prediction import (
     Example,
@@ -59,32 +57,20 @@ class FieldPredictor(Predictor[FieldNetwork]):
         self._person = person
 
     def chosen(self, count: int) -> list[int]:
-        """See ``Predictor``: evenly around the person, at the first of the moments that most views
-        show."""
-        rings = moments(self.views)
-        ring = max(rings.values(), key=len)
-        return sorted(set(spread(ring, min(count, len(ring)))))
+        return well_spread(self.views, count)
 
     def predict(self, views: Sequence[int]) -> PredictedField:
         shown = [self.views[i] for i in views]
-        if len(views) < FEWEST_VIEWS:
+        first = shown[0]
+        if len({(view.frame, view.time) for view in shown}) > 1 or all(
+            angle(first, view) < MIN_ANGLE for view in shown
+        ):
             raise DyngsError(
-                f"{self.name}: a field is predicted from two views at least, not one; give --views A,B"
+                f"{self.name}: a field is predicted from two views of one moment at least, that look from different "
+                "directions; give --views A,B"
             )
-        for view in shown:
-            if (view.frame, view.time) != (shown[0].frame, shown[0].time):
-                raise DyngsError(
-                    f"{self.name}: {shown[0].name} and {view.name} show two moments; give views of the same one"
-                )
-        if all(angle(shown[0], view) < MIN_ANGLE for view in shown[1:]):
-            raise DyngsError(
-                f"{self.name}: {shown[0].name} and the others look from the same direction; give other views"
-            )
-        body, scale = self._person.body_in(shown[0])
-        images = [self._person.images[i] for i in views]
-        for image in images:
-            require_shown(self.name, image, body, scale)
-        sources = sources_of(images, scale)
+        body, scale = self._person.body_in(first)
+        sources = sources_of([self._person.images[i] for i in views], scale)
         return PredictedField(self.network, sources, body, scale, background=self.background)
 
     def run_config(self, views: Sequence[int]) -> Config:
@@ -107,10 +93,8 @@ class FieldLearner(Learner[FieldNetwork]):
         people: Sequence[DataConfig],
         device: torch.device = CPU,
     ) -> None:
-        model = section_of(config)
-        names = [person.root.name for person in people]
-        super().__init__(config, network, names, model.lr, device)
-        self._template = template_of(model)
+        super().__init__(config, network, [person.root.name for person in people], device)
+        self._template = template_of(self.section)
         self._opened = kept_open(self._open, people)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
@@ -134,7 +118,7 @@ class FieldLearner(Learner[FieldNetwork]):
         another view."""
         rings = [ring for ring in moments(person.views).values() if len(ring) > FEWEST_VIEWS]
         ring = rings[random_index(len(rings), generator)]
-        most = min(section_of(self.config).source_views, len(ring) - 1)
+        most = min(self.section.source_views, len(ring) - 1)
         count = FEWEST_VIEWS + random_index(most - FEWEST_VIEWS + 1, generator)
         if random_index(2, generator):
             sources = spread(ring, count, random_index(len(ring), generator))
@@ -186,18 +170,12 @@ def predictor(
 
     ``say`` and ``report`` are told of that fit.
     """
-    model = section_of(config)
+    model: Any = config.model
     network = NETWORKS[model.kind](torch.Generator())
     load_weights(network, checkpoint)
     if model.body is None:
         data = with_fitted_body(data, only_if_needed=True, say=say, report=report)
     return FieldPredictor(config, network, person_of(data, template_of(model)), data)
-
-
-def section_of(config: Config) -> FieldPredictorModel:
-    if not isinstance(config.model, FieldPredictorModel):
-        raise TypeError(f"not a network that predicts fields: {config.model!r}")
-    return config.model
 
 
 def template_of(model: FieldPredictorModel) -> BodyTemplate:

@@ -16,9 +16,8 @@ from torch.nn.functional import grid_sample
 from dyngs.core.camera import Cameras
 from dyngs.core.initialisation import glorot
 from dyngs.data.loader import Image
-from dyngs.human.predict.fields.people import PosedBody, Sources
-from dyngs.human.predict.gps.stereo import Encoder
-from dyngs.models.prediction import begin_weights, upsampled
+from dyngs.human.predict.people import PosedBody, Sources
+from dyngs.models.prediction import Encoder, begin_weights, upsampled
 from dyngs.ops.perceptron import Layer, perceptron
 
 FINE = 8
@@ -76,7 +75,7 @@ class SourceFeatures:
 
     def look(self, points: Tensor) -> PointFeatures:
         """Return what the images show at points (M, 3); differentiable in the features."""
-        grid = self.grid(points)
+        grid, _ = self.projected(points)
         rgba = at_pixels(self.sources.rgba, grid)
         features = torch.cat([at_pixels(self.coarse, grid), at_pixels(self.fine, grid)], -1)
         return PointFeatures(
@@ -85,14 +84,11 @@ class SourceFeatures:
 
     def alpha(self, points: Tensor) -> Tensor:
         """Return the opacities (V, M) of points (M, 3) in the images, 0 beside them."""
-        return at_pixels(self.sources.rgba[:, 3:], self.grid(points))[..., 0]
-
-    def grid(self, points: Tensor) -> Tensor:
-        """Return where the images show points (M, 3), (V, M, 2) in [-1, 1] within the image."""
-        return self.projected(points)[0]
+        return at_pixels(self.sources.rgba[:, 3:], self.projected(points)[0])[..., 0]
 
     def projected(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return ``grid``, and the depth (V, M) of the points."""
+        """Return where the images show points (M, 3), (V, M, 2) in [-1, 1] within the image, and their
+        depth (V, M)."""
         sources = self.sources
         pose = sources.cam_from_world
         local = points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
@@ -123,11 +119,9 @@ def begin(network: nn.Module, generator: torch.Generator) -> None:
 def mean_and_variance(values: Tensor, weights: Tensor | None = None) -> Tensor:
     """Return (M, 2 D): mean and variance over views of values (V, M, D) with weights (V, M) that
     sum to 1."""
-    share = (
-        values.new_full((len(values), 1, 1), 1 / len(values))
-        if weights is None
-        else weights[..., None]
-    )
+    if weights is None:
+        weights = values.new_full((len(values), 1), 1 / len(values))
+    share = weights[..., None]
     mean = (share * values).sum(0)
     return torch.cat([mean, (share * (values - mean).square()).sum(0)], -1)
 
@@ -143,14 +137,21 @@ def between(directions: Tensor, points: Tensor, centers: Tensor) -> Tensor:
     return torch.cat([apart, (directions * theirs).sum(-1, keepdim=True)], -1)
 
 
-def blended(logits: Tensor, colours: Tensor, hidden: Tensor | None = None) -> Tensor:
-    """Return (M, 3) colours of V images (V, M, 3), weighted by the softmax of ``logits`` (V, M).
-
-    ``hidden`` (V, M) bool: images that do not count where another does.
-    """
-    if hidden is not None:
-        logits = logits - 1e4 * (hidden & ~hidden.all(0))
+def blended(logits: Tensor, colours: Tensor) -> Tensor:
+    """Return (M, 3) colours of V images (V, M, 3), weighted by the softmax of ``logits`` (V, M)."""
     return (logits.softmax(0)[..., None] * colours).sum(0)
+
+
+def ray_pieces(rays: Tensor) -> Sequence[Tensor]:
+    """Return the indices of rays that are drawn together: all where something is learned."""
+    return [rays] if torch.is_grad_enabled() else rays.split(CHUNK)
+
+
+def sample_shifts(*shape: int, generator: torch.Generator | None) -> Tensor:
+    """Return where samples lie in their part of a ray, in [0, 1): at random, or in the middle."""
+    if generator is None:
+        return torch.full(shape, 0.5, device="cpu")
+    return torch.rand(shape, generator=generator, device="cpu")
 
 
 NEAR = 0.1  # Nearest distance that is drawn, m

@@ -4,7 +4,7 @@ trained."""
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -19,12 +19,13 @@ from dyngs.core.tensor_checks import require_indices, require_positive, require_
 from dyngs.data.loader import Image
 from dyngs.human.predict.fields.eg_human_nerf import EgHumanNerf
 from dyngs.human.predict.fields.keypoint_nerf import AROUND, KeypointNerf
-from dyngs.human.predict.fields.keys import PredictedFieldModel
 from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
-from dyngs.human.predict.fields.people import MULTIPLE, PosedBody, Sources, metric
+from dyngs.human.predict.keys import PredictedFieldModel
+from dyngs.human.predict.people import MULTIPLE, PosedBody, Sources, metric
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Model, Updated
+from dyngs.models.prediction import load_weights
 from dyngs.models.renderable import (
     DrawOptions,
     Renderable,
@@ -40,8 +41,6 @@ NETWORKS: dict[str, Callable[[torch.Generator], FieldNetwork]] = {
     "eg_human_nerf": EgHumanNerf,
 }
 """Untrained networks, by ``model.kind``."""
-_MOST_VIEWS = 1024
-_MOST_PIXELS = 1 << 26  # Of stored images
 
 
 @dataclass(frozen=True)
@@ -61,13 +60,8 @@ class PredictedField(Renderable):
 
     @property
     def bounds(self) -> Tensor:
-        return self.scale * self._around
-
-    @property
-    def _around(self) -> Tensor:
-        """(2, 3) of ``bounds``, m."""
         points = self.body.key_points
-        return torch.stack([points.amin(0) - AROUND, points.amax(0) + AROUND])
+        return self.scale * torch.stack([points.amin(0) - AROUND, points.amax(0) + AROUND])
 
     @property
     def device(self) -> torch.device:
@@ -97,124 +91,52 @@ class PredictedField(Renderable):
         options = self.options if options is None else options
         behind = self.background if background is None else background
         cameras = fixed_cameras(cameras, behind, self.sources.rgba)
-        views = [self._view(cameras.select(i)) for i in range(len(cameras))]
-        rgb, through, depth = (torch.stack(x) for x in zip(*views, strict=True))
+        with torch.no_grad():
+            views = [
+                self.network.picture(self.known, metric(cameras.select(i), self.scale))
+                for i in range(len(cameras))
+            ]
+        rgb = torch.stack([view.colour for view in views])
+        through = torch.stack([view.transmittance for view in views])
+        depth = self.scale * torch.stack([view.depth for view in views])
         return composited(rgb, through, depth, options, behind)
 
-    @torch.no_grad()
-    def _view(self, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
-        """Return colours before black (H, W, 3), transmittance (H, W) and the sum of weight times z
-        (H, W)."""
-        shape = (camera.height, camera.width)
-        like = self.sources.rgba
-        colour = like.new_zeros(*shape, 3)
-        depth = like.new_zeros(shape)
-        through = like.new_ones(shape)
-        part = around_in(metric(camera, self.scale), self._around)
-        if part is not None:
-            seen, (top, left) = self.network.picture(self.known, part.camera), part.corner
-            own = slice(top, top + part.camera.height), slice(left, left + part.camera.width)
-            colour[own] = seen.colour
-            through[own] = seen.transmittance
-            depth[own] = self.scale * seen.depth
-        return colour, through, depth
 
-
-@dataclass(frozen=True)
-class ImagePart:
-    """A part of a camera's image, with its own camera, and its first row and column."""
-
-    camera: Cameras
-    corner: tuple[int, int]
-
-
-def around_in(camera: Cameras, box: Tensor) -> ImagePart | None:
-    """Return the part of an image that shows a box, of corners (2, 3); None: no part does.
-
-    Its sides are multiples of ``MULTIPLE`` where the image is as large. All of the image where the
-    box reaches behind the camera.
-    """
-    corners = torch.cartesian_prod(*box.T)
-    pose = camera.cam_from_world[0]
-    k = camera.intrinsics[0]
-    local = corners @ pose[:3, :3].T + pose[:3, 3]
-    if bool((local[:, 2] <= 0).all()):
-        return None
-    if bool((local[:, 2] <= 1e-3).any()):
-        return ImagePart(camera, (0, 0))
-    pixels = local[:, :2] / local[:, 2:] * torch.stack([k[0, 0], k[1, 1]]) + k[:2, 2]
-    first = pixels.amin(0).floor().tolist()
-    last = pixels.amax(0).ceil().tolist()
-    (left, width), (top, height) = (
-        _within(int(begin), int(end), size)
-        for begin, end, size in zip(first, last, (camera.width, camera.height), strict=True)
-    )
-    if width <= 0 or height <= 0:
-        return None
-    intrinsics = camera.intrinsics.clone()
-    intrinsics[:, 0, 2] -= left
-    intrinsics[:, 1, 2] -= top
-    return ImagePart(Cameras(camera.cam_from_world, intrinsics, width, height), (top, left))
-
-
-def _within(begin: int, end: int, size: int) -> tuple[int, int]:
-    """Return where a part of an image's side begins, and how long it is."""
-    begin = max(begin, 0)
-    end = min(end, size)
-    length = min(-(-(end - begin) // MULTIPLE) * MULTIPLE, size)
-    return min(begin, size - length), length
-
-
-def stored_field(name: str, checkpoint: Checkpoint) -> PredictedField:
-    """Return what the network ``name`` has predicted. Raises KeyError or ValueError where tensors
+def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedField:
+    """Return the field of a checkpoint. Raises KeyError or ValueError where tensors
     do not fit."""
     stored = checkpoint.part("field")
     # earlier versions stored sizes of the network behind the scale
     numbers = require_tensor("numbers", stored["numbers"][:1], (1,), torch.float64)
     require_positive("scale", numbers)
-    network = NETWORKS[name](torch.Generator())
-    own = network.state_dict()
-    weights = {
-        key: require_tensor(key, stored[f"network.{key}"], tuple(x.shape), x.dtype).clone()
-        for key, x in own.items()
-    }
-    network.load_state_dict(weights)
-    behind = evaluation_background(checkpoint.info.background, False)[1]
-    return PredictedField(
-        network, _sources(stored), _body(stored), float(numbers[0]), background=behind
-    )
-
-
-def _sources(stored: Mapping[str, Tensor]) -> Sources:
+    network = NETWORKS[model.network](torch.Generator())
+    load_weights(network, checkpoint, "field.network")
     rgba = require_tensor("rgba", stored["sources.rgba"], (None, 4, None, None))
     count, _, height, width = rgba.shape
-    if (
-        not 1 <= count <= _MOST_VIEWS
-        or height % MULTIPLE
-        or width % MULTIPLE
-        or not 0 < height * width <= _MOST_PIXELS
-    ):
+    if not rgba.numel() or height % MULTIPLE or width % MULTIPLE:
         raise ValueError(f"'rgba' is no set of images: {tuple(rgba.shape)}")
     poses = require_tensor("cam_from_world", stored["sources.cam_from_world"], (count, 4, 4))
-    return Sources(
-        rgba, poses, require_tensor("intrinsics", stored["sources.intrinsics"], (count, 3, 3))
-    )
-
-
-def _body(stored: Mapping[str, Tensor]) -> PosedBody:
+    intrinsics = require_tensor("intrinsics", stored["sources.intrinsics"], (count, 3, 3))
     points = require_tensor("key_points", stored["body.key_points"], (None, 3))
     vertices = require_tensor("vertices", stored["body.vertices"], (None, 3))
     faces = require_indices("faces", stored["body.faces"], (None, 3), len(vertices))
-    return PosedBody(points, vertices, faces)
+    return PredictedField(
+        network,
+        Sources(rgba, poses, intrinsics),
+        PosedBody(points, vertices, faces),
+        float(numbers[0]),
+        background=evaluation_background(checkpoint.info.background, False)[1],
+    )
 
 
 class PredictedModel(Model[PredictedField]):
     """What was predicted, in the place of a model in training; to train it is refused."""
 
     def __init__(self, run: RunStart) -> None:
-        self._run, self._scene = run, None
         assert isinstance(run.config.model, PredictedFieldModel)
-        self._name = run.config.model.network
+        self._run_dir = run.config.run.dir
+        self._section = run.config.model
+        self._scene: PredictedField | None = None
 
     def begin_with(self, scene: PredictedField) -> None:
         self._scene = scene
@@ -222,11 +144,17 @@ class PredictedModel(Model[PredictedField]):
     @property
     def scene(self) -> PredictedField:
         if self._scene is None:
-            raise _untrained(self._run.config.run.dir)
+            raise self._untrained()
         return self._scene
 
+    def _untrained(self) -> DyngsError:
+        return DyngsError(
+            f"{self._run_dir}: a predicted field is not trained; predict it from other views, or train `ngp` or "
+            "`human` on the capture"
+        )
+
     def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
-        raise _untrained(self._run.config.run.dir)
+        raise self._untrained()
 
     def update(self, step: int) -> Updated:
         return Updated(0)
@@ -239,19 +167,7 @@ class PredictedModel(Model[PredictedField]):
         return self.scene.state()
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        self._scene = stored_field(self._name, checkpoint)
+        self._scene = restore(self._section, checkpoint)
 
     def place(self, device: torch.device) -> None:
         self._scene = None if self._scene is None else self._scene.to(device)
-
-
-def _untrained(where: object) -> DyngsError:
-    return DyngsError(
-        f"{where}: a predicted field is not trained; predict it from other views, or train `ngp` or `human` on the "
-        "capture"
-    )
-
-
-def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedField:
-    """Return the scene of a checkpoint."""
-    return stored_field(model.network, checkpoint)

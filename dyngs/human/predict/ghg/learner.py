@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import torch
@@ -21,7 +22,7 @@ from dyngs.data.read import captures_in, read_capture
 from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.scene import GaussianTimeStep, render_options
 from dyngs.gaussians.schedule import Rates
-from dyngs.human.avatar.scene import HumanScene, first_scene
+from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import load_template
@@ -30,15 +31,15 @@ from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.human.predict.ghg.network import (
     WIDTHS,
     AtlasNetwork,
-    CapturedPerson,
+    AtlasPerson,
     TexelMaps,
-    captured_person,
+    atlas_person,
     num_input_channels,
-    observe_texels,
-    predict_gaussians,
+    predict_avatar,
     spread_views,
     to_atlas,
 )
+from dyngs.human.predict.people import Person, person_in
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
 from dyngs.models.prediction import (
     Example,
@@ -64,30 +65,6 @@ little about the other sides."""
 _FAINT = 0.02
 
 
-@dataclass
-class TrainingPerson:
-    """A person with images, and the choices of those that are predicted from, with their maps once
-    known."""
-
-    person: CapturedPerson
-    images: ImageLoader
-    choices: list[list[int]] = field(default_factory=list)
-    _maps: dict[int, TexelMaps] = field(default_factory=dict)
-
-    def maps(self, choice: int, device: torch.device) -> TexelMaps:
-        """Return the maps of the images of a choice on ``device``; kept."""
-        if choice not in self._maps:
-            self._maps[choice] = fields_moved_to(self.observe(self.choices[choice]), device)
-        return self._maps[choice]
-
-    def observe(self, views: Sequence[int]) -> TexelMaps:
-        """Return the maps of the images of some views."""
-        person = self.person
-        return observe_texels(
-            person, ((self.images[i], person.pose_in(person.views[i])) for i in views)
-        )
-
-
 class PersonPredictor(Predictor[AtlasNetwork]):
     """Predicts an avatar; ``adapt`` trains the network on images of the person before."""
 
@@ -96,15 +73,16 @@ class PersonPredictor(Predictor[AtlasNetwork]):
         config: Config,
         network: AtlasNetwork,
         mean: Tensor,
-        person: TrainingPerson,
+        person: AtlasPerson,
         data: DataConfig,
     ) -> None:
         """``mean`` (3, S, S) are colours of the people that the network was trained on."""
         super().__init__(config, network, person.person.views, data)
-        self.mean, self._person = mean, person
+        self.mean = mean
+        self._person = person
 
     def chosen(self, count: int) -> list[int]:
-        return spread_views(self._person.person, count)
+        return spread_views(self._person, count)
 
     @torch.no_grad()
     def predict(self, views: Sequence[int]) -> HumanScene:
@@ -120,7 +98,7 @@ class PersonPredictor(Predictor[AtlasNetwork]):
         """Train the network until its prediction shows the images better that it is predicted
         from."""
         steps = ADAPTING_STEPS if steps is None else steps
-        images = [self._person.images[i] for i in views]
+        images = [self._person.person.images[i] for i in views]
         maps = self._person.observe(views)
         rate = ADAPTING_RATE * len(views)
         optimizer = torch.optim.Adam(self.network.parameters(), lr=rate)
@@ -137,19 +115,17 @@ class PersonPredictor(Predictor[AtlasNetwork]):
         """Return the preset for one person, with the template of the network."""
         preset = load_config(packaged_preset("human"), ["data.root=."])
         same = ("body", "uv", "resolution", "near", "eps2d", "rasterize_mode", "sh_degree")
-        given = human_options(_section(self.config))
+        given = human_options(self.section)
         human = preset.model.model_copy(update={name: getattr(given, name) for name in same})
         return preset.model_copy(update={"data": self.data, "model": human})
 
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
-        if not isinstance(config.model, HumanModel):
-            raise TypeError(f"not the section of one person: {config.model!r}")
-        frames = self._person.person.subject.motion.frames
+        assert isinstance(config.model, HumanModel)
+        frames = self._person.person.motion.frames
         model.begin_with(scene, HumanTraining(config.model, frames, Rates(config.train.steps)))
 
     def _scene(self, maps: TexelMaps) -> HumanScene:
-        avatar = predict_gaussians(self._person.person, maps, self.mean, self.network)
-        return first_scene(avatar.gaussians, avatar.subject)
+        return predict_avatar(self._person, maps, self.mean, self.network)
 
 
 class AtlasLearner(Learner[AtlasNetwork]):
@@ -159,44 +135,51 @@ class AtlasLearner(Learner[AtlasNetwork]):
         self,
         config: Config,
         network: AtlasNetwork,
-        people: list[TrainingPerson],
+        people: list[AtlasPerson],
+        choices: list[list[list[int]]],
         mean: Tensor,
         device: torch.device = CPU,
     ) -> None:
-        names = [x.person.name for x in people]
-        super().__init__(config, network, names, _section(config).lr, device)
-        self.people, self.mean = people, mean
-        self._moved = [fields_moved_to(x.person, device) for x in people]
+        """``choices`` are views to predict each person from; their maps are kept."""
+        super().__init__(config, network, [x.person.name for x in people], device)
+        self.people = people
+        self.choices = choices
+        self.mean = mean
+        self._moved = [fields_moved_to(x, device) for x in people]
+        self._maps = cache(self._observed)
+
+    def _observed(self, person: int, choice: int) -> TexelMaps:
+        maps = self.people[person].observe(self.choices[person][choice])
+        return fields_moved_to(maps, self.device)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
-        filmed = self.people[person]
-        choice = random_index(len(filmed.choices), generator)
-        targets = self._targets(filmed, filmed.choices[choice], generator)
+        filmed = self.people[person].person
+        choice = random_index(len(self.choices[person]), generator)
+        targets = self._targets(filmed, self.choices[person][choice], generator)
         background = self.drawn_background(generator)
-        maps = filmed.maps(choice, self.device)
-        avatar = predict_gaussians(self._moved[person], maps, self.mean, self.network)
-        scene = first_scene(avatar.gaussians, avatar.subject)
-        row = avatar.subject.motion.rows[-1 if targets[0].frame is None else targets[0].frame]
+        maps = self._maps(person, choice)
+        scene = predict_avatar(self._moved[person], maps, self.mean, self.network)
+        row = filmed.motion.rows[-1 if targets[0].frame is None else targets[0].frame]
         gaussians, posing = scene.in_frame(row, scene.given_weights())
         frame = RestFrame(scene.gaussians.means, posing.rotations[0])
         moment = GaussianTimeStep(gaussians, targets[0].time, frame)
         loss, rendered, truth = _images_error(
             scene, [moment] * len(targets), targets, background, self.config
         )
-        return Example(loss, targets[-1], rendered.detach(), truth, len(avatar.gaussians))
+        return Example(loss, targets[-1], rendered.detach(), truth, len(scene))
 
     def kept(self) -> dict[str, Tensor]:
         return {"mean": self.mean}
 
     def load(self, checkpoint: Checkpoint) -> None:
-        resolution = _section(self.config).resolution
-        self.mean = load_network(self.network, checkpoint, resolution).to(self.device)
+        mean = load_network(self.network, checkpoint, self.section.resolution)
+        self.mean = mean.to(self.device)
 
     def _targets(
-        self, person: TrainingPerson, inputs: list[int], generator: torch.Generator
+        self, person: Person, inputs: list[int], generator: torch.Generator
     ) -> list[Image]:
         """Return images of one time step that were not predicted from, where there are any."""
-        views = person.person.views
+        views = person.views
         others = [i for i in range(len(views)) if i not in inputs] or inputs
         frame = views[others[random_index(len(others), generator)]].frame
         shown = [i for i in others if views[i].frame == frame]
@@ -208,15 +191,13 @@ def learner(config: Config, generator: torch.Generator) -> AtlasLearner:
     """Return the network of ``model.kind: human_predictor`` before the first step: captures read,
     nothing trained."""
     device = device_for(config.run.device)
-    model = _section(config)
+    model: Any = config.model
     body = load_template(human_options(model))
     network = new_network(model, generator).to(device)
-    people = [filmed(data, model, body) for data in captures_in(config.data)]
-    for person in people:
-        person.choices = _choices(person.person, model.source_views, generator)
-    return AtlasLearner(
-        config, network, people, mean_colours(people, model.resolution).to(device), device
-    )
+    people = [read_person(data, model, body) for data in captures_in(config.data)]
+    choices = [_choices(person, model.source_views, generator) for person in people]
+    mean = mean_colours(people, model.resolution).to(device)
+    return AtlasLearner(config, network, people, choices, mean, device)
 
 
 def predictor(
@@ -231,11 +212,11 @@ def predictor(
 
     ``say`` and ``report`` are told of that fit.
     """
-    model = _section(config)
+    model: Any = config.model
     network = new_network(model, torch.Generator())
     mean = load_network(network, checkpoint, model.resolution)
     data = with_fitted_body(data, human_options(model), only_if_needed=True, say=say, report=report)
-    person = filmed(data, model, load_template(human_options(model)))
+    person = read_person(data, model, load_template(human_options(model)))
     return PersonPredictor(config, network, mean, person, data)
 
 
@@ -251,11 +232,9 @@ def new_network(model: HumanPredictorModel, generator: torch.Generator) -> Atlas
 def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int) -> Tensor:
     """Return the mean colours (3, S, S) of a checkpoint, whose weights ``network`` takes; S is the
     ``resolution``."""
-    mean = checkpoint.tensors.get("model.mean")
     load_weights(network, checkpoint)
-    if mean is None:
-        raise DyngsError(f"{checkpoint.name} is not of this network; was its config changed?")
     with reading(checkpoint.name, OTHER_CONFIG):
+        mean = checkpoint.tensors["model.mean"]
         return require_tensor("mean", mean, (3, resolution, resolution))
 
 
@@ -269,15 +248,14 @@ def human_options(model: HumanPredictorModel) -> HumanModel:
     )
 
 
-def filmed(data: DataConfig, model: HumanPredictorModel, body: BodyTemplate) -> TrainingPerson:
-    """Return the person of one capture, without choices of images."""
+def read_person(data: DataConfig, model: HumanPredictorModel, body: BodyTemplate) -> AtlasPerson:
+    """Return the person of one capture."""
     capture = read_capture(data)
-    return TrainingPerson(
-        captured_person(capture, model, body), ImageLoader(capture.splits["train"], data)
-    )
+    images = ImageLoader(capture.splits["train"], data)
+    return atlas_person(person_in(capture, body, images), model)
 
 
-def mean_colours(people: list[TrainingPerson], resolution: int) -> Tensor:
+def mean_colours(people: list[AtlasPerson], resolution: int) -> Tensor:
     """Return (3, S, S) mean over people of the colours that their images show of the lowest
     scaffold.
 
@@ -286,24 +264,22 @@ def mean_colours(people: list[TrainingPerson], resolution: int) -> Tensor:
     total = torch.zeros(3, resolution, resolution, device="cpu")
     count = torch.zeros(1, resolution, resolution, device="cpu")
     for person in people:
-        maps = person.observe(spread_views(person.person, MEAN_VIEWS))
+        maps = person.observe(spread_views(person, MEAN_VIEWS))
         is_seen = (maps.seen[0] > 0).float()[:, None]
-        total += to_atlas(maps.rgb[0] * is_seen, person.person.texels)
-        count += to_atlas(is_seen, person.person.texels)
+        total += to_atlas(maps.rgb[0] * is_seen, person.texels)
+        count += to_atlas(is_seen, person.texels)
     overall = total.sum((1, 2)) / count.sum().clamp_min(1)
     return torch.where(count > 0, total / count.clamp_min(1), overall[:, None, None])
 
 
-def _choices(
-    person: CapturedPerson, source_views: int, generator: torch.Generator
-) -> list[list[int]]:
+def _choices(person: AtlasPerson, source_views: int, generator: torch.Generator) -> list[list[int]]:
     """Return views to predict from, of a random time step each: one at random, the others chosen to
     see much.
 
     Every other choice has fewer than ``source_views``, in turn each number from 1.
     """
     firsts = torch.randint(
-        len(person.views), (SOURCE_SETS,), generator=generator, device="cpu"
+        len(person.person.views), (SOURCE_SETS,), generator=generator, device="cpu"
     ).tolist()
     fewer = list(range(1, source_views)) or [source_views]
     counts = [fewer[i // 2 % len(fewer)] if i % 2 else source_views for i in range(SOURCE_SETS)]
@@ -319,7 +295,7 @@ def _images_error(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the mean loss of renders of ``moments`` against images; the last render and its truth
     (H, W, 3)."""
-    options = replace(render_options(_section(config)), nonfinite="trust")
+    options = replace(render_options(config.model), nonfinite="trust")
     total = torch.zeros((), device=background.device)
     for image, moment in zip(images, moments, strict=True):
         drawn = scene.render(image.cameras, moment, options=options, background=background)
@@ -330,9 +306,3 @@ def _images_error(
         loss = image_loss(rendered, drawn.alpha[0], image, truth, config.train)
         total = total + (loss + SQUARED_WEIGHT * known.square().mean()) / len(images)
     return total, rendered, truth
-
-
-def _section(config: Config) -> HumanPredictorModel:
-    if not isinstance(config.model, HumanPredictorModel):
-        raise TypeError(f"not a network: {config.model!r}")
-    return config.model

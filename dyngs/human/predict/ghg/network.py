@@ -6,7 +6,7 @@ Local letters: D input channels, K scaffolds, S texels per side.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -18,145 +18,93 @@ from torch import Tensor, nn
 
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0
-from dyngs.core.errors import DyngsError
-from dyngs.data.capture import Capture, View
+from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians
-from dyngs.human.avatar.observations import FACING_EXPONENT, Subject, project_points
+from dyngs.human.avatar.observations import FACING_EXPONENT, project_points
 from dyngs.human.avatar.posing import (
     BodyPose,
     Skeleton,
-    frame_pose,
     pose_blend_shapes,
     texel_gaussians,
 )
+from dyngs.human.avatar.scene import HumanScene, first_scene
 from dyngs.human.body.atlas import Texels, atlas_texels
-from dyngs.human.body.body import BodyTemplate
-from dyngs.human.body.body_reader import rest_shape
-from dyngs.human.body.mesh import interpolate, rasterize, vertex_normals
-from dyngs.human.body.skinning import apply_transforms, blend_transforms, joint_transforms
+from dyngs.human.body.mesh import vertex_normals
 from dyngs.human.keys import HumanPredictorModel
-from dyngs.human.motion.motion import captured_motion
-from dyngs.models.prediction import ResidualBlock, begin_weights, upsampled
-from dyngs.ops.quaternions import unit_quats
+from dyngs.human.predict.gps.rectification import spread
+from dyngs.human.predict.people import Person, depths
+from dyngs.models.prediction import Encoder, ResidualBlock, begin_weights, upsampled
+from dyngs.ops.quaternions import quat_product, unit_quats
 
 
 @dataclass(frozen=True)
-class CapturedPerson:
-    """A person with images, as input of a prediction."""
+class AtlasPerson:
+    """A person with images on the atlas, as input of a prediction."""
 
-    name: str  # of the capture, for messages
-    body: BodyTemplate  # the template in the person's shape, without a shape space
-    normals: Tensor  # (M, 3) unit normals of its vertices
-    texels: Texels  # P, of that shape
+    person: Person
+    normals: Tensor  # (M, 3) unit normals of the vertices of the body
+    texels: Texels  # P, of the person's shape
     mirror: Tensor  # (P,) index of the texel at the mirror image of each
     heights: tuple[float, ...]  # (K,) of the scaffolds, m, ascending
-    gaussians: Gaussians  # K P grey discs, ordered by scaffold
-    subject: Subject  # skeleton, poses, and the anchors of ``gaussians``
-    views: tuple[View, ...]  # with images, in the order of the split ``train``
+    scene: HumanScene  # K P grey discs, ordered by scaffold
 
-    def pose_in(self, view: View) -> BodyPose:
-        """Return the pose of the person in ``view``."""
-        motion = self.subject.motion
-        return frame_pose(motion.clip, motion.rows[-1 if view.frame is None else view.frame])
+    def observe(self, views: Sequence[int]) -> TexelMaps:
+        """Return the maps of the images of some views."""
+        shown = self.person.views
+        poses = [self.person.pose_in(shown[i]) for i in views]
+        images = (self.person.images[i] for i in views)
+        return observe_texels(self, zip(images, poses, strict=True))
 
 
-def captured_person(
-    capture: Capture, model: HumanPredictorModel, body: BodyTemplate
-) -> CapturedPerson:
-    """Return the person of a capture, on the template ``body``.
-
-    Raises DyngsError: a capture without body parameters, without silhouettes, or a view without
-    parameters.
-    """
-    if capture.body is None:
-        raise DyngsError(
-            f"{capture.root}: has no body parameters, which a prediction needs; see docs/human.md"
-        )
-    if not capture.has_alpha:
-        raise DyngsError(
-            f"{capture.root}: the images have no silhouettes; give them alpha, see docs/human.md"
-        )
-    given = capture.body["train"]
-    views = capture.splits["train"]
-    vertices, joints = rest_shape(body, given)
-    texels = atlas_texels(body, model.resolution, vertices)
+def atlas_person(person: Person, model: HumanPredictorModel) -> AtlasPerson:
+    """Return a person on the atlas of ``model``."""
+    body = person.body
+    texels = atlas_texels(body, model.resolution, body.vertices)
     heights = tuple(sorted(set(model.scaffold_heights)))
     gaussians, anchors = texel_gaussians(texels, heights, 0)
-    captured = captured_motion(capture.root, given, views, joints)
-    shape = {
-        "shape_dirs": None,
-        "joint_shape_dirs": None,
-        "expression_dirs": None,
-        "joint_expression_dirs": None,
-    }
-    return CapturedPerson(
-        name=capture.root.name,
-        body=replace(body, vertices=vertices, joints=joints, **shape),
-        normals=torch.from_numpy(
-            vertex_normals(vertices.double().cpu().numpy(), body.faces.cpu().numpy())
-        ).to(vertices),
+    skeleton = Skeleton(body.joints, body.parents)
+    normals = vertex_normals(body.vertices.double().cpu().numpy(), body.faces.cpu().numpy())
+    return AtlasPerson(
+        person=person,
+        normals=torch.from_numpy(normals).to(body.vertices),
         texels=texels,
         mirror=mirror_texels(texels),
         heights=heights,
-        gaussians=gaussians,
-        subject=Subject(Skeleton(joints, body.parents), anchors, captured, pose_blend_shapes(body)),
-        views=views,
+        scene=first_scene(
+            gaussians, anchors, skeleton, person.motion.clip, pose_blend_shapes(body)
+        ),
     )
 
 
-def spread_views(person: CapturedPerson, count: int, first: int | None = None) -> list[int]:
-    """Return the indices, ascending, of ``count`` views that see as much of the person as possible.
+def spread_views(person: AtlasPerson, count: int, first: int | None = None) -> list[int]:
+    """Return the indices, ascending, of ``count`` views, evenly around the body: from the one that
+    is most from the front on, or from the view ``first``.
 
-    The views are of one frame, the first with the most views, if it has enough; else of all frames.
-    They maximize the mean over texels of the best view's cosine between normal and view direction,
-    in the rest pose and without occlusion; found greedily, then by exchanging one view after the
-    other. All views if there are fewer than ``count``; the view ``first`` must be among them, and
-    its frame is chosen.
+    They are of one frame, that of ``first`` or the first with the most views, if it has enough;
+    else of all frames. All views if there are fewer than ``count``.
     """
-    views = person.views
-    frames = [view.frame for view in views]
+    shown = person.person.views
+    frames = [view.frame for view in shown]
     frame = max(dict.fromkeys(frames), key=frames.count) if first is None else frames[first]
     allowed = [i for i, own in enumerate(frames) if own == frame]
     if len(allowed) < count:
-        allowed = list(range(len(views)))
-    if len(allowed) <= count:
-        return allowed
-    normals = person.texels.normals[:: max(1, len(person.texels) // 1000)]
-    cosines = normals @ torch.stack([_direction(person, views[i]) for i in allowed], dim=1)
-    start = [] if first is None else [allowed.index(first)]
-    chosen = start + _best(cosines, start, count - len(start))
-    for _ in range(count):
-        before = list(chosen)
-        for place in range(len(start), count):
-            chosen[place] = _best(cosines, chosen[:place] + chosen[place + 1 :], 1)[0]
-        if chosen == before:
-            break
-    return sorted(allowed[i] for i in chosen)
+        allowed = list(range(len(shown)))
+    azimuths = {i: _azimuth(person, shown[i]) for i in allowed}
+    ring = sorted(allowed, key=lambda i: azimuths[i])
+    if first is None:
+        first = min(ring, key=lambda i: abs(azimuths[i]))
+    return sorted(set(spread(ring, count, ring.index(first))))
 
 
-def _best(cosines: Tensor, others: list[int], count: int) -> list[int]:
-    """Return the columns of ``cosines`` (P, V) that add most to ``others``, chosen greedily."""
-    chosen: list[int] = []
-    for _ in range(count):
-        taken = others + chosen
-        seen = (
-            cosines[:, taken].amax(1, keepdim=True) if taken else cosines.new_zeros(len(cosines), 1)
-        )
-        gain = torch.maximum(cosines, seen).clamp_min(0).mean(0)
-        gain[taken] = -1
-        chosen.append(int(gain.argmax()))
-    return chosen
-
-
-def _direction(person: CapturedPerson, view: View) -> Tensor:
-    """Return the unit vector (3,) from the pelvis to the camera, in the axes of the body at
-    rest."""
-    pose = person.pose_in(view)
+def _azimuth(person: AtlasPerson, view: View) -> float:
+    """Return the angle of a camera around the vertical of the body at rest, rad; 0 is before it."""
+    pose = person.person.pose_in(view)
     cam_from_world = torch.from_numpy(view.cam_from_world).to(pose.trans)
     center = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
-    pelvis = pose.scale * person.subject.skeleton.joints[0] + pose.trans
-    return torch.nn.functional.normalize(pose.rotations[0].T @ (center - pelvis), dim=0)
+    pelvis = pose.scale * person.scene.skeleton.joints[0] + pose.trans
+    x, _, z = pose.rotations[0].T @ (center - pelvis)
+    return float(torch.atan2(x, z))
 
 
 _NEAREST = 16  # seen texels that an unseen one takes its colour from
@@ -233,41 +181,53 @@ class TexelMaps:
 
 
 @torch.no_grad()
-def observe_texels(person: CapturedPerson, images: Iterable[tuple[Image, BodyPose]]) -> TexelMaps:
-    """Return the maps of at least one image, each with its body pose. Raises ValueError: no
-    image."""
+def observe_texels(person: AtlasPerson, images: Iterable[tuple[Image, BodyPose]]) -> TexelMaps:
+    """Return the maps of at least one image, each with its body pose."""
     shape = (len(person.heights), len(person.texels))
     device = person.texels.points.device
+    faces = person.person.body.faces.cpu().numpy()
     colour = torch.zeros(*shape, 3, device=device)
     weight, seen, inside, in_frames = (torch.zeros(shape, device=device) for _ in range(4))
     hull = torch.full(shape, HULL_LIMIT, device=device)
-    offsets: Tensor | None = None
-    count = 0
+    offsets: list[Tensor] = []
     for image, pose in images:
-        distances = _edge_distances(image)
-        count = count + 1
+        camera = image.cameras
+        focal = camera.intrinsics[0, 0, 0]
+        scale = float(pose.scale)
+        white = torch.ones_like(image.rgb_premultiplied[..., 0])
+        alpha = white if image.alpha is None else image.alpha
+        planes = [image.rgb_premultiplied, alpha[..., None], _edge_distances(image)[..., None]]
         scaffolds = [_posed_vertices(person, pose, height) for height in person.heights]
-        normals = _at_texels(person, vertex_normals(scaffolds[0], person.body.faces.cpu().numpy()))
+        normals = _at_texels(person, vertex_normals(scaffolds[0], faces))
         normals = torch.nn.functional.normalize(normals, dim=1)
-        if offsets is None:
-            offsets = normals @ pose.rotations[0]
+        offsets.append(normals @ pose.rotations[0])
         for level, vertices in enumerate(scaffolds):
-            view = _scaffold_view(person, image, distances, vertices, normals, float(pose.scale))
-            cosine = view.cosine * (view.alpha > 0.5)
-            colour[level] += cosine[:, None] ** FACING_EXPONENT * view.rgb
-            weight[level] += cosine**FACING_EXPONENT * view.alpha
+            world = _at_texels(person, vertices)
+            at, depth, in_frame = project_points(world, camera)
+            towards = torch.nn.functional.normalize(camera.centers[0] - world, dim=1)
+            cosine = (towards * normals).sum(1)
+            found = _sampled(torch.cat(planes, dim=-1), at) * in_frame[:, None]
+            covered = found[:, 3]
+            # On a slanted surface the pixels around a texel see nearer points, by their width over
+            # the cosine.
+            slack = scale * _TOLERANCE + _TOLERANCE_PX * depth / focal / cosine.clamp_min(_GRAZING)
+            is_clear = depth <= _nearest_depth(vertices, faces, camera, at) + slack
+            is_seen = is_clear & in_frame & (cosine > _GRAZING)
+            cosine = torch.where(is_seen, cosine, 0.0) * (covered > 0.5)
+            colour[level] += cosine[:, None] ** FACING_EXPONENT * found[:, :3]
+            weight[level] += cosine**FACING_EXPONENT * covered
             seen[level] = torch.maximum(seen[level], cosine)
-            inside[level] += (view.alpha > 0.5).float()
-            in_frames[level] += view.in_frame
-            hull[level] = torch.minimum(
-                hull[level], torch.where(view.in_frame > 0, view.to_edge, HULL_LIMIT)
-            )
-    if offsets is None:
-        raise ValueError("there must be an image")
+            inside[level] += (covered > 0.5).float()
+            in_frames[level] += in_frame.float()
+            # m of the body, within the frame
+            to_edge = torch.where(in_frame, found[:, 4] * depth / focal / scale, HULL_LIMIT)
+            hull[level] = torch.minimum(hull[level], to_edge)
     rgb = (colour / weight.clamp_min(1e-6)[..., None]).clamp(0, 1)
     fraction = torch.where(in_frames > 0, inside / in_frames.clamp_min(1), 1.0)
     nearby = colours_nearby(person.texels, rgb[0], seen[0])
-    return TexelMaps(rgb, seen, fraction, hull.clamp_min(-HULL_LIMIT), offsets, nearby, count)
+    return TexelMaps(
+        rgb, seen, fraction, hull.clamp_min(-HULL_LIMIT), offsets[0], nearby, len(offsets)
+    )
 
 
 def to_atlas(values: Tensor, texels: Texels) -> Tensor:
@@ -280,55 +240,6 @@ def to_atlas(values: Tensor, texels: Texels) -> Tensor:
 def from_atlas(atlas: Tensor, texels: Texels) -> Tensor:
     """Return the values (P, D) of a map (D, S, S) at the texels; differentiable."""
     return atlas.flatten(1).index_select(1, texels.index).T
-
-
-@dataclass(frozen=True)
-class _ScaffoldView:
-    """One scaffold in one view: premultiplied colour (P, 3); alpha, signed distance to the
-    silhouette's edge in m of the body, cosine (0 where hidden), in the frame (P,)."""
-
-    rgb: Tensor
-    alpha: Tensor
-    to_edge: Tensor
-    cosine: Tensor
-    in_frame: Tensor
-
-
-def _scaffold_view(
-    person: CapturedPerson,
-    image: Image,
-    distances: Tensor,
-    vertices: np.ndarray,
-    normals: Tensor,
-    scale: float,
-) -> _ScaffoldView:
-    """Return one image's view of the scaffold with ``vertices`` (M, 3) and ``normals`` (P, 3).
-
-    ``distances`` are those of ``_edge_distances``, ``scale`` is the length of a metre in world
-    units.
-    """
-    camera = image.cameras
-    world = _at_texels(person, vertices)
-    at, depth, in_frame = project_points(world, camera)
-    cosine = (torch.nn.functional.normalize(camera.centers[0] - world, dim=1) * normals).sum(1)
-    alpha = torch.ones_like(image.rgb_premultiplied[..., 0]) if image.alpha is None else image.alpha
-    planes = torch.cat([image.rgb_premultiplied, alpha[..., None], distances[..., None]], dim=-1)
-    found = _sampled(planes, at) * in_frame[:, None]
-    # On a slanted surface the pixels around a texel see nearer points, by their width over the
-    # cosine.
-    slack = scale * _TOLERANCE + _TOLERANCE_PX * depth / camera.intrinsics[
-        0, 0, 0
-    ] / cosine.clamp_min(_GRAZING)
-    is_clear = (
-        depth <= _nearest_depth(vertices, person.body.faces.cpu().numpy(), camera, at) + slack
-    )
-    return _ScaffoldView(
-        rgb=found[:, :3],
-        alpha=found[:, 3],
-        to_edge=found[:, 4] * depth / camera.intrinsics[0, 0, 0] / scale,
-        cosine=torch.where(is_clear & in_frame & (cosine > _GRAZING), cosine, 0.0),
-        in_frame=in_frame.float(),
-    )
 
 
 def _edge_distances(image: Image) -> Tensor:
@@ -353,23 +264,13 @@ def _edge_distances(image: Image) -> Tensor:
 def _nearest_depth(vertices: np.ndarray, faces: np.ndarray, camera: Cameras, at: Tensor) -> Tensor:
     """Return the least depth (P,) of a mesh in the four pixels around ``at`` (P, 2); infinite off
     the mesh."""
-    projected, distance, _ = project_points(torch.from_numpy(vertices), camera)
-    pixels = projected.double().numpy()
-    depth = distance.double().numpy()
-    corners = np.concatenate([pixels - 0.5, 1.0 / depth[:, None]], axis=1)[faces]
-    # behind the camera: zero area, which covers nothing
-    corners[(depth[faces] <= 0).any(axis=1)] = 0.0
-    fragments = rasterize(corners, camera.width, camera.height)
-    buffer = np.full((camera.height + 2, camera.width + 2), np.inf)
-    buffer[fragments.index // camera.width + 1, fragments.index % camera.width + 1] = interpolate(
-        fragments.barycentric, depth[faces[fragments.faces]][..., None]
-    )[:, 0]
-    least = np.minimum.reduce([buffer[:-1, :-1], buffer[1:, :-1], buffer[:-1, 1:], buffer[1:, 1:]])
+    depth = np.pad(depths(vertices, faces, camera).numpy(), 1, constant_values=np.inf)
+    least = np.minimum.reduce([depth[:-1, :-1], depth[1:, :-1], depth[:-1, 1:], depth[1:, 1:]])
     column, row = (
         (at[:, i] + 0.5).floor().nan_to_num().clamp(0, size).long()
         for i, size in enumerate((camera.width, camera.height))
     )
-    return torch.from_numpy(least)[row.cpu(), column.cpu()].float().to(at.device)
+    return torch.from_numpy(least)[row.cpu(), column.cpu()].to(at)
 
 
 def _sampled(image: Tensor, at: Tensor) -> Tensor:
@@ -384,27 +285,18 @@ def _sampled(image: Tensor, at: Tensor) -> Tensor:
     return found[0, :, 0].T
 
 
-def _at_texels(person: CapturedPerson, values: np.ndarray) -> Tensor:
+def _at_texels(person: AtlasPerson, values: np.ndarray) -> Tensor:
     """Return values (P, 3) at the texels, interpolated between those (M, 3) at the vertices."""
-    around = (
-        torch.from_numpy(values)
-        .float()
-        .to(person.texels.points.device)[person.body.faces[person.texels.faces]]
-    )
+    corners = person.person.body.faces[person.texels.faces]
+    around = torch.from_numpy(values).float().to(corners.device)[corners]
     return (person.texels.barycentric[..., None] * around).sum(1)
 
 
-def _posed_vertices(person: CapturedPerson, pose: BodyPose, height: float) -> np.ndarray:
+def _posed_vertices(person: AtlasPerson, pose: BodyPose, height: float) -> np.ndarray:
     """Return the vertices (M, 3) of a scaffold in the world."""
-    body = person.body
-    vertices = body.vertices + height * person.normals
-    if body.pose_dirs is not None:
-        features = (pose.rotations[1:] - torch.eye(3, device=vertices.device)).flatten()
-        vertices = vertices + (features @ body.pose_dirs).unflatten(0, (-1, 3))
-    transforms = blend_transforms(
-        body.weights, joint_transforms(body.joints, body.parents, pose.rotations)
-    )
-    return (pose.scale * apply_transforms(transforms, vertices) + pose.trans).cpu().numpy()
+    vertices = person.person.body.vertices + height * person.normals
+    posed, _ = person.person.posed(vertices, pose)
+    return (pose.scale * posed + pose.trans).cpu().numpy()
 
 
 WIDTHS = (24, 32, 48, 64)
@@ -424,7 +316,7 @@ HEADS = {
 ``dyngs.human.predict.ghg.network``."""
 
 
-class AtlasNetwork(nn.Module):
+class AtlasNetwork(Encoder):
     """UNet from maps (D, S, S) to raw predictions (K, 16, S, S) in the order of ``HEADS``, which
     are 0 before training.
 
@@ -437,16 +329,9 @@ class AtlasNetwork(nn.Module):
 
         The network is made on the CPU, with weights of ``generator``.
         """
-        super().__init__()
-        self.scaffolds = scaffolds
         with torch.device("cpu"):
-            self.down = nn.ModuleList(
-                nn.Sequential(
-                    nn.Conv2d(before, width, 5 if i == 0 else 3, 2, padding=2 if i == 0 else 1),
-                    ResidualBlock(width),
-                )
-                for i, (before, width) in enumerate(zip((channels, *WIDTHS), WIDTHS, strict=False))
-            )
+            super().__init__(channels, WIDTHS)
+            self.scaffolds = scaffolds
             self.up = nn.ModuleList(
                 nn.Sequential(nn.Conv2d(below + width, width, 3, padding=1), ResidualBlock(width))
                 for below, width in zip(WIDTHS[:0:-1], WIDTHS[-2::-1], strict=True)
@@ -461,9 +346,7 @@ class AtlasNetwork(nn.Module):
     def forward(self, maps: Tensor) -> Tensor:
         """Return the raw predictions (K, 16, S, S); S must be a multiple of 2 to the number of
         widths."""
-        levels = [maps[None]]
-        for layer in self.down:
-            levels.append(layer(levels[-1]))
+        levels = self.levels(maps[None])
         features = levels.pop()
         for layer in self.up:
             features = layer(torch.cat([upsampled(features), levels.pop()], dim=1))
@@ -480,28 +363,16 @@ _GUESS_LOGITS = (0.0, 2.0, 0.0)
 _MAX_HEIGHT = 0.01
 
 
-@dataclass(frozen=True)
-class PredictedAvatar:
-    """N Gaussians at rest, and the captured person with their anchors."""
-
-    gaussians: Gaussians
-    subject: Subject
-
-
 def num_input_channels(scaffolds: int) -> int:
     """Return the number of input channels D of a network for so many scaffolds."""
     return 6 * scaffolds + 18
 
 
-def network_inputs(person: CapturedPerson, maps: TexelMaps, mean: Tensor) -> Tensor:
+def network_inputs(person: AtlasPerson, maps: TexelMaps, guesses: Tensor) -> Tensor:
     """Return the input (D, S, S): per scaffold colour, cosine, silhouettes; then offsets, points,
-    guesses of colours.
-
-    ``mean`` (3, S, S) are mean colours of the training people.
-    """
+    and ``guesses`` (3, P, 3) of colours."""
     measured = torch.stack([maps.seen, maps.inside, maps.hull / HULL_LIMIT], dim=-1)
     scaffolds = torch.cat([maps.rgb, measured], dim=-1)
-    guesses = guessed_colours(person, maps, mean)
     ones = torch.ones(len(person.texels), 1, device=scaffolds.device)
     rest = [
         maps.offsets,
@@ -514,74 +385,48 @@ def network_inputs(person: CapturedPerson, maps: TexelMaps, mean: Tensor) -> Ten
     return to_atlas(torch.cat([*scaffolds, *rest], dim=1), person.texels)
 
 
-def guessed_colours(
-    person: CapturedPerson, maps: TexelMaps, mean: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return three guesses (P, 3) of the colours of texels that no image shows: the mean colours of
-    the training people, those of seen texels nearby, and those of the other side where it is seen,
-    else as nearby."""
+def guessed_colours(person: AtlasPerson, maps: TexelMaps, mean: Tensor) -> Tensor:
+    """Return three guesses (3, P, 3) of the colours of texels that no image shows: the mean colours
+    (3, S, S) of the training people, those of seen texels nearby, and those of the other side where
+    it is seen, else as nearby."""
     is_seen = maps.seen[0][person.mirror, None] > 0
-    return (
-        from_atlas(mean, person.texels),
-        maps.nearby,
-        torch.where(is_seen, maps.rgb[0][person.mirror], maps.nearby),
-    )
+    mirrored = torch.where(is_seen, maps.rgb[0][person.mirror], maps.nearby)
+    return torch.stack([from_atlas(mean, person.texels), maps.nearby, mirrored])
 
 
-def predict_gaussians(
-    person: CapturedPerson, maps: TexelMaps, mean: Tensor, network: AtlasNetwork
-) -> PredictedAvatar:
+def predict_avatar(
+    person: AtlasPerson, maps: TexelMaps, mean: Tensor, network: AtlasNetwork
+) -> HumanScene:
     """Return the avatar that ``network`` predicts, differentiable in its weights.
 
     All texels of the lowest scaffold get a Gaussian; those above it where a view sees them and they
     lie inside the fraction ``SILHOUETTE_FRACTION`` of the silhouettes. Rotations are relative to
     the tangent frame, scales to the initial Gaussian, means move along the normal. Colours are a
     weighted mean of those of the images and of the network, which mixes and corrects the
-    ``guessed_colours``. ``mean`` is as in ``network_inputs``.
+    ``guessed_colours``. ``mean`` is as there.
     """
     kept = (maps.inside >= SILHOUETTE_FRACTION) & (maps.seen > 0)
     kept[0] = True
     rows = kept.flatten().nonzero()[:, 0]
-    first = person.gaussians.select(rows)
-    subject = replace(person.subject, anchors=person.subject.anchors.select(rows))
-    seen = maps.seen.flatten()[rows]
-    observed = maps.rgb.flatten(0, 1)[rows]
-    guesses = torch.stack(guessed_colours(person, maps, mean))[:, rows % len(person.texels)]
-    raw = network(network_inputs(person, maps, mean))
+    scene = person.scene.select(rows)
+    first = scene.gaussians
+    texel = rows % len(person.texels)
+    guesses = guessed_colours(person, maps, mean)
+    raw = network(network_inputs(person, maps, guesses))
     raw = torch.cat([from_atlas(level, person.texels) for level in raw]).index_select(0, rows)
     part = dict(zip(HEADS, raw.split(tuple(HEADS.values()), dim=1), strict=True))
-    weight = (part["image_weight"] + _IMAGE_LOGIT).sigmoid() * (seen[:, None] > 0)
+    weight = (part["image_weight"] + _IMAGE_LOGIT).sigmoid()
+    weight = weight * (maps.seen.flatten()[rows, None] > 0)
     fractions = (part["guess"] + part["guess"].new_tensor(_GUESS_LOGITS)).softmax(dim=1)
-    guess = (fractions.T[..., None] * guesses).sum(0) + part["colour"]
-    rgb = weight * observed + (1 - weight) * guess
-    normals = person.texels.normals[rows % len(person.texels)]
+    guess = (fractions.T[..., None] * guesses[:, texel]).sum(0) + part["colour"]
+    rgb = weight * maps.rgb.flatten(0, 1)[rows] + (1 - weight) * guess
+    one = rgb.new_tensor([1.0, 0.0, 0.0, 0.0])
+    limit = min((0.5 * (b - a) for a, b in pairwise(person.heights)), default=_MAX_HEIGHT)
     gaussians = Gaussians(
-        means=first.means + _max_height(person.heights) * part["height"].tanh() * normals,
-        quats=_rotated(first.quats, part["rotation"]),
+        means=first.means + limit * part["height"].tanh() * person.texels.normals[texel],
+        quats=quat_product(first.quats, unit_quats(one + part["rotation"])),
         log_scales=first.log_scales + _MAX_LOG_SCALE * (part["scale"] / _MAX_LOG_SCALE).tanh(),
         logit_opacities=first.logit_opacities + part["opacity"][:, 0],
         sh=((rgb - 0.5) / SH_C0)[:, None],
     )
-    return PredictedAvatar(gaussians, subject)
-
-
-def _max_height(heights: tuple[float, ...]) -> float:
-    """Return the limit on the offset along the normal, m."""
-    return min((0.5 * (b - a) for a, b in pairwise(heights)), default=_MAX_HEIGHT)
-
-
-def _rotated(quats: Tensor, changes: Tensor) -> Tensor:
-    """Return Hamilton products q r (N, 4), wxyz, of ``quats`` q with normalised quaternions r of 1
-    + ``changes``.
-
-    Not ``quat_product``, whose sums round otherwise: predictions would differ in last bits.
-    """
-    one = changes.new_tensor([1.0, 0.0, 0.0, 0.0])
-    w, *xyz = unit_quats(one + changes).unbind(1)
-    a = quats[:, :1]
-    vector = quats[:, 1:]
-    other = torch.stack(xyz, dim=1)
-    real = a * w[:, None] - (vector * other).sum(1, keepdim=True)
-    return torch.cat(
-        [real, a * other + w[:, None] * vector + torch.linalg.cross(vector, other, dim=1)], dim=1
-    )
+    return replace(scene, gaussians=gaussians)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -23,11 +23,10 @@ from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.scene import render_options
 from dyngs.gaussians.static_scene import Sides, StaticScene
 from dyngs.gaussians.static_training import StaticTraining
-from dyngs.human.predict.gps.keys import GpsModel
 from dyngs.human.predict.gps.rectification import (
     MAX_ANGLE,
-    Pair,
     RectifiedPair,
+    best_pair,
     cropped,
     is_inside,
     lessons,
@@ -57,14 +56,6 @@ _AROUND = 8  # px of background around the person in the images that are compare
 _FAINT = 0.02  # Opacity below which a predicted Gaussian is left out
 
 
-@dataclass
-class StereoLessons:
-    """A person to train on: images with depth maps, and pairs of them with the views in between."""
-
-    images: ImageLoader
-    pairs: list[tuple[Pair, list[int]]]
-
-
 class GpsPredictor(Predictor[GpsNetwork]):
     """Predicts the surface that pairs of neighbouring views show."""
 
@@ -75,7 +66,7 @@ class GpsPredictor(Predictor[GpsNetwork]):
         self._capture = capture
 
     def chosen(self, count: int) -> list[int]:
-        return well_spread(self.views, count)
+        return best_pair(self.views) if count == 2 else well_spread(self.views, count)
 
     @torch.no_grad()
     def predict(self, views: Sequence[int]) -> StaticScene:
@@ -85,9 +76,9 @@ class GpsPredictor(Predictor[GpsNetwork]):
         found = []
         centers = []
         for pair in pairs:
-            both = images[pair.left], images[pair.right]
-            found.append(self._surface(*both))
-            centers.append(torch.cat([image.cameras.centers for image in both]).mean(0))
+            left, right = (images[i] for i in pair)
+            found.append(self._surface(left, right))
+            centers.append(torch.cat([left.cameras.centers, right.cameras.centers]).mean(0))
         gaussians = Gaussians.joined(found)
         if not len(gaussians):
             raise DyngsError(
@@ -102,8 +93,9 @@ class GpsPredictor(Predictor[GpsNetwork]):
 
     def _surface(self, left: Image, right: Image) -> Gaussians:
         """Return the surface that two views show, inside both silhouettes."""
-        pair = rectified(left, right, _section(self.config).person_px)
-        gaussians = gaussians_of(pair, self.network(pair))
+        pair = rectified(left, right, self.section.person_px)
+        offsets, raw = self.network(pair)
+        gaussians = gaussians_of(pair, offsets[-1], raw)
         inside = is_inside(left, gaussians.means) & is_inside(right, gaussians.means)
         return gaussians.select(inside & (gaussians.opacities >= _FAINT))
 
@@ -132,27 +124,25 @@ class GpsLearner(Learner[GpsNetwork]):
         people: Sequence[DataConfig],
         device: torch.device = CPU,
     ) -> None:
-        names = [person.root.name for person in people]
-        super().__init__(config, network, names, _section(config).lr, device)
+        super().__init__(config, network, [person.root.name for person in people], device)
         self._opened = kept_open(_lessons, people)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
-        lesson = self._opened(person)
-        pair, between = lesson.pairs[random_index(len(lesson.pairs), generator)]
+        images, pairs = self._opened(person)
+        pair, between = pairs[random_index(len(pairs), generator)]
         target = between[random_index(len(between), generator)]
         background = self.drawn_background(generator)
-        left = lesson.images[pair.left]
-        right = lesson.images[pair.right]
-        windows = rectified(left, right, _section(self.config).person_px)
+        left, right = (images[i] for i in pair)
+        windows = rectified(left, right, self.section.person_px)
         windows = fields_moved_to(windows, self.device)
         only_depth = step <= round(DEPTH_FRACTION * self.config.train.steps)
-        surface = self.network(windows, with_gaussians=not only_depth)
-        depth_loss = offset_loss(windows, surface.offsets, DECAY)
+        offsets, raw = self.network(windows, with_gaussians=not only_depth)
+        depth_loss = offset_loss(windows, offsets, DECAY)
         if only_depth:
-            found = _picture(windows, surface.offsets[-1].detach())
+            found = _picture(windows, offsets[-1].detach())
             return Example(depth_loss, left, found, _picture(windows, windows.offsets))
-        gaussians = gaussians_of(windows, surface)
-        image = cropped(lesson.images[target], _AROUND).to(self.device)
+        gaussians = gaussians_of(windows, offsets[-1], raw)
+        image = cropped(images[target], _AROUND).to(self.device)
         options = replace(render_options(self.config.model), nonfinite="trust")
         drawn = StaticScene(gaussians=gaussians).render(
             image.cameras, options=options, background=background
@@ -163,7 +153,8 @@ class GpsLearner(Learner[GpsNetwork]):
         return Example(loss, image, drawn.rgb[0].detach(), truth, len(gaussians))
 
 
-def _lessons(data: DataConfig) -> StereoLessons:
+def _lessons(data: DataConfig) -> tuple[ImageLoader, list[tuple[tuple[int, int], list[int]]]]:
+    """Return the images of a person with depth maps, and pairs of them with the views in between."""
     views = _with_silhouettes(data).splits["train"]
     pairs = lessons(views)
     if not pairs:
@@ -175,7 +166,7 @@ def _lessons(data: DataConfig) -> StereoLessons:
         raise DyngsError(
             f"{data.root}: has no depth maps, from which depth is learned; `dyngs data synth people` writes them"
         )
-    return StereoLessons(ImageLoader(views, data, with_maps=True), pairs)
+    return ImageLoader(views, data, with_maps=True), pairs
 
 
 def _with_silhouettes(data: DataConfig) -> Capture:
@@ -187,10 +178,9 @@ def _with_silhouettes(data: DataConfig) -> Capture:
     return capture
 
 
-def _picture(pair: RectifiedPair, offsets: Tensor | None) -> Tensor:
+def _picture(pair: RectifiedPair, offsets: Tensor) -> Tensor:
     """Return (H, W, 3) offsets of the left view as a picture, grey in the middle, black outside of
     the person."""
-    assert offsets is not None
     grey = (0.5 + offsets[0, 0] / pair.shift).nan_to_num(0.0).clamp(0, 1) * pair.solid[0, 0]
     return grey[..., None].expand(-1, -1, 3)
 
@@ -212,9 +202,3 @@ def predictor(
     network = GpsNetwork(torch.Generator())
     load_weights(network, checkpoint)
     return GpsPredictor(config, network, _with_silhouettes(data), data)
-
-
-def _section(config: Config) -> GpsModel:
-    if not isinstance(config.model, GpsModel):
-        raise TypeError(f"not a stereo network: {config.model!r}")
-    return config.model

@@ -13,6 +13,7 @@ Local letters: two views, left and right; windows of H x W pixels.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
@@ -34,60 +35,43 @@ _BEST_ANGLE = 30.0  # Degrees that a pair should have that may be chosen freely
 _LEVEL = 0.8  # Smallest cosine between the line from camera to camera and the rows of the images
 
 
-@dataclass(frozen=True)
-class Pair:
-    """Indices of two views, of which ``left`` stands on the left as seen by both."""
+def neighbours(name: str, views: Sequence[View], chosen: Sequence[int]) -> list[tuple[int, int]]:
+    """Return pairs, left and right, of the ``chosen`` views that are next to each other on their
+    ring, all around where it is closed.
 
-    left: int
-    right: int
-
-
-def neighbours(name: str, views: Sequence[View], chosen: Sequence[int]) -> list[Pair]:
-    """Return pairs of the ``chosen`` views that are next to each other on their ring, all around
-    where it is closed.
-
-    Raises DyngsError, for the capture ``name``: fewer than two views, or one without a neighbour
-    that suits.
+    Raises DyngsError, for the capture ``name``: a view without a neighbour that suits.
     """
-    if len(chosen) < 2:
-        raise DyngsError(
-            f"{name}: depth comes from two neighbouring views at least, not one; give --views A,B"
-        )
     ordered = around(views, chosen)
     steps = [*pairwise(ordered), *([(ordered[-1], ordered[0])] if len(ordered) > 2 else [])]
-    faults = {step: fault(views[step[0]], views[step[1]]) for step in steps}
-    pairs = [_pair(views, *step) for step in steps if faults[step] is None]
-    alone = set(chosen) - {i for pair in pairs for i in (pair.left, pair.right)}
-    for step in steps:
-        if faults[step] is not None and alone.intersection(step):
-            a, b = (views[i].name for i in step)
-            raise DyngsError(f"{name}: {a} and {b} {faults[step]}")
+    pairs = [pair for step in steps if (pair := as_pair(views, *step)) is not None]
+    alone = set(chosen) - {i for pair in pairs for i in pair}
+    if alone:
+        raise DyngsError(
+            f"{name}: {views[min(alone)].name} has no neighbour to find depth with; give two views or more of one "
+            f"moment, side by side, {MIN_ANGLE:g} to {MAX_ANGLE:g} degrees apart"
+        )
     return pairs
 
 
-def fault(one: View, other: View) -> str | None:
-    """Return why depth cannot be found from two views, to follow their names; None: it can."""
-    if one.frame != other.frame or one.time != other.time:
-        return "show two moments; give views of the same one"
-    apart = angle(one, other)
-    if apart > MAX_ANGLE:
-        return f"look from directions {apart:.0f} degrees apart; give neighbours, at most {MAX_ANGLE:g} degrees apart"
-    line = camera_center(other.cam_from_world) - camera_center(one.cam_from_world)
-    if apart < MIN_ANGLE or np.linalg.norm(line) == 0:
-        return f"look from the same direction, {apart:.1f} degrees apart; give two at least {MIN_ANGLE:g} degrees apart"
-    across = one.cam_from_world[0, :3] + other.cam_from_world[0, :3]
-    if abs(line @ across) < _LEVEL * np.linalg.norm(line) * np.linalg.norm(across):
-        return "do not stand side by side; give two whose images have the other camera on the left or right"
-    return None
+def as_pair(views: Sequence[View], one: int, other: int) -> tuple[int, int] | None:
+    """Return two views as left and right, as seen by both; None: depth cannot be found from
+    them."""
+    first = views[one]
+    second = views[other]
+    line = camera_center(second.cam_from_world) - camera_center(first.cam_from_world)
+    across = first.cam_from_world[0, :3] + second.cam_from_world[0, :3]
+    along = line @ across
+    is_level = along and abs(along) >= _LEVEL * np.linalg.norm(line) * np.linalg.norm(across)
+    is_near = MIN_ANGLE <= angle(first, second) <= MAX_ANGLE
+    if not is_level or not is_near or (first.frame, first.time) != (second.frame, second.time):
+        return None
+    return (one, other) if along > 0 else (other, one)
 
 
 def angle(one: View, other: View) -> float:
     """Return the angle between the view axes, degrees."""
-    return float(
-        np.degrees(
-            np.arccos(np.clip(one.cam_from_world[2, :3] @ other.cam_from_world[2, :3], -1, 1))
-        )
-    )
+    cosine = one.cam_from_world[2, :3] @ other.cam_from_world[2, :3]
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def around(views: Sequence[View], chosen: Sequence[int]) -> list[int]:
@@ -110,41 +94,46 @@ def moments(views: Sequence[View]) -> dict[tuple[int | None, float | None], list
     return {moment: around(views, own) for moment, own in found.items()}
 
 
+def spread(ring: Sequence[int], count: int, first: int = 0) -> list[int]:
+    """Return ``count`` of the views of a ring, evenly around it from the one at ``first`` on."""
+    return [ring[(first + round(i * len(ring) / count)) % len(ring)] for i in range(count)]
+
+
 def well_spread(views: Sequence[View], count: int) -> list[int]:
-    """Return ``count`` views of the moment that most views show: two neighbours, or some evenly
-    around the ring."""
-    ordered = max(moments(views).values(), key=len)
-    if count != 2:
-        return sorted(
-            {ordered[round(i * len(ordered) / count) % len(ordered)] for i in range(count)}
+    """Return ``count`` views, evenly around the person, at the first of the moments that most views
+    show."""
+    ring = max(moments(views).values(), key=len)
+    return sorted(set(spread(ring, count)))
+
+
+def best_pair(views: Sequence[View]) -> list[int]:
+    """Return the two neighbours, of the moment that most views show, that suit depth best."""
+    ring = max(moments(views).values(), key=len)
+    pairs = [pair for pair in combinations(ring, 2) if as_pair(views, *pair) is not None]
+    return list(
+        min(
+            pairs,
+            key=lambda pair: abs(angle(views[pair[0]], views[pair[1]]) - _BEST_ANGLE),
+            default=ring[:2],
         )
-    pairs = [(a, b) for a, b in combinations(ordered, 2) if fault(views[a], views[b]) is None]
-    by_angle = sorted(
-        pairs, key=lambda pair: abs(angle(views[pair[0]], views[pair[1]]) - _BEST_ANGLE)
     )
-    return list(by_angle[0]) if by_angle else ordered[:2]
 
 
-def lessons(views: Sequence[View]) -> list[tuple[Pair, list[int]]]:
+def lessons(views: Sequence[View]) -> list[tuple[tuple[int, int], list[int]]]:
     """Return the pairs to train on, each with the views that stand between its two, of which there
     is at least one."""
-    found: list[tuple[Pair, list[int]]] = []
+    found = []
     for ring in moments(views).values():
         for start, first in enumerate(ring):
             for step in range(2, len(ring)):
                 last = ring[(start + step) % len(ring)]
                 if angle(views[first], views[last]) > MAX_ANGLE:
                     break
-                if fault(views[first], views[last]) is None:
+                pair = as_pair(views, first, last)
+                if pair is not None:
                     between = [ring[(start + k) % len(ring)] for k in range(1, step)]
-                    found.append((_pair(views, first, last), between))
+                    found.append((pair, between))
     return found
-
-
-def _pair(views: Sequence[View], one: int, other: int) -> Pair:
-    line = camera_center(views[other].cam_from_world) - camera_center(views[one].cam_from_world)
-    across = views[one].cam_from_world[0, :3] + views[other].cam_from_world[0, :3]
-    return Pair(one, other) if line @ across > 0 else Pair(other, one)
 
 
 FACTOR = 16
@@ -167,8 +156,7 @@ class RectifiedPair:
     Attributes:
         rgb: (2, 3, H, W) colours, not multiplied by alpha.
         alpha: (2, 1, H, W).
-        offsets: (2, 1, H, W) true offset d in px, NaN where no depth map knows it; None without
-            depth maps.
+        offsets: (2, 1, H, W) true offset d in px, NaN where no depth map knows it.
         rect_from_world: (3, 3) rotation of both windows.
         centers: (2, 3) of the cameras in the world.
         focal: focal length of both windows, px.
@@ -179,7 +167,7 @@ class RectifiedPair:
 
     rgb: Tensor
     alpha: Tensor
-    offsets: Tensor | None
+    offsets: Tensor
     rect_from_world: Tensor
     centers: Tensor
     focal: float
@@ -226,28 +214,36 @@ def rectified(left: Image, right: Image, person_px: int) -> RectifiedPair:
     images = [_at_size(image, person_px) for image in (left, right)]
     poses = [image.cameras.cam_from_world[0].double() for image in images]
     centers = torch.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in poses])
-    turn = _turn(centers, poses[0][2, :3] + poses[1][2, :3])
+    across = torch.nn.functional.normalize(centers[1] - centers[0], dim=0)
+    forward = poses[0][2, :3] + poses[1][2, :3]
+    down = torch.nn.functional.normalize(torch.linalg.cross(forward, across), dim=0)
+    turn = torch.stack([across, down, torch.linalg.cross(across, down)])
     boxes = torch.stack([_box(image, turn) for image in images])
-    _require_same_person(boxes, left.name, right.name)
+    widths, heights = (boxes[..., 1] - boxes[..., 0]).amax(0).tolist()
+    off = float((boxes[0, 1] - boxes[1, 1]).abs().max()) / heights
+    is_before = boxes[0, 0].mean() > boxes[1, 0].mean()
+    if off > _SAME_HEIGHT or not is_before or widths > _LARGEST * heights:
+        raise DyngsError(
+            f"{left.name} and {right.name}: do not show the same person where their cameras say (heights differ by "
+            f"{off:.0%}); the calibration is wrong, or a mask is: see `dyngs data inspect`"
+        )
     height = float(boxes[:, 1, 1].max() - boxes[:, 1, 0].min())
     focal = person_px / height
-    size = [
-        _rounded(focal * height),
-        _rounded(focal * float((boxes[:, 0, 1] - boxes[:, 0, 0]).max())),
-    ]
-    middle = torch.stack([boxes[:, 0].mean(1), boxes[:, 1].mean().expand(2)], dim=1)
-    principal = (
-        torch.tensor([size[1] / 2, size[0] / 2], dtype=torch.float64, device="cpu") - focal * middle
+    rows, columns = (
+        FACTOR * math.ceil((focal * side + 2 * _MARGIN) / FACTOR) for side in (height, widths)
     )
-    rays = _rays(principal, focal, (size[0], size[1]))
+    middle = torch.stack([boxes[:, 0].mean(1), boxes[:, 1].mean().expand(2)], dim=1)
+    half = torch.tensor([columns / 2, rows / 2], dtype=torch.float64, device="cpu")
+    principal = half - focal * middle
+    rays = _rays(principal, focal, (rows, columns))
     baseline = float((centers[1] - centers[0]).norm())
     windows = [_window(image, turn, ray) for image, ray in zip(images, rays, strict=True)]
-    depth = None if any(x.depth is None for x in images) else torch.stack([x[2] for x in windows])
+    rgb, alpha, depth = (torch.stack(x) for x in zip(*windows, strict=True))
     shift = principal[1, 0] - principal[0, 0]
     return RectifiedPair(
-        rgb=torch.stack([x[0] for x in windows]),
-        alpha=torch.stack([x[1] for x in windows]),
-        offsets=None if depth is None else (focal * baseline / depth - shift).float(),
+        rgb=rgb,
+        alpha=alpha,
+        offsets=(focal * baseline / depth - shift).float(),
         rect_from_world=turn.float(),
         centers=centers.float(),
         focal=focal,
@@ -267,14 +263,6 @@ def _at_size(image: Image, person_px: int) -> Image:
     return image.shrunk(max(1, int(rows.max() - rows.min() + 1) // person_px))
 
 
-def _turn(centers: Tensor, forward: Tensor) -> Tensor:
-    """Return the rotation (3, 3) to axes along the line from left to right ``centers`` (2, 3), down
-    and forward."""
-    across = torch.nn.functional.normalize(centers[1] - centers[0], dim=0)
-    down = torch.nn.functional.normalize(torch.linalg.cross(forward, across), dim=0)
-    return torch.stack([across, down, torch.linalg.cross(across, down)])
-
-
 def _box(image: Image, turn: Tensor) -> Tensor:
     """Return the lowest and highest x and y (2, 2) of the person in the turned camera, at depth
     1."""
@@ -284,32 +272,8 @@ def _box(image: Image, turn: Tensor) -> Tensor:
     camera = image.cameras
     inverse = torch.linalg.inv(camera.intrinsics[0].double())
     seen = pixels @ inverse.T @ camera.cam_from_world[0, :3, :3].double() @ turn.T
-    if bool((seen[:, 2] <= 0).any()):
-        raise DyngsError(
-            f"{image.name}: looks along the line to the other camera; give two that look the same way"
-        )
     flat = seen[:, :2] / seen[:, 2:]
     return torch.stack([flat.amin(0), flat.amax(0)], dim=1)
-
-
-def _require_same_person(boxes: Tensor, left: str, right: str) -> None:
-    """Raise where the ``boxes`` (2, 2, 2) of one person cannot be that of both views."""
-    height = (boxes[:, 1, 1] - boxes[:, 1, 0]).max()
-    off = float((boxes[0, 1] - boxes[1, 1]).abs().max() / height)
-    if off > _SAME_HEIGHT:
-        raise DyngsError(
-            f"{left} and {right}: by their cameras the person begins or ends at other heights, {off:.0%} of the person "
-            "apart; the calibration is wrong, a mask is, or they do not show the same: see `dyngs data inspect`"
-        )
-    if not float(boxes[0, 0].mean() - boxes[1, 0].mean()) > 0:
-        raise DyngsError(
-            f"{left} and {right}: what they show of the person lies behind the cameras; the calibration is wrong, or "
-            "they do not show the same"
-        )
-    if float((boxes[:, 0, 1] - boxes[:, 0, 0]).max()) > _LARGEST * float(height):
-        raise DyngsError(
-            f"{left} and {right}: the person is {_LARGEST:g} times as wide as high; is a mask wrong?"
-        )
 
 
 def _window(image: Image, turn: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -318,16 +282,11 @@ def _window(image: Image, turn: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, T
     camera = image.cameras
     seen = rays @ turn @ camera.cam_from_world[0, :3, :3].double().T
     projected = seen @ camera.intrinsics[0].double().T
-    grid = (
-        2
-        * projected[..., :2]
-        / projected[..., 2:]
-        / projected.new_tensor([camera.width, camera.height])
-        - 1
-    )
-    grid = grid.float()[None]
-    alpha = torch.ones_like(image.rgb_premultiplied[..., 0]) if image.alpha is None else image.alpha
-    layers = torch.cat([image.rgb_premultiplied, alpha[..., None]], dim=2).permute(2, 0, 1)[None]
+    size = projected.new_tensor([camera.width, camera.height])
+    grid = (2 * projected[..., :2] / projected[..., 2:] / size - 1).float()[None]
+    assert image.alpha is not None
+    layers = torch.cat([image.rgb_premultiplied, image.alpha[..., None]], dim=2)
+    layers = layers.permute(2, 0, 1)[None]
     sampled = grid_sample(layers, grid, align_corners=False)[0]
     rgb = sampled[:3] / sampled[3:].clamp_min(1e-3)
     if image.depth is None:
@@ -354,15 +313,11 @@ def _depth_at(depth: Tensor, grid: Tensor) -> Tensor:
 
 def _rays(principal: Tensor, focal: float, size: tuple[int, int]) -> Tensor:
     """Return the rays (2, H, W, 3) through the pixels of the windows, at depth 1 in their axes."""
-    rows = torch.arange(size[0], dtype=principal.dtype, device=principal.device) + 0.5
-    columns = torch.arange(size[1], dtype=principal.dtype, device=principal.device) + 0.5
+    pixels = (torch.arange(n, dtype=principal.dtype, device=principal.device) for n in size)
+    rows, columns = (x + 0.5 for x in pixels)
     y = ((rows - principal[:, 1:]) / focal)[:, :, None].expand(-1, -1, size[1])
     x = ((columns - principal[:, :1]) / focal)[:, None].expand(-1, size[0], -1)
     return torch.stack([x, y, torch.ones_like(x)], dim=-1)
-
-
-def _rounded(pixels: float) -> int:
-    return int(-(-(pixels + 2 * _MARGIN) // FACTOR) * FACTOR)
 
 
 def is_inside(image: Image, points: Tensor) -> Tensor:
@@ -372,13 +327,11 @@ def is_inside(image: Image, points: Tensor) -> Tensor:
     camera = image.cameras
     pose = camera.cam_from_world[0]
     flat = (points @ pose[:3, :3].T + pose[:3, 3]) @ camera.intrinsics[0].T
-    place = (
-        flat[:, :2] / flat[:, 2:].clamp_min(1e-9) / flat.new_tensor([camera.width, camera.height])
-    )
+    size = flat.new_tensor([camera.width, camera.height])
+    place = flat[:, :2] / flat[:, 2:].clamp_min(1e-9) / size
     beyond = (flat[:, 2] <= 0) | ((place < 0) | (place > 1)).any(1)
-    alpha = grid_sample(image.alpha[None, None], (2 * place - 1)[None, None], align_corners=False)[
-        0, 0, 0
-    ]
+    grid = (2 * place - 1)[None, None]
+    alpha = grid_sample(image.alpha[None, None], grid, align_corners=False)[0, 0, 0]
     return beyond | (alpha > _REACHED)
 
 

@@ -13,7 +13,6 @@ channels, D offsets.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -30,7 +29,7 @@ from torch.nn.functional import (
 from dyngs.core.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.human.predict.gps.rectification import RectifiedPair
-from dyngs.models.prediction import ResidualBlock, begin_weights, upsampled
+from dyngs.models.prediction import Encoder, ResidualBlock, begin_weights, upsampled
 from dyngs.ops.quaternions import quat_product, quats_of, unit_quats
 
 QUARTER = 4
@@ -46,26 +45,6 @@ _SHARPNESS = 2.0
 _NEVER = -1e4  # Logits of upsampling: by squared distance, and of what cannot be
 SIDES = (1.0, -1.0)
 """A larger offset lies further left in the right view, further right in the left one."""
-
-
-class Encoder(nn.Module):
-    """Features (B, C, ...) of images at 1/2, 1/4 and 1/8 of their resolution."""
-
-    def __init__(self, channels: int, widths: Sequence[int]) -> None:
-        super().__init__()
-        self.down = nn.ModuleList(
-            nn.Sequential(
-                nn.Conv2d(before, width, 5 if i == 0 else 3, 2, 2 if i == 0 else 1),
-                ResidualBlock(width),
-            )
-            for i, (before, width) in enumerate(zip((channels, *widths), widths, strict=False))
-        )
-
-    def forward(self, images: Tensor) -> list[Tensor]:
-        levels = [images]
-        for layer in self.down:
-            levels.append(layer(levels[-1]))
-        return levels[1:]
 
 
 class StereoNetwork(nn.Module):
@@ -191,14 +170,6 @@ _RANGE = 64.0  # px; offsets are divided by it before they enter a network
 _LEAST = 0.2  # Smallest disparity, relative to that of the middle of the person
 
 
-@dataclass(frozen=True)
-class PredictedSurface:
-    """Prediction of the network for two views."""
-
-    offsets: list[Tensor]  # (2, 1, H, W), of which the last are the finest, px
-    raw: Tensor | None  # (2, 8, H, W) in the order of ``HEADS``; None: only depth was asked for
-
-
 class GpsNetwork(nn.Module):
     """Depth and Gaussians of two rectified views; features of the images are shared by both tasks.
 
@@ -225,37 +196,38 @@ class GpsNetwork(nn.Module):
         for layer in (self.heads, self.stereo.change, self.stereo.weights):
             nn.init.zeros_(layer.weight)
 
-    def forward(self, pair: RectifiedPair, *, with_gaussians: bool = True) -> PredictedSurface:
-        """Return the offsets of ``pair``, and what makes Gaussians of its pixels."""
+    def forward(
+        self, pair: RectifiedPair, *, with_gaussians: bool = True
+    ) -> tuple[list[Tensor], Tensor | None]:
+        """Return offsets (2, 1, H, W) of ``pair``, px, of which the last are the finest, and what makes
+        Gaussians of its pixels (2, 8, H, W) in the order of ``HEADS``."""
         inside = pair.solid.float()
         images = pixel_unshuffle(torch.cat([(2 * pair.rgb - 1) * inside, pair.alpha], dim=1), 2)
         levels = self.encoder(images)
         around = offsets_of(pair.shift)
         offsets, fused = self.stereo(levels, sweep(pair.rgb, pair.alpha, around), around, inside)
         if not with_gaussians:
-            return PredictedSurface(offsets, None)
+            return offsets, None
         depth = pixel_unshuffle(torch.cat([offsets[-1] / _RANGE * inside, inside], dim=1), 2)
         halves, quarters, eighths = self.depth_encoder(depth)
         features = self.up[0](torch.cat([fused, quarters, upsampled(eighths)], dim=1))
         features = self.up[1](torch.cat([upsampled(features), levels[0], halves], dim=1))
         features = self.last(torch.cat([upsampled(features), images, depth[:, :4]], dim=1))
-        return PredictedSurface(offsets, pixel_shuffle(self.heads(features), 2))
+        return offsets, pixel_shuffle(self.heads(features), 2)
 
 
-def gaussians_of(pair: RectifiedPair, surface: PredictedSurface) -> Gaussians:
+def gaussians_of(pair: RectifiedPair, offsets: Tensor, raw: Tensor) -> Gaussians:
     """Return the Gaussians of the pixels of the person in both views, differentiable in
-    ``surface``.
+    their ``offsets`` (2, 1, H, W) and ``raw`` values (2, 8, H, W).
 
     Means lie on the rays through the pixels, rotations are relative to the axes of the windows,
     colours are those of the images. Outlines are as transparent as in the images; what the other
     view would show beside the person, wholly (visual hull).
     """
-    assert surface.raw is not None
-    least = (_LEAST - 1) * pair.shift
-    offsets = torch.maximum(surface.offsets[-1], least)
+    offsets = torch.maximum(offsets, (_LEAST - 1) * pair.shift)
     depth = pair.depth(offsets)
     solid = pair.solid[:, 0]
-    parts = surface.raw.permute(0, 2, 3, 1)[solid].split(tuple(HEADS.values()), dim=1)
+    parts = raw.permute(0, 2, 3, 1)[solid].split(tuple(HEADS.values()), dim=1)
     part = dict(zip(HEADS, parts, strict=True))
     pixel = (depth[:, 0][solid] / pair.focal)[:, None]
     scales = LARGEST * pixel * (part["scale"] + _SCALE_LOGIT).sigmoid()
@@ -279,7 +251,6 @@ def offset_loss(pair: RectifiedPair, offsets: Sequence[Tensor], decay: float) ->
 
     The last ones count 1, each before ``decay`` times the next (Teed and Deng 2020).
     """
-    assert pair.offsets is not None
     known = pair.solid & pair.offsets.isfinite()
     truth = pair.offsets[known]
     total = torch.zeros((), device=pair.rgb.device)

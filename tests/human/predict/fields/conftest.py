@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from tiny_field_people import field_people, first_person
 
-from dyngs.human.predict.fields.people import Person
+from dyngs.human.predict.people import Person
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dyngs.core.camera import Cameras
-from dyngs.human.predict.fields.people import (
+from dyngs.human.predict.people import (
     INWARDS,
     OUTWARDS,
     Boundaries,
@@ -83,15 +83,15 @@ def test_boundaries_of_a_ball_are_balls() -> None:
     body = PosedBody(
         torch.zeros(22, 3), torch.from_numpy(vertices).float(), torch.from_numpy(faces.copy())
     )
-    found = Boundaries(body).interval(camera())
-    middle = found.begin[12, 16], found.body[12, 16], found.end[12, 16]
+    begin, end, met = Boundaries(body).interval(camera())
+    middle = begin[12, 16], met[12, 16], end[12, 16]
     expected = (DISTANCE - RADIUS - OUTWARDS, DISTANCE - RADIUS, DISTANCE - RADIUS + INWARDS)
     torch.testing.assert_close(torch.stack(middle), torch.tensor(expected), atol=2e-3, rtol=0)
-    outside = found.body.isinf() & found.begin.isfinite()
+    outside = met.isinf() & begin.isfinite()
     assert bool(outside.any())
     expected_end = true_depths(RADIUS + OUTWARDS, 1.0)
     sure = outside & expected_end.isfinite() & true_depths(RADIUS, 1.0).isinf()
-    assert float((found.end - expected_end)[sure].abs().median()) < 5e-3, (
+    assert float((end - expected_end)[sure].abs().median()) < 5e-3, (
         "what misses the body comes out again"
     )
 
@@ -102,20 +102,20 @@ def test_a_thin_body_ends_behind_its_front() -> None:
     body = PosedBody(
         torch.zeros(22, 3), torch.from_numpy(vertices).float(), torch.from_numpy(faces.copy())
     )
-    found = Boundaries(body).interval(camera())
-    assert float(found.end[12, 16]) > float(found.body[12, 16])
+    _, end, met = Boundaries(body).interval(camera())
+    assert float(end[12, 16]) > float(met[12, 16])
 
 
 def test_the_surface_of_a_dressed_person_lies_in_between(person: Person) -> None:
     body, scale = person.body_in(person.views[0])
     image = person.images[0]
-    found = Boundaries(body).interval(metric(image.cameras, scale))
+    begin, end, met = Boundaries(body).interval(metric(image.cameras, scale))
     assert image.depth is not None
     assert image.alpha is not None
     solid = (image.alpha > 0.99) & (image.depth > 0)
     truth = (image.depth / scale)[solid]
-    inside = (found.begin[solid] <= truth) & (truth <= found.end[solid])
+    inside = (begin[solid] <= truth) & (truth <= end[solid])
     assert float(inside.float().mean()) > 0.9
-    met = found.body.isfinite() & found.begin.isfinite()
-    assert bool((found.end > found.body)[met].all()), "also of mouth, eyes and fingers"
-    assert float(found.begin.isfinite().float().mean()) < 0.6
+    both = met.isfinite() & begin.isfinite()
+    assert bool((end > met)[both].all()), "also of mouth, eyes and fingers"
+    assert float(begin.isfinite().float().mean()) < 0.6

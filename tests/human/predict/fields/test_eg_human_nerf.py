@@ -14,7 +14,7 @@ from dyngs.human.predict.fields.eg_human_nerf import (
     opacities,
 )
 from dyngs.human.predict.fields.network import EncodedPerson
-from dyngs.human.predict.fields.people import Boundaries, Person, metric, sources_of, window
+from dyngs.human.predict.people import Boundaries, Person, metric, sources_of, window
 
 
 def network_with() -> EgHumanNerf:
@@ -123,15 +123,11 @@ def test_distances_are_compared_with_depth_maps(person: Person) -> None:
     ).flatten(1)
     lengths = local.norm(dim=0)
     true = []
-    for samples in picture.samples:
-        surface = (image.depth.flatten() / scale * lengths)[samples.rays][:, None]
-        meets = image.alpha.flatten()[samples.rays][:, None] > 0.5
-        limit = PARAMS.limit
-        true.append(
-            replace(
-                samples,
-                signed=torch.where(meets, surface - samples.at, limit).clamp(-limit, limit),
-            )
-        )
+    limit = PARAMS.limit
+    for rays, at, _ in picture.samples:
+        surface = (image.depth.flatten() / scale * lengths)[rays][:, None]
+        meets = image.alpha.flatten()[rays][:, None] > 0.5
+        signed = torch.where(meets, surface - at, limit).clamp(-limit, limit)
+        true.append((rays, at, signed))
     told = float(network.penalty(replace(picture, samples=true), image, scale))
     assert told < 1e-4 < off

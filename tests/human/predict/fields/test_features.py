@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from dyngs.human.predict.fields.network import (
-    SourceFeatures,
-    blended,
-)
-from dyngs.human.predict.fields.people import Sources
+from dyngs.human.predict.fields.network import SourceFeatures
+from dyngs.human.predict.people import Sources
 
 FOCAL, WIDTH, HEIGHT = 20.0, 32, 24
 
@@ -41,17 +38,3 @@ def test_points_show_what_their_pixels_show() -> None:
     assert looked.alpha[1, 2] == 0.5, "13 m before the other one"
     assert bool((looked.alpha[:, 3] == 0).all()), "beside the images"
     assert looked.features.shape == (2, 4, 5)
-
-
-def test_hidden_images_do_not_count_where_another_does() -> None:
-    colours = torch.rand(3, 4, 3, generator=torch.Generator().manual_seed(0))
-    logits = torch.tensor([[0.0] * 4, [1.0] * 4, [5.0] * 4])
-    hidden = torch.tensor(
-        [[False, True, True, False], [True, True, False, False], [True, True, True, False]]
-    )
-    found = blended(logits, colours, hidden)
-    torch.testing.assert_close(found[0], colours[0, 0])
-    torch.testing.assert_close(found[2], colours[1, 2])
-    plain = (logits.softmax(0)[..., None] * colours).sum(0)
-    torch.testing.assert_close(found[[1, 3]], plain[[1, 3]])
-    torch.testing.assert_close(blended(logits, colours), plain)

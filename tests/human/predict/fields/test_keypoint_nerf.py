@@ -14,7 +14,7 @@ from dyngs.human.predict.fields.keypoint_nerf import (
     spatial_code,
 )
 from dyngs.human.predict.fields.network import EncodedPerson
-from dyngs.human.predict.fields.people import Person, PosedBody, Sources, metric, sources_of, window
+from dyngs.human.predict.people import Person, PosedBody, Sources, metric, sources_of, window
 
 
 @pytest.fixture(scope="module")
@@ -66,13 +66,13 @@ def test_the_cells_hold_the_body_and_nothing_far_away(
     """What two opposite images leave open is closed by the bones."""
     for views in ((0, 2, 4), (0, 4)):
         own = known(network, person, views)
-        found = own.own
-        cells = (found.space.unit(own.body.vertices) * found.space.cells).long()
+        space, occupied = own.own
+        cells = (space.unit(own.body.vertices) * space.cells).long()
         x, y, z = cells.unbind(1)
         shown = (own.seen.alpha(own.body.vertices) > 0.5).all(0)
         assert float(shown.float().mean()) > 0.5, "at 40 px many vertices lie on the outline"
-        assert bool(found.occupied[0, z, y, x][shown].all())
-        assert 0.001 < float(found.occupied.float().mean()) < 0.15
+        assert bool(occupied[0, z, y, x][shown].all())
+        assert 0.001 < float(occupied.float().mean()) < 0.15
 
 
 def test_a_part_of_a_picture_is_the_same_alone(network: KeypointNerf, person: Person) -> None:

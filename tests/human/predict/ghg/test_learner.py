@@ -14,11 +14,11 @@ from dyngs.core.errors import DyngsError
 from dyngs.human.predict.ghg.learner import (
     AtlasLearner,
     PersonPredictor,
-    TrainingPerson,
     learner,
     mean_colours,
     new_network,
 )
+from dyngs.human.predict.ghg.network import AtlasPerson
 from dyngs.training.prediction import network_trainer
 
 
@@ -46,7 +46,7 @@ def test_training_lowers_the_loss(folder: Path, tmp_path: Path) -> None:
 def test_choices_are_as_many_as_asked_for(folder: Path, tmp_path: Path) -> None:
     """Every other one of fewer images."""
     atlas = assembled(config(folder, tmp_path, source_views=3))
-    assert [[len(choice) for choice in person.choices] for person in atlas.people] == [
+    assert [[len(choice) for choice in choices] for choices in atlas.choices] == [
         [3, 1, 3, 2, 3, 1]
     ] * 2
     assert [person.person.name for person in atlas.people] == ["p1", "p2"]
@@ -83,7 +83,7 @@ def test_training_on_the_images_of_one_person_shows_them_better(tmp_path: Path) 
     assert trained == again
 
 
-def error_after(shown: TrainingPerson, steps: int) -> float:
+def error_after(shown: AtlasPerson, steps: int) -> float:
     """Sum over three views of the mean absolute error on white, of a network trained on these for
     ``steps``."""
     values = {"data": {"root": "."}, "model": NET, "train": {"alpha_weight": 0.1}}
@@ -98,7 +98,7 @@ def error_after(shown: TrainingPerson, steps: int) -> float:
     assert unchanged == (steps == 0)
     scene = predictor.predict(views)
     white = torch.ones(3)
-    images = [shown.images[view] for view in views]
+    images = [shown.person.images[view] for view in views]
     errors = (
         scene.render(x.cameras, x.time, background=white).rgb[0] - x.composite(white)
         for x in images

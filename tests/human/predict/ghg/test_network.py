@@ -9,17 +9,17 @@ import torch
 from tiny_people import NET, people, person
 from torch import Tensor
 
+from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.human.predict.ghg.network import (
     HEADS,
     AtlasNetwork,
-    CapturedPerson,
-    PredictedAvatar,
+    AtlasPerson,
     TexelMaps,
     guessed_colours,
     network_inputs,
     num_input_channels,
-    predict_gaussians,
+    predict_avatar,
 )
 
 
@@ -29,14 +29,14 @@ def test_predictions_are_zero_before_training() -> None:
     assert (found == 0).all()
 
 
-Shown = tuple[CapturedPerson, TexelMaps]
+Shown = tuple[AtlasPerson, TexelMaps]
 MEAN = torch.full((3, NET.resolution, NET.resolution), 0.25)
 
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
-    filmed = person(people(tmp_path_factory.mktemp("people"), (1,)) / "p1")
-    return filmed.person, filmed.observe([0, 3, 6])
+    shown = person(people(tmp_path_factory.mktemp("people"), (1,)) / "p1")
+    return shown, shown.observe([0, 3, 6])
 
 
 def constant_network(bias: dict[str, float] | None = None) -> AtlasNetwork:
@@ -48,9 +48,9 @@ def constant_network(bias: dict[str, float] | None = None) -> AtlasNetwork:
     return made
 
 
-def predicted(shown: Shown, bias: dict[str, float] | None = None) -> PredictedAvatar:
+def predicted(shown: Shown, bias: dict[str, float] | None = None) -> HumanScene:
     with torch.no_grad():
-        return predict_gaussians(*shown, MEAN, constant_network(bias))
+        return predict_avatar(*shown, MEAN, constant_network(bias))
 
 
 def matrices(quats: Tensor) -> Tensor:
@@ -67,7 +67,7 @@ def matrices(quats: Tensor) -> Tensor:
 def test_the_skin_is_whole_and_scaffolds_are_carved(shown: Shown) -> None:
     """Above the skin: seen, and inside the silhouettes of all three views."""
     sitter, maps = shown
-    found = predicted(shown).subject.anchors
+    found = predicted(shown).anchors
     kept = (maps.inside[1] == 1) & (maps.seen[1] > 0)
     assert (found.points[: len(sitter.texels)] == sitter.texels.points).all()
     torch.testing.assert_close(
@@ -108,10 +108,8 @@ def test_unseen_texels_are_painted_and_mistrusted_ones_too(shown: Shown) -> None
         : len(sitter.texels)
     ]
     torch.testing.assert_close(trusting[seen], maps.rgb[0][seen])
-    mean, nearby, other_side = guessed_colours(sitter, maps, MEAN)
-    guess = torch.stack([mean, nearby, other_side], dim=-1) @ torch.tensor([0.0, 2.0, 0.0]).softmax(
-        0
-    )
+    fractions = torch.tensor([0.0, 2.0, 0.0]).softmax(0)
+    guess = (fractions[:, None, None] * guessed_colours(sitter, maps, MEAN)).sum(0)
     torch.testing.assert_close(trusting[~seen], guess[~seen] + 0.5)
     wary = predicted(shown, {"colour": 0.5, "image_weight": -50.0}).gaussians.base_rgb
     torch.testing.assert_close(wary[: len(sitter.texels)], guess + 0.5)
@@ -119,7 +117,7 @@ def test_unseen_texels_are_painted_and_mistrusted_ones_too(shown: Shown) -> None
 
 def test_all_heads_learn(shown: Shown) -> None:
     made = constant_network()
-    avatar = predict_gaussians(*shown, MEAN, made)
+    avatar = predict_avatar(*shown, MEAN, made)
     sum(x.square().sum() for x in avatar.gaussians.tensors().values()).backward()  # type: ignore[union-attr]
     grad = made.heads.bias.grad
     assert grad is not None
@@ -131,11 +129,12 @@ def test_all_heads_learn(shown: Shown) -> None:
 
 def test_inputs_hold_everything_in_the_atlas(shown: Shown) -> None:
     sitter, maps = shown
-    found = network_inputs(sitter, maps, MEAN)
+    found = network_inputs(sitter, maps, guessed_colours(sitter, maps, MEAN))
     assert found.shape == (num_input_channels(2), NET.resolution, NET.resolution)
     assert found[-2].sum() == len(sitter.texels)
     torch.testing.assert_close(found[-1], found[-2] / 3)
-    other = network_inputs(sitter, replace(maps, rgb=1 - maps.rgb), MEAN)
+    changed_maps = replace(maps, rgb=1 - maps.rgb)
+    other = network_inputs(sitter, changed_maps, guessed_colours(sitter, changed_maps, MEAN))
     changed = (found != other).flatten(1).any(1)
     level = [True] * 3 + [False] * 3
     other_side = [True] * 3

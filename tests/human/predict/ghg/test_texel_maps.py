@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import torch
@@ -13,7 +15,7 @@ from torch import Tensor
 from dyngs.core.camera import Cameras
 from dyngs.data.capture import BodyFrames, Capture, View
 from dyngs.data.geometry import cam_from_opengl
-from dyngs.data.loader import Image
+from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.synthetic.captures import CAMERA_ANGLE_X
 from dyngs.human.avatar.posing import BodyPose
 from dyngs.human.body.atlas import Texels, atlas_texels
@@ -24,11 +26,12 @@ from dyngs.human.body.mesh import interpolate, rasterize
 from dyngs.human.keys import HumanPredictorModel
 from dyngs.human.predict.ghg.network import (
     HULL_LIMIT,
-    CapturedPerson,
-    captured_person,
+    AtlasPerson,
+    atlas_person,
     colours_nearby,
     observe_texels,
 )
+from dyngs.human.predict.people import person_in
 from dyngs.human.synthetic.capture import (
     PosedMesh,
     render_mesh,
@@ -70,7 +73,7 @@ def body() -> BodyTemplate:
     return default_template()
 
 
-def sitter(poses: Tensor) -> CapturedPerson:
+def sitter(poses: Tensor) -> AtlasPerson:
     """A person of whom there is one view, in the pose (55, 3), scaffolds at 0 and 4 cm."""
     view = View("v", Path("v.png"), cam_from_opengl(FRONT), np.eye(3), SIZE, SIZE, frame=0)
     frames = BodyFrames(
@@ -79,9 +82,9 @@ def sitter(poses: Tensor) -> CapturedPerson:
     capture = Capture(
         Path("person"), "body_json", {"train": (view,)}, has_alpha=True, body={"train": frames}
     )
-    return captured_person(
-        capture, HumanPredictorModel(resolution=64, scaffold_heights=(0.0, 0.04)), body()
-    )
+    images = cast(ImageLoader, SimpleNamespace(views=(view,)))
+    person = person_in(capture, body(), images)
+    return atlas_person(person, HumanPredictorModel(resolution=64, scaffold_heights=(0.0, 0.04)))
 
 
 def arms_before_the_chest() -> Tensor:
@@ -130,8 +133,8 @@ def is_arm(joints: np.ndarray | Tensor) -> np.ndarray:
     return np.array([any(part in name for part in arm) for name in names])
 
 
-def posing(of: CapturedPerson) -> BodyPose:
-    return of.pose_in(of.views[0])
+def posing(of: AtlasPerson) -> BodyPose:
+    return of.person.pose_in(of.person.views[0])
 
 
 def test_distances_from_the_edge_are_those_of_the_outline() -> None:
@@ -139,7 +142,7 @@ def test_distances_from_the_edge_are_those_of_the_outline() -> None:
     cm outside."""
     shown = sitter(torch.zeros(55, 3))
     seen = image(torch.zeros(55, 3), np.full((4, 4, 3), 0.5), FRONT)
-    maps = observe_texels(shown, [(seen, shown.pose_in(shown.views[0]))])
+    maps = observe_texels(shown, [(seen, posing(shown))])
     points = shown.texels.points
     normals = shown.texels.normals
     outer = (

@@ -21,7 +21,7 @@ from dyngs.config import DataConfig
 from dyngs.core.conventions import report_nothing
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
-from dyngs.data.aim import look_at
+from dyngs.data.geometry import look_at
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import captures_in, read_capture
 from dyngs.evaluate.report import evaluate_run
@@ -124,7 +124,7 @@ def test_a_ring_is_seen_from_all_round(run: Path, folder: Path, tmp_path: Path) 
     pair = neighbours(
         "p", views, [[v.name for v in views].index(name) for name in all_round.views]
     )[side]
-    names = (views[pair.left].name, views[pair.right].name)
+    names = tuple(views[i].name for i in pair)
     two = load_run(predict(run, person, tmp_path / "2", names).run_dir).scene
     eye = (2 * found.sides.toward[side] + found.sides.middle).numpy()
     middle = found.sides.middle.numpy()

@@ -54,7 +54,6 @@ def test_rows_correspond(pair: RectifiedPair) -> None:
 
 
 def test_depth_maps_become_true_offsets(pair: RectifiedPair) -> None:
-    assert pair.offsets is not None
     exact = pair.focal * pair.baseline / exact_depth(pair) - pair.shift
     known = pair.offsets.isfinite() & (pair.alpha > 0.999)
     assert known.sum() > 1000
@@ -64,7 +63,7 @@ def test_depth_maps_become_true_offsets(pair: RectifiedPair) -> None:
         "at the outline, where depth is steep, that of the nearest pixel"
     )
     without = rectified(*(replace(ball(pose_at(x)), depth=None) for x in (0, 30)), 64)
-    assert without.offsets is None
+    assert without.offsets.isnan().all()
 
 
 def test_views_that_cannot_show_the_same_are_refused() -> None:
@@ -72,11 +71,9 @@ def test_views_that_cannot_show_the_same_are_refused() -> None:
     right = ball(pose_at(30), name="b")
     camera = right.cameras
     longer = camera.intrinsics * torch.tensor([[1.4], [1.4], [1.0]])
-    with pytest.raises(
-        DyngsError, match="a and b: by their cameras the person begins or ends at other heights"
-    ):
+    with pytest.raises(DyngsError, match="a and b: do not show the same person"):
         rectified(left, replace(right, cameras=replace(camera, intrinsics=longer)), 64)
-    with pytest.raises(DyngsError, match="lies behind the cameras"):
+    with pytest.raises(DyngsError, match="a and b: do not show the same person"):
         rectified(
             replace(left, cameras=aside(left.cameras, 25)),
             replace(right, cameras=aside(camera, -25)),

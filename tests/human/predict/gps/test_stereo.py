@@ -9,12 +9,12 @@ from torch import Tensor
 from dyngs.human.predict.gps.stereo import (
     NUM_OFFSETS,
     QUARTER,
-    Encoder,
     StereoNetwork,
     offsets_of,
     refined,
     sweep,
 )
+from dyngs.models.prediction import Encoder
 
 WIDTHS = (8, 16, 16)
 SHIFT = torch.tensor(200.0)

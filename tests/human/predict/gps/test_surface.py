@@ -8,7 +8,7 @@ import torch
 from ray_traced_ball import CENTER, RADIUS, ball, exact_depth, pose_at
 
 from dyngs.human.predict.gps.rectification import RectifiedPair, rectified
-from dyngs.human.predict.gps.stereo import GpsNetwork, PredictedSurface, gaussians_of, offset_loss
+from dyngs.human.predict.gps.stereo import GpsNetwork, gaussians_of, offset_loss
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def test_true_offsets_put_gaussians_on_the_surface(pair: RectifiedPair) -> None:
     depth = exact_depth(pair)
     offsets = pair.focal * pair.baseline / depth - pair.shift
     raw = torch.zeros(*offsets.shape[:1], 8, *offsets.shape[2:])
-    found = gaussians_of(pair, PredictedSurface([offsets], raw))
+    found = gaussians_of(pair, offsets, raw)
     assert len(found) == int(pair.solid.sum())
     inner = (pair.alpha[pair.solid] > 0.999) & (pair.seen_by_other(offsets)[pair.solid] > 0.999)
     assert found.opacities[inner].min() > 0.85
@@ -37,9 +37,7 @@ def test_what_the_other_view_does_not_show_is_transparent(pair: RectifiedPair) -
     is wrong with it."""
     offsets = pair.focal * pair.baseline / exact_depth(pair) - pair.shift
     raw = torch.zeros(2, 8, *offsets.shape[2:])
-    right, wrong = (
-        gaussians_of(pair, PredictedSurface([offsets + d], raw)).opacities for d in (0.0, 15.0)
-    )
+    right, wrong = (gaussians_of(pair, offsets + d, raw).opacities for d in (0.0, 15.0))
     known = pair.alpha[pair.solid] > 0.999
     assert right[known].mean() > 0.8
     beside = pair.seen_by_other(offsets + 15.0)[pair.solid] == 0
@@ -54,9 +52,9 @@ def test_gradients_reach_every_weight(pair: RectifiedPair) -> None:
     torch.nn.init.normal_(
         network.stereo.change.weight, std=0.1, generator=torch.Generator().manual_seed(2)
     )
-    surface = network(pair, with_gaussians=False)
-    assert surface.raw is None
-    offset_loss(pair, surface.offsets, 0.9).backward()
+    offsets, raw = network(pair, with_gaussians=False)
+    assert raw is None
+    offset_loss(pair, offsets, 0.9).backward()
     given = {
         name
         for name, x in network.named_parameters()
@@ -64,7 +62,8 @@ def test_gradients_reach_every_weight(pair: RectifiedPair) -> None:
     }
     assert {name.partition(".")[0] for name in given} == {"encoder", "stereo"}
     network.zero_grad()
-    found = gaussians_of(pair, network(pair))
+    offsets, raw = network(pair)
+    found = gaussians_of(pair, offsets[-1], raw)
     sum(x.square().mean() for x in found.tensors().values()).backward()
     assert [
         name

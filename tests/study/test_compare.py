@@ -11,7 +11,7 @@ import dyngs
 from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.study.models import MOST_STEPS, Comparison, QualityCurve, planned
+from dyngs.study.compare import MOST_STEPS, ModelComparison, QualityCurve
 
 
 @pytest.fixture(scope="module")
@@ -25,26 +25,22 @@ def test_data_are_those_of_the_comparison(capture: Path, tmp_path: Path) -> None
     own = tmp_path / "own.yaml"
     own.write_text("data:\n  longest_side: 8\n  background: white\nstrategy:\n  kind: mcmc\n")
     given = ("data.longest_side=12",)
-    comparison = Comparison(capture, tmp_path / "out", steps=30, overrides=given)
-    plan = planned(comparison, ["static", str(own)])
-    first, second = plan.configs.values()
+    comparison = ModelComparison(capture, tmp_path / "out", steps=30, overrides=given)
+    configs, _ = comparison.configs(["static", str(own)])
+    first, second = configs.values()
     assert first.data == second.data
     assert (second.data.longest_side, second.strategy.kind, second.train.steps) == (12, "mcmc", 30)
-    assert plan.notes == (
-        "own: its data.background are left out, so that all have the same images",
-    )
     assert not (tmp_path / "out").exists()
-    (config,) = planned(
-        Comparison(capture, tmp_path / "out", minutes=0.5), ["static"]
-    ).configs.values()
+    comparison = ModelComparison(capture, tmp_path / "out", minutes=0.5)
+    config = comparison.configs(["static"])[0]["static"]
     assert (config.train.minutes, config.train.steps) == (0.5, MOST_STEPS)
 
 
 @pytest.mark.parametrize("name", ["...yaml", ".hidden.yaml", "a b<c>.yaml", "-rf.yaml"])
 def test_any_name_of_a_file_stays_inside(capture: Path, tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("train:\n  steps: 3\n")
-    comparison = Comparison(capture, tmp_path / "out", steps=3)
-    (config,) = planned(comparison, [str(tmp_path / name)]).configs.values()
+    comparison = ModelComparison(capture, tmp_path / "out", steps=3)
+    (config,) = comparison.configs([str(tmp_path / name)])[0].values()
     assert config.run.dir is not None
     assert config.run.dir.resolve().parent == tmp_path / "out" / "runs"
     assert config.run.dir.name[0] not in ".-"
@@ -54,14 +50,14 @@ def test_a_broken_file_is_an_error_and_no_model_that_is_left_out(
     capture: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "own.yaml").write_text("train:\n  stesp: 3\n")
-    comparison = Comparison(capture, tmp_path / "out", steps=3)
+    comparison = ModelComparison(capture, tmp_path / "out", steps=3)
     with pytest.raises(DyngsError, match=r"own\.yaml.*unknown key"):
-        planned(comparison, ["static", str(tmp_path / "own.yaml")])
+        comparison.configs(["static", str(tmp_path / "own.yaml")])
 
 
 @pytest.mark.usefixtures("one_thread")
 def test_the_curve_changes_nothing_of_the_training(capture: Path, tmp_path: Path) -> None:
-    curve = QualityCurve(Comparison(capture, tmp_path, steps=20), tmp_path / "curve.json")
+    curve = QualityCurve(ModelComparison(capture, tmp_path, steps=20), tmp_path)
     runs = []
     for name, listeners in (("plain", []), ("watched", [curve])):
         words = ["train.steps=20", "init.num_random=50", "run.threads=1"]
@@ -69,6 +65,6 @@ def test_the_curve_changes_nothing_of_the_training(capture: Path, tmp_path: Path
         runs.append(dyngs.train(dyngs.load_config("static", words), listeners=listeners))
     plain, watched = (checkpoint_paths(run)[-1].read_bytes() for run in runs)
     assert plain == watched
-    steps = [point.step for point in curve.points()]
+    steps = [step for step, _, _ in curve.points()]
     assert steps == sorted(set(steps))
     assert (len(steps) > 5, steps[-1]) == (True, 20)

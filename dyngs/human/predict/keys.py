@@ -1,4 +1,4 @@
-"""Sections ``model`` of the networks that predict fields of people, and of what they predict."""
+"""Sections `model` of networks that predict people, and of the fields that some predict."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from dyngs.core.section import ModelSection, Positive
+from dyngs.core.section import ModelSection, Positive, SceneModel
 
 
 class FieldPredictorModel(ModelSection):
@@ -55,3 +55,20 @@ class PredictedFieldModel(ModelSection):
     network: Literal["keypoint_nerf", "eg_human_nerf"] = Field(
         default="keypoint_nerf", description="what has predicted it"
     )
+
+
+class GpsModel(SceneModel):
+    """A network that predicts people from pairs of neighbouring views (docs/people_network.md)."""
+
+    kind: Literal["gps"] = Field(
+        default="gps",
+        description="a network that predicts people from two neighbouring views, after GPS-Gaussian "
+        "(docs/people_network.md)",
+    )
+    person_px: int = Field(
+        default=256,
+        ge=32,
+        le=4096,
+        description="height of the person in the rectified views, px; a Gaussian per pixel",
+    )
+    lr: Positive = Field(default=1e-3, description="highest learning rate of AdamW (one cycle)")

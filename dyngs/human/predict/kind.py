@@ -1,12 +1,14 @@
-"""The kinds of networks that predict fields of people, and of what they predict."""
+"""The kinds of networks that predict people, and of the fields that some predict."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from dyngs.human.predict.fields.keys import (
+from dyngs.human.keys import HumanPredictorModel
+from dyngs.human.predict.keys import (
     EgHumanNerfModel,
     FieldPredictorModel,
+    GpsModel,
     KeypointNerfModel,
     PredictedFieldModel,
 )
@@ -15,6 +17,36 @@ from dyngs.models.kind import ModelKind, Predicts
 if TYPE_CHECKING:
     from dyngs.data.capture import Capture
     from dyngs.models.kind import MakeLearner, MakePredictor, Restore, Start
+
+
+class HumanPredictorKind(Predicts):
+    """See the module."""
+
+    def num_views(self, section: HumanPredictorModel) -> int:
+        return section.source_views
+
+    def networks(self) -> tuple[MakeLearner, MakePredictor]:
+        from dyngs.human.predict.ghg.learner import learner, predictor
+
+        return learner, predictor
+
+
+HUMAN_PREDICTOR = HumanPredictorKind(HumanPredictorModel)
+
+
+class GpsKind(Predicts):
+    """See the module."""
+
+    def num_views(self, section: GpsModel) -> int:
+        return 2
+
+    def networks(self) -> tuple[MakeLearner, MakePredictor]:
+        from dyngs.human.predict.gps.learner import learner, predictor
+
+        return learner, predictor
+
+
+GPS = GpsKind(GpsModel)
 
 
 class FieldPredictorKind(Predicts):

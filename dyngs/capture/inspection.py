@@ -1,0 +1,516 @@
+"""Inspection of captures and of videos: what one holds, everything that looks wrong about it, and
+the next command."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+
+from dyngs.capture.sfm.frame_choice import STANDS, displaced_by, measured, shrunk
+from dyngs.capture.sfm.several_videos import VIDEOS_FILE, CameraVideo, open_video, read_given
+from dyngs.config import DataConfig
+from dyngs.core.errors import DyngsError, as_word, counted, printable, reading
+from dyngs.data.body_frames import about_pelvis
+from dyngs.data.capture import Capture, View, all_views
+from dyngs.data.geometry import (
+    camera_center,
+    focus_point,
+    fraction_in_front,
+    inverse_rigid,
+    perpendicular,
+    times_seen,
+    unit,
+)
+from dyngs.data.images.images import read_header, read_image, read_mask
+from dyngs.data.images.video import opened_video, read_frames, videos_in
+from dyngs.data.times import distinct_times, evenly_spaced
+from dyngs.io.containment import inside, leaving_links
+from dyngs.io.outputs import Inputs
+from dyngs.io.write import write_image
+
+# Problems of captures, one line each
+
+MAX_LINES_PER_KIND = 5  # problems of one kind that are listed; the others are counted
+MAX_VIEWS = 300  # views, evenly spaced, in which points are looked for
+# degrees between neighbouring views, seen from the scene, from which they are far apart
+WIDE_BASELINE = 10.0
+CLOSE_IN_TIME, FEW_VIEWS = 0.08, 3
+"""Motion over this fraction of a clip is small; with fewer views in it, each time step is seen from
+one side only."""
+# degrees around a body without a camera from which on a part of it is hardly seen
+UNSEEN_SIDE = 200.0
+LOOKED_AT = 4  # masks that are read
+# fraction of the pixels that masks may ignore before that is suspicious: passers-by fill less
+MOST_IGNORED = 0.5
+
+
+def before_training(capture: Capture) -> list[str]:
+    """Return one line for everything about a capture that is likely to spoil a training; only some
+    masks are read."""
+    masks, problems = masks_of(capture)
+    line = [] if masks is None else [f"masks of {masks}"]
+    found = [*capture.warnings, *line, *problems, *time_problems(capture), *scene_problems(capture)]
+    return list(dict.fromkeys([*found, *body_problems(capture)]))
+
+
+def time_problems(capture: Capture) -> list[str]:
+    """Return the problems of times and of who saw them: a moving scene must be seen from several
+    sides.
+
+    A single camera that does not move, or few images of one time each from places far apart: what
+    moves has moved on before another side of it is seen. Many such images are no problem (D-NeRF's
+    are all like that): neighbours in time then show nearly the same.
+    """
+    views = [view for view in capture.splits.get("train", ()) if view.time is not None]
+    views.sort(key=lambda view: view.time or 0.0)
+    count = len(set(distinct_times(views).values()))
+    if capture.body is not None or count < 2:
+        return []
+    if len({view.cam_from_world.round(9).tobytes() for view in views}) == 1:
+        return [
+            f"one camera that does not move saw all {count} times: a moving scene cannot be reconstructed in 3D from "
+            "that; move the camera or use several"
+        ]
+    if not 3 <= len(views) == count or count * CLOSE_IN_TIME >= FEW_VIEWS:
+        return []
+    poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
+    center = focus_point(poses) if capture.points is None else np.median(capture.points.xyz, axis=0)
+    if center is None:
+        return []
+    directions = unit(poses[:, :3, 3] - center)
+    angles = np.degrees(np.arccos(np.clip((directions[1:] * directions[:-1]).sum(axis=1), -1, 1)))
+    if not angles.mean() >= WIDE_BASELINE:
+        return []
+    return [
+        f"{len(views)} images, each at a time of its own, {angles.mean():.0f} degrees apart on average: what moves "
+        "is seen from one side only at each time; expect a static result"
+    ]
+
+
+def body_problems(capture: Capture) -> list[str]:
+    """Return a line if no training view shows one side of a captured person, in any frame."""
+    body = None if capture.body is None else capture.body["train"]
+    if body is None:
+        return []
+    from scipy.spatial.transform import Rotation  # late: importing it takes a tenth of a second
+
+    body = about_pelvis(body, np.zeros(3) if body.pelvis is None else body.pelvis)
+    rows = {frame: row for row, frame in enumerate(body.frames)}
+    seen = [(rows[v.frame], v) for v in capture.splits.get("train", ()) if v.frame in rows]
+    if not seen:
+        return []
+    at = [row for row, _ in seen]
+    away = np.stack([camera_center(view.cam_from_world) for _, view in seen]) - body.trans[at]
+    away = Rotation.from_rotvec(body.poses[at, 0]).inv().apply(away)
+    # 0 in front, 90 on the person's left
+    around = np.sort(np.degrees(np.arctan2(away[:, 0], away[:, 2])))
+    gaps = np.diff(np.append(around, around[0] + 360))
+    widest = int(gaps.argmax())
+    if gaps[widest] < UNSEEN_SIDE:
+        return []
+    middle = round((around[widest] + gaps[widest] / 2) / 90) % 4
+    side = ("front", "left side", "back", "right side")[middle]
+    return [
+        f"the person's {side} is never seen: all cameras are within {360 - gaps[widest]:.0f} degrees around the body; "
+        "what they do not see will be a guess (turn around once, or use more cameras)"
+    ]
+
+
+def scene_problems(capture: Capture) -> list[str]:
+    """Return the problems of poses and points together: cameras that look away, points that no
+    camera sees, .."""
+    views = all_views(capture.splits)
+    problems = []
+    poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
+    centers = poses[:, :3, 3]
+    spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+    is_static = capture.body is None and all(view.time is None for view in views)
+    if len(poses) > 1 and spread < 1e-9 and is_static:
+        problems.append("all cameras are at one place, so no depth can be found")
+    xyz = capture.points.xyz if capture.points is not None else np.zeros((0, 3))
+    focus = np.median(xyz, axis=0) if len(xyz) else focus_point(poses)
+    if focus is not None and fraction_in_front(poses, focus) < 0.5:
+        problems.append(
+            f"{1 - fraction_in_front(poses, focus):.0%} of the cameras look away from the scene: are the poses in the "
+            "axes that the format wants (OpenGL camera-to-world for JSON files)?"
+        )
+    if len(xyz):
+        sample = xyz[np.random.default_rng(0).permutation(len(xyz))[:2000]]
+        some = [views[index] for index in evenly_spaced(len(views), MAX_VIEWS)]
+        unseen = float((times_seen(sample, some) == 0).mean())
+        if unseen > 0.1:
+            problems.append(f"{unseen:.0%} of the points are in no camera's view")
+    return problems
+
+
+def listed(lines: Iterable[str]) -> list[str]:
+    """Return the lines, and a count of those beyond ``MAX_LINES_PER_KIND``."""
+    found = list(lines)
+    more = len(found) - MAX_LINES_PER_KIND
+    if more <= 0:
+        return found
+    return [*found[:MAX_LINES_PER_KIND], f"... and {more} more like the last one"]
+
+
+def problems_of(capture: Capture, deep: bool) -> list[str]:
+    """Return a line for everything suspicious, next to the capture's own warnings; ``deep``: decode
+    every image."""
+    views = all_views(capture.splits)
+    train = capture.splits.get("train", ())
+    problems = []
+    if not capture.splits.get("test"):
+        problems.append(
+            "the split 'test' is empty, so nothing can be measured (see data.test_every)"
+        )
+    if len(train) < 3:
+        problems.append(f"only {len(train)} training views; a scene needs some 20 or more")
+    poses = Counter(view.cam_from_world.round(9).tobytes() for view in views if view.time is None)
+    same = sum(count for count in poses.values() if count > 1)
+    if same:
+        problems.append(f"{same} views of a static scene share their pose with another one")
+    problems += listed(
+        f"'{view.name}': odd intrinsics for an image of {view.width}x{view.height}: focal lengths "
+        f"({view.intrinsics[0, 0]:g}, {view.intrinsics[1, 1]:g}), centre ({view.intrinsics[0, 2]:g}, "
+        f"{view.intrinsics[1, 2]:g}) px"
+        for view in views
+        if not _is_usual_camera(view)
+    )
+    problems += [*_image_problems(views, deep), *masks_of(capture)[1]]
+    return [*problems, *time_problems(capture), *scene_problems(capture), *body_problems(capture)]
+
+
+def _is_usual_camera(view: View) -> bool:
+    size = np.array([view.width, view.height])
+    fx, fy = np.diag(view.intrinsics)[:2]
+    is_central = bool((np.abs(view.intrinsics[:2, 2] / size - 0.5) <= 0.2).all())
+    return is_central and 0.9 < fx / fy < 1.1 and 0.05 < fx / size.max() < 50
+
+
+def _image_problems(views: Iterable[View], deep: bool) -> list[str]:
+    problems = []
+    for view in views:
+        for path in (view.image_path, view.mask_path):
+            if path is None or (view.video is not None and not path.is_file()):
+                continue
+            described = (view.width, view.height)
+            try:
+                header = read_header(path)
+                if deep:
+                    read_image(path)
+            except DyngsError as error:
+                problems.append(str(error))
+                continue
+            if header.size_for(described) != described:
+                problems.append(
+                    f"{path} has {header.width}x{header.height} pixels, its camera says {view.width}x{view.height}"
+                )
+    return listed(problems)
+
+
+def masks_of(capture: Capture) -> tuple[str | None, list[str]]:
+    """Return a description of the masks of a capture, None without any, and a line if they ignore
+    most of the pixels.
+
+    A few masks are read; unreadable ones are reported by those who check files.
+    """
+    views = all_views(capture.splits)
+    paths = [view.mask_path for view in views if view.mask_path is not None]
+    if not paths:
+        return None, []
+    found = f"{len(paths)} of {len(views)} images; white counts, black is ignored"
+    sample = [paths[index] for index in evenly_spaced(len(paths), LOOKED_AT)]
+    try:
+        ignored = fmean(1 - float(read_mask(path).float().mean()) for path in sample)
+    except DyngsError:
+        return found, []
+    found += f": {ignored:.0%} of the pixels in {len(sample)} that were read"
+    if ignored <= MOST_IGNORED:
+        return found, []
+    return found, [
+        f"masks ignore {ignored:.0%} of the pixels in {len(sample)} that were looked at, first {sample[0]}; white "
+        "(255) counts and black is ignored: are they inverted, or labels?"
+    ]
+
+
+# Facts about captures, and reports
+
+
+@dataclass(frozen=True)
+class InspectReport:
+    """Facts of a capture, (name, value) pairs in order, and all that is suspicious; no ``capture``
+    if unreadable."""
+
+    root: Path
+    capture: Capture | None
+    facts: tuple[tuple[str, str], ...]
+    problems: tuple[str, ...]
+
+
+def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectReport:
+    """Return a report on the capture at ``source``; what makes a capture unreadable is a problem in
+    it, no error.
+
+    ``deep``: every image is decoded in full and videos to files, which is slow and finds truncated
+    files; otherwise only headers are read, and frames of videos only where they are decoded
+    already.
+    """
+    from dyngs.data.read import read_capture
+
+    options = source if isinstance(source, DataConfig) else DataConfig(root=source)
+    links = listed(
+        f"{path}: a link that leads out of the capture, to {place}"
+        for path, place in leaving_links(options.root)
+    )
+    try:
+        capture = read_capture(options, decode_videos=deep)
+        with reading(options.root, "`dyngs --debug` shows where"):
+            report = report_on(capture, deep)
+    except DyngsError as error:
+        return InspectReport(options.root, None, (), (str(error), *links))
+    return replace(report, problems=(*links, *report.problems))
+
+
+def report_on(capture: Capture, deep: bool = False) -> InspectReport:
+    """Return the report on a capture that has been read; see ``inspect_capture``."""
+    problems = dict.fromkeys([*capture.warnings, *problems_of(capture, deep)])
+    return InspectReport(capture.root, capture, tuple(_facts_of(capture)), tuple(problems))
+
+
+def format_report(report: InspectReport) -> str:
+    """Return the report as plain text of several lines."""
+    lines = [f"capture {report.root}", *_aligned(dict(report.facts))]
+    if not report.problems:
+        lines.append("nothing suspicious")
+    else:
+        lines.append(f"suspicious ({len(report.problems)}):")
+        lines += [f"  - {printable(problem)}" for problem in report.problems]
+    return "\n".join(lines)
+
+
+def _aligned(facts: dict[str, str]) -> list[str]:
+    width = max(map(len, facts), default=0)
+    return [f"  {name:<{width}}  {value}" for name, value in facts.items()]
+
+
+def _facts_of(capture: Capture) -> Iterator[tuple[str, str]]:
+    """Yield what a capture holds as (name, value) pairs, in the order in which they are shown."""
+    views = all_views(capture.splits)
+    split_sizes = [f"{len(views)} {split}" for split, views in capture.splits.items() if views]
+    focal_px = np.array([np.diag(view.intrinsics)[:2] for view in views])
+    sides = np.array([view.width for view in views])
+    fov_deg = np.degrees(2 * np.arctan2(0.5 * sides, focal_px[:, 0]))
+    yield "format", capture.format
+    yield "views", ", ".join(split_sizes)
+    yield "sizes", _tallied(f"{view.width}x{view.height}" for view in views)
+    yield "cameras", str(len({view.camera_id for view in views}))
+    yield "focal length", f"{_range(focal_px.ravel())} px"
+    yield "field of view", f"{_range(fov_deg)} degrees across"
+    yield "lens", _tallied(view.lens.model for view in views)
+    yield "alpha", "transparent background" if capture.has_alpha else "none"
+    yield "masks", masks_of(capture)[0] or "none"
+    priors = {
+        "depth maps": sum(view.depth_path is not None for view in views),
+        "motion masks": sum(view.motion_mask_path is not None for view in views),
+        "flow fields": sum(view.flow_path is not None for view in views),
+        "file of tracks": int(capture.tracks_path is not None),
+    }
+    found = [f"{count} {what}" for what, count in priors.items() if count]
+    if found:
+        yield "priors", ", ".join(found)
+    yield from _time_facts(capture)
+    file = "" if capture.points_file is None else f" ({capture.points_file.name})"
+    yield "points", "none" if capture.points is None else f"{len(capture.points.xyz)}{file}"
+    centers = np.array([camera_center(view.cam_from_world) for view in views])
+    centers *= capture.world_scale
+    spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    box = ", ".join(_range(axis) for axis in centers.T)
+    yield "camera centres", f"{box}; within {spread:.4g} of their mean"
+    if np.any(capture.world_offset):
+        yield "world offset", " ".join(f"{x:.10g}" for x in capture.world_offset) + " (rebased)"
+    if capture.body is not None:
+        frames = [f"{len(body.frames)} {name}" for name, body in capture.body.items()]
+        yield "body", f"{capture.body['train'].kind}, frames: {', '.join(frames)}"
+
+
+def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:
+    """Distinct times, cameras by times, and the frame rate."""
+    views = [view for view in all_views(capture.splits) if view.time is not None]
+    if not views:
+        yield "times", "none (a static scene)"
+        return
+    times = set(distinct_times(views).values())
+    written = (
+        "" if capture.span in (None, (0.0, 1.0)) else f" ({_range(capture.span)} in the files)"
+    )
+    yield "times", f"{len(times)} in {_range(times)}{written}"
+    cameras = counted(len({view.camera_id for view in views}), "camera")
+    yield (
+        "sequence",
+        f"{cameras} x {counted(len(times), 'time')}, {counted(len(views), 'image')}",
+    )
+    if capture.fps is not None:
+        yield "frame rate", f"{capture.fps:.6g} per second"
+    if capture.seconds is not None:
+        yield "duration", f"{capture.seconds:.4g} seconds from time 0 to time 1"
+
+
+def _tallied(keys: Iterable[str]) -> str:
+    """Return the most frequent keys with their counts."""
+    counter = Counter(keys)
+    if len(counter) == 1:
+        return next(iter(counter))
+    return ", ".join(f"{key} ({count})" for key, count in counter.most_common(6))
+
+
+def _range(values: Iterable[float]) -> str:
+    """Return "lowest to highest", or one number where both are about the same."""
+    found = list(values)
+    low = min(found)
+    high = max(found)
+    return f"{low:.4g}" if np.isclose(low, high) else f"{low:.4g} to {high:.4g}"
+
+
+BACKGROUND = (24, 26, 30)
+SPLIT_COLORS = {
+    "train": (255, 170, 60),
+    "val": (120, 230, 120),
+    "test": (80, 190, 255),
+    "pose": (80, 190, 255),
+}
+
+
+def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
+    """Write an image of 2 ``size`` x ``size`` pixels: the scene from above and from the side,
+    orthographic.
+
+    Frusta of training cameras are orange, of validation green, of test and new poses blue; points
+    have their colours. Up is the mean of the cameras' up axes. Points far beyond the cameras are
+    left out.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    Inputs((capture.root,)).require_output(out)
+    views = [(split, view) for split, views in capture.splits.items() for view in views]
+    poses = np.stack([inverse_rigid(view.cam_from_world) for _, view in views])
+    centers = poses[:, :3, 3]
+    up = -poses[:, :3, 1].mean(axis=0)
+    up = unit(up) if np.linalg.norm(up) > 1e-3 else np.array([0.0, 0.0, 1.0])
+    right = perpendicular(up)
+    axes = np.stack([right, np.cross(up, right), up])
+    xyz = np.zeros((0, 3)) if capture.points is None else capture.points.xyz
+    rgb = xyz if capture.points is None else capture.points.rgb
+    distance = np.linalg.norm(xyz - centers.mean(axis=0), axis=1)
+    spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    near = np.flatnonzero(distance <= 4.0 * spread)
+    near = near[:: max(len(near) // 20_000, 1)]
+    core = np.quantile(xyz[near] @ axes.T, [0.03, 0.97], axis=0) if len(near) else xyz[near]
+    reach = np.concatenate([centers @ axes.T, core])
+    low = reach.min(axis=0)
+    high = reach.max(axis=0)
+    extent = max(float((high - low).max()) * 1.2, 1e-6)
+    depth = extent * min(0.08, 0.4 / len(poses) ** 0.5)
+    panels = []
+    for title, shown in (("from above", [0, 1]), ("from the side", [0, 2])):
+        image = Image.new("RGB", (2 * size, 2 * size), BACKGROUND)  # at twice its size
+        draw = ImageDraw.Draw(image)
+        middle = 0.5 * (low + high)[shown]
+
+        def places(points: np.ndarray, at: list[int] = shown, middle: np.ndarray = middle) -> list:
+            """Return columns and rows of world points (P, 3); they may lie outside the panel."""
+            flat = np.clip((points @ axes[at].T - middle) / extent + 0.5, -10.0, 10.0)
+            return ((flat * (1, -1) + (0, 1)) * (2 * size - 1)).tolist()
+
+        for (x, y), colour in zip(
+            places(xyz[near]), np.maximum(rgb[near], 60).tolist(), strict=True
+        ):
+            draw.rectangle((x, y, x + 1, y + 1), fill=tuple(colour))
+        for (split, view), pose in zip(views, poses, strict=True):
+            corners = np.array(
+                [[0, 0], [view.width, 0], [view.width, view.height], [0, view.height]]
+            )
+            rays = np.c_[corners, np.ones(4)] @ np.linalg.inv(view.intrinsics).T
+            frustum = np.concatenate([np.zeros((1, 3)), depth * unit(rays)])
+            tips = [tuple(place) for place in places(frustum @ pose[:3, :3].T + pose[:3, 3])]
+            line = [tips[i] for i in (0, 1, 2, 3, 4, 1, 2, 0, 3, 4, 0)]
+            draw.line(line, fill=SPLIT_COLORS[split], width=2)
+        draw.text((16, 12), title, fill=(204, 204, 204), font=ImageFont.load_default(28))
+        panels.append(np.asarray(image.resize((size, size))))
+    write_image(out, np.concatenate(panels, axis=1))
+
+
+# Videos without poses
+
+MAX_FRAMES = 3000  # frames that are looked at, from the first one on
+UNEVEN = 1.5  # longest over typical gap between frames of a rate that varies
+BLURRED = 0.4  # frames with less than this fraction of the typical sharpness are blurred
+
+
+def video_report(path: Path) -> str:
+    """Return a report on a video file, or on the videos of a folder, as lines of text; their frames
+    are decoded once."""
+    videos = [
+        open_video(inside(video)) for video in ([path] if path.is_file() else videos_in(path))
+    ]
+    lines = []
+    moving = []
+    for video in videos:
+        facts, stands = video_facts(video)
+        moving += [] if stands else [video.name]
+        lines += [f"video {video.path}", *_aligned(facts)]
+    where = as_word(videos[0].path if len(videos) == 1 else path)
+    if len(videos) == 1 and moving:
+        lines.append(
+            f"next: dyngs train static data.root={where}     # nothing but the camera moves"
+        )
+        lines.append(f"      dyngs train dynamic data.root={where}    # something else moves, too")
+    elif len(videos) == 1:
+        lines.append(
+            "next: one fixed camera shows no depth; put videos of two or more that ran at once into a folder"
+        )
+    elif moving:
+        names = ", ".join(moving[:5])
+        lines.append(f"next: take {names} out: of several videos, only fixed cameras get poses")
+    else:
+        is_given = read_given(path, [video.name for video in videos])[0] is not None
+        known = f"as {VIDEOS_FILE} says" if is_given else "found by sound"
+        lines.append(f"{len(videos)} fixed cameras; offsets between them: {known}")
+        lines.append(f"next: dyngs train dynamic data.root={where}")
+    return "\n".join(lines)
+
+
+def video_facts(video: CameraVideo) -> tuple[dict[str, str], bool]:
+    """Return facts about a video for people, by name, and whether its camera is fixed."""
+    small: list[np.ndarray] = []
+
+    def frames() -> Iterator[np.ndarray]:
+        for rgb in islice(read_frames(video.path), min(MAX_FRAMES, len(video.seconds))):
+            small.append(shrunk(rgb))
+            yield rgb
+
+    measures = measured(frames())
+    displaced = displaced_by(np.stack(small))
+    with opened_video(video.path) as container:
+        has_sound = len(container.streams.audio) > 0
+    gaps = 1000 * np.diff(video.seconds)
+    rate = f"{video.rate:.4g} per second"
+    if len(gaps) and gaps.max() > UNEVEN * np.median(gaps):
+        rate = f"variable rate: {gaps.min():.0f} to {gaps.max():.0f} ms between frames (times are kept)"
+    blurred = int((measures.sharpness < BLURRED * np.median(measures.sharpness)).sum())
+    facts: dict[str, Any] = {
+        "size": f"{video.info.width}x{video.info.height}",
+        "frames": f"{len(video.seconds)} in {video.seconds[-1] + 1 / video.rate:.2f} s, {rate}",
+        "colours": video.info.colours,
+        "sound": "yes" if has_sound else "none",
+        "sharpness": counted(blurred, "blurred frame"),
+        "camera": f"moves by up to {displaced:.1%} of its width, {np.median(measures.motion):.2%} from frame to frame",
+    }
+    stands = displaced <= STANDS
+    facts |= {"camera": "stands still"} if stands else {}
+    return {name: value for name, value in facts.items() if value}, stands

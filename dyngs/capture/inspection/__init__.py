@@ -1,1 +1,0 @@
-"""Inspection of captures: what one holds and everything that looks wrong about it."""

@@ -1,0 +1,494 @@
+"""A run and its variants, measured: one setting at a time, then combinations; what each setting
+costs, and the variant that meets requirements (``psnr>=30,mb<=5``).
+
+The run folders of variants are pruned, masked and quantised as these say. None is made or measured
+twice.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError
+from pydantic.dataclasses import dataclass
+
+from dyngs.api.prune import prune_run
+from dyngs.api.scene_file import write_scene_file
+from dyngs.compress.stage import pruning
+from dyngs.config import BudgetConfig
+from dyngs.config.io import RESOLVED_NAME, load_resolved
+from dyngs.core.conventions import num_sh_terms
+from dyngs.core.errors import DyngsError, printable, show
+from dyngs.core.section import CutOff
+from dyngs.core.state import tensors_of
+from dyngs.models.checkpoint import read_capture_of, restored_model
+from dyngs.models.kind import HasGaussians, Moves, capability
+from dyngs.ops.device import device_for
+from dyngs.ops.native import kernel_threads, num_cores
+from dyngs.runs.checkpoint import (
+    SCENE_FILE,
+    checkpoint_paths,
+    has_only_scene_file,
+    latest_checkpoint,
+    load_run,
+    save_checkpoint,
+    seconds_at,
+)
+from dyngs.runs.folder import inputs_of, write_config
+from dyngs.runs.opened import split_views
+from dyngs.study.measure import SCORES, Bench, Measurement, Subject
+from dyngs.study.runs import AS_STORED, done_in_turn, finished, require_same_study
+from dyngs.training.new_trainer import assemble
+
+MIN_DOUBLINGS = 0.05
+"""Smaller gains (3.5 %) count as none."""
+MAX_LOSS_DB = 6.0
+"""A single change that loses more is not combined with others."""
+SEVERAL = "several"
+"""Stands for the setting of a variant that changes more than one."""
+METRICS = ("psnr", "ssim", "lpips", "fps", "mb", "gaussians")
+"""Columns that a requirement or a goal may name."""
+_CONDITION = re.compile(r"\s*([a-z_]+)\s*(>=|<=)\s*(\S+)\s*$")
+Row = dict[str, Any]
+Value = float | int | str
+
+
+@dataclass(frozen=True, config=AS_STORED)
+class Variant:
+    """Changes of a run; the defaults change nothing.
+
+    Attributes:
+        prune: fraction of the Gaussians removed, by ``sensitivity``.
+        mask_times: key times of visibility masks.
+        finetune: training steps after pruning and masking.
+        sh_degree: higher spherical harmonics are dropped.
+        storage: allowed change of images by quantisation, grey levels of 255, or "auto", that of
+            ``dyngs export --format dyngs``; None: float32.
+        alpha_min: ``model.alpha_min`` to render with.
+    """
+
+    prune: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    mask_times: Annotated[int, Field(ge=0, le=1000)] = 0
+    finetune: int = 0
+    sh_degree: Annotated[int, Field(ge=0, le=4)] | None = None
+    storage: Annotated[float, Field(ge=0.01, le=64)] | Literal["auto"] | None = None
+    alpha_min: CutOff | None = None
+
+    @property
+    def changes(self) -> dict[str, Value]:
+        """The fields that differ from the run; ``Variant(**changes)`` is the variant again."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {f.name: values[f.name] for f in fields(self) if values[f.name] != f.default}
+
+    @property
+    def name(self) -> str:
+        words = (
+            f"{k}={x:g}" if isinstance(x, float) else f"{k}={x}" for k, x in self.changes.items()
+        )
+        return " ".join(words) or "as it is"
+
+    @property
+    def slug(self) -> str:
+        """File name, different for different variants."""
+        words = (f"{k}-{x!r}".replace("'", "") for k, x in self.changes.items())
+        return "_".join(words) or "as_it_is"
+
+    @property
+    def settings(self) -> list[str]:
+        """Names of the changed settings; ``finetune`` belongs to the ones before it."""
+        return [name for name in self.changes if name != "finetune"]
+
+    @property
+    def setting(self) -> str:
+        """The changed setting with what belongs to it; "" for the run itself, ``SEVERAL`` for
+        combinations."""
+        return SEVERAL if len(self.settings) > 1 else " + ".join(self.changes)
+
+    def merged(self, other: Variant) -> Variant:
+        """Return this variant with the changes of ``other`` on top."""
+        return replace(self, **other.changes)
+
+
+SETTINGS: dict[str, tuple[Value, ...]] = {
+    "prune": (0.3, 0.5, 0.7, 0.85),
+    "mask_times": (6, 16),
+    "sh_degree": (2, 1, 0),
+    "storage": ("auto", 1.0, 3.0),
+    "alpha_min": (0.008, 0.016, 0.032),
+}
+"""The settings that can be varied, and the values that are tried, stronger ones later."""
+
+
+def parse_variations(words: Sequence[str]) -> dict[str, tuple[Value, ...]]:
+    """Return the settings of ``--vary SETTING`` or ``--vary SETTING=VALUE,VALUE`` with their
+    values; without any, all with defaults."""
+    found: dict[str, tuple[Value, ...]] = {}
+    for word in words:
+        name, equals, listed = word.partition("=")
+        shown = f"--vary {printable(word, 60)}"
+        if name not in SETTINGS:
+            raise DyngsError(f"{shown}: no such setting; there are {', '.join(SETTINGS)}")
+        found[name] = SETTINGS[name]
+        if equals:
+            texts = dict.fromkeys(text.strip() for text in listed.split(","))
+            try:
+                variants = [Variant(**{name: text}) for text in texts]  # pyright: ignore[reportArgumentType]
+            except ValidationError as error:
+                raise DyngsError(f"{shown}: {error.errors()[0]['msg']}") from None
+            found[name] = tuple(getattr(variant, name) for variant in variants)
+    return found or SETTINGS
+
+
+def own_settings(run_dir: Path) -> dict[str, Value | None]:
+    """Return the settings that can be varied in a run, with its own values. Raises DyngsError: none
+    can."""
+    if has_only_scene_file(run_dir):
+        raise DyngsError(
+            f"{run_dir}: only {SCENE_FILE} is there; give the run that it was exported from"
+        )
+    config = load_resolved(run_dir)
+    if capability(config.model, HasGaussians) is None:
+        raise DyngsError(f"{run_dir}: model.kind={config.model.kind} has no Gaussians to vary")
+    scene = load_run(run_dir).scene
+    own: dict[str, Value | None] = {
+        "prune": 0.0,
+        "sh_degree": scene.gaussians.sh_degree,
+        "storage": None,
+        "alpha_min": scene.options.alpha_min,
+    }
+    if capability(config.model, Moves) is not None and not scene.is_static:
+        own["mask_times"] = config.prune.mask_times
+    return own
+
+
+def single_changes(
+    settings: Mapping[str, Sequence[Value]], own: Mapping[str, Value | None], finetune: int
+) -> list[Variant]:
+    """Return one variant per setting and value that applies to a run with the settings ``own`` and
+    differs from its own; pruned and masked ones also with fine-tuning."""
+    variants = []
+    for name, values in settings.items():
+        before: Any = own.get(name)
+        for value in values if name in own else ():
+            if value < before if name == "sh_degree" else value != before:
+                variant = Variant(**{name: value})  # pyright: ignore[reportArgumentType]
+                variants.append(variant)
+                if finetune and name in ("prune", "mask_times"):
+                    variants.append(replace(variant, finetune=finetune))
+    return variants
+
+
+@dataclass(frozen=True)
+class Tradeoff:
+    """The variants of a run, their folders and measurements in ``out``.
+
+    Attributes:
+        settings: values to measure, by setting.
+        finetune: training steps after pruning and masking, for additional variants; 0: none.
+        combine: combinations in each of three directions, see ``combinations``.
+        rounds: renders of each timed view.
+        threads: 0: all cores.
+        device: what trains, prunes and renders.
+        ray_cores: of each variant that Ray makes and measures; None: all is done here.
+    """
+
+    run_dir: Path
+    out: Path
+    settings: Mapping[str, tuple[Value, ...]]
+    finetune: int = 0
+    combine: int = 4
+    split: str = "test"
+    rounds: int = 5
+    threads: int = 0
+    device: str = "auto"
+    ray_cores: int | None = None
+
+    def run(self) -> dict[Variant, Measurement]:
+        """Return the measurements of all variants, the run itself first.
+
+        Each is kept as a file in ``out / "points"`` and not made again.
+
+        Raises:
+            DyngsError: no such run or split, or the folder holds measurements of another run.
+        """
+        load_resolved(self.run_dir)  # what is no run is refused before anything else
+        inputs_of(self.run_dir).require_output(self.out)
+        own = own_settings(self.run_dir)  # refuses what cannot be varied before anything is written
+        run = load_run(self.run_dir)
+        split_views(read_capture_of(run.config.data, run.info), self.split)
+        newest = checkpoint_paths(self.run_dir)[-1]
+        source = {
+            "run": str(self.run_dir.absolute()),
+            "checkpoint": newest.name,
+            "sha256": hashlib.sha256(newest.read_bytes()).hexdigest(),
+            "split": self.split,
+            "device": device_for(self.device).type,
+        }
+        require_same_study(self.out, source, ("sha256", "split", "device"))
+        singles = [Variant(), *single_changes(self.settings, own, self.finetune)]
+        idle = self.settings.keys() - {name for variant in singles for name in variant.settings}
+        if idle:
+            show(f"nothing to vary in this run: {', '.join(sorted(idle))}")
+        found = self._measured(singles, self.ray_cores)
+        # combinations share folders, so these are made one after another
+        return self._measured([*singles, *combinations(found, self.combine)], None)
+
+    def _measured(
+        self, variants: Sequence[Variant], ray_cores: int | None
+    ) -> dict[Variant, Measurement]:
+        bench = Bench(self.out, self.split, self.threads, self.device, rounds=self.rounds)
+        subjects = [
+            Subject(v.name, v.slug, self.run_dir, partial(self.folder, v)) for v in variants
+        ]
+        missing = [subject for subject in subjects if not bench.point(subject.slug).is_file()]
+        for subject, found in done_in_turn(bench.measure, missing, ray_cores):
+            if isinstance(found, DyngsError):
+                raise found
+            show(f"{subject.name}: {found.psnr:.2f} dB, {found.mb:.2f} MB")
+        return dict(zip(variants, bench.with_speeds(subjects), strict=True))
+
+    def folder(self, variant: Variant) -> Path:
+        """Return the run folder of a variant; it is made if it does not exist.
+
+        After Ctrl-C while fine-tuning, the next call continues.
+        """
+        if variant == Variant():
+            return self.run_dir
+        folder = self.out / "models" / variant.slug
+        if not (folder / RESOLVED_NAME).is_file():
+            self._make(variant, folder)
+        return folder
+
+    def _make(self, wanted: Variant, folder: Path) -> None:
+        if wanted.storage is not None:
+            exact = self.folder(replace(wanted, storage=None))
+            max_change = wanted.storage if isinstance(wanted.storage, float) else None
+            write_scene_file(exact, folder, max_change)
+            return
+        if wanted.alpha_min is not None:
+            source = self.folder(replace(wanted, alpha_min=None))
+            checkpoint = latest_checkpoint(source)
+            config = load_resolved(source, [f"model.alpha_min={wanted.alpha_min}"])
+        elif wanted.sh_degree is not None:
+            source = self.folder(replace(wanted, sh_degree=None))
+            checkpoint = latest_checkpoint(source)
+            config = load_resolved(source, [f"model.sh_degree={wanted.sh_degree}"])
+            tensors = dict(checkpoint.tensors)
+            sh = tensors["gaussians.sh"][:, : num_sh_terms(wanted.sh_degree)]
+            tensors["gaussians.sh"] = sh.contiguous()
+            checkpoint = replace(checkpoint, tensors=tensors)
+        elif wanted.finetune:
+            source = self._finetuned(wanted)
+            checkpoint = latest_checkpoint(source)
+            config = load_resolved(source)
+        else:
+            source = self.run_dir
+            start = latest_checkpoint(source)
+            steps = f"train.steps={start.info.step}"
+            config = load_resolved(source, [steps, *self._pruning(wanted)])
+            with kernel_threads(self.threads or num_cores()):
+                capture = read_capture_of(config.data, start.info)
+                trainer = assemble(config, capture, restored=True)
+                trainer.restore(start)
+                trainer.apply(pruning(trainer))
+                checkpoint = trainer.checkpoint()
+        # optimizer, sampler and random state are left out
+        tensors = tensors_of(restored_model(checkpoint, config.model).state())
+        checkpoint = replace(checkpoint, tensors=tensors)
+        save_checkpoint(folder, checkpoint, seconds_at(source, checkpoint.info.step))
+        write_config(config, folder)  # marks the folder as complete
+
+    def _finetuned(self, wanted: Variant) -> Path:
+        """Prune and fine-tune the run."""
+        out = self.out / "training" / wanted.slug
+        if checkpoint_paths(out):
+            return finished(load_resolved(out), out)
+        steps = f"prune.steps={wanted.finetune}"
+        return prune_run(self.run_dir, out, [*self._pruning(wanted), steps])
+
+    def _pruning(self, wanted: Variant) -> list[str]:
+        """Return overrides of the pruning stage. Limits of the run would change its variants again;
+        masks are those of the run where the variant has none."""
+        masks = wanted.mask_times or load_resolved(self.run_dir).prune.mask_times
+        return [
+            *(f"budget.{name}=null" for name in BudgetConfig.model_fields),
+            f"run.threads={self.threads}",
+            f"run.device={self.device}",
+            f"prune.fraction={wanted.prune}",
+            f"prune.mask_times={masks}",
+        ]
+
+
+def pareto_mask(goals: Sequence[Sequence[float]]) -> list[bool]:
+    """Return which points are on the Pareto front: no other is as good in all goals and better in
+    one."""
+
+    def dominates(a: Sequence[float], b: Sequence[float]) -> bool:
+        return a != b and all(x >= y for x, y in zip(a, b, strict=True))
+
+    return [not any(dominates(other, own) for other in goals) for own in goals]
+
+
+def table_rows(measurements: Sequence[Measurement]) -> list[Row]:
+    """Return a row per measurement, by column. ``fps`` is that of the first one times the gain, so
+    that scenes timed at another hour compare; ``on_front``: on the Pareto front of PSNR, speed and
+    size."""
+    base = measurements[0].ms
+    fps = 0.0 if base is None else 1e3 / base
+    front = pareto_mask([(m.psnr, m.gain, -m.mb) for m in measurements])
+    columns = ("name", *SCORES, "gain", "ms", "mb", "gaussians", "steps", "seconds")
+    return [
+        {name: getattr(m, name) for name in columns} | {"fps": fps * m.gain, "on_front": on_front}
+        for m, on_front in zip(measurements, front, strict=True)
+    ]
+
+
+# The cost of each setting, and combinations worth measuring
+
+
+def slope(losses_and_factors: Iterable[tuple[float, float]]) -> float | None:
+    """Return dB lost per factor 2: the least-squares line through no loss at factor 1; None if
+    less than 3.5 % is gained."""
+    pairs = [(loss, math.log2(factor)) for loss, factor in losses_and_factors]
+    pairs = [(loss, doublings) for loss, doublings in pairs if doublings >= MIN_DOUBLINGS]
+    return sum(loss * x for loss, x in pairs) / sum(x * x for _, x in pairs) if pairs else None
+
+
+def exchange_rates(found: Mapping[Variant, Measurement]) -> list[Row]:
+    """Return a row per setting, from the variants that change it alone, in order of appearance.
+
+    ``db_per_speed``, ``db_per_size``: PSNR lost per doubled speed and per halved size; None where
+    no value of the setting gains any; negative: quality improves as well. ``speed``, ``size``:
+    largest gains of its values, as factors.
+    """
+    base = found[Variant()]
+    groups: dict[str, list[Measurement]] = {}
+    for variant, m in found.items():
+        if variant.setting not in ("", SEVERAL):
+            groups.setdefault(variant.setting, []).append(m)
+    return [
+        {
+            "name": setting,
+            "db_per_speed": slope((base.psnr - m.psnr, m.gain) for m in group),
+            "db_per_size": slope((base.psnr - m.psnr, base.mb / m.mb) for m in group),
+            "speed": max(m.gain for m in group),
+            "size": max(base.mb / m.mb for m in group),
+        }
+        for setting, group in groups.items()
+    ]
+
+
+def combinations(found: Mapping[Variant, Measurement], count: int) -> list[Variant]:
+    """Return combinations of single changes worth measuring next.
+
+    There are three greedy sequences, of ``count`` each: for speed, for size, and for both. Each
+    starts at the run and adds the change that loses the least PSNR per factor 2, then the next; a
+    stronger value of a setting, which comes later in ``found``, replaces a weaker one.
+    """
+    base = found[Variant()]
+    combined: dict[Variant, None] = {}
+    for gain_of in (
+        lambda m: m.gain,
+        lambda m: base.mb / m.mb,
+        lambda m: m.gain * base.mb / m.mb,
+    ):
+        costs = []
+        for strength, (variant, m) in enumerate(found.items()):
+            loss = base.psnr - m.psnr
+            cost = slope([(loss, gain_of(m))])
+            if loss <= MAX_LOSS_DB and cost is not None:
+                costs.append((cost, variant.slug, strength, variant))
+        now = Variant()
+        strongest: dict[str, int] = {}
+        steps = []
+        for _, _, strength, change in sorted(costs, key=lambda item: item[:2]):
+            (setting,) = change.settings
+            if strength > strongest.get(setting, -1):
+                now = now.merged(change)
+                strongest[setting] = strength
+                if len(now.settings) > 1:
+                    steps.append(now)
+        combined |= dict.fromkeys(variant for variant in steps[:count] if variant not in found)
+    return list(combined)
+
+
+# The best variant that meets requirements
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """``name >= bound``, or ``name <= bound`` if ``at_most``; as a goal: the more, or the less, the
+    better."""
+
+    name: str
+    at_most: bool
+    bound: float = math.nan
+
+    def __str__(self) -> str:
+        return f"{self.name}{'<=' if self.at_most else '>='}{self.bound:g}"
+
+    def is_met(self, row: Row) -> bool:
+        return self.cost(row) <= (self.bound if self.at_most else -self.bound)
+
+    def cost(self, row: Row) -> float:
+        """Return a value that is smaller for better rows, infinite where the metric was not
+        measured."""
+        value = row[self.name]
+        if value is None:
+            return math.inf
+        return value if self.at_most else -value
+
+
+def parse_requirements(text: str) -> list[Requirement]:
+    """Return the conditions of a list such as ``psnr>=30,fps>=20,mb<=5``."""
+    found = []
+    for part in text.split(","):
+        match = _CONDITION.match(part)
+        try:
+            bound = float(match[3]) if match else math.nan
+        except ValueError:
+            bound = math.nan
+        if match is None or not math.isfinite(bound):
+            raise DyngsError(
+                f"--require {printable(part.strip(), 60)!r} is no condition; write for instance "
+                "psnr>=30,fps>=20,mb<=5"
+            )
+        found.append(replace(parse_goal(match[1], smallest=match[2] == "<="), bound=bound))
+    return found
+
+
+def parse_goal(name: str, *, smallest: bool) -> Requirement:
+    """Return the goal of ``--minimize`` or ``--maximize``."""
+    if name not in METRICS:
+        raise DyngsError(f"{printable(name, 60)}: no such metric; there are {', '.join(METRICS)}")
+    return Requirement(name, smallest)
+
+
+def choose(rows: Sequence[Row], requirements: Sequence[Requirement], goal: Requirement) -> int:
+    """Return the number of the best row among those that meet all requirements; of equally good
+    ones that with the higher PSNR."""
+
+    def meeting(needed: Sequence[Requirement]) -> list[int]:
+        return [i for i, row in enumerate(rows) if all(r.is_met(row) for r in needed)]
+
+    fitting = meeting(requirements)
+    if fitting:
+        return min(fitting, key=lambda i: (goal.cost(rows[i]), -rows[i]["psnr"], rows[i]["name"]))
+    hints = []
+    for binding in requirements:
+        near = meeting([r for r in requirements if r is not binding])
+        best = (
+            rows[min(near, key=lambda i: binding.cost(rows[i]))] if near else {binding.name: None}
+        )
+        if best[binding.name] is not None:
+            value = f"{best[binding.name]:.5g} ({best['name']})"
+            hints.append(f"; with the others met the best {binding.name} is {value}")
+    asked = ", ".join(map(str, requirements))
+    raise DyngsError(f"no measured variant has {asked}{''.join(hints)}")
