@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +18,7 @@ from dyngs.data.body_frames import frame_number
 from dyngs.data.capture import Capture, View
 from dyngs.data.images.lens import undistorted_points
 from dyngs.human.body.joints import JOINT_NAMES
-from dyngs.io.fields import LARGEST, float_array, numbers_of, read_json
+from dyngs.io.fields import LARGEST, float_array, numbers_of, read_json_object
 from dyngs.io.numpy_files import read_npz
 
 _COCO = """
@@ -95,7 +94,7 @@ def read_keypoints(path: Path, views: Sequence[View]) -> Keypoints:
             name = name.removesuffix("_keypoints")
             if path.is_dir() and _view_of(named, name) is None:
                 continue
-            fields: Any = read_json(file)
+            fields = read_json_object(file)
             if path.is_dir():
                 people = [(name, person["pose_keypoints_2d"]) for person in fields["people"]]
             else:
