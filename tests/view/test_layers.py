@@ -22,7 +22,7 @@ from view_sessions import balls, looking_at_balls, opened_at
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.data.aim import look_at
+from dyngs.data.geometry import look_at
 from dyngs.export.images import render_frame
 from dyngs.gaussians import levels
 from dyngs.gaussians.levels import LevelScene

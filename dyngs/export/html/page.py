@@ -16,7 +16,7 @@ import numpy as np
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import counted
-from dyngs.data.aim import look_at_point
+from dyngs.data.geometry import look_at_point
 from dyngs.deform.bodies.field import bodies_of
 from dyngs.deform.scene import field_scene_of
 from dyngs.export.choose_path import in_front_of, orbit_around, points_at, view_to_show
