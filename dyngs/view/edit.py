@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dyngs.api.edit import write_part
 from dyngs.core.errors import DyngsError, counted
-from dyngs.data.aim import look_at, perpendicular, with_poses
+from dyngs.data.geometry import look_at, perpendicular, with_poses
 from dyngs.export.edit.crop import Box, held_by
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.similarity import UNMOVED, Similarity

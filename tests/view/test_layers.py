@@ -20,7 +20,7 @@ from pretend_gpu import GPU, pretend_gpu
 from view_sessions import balls, looking_at_balls
 
 from dyngs.core.camera import Cameras
-from dyngs.data.aim import look_at
+from dyngs.data.geometry import look_at
 from dyngs.export.images import render_frame
 from dyngs.runs.opened import Opened, open_run, open_scene
 from dyngs.view.controls import Frusta

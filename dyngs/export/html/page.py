@@ -16,7 +16,7 @@ import numpy as np
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import counted
-from dyngs.data.aim import look_at_point
+from dyngs.data.geometry import look_at_point
 from dyngs.export.choose_path import in_front_of, orbit_around, points_at, view_to_show
 from dyngs.export.html.numbers import Lists, add_levels, add_scene, block_files
 from dyngs.gaussians.levels import LevelScene
