@@ -17,7 +17,6 @@ from dyngs.gaussians.colour.network import ColourNetwork, box_around
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton, texel_gaussians
 from dyngs.human.avatar.scene import HumanScene, first_scene
 from dyngs.human.body.atlas import atlas_texels
@@ -26,6 +25,7 @@ from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs
+from dyngs.study.measure import Subject
 
 KINDS = ("static", *FIELDS, "windowed", "masked", "human")
 MOVING = torch.tensor([1, 4, 5, 8])

@@ -108,21 +108,6 @@ def parse_times(text: str) -> tuple[float, ...]:
     return tuple(np.linspace(start, stop, count).tolist())
 
 
-def world_pose(pose: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Return a ``cam_from_world`` pose (4, 4) with ``offset`` (3,) added to the camera's centre, in
-    float64.
-
-    Its rotation is made orthonormal: readers do that, and a far camera must not move by it.
-    """
-    if not np.any(offset):
-        return pose
-    left, _, right = np.linalg.svd(pose[:3, :3])
-    moved = np.eye(4)
-    moved[:3, :3] = left @ right
-    moved[:3, 3] = pose[:3, 3] - moved[:3, :3] @ offset
-    return moved
-
-
 def read_path(
     file: Path, world_offset: np.ndarray | None = None, size: tuple[int, int] | None = None
 ) -> CameraPath:
@@ -136,7 +121,7 @@ def read_path(
     """
     document = read_json_object(file, "a camera path is a JSON object; see docs/camera_paths.md")
     if size is not None:
-        document = {"width": size[0], "height": size[1]} | document
+        document = {"w": size[0], "h": size[1]} | document
     (name, *others) = [key for key in ("frames", "keyframes") if key in document] or ["frames"]
     frames = document.get(name)
     if others or not isinstance(frames, list) or not frames:
@@ -144,8 +129,11 @@ def read_path(
             f"{file}: a camera path needs one non-empty list, 'frames' or 'keyframes'; see docs"
         )
     require_at_most(file, len(frames), _MAX_FRAMES, "cameras")
-    width = int(_number(document, "width", file, 1, 65536))
-    height = int(_number(document, "height", file, 1, 65536))
+    first = frames[0] if isinstance(frames[0], dict) else {}
+    known = {key: value for key, value in first.items() if key in ("w", "h")} | document
+    # nerfstudio's names of the size, in the file or in its frames
+    width = int(_number(known, "width", file, 1, 65536, known.get("w")))
+    height = int(_number(known, "height", file, 1, 65536, known.get("h")))
     fps = _number(document, "fps", file, 1e-3, 1000, 30.0)
     poses = []
     matrices = []

@@ -208,7 +208,7 @@ def write_run_splats(
     """
     inputs_of(opened).require_output(path)
     splat = splats_at(opened, scene_part(opened.scene, part), time, how)
-    return write_splats(path, splat, sh_degree=how.sh_degree, own=how.own)
+    return write_splats(path, splat, sh_degree=how.sh_degree)
 
 
 def write_run_sequence(
@@ -316,7 +316,7 @@ def tracks_of(
     """Return the tracks of a scene, or with ``part`` "moving" of what moves, moved by ``frame`` to
     what people mean.
 
-    Raises DyngsError: nothing moves, or the positions would take more than 4 GB.
+    Raises DyngsError: nothing moves.
     """
     moves = torch.zeros(len(scene), dtype=torch.bool, device="cpu")
     moves[scene.rows] = not scene.is_static
@@ -325,12 +325,6 @@ def tracks_of(
     ids = torch.arange(len(scene), device="cpu")
     ids = ids[moves] if part == "moving" else ids
     kind = np.float32 if frame == UNMOVED else np.float64
-    size = 3 * len(ids) * len(times) * np.dtype(kind).itemsize
-    if size > 4e9:  # they are held in memory
-        raise DyngsError(
-            f"tracks of {len(ids)} Gaussians at {len(times)} times would take {size / 1e9:.1f} GB, the limit is "
-            "4 GB; give fewer --times, or --dynamic for only those that move"
-        )
     whole = scene.unmasked()
     positions = np.empty((len(ids), len(times), 3), kind)
     for k, time in enumerate(times):
@@ -455,8 +449,7 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
     labels[scene.moving] = field.rest.labels
     # Twice as many poses as training times: rotations are interpolated between them.
     moments = np.linspace(0.0, 1.0, 2 * max(len(scene.times) - 1, 1) + 1)
-    here_places, here_turns = _poses(field, [time], splat.frame)
-    there_places, there_turns = _poses(field, moments, splat.frame)
+    places, turns = _poses(field, [time, *moments.tolist()], splat.frame)
     document = GlbDocument()
     nodes = []
     meshes = []
@@ -468,13 +461,12 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
         name = "rest" if body < 0 else f"body {body}"
         node: dict[str, object] = {"name": name, "mesh": len(meshes)}
         if body >= 0:
-            place = here_places[0, body]
+            place = places[0, body]
             own = own.replace(means=(own.means.double() - torch.from_numpy(place)).float())
             node["translation"] = place.tolist()
-            turn_back = Rotation.from_quat(here_turns[0, body]).inv()
-            turns = Rotation.from_quat(there_turns[:, body]) * turn_back
-            channels.append((len(nodes), "translation", there_places[:, body]))
-            channels.append((len(nodes), "rotation", shorter_ways(turns.as_quat())))
+            turned = Rotation.from_quat(turns[1:, body]) * Rotation.from_quat(turns[0, body]).inv()
+            channels.append((len(nodes), "translation", places[1:, body]))
+            channels.append((len(nodes), "rotation", shorter_ways(turned.as_quat())))
         meshes.append({"name": name, "primitives": [add_gaussians(document, own)]})
         nodes.append(node)
     document.add_animation("motion", moments * opened.seconds, channels)
@@ -497,7 +489,7 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
 
 
 def _poses(
-    field: BodyField, times: Sequence[float] | np.ndarray, frame: Similarity
+    field: BodyField, times: Sequence[float], frame: Similarity
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return centres (T, B, 3) of B bodies at T times, in the axes of the file, and their rotations
     (T, B, 4) xyzw."""

@@ -98,7 +98,11 @@ class Predictor(ABC, Generic[N]):
     """
 
     def __init__(self, config: Config, network: N, views: Sequence[View], data: DataConfig) -> None:
-        self.config, self.network, self.views, self.data = config, network, tuple(views), data
+        self.config = config
+        self.section: Any = config.model
+        self.network = network
+        self.views = tuple(views)
+        self.data = data
 
     @property
     def name(self) -> str:
@@ -174,11 +178,14 @@ class Learner(ABC, Generic[N]):
         config: Config,
         network: N,
         names: Sequence[str],
-        lr: float,
         device: torch.device = CPU,
     ) -> None:
-        self.config, self.network, self.names, self.device = config, network, names, device
-        self.lr = lr
+        self.config = config
+        self.section: Any = config.model
+        self.network = network
+        self.names = names
+        self.device = device
+        self.lr: float = self.section.lr
         chosen = config.data.background
         self.background = chosen if chosen == "random" else evaluation_background(chosen, True)[0]
 

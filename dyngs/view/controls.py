@@ -136,8 +136,6 @@ class Controls:
         play = gui.add_button("Pause" if timeline.playing else "Play")
         play.on_click(lambda _: session.change_timeline(playing=not session.timeline.playing))
         session.on_play = lambda playing: setattr(play, "label", "Pause" if playing else "Play")
-        loop = gui.add_checkbox("Loop", timeline.loops)
-        loop.on_update(lambda _: session.change_timeline(loops=bool(loop.value)))
         hint = "1: as it was filmed"
         speed = gui.add_dropdown("Speed", SPEEDS, initial_value=f"{timeline.speed:g}", hint=hint)
         speed.on_update(lambda _: session.change_timeline(speed=float(speed.value)))
@@ -160,8 +158,6 @@ class Controls:
         """Add the motion picker, for files by name."""
         browsing = self._browsing
         motion = gui.add_dropdown("Motion", (AS_CAPTURED, AT_REST, *self._motions))
-        hint = "in motions of files, feet on the floor do not slide"
-        feet = gui.add_checkbox("Keep feet", False, hint=hint)
 
         def work() -> None:
             choice = str(motion.value)
@@ -169,11 +165,10 @@ class Controls:
             if choice == AT_REST:
                 opened = opened.at_rest()
             elif choice != AS_CAPTURED:
-                opened = opened.in_motion(self._motions[choice], keep_feet=bool(feet.value))
+                opened = opened.in_motion(self._motions[choice])
             browsing.session.show(opened)
 
-        for handle in (motion, feet):
-            handle.on_update(lambda _: browsing.session.ask(work))
+        motion.on_update(lambda _: browsing.session.ask(work))
 
     def _add_path(self, gui: viser.GuiApi) -> None:
         browsing = self._browsing
@@ -191,11 +186,9 @@ class Controls:
 
         def add(_: Any) -> None:
             if session.eye is not None:
-                known = recording.keyframes
-                size = (known[0].camera.width, known[0].camera.height) if known else None
                 time = None if session.opened.renderable.is_static else session.time
-                keyframe = Keyframe(session.eye.camera(size), time, float(seconds.value))
-                record(keyframes=(*known, keyframe))
+                keyframe = Keyframe(session.eye.camera(), time, float(seconds.value))
+                record(keyframes=(*recording.keyframes, keyframe))
 
         def save(_: Any) -> None:
             if len(recording):
@@ -210,7 +203,6 @@ class Controls:
         remove.on_click(lambda _: record(keyframes=recording.keyframes[:-1]))
         loop = gui.add_checkbox("Back to the first", False)
         loop.on_update(lambda _: record(loops=bool(loop.value)))
-        gui.add_button("Preview").on_click(lambda _: session.preview(recording))
         hint = f"{FILE_NAME}, for: dyngs render RUN --path {FILE_NAME}"
         gui.add_button("Save path", hint=hint).on_click(save)
 

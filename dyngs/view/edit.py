@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dyngs.api.edit import write_part
 from dyngs.core.errors import DyngsError, counted
-from dyngs.data.aim import look_at, perpendicular, with_poses
+from dyngs.data.geometry import look_at, perpendicular, with_poses
 from dyngs.export.edit.crop import Box, held_by
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.similarity import UNMOVED, Similarity
@@ -171,15 +171,11 @@ class EditControls:
         hint = "drag its arrows; along the axes of the scene"
         self._box = gui.add_checkbox("Box", False, hint=hint)
         step = 10.0 ** (math.floor(math.log10(2 * extent)) - 2)
-        longest = step * math.ceil(2 * extent / step)
-        self._sizes = [
-            gui.add_slider(f"Size {axis}", step, longest, step, size[0]) for axis in "xyz"
-        ]
+        self._size = gui.add_vector3("Size", tuple(size.tolist()), min=(step,) * 3, step=step)
         self._text = gui.add_markdown(self.editing.description)
         pick.on_update(lambda _: self._listen(bool(pick.value)))
         self._box.on_update(lambda _: self._show_box())
-        for slider in self._sizes:
-            slider.on_update(lambda _: self._refresh())
+        self._size.on_update(lambda _: self._refresh())
         jobs: dict[str, Callable[[], None]] = {
             "Delete inside": lambda: self._delete(inside=True),
             "Delete outside": lambda: self._delete(inside=False),
@@ -210,7 +206,7 @@ class EditControls:
     def _refresh(self) -> None:
         """Draw the picked points, the line between them, and the box; say where they are."""
         editing = self.editing
-        editing.size = np.array([float(slider.value) for slider in self._sizes])
+        editing.size = np.array(self._size.value, np.float64)
         scene = self._browsing.client.scene
         for name in ("A", "B", "line", "box"):
             if name in self._marks:

@@ -7,12 +7,10 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
-from torch.nn.functional import interpolate
 
 from dyngs.core.camera import Cameras
 from dyngs.export.camera_paths import resize_cameras
 from dyngs.export.images import color_map, depth_to_rgb
-from dyngs.gaussians.levels import LevelScene
 from dyngs.io.write import to_uint8
 from dyngs.models.renderable import Rendering, TimeStep
 from dyngs.runs.opened import Opened
@@ -34,7 +32,6 @@ class Shot:
         view: the view of the capture whose camera, time and truth are shown instead; None: no
             truth.
         divide: fraction of the width that shows the render; the truth is on the right of it.
-        is_moving: it is one of many, and drawn in levels of detail where ``coarser`` has made them.
     """
 
     camera: Cameras
@@ -43,7 +40,6 @@ class Shot:
     part: Part = "all"
     view: int | None = None
     divide: float = 1.0
-    is_moving: bool = False
 
 
 def draw(opened: Opened, shot: Shot) -> np.ndarray:
@@ -57,12 +53,13 @@ def draw(opened: Opened, shot: Shot) -> np.ndarray:
     truth = truth_in_window(opened, shot.view, size)
     if truth is None:
         return rgb
+    beside = truth[..., 3:] == 0
+    truth = truth[..., :3]
     if shot.layer == "error":
-        difference = np.abs(rgb.astype(np.float32) / 255.0 - truth).mean(axis=2)
-        return color_map(np.nan_to_num(4.0 * difference), "magma")
-    beside = np.isnan(truth)
+        difference = np.abs(rgb.astype(np.float32) - truth) * ~beside / 255.0
+        return color_map(4.0 * difference.mean(axis=2), "magma")
     rgb = np.where(beside, rgb // 2, rgb)  # there is no truth: darker
-    made = np.where(beside, rgb, to_uint8(np.nan_to_num(truth)))
+    made = np.where(beside, rgb, truth)
     column = round(min(max(shot.divide, 0.0), 1.0) * size[0])
     made[:, :column] = rgb[:, :column]
     if 0 < column < size[0]:
@@ -71,24 +68,16 @@ def draw(opened: Opened, shot: Shot) -> np.ndarray:
 
 
 def truth_in_window(opened: Opened, view: int, size: tuple[int, int]) -> np.ndarray | None:
-    """Return the true image of a view as large as it fits into a window of ``size``, px: (H, W, 3),
-    NaN next to it."""
+    """Return the true image of a view as large as it fits into a window of ``size``, px: (H, W, 4)
+    uint8, transparent next to it."""
+    from PIL import Image, ImageOps
+
     images = views_of(opened).images
     if images is None:
         return None
-    image = images[view].composite(opened.background.cpu())
-    high, wide = image.shape[:2]
-    width, height = size
-    scale = min(width / wide, height / high)
-    own = max(1, round(scale * high)), max(1, round(scale * wide))
-    shown = interpolate(
-        image.permute(2, 0, 1)[None], own, mode="bilinear", align_corners=False, antialias=scale < 1
-    )
-    window = np.full((height, width, 3), np.nan, np.float32)
-    top = (height - own[0]) // 2
-    left = (width - own[1]) // 2
-    window[top : top + own[0], left : left + own[1]] = shown[0].permute(1, 2, 0).clamp(0, 1).numpy()
-    return window
+    pixels = to_uint8(images[view].composite(opened.background.cpu()).numpy())
+    image = Image.fromarray(pixels).convert("RGBA")
+    return np.asarray(ImageOps.pad(image, size, color=(0, 0, 0, 0)))
 
 
 @torch.no_grad()
@@ -104,21 +93,10 @@ def _layer(opened: Opened, shot: Shot) -> np.ndarray:
     return to_uint8(pixels.clamp(0, 1).cpu().numpy())
 
 
-def coarser(opened: Opened, most: int) -> Opened:
-    """Return a still scene of which at most ``most`` Gaussians are drawn while anything moves.
-    Raises DyngsError."""
-    opened = opened.noted(f"while anything moves, at most {most:,} Gaussians are drawn")
-    opened.once("levels", lambda: [LevelScene.of(opened.renderable, most)])
-    return opened
-
-
 def _rendering(opened: Opened, shot: Shot, **options: Any) -> Rendering:
     """Return a rendering, on the CPU; the scene at the last time is kept."""
     part = shot.part
     scene = opened.renderable
-    levels: list[LevelScene] = opened.once("levels", list)
-    if levels and shot.is_moving and not options and part == "all" and shot.layer != "error":
-        return levels[0].render(shot.camera).to(device="cpu")
     if part != "all":
         scene = opened.once(part, lambda: opened.scene.part(part))
     kept: dict[str, tuple[float | None, TimeStep]] = opened.once("time steps", dict)

@@ -185,7 +185,6 @@ class Browsing:
         self.num_sent = 0
         self._shown_at = 0.0  # when the status was set, and the images until then
         self._shown_count = 0
-        self._has_refused = False
 
     def send(self, sent: Sent) -> None:
         """Pass an image to the browser; the status and the time slider follow every half second."""
@@ -213,14 +212,8 @@ class Browsing:
         """Take over the camera of the browser."""
         camera = self.client.camera
         wxyz, position = tuple(camera.wxyz.tolist()), tuple(camera.position.tolist())
-        if self.session.move(Eye(wxyz, position, float(camera.fov), _window(camera))):
-            self.on_move()
-        elif not self._has_refused:
-            self._has_refused = True
-            self.notify(
-                "Camera ignored",
-                "The browser sent a camera that cannot exist; the last one stays.",
-            )
+        self.session.move(Eye(wxyz, position, float(camera.fov), _window(camera)))
+        self.on_move()
 
     def go_to(self, index: int | None) -> None:
         """Move the browser's camera to a view of the capture; None: to where it began."""

@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.export.camera_paths import Keyframes, interpolate_keyframes, resize_cameras, world_pose
+from dyngs.data.geometry import checked_pose
+from dyngs.export.camera_paths import resize_cameras
 from dyngs.runs.opened import Opened
 from dyngs.view.layers import Layer, Part, Shot, draw
 from dyngs.view.views import camera_at, nearest_view, views_of
@@ -43,13 +43,6 @@ class Eye:
     fov: float
     size: tuple[int, int]
 
-    @property
-    def is_possible(self) -> bool:
-        """Whether there is such a camera: browsers may send anything."""
-        numbers = (*self.wxyz, *self.position, self.fov)
-        has_direction = all(map(math.isfinite, numbers)) and math.hypot(*self.wxyz) > 1e-6
-        return has_direction and self.fov > 0 and min(self.size) > 0
-
     def camera(self, size: tuple[int, int] | None = None) -> Cameras:
         """Return the camera for images of ``size``; None: that of the window."""
         return camera_at(self.wxyz, self.position, self.fov, size or self.size)
@@ -59,14 +52,12 @@ class Eye:
 class Timeline:
     """The time that is shown: ``time`` in [0, 1] when the clock read ``since``.
 
-    Where it is ``playing``, it takes ``seconds`` / ``speed`` from 0 to 1, where it begins again or
-    stops.
+    Where it is ``playing``, it takes ``seconds`` / ``speed`` from 0 to 1, where it begins again.
     """
 
     time: float = 0.0
     since: float = 0.0
     playing: bool = False
-    loops: bool = True
     speed: float = 1.0
     seconds: float = 4.0
 
@@ -74,15 +65,12 @@ class Timeline:
         """Return the time in [0, 1] when the clock reads ``clock``."""
         if not self.playing:
             return self.time
-        passed = self.time + max(clock - self.since, 0.0) * self.speed / max(self.seconds, 1e-6)
-        return passed % 1.0 if self.loops and passed > 1 else min(passed, 1.0)
+        passed = max(clock - self.since, 0.0) * self.speed / max(self.seconds, 1e-6)
+        return (self.time + passed) % 1.0 if passed else self.time
 
     def changed(self, clock: float, **changes: bool | float) -> Timeline:
-        """Return the timeline with other attributes; the time does not jump, but who plays from the
-        end begins at 0."""
-        now = self.at(clock)
-        now = 0.0 if changes.get("playing") and now >= 1.0 else now
-        return replace(self, **{"time": now, "since": clock, **changes})  # type: ignore[arg-type]
+        """Return the timeline with other attributes; the time does not jump."""
+        return replace(self, **{"time": self.at(clock), "since": clock, **changes})  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -111,8 +99,8 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class Recording:
-    """Keyframes of a camera path in their order, of one image size; ``loops``: the camera returns
-    to the first one at the end."""
+    """Keyframes of a camera path in their order; ``loops``: the camera returns to the first one at
+    the end."""
 
     keyframes: tuple[Keyframe, ...] = ()
     loops: bool = False
@@ -125,50 +113,24 @@ class Recording:
         """Seconds of the path; those after the last keyframe count only in a loop."""
         return sum(key.seconds for key in self.keyframes[: None if self.loops else -1])
 
-    @property
-    def cameras(self) -> Cameras:
-        """The cameras of at least one keyframe."""
-        each = [key.camera for key in self.keyframes]
-        poses = torch.cat([camera.cam_from_world for camera in each])
-        matrices = torch.cat([camera.intrinsics for camera in each])
-        return replace(each[0], cam_from_world=poses, intrinsics=matrices)
-
-    @property
-    def starts(self) -> np.ndarray:
-        return np.cumsum([0.0, *(key.seconds for key in self.keyframes[:-1])])
-
     def document(self, size: tuple[int, int], fps: float, opened: Opened) -> str:
         """Return the path as JSON that ``dyngs render --path`` reads (docs/camera_paths.md), in the
         coordinates of the capture; ``size`` of its images, px."""
-        cameras = opened.frame.cameras(resize_cameras(self.cameras, *size))
         keys: list[dict[str, Any]] = []
-        for i, (key, start) in enumerate(zip(self.keyframes, self.starts.tolist(), strict=True)):
-            pose = cameras.cam_from_world[i].double().cpu().numpy()
-            focal = float(cameras.intrinsics[i, 1, 1])
-            entry: dict[str, Any] = {"at": start, "fl_x": focal}
-            entry["cam_from_world"] = world_pose(pose, opened.world_offset).tolist()
+        start = 0.0
+        for key in self.keyframes:
+            camera = opened.frame.cameras(resize_cameras(key.camera, *size))
+            # rotations as readers repair them, which must not move a far camera
+            pose, _ = checked_pose(camera.cam_from_world[0].double().cpu().numpy(), "camera")
+            pose[:3, 3] -= pose[:3, :3] @ opened.world_offset
+            entry: dict[str, Any] = {"at": start, "fl_x": float(camera.intrinsics[0, 1, 1])}
+            entry["cam_from_world"] = pose.tolist()
             keys.append(entry if key.time is None else entry | {"time": key.time})
+            start += key.seconds
         document = {"width": size[0], "height": size[1], "fps": fps, "loop": self.loops}
         if self.loops:
             document["seconds"] = self.duration
         return json.dumps({**document, "keyframes": keys}, indent=1) + "\n"
-
-    def at(self, seconds: float) -> tuple[Cameras, float | None]:
-        """Return the camera and the time of the scene after ``seconds`` of the path, of at least
-        one keyframe."""
-        cameras = self.cameras
-        poses = cameras.cam_from_world.double().cpu().numpy()
-        matrices = cameras.intrinsics.double().cpu().numpy()
-        times = [key.time for key in self.keyframes if key.time is not None]
-        known = np.array(times) if len(times) == len(self) else None
-        period = self.duration if self.loops and len(self) > 1 else None
-        keys = Keyframes(poses, matrices, self.starts, known, period)
-        made = interpolate_keyframes(keys, np.array([seconds]))
-        pose, matrix = (
-            cameras.intrinsics.new_tensor(x) for x in (made.cam_from_world, made.intrinsics)
-        )
-        camera = replace(cameras, cam_from_world=pose, intrinsics=matrix)
-        return camera, None if made.times is None else float(made.times[0])
 
 
 @dataclass(frozen=True)
@@ -205,7 +167,6 @@ class Session:
         self._is_refined = (
             False  # whether the image that is shown is full, and of what is there now
         )
-        self._preview: tuple[Recording, float] | None = None
         self.on_change: Callable[[], None] = lambda: None
         self.on_play: Callable[[bool], None] = lambda playing: None
         self.on_error: Callable[[str], None] = lambda message: None
@@ -215,15 +176,11 @@ class Session:
         self.closed = False
         self.failure: str | None = None
 
-    def move(self, eye: Eye) -> bool:
-        """Look from ``eye`` from now on; return False, and go on as before, where there is no such
-        camera."""
-        if not eye.is_possible:
-            return False
+    def move(self, eye: Eye) -> None:
+        """Look from ``eye`` from now on."""
         if eye != self.eye:
             self.eye = eye
             self._note_change()
-        return True
 
     def change(self, **changes: Any) -> None:
         """Show something else: attributes of ``Display``."""
@@ -235,7 +192,7 @@ class Session:
         self.change_timeline(time=min(max(time, 0.0), 1.0))
 
     def change_timeline(self, **changes: bool | float) -> None:
-        """Play, pause, loop or change the speed: attributes of ``Timeline``."""
+        """Play, pause or change the speed: attributes of ``Timeline``."""
         with self._lock:
             self.timeline = self.timeline.changed(self._clock(), **changes)
         self.on_play(self.timeline.playing)
@@ -245,10 +202,6 @@ class Session:
         """Look at another scene, at the same time."""
         self.opened = opened
         self.change_timeline(seconds=opened.seconds)
-
-    def preview(self, recording: Recording) -> None:
-        self._preview = (recording, self._clock()) if len(recording) else None
-        self._note_change()
 
     def take(self, opened: Opened, *, refreshes: bool) -> None:
         """Look at a newer state of the scene; ``refreshes``: draw it, as large, even if nothing
@@ -306,7 +259,7 @@ class Session:
         size = _scaled(full, math.sqrt(self._area / math.prod(full))) if is_moving else full
         self._is_stale = False
         self._is_refined = True  # if it fails, it is not tried again
-        image = draw(self.opened, replace(self.shot(size), is_moving=is_moving))
+        image = draw(self.opened, self.shot(size))
         if not self.closed:
             self._send(Sent(image, not is_moving, self._clock() - start))
         now = self._clock()
@@ -314,38 +267,21 @@ class Session:
             factor = min(max(self._target / max(now - start, 1e-9), 0.5), 2.0)
             self._area = max(math.prod(size) * math.sqrt(factor), _SMALLEST_AREA)
         self._is_refined = not is_moving and version == self._changed_at
-        timeline = self.timeline
-        preview = self._preview
-        if timeline.playing and not timeline.loops and timeline.at(now) >= 1.0:
-            self.change_timeline(playing=False)
-        if preview is not None and now - preview[1] > preview[0].duration:
-            self.preview(Recording())
 
     def shot(self, size: tuple[int, int] | None = None) -> Shot:
         """Return what is shown now as an image of ``size``; None: that of the window."""
         if self.eye is None:
             raise ValueError("there is no camera yet")
-        size = size or self._full_size
-        time: float | None = self.time
-        preview = self._preview
-        if preview is None:
-            camera = self.eye.camera(size)
-            view = self.shown_view
-        else:
-            camera, recorded = preview[0].at(self._clock() - preview[1])
-            camera = resize_cameras(camera, *size)
-            view = None
-            time = time if recorded is None else recorded
-        if self.opened.renderable.is_static:
-            time = None
         look = self.look
+        view = self.shown_view
+        time = None if self.opened.renderable.is_static else self.time
         layer = "colour" if look.layer == "error" and view is None else look.layer
+        camera = self.eye.camera(size or self._full_size)
         return Shot(camera, time, layer, look.part, view, look.divide if look.comparing else 1.0)
 
     @property
     def _is_moving(self) -> bool:
-        is_playing = self.timeline.playing and not self.opened.renderable.is_static
-        return is_playing or self._preview is not None
+        return self.timeline.playing and not self.opened.renderable.is_static
 
     @property
     def _full_size(self) -> tuple[int, int]:

@@ -12,9 +12,8 @@ import torch
 
 from dyngs.config import DataConfig
 from dyngs.core.camera import Cameras
-from dyngs.data.aim import look_at_point, world_from_cam
 from dyngs.data.capture import View
-from dyngs.data.geometry import inverse_rigid, pinhole_matrix
+from dyngs.data.geometry import inverse_rigid, look_at_point, pinhole_matrix, world_from_cam
 from dyngs.data.loader import ImageLoader
 from dyngs.export.choose_path import orbit_around, points_at
 from dyngs.human.avatar.scene import avatar_of

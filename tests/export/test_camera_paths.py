@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.data.aim import look_at
+from dyngs.data.geometry import look_at
 from dyngs.export.camera_paths import (
     Keyframes,
     interpolate_keyframes,

@@ -192,13 +192,12 @@ def render_scene(
 
 
 def is_seen(scene: Scene, points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
-    """(R,) bool: points (R, 3) on surfaces that a camera sees, somewhere in its image or not; NaN
-    is never seen."""
+    """(R,) bool: points (R, 3) on surfaces that a camera sees, somewhere in its image or not."""
     origin = world_from_cam[:3, 3]
-    offset = np.nan_to_num(points - origin)
-    distance = np.maximum(np.sqrt(_dot(offset, offset)), 1e-6)
-    _, nearest = nearest_things(scene, f32(origin), (offset / distance[:, None]).astype(np.float32))
-    return np.isfinite(points).all(axis=1) & (nearest > distance - _SURFACE)
+    offset = points - origin
+    distance = np.sqrt(_dot(offset, offset))
+    _, nearest = nearest_things(scene, f32(origin), f32(offset / distance[:, None]))
+    return nearest > distance - _SURFACE
 
 
 def nearest_things(
@@ -856,7 +855,7 @@ def true_tracks(
 
 
 def is_in_image(points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
-    """(P,) bool: points (P, 3) before the camera and within its square image; NaN is not."""
-    x, y, z = ((np.nan_to_num(points) - world_from_cam[:3, 3]) @ world_from_cam[:3, :3]).T
+    """(P,) bool: points (P, 3) before the camera and within its square image."""
+    x, y, z = ((points - world_from_cam[:3, 3]) @ world_from_cam[:3, :3]).T
     reach = np.tan(0.5 * CAMERA_ANGLE_X) * -z
-    return np.isfinite(points).all(axis=1) & (z < 0) & (np.abs(x) < reach) & (np.abs(y) < reach)
+    return (z < 0) & (np.abs(x) < reach) & (np.abs(y) < reach)

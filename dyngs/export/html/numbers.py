@@ -276,12 +276,13 @@ def _add_network(network: ColourNetwork, lists: Lists) -> dict[str, Any]:
     first = -(-network.layers[0].weight.shape[1] // 4) * 4
     parts: list[NDArray[np.float32]] = []
     for i, layer in enumerate(network.layers):
+        weight = _numpy(layer.weight)
         rows = 3 if i == len(network.layers) - 1 else width
-        weight = np.zeros((rows, first if i == 0 else width), dtype=np.float32)
-        weight[: layer.weight.shape[0], : layer.weight.shape[1]] = _numpy(layer.weight.detach())
-        bias = np.zeros(-(-rows // 4) * 4, dtype=np.float32)
-        bias[: len(layer.bias)] = _numpy(layer.bias.detach())
-        parts += [weight.ravel(), bias]
+        columns = first if i == 0 else width
+        missing = (0, rows - weight.shape[0]), (0, columns - weight.shape[1])
+        bias = _numpy(layer.bias)
+        longer = -(-rows // 4) * 4 - len(bias)
+        parts += [np.pad(weight, missing).ravel(), np.pad(bias, (0, longer))]
     lists.exact("network", np.concatenate(parts).reshape(-1, 4))
     return {
         "network": {

@@ -16,9 +16,7 @@ import numpy as np
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import counted
-from dyngs.data.aim import look_at_point
-from dyngs.deform.bodies.field import bodies_of
-from dyngs.deform.scene import field_scene_of
+from dyngs.data.geometry import look_at_point
 from dyngs.export.choose_path import in_front_of, orbit_around, points_at, view_to_show
 from dyngs.export.html.numbers import Lists, add_levels, add_scene, block_files
 from dyngs.gaussians.levels import LevelScene
@@ -149,9 +147,6 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
         error = opened.frame.scale * curves["error"]
         fit = f"{curves['points']} control points for each of {curves['count']:,}, off by {error:.2g} units"
         notes.append(f"splines are fitted to the motion ({fit})")
-    moved = field_scene_of(opened.renderable)
-    if moved is not None and bodies_of(moved.field) is not None:
-        notes.append("shadows of bodies that turn are left out")
     return tuple(notes)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from statistics import median_high
 
 import torch
 from torch import Tensor
@@ -39,11 +40,6 @@ class Light:
 
     normals: Tensor  # (N, 3) outward at rest, of any length
     factors: Tensor  # (8, 3) A, red, green and blue
-
-    def on(self, sh: Tensor, linear: Tensor) -> Tensor:
-        """Return harmonics (N, K, 3) with their colours times the light, of Gaussians moved by (N,
-        3, 3)."""
-        return lit(sh, linear, self.normals, self.factors)
 
 
 def rest_normals(gaussians: Gaussians) -> Tensor:
@@ -102,11 +98,9 @@ def pose_blend_shapes(body: BodyTemplate) -> PoseBlendShapes | None:
     Relative error of a direction: at most 2^-11; random directions that shift points by 1 cm err by
     8 micrometres.
     """
-    return (
-        None
-        if body.pose_dirs is None
-        else PoseBlendShapes(body.pose_dirs.half().float(), body.faces)
-    )
+    if body.pose_dirs is None:
+        return None
+    return PoseBlendShapes(body.pose_dirs.half().float(), body.faces)
 
 
 @dataclass(frozen=True)
@@ -140,18 +134,17 @@ def pose_gaussians(
     )
     means = gaussians.means if offsets is None else gaussians.means + offsets
     moved = pose_by_joints(means, gaussians.quats, gaussians.log_scales, weights, world)
-    linear = moved.transforms[..., :3]
-    sh = (
-        gaussians.sh
-        if gaussians.sh.shape[1] == 1
-        else rotate_sh(gaussians.sh, blended_rotations(weights, moves))
-    )
+    sh = gaussians.sh
+    if sh.shape[1] > 1:
+        sh = rotate_sh(sh, blended_rotations(weights, moves))
+    if light is not None:
+        sh = lit(sh, moved.transforms[..., :3], light.normals, light.factors)
     return Gaussians(
         means=moved.means,
         quats=moved.quats,
         log_scales=moved.log_scales,
         logit_opacities=gaussians.logit_opacities,
-        sh=sh if light is None else light.on(sh, linear),
+        sh=sh,
     )
 
 
@@ -313,7 +306,7 @@ def pixel_size(cameras: Sequence[Cameras], clip: MotionClip, pelvis: Tensor) -> 
     away = [
         float((camera.centers[0] - place).norm() / camera.intrinsics[0, 0, 0]) for camera in cameras
     ]
-    return sorted(away)[len(away) // 2] / scale if away else torch.inf
+    return median_high(away) / scale if away else torch.inf
 
 
 def surface_texels(
@@ -337,12 +330,12 @@ def surface_texels(
 def surface_gaussians(parts: Sequence[Texels], sh_degree: int) -> tuple[Gaussians, Anchors, Tensor]:
     """Return the ``texel_gaussians`` on the skin of all parts, part by part, their anchors, and
     normals (N, 3)."""
-    made = [texel_gaussians(texels, (0.0,), sh_degree) for texels in parts]
-    normals = torch.cat([texels.normals for texels in parts])
-    anchors = {
-        name: torch.cat([a.tensors()[name] for _, a in made]) for name in made[0][1].tensors()
-    }
-    return Gaussians.joined([g for g, _ in made]), Anchors(**anchors), normals
+    gaussians, anchors = zip(
+        *(texel_gaussians(texels, (0.0,), sh_degree) for texels in parts), strict=True
+    )
+    columns = {name: [own.tensors()[name] for own in anchors] for name in anchors[0].tensors()}
+    joined = Anchors(**{name: torch.cat(x) for name, x in columns.items()})
+    return Gaussians.joined(gaussians), joined, torch.cat([texels.normals for texels in parts])
 
 
 LR = {
@@ -437,14 +430,13 @@ def corrected_clip(
 
     own = fit.turns.expand_as(clip.poses) if poses is None else fit.turns + poses
     given, extra = (
-        Rotation.from_rotvec(x.detach().double().reshape(-1, 3).cpu().numpy())
+        Rotation.from_rotvec(x.detach().double().flatten(0, 1).cpu().numpy())
         for x in (clip.poses, own)
     )
+    turned = torch.from_numpy((given * extra).as_rotvec()).to(clip.poses)
     return replace(
         clip,
-        poses=torch.from_numpy((given * extra).as_rotvec())
-        .to(clip.poses)
-        .reshape(clip.poses.shape),
+        poses=turned.view_as(clip.poses),
         trans=clip.trans if trans is None else clip.trans + trans.detach(),
         scale=clip.scale * math.exp(fit.log_scale),
     )

@@ -178,13 +178,15 @@ class HumanScene(GaussianScene, Posable):
     def in_pose(self, posing: BodyPose, time: float) -> GaussianTimeStep:
         """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable
         in the pose."""
+        gaussians = self._posed(posing, self.weights, self.learned_skeleton, self.light)
+        frame = RestFrame(self.gaussians.means, posing.rotations[0])
+        return GaussianTimeStep(gaussians, time, frame)
+
+    def _posed(
+        self, posing: BodyPose, weights: Tensor, skeleton: Skeleton, light: Light | None
+    ) -> Gaussians:
         offsets = rest_offsets(self.anchors, posing, self.shapes)
-        gaussians = pose_gaussians(
-            self.gaussians, self.weights, self.learned_skeleton, posing, offsets, self.light
-        )
-        return GaussianTimeStep(
-            gaussians, time, RestFrame(self.gaussians.means, posing.rotations[0])
-        )
+        return pose_gaussians(self.gaussians, weights, skeleton, posing, offsets, light)
 
     def in_frame(self, row: int, given_weights: Tensor | None = None) -> tuple[Gaussians, BodyPose]:
         """Return the Gaussians in frame ``row`` of the clip of training; differentiable in all that
@@ -192,19 +194,13 @@ class HumanScene(GaussianScene, Posable):
 
         With ``given_weights`` (N, J) nothing that was learned about the body is applied.
         """
-        skeleton = self.skeleton
-        light = None
-        if given_weights is None:
-            posing = corrected_pose(self.learned, self.clip, row)
-            skeleton = corrected_skeleton(self.learned, skeleton)
-            weights = skinning_weights(self.anchors, len(skeleton.joints), self.learned["weights"])
-            light = learned_light(self.learned)
-        else:
+        if given_weights is not None:
             posing = frame_pose(self.clip, row)
-            weights = given_weights
-        offsets = rest_offsets(self.anchors, posing, self.shapes)
-        gaussians = pose_gaussians(self.gaussians, weights, skeleton, posing, offsets, light)
-        return gaussians, posing
+            return self._posed(posing, given_weights, self.skeleton, None), posing
+        posing = corrected_pose(self.learned, self.clip, row)
+        skeleton = corrected_skeleton(self.learned, self.skeleton)
+        weights = skinning_weights(self.anchors, len(skeleton.joints), self.learned["weights"])
+        return self._posed(posing, weights, skeleton, learned_light(self.learned)), posing
 
     def given_weights(self) -> Tensor:
         """Return (N, J) skinning weights of the template."""
@@ -378,5 +374,3 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
         require_indices("shapes.faces", state["shapes.faces"], (None, 3), vertices, torch.int32)
     require_indices("anchors.joints", state["anchors.joints"], (n, k), j)
     require_indices("anchors.face", state["anchors.face"], (n,), faces)
-    if "near" in state:
-        require_indices("near", state["near"], (n, None), n)

@@ -240,7 +240,6 @@ class HumanTraining(SceneTraining[HumanScene]):
         self.frames_from = round(PARAMS.frames_from * rates.steps)
         self._rows = {frame: row for row, frame in enumerate(frames)}
         self._has_refined = False
-        self._given_weights: Tensor | None = None
         self._near: Tensor | None = None
         self._images: tuple[Tensor, Tensor] | None = None
         self._refit = refit
@@ -252,18 +251,36 @@ class HumanTraining(SceneTraining[HumanScene]):
         """
         if image.frame not in self._rows:
             raise DyngsError(f"view {image.name!r}: no body parameters for frame {image.frame}")
-        penalties = self._penalties(scene)
         row = self._row(scene, image.frame)
-        gaussians, posing = self._in_frame(scene, row, step)
+        rest = scene.gaussians
+        anchors = scene.anchors
+        away = (rest.means - anchors.points) / CENTIMETRE
+        longer = (rest.log_scales - anchors.size.log()[:, None]).clamp_min(0)
+        penalties = {
+            "offset": PARAMS.offset_weight * away.square().sum() / len(away),
+            "scale": PARAMS.scale_weight * longer.square().sum() / len(longer),
+        }
+        moved, posing = self._in_frame(scene, row, step)
         if self._refines(step):
             penalties |= correction_penalties(scene.learned)
             if scene.light is not None:
-                penalties["sides"] = PARAMS.sides_weight * difference_of_sides(
-                    scene.gaussians, *self._images_in(scene)
-                )
-        penalties |= self._between_neighbours(scene, gaussians, scene.clip.scale[row], step)
-        frame = RestFrame(scene.gaussians.means, posing.rotations[0])
-        return GaussianTimeStep(gaussians, image.time, frame, penalties)
+                if self._images is None:
+                    self._images = mirror_images(anchors, float(scene.skeleton.joints[0, 0]))
+                unlike = difference_of_sides(rest, *self._images)
+                penalties["sides"] = PARAMS.sides_weight * unlike
+        if self._near is None:
+            weights = scene.given_weights()
+            self._near = linked_neighbours(anchors.points, weights, PARAMS.neighbours)
+        if self._near.shape[1]:
+            # in each step between neighbours of one of the five columns, in cm^2: distances do not
+            # change, and offsets from the scaffold are alike
+            near = self._near[:, step % self._near.shape[1]]
+            scale = scene.clip.scale[row]
+            strain, uneven = strains(rest.means, moved.means, anchors.points, near, scale)
+            penalties["rigidity"] = PARAMS.rigidity * strain / CENTIMETRE**2
+            penalties["smoothness"] = PARAMS.smoothness * uneven / CENTIMETRE**2
+        frame = RestFrame(rest.means, posing.rotations[0])
+        return GaussianTimeStep(moved, image.time, frame, penalties)
 
     def optimize(self, scene: HumanScene, step: int) -> Count:
         """Update the corrections."""
@@ -315,12 +332,11 @@ class HumanTraining(SceneTraining[HumanScene]):
         return replace(scene, seen=trust), EditResult(None, changes, finding=finding)
 
     def follow(self, edit: TopologyEdit | None = None) -> None:
-        """Find out anew who the neighbours are, and what they weigh."""
-        self._given_weights = self._near = self._images = None
+        """Find out anew who the neighbours are."""
+        self._near = self._images = None
 
     def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
         self.follow()
-        self._near = tensors.get("near")
         if "refines_from" in tensors:  # the run may have become longer since
             self._has_refined = True
             self.refines_from = min(self.refines_from, int(tensors["refines_from"]))
@@ -329,7 +345,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         return HumanScene.restored(gaussians, tensors)
 
     def state(self) -> State:
-        kept = {} if self._near is None else {"near": self._near}
+        kept = {}
         if self._refit is not None and not self._refit.goes_on:
             kept["poses_stay"] = torch.ones(1, device="cpu")
         if self._has_refined:
@@ -342,48 +358,7 @@ class HumanTraining(SceneTraining[HumanScene]):
 
     def _in_frame(self, scene: HumanScene, row: int, step: int) -> tuple[Gaussians, BodyPose]:
         """Return the Gaussians in row ``row`` of the clip as ``step`` draws them, and the pose."""
-        if self._refines(step):
-            return scene.in_frame(row)
-        if self._given_weights is None:
-            self._given_weights = scene.given_weights()
-        return scene.in_frame(row, self._given_weights)
-
-    def _images_in(self, scene: HumanScene) -> tuple[Tensor, Tensor]:
-        if self._images is None:
-            self._images = mirror_images(scene.anchors, float(scene.skeleton.joints[0, 0]))
-        return self._images
+        return scene.in_frame(row, None if self._refines(step) else scene.given_weights())
 
     def _refines(self, step: int) -> bool:
         return self.options.refine and step > self.refines_from
-
-    def _penalties(self, scene: HumanScene) -> dict[str, Tensor]:
-        """Return penalties for Gaussians far from their scaffolds, or larger than their texels."""
-        now = scene.gaussians
-        away = (now.means - scene.anchors.points) / CENTIMETRE
-        longer = now.log_scales - scene.anchors.size.log()[:, None]
-        return {
-            "offset": PARAMS.offset_weight * away.square().sum() / len(away),
-            "scale": PARAMS.scale_weight * longer.clamp_min(0).square().sum() / len(longer),
-        }
-
-    def _between_neighbours(
-        self, scene: HumanScene, moved: Gaussians, scale: Tensor, step: int
-    ) -> dict[str, Tensor]:
-        """Return penalties between neighbours at rest, in cm^2; in each step for one of the five
-        neighbours.
-
-        Rigidity: distances do not change. Smoothness: offsets from the scaffold are alike.
-        """
-        means = scene.gaussians.means
-        if self._near is None:
-            self._near = linked_neighbours(
-                scene.anchors.points, scene.given_weights(), PARAMS.neighbours
-            )
-        if not self._near.shape[1]:
-            return {}
-        near = self._near[:, step % self._near.shape[1]]
-        strain, uneven = strains(means, moved.means, scene.anchors.points, near, scale)
-        return {
-            "rigidity": PARAMS.rigidity * strain / CENTIMETRE**2,
-            "smoothness": PARAMS.smoothness * uneven / CENTIMETRE**2,
-        }

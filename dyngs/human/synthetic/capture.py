@@ -447,15 +447,12 @@ class HumanOptions:
     seed: int = 0
     samples: int = 2  # per side of a pixel
     body_seed: int | None = None  # of the person's body shape; None: the template's own
-    # of the direction, strength and tint of the light; None: always the same
-    light_seed: int | None = None
-    # of the clips, see ``_clip``; None: a walk, then a squat
-    clip_seed: int | None = None
+    # of the light (direction, strength, tint), the clips (see ``_clip``), and the ring (radius and
+    # height; cameras are nearly level); None: the usual light, a walk, then a squat, and cameras
+    # alternately low and high, 3.5 m away
+    scene_seed: int | None = None
     # left mostly as right, back as front and bare hands, instead of clothes that differ everywhere
     usual_clothes: bool = False
-    # of radius and height of the ring, whose cameras are nearly level; None: alternately low and
-    # high, 3.5 m away
-    ring_seed: int | None = None
     with_depth: bool = False  # whether there are depth maps
 
 
@@ -476,7 +473,7 @@ class PosedMesh:
 
 
 def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Path:
-    """Write images of a walking person in the layout that ``dyngs.data.readers.blender`` reads;
+    """Write images of a walking person in the layout that ``dyngs.data.readers.transforms`` reads;
     returns ``out``.
 
     Files: ``images/SPLIT/fFFF_cCC.png`` (RGBA, straight alpha), ``transforms_SPLIT.json`` (OpenGL
@@ -497,7 +494,7 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
         clips["pose"] = options.num_new, {"pose": test}
     with new_folder(out) as started:
         for name, (num_frames, splits) in clips.items():
-            clip = _clip(body, num_frames, options.clip_seed, name == "pose")
+            clip = _clip(body, num_frames, options.scene_seed, name == "pose")
             motion = replace(
                 clip, trans=outfit.size * clip.trans, scale=outfit.size * clip.scale, betas=betas
             )
@@ -591,7 +588,7 @@ def _write_split(
     options: HumanOptions,
 ) -> None:
     entries = []
-    light = random_light(options.light_seed)
+    light = random_light(options.scene_seed)
     size = options.size
     for i, mesh in enumerate(meshes):
         for camera, pose in cameras.items():
@@ -643,11 +640,11 @@ def _cameras(options: HumanOptions) -> tuple[dict[int, np.ndarray], dict[int, np
     others = options.num_test
     around = np.arange(count) / max(count, 1)
     between = (np.arange(others) * count // max(others, 1) + 0.5) / count
-    if options.ring_seed is None:
+    if options.scene_seed is None:
         train = _on_ring(around, np.where(np.arange(count) % 2 == 0, 0.9, 1.7))
         test = _on_ring(between, np.full(others, 1.3))
     else:
-        make = np.random.default_rng([options.ring_seed, 5])
+        make = np.random.default_rng([options.scene_seed, 5])
         radius = make.uniform(3.3, 4.2)
         height = make.uniform(0.7, 1.6)
         train = _on_ring(around, height + make.uniform(-_UNSTEADY, _UNSTEADY, count), radius)
@@ -723,18 +720,8 @@ def write_people(
         raise DyngsError(
             f"people need size, cameras and frames of at least 1, a seed of at least 0, and be 1 to {_MOST:,}"
         )
-    _begin(out, {name: value for name, value in asdict(options).items() if name != "people"})
-    for number in range(options.people):
-        person = out / f"s{number // SHARD:04d}" / f"p{number:06d}"
-        if not person.is_dir():
-            write_human_capture(person, person_options(options, number))
-        report("people", number + 1, options.people)
-    return out
-
-
-def _begin(out: Path, made_with: dict[str, int]) -> None:
-    """Write that people in ``out`` are made with these options, or check that they were."""
     mark = out / PEOPLE_FILE
+    made_with = {name: value for name, value in asdict(options).items() if name != "people"}
     text = json.dumps(made_with) + "\n"
     if not mark.is_file():
         require_new_folder(out)
@@ -743,6 +730,12 @@ def _begin(out: Path, made_with: dict[str, int]) -> None:
         raise DyngsError(
             f"{out}: holds people of other options ({PEOPLE_FILE}); name a new folder, or give the same"
         )
+    for number in range(options.people):
+        person = out / f"s{number // SHARD:04d}" / f"p{number:06d}"
+        if not person.is_dir():
+            write_human_capture(person, person_options(options, number))
+        report("people", number + 1, options.people)
+    return out
 
 
 def person_options(options: PeopleOptions, number: int) -> HumanOptions:
@@ -756,9 +749,7 @@ def person_options(options: PeopleOptions, number: int) -> HumanOptions:
         num_test=0,
         seed=seed,
         body_seed=seed,
-        light_seed=seed,
-        clip_seed=seed,
+        scene_seed=seed,
         usual_clothes=number % 2 == 1,
-        ring_seed=seed,
         with_depth=True,
     )

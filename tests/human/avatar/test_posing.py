@@ -22,7 +22,6 @@ from dyngs.human.avatar.posing import (
     TERMS,
     Anchors,
     BodyPose,
-    Light,
     Skeleton,
     blended_rotations,
     pose_blend_shapes,
@@ -37,7 +36,7 @@ from dyngs.human.body.body import BodyTemplate, posed_vertices
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.body.skinning import axis_angle_to_matrix
-from dyngs.ops.harmonics import evaluate_harmonics
+from dyngs.ops.harmonics import evaluate_harmonics, lit
 from dyngs.ops.quaternions import rotation_matrices
 from tests.bare_person import bare_scene
 
@@ -67,9 +66,7 @@ def test_gradients_are_those_of_finite_differences() -> None:
     values = [
         torch.randn(shape, generator=make, dtype=torch.float64).requires_grad_() for shape in shapes
     ]
-    assert torch.autograd.gradcheck(
-        lambda sh, linear, normals, light: Light(normals, light).on(sh, linear), values
-    )
+    assert torch.autograd.gradcheck(lit, values)
 
 
 def test_a_person_is_lit_in_the_world() -> None:

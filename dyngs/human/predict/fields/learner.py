@@ -93,10 +93,8 @@ class FieldLearner(Learner[FieldNetwork]):
         people: Sequence[DataConfig],
         device: torch.device = CPU,
     ) -> None:
-        model = section_of(config)
-        names = [person.root.name for person in people]
-        super().__init__(config, network, names, model.lr, device)
-        self._template = template_of(model)
+        super().__init__(config, network, [person.root.name for person in people], device)
+        self._template = template_of(self.section)
         self._opened = kept_open(self._open, people)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
@@ -120,7 +118,7 @@ class FieldLearner(Learner[FieldNetwork]):
         another view."""
         rings = [ring for ring in moments(person.views).values() if len(ring) > FEWEST_VIEWS]
         ring = rings[random_index(len(rings), generator)]
-        most = min(section_of(self.config).source_views, len(ring) - 1)
+        most = min(self.section.source_views, len(ring) - 1)
         count = FEWEST_VIEWS + random_index(most - FEWEST_VIEWS + 1, generator)
         if random_index(2, generator):
             sources = spread(ring, count, random_index(len(ring), generator))
@@ -172,17 +170,12 @@ def predictor(
 
     ``say`` and ``report`` are told of that fit.
     """
-    model = section_of(config)
+    model: Any = config.model
     network = NETWORKS[model.kind](torch.Generator())
     load_weights(network, checkpoint)
     if model.body is None:
         data = with_fitted_body(data, only_if_needed=True, say=say, report=report)
     return FieldPredictor(config, network, person_of(data, template_of(model)), data)
-
-
-def section_of(config: Config) -> FieldPredictorModel:
-    assert isinstance(config.model, FieldPredictorModel)
-    return config.model
 
 
 def template_of(model: FieldPredictorModel) -> BodyTemplate:

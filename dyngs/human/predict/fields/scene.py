@@ -60,13 +60,8 @@ class PredictedField(Renderable):
 
     @property
     def bounds(self) -> Tensor:
-        return self.scale * self._around
-
-    @property
-    def _around(self) -> Tensor:
-        """(2, 3) of ``bounds``, m."""
         points = self.body.key_points
-        return torch.stack([points.amin(0) - AROUND, points.amax(0) + AROUND])
+        return self.scale * torch.stack([points.amin(0) - AROUND, points.amax(0) + AROUND])
 
     @property
     def device(self) -> torch.device:
@@ -96,68 +91,25 @@ class PredictedField(Renderable):
         options = self.options if options is None else options
         behind = self.background if background is None else background
         cameras = fixed_cameras(cameras, behind, self.sources.rgba)
-        views = [self._view(cameras.select(i)) for i in range(len(cameras))]
-        rgb, through, depth = (torch.stack(x) for x in zip(*views, strict=True))
+        with torch.no_grad():
+            views = [
+                self.network.picture(self.known, metric(cameras.select(i), self.scale))
+                for i in range(len(cameras))
+            ]
+        rgb = torch.stack([view.colour for view in views])
+        through = torch.stack([view.transmittance for view in views])
+        depth = self.scale * torch.stack([view.depth for view in views])
         return composited(rgb, through, depth, options, behind)
 
-    @torch.no_grad()
-    def _view(self, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
-        """Return colours before black (H, W, 3), transmittance (H, W) and the sum of weight times z
-        (H, W)."""
-        shape = (camera.height, camera.width)
-        like = self.sources.rgba
-        colour = like.new_zeros(*shape, 3)
-        depth = like.new_zeros(shape)
-        through = like.new_ones(shape)
-        part = around_in(metric(camera, self.scale), self._around)
-        if part is not None:
-            near, top, left = part
-            seen = self.network.picture(self.known, near)
-            own = slice(top, top + near.height), slice(left, left + near.width)
-            colour[own] = seen.colour
-            through[own] = seen.transmittance
-            depth[own] = self.scale * seen.depth
-        return colour, through, depth
 
-
-def around_in(camera: Cameras, box: Tensor) -> tuple[Cameras, int, int] | None:
-    """Return the camera of the part of an image that shows a box, of corners (2, 3), and its first
-    row and column; None: no part does.
-
-    Its sides are multiples of ``MULTIPLE`` where the image is as large. All of the image where the
-    box reaches behind the camera.
-    """
-    corners = torch.cartesian_prod(*box.T)
-    pose = camera.cam_from_world[0]
-    k = camera.intrinsics[0]
-    local = corners @ pose[:3, :3].T + pose[:3, 3]
-    if bool((local[:, 2] <= 0).all()):
-        return None
-    if bool((local[:, 2] <= 1e-3).any()):
-        return camera, 0, 0
-    pixels = local[:, :2] / local[:, 2:] * torch.stack([k[0, 0], k[1, 1]]) + k[:2, 2]
-    size = pixels.new_tensor([camera.width, camera.height])
-    first = pixels.amin(0).floor().clamp_min(0)
-    length = pixels.amax(0).ceil().minimum(size) - first
-    if bool((length <= 0).any()):
-        return None
-    length = ((length / MULTIPLE).ceil() * MULTIPLE).minimum(size)
-    left, top = (int(x) for x in first.minimum(size - length))
-    width, height = (int(x) for x in length)
-    intrinsics = camera.intrinsics.clone()
-    intrinsics[:, 0, 2] -= left
-    intrinsics[:, 1, 2] -= top
-    return Cameras(camera.cam_from_world, intrinsics, width, height), top, left
-
-
-def stored_field(name: str, checkpoint: Checkpoint) -> PredictedField:
-    """Return what the network ``name`` has predicted. Raises KeyError or ValueError where tensors
+def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedField:
+    """Return the field of a checkpoint. Raises KeyError or ValueError where tensors
     do not fit."""
     stored = checkpoint.part("field")
     # earlier versions stored sizes of the network behind the scale
     numbers = require_tensor("numbers", stored["numbers"][:1], (1,), torch.float64)
     require_positive("scale", numbers)
-    network = NETWORKS[name](torch.Generator())
+    network = NETWORKS[model.network](torch.Generator())
     load_weights(network, checkpoint, "field.network")
     rgba = require_tensor("rgba", stored["sources.rgba"], (None, 4, None, None))
     count, _, height, width = rgba.shape
@@ -183,7 +135,7 @@ class PredictedModel(Model[PredictedField]):
     def __init__(self, run: RunStart) -> None:
         assert isinstance(run.config.model, PredictedFieldModel)
         self._run_dir = run.config.run.dir
-        self._name = run.config.model.network
+        self._section = run.config.model
         self._scene: PredictedField | None = None
 
     def begin_with(self, scene: PredictedField) -> None:
@@ -215,12 +167,7 @@ class PredictedModel(Model[PredictedField]):
         return self.scene.state()
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        self._scene = stored_field(self._name, checkpoint)
+        self._scene = restore(self._section, checkpoint)
 
     def place(self, device: torch.device) -> None:
         self._scene = None if self._scene is None else self._scene.to(device)
-
-
-def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedField:
-    """Return the scene of a checkpoint."""
-    return stored_field(model.network, checkpoint)

@@ -115,7 +115,7 @@ class PersonPredictor(Predictor[AtlasNetwork]):
         """Return the preset for one person, with the template of the network."""
         preset = load_config(packaged_preset("human"), ["data.root=."])
         same = ("body", "uv", "resolution", "near", "eps2d", "rasterize_mode", "sh_degree")
-        given = human_options(_section(self.config))
+        given = human_options(self.section)
         human = preset.model.model_copy(update={name: getattr(given, name) for name in same})
         return preset.model_copy(update={"data": self.data, "model": human})
 
@@ -141,8 +141,7 @@ class AtlasLearner(Learner[AtlasNetwork]):
         device: torch.device = CPU,
     ) -> None:
         """``choices`` are views to predict each person from; their maps are kept."""
-        names = [x.person.name for x in people]
-        super().__init__(config, network, names, _section(config).lr, device)
+        super().__init__(config, network, [x.person.name for x in people], device)
         self.people = people
         self.choices = choices
         self.mean = mean
@@ -173,8 +172,8 @@ class AtlasLearner(Learner[AtlasNetwork]):
         return {"mean": self.mean}
 
     def load(self, checkpoint: Checkpoint) -> None:
-        resolution = _section(self.config).resolution
-        self.mean = load_network(self.network, checkpoint, resolution).to(self.device)
+        mean = load_network(self.network, checkpoint, self.section.resolution)
+        self.mean = mean.to(self.device)
 
     def _targets(
         self, person: Person, inputs: list[int], generator: torch.Generator
@@ -192,7 +191,7 @@ def learner(config: Config, generator: torch.Generator) -> AtlasLearner:
     """Return the network of ``model.kind: human_predictor`` before the first step: captures read,
     nothing trained."""
     device = device_for(config.run.device)
-    model = _section(config)
+    model: Any = config.model
     body = load_template(human_options(model))
     network = new_network(model, generator).to(device)
     people = [read_person(data, model, body) for data in captures_in(config.data)]
@@ -213,7 +212,7 @@ def predictor(
 
     ``say`` and ``report`` are told of that fit.
     """
-    model = _section(config)
+    model: Any = config.model
     network = new_network(model, torch.Generator())
     mean = load_network(network, checkpoint, model.resolution)
     data = with_fitted_body(data, human_options(model), only_if_needed=True, say=say, report=report)
@@ -233,11 +232,9 @@ def new_network(model: HumanPredictorModel, generator: torch.Generator) -> Atlas
 def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int) -> Tensor:
     """Return the mean colours (3, S, S) of a checkpoint, whose weights ``network`` takes; S is the
     ``resolution``."""
-    mean = checkpoint.tensors.get("model.mean")
     load_weights(network, checkpoint)
-    if mean is None:
-        raise DyngsError(f"{checkpoint.name} is not of this network; was its config changed?")
     with reading(checkpoint.name, OTHER_CONFIG):
+        mean = checkpoint.tensors["model.mean"]
         return require_tensor("mean", mean, (3, resolution, resolution))
 
 
@@ -298,7 +295,7 @@ def _images_error(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the mean loss of renders of ``moments`` against images; the last render and its truth
     (H, W, 3)."""
-    options = replace(render_options(_section(config)), nonfinite="trust")
+    options = replace(render_options(config.model), nonfinite="trust")
     total = torch.zeros((), device=background.device)
     for image, moment in zip(images, moments, strict=True):
         drawn = scene.render(image.cameras, moment, options=options, background=background)
@@ -309,9 +306,3 @@ def _images_error(
         loss = image_loss(rendered, drawn.alpha[0], image, truth, config.train)
         total = total + (loss + SQUARED_WEIGHT * known.square().mean()) / len(images)
     return total, rendered, truth
-
-
-def _section(config: Config) -> HumanPredictorModel:
-    if not isinstance(config.model, HumanPredictorModel):
-        raise TypeError(f"not a network: {config.model!r}")
-    return config.model

@@ -35,7 +35,6 @@ from dyngs.human.predict.gps.rectification import (
     well_spread,
 )
 from dyngs.human.predict.gps.stereo import GpsNetwork, gaussians_of, offset_loss
-from dyngs.human.predict.keys import GpsModel
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.prediction import (
     Example,
@@ -94,7 +93,7 @@ class GpsPredictor(Predictor[GpsNetwork]):
 
     def _surface(self, left: Image, right: Image) -> Gaussians:
         """Return the surface that two views show, inside both silhouettes."""
-        pair = rectified(left, right, _section(self.config).person_px)
+        pair = rectified(left, right, self.section.person_px)
         offsets, raw = self.network(pair)
         gaussians = gaussians_of(pair, offsets[-1], raw)
         inside = is_inside(left, gaussians.means) & is_inside(right, gaussians.means)
@@ -125,8 +124,7 @@ class GpsLearner(Learner[GpsNetwork]):
         people: Sequence[DataConfig],
         device: torch.device = CPU,
     ) -> None:
-        names = [person.root.name for person in people]
-        super().__init__(config, network, names, _section(config).lr, device)
+        super().__init__(config, network, [person.root.name for person in people], device)
         self._opened = kept_open(_lessons, people)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
@@ -135,7 +133,7 @@ class GpsLearner(Learner[GpsNetwork]):
         target = between[random_index(len(between), generator)]
         background = self.drawn_background(generator)
         left, right = (images[i] for i in pair)
-        windows = rectified(left, right, _section(self.config).person_px)
+        windows = rectified(left, right, self.section.person_px)
         windows = fields_moved_to(windows, self.device)
         only_depth = step <= round(DEPTH_FRACTION * self.config.train.steps)
         offsets, raw = self.network(windows, with_gaussians=not only_depth)
@@ -204,8 +202,3 @@ def predictor(
     network = GpsNetwork(torch.Generator())
     load_weights(network, checkpoint)
     return GpsPredictor(config, network, _with_silhouettes(data), data)
-
-
-def _section(config: Config) -> GpsModel:
-    assert isinstance(config.model, GpsModel)
-    return config.model

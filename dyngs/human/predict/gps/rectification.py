@@ -13,6 +13,7 @@ Local letters: two views, left and right; windows of H x W pixels.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
@@ -213,13 +214,24 @@ def rectified(left: Image, right: Image, person_px: int) -> RectifiedPair:
     images = [_at_size(image, person_px) for image in (left, right)]
     poses = [image.cameras.cam_from_world[0].double() for image in images]
     centers = torch.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in poses])
-    turn = _turn(centers, poses[0][2, :3] + poses[1][2, :3])
+    across = torch.nn.functional.normalize(centers[1] - centers[0], dim=0)
+    forward = poses[0][2, :3] + poses[1][2, :3]
+    down = torch.nn.functional.normalize(torch.linalg.cross(forward, across), dim=0)
+    turn = torch.stack([across, down, torch.linalg.cross(across, down)])
     boxes = torch.stack([_box(image, turn) for image in images])
-    _require_same_person(boxes, left.name, right.name)
+    widths, heights = (boxes[..., 1] - boxes[..., 0]).amax(0).tolist()
+    off = float((boxes[0, 1] - boxes[1, 1]).abs().max()) / heights
+    is_before = boxes[0, 0].mean() > boxes[1, 0].mean()
+    if off > _SAME_HEIGHT or not is_before or widths > _LARGEST * heights:
+        raise DyngsError(
+            f"{left.name} and {right.name}: do not show the same person where their cameras say (heights differ by "
+            f"{off:.0%}); the calibration is wrong, or a mask is: see `dyngs data inspect`"
+        )
     height = float(boxes[:, 1, 1].max() - boxes[:, 1, 0].min())
     focal = person_px / height
-    rows = _rounded(focal * height)
-    columns = _rounded(focal * float((boxes[:, 0, 1] - boxes[:, 0, 0]).max()))
+    rows, columns = (
+        FACTOR * math.ceil((focal * side + 2 * _MARGIN) / FACTOR) for side in (height, widths)
+    )
     middle = torch.stack([boxes[:, 0].mean(1), boxes[:, 1].mean().expand(2)], dim=1)
     half = torch.tensor([columns / 2, rows / 2], dtype=torch.float64, device="cpu")
     principal = half - focal * middle
@@ -251,14 +263,6 @@ def _at_size(image: Image, person_px: int) -> Image:
     return image.shrunk(max(1, int(rows.max() - rows.min() + 1) // person_px))
 
 
-def _turn(centers: Tensor, forward: Tensor) -> Tensor:
-    """Return the rotation (3, 3) to axes along the line from left to right ``centers`` (2, 3), down
-    and forward."""
-    across = torch.nn.functional.normalize(centers[1] - centers[0], dim=0)
-    down = torch.nn.functional.normalize(torch.linalg.cross(forward, across), dim=0)
-    return torch.stack([across, down, torch.linalg.cross(across, down)])
-
-
 def _box(image: Image, turn: Tensor) -> Tensor:
     """Return the lowest and highest x and y (2, 2) of the person in the turned camera, at depth
     1."""
@@ -272,19 +276,6 @@ def _box(image: Image, turn: Tensor) -> Tensor:
     return torch.stack([flat.amin(0), flat.amax(0)], dim=1)
 
 
-def _require_same_person(boxes: Tensor, left: str, right: str) -> None:
-    """Raise where the ``boxes`` (2, 2, 2) of one person cannot be that of both views."""
-    height = float((boxes[:, 1, 1] - boxes[:, 1, 0]).max())
-    off = float((boxes[0, 1] - boxes[1, 1]).abs().max()) / height
-    is_before = float(boxes[0, 0].mean() - boxes[1, 0].mean()) > 0
-    width = float((boxes[:, 0, 1] - boxes[:, 0, 0]).max())
-    if off > _SAME_HEIGHT or not is_before or width > _LARGEST * height:
-        raise DyngsError(
-            f"{left} and {right}: do not show the same person where their cameras say (heights differ by "
-            f"{off:.0%}); the calibration is wrong, or a mask is: see `dyngs data inspect`"
-        )
-
-
 def _window(image: Image, turn: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return colours (3, H, W), alpha (1, H, W) and depth (1, H, W; NaN unknown) along ``rays`` (H,
     W, 3)."""
@@ -294,8 +285,8 @@ def _window(image: Image, turn: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, T
     size = projected.new_tensor([camera.width, camera.height])
     grid = (2 * projected[..., :2] / projected[..., 2:] / size - 1).float()[None]
     assert image.alpha is not None
-    alpha = image.alpha
-    layers = torch.cat([image.rgb_premultiplied, alpha[..., None]], dim=2).permute(2, 0, 1)[None]
+    layers = torch.cat([image.rgb_premultiplied, image.alpha[..., None]], dim=2)
+    layers = layers.permute(2, 0, 1)[None]
     sampled = grid_sample(layers, grid, align_corners=False)[0]
     rgb = sampled[:3] / sampled[3:].clamp_min(1e-3)
     if image.depth is None:
@@ -322,15 +313,11 @@ def _depth_at(depth: Tensor, grid: Tensor) -> Tensor:
 
 def _rays(principal: Tensor, focal: float, size: tuple[int, int]) -> Tensor:
     """Return the rays (2, H, W, 3) through the pixels of the windows, at depth 1 in their axes."""
-    rows = torch.arange(size[0], dtype=principal.dtype, device=principal.device) + 0.5
-    columns = torch.arange(size[1], dtype=principal.dtype, device=principal.device) + 0.5
+    pixels = (torch.arange(n, dtype=principal.dtype, device=principal.device) for n in size)
+    rows, columns = (x + 0.5 for x in pixels)
     y = ((rows - principal[:, 1:]) / focal)[:, :, None].expand(-1, -1, size[1])
     x = ((columns - principal[:, :1]) / focal)[:, None].expand(-1, size[0], -1)
     return torch.stack([x, y, torch.ones_like(x)], dim=-1)
-
-
-def _rounded(pixels: float) -> int:
-    return int(-(-(pixels + 2 * _MARGIN) // FACTOR) * FACTOR)
 
 
 def is_inside(image: Image, points: Tensor) -> Tensor:
