@@ -17,13 +17,12 @@ from dyngs.gaussians.colour.network import ColourNetwork, box_around
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.human.avatar.observations import Subject
 from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton, texel_gaussians
 from dyngs.human.avatar.scene import HumanScene, first_scene
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.keys import HumanModel
-from dyngs.human.motion.motion import CapturedMotion, MotionClip
+from dyngs.human.motion.motion import MotionClip
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs
 
@@ -108,10 +107,8 @@ def _person() -> HumanScene:
     )
     # of a body of three vertices
     shapes = PoseBlendShapes(directions, torch.arange(3).repeat(len(body.faces), 1))
-    subject = Subject(
-        Skeleton(body.joints, body.parents), anchors, CapturedMotion(clip, (0, 1, 2)), shapes
-    )
-    scene = first_scene(gaussians, subject)
+    skeleton = Skeleton(body.joints, body.parents)
+    scene = first_scene(gaussians, anchors, skeleton, clip, shapes)
     for x in scene.learned.values().values():
         x += 0.05 * torch.randn(x.shape, generator=generator)
     return scene
