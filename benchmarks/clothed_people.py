@@ -63,7 +63,7 @@ from dyngs.human.body.skinning import (
 )
 from dyngs.human.motion.amass import read_amass, write_amass
 from dyngs.human.motion.motion import Motion
-from dyngs.human.motion.retarget import least_rotation
+from dyngs.human.motion.placement import least_rotation
 from dyngs.human.synthetic.capture import Lamp, random_light
 from dyngs.io.write import write_image, write_text
 

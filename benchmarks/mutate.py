@@ -128,7 +128,7 @@ MUTATIONS = (
     ("data/readers/colmap.py", "fy = values[num_focal - 1]", "fy = values[0]", "data/readers/test_colmap.py"),
     ("export/camera_paths.py", "slopes[:-1] * steps[1:] + slopes[1:] * steps[:-1]", "slopes[:-1] * steps[:-1] + slopes[1:] * steps[1:]", "export/test_camera_paths.py"),
     ("export/camera_paths.py", "np.log(keys.intrinsics[index, axis, axis])", "(keys.intrinsics[index, axis, axis])", "export/test_camera_paths.py"),
-    ("data/aim.py", "values[0] < 0.2**2", "values[0] < 9", "export/test_orbits.py"),
+    ("data/geometry.py", "values[0] < 0.2**2", "values[0] < 9", "export/test_orbits.py"),
     ("export/orbits.py", "-np.sin(2 * phase)", "np.sin(2 * phase)", "export/test_orbits.py"),
     ("export/orbits.py", "order = np.argsort(seconds)", "order = np.arange(len(seconds))", "export/test_orbits.py"),
 )  # fmt: skip

@@ -194,7 +194,7 @@ def read_a_body(root: Path) -> object:
         uv if uv.is_file() else None,
     )
     poses = torch.full((1, len(body.joints), 3), 0.1)
-    return body, posed_vertices(body, poses, torch.zeros(1, 3), None, None)
+    return body, posed_vertices(body, poses, torch.zeros(1, 3))
 
 
 def read_a_motion(root: Path) -> object:
@@ -210,7 +210,7 @@ def read_given_joints(root: Path) -> object:
     """Read 3D joints, for two images of a capture."""
     from dyngs.human.fit.keypoints import read_joints
 
-    return read_joints(only(root), two_images(root), small_body(24))
+    return read_joints(only(root), two_images(root))
 
 
 def read_2d_key_points(root: Path) -> object:
@@ -384,9 +384,6 @@ _RUNS: dict[str, Seed] = {
 }
 _JOINTS: dict[str, Seed] = {
     "npz": files.write_joints_npz,
-    "json": files.write_joints_json,
-    "vertices": files.write_vertices_npz,
-    "frame_data": files.write_frame_data,
     "sam_3d_body": files.write_sam_3d_body,
 }
 _IMAGES: dict[str, Seed] = {

@@ -50,35 +50,8 @@ def write_jpeg(root: Path) -> None:
 
 
 def write_joints_npz(root: Path) -> None:
-    """Write 3D joints with their frames, order and space."""
-    arrays = {
-        "joints": random_places(2, 17, 4),
-        "frames": np.arange(2),
-        "order": "coco17",
-        "space": "world",
-    }
-    np.savez(root / "a.npz", **arrays)  # pyright: ignore[reportArgumentType]
-
-
-def write_joints_json(root: Path) -> None:
-    """Write 3D joints by the names of images."""
-    joints = {f"p{i}": row.tolist() for i, row in enumerate(random_places(2, 25, 3))}
-    (root / "a.json").write_text(
-        json.dumps({"order": "openpose25", "space": "camera", "joints": joints})
-    )
-
-
-def write_vertices_npz(root: Path) -> None:
-    """Write posed vertices."""
-    np.savez(root / "a.npz", vertices=tiny_body(24).vertices.numpy()[None].repeat(2, 0))
-
-
-def write_frame_data(root: Path) -> None:
-    """Write posed vertices as semantic_human_texture_stitching has them."""
-    vertices = tiny_body(24).vertices.numpy()[None].repeat(2, 0)
-    (root / "a.pkl").write_bytes(
-        pickle.dumps({"vertices": vertices, "camera_f": np.ones(2), "width": 8}, 2)
-    )
+    """Write 3D joints with their frames."""
+    np.savez(root / "a.npz", joints=random_places(2, 17, 4), frames=np.arange(2))
 
 
 def write_sam_3d_body(root: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from dyngs.core.camera import Cameras
-from dyngs.data.aim import look_at
+from dyngs.data.geometry import look_at
 
 UP = np.array([0.0, 0.0, 1.0])
 

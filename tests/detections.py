@@ -14,46 +14,12 @@ def person(
     off."""
     points = np.zeros((17, 3), np.float32)
     points[:, 2] = 0.9
-    rows = [
-        0.02,
-        0.0,
-        0.0,
-        0.02,
-        0.02,
-        0.2,
-        0.2,
-        0.38,
-        0.38,
-        0.5,
-        0.5,
-        0.52,
-        0.52,
-        0.75,
-        0.75,
-        1.0,
-        1.0,
-    ]
-    offsets = [
-        0,
-        0.02,
-        -0.02,
-        0.04,
-        -0.04,
-        0.12,
-        -0.12,
-        0.15,
-        -0.15,
-        0.16,
-        -0.16,
-        0.08,
-        -0.08,
-        0.08,
-        -0.08,
-        0.08,
-        -0.08,
-    ]
-    points[:, 0] = column + height * width * np.array(offsets)
-    points[:, 1] = 40 + height * np.array(rows)
+    rows = np.array([0.02, 0.0, 0.02, 0.2, 0.38, 0.5, 0.52, 0.75, 1.0])
+    offsets = np.array([0, 0.02, 0.04, 0.12, 0.15, 0.16, 0.08, 0.08, 0.08])
+    pairs = (np.arange(17) + 1) // 2  # the nose, then left and right of each part
+    signs = np.where(np.arange(17) % 2, 1, -1)
+    points[:, 0] = column + height * width * signs * offsets[pairs]
+    points[:, 1] = 40 + height * rows[pairs]
     points[9, 0] += swing
     points[10, 0] -= swing
     return Detection(points, np.zeros((4, 4), np.uint8))

@@ -266,11 +266,9 @@ def _written_moving(found: EditSource, out: Path, edits: Edits, tell: Tell) -> E
         )
     how, up = _frame(found, edits, UP, tell)
     writing = Writing(edit=how, up=up) if edits.has_frame else Writing(turn=how.turn, up=up)
-    written = write_moving(found.opened, out, scene.times, how=writing)
-    redrawn = compare_run(
-        found.opened, scene, scene.times[0], written.splats[0], read_moment(out, 0)
-    )
-    return EditedFile(out, redrawn, written.notes)
+    splats, notes = write_moving(found.opened, out, scene.times, how=writing)
+    redrawn = compare_run(found.opened, scene, scene.times[0], splats[0], read_moment(out, 0))
+    return EditedFile(out, redrawn, notes)
 
 
 def _written_run(

@@ -12,7 +12,7 @@ from dyngs.data.capture import Capture, Silhouette, VideoFrame, View
 from dyngs.data.geometry import OPENGL_FROM_OPENCV, pinhole_matrix
 from dyngs.data.images.images import SUFFIXES, files_in, read_header
 from dyngs.data.images.video import colour_notes, decode_frames, planned_frames
-from dyngs.data.readers.colmap import find_masks, mask_of
+from dyngs.data.readers.transforms import find_masks, mask_of
 from dyngs.data.times import evenly_spaced, natural_order, parse_frames
 from dyngs.io.containment import check_size, inside, staying_within
 from dyngs.io.outputs import VIDEO_SUFFIXES

@@ -17,7 +17,6 @@ from dyngs.capture.sfm.frame_choice import STANDS, displaced_by, measured, shrun
 from dyngs.capture.sfm.several_videos import VIDEOS_FILE, CameraVideo, open_video, read_given
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError, as_word, counted, printable, reading
-from dyngs.data.aim import perpendicular, unit
 from dyngs.data.body_frames import about_pelvis
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry import (
@@ -25,7 +24,9 @@ from dyngs.data.geometry import (
     focus_point,
     fraction_in_front,
     inverse_rigid,
+    perpendicular,
     times_seen,
+    unit,
 )
 from dyngs.data.images.images import read_header, read_image, read_mask
 from dyngs.data.images.video import opened_video, read_frames, videos_in

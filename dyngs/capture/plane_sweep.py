@@ -296,14 +296,10 @@ def _window_mean(x: Tensor) -> Tensor:
 def _agreed(shot: _Shot, depth: np.ndarray, maps: Sequence[tuple[_Shot, np.ndarray]]) -> np.ndarray:
     """Return (H, W) bool: pixels of a depth map whose points ``MIN_AGREEING`` others have as
     well."""
-    is_known = np.isfinite(depth)
+    agreed = np.isfinite(depth)
     xyz = shot.points_at(depth)
-    agreeing = np.zeros(len(xyz), np.int64)
-    for other, theirs in maps:
-        if other is not shot:
-            agreeing += _agrees(xyz, other, theirs)
-    agreed = np.zeros(depth.shape, bool)
-    agreed[is_known] = agreeing >= MIN_AGREEING
+    votes = [_agrees(xyz, other, theirs) for other, theirs in maps if other is not shot]
+    agreed[agreed] = np.sum(votes, axis=0) >= MIN_AGREEING
     return agreed
 
 

@@ -25,11 +25,7 @@ _OF_A_FIT = {
     ),
     "joints": (
         "PATH",
-        "a fit of another program: 3D joints (.npz, .json), a folder of SAM 3D Body, or posed vertices",
-    ),
-    "body": (
-        "FILE",
-        "body file (SMPL, ...) that posed vertices belong to, if it is not the one that is fitted",
+        "a fit of another program: 3D joints (.npz), or a folder of SAM 3D Body",
     ),
     "person": (
         "PATH",
@@ -293,9 +289,7 @@ def run_fit(arguments: argparse.Namespace) -> int:
         result = write_fitted_capture(options, arguments.out, report, inputs)
     files = {"model.body": result.model.body, "model.uv": result.model.uv}
     keys = "".join(f" {key}={as_word(path)}" for key, path in files.items() if path is not None)
-    print_lines(
-        f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}{keys}"
-    )
+    print_lines(f"{result.summary}\nnext: dyngs train human data.root={as_word(result.root)}{keys}")
     return 0
 
 
@@ -308,7 +302,7 @@ def run_people(arguments: argparse.Namespace) -> int:
     detector = MediaPipe(arguments.mediapipe)
     with ProgressBar() as report:
         result = write_found_person(options, arguments.out, detector, report)
-    print_lines(f"{result.summary()}\nnext: dyngs train human data.root={as_word(result.root)}")
+    print_lines(f"{result.summary}\nnext: dyngs train human data.root={as_word(result.root)}")
     return 0
 
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 from dyngs.cli.arguments import Commands, add_command, add_threads, output_path, whole
 from dyngs.cli.output import numbers_table, print_tables
 from dyngs.core.errors import as_word, counted, show
-from dyngs.io.outputs import LOCK_NAME, writing
 
 if TYPE_CHECKING:
     from dyngs.config import Config
@@ -40,6 +39,7 @@ def add_parser(commands: Commands) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo in ``--out``, or in ``OUT-2`` and so on if that is not empty."""
     from dyngs.cli.training_progress import TrainingProgress
+    from dyngs.io.outputs import writing
 
     folder: Path = arguments.out
     numbers = count(2)
@@ -52,6 +52,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def is_unused(folder: Path) -> bool:
     """Whether ``folder`` can be made, or holds at most a lock file."""
+    from dyngs.io.outputs import LOCK_NAME
+
     return not folder.exists() or (
         folder.is_dir() and all(path.name == LOCK_NAME for path in folder.iterdir())
     )

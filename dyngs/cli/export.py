@@ -116,9 +116,11 @@ def add_parser(commands: args.Commands) -> None:
     about = "--format mesh of a radiance field: density of the surface (default: 25 per half extent / 1.5)"
     parser.add_argument("--level", type=float, metavar="X", help=about)
     about = "--format mesh of Gaussians or a field: cells along the longest side of the scene (default 192)"
-    parser.add_argument("--cells", type=int, metavar="N", help=about)
+    kind = args.whole("a number of cells", 8, 1024)
+    parser.add_argument("--cells", type=kind, metavar="N", help=about)
     about = "--format mesh of curved triangles: segments of an edge of each (default 6)"
-    parser.add_argument("--segments", type=int, metavar="N", help=about)
+    kind = args.whole("a number of segments", 1, 64)
+    parser.add_argument("--segments", type=kind, metavar="N", help=about)
     about = "--format html, sog: a folder for a web server, of which a page or PlayCanvas fetches what is seen"
     parser.add_argument("--folder", action="store_true", help=about)
     args.add_most_drawn(
@@ -242,7 +244,7 @@ def _is_sequence(arguments: argparse.Namespace) -> bool:
 
 
 def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
-    if getattr(opened.scene, "sides", None) is not None:
+    if getattr(opened.renderable, "sides", None) is not None:
         line = "of the sides that it was found from dyngs draws the one nearest to the camera, a file all: less sharply"
         print_notes((line,))
     return args.in_motion(arguments, opened)
@@ -352,13 +354,14 @@ def _export_moving(
     print_notes((line,))
     part = _part(arguments)
     scene = scene_part(opened.scene, part)
-    written = write_moving(opened, _target(arguments, f"splats{SUFFIX}"), times, part, how)
+    path = _target(arguments, f"splats{SUFFIX}")
+    splats, notes = write_moving(opened, path, times, part, how)
     found = [
-        compare_run(opened, scene, times[i], written.splats[i], read_moment(written.path, i))
+        compare_run(opened, scene, times[i], splats[i], read_moment(path, i))
         for i in _shown(len(times))
     ]
-    print_redrawn(written.notes, found)
-    return [written.path]
+    print_redrawn(notes, found)
+    return [path]
 
 
 def _export_tracks(
@@ -483,8 +486,9 @@ def _has_surface(arguments: argparse.Namespace) -> bool:
 
 def _export_surface(arguments: argparse.Namespace) -> None:
     """Write the surface of a scene, at several times one file each."""
-    from dyngs.export.surface_file import Cut, upright_surface, write_surface
+    from dyngs.export.surface_file import upright_surface, write_surface
     from dyngs.gaussians.surface import num_holes
+    from dyngs.models.renderable import SurfaceOptions
 
     out: Path = arguments.out or arguments.run_dir / ("mesh" if arguments.times else "mesh.ply")
     if arguments.times and out.suffix:
@@ -492,14 +496,14 @@ def _export_surface(arguments: argparse.Namespace) -> None:
             f"{out}: a sequence is a folder of files; give --out {out.with_suffix('')}, or --time for one"
         )
     opened = _open(arguments)
-    cut = Cut(arguments.level, arguments.cells, arguments.segments)
+    options = SurfaceOptions(arguments.level, arguments.cells, arguments.segments)
     how, line = upright_surface(
         opened, ".ply" if arguments.times else out.suffix, arguments.up, arguments.from_up
     )
     print_notes((line,))
     for i, time in enumerate(_times(arguments) or (0.0,)):
         path = out / f"mesh_{i:04d}.ply" if arguments.times else out
-        surface = write_surface(opened, path, time=time, cut=cut, how=how)
+        surface = write_surface(opened, path, time=time, options=options, how=how)
         holes = num_holes(surface)
         closed = "closed" if holes == 0 else f"open at {counted(holes, 'place')}"
         faces = counted(len(surface.faces), "triangle")

@@ -16,7 +16,6 @@ examples:
   dyngs view splats.ply --up=-y                  any file that dyngs reads
   dyngs view runs                                a folder of runs, with a picker
   dyngs view runs/ann --motion motions           a person, with the motions in a folder
-  dyngs view runs/net --capture people           a network of people, and whom it may predict
   dyngs view runs/bench --host 0.0.0.0           for other machines; the link that is printed has a token
 
 Needs viser: pip install 'dyngs[view]'. All controls are in docs/viewer.md.
@@ -34,11 +33,6 @@ def add_parser(commands: args.Commands) -> None:
     add_serving_arguments(parser)
     about = "motion file for a person, or a folder of them"
     parser.add_argument("--motion", type=args.input_path, metavar="PATH", help=about)
-    about = "for a network of people: whom to predict, or a folder of people"
-    parser.add_argument("--capture", type=args.input_path, metavar="PATH", help=about)
-    args.add_most_drawn(
-        parser, "of a large still scene: so many are drawn at most while anything moves"
-    )
     args.add_up(parser)
     args.add_threads(parser)
     args.add_device(parser)
@@ -72,8 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     motions = motion_files(arguments.motion)
     device = args.computing_device(arguments.device)
     root = args.data_root(arguments)
-    most = arguments.max_gaussians_drawn
-    source = open_source(arguments.source, arguments.up, arguments.capture, device, root, most)
+    source = open_source(arguments.source, arguments.up, device, root)
     first = first_of(source)
     if motions and first.person is None:
         raise DyngsError(

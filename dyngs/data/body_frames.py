@@ -6,9 +6,10 @@ Local letters: F frames, J joints, B shape coefficients. Bodies are those of SMP
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -63,16 +64,20 @@ def body_frames(
             f"{where}: 'poses' has {rows.shape[1]} numbers per frame; the known bodies have {wanted}"
         )
     scale = np.asarray(scale)
-    scales = _rows(
-        where, "scale", np.full(len(frames), scale.item()) if scale.size == 1 else scale, frames, 1
-    )
+    scale = np.full(len(frames), scale.item()) if scale.size == 1 else scale
+    scales = _rows(where, "scale", scale, frames, 1)
     if not (scales > 0).all():
         raise DyngsError(f"{where}: 'scale' must be positive; export the file again")
+    shape = float_array(betas)
+    if shape is not None and (shape.ndim == 1 or len(shape) == 1):
+        shape = numbers_of(f"{where}: 'betas'", shape, None)
+    else:
+        shape = _rows(where, "betas", betas, frames).mean(axis=0)
     return BodyFrames(
         frames=numbers,
         poses=rows[order].reshape(len(rows), -1, 3),
         trans=_rows(where, "trans", trans, frames, 3)[order],
-        betas=_mean_row(where, "betas", betas, frames),
+        betas=shape,
         scale=scales[order, 0],
         turns=None if turns is None else _rows(where, "turns", turns, frames, 3)[order],
     )
@@ -112,26 +117,14 @@ def rows_of(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
     """Return (V,) the row of ``body`` for each view, by frame number; each must have one with
     parameters."""
     rows = {number: row for row, number in enumerate(body.frames)}
-    found = []
-    for view in views:
-        if view.frame is None:
-            raise DyngsError(
-                f"{where}: {view.image_path} has no frame number; give each image its 'frame'"
-            )
-        found.append(rows.get(view.frame, -1))
-    lacking = sorted(
-        {
-            view.frame
-            for view, row in zip(views, found, strict=True)
-            if row < 0 and view.frame is not None
-        }
-    )
+    lacking = sorted({frame_number(view) for view in views} - rows.keys())
     if lacking:
         raise DyngsError(
             f"{where}: no body parameters for {len(lacking)} frames that have images ({first_few(lacking)}); the "
-            f"file has {len(rows)} frames from {body.frames[0]} to {body.frames[-1]}; add them or remove the images"
+            f"file has {len(rows)} frames from {body.frames[0]} to {body.frames[-1]}; add them, remove the images, or "
+            "give each image its 'frame'"
         )
-    return np.array(found, dtype=np.int64)
+    return np.array([rows[frame_number(view)] for view in views], dtype=np.int64)
 
 
 def of_one_clip(body: BodyFrames) -> dict[Split, BodyFrames]:
@@ -140,40 +133,26 @@ def of_one_clip(body: BodyFrames) -> dict[Split, BodyFrames]:
 
 
 def _rows(
-    where: Path, name: str, value: object, frames: Sequence[int], width: int = 0
+    where: Path, name: str, value: object, frames: Sequence[int], width: int | None = None
 ) -> np.ndarray:
-    """(F, width) float64 numbers of at most ``LARGEST``, any width where that is 0."""
+    """(F, width) float64 numbers of at most ``LARGEST``, any width where that is None."""
     array = float_array(value)
-    if array is None:
+    if array is None or array.shape[:1] != (len(frames),):
         raise DyngsError(
-            f"{where}: '{name}' must hold as many numbers for each frame; export the file again"
-        )
-    if not array.ndim or len(array) != len(frames):
-        count = len(array) if array.ndim else 1
-        raise DyngsError(
-            f"{where}: '{name}' has {count} rows for {len(frames)} frames; export the file again"
+            f"{where}: '{name}' must hold as many numbers for each of {len(frames)} frames; export the file again"
         )
     array = array.reshape(len(frames), -1)
-    if width and array.shape[1] != width:
+    if width not in (None, array.shape[1]):
         raise DyngsError(
             f"{where}: '{name}' has {array.shape[1]} numbers per frame instead of {width}; export it again"
         )
     bad = ~(np.abs(array) <= LARGEST).all(axis=1)
     if bad.any():
-        frame = frames[int(np.argmax(bad))]
         raise DyngsError(
-            f"{where}: '{name}' of frame {frame} holds NaN, infinite or huge numbers; repair or remove it"
+            f"{where}: '{name}' of frame {frames[int(np.argmax(bad))]} holds NaN, infinite or huge numbers; repair or "
+            "remove it"
         )
     return array
-
-
-def _mean_row(where: Path, name: str, value: object, frames: Sequence[int]) -> np.ndarray:
-    array = float_array(value)
-    if array is not None and array.ndim == 1:
-        array = array[None]
-    if array is not None and array.ndim > 1 and len(array) == 1:
-        return numbers_of(f"{where}: '{name}'", array, None)
-    return _rows(where, name, value, frames).mean(axis=0)
 
 
 def read_body_file(path: Path) -> BodyFrames:
@@ -221,6 +200,25 @@ def with_fitted_body(capture: Capture, folder: Path) -> Capture:
     if "pose" in splits and "pose" not in body:
         splits = {name: views for name, views in splits.items() if name != "pose"}
     return capture.replace(splits=splits, body=body)
+
+
+def number_in_name(where: Path, name: str) -> int:
+    """Frame number of ``000123.jpg``, ``frame_000123`` or ``Camera
+    (1)_0123_2019-08-23_16.592.jpg``."""
+    stem = PurePosixPath(name.replace("\\", "/")).name
+    found = re.search(r"\)_(\d{1,15})(?!\d)", stem) or re.search(
+        r"(?<!\d)(\d{1,15})(?:\.\w+)?$", stem
+    )
+    if not found:
+        raise DyngsError(
+            f"{where}: no frame number in the name {name!r:.80}; call the image 000000.jpg or the like"
+        )
+    return int(found[1])
+
+
+def frame_number(view: View) -> int:
+    """Return the frame number of a view; -1 without one."""
+    return -1 if view.frame is None else view.frame
 
 
 def numbered(splits: Splits) -> Splits:

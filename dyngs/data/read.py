@@ -25,14 +25,13 @@ from dyngs.data.geometry import match_size
 from dyngs.data.images.images import header_if_readable, read_header, target_size
 from dyngs.data.images.video import decode_frames
 from dyngs.data.readers import (
-    blender,
     camera_folders,
     colmap,
     nerfies,
     neuman,
     people_snapshot,
-    phone_apps,
     photogrammetry,
+    transforms,
     zju_mocap,
 )
 from dyngs.data.scene_space import normalise_capture
@@ -135,16 +134,16 @@ _PRIORS = {
 are called."""
 
 FORMATS: tuple[CaptureFormat, ...] = (
-    blender.BODY_FORMAT,
+    transforms.BODY_FORMAT,
     zju_mocap.FORMAT,
     people_snapshot.FORMAT,
     neuman.FORMAT,
-    blender.FORMAT,
-    blender.NERFSTUDIO_FORMAT,
+    transforms.FORMAT,
+    transforms.NERFSTUDIO_FORMAT,
     colmap.FORMAT,
     nerfies.FORMAT,
-    phone_apps.POLYCAM_FORMAT,
-    phone_apps.RECORD3D_FORMAT,
+    photogrammetry.POLYCAM_FORMAT,
+    photogrammetry.RECORD3D_FORMAT,
     photogrammetry.METASHAPE_FORMAT,
     photogrammetry.REALITYCAPTURE_FORMAT,
     photogrammetry.ODM_FORMAT,

@@ -34,14 +34,11 @@ class ImageTracks:
 
     def rows_of(self, views: Sequence[View]) -> dict[str, int]:
         """Return the row of each view that the tracks name, by the view's name."""
-        rows = {_plain(name): row for row, name in enumerate(self.names)}
-        shorter = {
-            name.rpartition(".")[0]: row
-            for name, row in rows.items()
-            if "." in name.rpartition("/")[2]
-        }
-        found = {view.name: rows.get(view.name, shorter.get(view.name)) for view in views}
-        return {name: row for name, row in found.items() if row is not None}
+        rows: dict[str, int] = {}
+        for row, name in enumerate(self.names):
+            plain = PurePosixPath(_plain(name))
+            rows |= {str(plain.with_suffix("")): row, str(plain): row}
+        return {view.name: rows[view.name] for view in views if view.name in rows}
 
 
 def read_tracks(path: Path) -> ImageTracks:
@@ -72,8 +69,6 @@ def read_tracks(path: Path) -> ImageTracks:
     listed = tuple(
         x.decode("utf-8", "replace") if isinstance(x, bytes) else str(x) for x in names.tolist()
     )
-    if len(set(listed)) < len(listed):
-        raise DyngsError(f"{path}: names holds one name more than once; give one row per image")
     xy = xy.astype(np.float64)
     good = np.all(np.abs(xy) < _LARGEST, axis=-1)  # phrased so that NaN fails it
     return ImageTracks(

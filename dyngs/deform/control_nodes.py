@@ -23,12 +23,13 @@ import torch
 from torch import Tensor
 
 from dyngs.core.state import Role, State, StateTensor, moved_to, part_of, prefixed
-from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
+from dyngs.core.tensor_checks import require_indices, require_tensor
 from dyngs.deform.field import (
     MAX_KEY_TIMES,
     DeformationField,
     FieldSetup,
     Offsets,
+    chosen,
     head_sizes,
     offsets_of,
 )
@@ -53,9 +54,6 @@ class Nodes:
     radii: Tensor  # (S,) of influence, world units: the mean distance to the nearest other nodes
     followed: Tensor  # (M, B) indices of the nodes that each point follows, nearest first
 
-    def followed_by(self, rows: Tensor) -> Nodes:
-        return replace(self, followed=self.followed.index_select(0, rows))
-
     def weights(self, means: Tensor) -> Tensor:
         """Return (M, B) weights of the followed nodes: Gaussians of the distance, normalised;
         constant in ``means``."""
@@ -67,25 +65,16 @@ def nodes_at(positions: Tensor, means: Tensor) -> Nodes:
     """Return the nodes at ``positions`` (S, 3), at least one, followed by the points ``means`` (M,
     3)."""
     tree = _tree(positions)
-    places = positions.double().cpu().numpy()
-    points = means.detach().double().cpu().numpy()
     count = min(FOLLOWED, len(positions))
-    gaps = (
-        torch.from_numpy(tree.query(places, k=count)[0])
-        .to(positions.device)
-        .reshape(len(positions), -1)
-    )
-    radii = (
-        gaps[:, 1:].mean(1)
-        if count > 1
-        else torch.ones(len(positions), dtype=torch.float64, device=gaps.device)
-    )
-    followed = (
-        torch.from_numpy(tree.query(points, k=count)[1])
-        .to(positions.device)
-        .reshape(len(points), -1)
-    )
+
+    def nearest(points: Tensor, which: int) -> Tensor:
+        """Return (M, count) distances (0) to the nearest nodes, or their indices (1)."""
+        numbers = points.detach().double().cpu().numpy()
+        return torch.from_numpy(tree.query(numbers, k=range(1, count + 1))[which])
+
+    radii = nearest(positions, 0)[:, 1:].mean(1) if count > 1 else torch.ones(1)
     floor = max(1e-6 * float(radii.max()), 1e-12)
+    followed = nearest(means, 1).to(positions.device)
     return Nodes(positions, radii.clamp_min(floor).to(positions), followed)
 
 
@@ -97,22 +86,21 @@ def spread_out(points: Tensor, count: int, taken: Tensor) -> Tensor:
     to the mean.
     """
     points = points.detach().double()
-    chosen: list[int] = []
+    picked: list[int] = []
     if len(taken):
         nearest, _ = _tree(taken).query(points.cpu().numpy())
         apart = torch.from_numpy(nearest).to(points.device).square()
-    elif count and len(points):
-        chosen = [int((points - points.mean(0)).square().sum(1).argmin())]
-        apart = (points - points[chosen[0]]).square().sum(1)
     else:
-        return torch.zeros(0, dtype=torch.long, device=points.device)
-    while len(chosen) < min(count, len(points)):
+        # largest at the mean
+        stray = (points - points.mean(0)).square().sum(1)
+        apart = (2 * torch.cat([stray, stray.new_zeros(1)]).max() - stray).clamp_min(1e-300)
+    while len(picked) < min(count, len(points)):
         farthest = int(apart.argmax())
         if float(apart[farthest]) <= 0:
             break
-        chosen.append(farthest)
+        picked.append(farthest)
         apart = torch.minimum(apart, (points - points[farthest]).square().sum(1))
-    return torch.tensor(chosen, dtype=torch.long, device=points.device)
+    return torch.tensor(picked, dtype=torch.long, device=points.device)
 
 
 def follow(
@@ -188,23 +176,15 @@ class ControlNodes(DeformationField):
     def restored(self, tensors: Mapping[str, Tensor]) -> ControlNodes:
         buffers = part_of(tensors, "buffers")
         count = len(buffers["positions"])
-        moving = self.setup.num_moving
-        require_tensor("positions", buffers["positions"], (count, 3))
-        learned = part_of(tensors, "learned")
-        field = copy.copy(self)
-        field.parameters = field._untrained(0).restored(
-            learned, dict.fromkeys(head_sizes(self.options), count)
-        )
-        if count and ("radii" in buffers or "followed" in buffers):
-            # both are found where nodes are first needed
-            require_positive("radii", require_tensor("radii", buffers["radii"], (count,)))
-        for name, length in (("followed", moving), ("neighbours", count)):
+        shapes = {"positions": (count, 3), "radii": (count,)}
+        for name, shape in shapes.items():
+            require_tensor(name, buffers.get(name, torch.zeros(shape)), shape)
+        for name, length in (("followed", self.setup.num_moving), ("neighbours", count)):
             if name in buffers:
                 require_indices(name, buffers[name], (length, None), count)
-        if "followed" in buffers and not 1 <= buffers["followed"].shape[1] <= FOLLOWED:
-            raise ValueError(
-                f"'followed' names {buffers['followed'].shape[1]} nodes for each Gaussian"
-            )
+        field = copy.copy(self)
+        lengths = dict.fromkeys(head_sizes(self.options), count)
+        field.parameters = self._untrained(0).restored(part_of(tensors, "learned"), lengths)
         field.buffers = buffers
         return field
 
@@ -235,6 +215,10 @@ class ControlNodes(DeformationField):
         return field
 
     @property
+    def num_nodes(self) -> int:
+        return len(self.buffers["positions"])
+
+    @property
     def num_points(self) -> int:
         return self.num_pieces + SPAN - 1
 
@@ -260,24 +244,22 @@ class ControlNodes(DeformationField):
         self, means: Tensor, rows: Tensor | None, motion: Tensor, values: Tensor
     ) -> Offsets:
         nodes = self.nodes_for(means)
-        if rows is not None:
-            nodes = nodes.followed_by(rows)
-            means = means.index_select(0, rows)
-        return follow(nodes, means, motion, values, head_sizes(self.options))
+        nodes = replace(nodes, followed=chosen(nodes.followed, rows))
+        return follow(nodes, chosen(means, rows), motion, values, head_sizes(self.options))
 
     def _penalties(self, motion: Tensor) -> dict[str, Tensor]:
         """Return the nodes' acceleration and their neighbours' deviation from rigid motion, in
         squared spacings."""
-        if len(self.buffers["positions"]) < 2:
+        if self.num_nodes < 2:
             return {}
         places, radii, near = (self.buffers[name] for name in ("positions", "radii", "neighbours"))
         acceleration, strain = node_penalties(
             places, radii, near, motion, self.parameters["means"]
         ).unbind()
-        penalties = {"node acceleration": SMOOTHNESS * acceleration}
-        return penalties | (
-            {"node rigidity": self.options.rigidity * strain} if self.options.rigidity else {}
-        )
+        return {
+            "node acceleration": SMOOTHNESS * acceleration,
+            "node rigidity": self.options.rigidity * strain,
+        }
 
     @torch.no_grad()
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
@@ -289,21 +271,15 @@ class ControlNodes(DeformationField):
         last = self.num_points - 1
         low = 0 if seen[0] <= 0 else math.floor(seen[0] * self.num_pieces) + 1
         high = last if seen[1] >= 1 else math.ceil(seen[1] * self.num_pieces) + SPAN - 3
-        if low == 0 and high == last:  # nothing lies beyond
-            return
         reach = min(2, high - low)
         device = self.setup.center.device
         after = torch.arange(1, last - high + 1, device=device)[:, None]
         before = torch.arange(low, 0, -1, device=device)[:, None]
-        for x in (points.data for points in self._splines().values()):
-            x[:, high + 1 :] = (
-                x[:, high, None]
-                + after * ((x[:, high] - x[:, high - reach]) / max(reach, 1))[:, None]
-            )
-            x[:, :low] = (
-                x[:, low, None]
-                + before * ((x[:, low] - x[:, low + reach]) / max(reach, 1))[:, None]
-            )
+        for x in (self.parameters[name].data for name in head_sizes(self.options)):
+            pace = (x[:, high] - x[:, high - reach]) / max(reach, 1)
+            x[:, high + 1 :] = x[:, high, None] + after * pace[:, None]
+            pace = (x[:, low] - x[:, low + reach]) / max(reach, 1)
+            x[:, :low] = x[:, low, None] + before * pace[:, None]
 
     def at(self, time: float) -> Offsets:
         motion, values = spline_motion(self._heads(), time)
@@ -320,7 +296,7 @@ class ControlNodes(DeformationField):
         return Parameters(tensors, {name: rates[name] for name in sizes}, LR_DECAY)
 
     def _splines(self) -> dict[str, Tensor]:
-        return {name: self.parameters[name] for name in head_sizes(self.options)}
+        return {name: self.parameters[name].detach() for name in head_sizes(self.options)}
 
     def _heads(self) -> list[Tensor | None]:
         return [self.parameters.get(field.name) for field in fields(Offsets)]
@@ -343,10 +319,7 @@ class ControlNodes(DeformationField):
         source = torch.cat([kept, torch.zeros(len(added), dtype=torch.long, device=kept.device)])
         is_new = torch.arange(len(source), device=source.device) >= len(kept)
         started = self._motion_at(means[added])
-        values = {
-            name: torch.cat([x.detach()[kept], started[name]])
-            for name, x in self._splines().items()
-        }
+        values = {name: torch.cat([x[kept], started[name]]) for name, x in self._splines().items()}
         self.parameters = self.parameters.rearranged(values, source, is_new)
         self._assign(torch.cat([old[kept], means[added]]), means)
 
@@ -359,8 +332,8 @@ class ControlNodes(DeformationField):
     def _motion_at(self, points: Tensor) -> dict[str, Tensor]:
         """Return the control points (S', P, size), by head, that the present nodes give to
         ``points`` (S', 3)."""
-        splines = {name: x.detach() for name, x in self._splines().items()}
-        if not len(self.buffers["positions"]) or not len(points):
+        splines = self._splines()
+        if not self.num_nodes or not len(points):
             return {name: x.new_zeros(len(points), *x.shape[1:]) for name, x in splines.items()}
         nodes = nodes_at(self.buffers["positions"], points)
         weights = nodes.weights(points)

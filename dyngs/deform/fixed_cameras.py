@@ -1,8 +1,7 @@
-"""Where motion begins before cameras that stand still: at what they see to change, at each time
-anew.
+"""Where motion begins before cameras that stand still: at what they see to change.
 
 Changes are carved into visual hulls (Laurentini 1994): cubes that project onto changes are divided
-again and again until they are about two pixels large. Things may be hidden behind still ones in
+again and again until they are about two pixels large, and linked over time. Things may be hidden behind still ones in
 some cameras: where many see a place, not all need agree.
 
 Local letters: C cubes, T images of one camera, N still Gaussians.
@@ -12,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -128,7 +127,10 @@ class ChangedView:
         self.image = clip.images[index]
         self.changed = clip.changed[index]
         self.counted = clip.counted[index]
-        self._sums = np.pad(self.changed.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+        # summed areas
+        self._changed, self._masked = (
+            np.pad(x.cumsum(0).cumsum(1), ((1, 0), (1, 0))) for x in (self.changed, ~self.counted)
+        )
 
     def pixels(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (C, 2) pixel coordinates and (C,) depths of ``points`` (C, 3); those behind the
@@ -148,18 +150,24 @@ class ChangedView:
         inside &= self.counted[y, x]
         return inside, inside & self.changed[y, x]
 
-    def may_change(self, centers: np.ndarray, side: float) -> np.ndarray:
-        """Return (C,) bool: whether the image changes where any part of a cube may be."""
+    def cubes(self, centers: np.ndarray, side: float) -> np.ndarray:
+        """Return (3, C) bool of cubes: part of it may be in the image, all of it is and does not
+        change, and part of it may change."""
         place, depth = self.pixels(centers)
         reach = 0.5 * np.sqrt(3.0) * side
         spread = self.focal * reach / np.maximum(depth - reach, NEAR) + 1.0
-        height, width = self.changed.shape
-        x0, y0 = np.clip(np.floor(place - spread[:, None]), 0, [width, height]).astype(int).T
-        x1, y1 = np.clip(np.ceil(place + spread[:, None]), 0, [width, height]).astype(int).T
-        sums = self._sums
-        changing = sums[y1, x1] - sums[y0, x1] - sums[y1, x0] + sums[y0, x0]
+        low = np.floor(place - spread[:, None])
+        high = np.ceil(place + spread[:, None])
+        size = self.changed.shape[::-1]
+        x0, y0 = np.clip(low, 0, size).astype(int).T
+        x1, y1 = np.clip(high, 0, size).astype(int).T
+        changing, masked = (
+            x[y1, x1] - x[y0, x1] - x[y1, x0] + x[y0, x0] for x in (self._changed, self._masked)
+        )
         around = np.abs(depth) <= reach
-        return around | ((depth > reach) & (changing > 0))
+        partly = (depth > reach) & (high > 0).all(1) & (low < size).all(1)
+        still = partly & (low >= 0).all(1) & (high <= size).all(1) & (masked + changing == 0)
+        return np.stack([partly | around, still, partly & (changing > 0) | around])
 
     def colours(self, points: np.ndarray) -> np.ndarray:
         """Return (C, 3) colours, 0 to 1, of ``points`` in the image."""
@@ -172,11 +180,26 @@ def views_at(clips: Sequence[FixedCameraClip], time: float) -> list[ChangedView]
     return [ChangedView(x, x.times.index(time)) for x in clips if time in x.times]
 
 
-def hulls_in(
-    views: Sequence[ChangedView], low: np.ndarray, high: np.ndarray
-) -> list[tuple[np.ndarray, float]]:
+@dataclass(frozen=True)
+class Hull:
+    """A connected part of a visual hull at one time."""
+
+    cubes: np.ndarray  # (C, 3) centres
+    side: float
+
+    @property
+    def center(self) -> np.ndarray:
+        return self.cubes.mean(0)
+
+    @property
+    def radius(self) -> float:
+        """Radius of a ball of that volume, world units."""
+        return float((len(self.cubes) * self.side**3 * 3 / (4 * np.pi)) ** (1 / 3))
+
+
+def hulls_in(views: Sequence[ChangedView], low: np.ndarray, high: np.ndarray) -> list[Hull]:
     """Return the connected parts of the visual hull of what ``views`` see to change, in the box
-    ``low`` to ``high``: the centres (C, 3) of the cubes on the surface of each, and their side.
+    ``low`` to ``high``.
 
     A change must be seen by three cameras, or all there are. A quarter of those that see a place
     may see no change there, because something still hides it.
@@ -193,7 +216,8 @@ def hulls_in(
     halves = np.argwhere(np.ones((2, 2, 2), bool))
     for level in range(8):
         centers = low + (cubes + 0.5) * side
-        cubes = cubes[np.sum([x.may_change(centers, side) for x in views], 0) >= needed]
+        seeing, still, agreeing = np.sum([x.cubes(centers, side) for x in views], 0)
+        cubes = cubes[(agreeing >= needed) & (still <= np.floor(0.25 * seeing))]
         if not len(cubes):
             return []
         middle = np.median(centers, axis=0)[None]
@@ -209,12 +233,8 @@ def hulls_in(
     beside = KDTree(cubes).query_pairs(1, p=1, output_type="ndarray") if len(cubes) else cubes
     graph = coo_matrix((np.ones(len(beside), bool), beside.T[:2]), shape=(len(cubes),) * 2)
     labels = connected_components(graph, directed=False)[1]
-    found = []
-    for label in np.flatnonzero(np.bincount(labels) >= 12):
-        part = _solid(labels == label, agreeing)
-        inner = np.bincount(beside[part[beside].all(1)].ravel(), minlength=len(cubes)) == 6
-        found.append((low + (cubes[part & ~inner] + 0.5) * side, side))
-    return found
+    parts = [labels == label for label in np.flatnonzero(np.bincount(labels) >= 12)]
+    return [Hull(low + (cubes[_solid(x, agreeing)] + 0.5) * side, side) for x in parts]
 
 
 def _solid(part: np.ndarray, agreeing: np.ndarray) -> np.ndarray:
@@ -225,25 +245,111 @@ def _solid(part: np.ndarray, agreeing: np.ndarray) -> np.ndarray:
     return part & (agreeing >= least)
 
 
+Track = list[tuple[float, Hull]]
+"""Times, ascending, and hulls of a thing."""
+
+
+def linked(times: Sequence[float], hulls: Sequence[Sequence[Hull]]) -> list[Track]:
+    """Return the tracks among the ``hulls`` of each of ``times`` (ascending).
+
+    Hulls are assigned to the tracks so far by the least total distance (Kuhn 1955), each within a
+    gate around where constant velocity takes a track. A track may miss three times in a row; those
+    found at fewer than four are left out.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    tracks: list[Track] = []
+    for i, (time, found) in enumerate(zip(times, hulls, strict=True)):
+        current = [x for x in tracks if x[-1][0] >= times[max(i - 4, 0)]]
+        distances = np.array([[_distance(x, time, y) for y in found] for x in current])
+        pairs = zip(*linear_sum_assignment(distances), strict=True) if current and found else ()
+        taken = {column: row for row, column in pairs if distances[row, column] < 1e3}
+        for column, hull in enumerate(found):
+            track = current[taken[column]] if column in taken else []
+            if not track:
+                tracks.append(track)
+            track.append((time, hull))
+    return [x for x in tracks if len(x) >= 4]
+
+
+def _distance(track: Track, time: float, hull: Hull) -> float:
+    """Return how far ``hull`` is from where ``track`` is expected, in radii of its gate, and how
+    much larger or smaller it is; 1000 where it is another thing."""
+    before, last = track[-1]
+    usual = float(np.median([x.radius for _, x in track]))
+    expected = last.center
+    reach = 6 * last.radius
+    if len(track) > 1:
+        earlier, previous = track[-2]
+        step = (time - before) / (before - earlier) * (last.center - previous.center)
+        expected = expected + step
+        reach = 3 * max(last.radius, usual) + 1.5 * float(np.linalg.norm(step))
+    distance = float(np.linalg.norm(hull.center - expected)) / reach
+    growth = abs(math.log(hull.radius / usual)) / 1.2
+    return distance + growth if max(distance, growth) < 1 else 1e3
+
+
+def travels(track: Track) -> bool:
+    """Return whether a thing goes on and on: what turns or bends in place is no track to start
+    from.
+
+    Of two or more steps of at least a radius, successive ones must not mostly turn back; what hops
+    does, too, but less often than noise.
+    """
+    radius = np.median([hull.radius for _, hull in track])
+    places = [track[0][1].center]
+    for _, hull in track:
+        if np.linalg.norm(hull.center - places[-1]) >= radius:
+            places.append(hull.center)
+    steps: np.ndarray = np.diff(np.stack(places), axis=0)
+    return len(steps) > 1 and (steps[1:] * steps[:-1]).sum() > -0.2 * (steps**2).sum()
+
+
+def surface(hulls: Sequence[Hull]) -> tuple[np.ndarray, float]:
+    """Return (C, 3) points on the surface of a thing, from its centre, and the distance between
+    them.
+
+    Cubes that lie in four tenths of its hulls belong to it; hulls of less than three quarters of
+    the usual radius do not show all of it.
+    """
+    from scipy.spatial import KDTree
+
+    radii = np.array([hull.radius for hull in hulls])
+    whole = [x for x, radius in zip(hulls, radii, strict=True) if radius >= 0.75 * np.median(radii)]
+    side = float(np.median([hull.side for hull in whole]))
+    cells = [np.unique(np.round((x.cubes - x.center) / side), axis=0) for x in whole]
+    cubes, counts = np.unique(np.concatenate(cells), axis=0, return_counts=True)
+    often = counts >= 0.4 * len(whole)
+    cubes = cubes[often] if often.any() else cubes
+    beside = KDTree(cubes).query_pairs(1, p=1, output_type="ndarray")
+    return cubes[np.bincount(beside.ravel(), minlength=len(cubes)) < 6] * side, side
+
+
 @dataclass(frozen=True)
 class TimedGaussians:
     """Gaussians that are there at one time."""
 
     time: float
     gaussians: Gaussians
+    velocity: Tensor  # (3,) world units per clip
 
 
 def hull_gaussians(
-    views: Sequence[ChangedView], points: np.ndarray, side: float, num_terms: int
+    views: Sequence[ChangedView],
+    center: np.ndarray,
+    outward: np.ndarray,
+    side: float,
+    num_terms: int,
 ) -> Gaussians:
-    """Return Gaussians at the ``points`` (C, 3) of a hull's surface, ``side`` apart.
+    """Return Gaussians at the points ``outward`` (C, 3) of a thing's surface, from its ``center``,
+    ``side`` apart.
 
     Each has the mean of its colours in the images in which it is on the side of the camera and the
     image changes there.
     """
+    points = center + outward
     total = np.zeros((len(points), 3))
     count = np.zeros((len(points), 1))
-    outward = points - points.mean(0)
     for view in views:
         towards = view.center - points
         lengths = np.linalg.norm(towards, axis=1) * np.linalg.norm(outward, axis=1)
@@ -323,7 +429,11 @@ def surface_changes(
     least = float(ordered[limit]) if len(ordered) > limit else SMALLEST_CHANGE
     towards = torch.cat([one.camera.centers for one in clips]).mean(0)
     return [
-        TimedGaussians(time, _recoloured(still.select(size > least), change[size > least], towards))
+        TimedGaussians(
+            time,
+            _recoloured(still.select(size > least), change[size > least], towards),
+            torch.zeros(3),
+        )
         for time, change, size in zip(times, changes, sizes, strict=True)
         if bool((size > least).any())
     ]
@@ -359,15 +469,21 @@ def first_motion(
     if len(clips) < 2 or limit < 1:
         return []
     low, high = _box(clips, still, extent)
+    times = sorted({time for one in clips for time in one.times})
     found: list[TimedGaussians] = []
-    for time in sorted({time for one in clips for time in one.times}):
-        views = views_at(clips, time)
-        hulls = [
-            hull_gaussians(views, *hull, still.sh.shape[1]) for hull in hulls_in(views, low, high)
-        ]
-        found += [TimedGaussians(time, hull) for hull in hulls if pays(hull, time, clips)]
-    thinned = max(sum(len(one.gaussians) for one in found) / limit, 1)
-    things = [TimedGaussians(one.time, _thinned(one.gaussians, thinned)) for one in found]
+    for track in linked(times, [hulls_in(views_at(clips, time), low, high) for time in times]):
+        hulls = [hull for _, hull in track]
+        goes_on = travels(track)
+        usual = surface(hulls)
+        pace = np.gradient([x.center for x in hulls], [time for time, _ in track], axis=0) * goes_on
+        for (time, hull), velocity in zip(track, torch.from_numpy(pace).float(), strict=True):
+            shape = usual if goes_on else surface([hull])
+            views = views_at(clips, time)
+            gaussians = hull_gaussians(views, hull.center, *shape, still.sh.shape[1])
+            if pays(gaussians, time, clips):
+                found.append(TimedGaussians(time, gaussians, velocity))
+    factor = max(sum(len(one.gaussians) for one in found) / limit, 1)
+    things = [replace(one, gaussians=_thinned(one.gaussians, factor)) for one in found]
     return [*things, *surface_changes(clips, still, options, limit)]
 
 

@@ -49,11 +49,14 @@ class FreePrimitives(DeformationField):
         self.options, self.setup = options, setup
         self.gap = 1 / max(setup.num_times - 1, 1)
         centers = torch.rand((setup.num_moving, 1), generator=generator, device="cpu")
-        self.parameters = self._untrained(centers, torch.ones_like(centers))
+        velocities = torch.zeros(len(centers), 3, device="cpu")
+        self.parameters = self._untrained(centers, torch.ones_like(centers), velocities)
 
     def started(self, start: FreeStart) -> FreePrimitives:
-        """Return an untrained field with the windows of ``start``."""
-        return self.with_parameters(self._untrained(start.centers[:, None], start.spans[:, None]))
+        """Return an untrained field with the windows and velocities of ``start``."""
+        return self.with_parameters(
+            self._untrained(start.centers[:, None], start.spans[:, None], start.velocities)
+        )
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         centers, origins, log_spans, velocities = (
@@ -79,13 +82,13 @@ class FreePrimitives(DeformationField):
             centers[ordered] = (centers[ordered] + SHIFT * spans * signs).clamp(0, 1)
         return self.with_parameters(parameters)
 
-    def _untrained(self, centers: Tensor, spans: Tensor) -> Parameters:
+    def _untrained(self, centers: Tensor, spans: Tensor, velocities: Tensor) -> Parameters:
         log_spans = (spans - SHORTEST * self.gap).clamp_min(1e-3 * self.gap).log()
         tensors = {
             "centers": centers,
             "origins": centers.clone(),
             "log_spans": log_spans,
-            "velocities": torch.zeros(len(centers), 3, device="cpu"),
+            "velocities": velocities,
         }
         rates = {
             "centers": LR_CENTERS * self.gap,
@@ -105,6 +108,7 @@ class FreeStart:
     added: tuple[Gaussians, ...]
     centers: Tensor  # (M,) in units of the clip
     spans: Tensor  # (M,)
+    velocities: Tensor  # (M, 3) world units per clip
 
 
 def free_start(
@@ -120,16 +124,19 @@ def free_start(
     faint = still.replace(
         logit_opacities=still.logit_opacities.clamp_max(FAINT if moments else math.inf)
     )
-    parts = [TimedGaussians((i + 0.5) / copies, faint) for i in range(copies)]
+    resting = torch.zeros(3, device="cpu")
+    parts = [TimedGaussians((i + 0.5) / copies, faint, resting) for i in range(copies)]
     groups = [*parts, *moments]
     sizes = torch.tensor([len(one.gaussians) for one in groups], device="cpu")
     centers = torch.tensor([one.time for one in groups], device="cpu")
     spans = torch.full_like(centers, FIRST_SPAN / max(num_times - 1, 1))
     spans[:copies] = 1 / copies
+    velocities = torch.stack([one.velocity for one in groups]).repeat_interleave(sizes, dim=0)
     rest = torch.linspace(0, 1, len(others), device="cpu")
     return FreeStart(
         faint.logit_opacities,
         (*(one.gaussians for one in groups[1:]), others),
         torch.cat([centers.repeat_interleave(sizes), rest]),
         torch.cat([spans.repeat_interleave(sizes), torch.full_like(rest, OTHERS_SPAN)]),
+        torch.cat([velocities, torch.zeros(len(others), 3, device="cpu")]),
     )

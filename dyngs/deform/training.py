@@ -39,58 +39,46 @@ from dyngs.ops.adam import Count
 PX_PER_OPACITY = 6.0
 """A change of opacity, or of a colour in units of SH, by x counts as much as a motion by 6 x
 pixels."""
-MAX_SAMPLES = 24  # Largest number of times at which motion is measured
-
-
-@dataclass(frozen=True)
-class MeasuredMotion:
-    """Motion of M Gaussians over time."""
-
-    # (M,) farthest stray from the mean position, turning and growing of the outline included, in
-    # pixels
-    pixels: Tensor
-    mean: Offsets  # the offsets' means over time
 
 
 @torch.no_grad()
 def measure_motion(
     field: DeformationField, gaussians: Gaussians, times: Sequence[float], px_size: Tensor
-) -> MeasuredMotion:
-    """Return the motion of M Gaussians over ``times``, of which at most ``MAX_SAMPLES`` are looked
-    at, evenly chosen.
+) -> tuple[Tensor, Offsets]:
+    """Return the motion of M Gaussians over ``times``, of which at most 24 are looked
+    at, evenly chosen: (M,) in pixels, and the means of the offsets.
 
     The score is max_t |x_t - mean| + s (2 |q_t - mean| + max_axis |log s_t - mean|) over the size
     of a pixel, s being the Gaussian's longest standard deviation, plus ``PX_PER_OPACITY`` times the
     change of opacity and colour. A pixel covers ``px_size`` (M,) world units in the nearest
     training view.
     """
-    chosen = (
-        torch.linspace(0, len(times) - 1, min(len(times), MAX_SAMPLES), device="cpu")
-        .round()
-        .long()
-        .tolist()
-    )
-    samples = [field.offsets(gaussians.means, times[i]) for i in chosen]
-    mean = _mean(samples)
+    picked = torch.linspace(0, len(times) - 1, min(len(times), 24), device="cpu").round().long()
+    samples = [field.offsets(gaussians.means, times[i]) for i in picked.tolist()]
+    heads = [
+        [x for x in found if x is not None]
+        for found in zip(*(vars(s).values() for s in samples), strict=True)
+    ]
+    means = [torch.stack(found).mean(0) if found else None for found in heads]
+    mean = Offsets(*means)  # type: ignore[arg-type]
     longest = gaussians.scales.amax(1)
-    score = torch.zeros(len(gaussians), device=gaussians.means.device)
+    score = torch.zeros_like(longest)
+    nothing = torch.zeros_like(gaussians.quats)
     for sample in samples:
-        stray = (sample.means - mean.means).norm(dim=1)
-        if sample.quats is not None and mean.quats is not None:
-            stray = stray + 2 * longest * (sample.quats - mean.quats)[:, 1:].norm(dim=1)
-        if sample.log_scales is not None and mean.log_scales is not None:
-            stray = stray + longest * (sample.log_scales - mean.log_scales).abs().amax(1)
-        pixels = stray / px_size
+        apart = {
+            name: nothing if x is None else x - getattr(mean, name)
+            for name, x in vars(sample).items()
+        }
+        stray = apart["means"].norm(dim=1) + 2 * longest * apart["quats"][:, 1:].norm(dim=1)
+        stray = stray + longest * apart["log_scales"].abs().amax(1)
+        pixels = stray / px_size + PX_PER_OPACITY * apart["colors"].abs().amax(1)
         if sample.logit_opacities is not None and mean.logit_opacities is not None:
-            logits = gaussians.logit_opacities
-            change = (logits + sample.logit_opacities).sigmoid() - (
-                logits + mean.logit_opacities
-            ).sigmoid()
-            pixels = pixels + PX_PER_OPACITY * change.abs()
-        if sample.colors is not None and mean.colors is not None:
-            pixels = pixels + PX_PER_OPACITY * (sample.colors - mean.colors).abs().amax(1)
+            now, usual = (
+                (gaussians.logit_opacities + x.logit_opacities).sigmoid() for x in (sample, mean)
+            )
+            pixels = pixels + PX_PER_OPACITY * (now - usual).abs()
         score = torch.maximum(score, pixels)
-    return MeasuredMotion(score, mean)
+    return score, mean
 
 
 @torch.no_grad()
@@ -99,16 +87,6 @@ def bake_(gaussians: Gaussians, rows: Tensor, offsets: Offsets) -> None:
     moved = deformed(gaussians.detach(), offsets, rows).tensors()
     for name, x in gaussians.tensors().items():
         x.data.copy_(moved[name])
-
-
-def _mean(samples: Sequence[Offsets]) -> Offsets:
-    heads = [
-        [x for x in found if x is not None]
-        for found in zip(*(vars(s).values() for s in samples), strict=True)
-    ]
-    means, *others = (torch.stack(found).mean(0) if found else None for found in heads)
-    assert means is not None
-    return Offsets(means, *others)
 
 
 SURELY_MOVING = 1.5  # Multiple of ``motion_threshold`` above which an error always counts as motion
@@ -150,6 +128,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         generator: torch.Generator,
     ) -> None:
         self.options, self.schedule, self.capture = options, schedule, capture
+        self._is_free = isinstance(options.deform, FreeField)
         self.times = tuple(sorted(set(capture.times)))
         self._see_all(False)
         self._update, self._generator = update, generator
@@ -249,52 +228,44 @@ class DynamicTraining(SceneTraining[DynamicScene]):
 
     def _see_all(self, at_once: bool) -> None:
         """Train on all times from the first if ``at_once``: nothing need be followed outwards."""
-        first = (
-            1.0
-            if at_once or isinstance(self.options.deform, FreeField)
-            else self.options.time_window
-        )
+        first = 1.0 if at_once or self._is_free else self.options.time_window
         phases = self.schedule.fine, self.schedule.opens, self.schedule.full
-        self._sees_all, self._window = (
-            at_once,
-            TimeWindow.around_middle(self.capture.times, first, *phases),
-        )
+        self._sees_all = at_once
+        self._window = TimeWindow.around_middle(self.capture.times, first, *phases)
 
     def _first_bodies(self, still: Gaussians) -> Bodies | None:
         """Return what moves rigidly before one moving camera."""
-        shots = None if isinstance(self.options.deform, FreeField) else self.capture.shots(still)
-        return (
-            None
-            if shots is None
-            else found_bodies(shots, self.options.num_random_moving, still.sh.shape[1])
-        )
+        shots = None if self._is_free else self.capture.shots(still)
+        if shots is None:
+            return None
+        return found_bodies(shots, self.options.num_random_moving, still.sh.shape[1])
 
     def _begun(
-        self, now: Gaussians, rows: Tensor, first: Sequence[TimedGaussians], bodies: Bodies | None
+        self,
+        now: Gaussians,
+        rows: Tensor,
+        first: Sequence[TimedGaussians],
+        bodies: Bodies | None,
     ) -> tuple[Sequence[Gaussians], FreeStart | None]:
         """Return the Gaussians to add when motion begins, and the windows of all that move where
         these have some."""
-        count = 0 if first or (bodies and bodies.explain_all) else self.options.num_random_moving
+        is_explained = first or (bodies and bodies.explain_all)
+        count = 0 if is_explained else self.options.num_random_moving
         added = random_gaussians(now, count, self.capture.extent, self._generator)
-        if not isinstance(self.options.deform, FreeField):
+        if not self._is_free:
             return [added, *(bodies.seeds if bodies else ())], None
-        start = free_start(
-            now.select(rows).to(device="cpu"),
-            first,
-            added.to(device="cpu"),
-            len(self.times),
-        )
+        still, others = (x.to(device="cpu") for x in (now.select(rows), added))
+        start = free_start(still, first, others, len(self.times))
         return start.added, start
 
     def _first_motion(self, still: Gaussians) -> list[TimedGaussians]:
         """Return what changes before fixed cameras, for a field that can begin there."""
-        if not isinstance(self.options.deform, FreeField):
+        if not self._is_free:
             return []
-        standing = self.capture.standing()
+        capture = self.capture
         limit = self.options.num_random_moving
-        return first_motion(
-            standing, still.to(device="cpu"), self.capture.extent, limit, self.capture.options
-        )
+        still = still.to(device="cpu")
+        return first_motion(capture.standing(), still, capture.extent, limit, capture.options)
 
     def _windowed(self, scene: DynamicScene, step: int) -> DynamicScene:
         """Return the scene in which what follows nodes may be there for a part of the clip, once
@@ -317,24 +288,20 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         px_size = filter_std(now.means, self.capture.cameras)[scene.moving] / math.sqrt(
             FILTER_VARIANCE
         )
-        motion = measure_motion(field, now.select(scene.moving), self.times, px_size)
-        moves = motion.pixels >= self.options.freeze_below_px
+        pixels, mean = measure_motion(field, now.select(scene.moving), self.times, px_size)
+        moves = pixels >= self.options.freeze_below_px
         if self.capture.cameras_stay:
             means = now.means[scene.moving]
             seen = self.capture.still_errors(
                 lambda time: deformed(now, field.offsets(means, time), scene.moving)
             )
             moves &= seen.usual[scene.moving] > SURELY_STILL * self.options.motion_threshold
-        return _with_frozen(scene, motion.mean, ~moves)
+        return _with_frozen(scene, mean, ~moves)
 
     def _sparsity(self, offsets: Offsets) -> dict[str, Tensor]:
         """Return the mean motion as a penalty: what need not move should not. Windows are short
         instead."""
-        if (
-            self.options.motion_sparsity == 0
-            or isinstance(self.options.deform, FreeField)
-            or not len(offsets.means)
-        ):
+        if self.options.motion_sparsity == 0 or self._is_free or not len(offsets.means):
             return {}
         tiny = 1e-6 * self.capture.extent
         length = (offsets.means.square().sum(1) + tiny**2).sqrt().mean()

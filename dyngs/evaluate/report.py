@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import fmean, median
@@ -227,7 +226,7 @@ def evaluate_run(
     """Return the report of a run on one split and write it into its folder: ``metrics.json``,
     ``metrics_SPLIT.json``.
 
-    ``threads``: 0 leaves their number as it is. ``refine_poses``: also score from poses of a
+    ``threads``: of torch from now on; 0 leaves their number as it is. ``refine_poses``: also score from poses of a
     person, else of the cameras, that were fitted to the images themselves; always done for a run
     that refined its cameras. ``data_root``: where the capture lies by now. ``capture``: of the run,
     if it was read already.
@@ -244,20 +243,21 @@ def evaluate_run(
     background, colour = evaluation_background(run.config.data.background, capture.has_alpha)
     scene = scene_of_split(run, capture, split).to(draws_on)
     drawing = Drawing(scene, scene.options, colour.to(draws_on))
-    with _num_threads(threads):
-        loader = images_of_split(capture, views, run_dir, run)
-        loader.device = draws_on
-        regions = Regions(views, loader, drawing.background)
-        images = (loader[i] for i in range(len(loader)))
-        lpips = load_lpips(lpips_net, draws_on)
-        scores, reasons = score_views(
-            scene, images, drawing.options, drawing.background, lpips, regions
-        )
-        temporal = temporal_scores(drawing, loader, views)
-        tracks = _track_scores(run, capture, scene, views)
-        fitted = {}
-        if split != "train" and (refine_poses or run.config.camera.refine == "always"):
-            fitted = scores_from_own_poses(drawing, loader, run.info.extent, lpips)
+    if threads:
+        torch.set_num_threads(threads)
+    loader = images_of_split(capture, views, run_dir, run)
+    loader.device = draws_on
+    regions = Regions(views, loader, drawing.background)
+    images = (loader[i] for i in range(len(loader)))
+    lpips = load_lpips(lpips_net, draws_on)
+    scores, reasons = score_views(
+        scene, images, drawing.options, drawing.background, lpips, regions
+    )
+    temporal = temporal_scores(drawing, loader, views)
+    tracks = _track_scores(run, capture, scene, views)
+    fitted = {}
+    if split != "train" and (refine_poses or run.config.camera.refine == "always"):
+        fitted = scores_from_own_poses(drawing, loader, run.info.extent, lpips)
     means = means_of(scores, MEAN_METRICS)
     reasons |= {name: metric.reason for name, metric in temporal.items() if metric.reason}
     reasons |= {name: regions.reason(name) for name in REGION_METRICS if means[name] is None}
@@ -375,16 +375,6 @@ def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
     if len({(s.width, s.height) for s in scores}) > 1:
         notes.append("views differ in size; width and height are those of the first")
     return tuple(notes)
-
-
-@contextmanager
-def _num_threads(threads: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads or before)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 # number of views compared per split; enough for before and after, not for a benchmark

@@ -443,13 +443,17 @@ def flicker_error(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) 
     """
     total = weight = 0.0
     for indices in static_cameras(views):
-        errors = (_signed_error(drawing, loader[i]) for i in indices)
-        before, counted = next(errors)
-        for now, counts in errors:
-            weights = torch.minimum(counted, counts)
-            total += float(((now - before).abs().mean(-1) * weights).double().sum())
-            weight += float(weights.double().sum())
-            before, counted = now, counts
+        before: tuple[Tensor, Tensor] | None = None
+        for image in (loader[i] for i in indices):
+            # R' - R - (G' - G) is the difference of two errors
+            truth = image.composite(drawing.background).clamp(0, 1)
+            error = drawing.image(image.cameras, image.time).clamp(0, 1) - truth
+            counts = torch.ones_like(truth[..., 0]) if image.mask is None else image.mask
+            if before is not None:
+                weights = torch.minimum(before[1], counts)
+                total += float(((error - before[0]).abs().mean(-1) * weights).double().sum())
+                weight += float(weights.double().sum())
+            before = error, counts
     if not weight:
         return MetricValue(None, "no camera of this split stands still while time passes")
     return MetricValue(255 * total / weight)
@@ -466,11 +470,3 @@ def temporal_scores(
         "flicker": flicker(drawing, loader[0].cameras, drawing.scene.times),
         "flicker_error": flicker_error(drawing, loader, views),
     }
-
-
-def _signed_error(drawing: Drawing, image: Image) -> tuple[Tensor, Tensor]:
-    """Return (H, W, 3) render minus truth and its mask (H, W): R' - R - (G' - G) is the difference
-    of two of them."""
-    truth = image.composite(drawing.background).clamp(0, 1)
-    counts = torch.ones(truth.shape[:2], device=truth.device) if image.mask is None else image.mask
-    return drawing.image(image.cameras, image.time).clamp(0, 1) - truth, counts

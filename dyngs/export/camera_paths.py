@@ -1,5 +1,5 @@
-"""Camera paths for rendering: their scene times, JSON files (docs/camera_paths.md) of dyngs and of
-other programs, and the interpolation of keyframes."""
+"""Camera paths for rendering: their scene times, JSON files (docs/camera_paths.md), and
+the interpolation of keyframes."""
 
 from __future__ import annotations
 
@@ -108,21 +108,6 @@ def parse_times(text: str) -> tuple[float, ...]:
     return tuple(np.linspace(start, stop, count).tolist())
 
 
-def world_pose(pose: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Return a ``cam_from_world`` pose (4, 4) with ``offset`` (3,) added to the camera's centre, in
-    float64.
-
-    Its rotation is made orthonormal: readers do that, and a far camera must not move by it.
-    """
-    if not np.any(offset):
-        return pose
-    left, _, right = np.linalg.svd(pose[:3, :3])
-    moved = np.eye(4)
-    moved[:3, :3] = left @ right
-    moved[:3, 3] = pose[:3, 3] - moved[:3, :3] @ offset
-    return moved
-
-
 def read_path(
     file: Path, world_offset: np.ndarray | None = None, size: tuple[int, int] | None = None
 ) -> CameraPath:
@@ -135,9 +120,8 @@ def read_path(
         DyngsError: names the file, the frame and the key that is missing or wrong.
     """
     document = read_json_object(file, "a camera path is a JSON object; see docs/camera_paths.md")
-    document, notes = _as_document(document, file)
     if size is not None:
-        document = {"width": size[0], "height": size[1]} | document
+        document = {"w": size[0], "h": size[1]} | document
     (name, *others) = [key for key in ("frames", "keyframes") if key in document] or ["frames"]
     frames = document.get(name)
     if others or not isinstance(frames, list) or not frames:
@@ -145,8 +129,11 @@ def read_path(
             f"{file}: a camera path needs one non-empty list, 'frames' or 'keyframes'; see docs"
         )
     require_at_most(file, len(frames), _MAX_FRAMES, "cameras")
-    width = int(_number(document, "width", file, 1, 65536))
-    height = int(_number(document, "height", file, 1, 65536))
+    first = frames[0] if isinstance(frames[0], dict) else {}
+    known = {key: value for key, value in first.items() if key in ("w", "h")} | document
+    # nerfstudio's names of the size, in the file or in its frames
+    width = int(_number(known, "width", file, 1, 65536, known.get("w")))
+    height = int(_number(known, "height", file, 1, 65536, known.get("h")))
     fps = _number(document, "fps", file, 1e-3, 1000, 30.0)
     poses = []
     matrices = []
@@ -163,19 +150,17 @@ def read_path(
         keys, num_frames = _with_seconds(keys, document, fps, file)
         keys = interpolate_keyframes(keys, np.arange(num_frames) / fps)
     poses, matrices = (torch.from_numpy(x).float() for x in (keys.cam_from_world, keys.intrinsics))
-    path = CameraPath(Cameras(poses, matrices, width, height), fps, notes=notes)
+    path = CameraPath(Cameras(poses, matrices, width, height), fps)
     return path if keys.times is None else with_times(path, keys.times.tolist())
 
 
 def _read_pose(frame: object, where: str) -> np.ndarray:
-    """Return the world-to-camera pose (4, 4) of a frame; 12 or 16 numbers may stand in a row."""
+    """Return the world-to-camera pose (4, 4) of a frame."""
     fields = frame if isinstance(frame, dict) else {}
     given = [key for key in ("cam_from_world", "transform_matrix") if key in fields]
     if len(given) != 1:
         raise DyngsError(f"{where} needs exactly one of 'cam_from_world' and 'transform_matrix'")
     matrix = float_array(fields[given[0]])
-    if matrix is not None and matrix.shape in ((12,), (16,)):
-        matrix = matrix.reshape(-1, 4)
     pose, _ = checked_pose(np.zeros(0) if matrix is None else matrix, f"{where}: '{given[0]}'")
     return cam_from_opengl(pose) if given[0] == "transform_matrix" else pose
 
@@ -338,44 +323,3 @@ def _tangents(knots: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _shortened(vectors: np.ndarray, speeds: np.ndarray) -> np.ndarray:
     length = np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)
     return vectors * np.minimum(3.0 * speeds / length, 1.0)[:, None]
-
-
-# Paths of other programs, rewritten as documents of our own.
-
-
-def _as_document(found: dict[str, Any], file: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return what the JSON of a camera path holds as a document with 'width', 'height' and
-    'frames', and notes: of nerfstudio's ``camera_path.json`` and ``transforms.json``.
-
-    What is no path of another program stays as it is. Raises DyngsError: a path that cannot be
-    read.
-    """
-    kind = str(found.get("camera_type", found.get("camera_model")))
-    panoramic = ("fisheye", "equirectangular", "spherical", "omni", "vr180")
-    if any(name in kind.lower() for name in panoramic):
-        raise DyngsError(
-            f"{file}: its cameras are {printable(kind, 40)}; cameras of a path are pinholes"
-        )
-    views = found.get("camera_path", found.get("frames"))
-    views = [x for x in views if isinstance(x, dict)] if isinstance(views, list) else []
-    if "camera_path" not in found:
-        size = {**found, **(views[0] if views else {})}
-        keys = {"width": "w", "height": "h"}
-        return {key: size[w] for key, w in keys.items() if w in size} | found, ()
-    height = _number(found, "render_height", file, 1, 65536)
-    frames = []
-    for i, view in enumerate(views):
-        view = {"fov": found.get("default_fov")} | view
-        # vertical, in degrees
-        degrees = _number(view, "fov", f"{file}: camera_path[{i}]", 0.01, 179)
-        frame = {
-            "transform_matrix": view.get("camera_to_world"),
-            "fl_x": 0.5 * height / math.tan(math.radians(degrees) / 2),
-        }
-        frames.append(frame | {"time": view["render_time"]} if "render_time" in view else frame)
-    note = (
-        "nerfstudio's path is taken to be in the coordinates of the capture; its viewer has others if it turned, "
-        "shifted or scaled the capture (dataparser_transforms.json)"
-    )
-    size = {"width": found.get("render_width"), "height": height}
-    return {**size, "fps": found.get("fps", 30.0), "frames": frames}, (note,)

@@ -8,8 +8,6 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from dyngs.data.capture import Capture, Split, View
 from dyngs.data.geometry import opengl_from_cam
 from dyngs.io.formats.ply import double_ply
@@ -19,7 +17,6 @@ from dyngs.runs.folder import inputs_of
 
 NAME, POINTS_NAME = "transforms.json", "points.ply"
 _OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-_FISHEYE_NAMES = ("k1", "k2", "k3", "k4")
 
 
 def write_cameras(
@@ -60,44 +57,39 @@ def write_cameras(
 def _frame(view: View, folder: Path, capture: Capture, world: Similarity) -> dict[str, object]:
     """Return the entry of a view; its files are named as seen from ``folder``."""
     pose = opengl_from_cam(view.cam_from_world)
-    pose[:3] = np.concatenate(
-        [world.rotation @ pose[:3, :3], world.points(pose[:3, 3])[:, None]], axis=1
-    )
+    pose[:3, :3] = world.rotation @ pose[:3, :3]
+    pose[:3, 3] = world.points(pose[:3, 3])
     first, last = capture.span or (0.0, 1.0)
-    (fx, _, cx), (_, fy, cy) = view.intrinsics.tolist()[:2]
-    frame: dict[str, object] = {
-        "file_path": _way(view.image_path, folder),
-        "transform_matrix": pose.tolist(),
-        "fl_x": fx,
-        "fl_y": fy,
-        "cx": cx,
-        "cy": cy,
-        "w": view.width,
-        "h": view.height,
-        "camera": view.camera_id,
-    }
-    match view.lens.model:
-        case "none":
-            frame["camera_model"] = "PINHOLE"
-        case "opencv":
-            frame["camera_model"] = "FULL_OPENCV" if len(view.lens.params) > 5 else "OPENCV"
-            frame |= dict(zip(_OPENCV_NAMES, view.lens.params, strict=False))
-        case "fisheye":
-            frame["camera_model"] = "OPENCV_FISHEYE"
-            frame |= dict(zip(_FISHEYE_NAMES, view.lens.params, strict=False))
-    if view.time is not None:
-        frame["time"] = first + view.time * (last - first)
-    if view.frame is not None:
-        frame["frame"] = view.frame
+    lens = view.lens
+    matrix = view.intrinsics
+    model, names = {
+        "none": ("PINHOLE", ()),
+        "opencv": ("FULL_OPENCV" if len(lens.params) > 5 else "OPENCV", _OPENCV_NAMES),
+        "fisheye": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
+    }[lens.model]
+    mask = "instance_mask_path" if view.motion_mask_labels else "motion_mask_path"
     files = {
         "mask_path": view.mask_path,
         "depth_file_path": view.depth_path,
         "flow_file_path": view.flow_path,
+        mask: view.motion_mask_path,
     }
-    files["instance_mask_path" if view.motion_mask_labels else "motion_mask_path"] = (
-        view.motion_mask_path
-    )
-    return frame | {key: _way(file, folder) for key, file in files.items() if file is not None}
+    return {
+        "file_path": _way(view.image_path, folder),
+        "transform_matrix": pose.tolist(),
+        "fl_x": float(matrix[0, 0]),
+        "fl_y": float(matrix[1, 1]),
+        "cx": float(matrix[0, 2]),
+        "cy": float(matrix[1, 2]),
+        "w": view.width,
+        "h": view.height,
+        "camera": view.camera_id,
+        "camera_model": model,
+        **dict(zip(names, lens.params, strict=False)),
+        **({} if view.time is None else {"time": first + view.time * (last - first)}),
+        **({} if view.frame is None else {"frame": view.frame}),
+        **{key: _way(file, folder) for key, file in files.items() if file is not None},
+    }
 
 
 def _way(file: Path, folder: Path) -> str:

@@ -63,8 +63,15 @@ def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
     """
     scene = opened.renderable
     times = options.times
-    if opened.captured is None:
-        _require_fitting(opened, options)
+    has_time = options.path is None or times is not None
+    if opened.captured is None and (
+        options.path == "along" or options.view is not None or (has_time and opened.person is None)
+    ):
+        file = opened.config.data.root
+        raise DyngsError(
+            f"{file}: a {file.suffix.lower()} holds one time and no views; leave out --path along, --time, --times "
+            "and --view"
+        )
     if options.path is None:
         path = _fixed_camera(opened, options)
     else:
@@ -147,22 +154,6 @@ def in_front_of(opened: Opened, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras
         facing = axis_angle_to_matrix(person.clip.poses[0, 0])[:, 2]
         front = int((ring.centers @ facing).argmax())
     return pick_cameras(ring, [(front + i) % _RING for i in (-1, 0, 1)])
-
-
-def _require_fitting(opened: Opened, options: PathOptions) -> None:
-    file = opened.config.data.root
-    if options.path == "along":
-        raise DyngsError(
-            f"{file}: holds no cameras that --path along could follow; give its run, or --path orbit"
-        )
-    if opened.person is not None:
-        if options.view is not None:
-            raise DyngsError(f"{file}: an avatar file holds no views; leave out --view")
-    elif options.path is None or options.times is not None or options.view is not None:
-        kind = file.suffix.lower()
-        raise DyngsError(
-            f"{file}: a {kind} holds one time and no views; leave out --time, --times and --view"
-        )
 
 
 def _fixed_camera(opened: Opened, options: PathOptions) -> CameraPath:

@@ -102,7 +102,7 @@ def write_path_images(
     return the paths.
 
     ``out_dir``: None writes only the video. Images of the capture are not overwritten; depth
-    colours share one range over the full path. Raises DyngsError: no cameras, nothing to write, or
+    colours have the range of the first frame. Raises DyngsError: no cameras, nothing to write, or
     a file cannot be written.
     """
     if len(path) == 0:
@@ -111,14 +111,6 @@ def write_path_images(
         raise DyngsError("nothing to write: give a folder for the images or a video file")
     scene = opened.renderable
     options = _with_depth(scene, output)
-    limits = None
-    if output.depth and out_dir is not None:
-        rows = np.linspace(0, len(path) - 1, min(len(path), 8)).round().astype(int)
-        times = path.times and tuple(path.times[i] for i in rows)
-        sample = CameraPath(pick_cameras(path.cameras, rows), times=times)
-        found = [(x.depth, x.alpha) for x in path_frames(scene, sample, options)]
-        depths, alphas = (np.stack(x) for x in zip(*found, strict=True))
-        limits = _depth_limits(depths, alphas)
     digits = max(4, len(str(len(path) - 1)))
 
     def frames() -> Iterator[tuple[str, DrawnImage]]:
@@ -126,7 +118,7 @@ def write_path_images(
             yield f"frame_{i:0{digits}d}", frame
             report("frames", i + 1, len(path))
 
-    return _write_images(opened, frames(), out_dir, output, limits)
+    return _write_images(opened, frames(), out_dir, output, one_range=True)
 
 
 def write_split_images(
@@ -208,9 +200,12 @@ def _write_images(
     frames: Iterable[tuple[str, DrawnImage]],
     out_dir: Path | None,
     output: OutputOptions,
-    limits: tuple[float, float] | None = None,
+    *,
+    one_range: bool = False,
 ) -> list[Path]:
-    """Write named frames as images and a video; return the paths."""
+    """Write named frames as images and a video; return the paths. ``one_range``: depth colours of
+    all frames have the range of the first one."""
+    limits = None
     inputs = inputs_of(opened)
     for out in (out_dir, output.video):
         if out is not None:
@@ -227,6 +222,8 @@ def _write_images(
             if output.alpha:
                 pixels[f"{stem}_alpha.png"] = frame.alpha
             if frame.depth is not None:
+                limits = limits if one_range else None
+                limits = limits or _depth_limits(frame.depth, frame.alpha)
                 colours = depth_to_rgb(frame.depth, frame.alpha, limits)
                 pixels[f"{stem}_depth.png"] = colours
                 pixels[f"{stem}_depth.exr"] = frame.depth * np.float32(opened.frame.scale)

@@ -10,16 +10,17 @@ import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.data.aim import (
+from dyngs.data.geometry import (
+    fraction_in_front,
     look_at,
     look_at_point,
     perpendicular,
+    pinhole_matrix,
     unit,
     up_direction,
     with_poses,
     world_from_cam,
 )
-from dyngs.data.geometry import fraction_in_front, pinhole_matrix
 from dyngs.export.camera_paths import CameraPath
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -21,7 +19,7 @@ from dyngs.core.gaussians import Gaussians
 from dyngs.deform.bodies.field import BodyField, bodies_of
 from dyngs.deform.scene import field_scene_of
 from dyngs.gaussians.colour.network import with_harmonics
-from dyngs.gaussians.levels import MERGED, Levels, levels_of
+from dyngs.gaussians.levels import MERGED, levels_of
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
     SOG_INDEX,
@@ -54,7 +52,7 @@ from dyngs.io.formats.splat_file import (
 )
 from dyngs.io.gltf import GlbDocument
 from dyngs.io.outputs import new_folder, require_new_folder
-from dyngs.io.write import atomic_file, remove_quietly, temporary_folder_beside
+from dyngs.io.write import atomic_file
 from dyngs.ops.quaternions import rotation_matrices, shorter_ways, unit_quats
 from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import Opened
@@ -62,7 +60,6 @@ from dyngs.runs.opened import Opened
 PER_LEAF = MERGED**7  # Gaussians of a leaf at level 0
 PER_FILE = MERGED**9  # at most, at each level
 COARSEST = 4  # Level, at most; 64 Gaussians of a leaf
-_REACH = 3.0  # standard deviations of a Gaussian that its box holds
 
 
 def write_sog_levels(folder: Path, splat: SplatFile) -> tuple[int, ...]:
@@ -72,8 +69,7 @@ def write_sog_levels(folder: Path, splat: SplatFile) -> tuple[int, ...]:
     Raises DyngsError: the folder holds something, or cannot be written.
     """
     require_new_folder(folder)
-    tree = levels_of(splat.gaussians)
-    levels = tree.levels[: COARSEST + 1]
+    levels = levels_of(splat.gaussians).levels[: COARSEST + 1]
     counts = tuple(len(level) for level in levels)
     names: list[str] = []
     with new_folder(folder) as started:
@@ -81,13 +77,31 @@ def write_sog_levels(folder: Path, splat: SplatFile) -> tuple[int, ...]:
         for number, level in enumerate(levels):
             first.append(len(names))
             for i, start in enumerate(range(0, len(level), PER_FILE)):
-                part = level.select(
-                    torch.arange(start, min(start + PER_FILE, len(level)), device="cpu")
-                )
-                names.append(f"{number}_{i}/meta.json")
-                (started / f"{number}_{i}").mkdir()
-                for name, data in sog_parts(replace(splat, gaussians=part)):
-                    (started / f"{number}_{i}" / name).write_bytes(data)
+                own = started / f"{number}_{i}"
+                own.mkdir()
+                names.append(f"{own.name}/meta.json")
+                part = replace(splat, gaussians=_rows(level, start, PER_FILE))
+                for name, data in sog_parts(part):
+                    (own / name).write_bytes(data)
+        nodes = []
+        for start in range(0, counts[0], PER_LEAF):
+            lods = {}
+            for level, count in enumerate(counts):
+                own = start // MERGED**level
+                lods[str(level)] = {
+                    "file": first[level] + own // PER_FILE,
+                    "offset": own % PER_FILE,
+                    "count": min(PER_LEAF // MERGED**level, count - own),
+                }
+            nodes.append({"bound": _box(_rows(levels[0], start, PER_LEAF)), "lods": lods})
+        while len(nodes) > 1:  # four nodes below each
+            groups = [nodes[i : i + MERGED] for i in range(0, len(nodes), MERGED)]
+            nodes = []
+            for group in groups:
+                low = np.min([node["bound"]["min"] for node in group], axis=0)
+                high = np.max([node["bound"]["max"] for node in group], axis=0)
+                bound = {"min": low.tolist(), "max": high.tolist()}
+                nodes.append({"bound": bound, "children": group})
         index = {
             "version": 1,
             "asset": {"generator": "dyngs"},
@@ -95,52 +109,22 @@ def write_sog_levels(folder: Path, splat: SplatFile) -> tuple[int, ...]:
             "counts": counts,
             "lodLevels": len(levels),
             "filenames": names,
-            "tree": _joined(list(_leaves(tree, counts, first))),
+            "tree": nodes[0],
         }
         (started / SOG_INDEX).write_text(json.dumps(index, separators=(",", ":")), encoding="utf-8")
     return counts
 
 
-def _leaves(tree: Levels, counts: tuple[int, ...], first: list[int]) -> Iterator[dict[str, Any]]:
-    """Yield the leaves in the order of the tree."""
-    for start in range(0, counts[0], PER_LEAF):
-        lods = {}
-        for level, count in enumerate(counts):
-            own = start // MERGED**level
-            size = PER_LEAF // MERGED**level
-            where = {
-                "file": first[level] + own // PER_FILE,
-                "offset": own % PER_FILE,
-                "count": min(size, count - own),
-            }
-            lods[str(level)] = where
-        rows = torch.arange(start, min(start + PER_LEAF, counts[0]), device="cpu")
-        yield {"bound": _box(tree.levels[0].select(rows)), "lods": lods}
+def _rows(gaussians: Gaussians, start: int, count: int) -> Gaussians:
+    return gaussians.select(torch.arange(start, min(start + count, len(gaussians)), device="cpu"))
 
 
 def _box(gaussians: Gaussians) -> dict[str, list[float]]:
     """Return the box around Gaussians, to three standard deviations."""
     axes = rotation_matrices(gaussians.quats) * gaussians.scales[:, None]
-    reach = _REACH * axes.square().sum(2).sqrt()
+    reach = 3.0 * axes.square().sum(2).sqrt()
     low = (gaussians.means - reach).amin(0)
     high = (gaussians.means + reach).amax(0)
-    return {"min": low.tolist(), "max": high.tolist()}
-
-
-def _joined(nodes: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the root above nodes that follow each other, four below each."""
-    while len(nodes) > 1:
-        groups = [nodes[i : i + MERGED] for i in range(0, len(nodes), MERGED)]
-        nodes = [
-            {"bound": _around([node["bound"] for node in group]), "children": group}
-            for group in groups
-        ]
-    return nodes[0]
-
-
-def _around(boxes: list[dict[str, list[float]]]) -> dict[str, list[float]]:
-    low = np.min([box["min"] for box in boxes], axis=0)
-    high = np.max([box["max"] for box in boxes], axis=0)
     return {"min": low.tolist(), "max": high.tolist()}
 
 
@@ -223,7 +207,8 @@ def write_run_splats(
     empty, or an unknown suffix.
     """
     inputs_of(opened).require_output(path)
-    return _write(opened, scene_part(opened.scene, part), path, time, how)
+    splat = splats_at(opened, scene_part(opened.scene, part), time, how)
+    return write_splats(path, splat, sh_degree=how.sh_degree)
 
 
 def write_run_sequence(
@@ -236,43 +221,24 @@ def write_run_sequence(
 ) -> list[Written]:
     """Write a sequence ``frame_0000.ply`` and so on, one file per time in [0, 1], for players.
 
-    All files are written into a hidden folder first and appear together; those of an earlier
-    sequence of the same length are replaced. Raises DyngsError: the part is empty, the folder holds
-    other such files, or they cannot be written.
+    Files of an earlier sequence of the same length are replaced. Raises DyngsError: the part is
+    empty, the folder holds other such files, or they cannot be written.
     """
-    scene = scene_part(opened.scene, part)
     digits = max(4, len(str(len(times) - 1)))
     names = [f"frame_{i:0{digits}d}{suffix}" for i in range(len(times))]
     inputs = inputs_of(opened)
     for path in (folder, *(folder / name for name in names)):
         inputs.require_output(path)
-    if folder.exists() and not folder.is_dir():
-        raise DyngsError(f"{folder}: is a file, but a sequence needs a folder")
     others = sorted(file.name for file in folder.glob(f"[!.]*{suffix}") if file.name not in names)
     if others:
         raise DyngsError(
             f"{folder}: holds other {suffix} files ({others[0]}), which players would take for frames; give an empty "
             "folder"
         )
-    is_new = not folder.exists()
-    staging = temporary_folder_beside(folder / "frames")
-    try:
-        written = []
-        for name, time in zip(names, times, strict=True):
-            one = _write(opened, scene, staging / name, time, how)
-            written.append(replace(one, path=folder / name))
-        for name in names:
-            os.replace(staging / name, folder / name)
-    except OSError as error:
-        raise DyngsError(
-            f"cannot write the sequence {folder}: {error.strerror or error}"
-        ) from error
-    finally:
-        remove_quietly(staging)
-        if is_new:
-            with suppress(OSError):
-                folder.rmdir()  # only succeeds while it is empty
-    return written
+    return [
+        write_run_splats(opened, folder / name, time, part, how)
+        for name, time in zip(names, times, strict=True)
+    ]
 
 
 def write_run_levels(
@@ -329,13 +295,6 @@ def splats_at(
     return splat if how.edit == UNMOVED else moved_file(splat, how.edit, how.up)
 
 
-def _write(opened: Opened, scene: GaussianScene, path: Path, time: float, how: Writing) -> Written:
-    return write_splats(path, splats_at(opened, scene, time, how), sh_degree=how.sh_degree)
-
-
-MAX_BYTES = 4_000_000_000  # largest size of the positions, which are held in memory
-
-
 @dataclass(frozen=True)
 class Tracks:
     """Positions of N Gaussians (or of the M moving ones) at T times; fields are named as the arrays
@@ -357,23 +316,17 @@ def tracks_of(
     """Return the tracks of a scene, or with ``part`` "moving" of what moves, moved by ``frame`` to
     what people mean.
 
-    Raises DyngsError: nothing moves, or the positions would take more than 4 GB.
+    Raises DyngsError: nothing moves.
     """
     moves = torch.zeros(len(scene), dtype=torch.bool, device="cpu")
     moves[scene.rows] = not scene.is_static
     if part == "moving":
         scene_part(scene, "moving")
-    rows = torch.arange(len(scene), device="cpu")
-    ids = rows[moves] if part == "moving" else rows
+    ids = torch.arange(len(scene), device="cpu")
+    ids = ids[moves] if part == "moving" else ids
     kind = np.float32 if frame == UNMOVED else np.float64
-    size = 3 * len(ids) * len(times) * np.dtype(kind).itemsize
-    if size > MAX_BYTES:
-        raise DyngsError(
-            f"tracks of {len(ids)} Gaussians at {len(times)} times would take {size / 1e9:.1f} GB, the limit is "
-            f"{MAX_BYTES / 1e9:.0f} GB; give fewer --times, or --dynamic for only those that move"
-        )
-    positions = np.empty((len(ids), len(times), 3), kind)
     whole = scene.unmasked()
+    positions = np.empty((len(ids), len(times), 3), kind)
     for k, time in enumerate(times):
         positions[:, k] = whole.at(time).means[ids].numpy()
     if frame != UNMOVED:
@@ -399,23 +352,15 @@ UP = "-y"
 FPS = 30.0
 
 
-@dataclass(frozen=True)
-class MovingFile:
-    """A file that was written."""
-
-    path: Path  # of it
-    splats: tuple[SplatFile, ...]  # what it is meant to hold at each time
-    notes: tuple[str, ...]  # a line about each thing that the format could not hold
-
-
 def write_moving(
     opened: Opened,
     path: Path,
     times: Sequence[float],
     part: Part = "all",
     how: Writing = AS_THEY_ARE,
-) -> MovingFile:
-    """Write a run at T >= 1 times in [0, 1] as one .4dgs, each shown for 1/30 s.
+) -> tuple[tuple[SplatFile, ...], tuple[str, ...]]:
+    """Write a run at T >= 1 times in [0, 1] as one .4dgs, each shown for 1/30 s; return what it is
+    meant to hold at each time, and notes about what the format could not hold.
 
     Raises DyngsError: the package is missing, the part is empty, or the file cannot be written.
     """
@@ -451,9 +396,8 @@ def write_moving(
         *offset_notes(splats[0], "4dgs cannot state it"),
     )
     if any(bool(splat.gaussians.sh[:, 1:].any()) for splat in splats):
-        left_out = "harmonics above degree 0 are left out: .4dgs holds none of moving Gaussians"
-        notes = (*notes, left_out)
-    return MovingFile(path, splats, notes)
+        notes += ("harmonics above degree 0 are left out: .4dgs holds none of moving Gaussians",)
+    return splats, notes
 
 
 def read_moment(path: Path, index: int) -> SplatFile:
@@ -505,8 +449,7 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
     labels[scene.moving] = field.rest.labels
     # Twice as many poses as training times: rotations are interpolated between them.
     moments = np.linspace(0.0, 1.0, 2 * max(len(scene.times) - 1, 1) + 1)
-    here_places, here_turns = _poses(field, [time], splat.frame)
-    there_places, there_turns = _poses(field, moments, splat.frame)
+    places, turns = _poses(field, [time, *moments.tolist()], splat.frame)
     document = GlbDocument()
     nodes = []
     meshes = []
@@ -518,13 +461,12 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
         name = "rest" if body < 0 else f"body {body}"
         node: dict[str, object] = {"name": name, "mesh": len(meshes)}
         if body >= 0:
-            place = here_places[0, body]
+            place = places[0, body]
             own = own.replace(means=(own.means.double() - torch.from_numpy(place)).float())
             node["translation"] = place.tolist()
-            turn_back = Rotation.from_quat(here_turns[0, body]).inv()
-            turns = Rotation.from_quat(there_turns[:, body]) * turn_back
-            channels.append((len(nodes), "translation", there_places[:, body]))
-            channels.append((len(nodes), "rotation", shorter_ways(turns.as_quat())))
+            turned = Rotation.from_quat(turns[1:, body]) * Rotation.from_quat(turns[0, body]).inv()
+            channels.append((len(nodes), "translation", places[1:, body]))
+            channels.append((len(nodes), "rotation", shorter_ways(turned.as_quat())))
         meshes.append({"name": name, "primitives": [add_gaussians(document, own)]})
         nodes.append(node)
     document.add_animation("motion", moments * opened.seconds, channels)
@@ -547,7 +489,7 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
 
 
 def _poses(
-    field: BodyField, times: Sequence[float] | np.ndarray, frame: Similarity
+    field: BodyField, times: Sequence[float], frame: Similarity
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return centres (T, B, 3) of B bodies at T times, in the axes of the file, and their rotations
     (T, B, 4) xyzw."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -104,10 +105,10 @@ class DefaultDensifier(Densifier):
         self, options: DefaultStrategy, schedule: DensifySchedule, extent: float, center: Tensor
     ) -> None:
         self.options, self.schedule, self.extent, self.center = options, schedule, extent, center
-        self.grad_sum = torch.zeros(0, device="cpu")
-        self.seen = torch.zeros(0, device="cpu")
-        self._step_grad_sum = self.grad_sum
-        self._step_seen = self.seen
+        # (2, N) sums of the gradient norms, and numbers of views: of the steps since the last edit,
+        # and of this step
+        self.sums = torch.zeros(2, 0, device="cpu")
+        self._step_sums = self.sums
 
     def wants_signal(self, step: int) -> bool:
         return step < self.schedule.stop
@@ -124,14 +125,13 @@ class DefaultDensifier(Densifier):
         length = torch.hypot(x, y)
         # a view without a usable gradient says nothing
         counts = (radii > 0).all(-1) & length.isfinite()
-        self._step_grad_sum += torch.where(counts, length, 0.0).sum(0)
-        self._step_seen += counts.sum(0)
+        self._step_sums += torch.stack([torch.where(counts, length, 0.0).sum(0), counts.sum(0)])
 
     def tallies(self, step: int, count: int) -> list[Tensor]:
         if not self.wants_signal(step):
             return []
-        self._begin_step(count, self._step_seen.device)
-        return [self._step_grad_sum, self._step_seen]
+        self._begin_step(count, self._step_sums.device)
+        return [self._step_sums]
 
     def edit(
         self, step: int, parameters: Gaussians, generator: torch.Generator
@@ -139,9 +139,9 @@ class DefaultDensifier(Densifier):
         self._take_in_step()
         resets = step in self.schedule.resets
         parameters = parameters.detach()
-        if self.schedule.densifies_at(step) and len(self.seen) == len(parameters):
+        if self.schedule.densifies_at(step) and self.sums.shape[1] == len(parameters):
             result = self._densify(step, parameters, generator)
-            self.grad_sum, self.seen = torch.zeros(0, device="cpu"), torch.zeros(0, device="cpu")
+            self.sums = torch.zeros(2, 0, device="cpu")
         elif resets:
             result = EditResult(None)
         else:
@@ -149,7 +149,7 @@ class DefaultDensifier(Densifier):
         return _with_lowered_opacities(result, parameters.logit_opacities) if resets else result
 
     def place(self, device: torch.device) -> None:
-        self.grad_sum, self.seen = self.grad_sum.to(device), self.seen.to(device)
+        self.sums = self.sums.to(device)
         self.center = self.center.to(device)
 
     def limit(self, max_gaussians: int) -> None:
@@ -157,47 +157,34 @@ class DefaultDensifier(Densifier):
 
     def state(self) -> dict[str, Tensor]:
         self._take_in_step()
-        return {"grad_sum": self.grad_sum, "seen": self.seen}
+        return {"grad_sum": self.sums[0], "seen": self.sums[1]}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        if not state:  # of a run that was edited after its end: counted anew from the next step on
-            state = {"grad_sum": self.grad_sum[:0], "seen": self.seen[:0]}
-        count = len(state["seen"])
-        self.grad_sum, self.seen = (
-            require_tensor(x, state[x], (count,)).clone() for x in ("grad_sum", "seen")
-        )
-        self._step_grad_sum, self._step_seen = (
-            torch.zeros(0, device=self.seen.device) for _ in range(2)
-        )
+        count = len(state.get("seen", ()))  # none of a run that was edited after its end
+        names = ("grad_sum", "seen") if count else ()
+        found = [require_tensor(name, state[name], (count,)) for name in names]
+        self.sums = torch.stack(found) if found else self.sums[:, :0]
+        self._step_sums = self.sums[:, :0]
 
     def _begin_step(self, count: int, device: torch.device) -> None:
-        if len(self._step_seen) != count:
-            self._step_grad_sum, self._step_seen = (
-                torch.zeros(count, device=device) for _ in range(2)
-            )
+        if self._step_sums.shape[1] != count:
+            self._step_sums = torch.zeros(2, count, device=device)
 
     def _take_in_step(self) -> None:
         """Add what the views of a step have said to what those before it have."""
-        if not len(self._step_seen):
+        if not self._step_sums.shape[1]:
             return
-        if len(self.seen) != len(self._step_seen):
-            self.grad_sum, self.seen = (torch.zeros_like(self._step_seen) for _ in range(2))
-        self.grad_sum += self._step_grad_sum
-        self.seen += self._step_seen
-        self._step_grad_sum, self._step_seen = (
-            torch.zeros(0, device=self.seen.device) for _ in range(2)
-        )
+        same = self.sums.shape == self._step_sums.shape
+        self.sums = self.sums + self._step_sums if same else self._step_sums
+        self._step_sums = self._step_sums[:, :0]
 
     def _densify(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult:
         distance = (parameters.means - self.center).norm(dim=1)
         reach = torch.where(distance > FAR * self.extent, distance, self.extent)
         max_scale = PRUNE_SCALE * reach if step > self.schedule.prune_scale_after else math.inf
-        plan = plan_edit(
-            parameters, self.grad_sum / self.seen.clamp_min(1), self.options, reach, max_scale
-        )
-        kept, cloned, split = (
-            torch.nonzero(mask)[:, 0] for mask in (plan.kept, plan.cloned, plan.split)
-        )
+        score = self.sums[0] / self.sums[1].clamp_min(1)
+        masks = plan_edit(parameters, score, self.options, reach, max_scale)
+        kept, cloned, split = (torch.nonzero(mask)[:, 0] for mask in masks)
         source = torch.cat([kept, cloned, split, split])
         is_new = torch.ones(len(source), dtype=torch.bool, device=source.device)
         is_new[: len(kept)] = False
@@ -214,8 +201,7 @@ class DefaultDensifier(Densifier):
         return EditResult(TopologyEdit(source, is_new), {"means": means, "log_scales": log_scales})
 
 
-@dataclass(frozen=True)
-class EditPlan:
+class EditPlan(NamedTuple):
     """Masks (N,) bool of the old Gaussians that stay as they are, are copied, and are split in two.
 
     A copied Gaussian is also kept, a split one is not; those in none of the three are removed.

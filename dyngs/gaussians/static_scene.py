@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -72,6 +73,7 @@ class StaticScene(GaussianScene):
     """The same N Gaussians at every time; with ``sides`` each camera sees those of the side nearest
     to it."""
 
+    has_levels: ClassVar[bool] = True
     filter_std: Tensor | None = None
     sides: Sides | None = None
     # distinct training times in [0, 1], ascending, where a dynamic model was asked for and nothing

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -28,6 +28,22 @@ class Surface:
     vertices: np.ndarray  # (V, 3)
     faces: np.ndarray  # (F, 3) int; anticlockwise from outside where there is an outside
     colours: np.ndarray  # (V, 3) in [0, 1], seen from straight ahead
+
+
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """How a surface is made from a scene; None: as usual.
+
+    Attributes:
+        level: density at the surface of a field, per unit of a world whose innermost cube has half
+            side 1.5.
+        cells: along the longest side of the space that a field or Gaussians are looked at in.
+        segments: of an edge of a curved triangle.
+    """
+
+    level: float | None = None
+    cells: int | None = None
+    segments: int | None = None
 
 
 R = TypeVar("R", bound="Renderable")
@@ -137,8 +153,12 @@ class Renderable(ABC):
         options: ``DrawOptions``, or more than that: how it is drawn unless ``render`` is told
             otherwise.
         background: (3,) colour behind it unless ``render`` is told otherwise; None is black.
+        surface_options: which ``SurfaceOptions`` have an effect.
+        has_levels: it can be drawn in levels of detail.
     """
 
+    surface_options: ClassVar[frozenset[str]] = frozenset({"cells"})
+    has_levels: ClassVar[bool] = False
     options: Any
     background: Tensor | None
 
@@ -195,6 +215,16 @@ class Renderable(ABC):
         """Return the part of ``state`` that drawing needs, in an equivalent form where that is
         smaller."""
         return {name: x for name, x in self.state().items() if x.role is not Role.TRAINING}
+
+    def own_surface(self, time: float, options: SurfaceOptions) -> Surface | None:
+        """Return the surface that the scene itself states; None: it is fused from what cameras
+        see."""
+        return None
+
+    def page_lists(self) -> tuple[dict[str, Any], dict[str, tuple[Tensor, Literal[8, 16]]]] | None:
+        """Return what a page draws of a scene that is not made of Gaussians: its header, and rows
+        (R, D) by name with the bits of each number; None: there is no page of it."""
+        return None
 
     def on_background(self: R, colour: Tensor) -> R:
         """Return it before a background (3,), with caches of its own."""

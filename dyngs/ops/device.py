@@ -55,11 +55,6 @@ def gpu_memory(device: torch.device) -> tuple[int, int] | None:
     return torch.cuda.mem_get_info(device) if device.type == "cuda" else None
 
 
-def num_gpus() -> int:
-    """Return the number of GPUs, at least 1."""
-    return max(torch.cuda.device_count(), 1)
-
-
 @contextmanager
 def deterministic(device: torch.device, wanted: bool = True) -> Generator[None]:
     """Let torch's operators on a GPU give the same bytes every time, inside this context; ours
@@ -140,26 +135,15 @@ def findings() -> Mapping[str, str]:
     """Return what there is of torch's CUDA, driver, GPU and compiled core, by name; for ``dyngs
     doctor``."""
     version = torch.version.cuda
-    found = {"torch for": "the CPU alone" if version is None else f"CUDA {version}"}
-    if has_cuda_core():
-        try:
-            kernels = cuda_core()
-        except DyngsError as error:
-            return found | {"kernels for GPUs": str(error)}
-        found["kernels for GPUs"] = f"built with CUDA {_said(kernels.runtime_version())}"
-        driver = kernels.driver_version()
-        found["driver"] = f"knows CUDA {_said(driver)}" if driver else "none"
-    else:
-        found["kernels for GPUs"] = "not built"
-        found["driver"] = "there" if has_driver() else "none"
+    gpu = "none"
     if version is not None and torch.cuda.is_available():
-        major, minor = torch.cuda.get_device_capability()
-        gigabytes = torch.cuda.mem_get_info()[1] / 1e9
-        name = torch.cuda.get_device_name()
-        found["GPU"] = f"{name}, compute capability {major}.{minor}, {gigabytes:.0f} GB"
-    else:
-        found["GPU"] = "none"
-    return found
+        gpu = f"{torch.cuda.get_device_name()}, {torch.cuda.mem_get_info()[1] / 1e9:.0f} GB"
+    return {
+        "torch for": "the CPU alone" if version is None else f"CUDA {version}",
+        "kernels for GPUs": "built" if has_cuda_core() else "not built",
+        "driver": "there" if has_driver() else "none",
+        "GPU": gpu,
+    }
 
 
 def _said(version: int) -> str:

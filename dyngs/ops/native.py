@@ -126,54 +126,48 @@ def active_isa() -> str:
 _kernel_threads: ContextVar[int | None] = ContextVar("kernel_threads", default=None)
 
 
-def num_threads() -> int:
-    """Return the number of threads of the kernels: of ``kernel_threads``, else torch's; after a
-    fork see ``Fork``."""
-    return _fork.allowed(_kernel_threads.get() or torch.get_num_threads())
-
-
-class Fork:
-    """Handling of the threads of OpenMP in a process made by ``os.fork``.
+class _Threads:
+    """Threads of OpenMP in a process made by ``os.fork``.
 
     The child has the parent's list of waiting threads, but not the threads: the next parallel loop
     would wait without end. Where kernels of the parent had started any, the child runs kernels and
-    torch's operators on one thread, and says so once.
+    torch's operators on one thread.
     """
 
-    def __init__(self) -> None:
-        self.started_threads = False
-        self.lost_threads = False
-        self._told = False
-
-    def begin_child(self) -> None:
-        """Set the number of threads; called in the child just after the fork."""
-        self.lost_threads = self.started_threads
-        self._told = False
-        if self.lost_threads:
-            self._told = (_kernel_threads.get() or torch.get_num_threads()) == 1
-            torch.set_num_threads(1)
-
-    def allowed(self, wanted: int) -> int:
-        """Return ``wanted``; where threads were lost 1, with one warning where more were wanted or
-        would have been before the fork."""
-        self.started_threads = self.started_threads or wanted > 1
-        if not self.lost_threads:
-            return wanted
-        if not self._told and torch.utils.data.get_worker_info() is None:
-            self._told = True
-            warnings.warn(
-                "dyngs and torch run on one thread: this process was forked from one that had "
-                "started threads, which it has not got; start processes with multiprocessing's "
-                "'spawn' method to use more",
-                RuntimeWarning,
-                stacklevel=2,
-            )
-        return min(wanted, 1)
+    started = False
+    lost = False
+    warned = False
 
 
-_fork = Fork()
+def _begin_child() -> None:
+    """Set the number of threads; called in the child just after the fork."""
+    _Threads.lost = _Threads.started
+    _Threads.warned = False
+    if _Threads.lost:
+        torch.set_num_threads(1)
+
+
 if sys.platform != "win32":
-    os.register_at_fork(after_in_child=_fork.begin_child)
+    os.register_at_fork(after_in_child=_begin_child)
+
+
+def num_threads() -> int:
+    """Return the number of threads of the kernels: of ``kernel_threads``, else torch's; 1, with a
+    warning, after a fork that lost threads."""
+    wanted = _kernel_threads.get() or torch.get_num_threads()
+    if not _Threads.lost:
+        _Threads.started |= wanted > 1
+        return wanted
+    if not _Threads.warned and torch.utils.data.get_worker_info() is None:
+        _Threads.warned = True
+        warnings.warn(
+            "dyngs and torch run on one thread: this process was forked from one that had "
+            "started threads, which it has not got; start processes with multiprocessing's "
+            "'spawn' method to use more",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    return 1
 
 
 @contextmanager

@@ -16,8 +16,8 @@ from dyngs.config import Config, DataConfig
 from dyngs.config.kinds import installed_kind
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, counted
-from dyngs.data.aim import up_direction
 from dyngs.data.capture import Capture, Split, View
+from dyngs.data.geometry import up_direction
 from dyngs.gaussians.rendering import drawing_options
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene

@@ -10,12 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from dyngs.config import Config, DefaultStrategy, FixedStrategy, McmcStrategy, RandomInit
 from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians.schedule import densify_schedule, growth_per_change
 from dyngs.models.kind import kind_of
-from dyngs.ops.device import gpu_memory, num_gpus
+from dyngs.ops.device import gpu_memory
 from dyngs.training.trainer import Trainer
 
 
@@ -148,7 +150,7 @@ def memory_forecasts(trainer: Trainer[Any], processes: int = 1) -> list[MemoryFo
             MemoryForecast("memory", program, decoded, drawing, gaussians, count, certain, *machine)
         ]
     shown = images.bytes_on_gpu
-    each = -(-processes // num_gpus())
+    each = -(-processes // max(torch.cuda.device_count(), 1))
     on_gpu = MemoryForecast(
         "memory of the GPU", 0, shown, drawing, gaussians, count, needed, *gpu, each, largest
     )

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dyngs.api.edit import write_part
 from dyngs.core.errors import DyngsError, counted
-from dyngs.data.aim import look_at, perpendicular, with_poses
+from dyngs.data.geometry import look_at, perpendicular, with_poses
 from dyngs.export.edit.crop import Box, held_by
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.similarity import UNMOVED, Similarity
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
 _SIZE = 9  # px, width and height of the image whose middle is picked
 _SOLID = 0.5  # opacity below which a ray meets nothing
-_COLOURS = (255, 200, 0), (80, 200, 255)
 _CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 # (12, 2, 3) of a cube
 _EDGES = np.array([(a, b) for a, b in combinations(_CORNERS, 2) if np.abs(a - b).sum() == 1])
@@ -137,7 +136,7 @@ class Editing:
             lines.append(f'`--scale "{texts[0]} {texts[1]} LENGTHm"`')
         lines.append(f"box: `--crop {low} {high}`")
         total = counted(len(self.whole.scene), "Gaussian")
-        lines.append(f"{len(self.rows):,} of {total} left" if self.steps else total)
+        lines.append(f"{len(self.rows):,} of {total} left")
         return "\n\n".join(lines)
 
     def _digits(self, point: np.ndarray) -> str:
@@ -169,17 +168,14 @@ class EditControls:
         gui = browsing.client.gui
         hint = "click on the scene: two points and their distance"
         pick = gui.add_checkbox("Pick points", False, hint=hint)
-        box = gui.add_checkbox("Box", False, hint="drag its arrows; along the axes of the scene")
+        hint = "drag its arrows; along the axes of the scene"
+        self._box = gui.add_checkbox("Box", False, hint=hint)
         step = 10.0 ** (math.floor(math.log10(2 * extent)) - 2)
-        longest = step * math.ceil(2 * extent / step)
-        self._sizes = [
-            gui.add_slider(f"Size {axis}", step, longest, step, size[0]) for axis in "xyz"
-        ]
+        self._size = gui.add_vector3("Size", tuple(size.tolist()), min=(step,) * 3, step=step)
         self._text = gui.add_markdown(self.editing.description)
         pick.on_update(lambda _: self._listen(bool(pick.value)))
-        box.on_update(lambda _: self._show_box() if box.value else self._drop("box", "gizmo"))
-        for slider in self._sizes:
-            slider.on_update(lambda _: self._resize())
+        self._box.on_update(lambda _: self._show_box())
+        self._size.on_update(lambda _: self._refresh())
         jobs: dict[str, Callable[[], None]] = {
             "Delete inside": lambda: self._delete(inside=True),
             "Delete outside": lambda: self._delete(inside=False),
@@ -190,8 +186,10 @@ class EditControls:
             gui.add_button(name).on_click(lambda _, job=job: self._ask(job))
 
     def remove(self) -> None:
-        self._listen(False)
-        self._drop(*list(self._marks))
+        self._browsing.client.scene.remove_click_callback()
+        for mark in self._marks.values():
+            mark.remove()
+        self._marks.clear()
 
     def _ask(self, job: Callable[[], None]) -> None:
         """Have a job done by the thread that draws; what cannot be done is told."""
@@ -201,9 +199,38 @@ class EditControls:
                 job()
             except DyngsError as error:
                 self._browsing.notify("Not done", str(error))
-            self._text.content = self.editing.description
+            self._refresh()
 
         self._browsing.session.ask(work)
+
+    def _refresh(self) -> None:
+        """Draw the picked points, the line between them, and the box; say where they are."""
+        editing = self.editing
+        editing.size = np.array(self._size.value, np.float64)
+        scene = self._browsing.client.scene
+        for name in ("A", "B", "line", "box"):
+            if name in self._marks:
+                self._marks.pop(name).remove()
+        colours = (255, 200, 0), (80, 200, 255)
+        for name, place, colour in zip("AB", editing.points, colours, strict=False):
+            radius = 0.008 * self._extent
+            self._marks[name] = scene.add_icosphere(
+                f"/edit/{name}", radius=radius, color=colour, position=place
+            )
+        lines = dict[str, np.ndarray]()
+        if len(editing.points) == 2:
+            lines["line"] = np.stack(editing.points)[None]
+        if self._box.value:
+            lines["box"] = self._back.points(editing.centre + _EDGES * editing.size)
+        for name, ends in lines.items():
+            self._marks[name] = scene.add_line_segments(
+                f"/edit/{name}",
+                ends.astype(np.float32),
+                colours[0],
+                thickness=2,
+                thickness_units="screen",
+            )
+        self._text.content = editing.description
 
     def _listen(self, listens: bool) -> None:
         scene = self._browsing.client.scene
@@ -212,8 +239,7 @@ class EditControls:
             scene.on_click()(lambda event: self._ask(lambda: self._pick(event)))
         else:
             self.editing.points = []
-            self._drop("A", "B", "line")
-            self._text.content = self.editing.description
+            self._refresh()
 
     def _pick(self, event: Any) -> None:
         session = self._browsing.session
@@ -224,60 +250,29 @@ class EditControls:
         direction = np.array(event.ray_direction, np.float64)
         point = picked(session.opened, origin, direction, pixel, session.shot())
         if point is None:
-            self._browsing.notify("Nothing there", "The scene is not solid at this place.")
-            return
+            raise DyngsError("the scene is not solid at this place")
         self.editing.pick(point)
-        self._drop("A", "B", "line")
-        scene = self._browsing.client.scene
-        points = self.editing.points
-        for name, place, colour in zip("AB", points, _COLOURS, strict=False):
-            radius = 0.008 * float(np.linalg.norm(place - origin))
-            self._marks[name] = scene.add_icosphere(
-                f"/edit/{name}", radius=radius, color=colour, position=place
-            )
-        if len(points) == 2:
-            self._add_lines("line", np.stack(points)[None])
-
-    def _add_lines(self, name: str, ends: np.ndarray, **place: Any) -> None:
-        self._marks[name] = self._browsing.client.scene.add_line_segments(
-            f"/edit/{name}",
-            ends.astype(np.float32),
-            _COLOURS[0],
-            thickness=2,
-            thickness_units="screen",
-            **place,
-        )
 
     def _show_box(self) -> None:
-        """Show the box and its gizmo, along the axes of the frame."""
-        self._drop("gizmo")
-        self._marks["gizmo"] = gizmo = self._browsing.client.scene.add_transform_controls(
-            "/edit/gizmo",
-            scale=0.3 * self._extent,
-            disable_rotations=True,
-            wxyz=self._back.turn,
-            position=self._back.points(self.editing.centre),
-        )
-        gizmo.on_update(lambda _: self._move(np.array(gizmo.position)))
-        self._show_edges()
-
-    def _show_edges(self) -> None:
-        self._drop("box")
-        edges = _EDGES * self._back.scale * self.editing.size
-        place = self._back.points(self.editing.centre)
-        self._add_lines("box", edges, wxyz=self._back.turn, position=place)
+        """Show or hide the box and its gizmo, along the axes of the frame."""
+        if self._box.value:
+            gizmo = self._browsing.client.scene.add_transform_controls(
+                "/edit/gizmo",
+                scale=0.3 * self._extent,
+                disable_rotations=True,
+                wxyz=self._back.turn,
+                position=self._back.points(self.editing.centre),
+            )
+            gizmo.on_update(lambda _: self._move(np.array(gizmo.position)))
+            self._marks["gizmo"] = gizmo
+        else:
+            self._marks.pop("gizmo").remove()
+        self._refresh()
 
     def _move(self, place: np.ndarray) -> None:
         if np.isfinite(place).all():
             self.editing.centre = world_of(self.editing.whole).points(place)
-            self._marks["box"].position = place
-            self._text.content = self.editing.description
-
-    def _resize(self) -> None:
-        self.editing.size = np.array([float(slider.value) for slider in self._sizes])
-        if "box" in self._marks:
-            self._show_edges()
-        self._text.content = self.editing.description
+            self._refresh()
 
     def _delete(self, *, inside: bool) -> None:
         gone = self.editing.delete(inside=inside)
@@ -297,8 +292,3 @@ class EditControls:
         data = self.editing.file(self._browsing.session.time)
         name = f"{self.editing.whole.name.removesuffix('.ply')}_edited.ply"
         self._browsing.client.send_file_download(name, data, save_immediately=True)
-
-    def _drop(self, *names: str) -> None:
-        for name in names:
-            if name in self._marks:
-                self._marks.pop(name).remove()

@@ -1,5 +1,4 @@
-"""Images of a scene for the viewer: colours, depth, opacity, motion, and the error against the
-truth."""
+"""Images of a scene for the viewer: colours, depth, opacity, and the error against the truth."""
 
 from __future__ import annotations
 
@@ -8,31 +7,19 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
-from torch import Tensor
-from torch.nn.functional import interpolate
 
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import SH_C0
 from dyngs.export.camera_paths import resize_cameras
 from dyngs.export.images import color_map, depth_to_rgb
-from dyngs.gaussians.levels import LevelScene
-from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
-from dyngs.human.avatar.scene import avatar_of
 from dyngs.io.write import to_uint8
 from dyngs.models.renderable import Rendering, TimeStep
 from dyngs.runs.opened import Opened
 from dyngs.view.views import views_of
 
-Layer = Literal["colour", "depth", "alpha", "motion", "filled", "error"]
+Layer = Literal["colour", "depth", "alpha", "error"]
 Part = Literal["all", "moving", "still"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 PARTS: tuple[Part, ...] = get_args(Part)
-
-ERROR_GAIN = 4.0
-"""Factor of the mean absolute error before it is coloured, as in contact sheets."""
-_MOTION_TIMES = 12
-_FILLED = (1.0, 0.0, 1.0)  # colour that marks what no training view of a person shows
-_LINE = (255, 200, 0)  # colour of the line between render and truth
 
 
 @dataclass(frozen=True)
@@ -45,7 +32,6 @@ class Shot:
         view: the view of the capture whose camera, time and truth are shown instead; None: no
             truth.
         divide: fraction of the width that shows the render; the truth is on the right of it.
-        is_moving: it is one of many, and drawn in levels of detail where ``coarser`` has made them.
     """
 
     camera: Cameras
@@ -54,7 +40,6 @@ class Shot:
     part: Part = "all"
     view: int | None = None
     divide: float = 1.0
-    is_moving: bool = False
 
 
 def draw(opened: Opened, shot: Shot) -> np.ndarray:
@@ -64,42 +49,35 @@ def draw(opened: Opened, shot: Shot) -> np.ndarray:
     views = views_of(opened)
     size = shot.camera.width, shot.camera.height
     camera = resize_cameras(views.cameras[shot.view], *size)
-    rgb = _layer(opened, replace(shot, camera=camera, time=views.times[shot.view]))
+    rgb = _layer(opened, replace(shot, camera=camera, time=views.views[shot.view].time))
     truth = truth_in_window(opened, shot.view, size)
     if truth is None:
         return rgb
-    beside = np.isnan(truth)
+    beside = truth[..., 3:] == 0
+    truth = truth[..., :3]
     if shot.layer == "error":
-        difference = np.abs(rgb.astype(np.float32) / 255.0 - truth).mean(axis=2)
-        return color_map(np.nan_to_num(ERROR_GAIN * difference), "magma")
+        difference = np.abs(rgb.astype(np.float32) - truth) * ~beside / 255.0
+        return color_map(4.0 * difference.mean(axis=2), "magma")
     rgb = np.where(beside, rgb // 2, rgb)  # there is no truth: darker
+    made = np.where(beside, rgb, truth)
     column = round(min(max(shot.divide, 0.0), 1.0) * size[0])
-    made = np.where(beside, rgb, to_uint8(np.nan_to_num(truth))).astype(np.uint8)
     made[:, :column] = rgb[:, :column]
     if 0 < column < size[0]:
-        made[:, max(column - 1, 0) : column + 1] = _LINE
+        made[:, max(column - 1, 0) : column + 1] = (255, 200, 0)
     return made
 
 
 def truth_in_window(opened: Opened, view: int, size: tuple[int, int]) -> np.ndarray | None:
-    """Return the true image of a view as large as it fits into a window of ``size``, px: (H, W, 3),
-    NaN next to it."""
+    """Return the true image of a view as large as it fits into a window of ``size``, px: (H, W, 4)
+    uint8, transparent next to it."""
+    from PIL import Image, ImageOps
+
     images = views_of(opened).images
     if images is None:
         return None
-    image = images[view].composite(opened.background.cpu())
-    high, wide = image.shape[:2]
-    width, height = size
-    scale = min(width / wide, height / high)
-    own = max(1, round(scale * high)), max(1, round(scale * wide))
-    shown = interpolate(
-        image.permute(2, 0, 1)[None], own, mode="bilinear", align_corners=False, antialias=scale < 1
-    )
-    window = np.full((height, width, 3), np.nan, np.float32)
-    top = (height - own[0]) // 2
-    left = (width - own[1]) // 2
-    window[top : top + own[0], left : left + own[1]] = shown[0].permute(1, 2, 0).clamp(0, 1).numpy()
-    return window
+    pixels = to_uint8(images[view].composite(opened.background.cpu()).numpy())
+    image = Image.fromarray(pixels).convert("RGBA")
+    return np.asarray(ImageOps.pad(image, size, color=(0, 0, 0, 0)))
 
 
 @torch.no_grad()
@@ -108,36 +86,17 @@ def _layer(opened: Opened, shot: Shot) -> np.ndarray:
     match shot.layer:
         case "depth":
             return depth_to_rgb(*depth_of(opened, shot))
-        case "motion":
-            return _pixels(_motion(opened, shot))
-        case "filled":
-            return _pixels(_filled(opened, shot))
         case "alpha":
-            alpha = _rendering(opened, shot).alpha[0]
-            return to_uint8(alpha[..., None].expand(-1, -1, 3).clamp(0, 1).numpy())
+            pixels = _rendering(opened, shot).alpha[0, ..., None].expand(-1, -1, 3)
         case _:
-            return _pixels(_rendering(opened, shot))
-
-
-def _pixels(rendering: Rendering) -> np.ndarray:
-    return to_uint8(rendering.rgb[0].clamp(0, 1).cpu().numpy())
-
-
-def coarser(opened: Opened, most: int) -> Opened:
-    """Return a still scene of which at most ``most`` Gaussians are drawn while anything moves.
-    Raises DyngsError."""
-    opened = opened.noted(f"while anything moves, at most {most:,} Gaussians are drawn")
-    opened.once("levels", lambda: [LevelScene.of(opened.renderable, most)])
-    return opened
+            pixels = _rendering(opened, shot).rgb[0]
+    return to_uint8(pixels.clamp(0, 1).cpu().numpy())
 
 
 def _rendering(opened: Opened, shot: Shot, **options: Any) -> Rendering:
     """Return a rendering, on the CPU; the scene at the last time is kept."""
     part = shot.part
     scene = opened.renderable
-    levels: list[LevelScene] = opened.once("levels", list)
-    if levels and shot.is_moving and not options and part == "all" and shot.layer != "error":
-        return levels[0].render(shot.camera).to(device="cpu")
     if part != "all":
         scene = opened.once(part, lambda: opened.scene.part(part))
     kept: dict[str, tuple[float | None, TimeStep]] = opened.once("time steps", dict)
@@ -153,62 +112,3 @@ def depth_of(opened: Opened, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
     (H, W) there."""
     made = _rendering(opened, shot, depth="expected")
     return np.zeros(0) if made.depth is None else made.depth[0].numpy(), made.alpha[0].numpy()
-
-
-def _motion(opened: Opened, shot: Shot) -> Rendering:
-    """Return the image of the motion, on black."""
-    scene = replace(opened.scene.unmasked(), colour=None, background=None)
-    gaussians = scene.at(shot.time)
-    sh = ((motion_colours(opened) - 0.5) / SH_C0)[:, None].to(gaussians.means)
-    coloured = gaussians.replace(sh=sh)
-    if shot.part != "all":
-        moves = torch.zeros(len(scene), dtype=torch.bool, device=sh.device)
-        moves[scene.rows] = not scene.is_static
-        coloured = coloured.select(moves if shot.part == "moving" else ~moves)
-    options = replace(scene.options, sh_degree=0)
-    return scene.render(shot.camera, GaussianTimeStep(coloured, shot.time), options=options)
-
-
-def motion_colours(opened: Opened) -> Tensor:
-    """Return (N, 3) colours of how far each Gaussian moves over all times: dark blue is not at all,
-    red is far.
-
-    Red begins where 99% of those that move are left behind. On the CPU.
-    """
-    return opened.once("motion", lambda: _motion_colours(opened.scene))
-
-
-def _motion_colours(scene: GaussianScene) -> Tensor:
-    far = torch.zeros(len(scene), device=scene.device)
-    if not scene.is_static:
-        whole = scene.unmasked()
-        low = high = whole.at(0.0).means
-        for time in np.linspace(0, 1, _MOTION_TIMES)[1:].tolist():
-            means = whole.at(time).means
-            low = torch.minimum(low, means)
-            high = torch.maximum(high, means)
-        far = (high - low).norm(dim=1)
-        moves = far[scene.rows]
-        moves = moves[:: max(1, len(moves) // 100_000)]
-        far = far / torch.quantile(moves, 0.99).clamp_min(1e-12)
-    coloured = color_map(far.cpu().numpy()[None], "turbo")[0]
-    return torch.from_numpy(coloured.astype(np.float32) / 255.0)
-
-
-def shows_filled(opened: Opened) -> bool:
-    """Return whether it is known which surface of a person no training view shows."""
-    person = avatar_of(opened.renderable)
-    return person is not None and person.seen is not None and person.colour is None
-
-
-def _filled(opened: Opened, shot: Shot) -> Rendering:
-    """Return the image with filled-in parts marked; the plain image where they are not known."""
-    person = avatar_of(opened.renderable)
-    if person is None or person.seen is None or not shows_filled(opened):
-        return _rendering(opened, shot)
-    now = opened.scene.time_step(shot.time)
-    mark = (now.gaussians.sh.new_tensor(_FILLED) - 0.5) / SH_C0
-    sh = now.gaussians.sh * person.seen[:, None, None]
-    sh[:, 0] += (1 - person.seen)[:, None] * mark
-    marked = replace(now, gaussians=now.gaussians.replace(sh=sh))
-    return opened.scene.render(shot.camera, marked)

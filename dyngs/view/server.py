@@ -3,15 +3,12 @@ token."""
 
 from __future__ import annotations
 
-import errno
 import hmac
 import http
 import ipaddress
-import math
 import re
 import secrets
 import socket
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -23,7 +20,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from dyngs.core.errors import DyngsError, printable
 from dyngs.runs.opened import Opened
-from dyngs.view.session import Drawer, Eye, Pace, Sent, Session
+from dyngs.view.session import Drawer, Eye, Sent, Session
 from dyngs.view.source import Source
 from dyngs.view.views import fitting_fov, look_point, pose_of, viewpoint_of, views_of
 
@@ -31,7 +28,6 @@ if TYPE_CHECKING:
     import viser
 
 
-DEFAULT_PORT = 8080
 COOKIE = "dyngs_view"
 
 
@@ -54,18 +50,16 @@ class Gate:
         origin = headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
             return "a page of another site asks for it"
-        if self.token is None:
-            try:
-                name = urlsplit(f"//{host}").hostname or ""
-            except ValueError:
-                name = ""
-            return None if is_loopback(name) else "only for requests to localhost"
         try:
+            name = urlsplit(f"//{host}").hostname or ""
             cookie = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)
-        except CookieError:
-            cookie = None
+        except (ValueError, CookieError):
+            return "its headers are broken"
+        if self.token is None:
+            return None if is_loopback(name) else "only for requests to localhost"
         given = parse_qs(urlsplit(path).query).get("token", [])
-        given = given if cookie is None else [*given, cookie.value]
+        if cookie is not None:
+            given.append(cookie.value)
         if any(hmac.compare_digest(word.encode(), self.token.encode()) for word in given):
             return None
         return "the token is missing or wrong; open the link that `dyngs view` printed"
@@ -108,17 +102,16 @@ def free_port(host: str, port: int | None) -> int:
     """Return the port to listen on: ``port``; None: 8080, or the next that is free. Raises
     DyngsError."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    for candidate in range(DEFAULT_PORT, DEFAULT_PORT + 50) if port is None else [port]:
+    problem = None
+    for candidate in range(8080, 8130) if port is None else [port]:
         try:
             socket.create_server((host, candidate), family=family).close()
             return candidate
         except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise DyngsError(
-                    f"--host {host}, port {candidate}: cannot listen there ({error.strerror or error})"
-                ) from error
+            problem = error
     raise DyngsError(
-        f"--port {port or DEFAULT_PORT}: taken; choose another, or leave it out to get a free one"
+        f"--host {host}, --port {port or '8080 to 8129'}: cannot listen there ({problem}); choose another, or leave "
+        "--port out to get a free one"
     )
 
 
@@ -153,9 +146,6 @@ def guarded(gate: Gate) -> Iterator[None]:
         server.serve = original
 
 
-_STATUS_EVERY = 0.5
-"""Seconds between two changes of the line about the images, and of the time slider while it
-plays."""
 _PUNCTUATION = re.compile(r"([!-/:-@\[-`{-~])")
 _IN_LINKS = re.compile(r"(?=://|@)|(?<=www)(?=\.)", re.IGNORECASE)
 """Where addresses are recognised even if their punctuation is escaped."""
@@ -168,7 +158,7 @@ class Serving:
     Attributes:
         port: None: 8080 or the next that is free.
         motions: motion files for people, by name.
-        target, longest: seconds that an image may take while something moves, and at all.
+        target: seconds that an image may take while something moves.
         in_thread: images are drawn in a thread of the server; else by whoever calls
             ``drawer.draw_one``.
     """
@@ -177,7 +167,6 @@ class Serving:
     port: int | None = None
     motions: Mapping[str, Path] = field(default_factory=dict)
     target: float = 1 / 14
-    longest: float = math.inf
     in_thread: bool = True
 
 
@@ -185,54 +174,46 @@ class Browsing:
     """One browser: its connection, its session, and the images that went to it; ``opened`` is what
     it sees first."""
 
-    def __init__(self, client: viser.ClientHandle, opened: Opened, pace: Pace) -> None:
+    def __init__(self, client: viser.ClientHandle, opened: Opened, target: float) -> None:
         self.client = client
         self.loaded = opened
-        self.session = Session(opened, self.send, pace)
+        self.session = Session(opened, self.send, target)
+        self.session.on_error = lambda message: self.notify("Error", message)
         self.status: viser.GuiMarkdownHandle | None = None
         self.time_slider: viser.GuiSliderHandle | None = None
         self.on_move: Callable[[], None] = lambda: None
         self.num_sent = 0
-        self._told_at = 0.0
-        self._told_count = 0
-        self._has_refused = False
+        self._shown_at = 0.0  # when the status was set, and the images until then
+        self._shown_count = 0
 
     def send(self, sent: Sent) -> None:
-        """Pass an image to the browser."""
+        """Pass an image to the browser; the status and the time slider follow every half second."""
         quality = 95 if sent.is_refined else 75
         self.client.scene.set_background_image(sent.image, format="jpeg", jpeg_quality=quality)
         self.num_sent += 1
-        now = time.monotonic()
-        if now - self._told_at >= _STATUS_EVERY or sent.is_refined:
-            self._tell(sent, now)
+        passed = max(time.monotonic() - self._shown_at, 1e-6)
+        if passed >= 0.5 or sent.is_refined:
+            height, width = sent.image.shape[:2]
+            rate = (self.num_sent - self._shown_count) / passed
+            shown = "still" if sent.is_refined else f"{rate:.0f} images/s"
+            view = self.session.shown_view
+            if view is not None:
+                shown += f", truth: {as_text(views_of(self.session.opened).names[view])}"
+            if self.status is not None:
+                text = f"{width} x {height} px, {1000 * sent.seconds:.0f} ms, {shown}"
+                self.status.content = text
+            if self.time_slider is not None and self.session.timeline.playing:
+                self.time_slider.value = round(self.session.time, 3)
+            self._shown_at += passed
+            self._shown_count = self.num_sent
         self.client.flush()
-
-    def _tell(self, sent: Sent, now: float) -> None:
-        height, width = sent.image.shape[:2]
-        rate = (self.num_sent - self._told_count) / max(now - self._told_at, 1e-6)
-        shown = "still" if sent.is_refined else f"{rate:.0f} images/s"
-        view = self.session.shown_view
-        if view is not None:
-            shown += f", truth: {as_text(views_of(self.session.opened).names[view])}"
-        if self.status is not None:
-            self.status.content = f"{width} x {height} px, {1000 * sent.seconds:.0f} ms, {shown}"
-        if self.time_slider is not None and self.session.timeline.playing:
-            self.time_slider.value = round(self.session.time, 3)
-        self._told_at = now
-        self._told_count = self.num_sent
 
     def camera_moved(self) -> None:
         """Take over the camera of the browser."""
         camera = self.client.camera
         wxyz, position = tuple(camera.wxyz.tolist()), tuple(camera.position.tolist())
-        if self.session.move(Eye(wxyz, position, float(camera.fov), _window(camera))):
-            self.on_move()
-        elif not self._has_refused:
-            self._has_refused = True
-            self.notify(
-                "Camera ignored",
-                "The browser sent a camera that cannot exist; the last one stays.",
-            )
+        self.session.move(Eye(wxyz, position, float(camera.fov), _window(camera)))
+        self.on_move()
 
     def go_to(self, index: int | None) -> None:
         """Move the browser's camera to a view of the capture; None: to where it began."""
@@ -282,9 +263,8 @@ class Viewer:
         import viser
 
         self.source, self.first, self.serving = source, first, serving
-        self.drawer = Drawer(self._tell_error)
+        self.drawer = Drawer()
         self._browsing: dict[int, Browsing] = {}
-        self._lock = threading.Lock()
         gate = gate_for(serving.host)
         port = free_port(serving.host, serving.port)
         with guarded(gate), quiet():
@@ -295,8 +275,7 @@ class Viewer:
     @property
     def browsing(self) -> tuple[Browsing, ...]:
         """All browsers that are connected."""
-        with self._lock:
-            return tuple(self._browsing.values())
+        return tuple(self._browsing.values())
 
     def __enter__(self) -> Viewer:
         if self.serving.in_thread:
@@ -337,9 +316,8 @@ class Viewer:
     def _connected(self, client: viser.ClientHandle) -> None:
         from dyngs.view.controls import Controls
 
-        browsing = Browsing(client, self.first, Pace(self.serving.target, self.serving.longest))
-        with self._lock:
-            self._browsing[client.client_id] = browsing
+        browsing = Browsing(client, self.first, self.serving.target)
+        self._browsing[client.client_id] = browsing
         Controls(browsing, self.source, self.serving.motions)
 
         async def moved(_: viser.CameraHandle) -> None:
@@ -352,15 +330,9 @@ class Viewer:
             self._gone(client)
 
     def _gone(self, client: viser.ClientHandle) -> None:
-        with self._lock:
-            browsing = self._browsing.pop(client.client_id, None)
+        browsing = self._browsing.pop(client.client_id, None)
         if browsing is not None:
             self.drawer.remove(browsing.session)
-
-    def _tell_error(self, session: Session, message: str) -> None:
-        for browsing in self.browsing:
-            if browsing.session is session:
-                browsing.notify("Error", message)
 
 
 def require_viser() -> None:

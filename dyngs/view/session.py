@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.export.camera_paths import Keyframes, interpolate_keyframes, resize_cameras, world_pose
+from dyngs.data.geometry import checked_pose
+from dyngs.export.camera_paths import resize_cameras
 from dyngs.runs.opened import Opened
 from dyngs.view.layers import Layer, Part, Shot, draw
 from dyngs.view.views import camera_at, nearest_view, views_of
@@ -27,32 +27,10 @@ from dyngs.view.views import camera_at, nearest_view, views_of
 _LOG = logging.getLogger(__name__)
 STILL_AFTER = 0.2
 """Seconds without change after which the image is refined."""
-_SHORTEST = 1 / 30
-"""Seconds between two images at least."""
 _SMALLEST_AREA = 320 * 240
 """Pixels of an image at least: where Gaussians take all the time, a smaller one would hardly come
 sooner."""
-
-
-class Pace:
-    """Number of pixels that can be drawn within ``target`` seconds, by how long the last images
-    took.
-
-    Refined images may take ``longest`` seconds. ``area``: pixels of an image while something moves.
-    ``largest``: most pixels of a refined image.
-    """
-
-    def __init__(self, target: float = 1 / 14, longest: float = math.inf) -> None:
-        self._target, self._longest = target, longest
-        self.area = float(_SMALLEST_AREA)
-        self.largest = math.inf
-
-    def observe(self, pixels: float, seconds: float) -> None:
-        """Note how long an image took while something moves."""
-        seconds = max(seconds, 1e-9)
-        factor = min(max(self._target / seconds, 0.5), 2.0)
-        self.area = max(pixels * math.sqrt(factor), _SMALLEST_AREA)
-        self.largest = max(pixels * self._longest / seconds, self.area)
+_LONGEST_SIDE = 1600  # px of an image at most
 
 
 @dataclass(frozen=True)
@@ -65,13 +43,6 @@ class Eye:
     fov: float
     size: tuple[int, int]
 
-    @property
-    def is_possible(self) -> bool:
-        """Whether there is such a camera: browsers may send anything."""
-        numbers = (*self.wxyz, *self.position, self.fov)
-        has_direction = all(map(math.isfinite, numbers)) and math.hypot(*self.wxyz) > 1e-6
-        return has_direction and self.fov > 0 and min(self.size) > 0
-
     def camera(self, size: tuple[int, int] | None = None) -> Cameras:
         """Return the camera for images of ``size``; None: that of the window."""
         return camera_at(self.wxyz, self.position, self.fov, size or self.size)
@@ -81,14 +52,12 @@ class Eye:
 class Timeline:
     """The time that is shown: ``time`` in [0, 1] when the clock read ``since``.
 
-    Where it is ``playing``, it takes ``seconds`` / ``speed`` from 0 to 1, where it begins again or
-    stops.
+    Where it is ``playing``, it takes ``seconds`` / ``speed`` from 0 to 1, where it begins again.
     """
 
     time: float = 0.0
     since: float = 0.0
     playing: bool = False
-    loops: bool = True
     speed: float = 1.0
     seconds: float = 4.0
 
@@ -96,15 +65,12 @@ class Timeline:
         """Return the time in [0, 1] when the clock reads ``clock``."""
         if not self.playing:
             return self.time
-        passed = self.time + max(clock - self.since, 0.0) * self.speed / max(self.seconds, 1e-6)
-        return passed % 1.0 if self.loops and passed > 1 else min(passed, 1.0)
+        passed = max(clock - self.since, 0.0) * self.speed / max(self.seconds, 1e-6)
+        return (self.time + passed) % 1.0 if passed else self.time
 
     def changed(self, clock: float, **changes: bool | float) -> Timeline:
-        """Return the timeline with other attributes; the time does not jump, but who plays from the
-        end begins at 0."""
-        now = self.at(clock)
-        now = 0.0 if changes.get("playing") and now >= 1.0 else now
-        return replace(self, time=now, since=clock, **changes)  # type: ignore[arg-type]
+        """Return the timeline with other attributes; the time does not jump."""
+        return replace(self, **{"time": self.at(clock), "since": clock, **changes})  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -114,16 +80,12 @@ class Display:
     Attributes:
         layer, part, divide: as in ``Shot``.
         comparing: show the truth next to the render.
-        view: index of the view that is compared with; None: the nearest.
-        longest: most pixels of the longer side of an image.
     """
 
     layer: Layer = "colour"
     part: Part = "all"
     comparing: bool = False
-    view: int | None = None
     divide: float = 0.5
-    longest: int = 1600
 
 
 @dataclass(frozen=True)
@@ -151,46 +113,24 @@ class Recording:
         """Seconds of the path; those after the last keyframe count only in a loop."""
         return sum(key.seconds for key in self.keyframes[: None if self.loops else -1])
 
-    def keys(self) -> Keyframes:
-        """Return at least one keyframe as the interpolation takes them."""
-        cameras = [key.camera for key in self.keyframes]
-        poses, matrices = (
-            torch.cat(x).double().cpu().numpy()
-            for x in zip(*((c.cam_from_world, c.intrinsics) for c in cameras), strict=True)
-        )
-        starts = np.cumsum([0.0, *(key.seconds for key in self.keyframes[:-1])])
-        times = [key.time for key in self.keyframes if key.time is not None]
-        has_times = len(times) == len(self)
-        period = self.duration if self.loops and len(self) > 1 else None
-        return Keyframes(poses, matrices, starts, np.array(times) if has_times else None, period)
-
     def document(self, size: tuple[int, int], fps: float, opened: Opened) -> str:
         """Return the path as JSON that ``dyngs render --path`` reads (docs/camera_paths.md), in the
-        coordinates of the capture; focal lengths follow the height, px."""
-        width, height = size
+        coordinates of the capture; ``size`` of its images, px."""
         keys: list[dict[str, Any]] = []
-        for key, start in zip(self.keyframes, self.keys().seconds.tolist(), strict=True):
-            camera = opened.frame.cameras(key.camera)
-            pose = camera.cam_from_world[0].double().cpu().numpy()
-            focal = float(camera.intrinsics[0, 1, 1]) * height / camera.height
-            entry: dict[str, Any] = {"at": start, "fl_x": focal}
-            entry["cam_from_world"] = world_pose(pose, opened.world_offset).tolist()
+        start = 0.0
+        for key in self.keyframes:
+            camera = opened.frame.cameras(resize_cameras(key.camera, *size))
+            # rotations as readers repair them, which must not move a far camera
+            pose, _ = checked_pose(camera.cam_from_world[0].double().cpu().numpy(), "camera")
+            pose[:3, 3] -= pose[:3, :3] @ opened.world_offset
+            entry: dict[str, Any] = {"at": start, "fl_x": float(camera.intrinsics[0, 1, 1])}
+            entry["cam_from_world"] = pose.tolist()
             keys.append(entry if key.time is None else entry | {"time": key.time})
-        document = {"width": width, "height": height, "fps": fps, "loop": self.loops}
+            start += key.seconds
+        document = {"width": size[0], "height": size[1], "fps": fps, "loop": self.loops}
         if self.loops:
             document["seconds"] = self.duration
         return json.dumps({**document, "keyframes": keys}, indent=1) + "\n"
-
-    def at(self, seconds: float) -> tuple[Cameras, float | None]:
-        """Return the camera and the time of the scene after ``seconds`` of the path, of at least
-        one keyframe."""
-        first = self.keyframes[0].camera
-        made = interpolate_keyframes(self.keys(), np.array([seconds]))
-        pose, matrix = (
-            first.cam_from_world.new_tensor(x) for x in (made.cam_from_world, made.intrinsics)
-        )
-        camera = replace(first, cam_from_world=pose, intrinsics=matrix)
-        return camera, None if made.times is None else float(made.times[0])
 
 
 @dataclass(frozen=True)
@@ -206,43 +146,41 @@ class Sent:
 class Session:
     """One browser's view of a scene.
 
-    Several threads tell it what has changed; one thread calls ``draw_next``, and gets the newest
-    state, for ``send``. Images are as large as ``pace`` says: by default fourteen a second while
-    something moves, full when all is still.
+    Several threads change it; one thread calls ``draw_next``, and passes the newest state to
+    ``send``. While something moves, images have as many pixels as can be drawn in ``target``
+    seconds, by how long the last one took; when all is still they are full.
     """
 
     def __init__(
         self,
         opened: Opened,
         send: Callable[[Sent], None],
-        pace: Pace | None = None,
+        target: float = 1 / 14,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._lock = threading.RLock()
-        self._send, self._clock = send, clock
-        self._pace = pace or Pace()
-        self._jobs: deque[tuple[str | None, Callable[[], None]]] = deque()
+        self._lock = threading.Lock()
+        self._send, self._target, self._clock = send, target, clock
+        self._jobs: deque[Callable[[], None]] = deque()
         self._changed_at = self._drawn_at = -1e9
         self._is_stale = True
-        self._refined_area = 0.0  # pixels of the image that is shown, if it is of what is there now
-        self._preview: tuple[Recording, float] | None = None
+        self._area = float(_SMALLEST_AREA)  # pixels of an image while something moves
+        self._is_refined = (
+            False  # whether the image that is shown is full, and of what is there now
+        )
         self.on_change: Callable[[], None] = lambda: None
         self.on_play: Callable[[bool], None] = lambda playing: None
+        self.on_error: Callable[[str], None] = lambda message: None
         self.opened, self.look = opened, Display()
         self.eye: Eye | None = None
         self.timeline = Timeline(seconds=opened.seconds)
         self.closed = False
         self.failure: str | None = None
 
-    def move(self, eye: Eye) -> bool:
-        """Look from ``eye`` from now on; return False, and go on as before, where there is no such
-        camera."""
-        if not eye.is_possible:
-            return False
+    def move(self, eye: Eye) -> None:
+        """Look from ``eye`` from now on."""
         if eye != self.eye:
             self.eye = eye
             self._note_change()
-        return True
 
     def change(self, **changes: Any) -> None:
         """Show something else: attributes of ``Display``."""
@@ -251,13 +189,10 @@ class Session:
         self._note_change()
 
     def set_time(self, time: float) -> None:
-        now = min(max(time, 0.0), 1.0)
-        with self._lock:
-            self.timeline = replace(self.timeline, time=now, since=self._clock())
-        self._note_change()
+        self.change_timeline(time=min(max(time, 0.0), 1.0))
 
     def change_timeline(self, **changes: bool | float) -> None:
-        """Play, pause, loop or change the speed: attributes of ``Timeline``."""
+        """Play, pause or change the speed: attributes of ``Timeline``."""
         with self._lock:
             self.timeline = self.timeline.changed(self._clock(), **changes)
         self.on_play(self.timeline.playing)
@@ -265,38 +200,19 @@ class Session:
 
     def show(self, opened: Opened) -> None:
         """Look at another scene, at the same time."""
-        with self._lock:
-            if self.look.view is not None and self.look.view >= len(views_of(opened)):
-                self.look = replace(self.look, view=None)
-            self.opened = opened
-            self.timeline = self.timeline.changed(self._clock(), seconds=opened.seconds)
-        self._note_change()
-
-    def preview(self, recording: Recording) -> None:
-        self._preview = (recording, self._clock()) if len(recording) else None
-        self._note_change()
+        self.opened = opened
+        self.change_timeline(seconds=opened.seconds)
 
     def take(self, opened: Opened, *, refreshes: bool) -> None:
         """Look at a newer state of the scene; ``refreshes``: draw it, as large, even if nothing
         else has changed."""
-        with self._lock:
-            self.opened = opened
-            self._is_stale = self._is_stale or refreshes
+        self.opened = opened
+        self._is_stale |= refreshes
 
-    def ask(self, job: Callable[[], None], kind: str | None = None) -> None:
-        """Have ``job`` run by the thread that draws, before the next image, instead of waiting ones
-        of its kind."""
-        with self._lock:
-            if kind is not None:
-                self._jobs = deque(entry for entry in self._jobs if entry[0] != kind)
-            self._jobs.append((kind, job))
+    def ask(self, job: Callable[[], None]) -> None:
+        """Have ``job`` run by the thread that draws, before the next image."""
+        self._jobs.append(job)
         self.on_change()
-
-    def close(self) -> None:
-        """The browser is gone: nothing is drawn any more."""
-        with self._lock:
-            self.closed = True
-            self._jobs.clear()
 
     @property
     def time(self) -> float:
@@ -306,127 +222,91 @@ class Session:
     @property
     def shown_view(self) -> int | None:
         """Index of the view whose truth is shown; None without any."""
-        with self._lock:
-            look = self.look
-            eye = self.eye
-            opened = self.opened
+        look = self.look
+        eye = self.eye
+        opened = self.opened
         has_truth = look.comparing or look.layer == "error"
         if eye is None or not has_truth or not len(views_of(opened)):
             return None
-        return nearest_view(opened, eye.camera(), self.time) if look.view is None else look.view
+        return nearest_view(opened, eye.camera(), self.time)
 
     def due(self) -> float | None:
         """Return in how many seconds something is to be drawn; 0: now, None: not before something
         changes."""
-        with self._lock:
-            if self.closed or self.eye is None:
-                return None
-            if self._jobs:
-                return 0.0
-            now = self._clock()
-            soonest = max(0.0, self._drawn_at + _SHORTEST - now)
-            if self._is_moving or self._is_stale:
-                return soonest
-            if self._refined_area < 0.99 * self._most_pixels:
-                return max(soonest, self._changed_at + STILL_AFTER - now)
+        if self.closed or self.eye is None:
             return None
+        if self._jobs:
+            return 0.0
+        now = self._clock()
+        soonest = max(0.0, self._drawn_at + 1 / 30 - now)
+        if self._is_moving or self._is_stale:
+            return soonest
+        if not self._is_refined:
+            return max(soonest, self._changed_at + STILL_AFTER - now)
+        return None
 
     def draw_next(self) -> None:
         """Do what is due: a job, or the next image."""
-        with self._lock:
-            job = self._jobs.popleft()[1] if self._jobs and not self.closed else None
-        if job is not None:
-            job()
+        if self.closed or self.eye is None:
             return
-        with self._lock:
-            if self.closed or self.eye is None:
-                return
-            start = self._clock()
-            is_moving = self._is_moving or start < self._changed_at + STILL_AFTER
-            area = self._pace.area
-            if not is_moving:  # in steps, so that a browser that moves again need not wait long
-                area = max(area, 6.0 * self._refined_area)
-            area = min(area, self._most_pixels)
-            width, height = self._full_size
-            scale = min(1.0, math.sqrt(area / (width * height)))
-            size = max(16, round(width * scale)), max(16, round(height * scale))
-            opened = self.opened
-            version = self._changed_at
-            self._is_stale = False
-            self._refined_area = math.inf  # if it fails, it is not tried again
-            self._drawn_at = start
-            shot = replace(self.shot(size), is_moving=is_moving)
-        image = draw(opened, shot)
+        if self._jobs:
+            self._jobs.popleft()()
+            return
+        start = self._drawn_at = self._clock()
+        version = self._changed_at
+        is_moving = self._is_moving or start < version + STILL_AFTER
+        full = self._full_size
+        size = _scaled(full, math.sqrt(self._area / math.prod(full))) if is_moving else full
+        self._is_stale = False
+        self._is_refined = True  # if it fails, it is not tried again
+        image = draw(self.opened, self.shot(size))
         if not self.closed:
             self._send(Sent(image, not is_moving, self._clock() - start))
         now = self._clock()
-        with self._lock:
-            if is_moving:
-                self._pace.observe(size[0] * size[1], now - start)
-            is_current = version == self._changed_at
-            # Also a full image is drawn once more when all is still: in better quality.
-            self._refined_area = area * (0.9 if is_moving else 1.0) if is_current else 0.0
-            timeline = self.timeline
-            preview = self._preview
-        if timeline.playing and not timeline.loops and timeline.at(now) >= 1.0:
-            self.change_timeline(playing=False)
-        if preview is not None and now - preview[1] > preview[0].duration:
-            self.preview(Recording())
+        if is_moving:
+            factor = min(max(self._target / max(now - start, 1e-9), 0.5), 2.0)
+            self._area = max(math.prod(size) * math.sqrt(factor), _SMALLEST_AREA)
+        self._is_refined = not is_moving and version == self._changed_at
 
     def shot(self, size: tuple[int, int] | None = None) -> Shot:
         """Return what is shown now as an image of ``size``; None: that of the window."""
-        with self._lock:
-            if self.eye is None:
-                raise ValueError("there is no camera yet")
-            size = size or self._full_size
-            time = self.time
-            if self._preview is None:
-                camera = self.eye.camera(size)
-                view = self.shown_view
-            else:
-                recording, since = self._preview
-                camera, recorded = recording.at(self._clock() - since)
-                camera = resize_cameras(camera, *size)
-                view = None
-                time = time if recorded is None else recorded
-            look = self.look
-            shown = None if self.opened.renderable.is_static else time
+        if self.eye is None:
+            raise ValueError("there is no camera yet")
+        look = self.look
+        view = self.shown_view
+        time = None if self.opened.renderable.is_static else self.time
         layer = "colour" if look.layer == "error" and view is None else look.layer
-        return Shot(camera, shown, layer, look.part, view, look.divide if look.comparing else 1.0)
+        camera = self.eye.camera(size or self._full_size)
+        return Shot(camera, time, layer, look.part, view, look.divide if look.comparing else 1.0)
 
     @property
     def _is_moving(self) -> bool:
-        is_playing = self.timeline.playing and not self.opened.renderable.is_static
-        return is_playing or self._preview is not None
+        return self.timeline.playing and not self.opened.renderable.is_static
 
     @property
     def _full_size(self) -> tuple[int, int]:
-        width, height = (640, 480) if self.eye is None else self.eye.size
-        scale = min(1.0, self.look.longest / max(width, height))
-        return max(16, round(width * scale)), max(16, round(height * scale))
-
-    @property
-    def _most_pixels(self) -> float:
-        """Pixels of the image that is shown when all is still."""
-        return min(math.prod(self._full_size), self._pace.largest)
+        size = (640, 480) if self.eye is None else self.eye.size
+        return _scaled(size, _LONGEST_SIDE / max(size))
 
     def _note_change(self) -> None:
-        with self._lock:
-            self._changed_at = self._clock()
-            self._is_stale = True
-            self._refined_area = 0.0
+        self._changed_at = self._clock()
+        self._is_stale = True
+        self._is_refined = False
         self.on_change()
+
+
+def _scaled(size: tuple[int, int], factor: float) -> tuple[int, int]:
+    """Return a size, px, made smaller by ``factor``, at least 16 x 16."""
+    width, height = (max(16, round(side * min(factor, 1.0))) for side in size)
+    return width, height
 
 
 class Drawer:
     """The one thread that draws for all browsers: whoever waits longest is next, and gets the
-    newest state.
-
-    ``on_error`` is told what went wrong for one session, the others go on.
+    newest state. What went wrong for one session goes to its ``on_error``, the others go on.
     """
 
-    def __init__(self, on_error: Callable[[Session, str], None]) -> None:
-        self._on_error = on_error
+    def __init__(self) -> None:
         self._changed = threading.Condition()
         self._sessions: list[Session] = []
         self._thread: threading.Thread | None = None
@@ -444,7 +324,7 @@ class Drawer:
         self._wake()
 
     def remove(self, session: Session) -> None:
-        session.close()
+        session.closed = True
         with self._changed:
             if session in self._sessions:
                 self._sessions.remove(session)
@@ -460,10 +340,16 @@ class Drawer:
                 self._sessions.append(session)
         try:
             session.draw_next()
-        except Exception as error:  # a fault of one session must not end the images of all
-            self._fail(session, error)
-        else:
             session.failure = None
+        except Exception as error:  # a fault of one session must not end the images of all
+            is_known = isinstance(error, DyngsError)
+            message = str(error) if is_known else f"{type(error).__name__}: {error}"
+            # once in a row: what is played fails many times a second
+            if not session.closed and session.failure != message:
+                session.failure = message
+                session.on_error(message)
+                if not is_known:
+                    _LOG.error("the viewer failed to draw", exc_info=error)
         return True
 
     def start(self) -> None:
@@ -497,17 +383,6 @@ class Drawer:
             if wait is not None and wait < best[1]:
                 best = (session, wait)
         return best
-
-    def _fail(self, session: Session, error: Exception) -> None:
-        """Say what went wrong, once in a row: what is played fails many times a second."""
-        is_known = isinstance(error, DyngsError)
-        message = str(error) if is_known else f"{type(error).__name__}: {error}"
-        if session.closed or session.failure == message:
-            return
-        session.failure = message
-        self._on_error(session, message)
-        if not is_known:
-            _LOG.error("the viewer failed to draw", exc_info=error)
 
     def _wake(self) -> None:
         with self._changed:

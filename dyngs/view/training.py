@@ -26,8 +26,6 @@ from dyngs.view.session import Drawer
 from dyngs.view.source import Source
 from dyngs.view.views import captured_views
 
-FRACTION = 0.2
-"""Most of the time of training that images for browsers may take."""
 REFRESH_SECONDS = 1.0
 """Seconds between two images of a browser in which nothing moves but the scene."""
 
@@ -36,15 +34,15 @@ class DrawnBetweenSteps:
     """Draws for browsers in the thread that trains, between two steps, since steps change the scene
     in place.
 
-    Without browsers a step costs one look at an empty list. Images change nothing of the training:
-    they are drawn from a copy of the scene's shell, with caches of its own, and without gradients
-    or random numbers.
+    Images take at most ``fraction`` of the time. Without browsers a step costs one look at an empty
+    list. Images change nothing of the training: they are drawn from a copy of the scene's shell,
+    with caches of its own, and without gradients or random numbers.
     """
 
     def __init__(
         self,
         drawer: Drawer,
-        fraction: float = FRACTION,
+        fraction: float = 0.2,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self._drawer, self._fraction, self._clock = drawer, fraction, clock
@@ -85,12 +83,12 @@ class TrainingView:
     def __init__(self, config: Config, serving: Serving, say: Callable[[str], None]) -> None:
         if capability(config.model, Predicts) is not None:
             raise DyngsError(
-                "--view shows scenes, and a network has none; `dyngs view RUN` shows what it predicts"
+                "--view shows scenes, and a network has none; `dyngs predict` makes one"
             )
         require_viser()
         free_port(serving.host, serving.port)  # now, not after reading the capture
         self._say = say
-        self._serving = replace(serving, in_thread=False, target=0.05, longest=0.3)
+        self._serving = replace(serving, in_thread=False, target=0.05)
         self._drawn: DrawnBetweenSteps | None = None
         self._stack = ExitStack()
 
@@ -101,25 +99,20 @@ class TrainingView:
         self._stack.close()
 
     def __call__(self, event: Event) -> None:
-        """Draw what browsers ask for, after a step."""
-        if isinstance(event, StepDone) and isinstance(event.loop.trainer, Trainer):
-            trainer = event.loop.trainer
-            start = time.perf_counter()
-            if self._drawn is None:
-                self._drawn = self._begin(opened_training(trainer))
-                took = time.perf_counter() - start
-            else:
-                took = self._drawn.after_step(trainer.model.scene)
-            if took:
-                event.loop.watch.pause(took)
-
-    def _begin(self, first: Opened) -> DrawnBetweenSteps:
-        """Serve the page, now that there is a scene."""
-        viewer = self._stack.enter_context(
-            Viewer(Source((first.name,), lambda _: first), first, self._serving)
-        )
-        self._say(f"viewing: {viewer.link} (until the training ends)")
-        return DrawnBetweenSteps(viewer.drawer)
+        """Draw what browsers ask for, after a step; serve the page after the first one."""
+        if not isinstance(event, StepDone) or not isinstance(event.loop.trainer, Trainer):
+            return
+        trainer = event.loop.trainer
+        start = time.perf_counter()
+        begins = self._drawn is None
+        if self._drawn is None:
+            first = opened_training(trainer)
+            source = Source((first.name,), lambda _: first)
+            viewer = self._stack.enter_context(Viewer(source, first, self._serving))
+            self._say(f"viewing: {viewer.link} (until the training ends)")
+            self._drawn = DrawnBetweenSteps(viewer.drawer)
+        if self._drawn.after_step(trainer.model.scene) or begins:
+            event.loop.watch.pause(time.perf_counter() - start)
 
 
 def opened_training(trainer: Trainer[Any]) -> Opened:
@@ -131,14 +124,13 @@ def opened_training(trainer: Trainer[Any]) -> Opened:
     captured.once("views", lambda: shown)
     with torch.no_grad():
         scene = _shell(trainer.model.scene, background_colour(trainer.background))
-    name = config.run.name
     return Opened(
         config,
         scene,
         trainer.done,
         0.0,
         trainer.info,
-        name=name,
+        name=config.run.name,
         captured=captured,
         in_training=True,
     )

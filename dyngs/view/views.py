@@ -12,8 +12,8 @@ import torch
 
 from dyngs.config import DataConfig
 from dyngs.core.camera import Cameras
-from dyngs.data.aim import look_at_point, world_from_cam
 from dyngs.data.capture import View
+from dyngs.data.geometry import inverse_rigid, look_at_point, pinhole_matrix, world_from_cam
 from dyngs.data.loader import ImageLoader
 from dyngs.export.choose_path import orbit_around, points_at
 from dyngs.human.avatar.scene import avatar_of
@@ -43,15 +43,6 @@ class CapturedViews:
     def names(self) -> tuple[str, ...]:
         return tuple(view.name for view in self.views)
 
-    @property
-    def times(self) -> tuple[float | None, ...]:
-        return tuple(view.time for view in self.views)
-
-    @property
-    def poses(self) -> np.ndarray:
-        """(V, 4, 4) world to camera."""
-        return np.stack([view.cam_from_world for view in self.views])
-
 
 @dataclass(frozen=True)
 class Viewpoint:
@@ -78,11 +69,10 @@ def _views_of_capture(opened: Opened) -> CapturedViews:
     other clips, too."""
     if opened.missing is not None:
         return CapturedViews()
-    capture = opened.capture
     by_name = {}
     for split in ("train", "val", "test"):
-        views = capture.splits.get(split, ())
-        if views and scene_of_split(opened, capture, split) is opened.renderable:
+        views = opened.capture.splits.get(split, ())
+        if views and scene_of_split(opened, opened.capture, split) is opened.renderable:
             by_name |= {view.name: view for view in views}
     return captured_views(tuple(by_name.values()), opened.config.data)
 
@@ -108,24 +98,20 @@ def viewpoint_of(opened: Opened) -> Viewpoint:
 
 def _viewpoint(opened: Opened) -> Viewpoint:
     shown = views_of(opened)
-    if len(shown):
-        poses = torch.from_numpy(shown.poses).float()
+    cameras = opened.cameras
+    person = avatar_of(opened.renderable)
+    if len(shown) and cameras is not None:
         start = shown.cameras[0]
-        intrinsics = start.intrinsics.expand(len(poses), 3, 3)
-        together = Cameras(poses, intrinsics, start.width, start.height)
-        center = look_at_point(together)
-        eyes = together.centers.double().cpu().numpy()
-        person = avatar_of(opened.renderable)
+        center = look_at_point(cameras)
         if person is not None:
             center = person.at(None).means.double().cpu().numpy().mean(0)
     else:
         means = points_at(opened.renderable).double().cpu().numpy()
-        start = orbit_around(opened, 1)
+        start = cameras = orbit_around(opened, 1)
         center = np.median(means[np.isfinite(means).all(1)], axis=0)
-        eyes = start.centers.double().cpu().numpy()
-    extent = float(np.median(np.linalg.norm(eyes - center, axis=1)))
+    apart = np.linalg.norm(cameras.centers.double().cpu().numpy() - center, axis=1)
     up = np.array([0.0, 0.0, 1.0]) if opened.up is None else opened.up[0]
-    return Viewpoint(start, center, extent, up)
+    return Viewpoint(start, center, float(np.median(apart)), up)
 
 
 def has_timeline(opened: Opened) -> bool:
@@ -142,14 +128,14 @@ def nearest_view(opened: Opened, camera: Cameras, time: float) -> int:
     times.
     """
     shown = views_of(opened)
-    poses = shown.poses
+    poses = np.stack([view.cam_from_world for view in shown.views])
     own = camera.cam_from_world[0].double().cpu().numpy()
-    centers = centers_of(np.concatenate([own[None], poses]))
-    apart = np.linalg.norm(centers[1:] - centers[0], axis=1)
+    apart = np.linalg.norm(centers_of(poses) - centers_of(own[None]), axis=1)
     cost = apart / max(viewpoint_of(opened).extent, 1e-9)
     cost += 0.5 * np.arccos(np.clip(poses[:, 2, :3] @ own[2, :3], -1, 1))
     if not opened.renderable.is_static:
-        cost += 2.0 * np.array([0.0 if t is None else abs(t - time) for t in shown.times])
+        times = [view.time for view in shown.views]
+        cost += 2.0 * np.array([0.0 if t is None else abs(t - time) for t in times])
     return int(cost.argmin())
 
 
@@ -169,14 +155,13 @@ def camera_at(
     from scipy.spatial.transform import Rotation
 
     w, x, y, z = (float(value) for value in wxyz)
-    rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
     pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = -rotation @ np.asarray(position, np.float64)
+    pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+    pose[:3, 3] = position
     width, height = size
     focal = 0.5 * height / math.tan(0.5 * min(max(fov, 1e-3), MAX_FOV))
-    matrix = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])
-    poses, matrices = (torch.from_numpy(x).float()[None] for x in (pose, matrix))
+    matrix = pinhole_matrix(focal, focal, 0.5 * width, 0.5 * height)
+    poses, matrices = (torch.from_numpy(x).float()[None] for x in (inverse_rigid(pose), matrix))
     return Cameras(poses, matrices, width, height)
 
 

@@ -86,9 +86,8 @@ def test_a_motion_of_romp_without_a_rate_is_read_with_one_and_what_is_assumed_is
     printed = capsys.readouterr().out
     assert "4 frames, 0.15 s at 20 frames per second" in printed
     notes = [line for line in printed.splitlines() if line.startswith("note: ")]
-    assert len(notes) == 2
-    assert "'betas' differ between frames by up to 0.6: the mean is taken, but dropped" in notes[0]
-    assert "the file does not say what is up; -y is taken" in notes[1]
+    assert len(notes) == 1
+    assert "the file does not say what is up; -y is taken" in notes[0]
     found = read_motion(tmp_path / "out.npz")
     assert float(found.poses.abs().max()) < 1e-6, "upright, in the axes of the template"
 
@@ -98,7 +97,7 @@ def test_a_motion_of_romp_without_a_rate_is_read_with_one_and_what_is_assumed_is
     [
         ("in.npz used.npz", "used.npz exists already; name a new file"),
         ("in.npz new.bvh", "new.bvh: a motion is written as .npz"),
-        ("nowhere.npz new.npz", "nowhere.npz: no such file"),
+        ("nowhere.npz new.npz", "nowhere.npz: cannot be read (No such file"),
         ("in.txt new.npz", "in.txt: unknown kind of motion"),
         ("in.npz new.npz --clip walk", "do not ask for 'walk'"),
         ("in.npz new.npz --fps 0", "0 frames per second"),
@@ -302,7 +301,7 @@ def test_a_body_file_that_cannot_be_fitted_is_refused_in_one_line(
         (str(tmp_path / "none.npz"), uv, "none.npz: "),
         (str(damaged), uv, "damaged.npz: "),
         (body, None, "smpl.npz: has no texture coordinates"),
-        (body, str(wrong), "wrong.obj: has 1 vertices and 1 triangles, the body has"),
+        (body, str(wrong), "wrong.obj: cannot be read"),
         (None, uv, "goes with --template"),
     ):
         out = tmp_path / "out"

@@ -6,8 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.data.aim import look_at
-from dyngs.data.geometry import focus_point, fraction_in_front
+from dyngs.data.geometry import focus_point, fraction_in_front, look_at
 
 
 def _ring(center: np.ndarray, count: int) -> np.ndarray:

@@ -12,14 +12,18 @@ from tiny_fields import cloud
 from dyngs.data.loader import Image
 from dyngs.deform.fixed_cameras import (
     LONGEST_SIDE,
+    Hull,
     TimedGaussians,
     changes,
     first_motion,
     fixed_camera_clip,
     hull_gaussians,
     hulls_in,
+    linked,
     pays,
+    surface,
     surface_changes,
+    travels,
     views_at,
 )
 from dyngs.gaussians import Gaussians
@@ -93,12 +97,12 @@ MOMENTS = tuple(i / 4 for i in range(5))
 
 
 def hulls(*balls: Ball, count: int = 8, blind: int = 0) -> list[np.ndarray]:
-    """Points on those of the last of some moments; before, the balls were not there."""
+    """Cubes of those of the last of some moments; before, the balls were not there."""
     clips = filmed(lambda t: balls if t == 1.0 else [], MOMENTS, count)
     for one in clips[:blind]:
         one.changed[:] = False
-    found = [points for points, _ in hulls_in(views_at(clips, 1.0), LOW, HIGH)]
-    return sorted(found, key=lambda points: -len(points))
+    found = [hull.cubes for hull in hulls_in(views_at(clips, 1.0), LOW, HIGH)]
+    return sorted(found, key=lambda cubes: -len(cubes))
 
 
 # of four, three suffice: their hull has corners
@@ -108,7 +112,8 @@ def test_a_hull_has_the_centre_and_the_radius_of_its_ball(count: int, fraction: 
     (found,) = hulls(ball, count=count)
     assert np.linalg.norm(found.mean(0) - ball.center) < fraction * ball.radius
     distances = np.linalg.norm(found - np.array(ball.center), axis=1)
-    assert np.median(distances) == pytest.approx(ball.radius, rel=0.25)
+    # of a ball: 0.79 of its radius
+    assert np.median(distances) == pytest.approx(0.79 * ball.radius, rel=0.25)
 
 
 def test_two_balls_are_two() -> None:
@@ -137,10 +142,13 @@ def ball_at(time: float) -> Ball:
 def test_gaussians_cover_a_ball_at_each_time_and_pay() -> None:
     """On its surface, in its colour of that time; at another place or time they would not pay."""
     clips = filmed(lambda t: [ball_at(t)], TIMES, 7)
-    for time in TIMES:
-        views = views_at(clips, time)
-        found = [hull_gaussians(views, *hull, 4) for hull in hulls_in(views, LOW, HIGH)]
-        now = max(found, key=len)
+    hulls = [hulls_in(views_at(clips, time), LOW, HIGH) for time in TIMES]
+    (track,) = linked(TIMES, hulls)
+    assert [time for time, _ in track] == list(TIMES)
+    assert travels(track)
+    shape = surface([hull for _, hull in track])
+    for time, hull in track:
+        now = hull_gaussians(views_at(clips, time), hull.center, *shape, 4)
         assert pays(now, time, clips)
         ball = ball_at(time)
         apart = (now.means - torch.tensor(ball.center)).norm(dim=1)
@@ -151,6 +159,28 @@ def test_gaussians_cover_a_ball_at_each_time_and_pay() -> None:
         beside = now.replace(means=now.means + torch.tensor([0.0, 0.9, 0.0]))
         assert not pays(beside, time, clips)
         assert not pays(now, TIMES[0] if time > 0.5 else TIMES[-1], clips)
+
+
+def test_what_jumps_to_and_fro_does_not_travel() -> None:
+    cubes = np.argwhere(np.ones((3, 3, 3))) - 1.0
+    places = [(0.0, 0, 0), (4.0, 0, 0)] * 4
+    assert not travels([(i / 7, Hull(cubes + place, 1.0)) for i, place in enumerate(places)])
+
+
+def test_two_that_cross_are_told_apart_and_may_be_lost_for_a_while() -> None:
+    cubes = np.argwhere(np.ones((3, 3, 3))) - 1.0
+    hulls = [
+        [
+            Hull(cubes + np.array(place), 1.0)
+            for place in ((4 * i, 2 * i, 0), (4 * i, 20 - 2 * i, 0))
+        ]
+        for i in range(11)
+    ]
+    hulls[3] = hulls[3][1:]
+    first, second = linked([i / 10 for i in range(11)], hulls)
+    assert (len(first), len(second)) == (10, 11)
+    assert first[-1][1].center[1] == 20
+    assert second[-1][1].center[1] == 0
 
 
 def started(balls: Balls, count: int = 6, limit: int = 600) -> list[TimedGaussians]:
@@ -166,7 +196,7 @@ def test_one_ball_begins_at_each_time() -> None:
     for time in TIMES:
         now = [one for one in found if one.time == time]
         center = torch.cat([one.gaussians.means for one in now]).median(0).values
-        assert (center - torch.tensor(crossing(time))).norm() < 0.15
+        assert (center - torch.tensor(crossing(time))).norm() < 0.1
 
 
 @pytest.mark.parametrize(("count", "limit"), [(6, 600), (1, 600), (6, 0)])

@@ -23,10 +23,10 @@ GAP = 1 / 9  # ``tiny_setup`` has ten times
 def field_of(
     centers: list[float], spans: list[float], velocities: list[list[float]]
 ) -> FreePrimitives:
-    start = FreeStart(torch.zeros(0), (), torch.tensor(centers), torch.tensor(spans))
-    field = FreePrimitives(FreeField(), tiny_setup(len(centers)), torch.Generator()).started(start)
-    field.parameters["velocities"].data.copy_(torch.tensor(velocities))
-    return field
+    start = FreeStart(
+        torch.zeros(0), (), torch.tensor(centers), torch.tensor(spans), torch.tensor(velocities)
+    )
+    return FreePrimitives(FreeField(), tiny_setup(len(centers)), torch.Generator()).started(start)
 
 
 def test_paths_are_straight_and_windows_follow_their_definition() -> None:
@@ -90,13 +90,16 @@ def test_static_gaussians_are_copied_over_the_clip_and_moments_have_their_times(
     still = cloud(3)
     thing = cloud(5)
     others = cloud(4)
-    start = free_start(still, [TimedGaussians(0.25, thing)], others, num_times=10)
+    velocity = torch.tensor([1.0, 0.0, 2.0])
+    start = free_start(still, [TimedGaussians(0.25, thing, velocity)], others, num_times=10)
     assert [len(x) for x in start.added] == [3] * 9 + [5, 4]
-    assert len(start.centers) == len(start.spans) == 30 + 5 + 4
+    assert len(start.centers) == len(start.spans) == len(start.velocities) == 30 + 5 + 4
     assert start.centers[:30:3].tolist() == pytest.approx([0.05 + 0.1 * i for i in range(10)])
     assert (start.spans[:30] == 0.1).all()
     assert (start.centers[30:35] == 0.25).all()
     assert (start.spans[30:35] < GAP).all()
+    assert torch.equal(start.velocities[30:35], velocity.expand(5, 3))
+    assert not start.velocities[35:].any()
 
 
 def test_a_rolling_ball_before_fixed_cameras_is_learned(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ def filled(count: int, *values: float) -> Tensor:
 def score(script: Callable[[Tensor, float], Offsets], px_size: Tensor | None = None) -> Tensor:
     gaussians = cloud(4)
     size = torch.ones(4) if px_size is None else px_size
-    return measure_motion(Scripted(script), gaussians, TIMES, size).pixels
+    return measure_motion(Scripted(script), gaussians, TIMES, size)[0]
 
 
 def still(means: Tensor) -> Tensor:
@@ -50,7 +50,7 @@ def test_a_circle_counts_by_its_radius() -> None:
         return Offsets(filled(len(means), *turn.tolist()))
 
     even = tuple(i / 16 for i in range(16))
-    found = measure_motion(Scripted(circle), cloud(4), even, torch.ones(4)).pixels
+    found = measure_motion(Scripted(circle), cloud(4), even, torch.ones(4))[0]
     torch.testing.assert_close(found, torch.full((4,), 0.2))
 
 
@@ -92,7 +92,7 @@ def test_baking_freezes_at_the_mean(everything: bool) -> None:
     """Rows that are baked look as the field shows them on average; the others do not change."""
     gaussians = cloud()
     field = stirred_field("control_nodes", everything=everything)
-    mean = measure_motion(field, gaussians, TIMES, torch.ones(9)).mean
+    mean = measure_motion(field, gaussians, TIMES, torch.ones(9))[1]
     samples = [field.offsets(gaussians.means, t).means.detach() for t in TIMES]
     torch.testing.assert_close(mean.means, torch.stack(samples).mean(0))
     rows = torch.tensor([1, 4, 8])

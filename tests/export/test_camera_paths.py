@@ -1,9 +1,8 @@
-"""Files of camera paths, our own and of other programs, cameras between keyframes, and times."""
+"""Files of camera paths, cameras between keyframes, and times."""
 
 from __future__ import annotations
 
 import json
-import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.data.aim import look_at
+from dyngs.data.geometry import look_at
 from dyngs.export.camera_paths import (
     Keyframes,
     interpolate_keyframes,
@@ -59,57 +58,6 @@ def test_the_examples_of_the_documentation_are_read(tmp_path: Path) -> None:
     assert keys.times is not None
     assert (keys.times[0], keys.times[-1]) == (0.0, 0.5)
     assert torch.equal(keys.cameras.cam_from_world[0], keys.cameras.cam_from_world[59])
-
-
-# Paths of other programs: the cameras that each program means.
-
-WIDTH, HEIGHT, FOCAL = 96, 72, 80.0
-EYES = [
-    look_at(np.array([3 * math.cos(a), 3 * math.sin(a), 1 + 0.2 * a]), np.zeros(3), UP)
-    for a in (0.1, 0.9, 2.0)
-]
-"""Camera to world, OpenCV's axes."""
-OPENGL = [eye @ np.diag([1.0, -1, -1, 1]) for eye in EYES]
-FOV = math.degrees(2 * math.atan(HEIGHT / 2 / FOCAL))
-
-
-def nerfstudio(**more: Any) -> dict[str, Any]:
-    views = [
-        {"camera_to_world": pose.ravel().tolist(), "fov": FOV, "render_time": 0.25 * i}
-        for i, pose in enumerate(OPENGL)
-    ]
-    size = {"camera_type": "perspective", "render_width": WIDTH, "render_height": HEIGHT}
-    others = {"seconds": 0.25, "default_fov": 50, "keyframes": [{"fov": FOV}]}
-    return size | others | {"fps": 12, "camera_path": views} | more
-
-
-def transforms(poses: list[Any] = OPENGL, **more: Any) -> dict[str, Any]:
-    frames = [{"transform_matrix": pose.tolist()} for pose in poses]
-    return {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "frames": frames} | more
-
-
-@pytest.mark.parametrize(
-    "document",
-    [
-        pytest.param(nerfstudio(), id="camera_path.json"),
-        pytest.param(transforms(), id="transforms.json"),
-        pytest.param(transforms([pose.ravel() for pose in OPENGL]), id="16 numbers"),
-        pytest.param(transforms([pose[:3].ravel() for pose in OPENGL]), id="12 numbers"),
-    ],
-)
-def test_cameras_are_those_that_were_meant(document: Any, tmp_path: Path) -> None:
-    path = read_path(written(tmp_path, document))
-    cameras = path.cameras
-    assert (cameras.width, cameras.height) == (WIDTH, HEIGHT)
-    poses = np.linalg.inv(np.stack(EYES))
-    np.testing.assert_allclose(cameras.cam_from_world.numpy(), poses, atol=1e-5)
-    wanted = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
-    np.testing.assert_allclose(cameras.intrinsics.numpy(), [wanted] * 3, atol=1e-4)
-    if "camera_path" in document:
-        assert (path.fps, path.times) == (12.0, (0.0, 0.25, 0.5))
-        assert "dataparser_transforms.json" in path.notes[0]
-    else:
-        assert (path.fps, path.times, path.notes) == (30.0, None, ())
 
 
 # Keyframes in files.
@@ -170,10 +118,6 @@ SPINE = keyed([key(0), key(1)])
         (GOOD | {"frames": [FRAME | {"time": "late"}]}, "'time'"),
         (GOOD | {"keyframes": [FRAME]}, "one non-empty list"),
         (GOOD | {"frames": [FRAME, FRAME | {"time": 0.5}]}, r"frames\[0\]: 'time' is missing"),
-        (nerfstudio(camera_type="equirectangular"), "equirectangular"),
-        (nerfstudio(camera_path=[{"camera_to_world": [1] * 16, "fov": "wide"}]), "'fov' is 'wide'"),
-        (nerfstudio(render_height=10**400), "'render_height' is 1000"),
-        (transforms(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE"),
         ("frames", "a camera path is a JSON object"),
         (keyed([key(0, time=0.1), key(1)]), r"keyframes\[1\]: 'time' is missing"),
         (keyed([key(0, at=2), key(1, at=2)]), "a later second"),

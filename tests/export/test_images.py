@@ -127,11 +127,6 @@ def test_depth_colours_share_one_range_along_a_path(tmp_path: Path) -> None:
     a, b = (read_image(tmp_path / f"frame_000{i}_depth.png") for i in range(2))
     assert a[9, 8, 0] > 3 * a[9, 8, 2]  # the near ball is red, the far one blue
     assert b[9, 10, 2] > b[9, 10, 0]
-    path = standing(*np.linspace(0, 1, 20).tolist())
-    opened = opened_scene(moving_scene(Sliding()))
-    assert (
-        len(write_path_images(opened, path, tmp_path / "moving", OutputOptions(depth=True))) == 60
-    )
 
 
 def test_split_of_a_run(run: Opened, tmp_path: Path) -> None:

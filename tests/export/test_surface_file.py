@@ -89,9 +89,9 @@ def test_a_moving_scene_has_a_mesh_for_each_time(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ("--cells 7", "--cells 7: give 8 to 1024"),
-        ("--level 2", "--level goes with --format mesh of a radiance field"),
-        ("--segments 3", "--segments goes with --format mesh of curved triangles"),
+        ("--cells 7", "--cells: '7' is not a number of cells"),
+        ("--level 2", "--level does not go with the mesh"),
+        ("--segments 3", "--segments does not go with the mesh"),
         (
             "--out x.stl",
             r"x\.stl: a mesh of a surface is one file that ends in \.ply, \.glb, \.obj",

@@ -61,9 +61,9 @@ def test_a_gpu_that_can_be_used_is(machine: pytest.MonkeyPatch) -> None:
     assert why_on_cpu("auto") is None
     assert findings() == {
         "torch for": "CUDA 13.0",
-        "kernels for GPUs": "built with CUDA 13.0",
-        "driver": "knows CUDA 13.2",
-        "GPU": "GPU, compute capability 9.0, 8 GB",
+        "kernels for GPUs": "built",
+        "driver": "there",
+        "GPU": "GPU, 8 GB",
     }
 
 
@@ -90,7 +90,6 @@ def test_kernels_that_cannot_be_loaded(machine: pytest.MonkeyPatch) -> None:
 
     machine.setattr(device, "cuda_core", fail)
     assert "(broken)" in refused()
-    assert "(broken)" in findings()["kernels for GPUs"]
 
 
 def test_a_driver_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:

@@ -11,34 +11,24 @@ import numpy as np
 import pytest
 import torch
 from moving_scene import (
-    MOVING_ROWS,
     TEST_TIMES,
     TRAIN_TIMES,
     camera,
     write_moving_run,
 )
 from pretend_gpu import GPU, pretend_gpu
-from scene_kinds import scene_of_kind
-from splat_scenes import cloud
-from view_sessions import balls, looking_at_balls, opened_at
+from view_sessions import balls, looking_at_balls
 
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError
-from dyngs.data.aim import look_at
+from dyngs.data.geometry import look_at
 from dyngs.export.images import render_frame
-from dyngs.gaussians import levels
-from dyngs.gaussians.levels import LevelScene
-from dyngs.gaussians.static_scene import StaticScene
 from dyngs.runs.opened import Opened, open_run, open_scene
-from dyngs.view.controls import Frusta, distinct, frustum_size
+from dyngs.view.controls import Frusta
 from dyngs.view.layers import (
     LAYERS,
     PARTS,
     Shot,
-    coarser,
     draw,
-    motion_colours,
-    shows_filled,
 )
 from dyngs.view.views import (
     Viewpoint,
@@ -77,35 +67,6 @@ def test_a_gpu_draws_every_layer_alike(run: Opened, layer: str) -> None:
         assert np.array_equal(a, b)
 
 
-def test_many_gaussians_are_drawn_in_levels_while_anything_moves(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(levels, "BLOCK", 16)
-    whole = opened_at(StaticScene(gaussians=cloud(2000)))
-    opened = coarser(whole, 300)
-    shot = Shot(camera(80, 56))
-    assert "at most 300 Gaussians" in opened.notes[-1]
-    few = render_frame(LevelScene.of(whole.renderable, 300), camera(80, 56), None).rgb
-    coarse = draw(opened, replace(shot, is_moving=True))
-    assert np.abs(coarse / 255.0 - few).max() <= 0.5 / 255 + 1e-6
-    assert not np.array_equal(coarse, draw(whole, shot))
-    assert np.array_equal(draw(whole, replace(shot, is_moving=True)), draw(whole, shot))
-    for same in (shot, replace(shot, is_moving=True, part="still")):
-        assert np.array_equal(draw(opened, same), draw(whole, same))
-    edited = opened.showing(opened.scene.select(torch.arange(1000)))
-    assert np.array_equal(draw(edited, replace(shot, is_moving=True)), draw(edited, shot))
-    with pytest.raises(DyngsError, match="for still scenes"):
-        coarser(balls(), 300)
-
-
-def test_motion_is_red_where_it_is_far_and_dark_where_nothing_moves() -> None:
-    colours = motion_colours(balls())
-    moving = colours[list(MOVING_ROWS)]
-    assert bool((moving[:, 0] > moving[:, 2]).all())
-    assert bool((colours[0] == colours[2]).all())
-    assert not bool(torch.isclose(moving[0], colours[0]).all())
-
-
 def test_the_moment_of_a_time_is_computed_once() -> None:
     opened = balls()
     asked = opened.scene.field  # type: ignore[attr-defined]
@@ -126,22 +87,6 @@ def test_the_line_divides_render_and_truth(run: Opened) -> None:
     assert np.array_equal(both[:, :31], render[:, :31])
     assert np.array_equal(both[:, 33:], truth[:, 33:])
     assert not np.array_equal(render, truth)
-
-
-def test_what_no_training_view_shows_of_a_person_is_marked() -> None:
-    scene = scene_of_kind("human")
-    opened = opened_at(scene, "person")
-    assert not shows_filled(opened)
-    seen = torch.ones(len(scene))
-    plain = draw(opened_at(replace(scene, seen=seen)), Shot(camera(80, 56), layer="filled"))
-    assert np.array_equal(plain, draw(opened, Shot(camera(80, 56)))), "all was seen"
-    nothing = opened_at(replace(scene, seen=0 * seen))
-    assert shows_filled(nothing)
-    marked = draw(nothing, Shot(camera(80, 56), layer="filled")).astype(int)
-    covered = draw(opened, Shot(camera(80, 56), layer="alpha"))[..., 0] > 250
-    assert covered.any()
-    assert (marked[covered] >= [240, 0, 240]).all()
-    assert (marked[covered][:, 1] < 20).all(), "magenta"
 
 
 def looking(
@@ -177,26 +122,13 @@ def test_the_nearest_view_is_near_in_place_direction_and_time(tmp_path: Path) ->
     opened = open_scene(write_moving_run(tmp_path))
     shown = views_of(opened)
     for index in range(len(shown)):
-        time = shown.times[index] or 0.0
+        time = shown.views[index].time or 0.0
         assert nearest_view(opened, shown.cameras[index], time) == index
-    assert set(shown.times) == {*TRAIN_TIMES, *TEST_TIMES}
+    assert {view.time for view in shown.views} == {*TRAIN_TIMES, *TEST_TIMES}
     assert has_timeline(opened)
     begin = viewpoint_of(opened)
     assert torch.equal(begin.start.cam_from_world, shown.cameras[0].cam_from_world)
     assert views_of(replace(opened, as_captured=False)).images is None
-
-
-@pytest.mark.parametrize("unit", [1.0, 1e-9])
-def test_a_fixed_camera_has_one_frustum_of_a_size_that_fits(unit: float) -> None:
-    poses = np.tile(np.eye(4), (6, 1, 1))
-    poses[[1, 3], 0, 3] = unit
-    poses[5, 2, 3] = 2.0 * unit
-    assert distinct(poses) == [0, 1, 5]
-    poses = np.tile(np.eye(4), (4, 1, 1))
-    assert frustum_size(poses, 4.0) == pytest.approx(0.2)  # one fixed camera
-    poses[:, 0, 3] = [-1, 1, -1, 1]
-    assert frustum_size(poses, 4.0) == pytest.approx(0.15)
-    assert frustum_size(100 * poses, 4.0) == pytest.approx(0.2)
 
 
 def test_a_frustum_that_the_camera_stands_in_is_hidden() -> None:

@@ -28,13 +28,12 @@ from dyngs.view.session import (
     Drawer,
     Eye,
     Keyframe,
-    Pace,
     Recording,
     Sent,
     Session,
     Timeline,
 )
-from dyngs.view.views import camera_at, pose_of
+from dyngs.view.views import pose_of
 
 
 class Clock:
@@ -68,21 +67,6 @@ class Looked:
             self.clock.now += 0.05
 
 
-@pytest.mark.parametrize(
-    ("fixed", "per_pixel", "area"),
-    [(0.01, 1e-6, 60_000 / 0.7), (1e-4, 1e-9, 480_000), (0.0, 1.0, 320 * 240)],
-)
-def test_images_take_as_long_as_they_may(fixed: float, per_pixel: float, area: float) -> None:
-    pace = Pace(0.07 if area < 320 * 240 else fixed + per_pixel * area, longest=1.0)
-    for _ in range(40):
-        pixels = min(pace.area, 480_000)
-        pace.observe(pixels, fixed + per_pixel * pixels)
-    assert min(pace.area, 480_000) == pytest.approx(area, rel=0.05)
-    assert pace.largest == pytest.approx(
-        max(pixels / (fixed + per_pixel * pixels), pace.area), rel=0.05
-    )
-
-
 def test_small_while_moving_then_whole_and_then_nothing_until_something_changes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -105,34 +89,11 @@ def test_small_while_moving_then_whole_and_then_nothing_until_something_changes(
     looked.after(0.1)
     assert looked.sent[-1].is_refined
     assert looked.sent[-1].image.shape == (900, 1200, 3)
-    refined = [sent.image.size for sent in looked.sent if sent.is_refined]
-    assert refined == sorted(set(refined))
-    assert len(refined) > 1, "in steps"
-    assert [shot.is_moving for shot in shots] == [not sent.is_refined for sent in looked.sent]
     assert looked.session.due() is None
     looked.session.move(eye(size=(1200, 900)))  # the same
     assert looked.session.due() is None
     looked.session.change(layer="alpha")
     assert looked.session.due() == 0.0
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"wxyz": (0.0, 0.0, 0.0, 0.0)},
-        {"wxyz": (float("nan"), 0.0, 0.0, 1.0)},
-        {"position": (0.0, float("inf"), 0.0)},
-        {"fov": 0.0},
-        {"size": (0, 40)},
-    ],
-)
-def test_cameras_that_cannot_be_are_ignored(change: dict[str, Any]) -> None:
-    looked = Looked()
-    assert not looked.session.move(replace(eye(), **change))
-    assert looked.session.due() is None
-    looked.session.move(eye())
-    assert not looked.session.move(replace(eye(), **change))
-    assert looked.session.eye == eye()
 
 
 def test_a_playing_scene_is_drawn_on_and_on_and_a_still_one_is_not() -> None:
@@ -142,7 +103,7 @@ def test_a_playing_scene_is_drawn_on_and_on_and_a_still_one_is_not() -> None:
     looked.after(1)
     assert looked.session.due() is None
     before = len(looked.sent)
-    looked.session.change_timeline(playing=True, loops=False)
+    looked.session.change_timeline(playing=True)
     images = []
     for _ in range(4):
         looked.clock.now += 1.0
@@ -150,9 +111,8 @@ def test_a_playing_scene_is_drawn_on_and_on_and_a_still_one_is_not() -> None:
         images.append(looked.sent[-1].image)
     assert len(looked.sent) == before + 4
     assert not np.array_equal(images[0], images[1])
-    looked.after(5)
-    assert not looked.session.timeline.playing  # the end
-    assert looked.session.time == 1.0
+    looked.session.change_timeline(playing=False)
+    looked.after(1)
     looked.after(1)
     assert looked.session.due() is None
     still = Looked(still_scene())
@@ -163,32 +123,17 @@ def test_a_playing_scene_is_drawn_on_and_on_and_a_still_one_is_not() -> None:
     assert still.session.due() is None
 
 
-def test_a_preview_shows_the_recorded_cameras_and_then_the_browser_s_own() -> None:
-    looked = Looked()
-    looked.session.move(eye())
-    looked.after(1)
-    far = camera_at(pose_of(camera())[0], (0, 0, -9), 0.7, (400, 300))
-    looked.session.preview(Recording((Keyframe(far, 0.5, 1.0), Keyframe(far, 0.5, 1.0))))
-    shot = looked.session.shot()
-    assert torch.allclose(shot.camera.cam_from_world, far.cam_from_world, atol=1e-6)
-    assert shot.time == pytest.approx(0.5)
-    looked.after(2)
-    own = looked.session.shot().camera.cam_from_world
-    assert torch.allclose(own, eye().camera().cam_from_world)
-
-
 def test_jobs_and_who_has_gone() -> None:
     looked = Looked()
     done = list[int]()
     looked.session.move(eye())
-    for number in (1, 2, 3):  # of jobs of a kind the newest is done
-        looked.session.ask(lambda number=number: done.append(number), "pose")
-    looked.session.ask(lambda: done.append(4))
+    for number in (1, 2):
+        looked.session.ask(lambda number=number: done.append(number))
     looked.after(1)
-    assert done == [3, 4]
+    assert done == [1, 2]
     count = len(looked.sent)
     looked.session.ask(lambda: pytest.fail("asked"))
-    looked.session.close()
+    looked.session.closed = True
     assert looked.session.due() is None
     looked.session.draw_next()
     assert len(looked.sent) == count
@@ -217,9 +162,6 @@ def test_the_timeline() -> None:
     assert playing.changed(11.0, playing=False).at(50.0) == pytest.approx(0.75)
     loop = Timeline(seconds=2).changed(0.0, playing=True)
     assert loop.at(2.5) == pytest.approx(0.25)
-    once = loop.changed(0.0, loops=False)
-    assert once.at(2.5) == 1.0
-    assert once.changed(3.0, playing=False).changed(5.0, playing=True).at(5.0) == 0.0
     one = Session(opened(), lambda sent: None)
     for chosen, shown in ((7.0, 1.0), (-7.0, 0.0)):
         one.set_time(chosen)
@@ -238,9 +180,7 @@ def placed(frame: Similarity = UNMOVED, offset: tuple[float, ...] = (10.0, -20.0
 
 
 @pytest.mark.parametrize("loops", [False, True])
-def test_dyngs_render_reads_what_was_recorded_and_sees_what_was_previewed(
-    tmp_path: Path, loops: bool
-) -> None:
+def test_dyngs_render_reads_what_was_recorded(tmp_path: Path, loops: bool) -> None:
     keys = (
         Keyframe(at_depth(4), 0.0, 1.0),
         Keyframe(at_depth(6), 0.5, 2.0),
@@ -255,11 +195,11 @@ def test_dyngs_render_reads_what_was_recorded_and_sees_what_was_previewed(
     assert (cameras.width, cameras.height, path.fps) == (20, 14, 10.0)
     assert path.times is not None
     assert len(path) == (40 if loops else 31)
-    for frame in (0, 7, 10, 25, len(path) - 1):
-        shown, moment = recording.at(frame / 10)
-        assert moment == pytest.approx(path.times[frame], abs=1e-6)
-        assert torch.allclose(cameras.cam_from_world[frame], shown.cam_from_world[0], atol=1e-4)
-        focal = float(shown.intrinsics[0, 1, 1]) / 2
+    for frame, key in zip((0, 10, 30), keys, strict=True):
+        assert path.times[frame] == pytest.approx(key.time, abs=1e-6)
+        wanted = key.camera.cam_from_world[0]
+        assert torch.allclose(cameras.cam_from_world[frame], wanted, atol=1e-4)
+        focal = float(key.camera.intrinsics[0, 1, 1]) / 2
         assert float(cameras.intrinsics[frame, 1, 1]) == pytest.approx(focal)
 
 
@@ -276,7 +216,7 @@ def test_a_path_through_a_moved_still_scene(tmp_path: Path) -> None:
 
 def test_each_gets_a_turn_and_the_thread_ends() -> None:
     before = threading.active_count()
-    drawer = Drawer(lambda session, message: None)
+    drawer = Drawer()
     browsers = [looking_at_balls() for _ in range(3)]
     drawer.start()
     for one, _ in browsers:
@@ -296,13 +236,14 @@ def test_each_gets_a_turn_and_the_thread_ends() -> None:
 
 def test_a_fault_of_one_is_told_once_and_the_others_go_on() -> None:
     told: list[tuple[Session, str]] = []
-    drawer = Drawer(lambda session, message: told.append((session, message)))
+    drawer = Drawer()
     (bad, _), (worse, _), (good, sent) = (looking_at_balls() for _ in range(3))
 
     def fail(error: Exception) -> None:
         raise error
 
     for one in (bad, worse, good):
+        one.on_error = lambda message, one=one: told.append((one, message))
         drawer.add(one)
     for _ in range(20):
         bad.ask(lambda: fail(DyngsError("no such file")))

@@ -1,4 +1,4 @@
-"""What can be looked at: folders of runs, networks of people, people in motion, and training."""
+"""What can be looked at: folders of runs, motion files, and training."""
 
 from __future__ import annotations
 
@@ -7,29 +7,17 @@ import threading
 from pathlib import Path
 
 import pytest
-import torch
 from moving_scene import write_moving_run
-from scene_kinds import scene_of_kind
-from tiny_people import NET, people
-from view_sessions import looking_at_balls, opened_at
+from view_sessions import looking_at_balls
 
 import dyngs
 from dyngs.core.errors import DyngsError
-from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.runs.opened import Opened
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
-from dyngs.view.controls import (
-    AS_CAPTURED,
-    AT_REST,
-    BY_SLIDERS,
-    MAIN_JOINTS,
-    in_motion,
-    motion_files,
-)
+from dyngs.view.controls import motion_files
 from dyngs.view.session import Drawer, Session
-from dyngs.view.source import first_of, open_network, open_source
+from dyngs.view.source import first_of, open_source
 from dyngs.view.training import DrawnBetweenSteps, opened_training
 
 
@@ -52,53 +40,8 @@ def test_a_folder_of_runs_is_a_picker(tmp_path: Path) -> None:
 def test_where_nothing_is_to_be_seen_one_line_says_so(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="no runs there"):
         open_source(tmp_path)
-    with pytest.raises(DyngsError, match="no such run"):
-        open_source(tmp_path / "nothing")
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a person, and a network that has hardly been trained on them."""
-    root = tmp_path_factory.mktemp("network")
-    options = [
-        f"data.root={people(root / 'people', (1,))}",
-        f"run.dir={root / 'net'}",
-        "train.steps=1",
-    ]
-    options += [f"model.{name}={getattr(NET, name)}" for name in ("resolution", "source_views")]
-    options += ["run.threads=1"]
-    dyngs.train(dyngs.load_config("human_predictor", options))
-    return root
-
-
-def test_a_person_is_predicted_from_the_images_that_are_picked(folder: Path) -> None:
-    source = open_source(folder / "net")
-    assert source.network is not None
-    person = source.names[0]
-    names = source.network.images_of(person)
-    opened = source.network.predict(person, names[:2])
-    assert opened.person is not None
-    assert all(name in opened.notes[-1] for name in names[:2])
-
-
-def test_one_person_may_be_given(folder: Path) -> None:
-    one = next((folder / "people").iterdir())
-    assert list(open_network(folder / "net", one).people) == [one.name]
-    with pytest.raises(DyngsError, match="--capture goes with"):
-        open_source(folder / "people", capture=one)
-
-
-@pytest.fixture
-def opened() -> Opened:
-    return opened_at(scene_of_kind("human"), "person")
-
-
-def test_sliders_at_zero_are_the_rest_pose(opened: Opened) -> None:
-    rest = in_motion(opened, AT_REST, {}, {"neck": (90.0, 0, 0)})  # sliders do not count
-    zero = in_motion(opened, BY_SLIDERS, {}, {"neck": (0.0, 0, 0)})
-    assert rest.scene.is_static
-    assert torch.allclose(rest.scene.at(None).means, zero.scene.at(None).means, atol=1e-6)
-    assert in_motion(opened, AS_CAPTURED, {}, {}) is opened
+    with pytest.raises(DyngsError, match="no such file"):
+        first_of(open_source(tmp_path / "nothing"))
 
 
 def test_motion_files_are_found_by_suffix(tmp_path: Path) -> None:
@@ -108,21 +51,9 @@ def test_motion_files_are_found_by_suffix(tmp_path: Path) -> None:
     assert list(motion_files(tmp_path)) == ["b/run.BVH", "walk.npz"]
     assert list(motion_files(tmp_path / "walk.npz")) == ["walk.npz"]
     assert motion_files(None) == {}
-    with pytest.raises(DyngsError, match="no such file"):
-        motion_files(tmp_path / "nothing")
     (tmp_path / "empty").mkdir()
     with pytest.raises(DyngsError, match="no motion files"):
         motion_files(tmp_path / "empty")
-
-
-def test_a_motion_that_cannot_be_read_is_one_line(opened: Opened, tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match=r"--motion .*walk\.npz"):
-        in_motion(opened, "walk.npz", {"walk.npz": tmp_path / "walk.npz"}, {})
-
-
-def test_every_body_has_the_main_joints() -> None:
-    for rows in SMPLX_ROWS.values():
-        assert {JOINT_NAMES.index(name) for name in MAIN_JOINTS} <= set(rows)
 
 
 class Onlooker:
@@ -130,7 +61,7 @@ class Onlooker:
     keeps still."""
 
     def __init__(self) -> None:
-        self.drawer = Drawer(lambda session, message: pytest.fail(message))
+        self.drawer = Drawer()
         # an image is due after each step, however fast the machine is
         ticks = itertools.count(step=100.0)
         self.clock = lambda: next(ticks)
@@ -147,6 +78,7 @@ class Onlooker:
                     session = Session(
                         first, lambda sent: self.seen.append(sent.image.tobytes()), clock=self.clock
                     )
+                    session.on_error = pytest.fail
                     self.drawer.add(session)
                 for session in self.drawer.sessions:
                     session.change(divide=event.step / 1000)
@@ -179,7 +111,7 @@ def test_training_gives_the_same_bytes_whoever_looks(
 def test_images_take_no_more_than_their_share() -> None:
     threads = threading.active_count()
     now = [0.0]
-    drawer = Drawer(lambda session, message: None)
+    drawer = Drawer()
     session, sent = looking_at_balls()
     scene = session.opened.scene
 

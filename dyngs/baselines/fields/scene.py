@@ -8,7 +8,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
@@ -28,6 +28,7 @@ from dyngs.models.renderable import (
     Renderable,
     Rendering,
     Surface,
+    SurfaceOptions,
     TimeStep,
     composited,
     fixed_cameras,
@@ -197,6 +198,10 @@ class FieldScene(Renderable):
     seen_at: tuple[float, ...] = ()
     options: DrawOptions = dataclasses.field(default_factory=DrawOptions)
     background: Tensor | None = None
+    surface_options: ClassVar[frozenset[str]] = frozenset({"level", "cells"})
+
+    def own_surface(self, time: float, options: SurfaceOptions) -> Surface:
+        return surface_of(self, time, options.level, options.cells)
 
     @property
     def times(self) -> tuple[float, ...]:

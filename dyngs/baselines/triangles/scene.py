@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from dyngs.baselines.triangles.keys import BgTriangleModel
-from dyngs.baselines.triangles.patches import CORNERS, Patches
+from dyngs.baselines.triangles.patches import CORNERS, Patches, evaluated
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0
+from dyngs.core.gaussians import storage_order
 from dyngs.core.state import Role, State, StateTensor, prefixed
 from dyngs.core.tensor_checks import require_positive, require_tensor
 from dyngs.models.checkpoint import Checkpoint
@@ -21,6 +23,8 @@ from dyngs.models.renderable import (
     DrawOptions,
     Renderable,
     Rendering,
+    Surface,
+    SurfaceOptions,
     TimeStep,
     composited,
     fixed_cameras,
@@ -30,6 +34,7 @@ from dyngs.ops.patches import (
     SEGMENTS,
     Places,
     blend_patches,
+    lattice,
     outline_crossings,
     patch_values,
     project_points,
@@ -68,9 +73,51 @@ class TriangleScene(Renderable):
     unit: float
     options: TriangleOptions = dataclasses.field(default_factory=TriangleOptions)
     background: Tensor | None = None
+    surface_options: ClassVar[frozenset[str]] = frozenset({"segments"})
 
     def __len__(self) -> int:
         return len(self.patches)
+
+    @torch.no_grad()
+    def own_surface(self, time: float, options: SurfaceOptions) -> Surface:
+        """Return the surface: of each triangle ``segments``^2 flat ones, with the colours without
+        harmonics.
+
+        Triangles do not share vertices, as they do not in the scene. Without ``segments`` they are
+        as many as the scene is drawn with, or as its textures need.
+        """
+        patches = self.patches
+        count = options.segments or max(SEGMENTS, patches.texture)
+        places, faces = lattice(count)
+        vertices = evaluated(patches.points, places)
+        ids = torch.arange(len(patches), dtype=torch.int32, device="cpu").repeat_interleave(
+            len(places)
+        )
+        colours = patches.colours_at(ids, places.to(vertices.dtype).repeat(len(patches), 1))
+        first = torch.arange(len(patches), device="cpu")[:, None, None] * len(places)
+        flat = (faces + first).flatten(0, 1)
+        return Surface(vertices.flatten(0, 1).numpy(), flat.numpy(), colours.clamp(0, 1).numpy())
+
+    def page_lists(self) -> tuple[dict[str, Any], dict[str, tuple[Tensor, Literal[8, 16]]]]:
+        patches = self.patches
+        middles = patches.points.detach()[:, CORNERS].mean(1).float().numpy()
+        order = torch.from_numpy(storage_order(middles, np.zeros(0, dtype=np.int64)))
+        lists: dict[str, tuple[Tensor, Literal[8, 16]]] = {
+            "points": (patches.points[order].flatten(1), 16),
+            "colours": (patches.colours[order].flatten(1), 8),
+        }
+        if patches.sh_degree:
+            lists["rest"] = (patches.harmonics[order].flatten(1), 8)
+        header = {
+            "count": len(self),
+            "frames": 0,
+            "moves": False,
+            "degree": patches.sh_degree,
+            "texture": patches.texture,
+            "segments": self.options.segments,
+            "bounds": self.bounds.tolist(),
+        }
+        return header, lists
 
     @property
     def times(self) -> tuple[float, ...]:

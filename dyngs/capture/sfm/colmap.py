@@ -151,11 +151,6 @@ def quiet_colmap() -> Iterator[None]:
         yield
     except (RuntimeError, ValueError) as error:
         lines = str(error).strip().splitlines()
-        if "database factory" in str(error):
-            # all that COLMAP says where it cannot open or fill one
-            raise ColmapError(
-                "COLMAP can make no database there: free some space, or check the disk"
-            ) from error
         raise ColmapError(
             f"structure from motion failed: {lines[-1] if lines else error}"
         ) from error

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -26,7 +25,6 @@ from dyngs.capture.sfm.colmap import (
     quiet_colmap,
 )
 from dyngs.capture.sfm.frame_choice import STILL, chosen_frames, measured
-from dyngs.capture.sfm.matches import agreement, angles_deg, flat_fraction
 from dyngs.capture.sfm.photos import Photo, copied, gather_photos, lay_out
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, counted
@@ -38,15 +36,97 @@ from dyngs.data.images.video import (
     read_frames,
     read_numbered_frames,
 )
-from dyngs.data.readers.colmap import find_masks, mask_of
+from dyngs.data.readers.transforms import find_masks, mask_of
 from dyngs.data.times import write_seconds
 from dyngs.io.containment import inside, staying_within
 from dyngs.io.fields import first_few
 from dyngs.io.outputs import new_folder
-from dyngs.io.write import write_image, write_text
+from dyngs.io.write import write_image
 
 if TYPE_CHECKING:
     import pycolmap
+
+
+_FITS_PX = 4.0
+"""Median distance from the epipolar lines up to which a pair fits its poses, in pixels of images up
+to 1,000 px."""
+_WELL = 30  # matches of a pair that is looked at
+_MOST_FITTED_PAIRS = 2000
+
+
+def agreement(model: pycolmap.Reconstruction, database: Path, longest_side: int) -> float:
+    """Return the fraction of well matched pairs, of images with a pose, whose verified matches fit
+    the poses."""
+    import pycolmap
+
+    posed = {key: image for key, image in model.images.items() if image.has_pose}
+    rays: dict[int, np.ndarray] = {}
+    fits = []
+    with pycolmap.Database.open(database) as opened:
+        ids, geometries = opened.read_two_view_geometries()
+        found = [
+            (pycolmap.pair_id_to_image_pair(i), g.inlier_matches)
+            for i, g in zip(ids, geometries, strict=True)
+        ]
+        found = [
+            (pair, matches)
+            for pair, matches in found
+            if len(matches) >= _WELL and set(pair) <= posed.keys()
+        ]
+        for (a, b), matches in found[:: max(len(found) // _MOST_FITTED_PAIRS, 1)]:
+            for key in (a, b):
+                if key not in rays:
+                    places = np.asarray(opened.read_keypoints(key))[:, :2].astype(np.float64)
+                    camera = model.cameras[posed[key].camera_id]
+                    rays[key] = np.asarray(camera.cam_from_img(places), np.float64)
+            b_from_a = posed[b].cam_from_world() * posed[a].cam_from_world().inverse()
+            x, y, z = b_from_a.translation / max(float(np.linalg.norm(b_from_a.translation)), 1e-12)
+            essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ b_from_a.rotation.matrix()
+            distances = _sampson(essential, rays[a][matches[:, 0]], rays[b][matches[:, 1]])
+            focal = model.cameras[posed[a].camera_id].mean_focal_length()
+            fits.append(
+                np.nanmedian(distances) * focal <= _FITS_PX * max(longest_side, 1000) / 1000
+            )
+    return float(np.mean(fits)) if fits else 1.0
+
+
+def angles_deg(model: pycolmap.Reconstruction) -> np.ndarray:
+    """Return the largest angle under which each of some 2,000 points is seen from two images, in
+    degrees."""
+    centres = {i: image.projection_center() for i, image in model.images.items() if image.has_pose}
+    angles = []
+    ids = sorted(model.points3D)
+    for key in ids[:: max(len(ids) // 2000, 1)]:
+        point = model.points3D[key]
+        rays = np.array([centres[element.image_id] for element in point.track.elements]) - point.xyz
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True) + 1e-12
+        angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
+    return np.array(angles)
+
+
+def flat_fraction(database: Path) -> float:
+    """Return the fraction of well matched pairs that a homography explains: all of them where the
+    camera only rotated."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        _, geometries = opened.read_two_view_geometries()
+    kinds = [x.config for x in geometries if len(x.inlier_matches) >= _WELL]
+    kind = pycolmap.TwoViewGeometryConfiguration
+    flat = [x.value for x in (kind.PLANAR, kind.PANORAMIC, kind.PLANAR_OR_PANORAMIC)]
+    return float(np.isin(kinds, flat).mean()) if kinds else 0.0
+
+
+def _sampson(matrix: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the Sampson distances (M,) of places (M, 2) to a (3, 3) fundamental or essential
+    matrix."""
+    a = np.c_[first, np.ones(len(first))]
+    b = np.c_[second, np.ones(len(second))]
+    lines_b = a @ matrix.T
+    lines_a = b @ matrix
+    slope = (lines_b[:, :2] ** 2).sum(1) + (lines_a[:, :2] ** 2).sum(1)
+    return np.abs((b * lines_b).sum(1)) / np.sqrt(np.maximum(slope, 1e-18))
+
 
 _NUM_FRAMES = 100
 _SMALL_ANGLE_DEG = 1.0
@@ -83,22 +163,6 @@ class SfmResult:
             lines.append("no pose for " + first_few(self.unregistered))
         return "\n".join((*lines, *self.notes))
 
-    def write(self, folder: Path) -> None:
-        """Write the result, without its folder, to ``sfm_report.json``."""
-        fields = asdict(self)
-        del fields["root"]
-        write_text(folder / "sfm_report.json", json.dumps(fields, indent=1) + "\n")
-
-
-@dataclass(frozen=True)
-class _Images:
-    """The images in ``capture/images``, names of those that are blurred, and lines on what was
-    taken."""
-
-    photos: list[Photo]
-    blurred: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-
 
 def estimate_poses(
     source: Path,
@@ -132,16 +196,14 @@ def estimate_poses(
 def _posed_in(
     capture: Path, source: Path, out: Path, options: SfmOptions, report: ReportProgress
 ) -> SfmResult:
+    blurred: list[str] = []
     if source.is_file():
-        images = _frames_of(source, capture, options, report)
+        photos, notes, blurred = _frames_of(source, capture, options, report)
     else:
-        gathered, left_out = gather_photos(source, capture / "images", out)
-        images = _Images(gathered, notes=left_out)
-    photos = images.photos
+        photos, notes = gather_photos(source, capture / "images", out)
     if len(photos) < 3:
-        found = "; ".join((f"{source} has {counted(len(photos), 'image')}", *images.notes))
+        found = "; ".join((f"{source} has {counted(len(photos), 'image')}", *notes))
         raise DyngsError(f"{found}; structure from motion needs at least 3, better 30")
-    notes = [*images.notes]
     with quiet_colmap():
         masks = options.masks
         with nullcontext() if masks is None else staying_within(masks, options.follow_links):
@@ -162,15 +224,13 @@ def _posed_in(
     _require_depth(model, task)
     own = dict(zip(task.names, (photo.name for photo in photos), strict=True))
     missing = _write_model(model, capture, own)
-    notes += _advice(missing, images.blurred, task.is_video)
+    notes += _advice(missing, blurred, task.is_video)
     count = len(photos)
     points = model.reconstruction.num_points3D()
-    result = SfmResult(
+    shutil.rmtree(task.images.parent)
+    return SfmResult(
         out, count, count - len(missing), missing, points, model.error_px, tuple(notes)
     )
-    result.write(capture)
-    shutil.rmtree(task.images.parent)
-    return result
 
 
 def _laid_out(
@@ -244,7 +304,9 @@ def _advice(unregistered: Sequence[str], blurred: Sequence[str], is_video: bool)
         yield f"{len(blurred)} images are much less sharp than the others ({first_few(blurred)}): {more}"
 
 
-def _frames_of(video: Path, capture: Path, options: SfmOptions, report: ReportProgress) -> _Images:
+def _frames_of(
+    video: Path, capture: Path, options: SfmOptions, report: ReportProgress
+) -> tuple[list[Photo], list[str], list[str]]:
     """Frames of a video, chosen by ``frame_choice``; their seconds are written, too.
 
     Two passes, so that only one image is held in memory: the first one measures.
@@ -265,8 +327,8 @@ def _frames_of(video: Path, capture: Path, options: SfmOptions, report: ReportPr
         report("frames of the video", len(photos), len(names))
     seconds = frame_seconds(video, len(measures))
     write_seconds(capture, {name: seconds[index] for index, name in names.items()})
-    notes = (*colour_notes([probe_video(video)]), choice.summary())
-    return _Images(photos, tuple(names[index] for index in choice.blurred), notes)
+    notes = [*colour_notes([probe_video(video)]), choice.summary()]
+    return photos, notes, [names[index] for index in choice.blurred]
 
 
 # Features, and which images are compared

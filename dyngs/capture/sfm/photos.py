@@ -6,7 +6,6 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -15,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, reading
-from dyngs.data.images.colour_space import UNSPECIFIED, ColourTags, to_srgb
+from dyngs.core.errors import DyngsError, counted, reading
 from dyngs.data.images.images import (
     END_MARKERS,
     SUFFIXES,
@@ -27,7 +25,13 @@ from dyngs.data.images.images import (
     read_image,
     read_mask,
 )
-from dyngs.data.images.video import DECODER_VERSION, VIDEO_SUFFIXES
+from dyngs.data.images.video import (
+    DECODER_VERSION,
+    UNSPECIFIED,
+    VIDEO_SUFFIXES,
+    ColourTags,
+    to_srgb,
+)
 from dyngs.io.containment import check_size, inside
 from dyngs.io.outputs import PHOTO_SUFFIXES
 from dyngs.io.write import atomic_file, write_image
@@ -73,7 +77,7 @@ def digest_of(source: Path, files: Sequence[Path] | None = None) -> str:
     return digest.hexdigest()[:16]
 
 
-def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], tuple[str, ...]]:
+def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], list[str]]:
     """Copy all photos below ``source`` to ``images``; return them, sorted by source, and lines on
     what is left out.
 
@@ -87,7 +91,12 @@ def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], t
     result = out.resolve()
     files = [file for file in _files_below(source) if result not in file.resolve().parents]
     taken = [file for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
-    _require_heif([file for file in taken if _is_heif(file)], source)
+    heif = [file for file in taken if _is_heif(file)]
+    if heif and find_spec("pillow_heif") is None:
+        raise DyngsError(
+            f"{source}: {len(heif)} photos are HEIC, first {heif[0].name}, which needs the package pillow-heif: "
+            "pip install 'dyngs[heic]', or convert them to JPEG"
+        )
     headers = {photo: _checked(photo) for photo in taken}
     names = _stored_names(
         {photo.relative_to(source): _is_converted(photo, headers[photo]) for photo in taken}
@@ -102,17 +111,12 @@ def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], t
             header if header is not None and target.suffix == photo.suffix else read_header(target)
         )
         photos.append(Photo(names[relative].as_posix(), stored, relative.as_posix()))
-    left_out = Counter(
-        file.suffix.lower() or "without a suffix" for file in files if file not in headers
-    )
     notes = [f"HEIC photos: {conversion}" for conversion in sorted(conversions - {""})]
+    left_out = len(files) - len(taken)
     if left_out:
-        what = ", ".join(f"{count} {suffix}" for suffix, count in sorted(left_out.items()))
         known = ", ".join(sorted(PHOTO_SUFFIXES))
-        notes.append(f"left out, no photos: {what} (photos are {known}; convert what else is one)")
-    animated = sum(photo.suffix.lower() == ".gif" for photo in taken)
-    notes += [f"{animated} .gif: the first frame of each is taken"] if animated else []
-    return photos, tuple(notes)
+        notes.append(f"{counted(left_out, 'file')} left out, no photos (photos are {known})")
+    return photos, notes
 
 
 def copied(source: Path, target: Path) -> None:
@@ -160,14 +164,6 @@ def _files_below(folder: Path) -> list[Path]:
         path for path in folder.rglob("*")
         if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
     )  # fmt: skip
-
-
-def _require_heif(photos: Sequence[Path], source: Path) -> None:
-    if photos and find_spec("pillow_heif") is None:
-        raise DyngsError(
-            f"{source}: {len(photos)} photos are HEIC, first {photos[0].name}, which needs the package pillow-heif: "
-            "pip install 'dyngs[heic]', or convert them to JPEG"
-        )
 
 
 def _checked(photo: Path) -> ImageHeader | None:

@@ -111,8 +111,6 @@ def poses_of_videos(
                 f"{source}: holds {len(videos)} videos, two or more are needed; give one video as the file itself"
             )
         starts, test = read_given(source, names)
-        if options.starts is not None:
-            starts = checked_starts(options.starts, names, "--start")
         lines = colour_notes(video.info for video in videos)
         images, line = _static_images(source, videos, report)
         lines.append(line)
@@ -167,23 +165,16 @@ def read_given(
     with reading(path, wrong):
         if fields.keys() - {"starts", "test"} or not set(test or ()) < set(names):
             raise ValueError("an unknown key or camera, or no camera left to train on")
+    if starts is None:
+        return None, test
     if starts == 0:
         starts = dict.fromkeys(names, 0.0)
-    return None if starts is None else checked_starts(starts, names, str(path)), test
-
-
-def checked_starts(starts: Any, names: Sequence[str], where: str) -> dict[str, float]:
-    """Return the seconds at which the videos begin, for every camera.
-
-    Raises DyngsError: a camera that is not there or missing, or something that is no number of at
-    most a day.
-    """
     fits = isinstance(starts, dict) and starts.keys() == set(names)
     if not fits or not all(is_number(x) and abs(x) <= MAX_START for x in starts.values()):
         raise DyngsError(
-            f"{where}: give the second at which each video begins, for {first_few(names)}, got {starts!r:.80}"
+            f"{path}: give the second at which each video begins, for {first_few(names)}, got {starts!r:.80}"
         )
-    return {name: float(second) for name, second in starts.items()}
+    return {name: float(second) for name, second in starts.items()}, test
 
 
 def _described(starts: Mapping[str, float]) -> str:

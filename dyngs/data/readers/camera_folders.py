@@ -15,12 +15,10 @@ from dyngs.data.capture import Capture, CaptureFormat, Splits, VideoFrame, View
 from dyngs.data.geometry import (
     OPENGL_FROM_OPENCV,
     checked_pose,
-    match_size,
     opengl_from_cam,
-    rescale_warning,
 )
 from dyngs.data.images.images import SUFFIXES, files_in
-from dyngs.data.images.video import VideoFrames, VideoInfo, colour_notes, planned_frames, videos_in
+from dyngs.data.images.video import VideoFrames, colour_notes, planned_frames, videos_in
 from dyngs.data.readers.transforms import MAX_FPS, FrameEntry, FrameFile, read_views
 from dyngs.io.fields import first_few, is_number, matrix_of, read_json_object
 from dyngs.io.numpy_files import read_npy
@@ -96,23 +94,23 @@ def sequence_views(
     views: dict[str, tuple[View, ...]] = {}
     warnings = colour_notes(camera.video.info for camera in cameras if camera.video is not None)
     for index, camera in enumerate(cameras):
-        own = dict(calibrations[camera.name])
+        own = calibrations[camera.name]
         where = f"{path}, camera {camera.name}"
-        if camera.video is not None and ("w" not in own or "h" not in own):
-            own |= {"w": camera.video.info.width, "h": camera.video.info.height}
+        source = camera.video
+        size = None if source is None else (source.info.width, source.info.height)
         frames = []
         for number, image in sorted(camera.images.items()):
             times = {"frame": number, "time": (number - numbers[0]) / span}
             fields = {**own, **times, "file_path": str(image), "camera": index}
-            video = None if camera.video is None else VideoFrame(camera.video.source, number)
-            frames.append(FrameEntry(where, fields, image=image, video=video))
+            video = None if source is None else VideoFrame(source.source, number)
+            frames.append(FrameEntry(where, fields, image=image, video=video, stored=size))
         read, notes = read_views(FrameFile(path, frames))
         views[camera.name] = tuple(read.values())
-        if camera.video is not None:
-            views[camera.name], more = _at_video_size(
-                camera.name, camera.video.info, views[camera.name], where
+        if source is not None:  # named after the video, not after the cache
+            views[camera.name] = tuple(
+                replace(view, name=f"{camera.name}/{view.image_path.stem}")
+                for view in read.values()
             )
-            notes += more
         warnings += notes
     return views, warnings
 
@@ -123,26 +121,6 @@ def video_fps(cameras: Sequence[CameraSource]) -> float | None:
         (camera.video.info.fps for camera in cameras if camera.video and camera.video.info.fps > 0),
         None,
     )
-
-
-def _at_video_size(
-    name: str, video: VideoInfo, views: tuple[View, ...], where: str
-) -> tuple[tuple[View, ...], list[str]]:
-    """Return the views named after the video and with its size: its frames may not be decoded
-    yet."""
-    sized = []
-    rescaled = []
-    for view in views:
-        described = (view.width, view.height)
-        intrinsics, size, changed = match_size(
-            view.intrinsics, described, (video.width, video.height), where
-        )
-        rescaled += [where] if changed else []
-        frame = f"{name}/{view.image_path.stem}"
-        sized.append(
-            replace(view, name=frame, intrinsics=intrinsics, width=size[0], height=size[1])
-        )
-    return tuple(sized), rescale_warning(rescaled)
 
 
 CALIBRATION = "cameras.json"

@@ -7,7 +7,7 @@ import re
 import struct
 from array import array
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -24,8 +24,8 @@ from dyngs.data.geometry import (
     repair_warning,
     rescale_warning,
 )
-from dyngs.data.images.images import SUFFIXES, header_if_readable
-from dyngs.data.readers.transforms import view_name
+from dyngs.data.images.images import header_if_readable
+from dyngs.data.readers.transforms import find_masks, mask_of, unmasked_warning, view_name
 from dyngs.data.times import read_seconds
 from dyngs.io.containment import inside
 from dyngs.io.fields import open_text, read_text
@@ -381,34 +381,6 @@ def _splits(folder: Path, names: list[str], views: list[View]) -> tuple[Splits, 
     for name, view in zip(names, views, strict=True):
         splits["test" if folded(name) in listed else "train"] += (view,)
     return splits if splits["test"] else {"train": splits["train"]}, notes
-
-
-def find_masks(folder: Path) -> dict[str, Path]:
-    """Map paths below ``folder``, ``folded``, with and without the last extension, to masks."""
-    found: dict[str, Path] = {}
-    for path in sorted(inside(folder).rglob("*")) if folder.is_dir() else ():
-        if path.suffix.lower() in SUFFIXES:
-            relative = path.relative_to(folder)
-            found[folded(relative.as_posix())] = path
-            found.setdefault(folded(relative.with_suffix("").as_posix()), path)
-    return found
-
-
-def mask_of(image_name: str, masks: Mapping[str, Path]) -> Path | None:
-    """Find the mask of ``a/b.jpg``: ``a/b.jpg.png`` or the like, else ``a/b.jpg``, ``a/b.png`` or
-    ``a/b.mask.png``."""
-    stem = image_name.rpartition(".")[0]
-    names = (f"{image_name}.png", image_name, stem, f"{stem}.mask")
-    return next((masks[key] for name in names if (key := folded(name)) in masks), None)
-
-
-def unmasked_warning(views: list[View], has_masks: bool) -> list[str]:
-    """Return a line about the images that have no mask although others have, none if there are
-    none."""
-    without = [view.name for view in views if view.mask_path is None]
-    return (
-        [f"{len(without)} images have no mask, first {without[0]}"] if has_masks and without else []
-    )
 
 
 FORMAT = CaptureFormat("colmap", FILES, _is_chosen, read_colmap)

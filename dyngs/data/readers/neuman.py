@@ -3,14 +3,14 @@ with the model."""
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dyngs.core.errors import DyngsError, reading
-from dyngs.data.body_frames import body_frames, of_one_clip
+from dyngs.data.body_frames import body_frames, number_in_name, of_one_clip
 from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette, Splits, View
 from dyngs.data.geometry import checked_pose
 from dyngs.data.readers.colmap import is_colmap, read_colmap
@@ -39,7 +39,7 @@ def read_neuman(root: Path) -> Capture:
     capture = read_colmap(root)
     posed = sorted(capture.splits["train"], key=lambda view: view.image_path.name)
     names = [view.image_path.name for view in posed]
-    numbers = [_number(root, name) for name in names]
+    numbers = [number_in_name(root / "images", name) for name in names]
     first = min(numbers, default=0)
     last = max(numbers, default=0)
     people: dict[str, View] = {}
@@ -52,33 +52,23 @@ def read_neuman(root: Path) -> Capture:
             time=(number - first) / max(last - first, 1),
             silhouette=Silhouette(mask, "black") if mask.is_file() else None,
         )
-    body = _aligned(root, numbers) if (root / ALIGNED).is_file() else _fitted(root, names, numbers)
+    if (root / ALIGNED).is_file():
+        path = root / ALIGNED
+        found = read_npz(path, ("global_orient", "body_pose", "betas", "transl", "scale"))
+        with reading(path, "it must hold a row for each posed image"):
+            parts = [found[key].reshape(len(names), -1) for key in ("global_orient", "body_pose")]
+            poses = np.concatenate(parts, axis=1)
+        body = body_frames(path, numbers, poses, found["transl"], found["betas"], found["scale"])
+    else:
+        body = _fitted(root, names, numbers)
     without = [name for name, view in people.items() if view.silhouette is None]
-    notes = (
-        [f"{len(without)} images have no mask in segmentations, first {without[0]}"]
-        if without
-        else []
-    )
+    notes = []
+    if without:
+        notes = [f"{len(without)} images have no mask in segmentations, first {without[0]}"]
     splits, more = _splits(root, people)
     warnings = (*capture.warnings, *notes, *more)
     return capture.replace(
         format="neuman", splits=splits, body=of_one_clip(body), warnings=warnings
-    )
-
-
-def _aligned(root: Path, numbers: list[int]) -> BodyFrames:
-    path = root / ALIGNED
-    found = read_npz(path, ("global_orient", "body_pose", "betas", "transl", "scale"))
-    parts = [
-        _per_image(path, key, found[key], len(numbers)) for key in ("global_orient", "body_pose")
-    ]
-    return body_frames(
-        path,
-        numbers,
-        np.concatenate(parts, axis=1),
-        found["transl"],
-        found["betas"],
-        found["scale"],
     )
 
 
@@ -88,14 +78,11 @@ def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
     from scipy.spatial.transform import Rotation  # late: other captures need none of scipy
 
     path = next((root / name for name in FITS if (root / name).is_file()), root / FITS[0])
-    fits = read_pickle(inside(path))
-    if not isinstance(fits, dict) or len(fits) != 1:
-        count = len(fits) if isinstance(fits, dict) else 0
-        raise DyngsError(
-            f"{path}: must hold the body parameters of one person, got {count}; keep one"
-        )
-    fit = next(iter(fits.values()))
-    poses = _per_image(path, "pose", entry(path, fit, "pose"), len(numbers))
+    with reading(path, "it must hold the body parameters of one person"):
+        fits: Any = read_pickle(inside(path))
+        (fit,) = fits.values()
+        poses = fit["pose"]
+        betas = fit["betas"]
     alignments = read_pickled_array(inside(root / ALIGNMENTS))
     scales = []
     turns = []
@@ -105,42 +92,13 @@ def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
         matrix = numbers_of(where, entry(root / ALIGNMENTS, alignments, name), (4, 3)).T
         scale = float(np.cbrt(np.linalg.det(matrix[:, :3])))
         if scale <= 0:
-            raise DyngsError(
-                f"{where}: the alignment is no similarity (its determinant is not positive); export it again"
-            )
-        pose, _ = checked_pose(
-            np.concatenate([matrix[:, :3] / scale, matrix[:, 3:]], axis=1), where
-        )
+            raise DyngsError(f"{where}: the alignment is no similarity; export it again")
+        rigid = np.concatenate([matrix[:, :3] / scale, matrix[:, 3:]], axis=1)
+        pose, _ = checked_pose(rigid, where)
         scales.append(scale)
         turns.append(Rotation.from_matrix(pose[:3, :3]).as_rotvec())
         trans.append(pose[:3, 3])
-    return body_frames(
-        path,
-        numbers,
-        poses,
-        np.array(trans),
-        entry(path, fit, "betas"),
-        np.array(scales),
-        np.array(turns),
-    )
-
-
-def _per_image(path: Path, key: str, value: object, count: int) -> np.ndarray:
-    rows = len(value) if isinstance(value, np.ndarray) and value.ndim else 0
-    if rows != count or not isinstance(value, np.ndarray):
-        raise DyngsError(
-            f"{path}: '{key}' has {rows} rows, but the COLMAP model has {count} posed images; fit the body to those"
-        )
-    return value.reshape(count, -1)
-
-
-def _number(root: Path, name: str) -> int:
-    digits = re.findall(r"\d+", Path(name).stem)
-    if not digits or len(digits[-1]) > 15:
-        raise DyngsError(
-            f"{root / 'images' / name}: no frame number in its name; call it 00000.png or the like"
-        )
-    return int(digits[-1])
+    return body_frames(path, numbers, poses, trans, betas, np.array(scales), turns)
 
 
 def _splits(root: Path, people: dict[str, View]) -> tuple[Splits, list[str]]:

@@ -83,20 +83,11 @@ def _calibration(path: Path) -> dict[str, object]:
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_rotvec(numbers("camera_rt", 3)).as_matrix()
     pose[:3, 3] = numbers("camera_t", 3)
-    values = np.concatenate(
-        [
-            numbers("camera_f", 2),
-            numbers("camera_c", 2),
-            numbers("camera_k", 5),
-            numbers("width", 1),
-            numbers("height", 1),
-        ]
-    )
+    counts = {"camera_f": 2, "camera_c": 2, "camera_k": 5, "width": 1, "height": 1}
+    values = [x for key, count in counts.items() for x in numbers(key, count).tolist()]
     keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "w", "h")
-    return {
-        **dict(zip(keys, values.tolist(), strict=True)),
-        "transform_matrix": opengl_from_cam(pose).tolist(),
-    }
+    own = dict(zip(keys, values, strict=True))
+    return own | {"transform_matrix": opengl_from_cam(pose).tolist()}
 
 
 def _body(path: Path) -> BodyFrames:
@@ -106,9 +97,7 @@ def _body(path: Path) -> BodyFrames:
         raise DyngsError(
             f"{path}: 'pose' has {len(poses)} rows but 'trans' {len(trans)}; export it again"
         )
-    fitted = np.flatnonzero(
-        [bool(np.any(p)) or bool(np.any(t)) for p, t in zip(poses, trans, strict=True)]
-    )
+    fitted = np.flatnonzero([x.any() or y.any() for x, y in zip(poses, trans, strict=True)])
     return body_frames(path, fitted.tolist(), poses[fitted], trans[fitted], betas)
 
 

@@ -1,5 +1,6 @@
 """Readers for cameras that photogrammetry programs export: Metashape, RealityCapture (RealityScan)
-and ODM."""
+and ODM.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +17,9 @@ from dyngs.core.errors import DyngsError, counted, reading
 from dyngs.data.capture import Capture, CaptureFormat, PointCloud
 from dyngs.data.geometry import OPENGL_FROM_OPENCV, opengl_from_cam
 from dyngs.data.images.images import SUFFIXES, files_in, read_header
-from dyngs.data.readers.blender import training_capture
-from dyngs.data.readers.transforms import FrameEntry, FrameFile
+from dyngs.data.readers.transforms import FrameEntry, FrameFile, training_capture
 from dyngs.io.containment import inside
-from dyngs.io.fields import first_few, numbers_of
+from dyngs.io.fields import entry, first_few, numbers_of, read_json_object
 
 _HEAD_BYTES = 4096
 _ADVICE = "export it again"
@@ -27,32 +27,37 @@ _Fields = dict[str, Any]
 """Fields of a frame in a transforms file."""
 
 
-class _Photos:
-    """The photos of a capture: in ``images``, else anywhere below its folder."""
+def _photos_of(root: Path) -> dict[str, Path]:
+    """Return the photos of a capture by name, with and without suffix: those in ``images``, else
+    anywhere below its folder."""
+    folder = root / "images" if (root / "images").is_dir() else root
+    found: dict[str, Path] = {}
+    for path in sorted(folder.rglob("*"), key=lambda path: len(path.parts)):
+        if path.suffix.lower() in SUFFIXES:
+            found.setdefault(path.name, path)
+            found.setdefault(path.stem, path)
+    return found
 
-    def __init__(self, root: Path) -> None:
-        self.folder = root / "images" if (root / "images").is_dir() else root
-        self._by_name: dict[str, Path] = {}
-        for path in sorted(self.folder.rglob("*"), key=lambda path: len(path.parts)):
-            if path.suffix.lower() in SUFFIXES:
-                self._by_name.setdefault(path.name, path)
-                self._by_name.setdefault(path.stem, path)
 
-    def find(self, name: str) -> Path | None:
-        """Return the photo that a program calls ``name``, with or without its folder and suffix."""
-        path = PureWindowsPath(name)
-        return self._by_name.get(path.name, self._by_name.get(path.stem))
+def _find(photos: dict[str, Path], name: str) -> Path | None:
+    """Return the photo that a program calls ``name``, with or without its folder and suffix."""
+    path = PureWindowsPath(name)
+    return photos.get(path.name, photos.get(path.stem))
 
 
 def _capture(
-    root: Path, format: str, path: Path, photos: _Photos, cameras: Sequence[tuple[str, _Fields]]
+    root: Path,
+    format: str,
+    path: Path,
+    photos: dict[str, Path],
+    cameras: Sequence[tuple[str, _Fields]],
 ) -> Capture:
     """Return a capture of the cameras, each the name of a photo and its fields, which lack a pose
     if it has none."""
     frames: list[FrameEntry] = []
     left_out: list[str] = []
     for name, fields in cameras:
-        image = photos.find(name)
+        image = _find(photos, name)
         if image is None or "transform_matrix" not in fields:
             left_out.append(name)
         else:
@@ -61,7 +66,7 @@ def _capture(
             )
     if not frames:
         raise DyngsError(
-            f"{path}: no photo in {photos.folder} has the name of a camera with a pose; put the photos there"
+            f"{path}: no photo in {root} has the name of a camera with a pose; put the photos there"
         )
     count = f"{len(left_out)} of {counted(len(cameras), 'camera')}"
     line = f"{path.name}: {count} have no pose or no photo and are left out: {first_few(left_out)}"
@@ -130,7 +135,7 @@ def read_metashape(root: Path) -> Capture:
                 placed = _placed(placement, np.array(pose.split(), np.float64).reshape(4, 4))
                 fields["transform_matrix"] = (placed @ OPENGL_FROM_OPENCV).tolist()
             cameras.append((camera.attrib["label"], fields))
-    return _capture(root, "metashape", path, _Photos(root), cameras)
+    return _capture(root, "metashape", path, _photos_of(root), cameras)
 
 
 def _placed(transform: ElementTree.Element | None, pose: np.ndarray) -> np.ndarray:
@@ -204,13 +209,13 @@ def read_realitycapture(root: Path) -> Capture:
     ``t1`` and ``t2`` are OpenCV's p2 and p1.
     """
     path = _only(_exports(root, ".csv", _REALITYCAPTURE_MARK))
-    photos = _Photos(root)
+    photos = _photos_of(root)
     cameras: list[tuple[str, _Fields]] = []
     with reading(path, _ADVICE), path.open(encoding="utf-8-sig", newline="") as file:
         titles = next(line for line in file if line.startswith("#name")).strip().split(",")
         for row in csv.DictReader(file, [_RENAMED.get(title, title) for title in titles]):
             name = row.pop("#name")
-            image = photos.find(name)
+            image = _find(photos, name)
             fields: _Fields = {}
             if image is not None:
                 width, height = read_header(image).size
@@ -297,7 +302,7 @@ def read_odm(root: Path) -> Capture:
                 for feature in content["features"]
             }
         cameras = [(name, _odm_camera(path, name, shot, lenses)) for name, shot in shots.items()]
-    capture = _capture(root, "odm", path, _Photos(root), cameras)
+    capture = _capture(root, "odm", path, _photos_of(root), cameras)
     return capture.replace(points=points or capture.points, warnings=(*warnings, *capture.warnings))
 
 
@@ -345,4 +350,107 @@ ODM_FORMAT = CaptureFormat(
     lambda root: any((root / name).is_file() for name in _ODM_FILES),
     read_odm,
     extends="camera_folders",  # which has a cameras.json, too
+)
+
+
+_POLYCAM = (
+    ("keyframes/corrected_images", "keyframes/corrected_cameras"),
+    ("keyframes/images", "keyframes/cameras"),
+)
+_RECORD3D = (
+    ("EXR_RGBD/rgb", "EXR_RGBD/metadata.json"),
+    ("rgb", "metadata.json"),
+    ("rgbd", "metadata"),  # of an unpacked .r3d
+)
+_INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
+"""Keys of transforms files, and those of Polycam."""
+
+
+def read_polycam(root: Path) -> Capture:
+    """Read ``keyframes`` of Polycam's raw data: an image, a camera and, if there, a depth map of
+    the same name each.
+
+    Poses are OpenGL camera-to-world, y up. Corrected images have no distortion, corrected cameras
+    closed loops.
+    """
+    images, cameras = _existing(root, _POLYCAM)[0]
+    frames: list[FrameEntry] = []
+    for image in files_in(images, SUFFIXES):
+        path = cameras / f"{image.stem}.json"
+        fields = read_json_object(path)
+        own: dict[str, object] = {
+            key: entry(path, fields, name) for key, name in _INTRINSICS.items()
+        }
+        own |= _depth_of(root / "keyframes" / "depth" / f"{image.stem}.png")
+        own["transform_matrix"] = [
+            [entry(path, fields, f"t_{row}{column}") for column in range(4)] for row in range(3)
+        ]
+        frames.append(FrameEntry(str(path), own | {"file_path": str(image)}, image=image))
+    return training_capture(root, "polycam", FrameFile(root / "keyframes", frames))
+
+
+def _depth_of(path: Path) -> dict[str, object]:
+    return {"depth_file_path": str(path)} if path.is_file() else {}
+
+
+def _existing(root: Path, places: Sequence[tuple[str, str]]) -> list[tuple[Path, Path]]:
+    """Return the folders that hold images, each with its file or folder of cameras, in the order of
+    ``places``."""
+    pairs = [(root / images, root / cameras) for images, cameras in places]
+    return [
+        (images, cameras)
+        for images, cameras in pairs
+        if cameras.exists() and files_in(images, SUFFIXES)
+    ]
+
+
+POLYCAM_FORMAT = CaptureFormat(
+    "polycam",
+    "keyframes/images and keyframes/cameras",
+    lambda root: bool(_existing(root, _POLYCAM)),
+    read_polycam,
+)
+
+
+def read_record3d(root: Path) -> Capture:
+    """Read ``metadata.json`` and the images ``rgb/NUMBER.jpg`` of Record3D, or those of an unpacked
+    ``.r3d``.
+
+    Poses are OpenGL camera-to-world: a quaternion xyzw and the position. ``K`` is written column by
+    column.
+    """
+    from scipy.spatial.transform import Rotation  # late: other captures do not need it
+
+    images, path = _existing(root, _RECORD3D)[0]
+    fields = read_json_object(path)
+    poses = numbers_of(f"{path}: poses", entry(path, fields, "poses"), None).reshape(-1, 7)
+    fx, _, _, _, fy, _, cx, cy, _ = numbers_of(f"{path}: K", entry(path, fields, "K"), (9,))
+    lenses = np.tile((fx, fy, cx, cy), (len(poses), 1))
+    own_lenses = fields.get("perFrameIntrinsicCoeffs")
+    if own_lenses:
+        lenses = numbers_of(f"{path}: perFrameIntrinsicCoeffs", own_lenses, (len(poses), 4))
+    frames: list[FrameEntry] = []
+    for image in files_in(images, SUFFIXES):
+        if not image.stem.isdecimal():  # a copy, such as "12(1).jpg"
+            continue
+        number = int(image.stem)
+        if number >= len(poses):
+            raise DyngsError(
+                f"{image}: has no pose, {path} has {len(poses)}, from number 0 on; export it again"
+            )
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_quat(poses[number, :4]).as_matrix()
+        pose[:3, 3] = poses[number, 4:]
+        own = dict(zip(("fl_x", "fl_y", "cx", "cy"), lenses[number].tolist(), strict=True))
+        own |= _depth_of(images.parent / "depth" / f"{number}.exr")
+        own |= {"file_path": str(image), "transform_matrix": pose.tolist()}
+        frames.append(FrameEntry(f"{path}, pose {number}", own, fields, image))
+    return training_capture(root, "record3d", FrameFile(root / "metadata.json", frames, fields))
+
+
+RECORD3D_FORMAT = CaptureFormat(
+    "record3d",
+    "metadata.json and rgb (in EXR_RGBD)",
+    lambda root: bool(_existing(root, _RECORD3D)),
+    read_record3d,
 )

@@ -20,8 +20,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dyngs.baselines.triangles.patches import CORNERS
-from dyngs.baselines.triangles.scene import TriangleScene
 from dyngs.core.gaussians import storage_order
 from dyngs.deform.control_nodes import FOLLOWED, ControlNodes, spline_basis
 from dyngs.deform.field import DeformationField, Offsets
@@ -63,33 +61,24 @@ class Lists:
         """
         rows, columns = values.shape
         count = -(-rows // CHUNK)
-        ranges = np.zeros((count, columns, 2), dtype="<f4")
-        quantised = np.zeros((rows, columns), dtype=np.uint16)
-        for i in range(count):
-            part = slice(i * CHUNK, (i + 1) * CHUNK)
-            low = values[part].min(0)
-            high = values[part].max(0)
-            step = ((high.astype(np.float64) - low) / (2**bits - 1)).astype(np.float32)
-            ranges[i] = np.stack([low, step], axis=1)
-            relative = (values[part].astype(np.float64) - low) / np.where(step > 0, step, 1)
-            quantised[part] = relative.round().clip(0, 2**bits - 1)
+        filled = np.pad(values, ((0, count * CHUNK - rows), (0, 0)), mode="edge")
+        chunks = filled.reshape(count, CHUNK, columns).astype(np.float64)
+        low = chunks.min(axis=1)
+        step = ((chunks.max(axis=1) - low) / (2**bits - 1)).astype(np.float32)
+        relative = (chunks - low[:, None]) / np.where(step > 0, step, 1)[:, None]
+        quantised = relative.round().clip(0, 2**bits - 1).astype(np.uint16)
+        quantised = quantised.reshape(-1, columns)[:rows]
         planes = [quantised >> 8, quantised & 255] if bits == 16 else [quantised]
         # (D, planes, R)
         bytes_of = np.stack([plane.T.astype(np.uint8) for plane in planes], axis=1)
+        ranges = np.stack([low, step], axis=2).astype("<f4")
         data = ranges.tobytes() + bytes_of.tobytes()
         self._add(name, data, "quantised", values.shape, bits=bits, chunk=CHUNK)
 
     def exact(self, name: str, values: NDArray[Any]) -> None:
         """Add ``values`` (R, D) as they are: uint8, uint16 or float32."""
-        kind = values.dtype.name
-        if kind not in ("uint8", "uint16", "float32"):
-            raise ValueError(f"{name}: a list of {kind} cannot be added")
-        self._add(name, values.astype(values.dtype.newbyteorder("<")).tobytes(), kind, values.shape)
-
-    @property
-    def size(self) -> int:
-        """Number of bytes before they are deflated."""
-        return self._size
+        data = values.astype(values.dtype.newbyteorder("<")).tobytes()
+        self._add(name, data, values.dtype.name, values.shape)
 
     def deflated(self) -> bytes:
         """Return the block as zlib writes it."""
@@ -168,27 +157,6 @@ def block_files(levels: Levels, *, with_rest: bool) -> Iterator[tuple[str, bytes
         for place in range(len(balls)):
             numbers = block_numbers(levels, (level, place), with_rest=with_rest)
             yield f"{level}-{place}.bin", numbers.deflated()
-
-
-def add_triangles(scene: TriangleScene, lists: Lists) -> dict[str, Any]:
-    """Add the numbers of curved triangles to ``lists`` and return what the page needs to know about
-    them."""
-    patches = scene.patches
-    middles = _numpy(patches.points[:, CORNERS].mean(1))
-    order = torch.from_numpy(storage_order(middles, np.zeros(0, dtype=np.int64)))
-    lists.quantised("points", _numpy(patches.points[order].flatten(1)), 16)
-    lists.quantised("colours", _numpy(patches.colours[order].flatten(1)), 8)
-    if patches.sh_degree:
-        lists.quantised("rest", _numpy(patches.harmonics[order].flatten(1)), 8)
-    return {
-        "count": len(scene),
-        "frames": 0,
-        "moves": False,
-        "degree": patches.sh_degree,
-        "texture": patches.texture,
-        "segments": scene.options.segments,
-        "bounds": scene.bounds.tolist(),
-    }
 
 
 def _add_gaussians(gaussians: Gaussians, lists: Lists, *, with_rest: bool) -> dict[str, Any]:
@@ -308,12 +276,13 @@ def _add_network(network: ColourNetwork, lists: Lists) -> dict[str, Any]:
     first = -(-network.layers[0].weight.shape[1] // 4) * 4
     parts: list[NDArray[np.float32]] = []
     for i, layer in enumerate(network.layers):
+        weight = _numpy(layer.weight)
         rows = 3 if i == len(network.layers) - 1 else width
-        weight = np.zeros((rows, first if i == 0 else width), dtype=np.float32)
-        weight[: layer.weight.shape[0], : layer.weight.shape[1]] = _numpy(layer.weight.detach())
-        bias = np.zeros(-(-rows // 4) * 4, dtype=np.float32)
-        bias[: len(layer.bias)] = _numpy(layer.bias.detach())
-        parts += [weight.ravel(), bias]
+        columns = first if i == 0 else width
+        missing = (0, rows - weight.shape[0]), (0, columns - weight.shape[1])
+        bias = _numpy(layer.bias)
+        longer = -(-rows // 4) * 4 - len(bias)
+        parts += [np.pad(weight, missing).ravel(), np.pad(bias, (0, longer))]
     lists.exact("network", np.concatenate(parts).reshape(-1, 4))
     return {
         "network": {

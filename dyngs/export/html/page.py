@@ -13,18 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.baselines.triangles.scene import TriangleScene
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import counted
-from dyngs.data.aim import look_at_point
-from dyngs.deform.bodies.field import bodies_of
-from dyngs.deform.scene import field_scene_of
+from dyngs.data.geometry import look_at_point
 from dyngs.export.choose_path import in_front_of, orbit_around, points_at, view_to_show
-from dyngs.export.html.numbers import Lists, add_levels, add_scene, add_triangles, block_files
+from dyngs.export.html.numbers import Lists, add_levels, add_scene, block_files
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.io.formats.similarity import AXES
 from dyngs.io.outputs import new_folder, require_new_folder
@@ -114,7 +110,7 @@ def write_folder(
     """
     require_new_folder(folder)
     lists = Lists(chunked=True)
-    if most is not None or isinstance(opened.renderable, StaticScene):
+    if most is not None or opened.renderable.has_levels:
         levelled = LevelScene.of(opened.renderable, most)
         colour = levelled.scene.colour
         header = add_levels(levelled.levels, colour, lists) | _drawn(levelled.options)
@@ -136,10 +132,9 @@ def write_folder(
 
 def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
     notes: list[str] = []
-    if opened.captured is not None and opened.missing is not None:
-        up = "" if opened.person is not None else f", {opened.stated_up or 'z'} up"
+    if opened.missing is not None:
         notes.append(
-            f"without the capture ({opened.missing}) the page begins with a view from outside{up}"
+            f"without the capture ({opened.missing}) the page begins with a view from outside"
         )
     if any(opened.world_offset):
         offset = " ".join(f"{x:.12g}" for x in opened.world_offset)
@@ -152,16 +147,16 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
         error = opened.frame.scale * curves["error"]
         fit = f"{curves['points']} control points for each of {curves['count']:,}, off by {error:.2g} units"
         notes.append(f"splines are fitted to the motion ({fit})")
-    moved = field_scene_of(opened.renderable)
-    if moved is not None and bodies_of(moved.field) is not None:
-        notes.append("shadows of bodies that turn are left out")
     return tuple(notes)
 
 
 def _header(opened: Opened, time: float, views: Sequence[Cameras], lists: Lists) -> dict[str, Any]:
     views, target = _beginning(opened, views)
-    if isinstance(opened.renderable, TriangleScene):
-        told = add_triangles(opened.renderable, lists)
+    found = opened.renderable.page_lists()
+    if found is not None:
+        told, own = found
+        for name, (rows, bits) in own.items():
+            lists.quantised(name, rows.detach().float().numpy(), bits)
     else:
         apart = float((views[0].centers[0] - views[0].centers.new_tensor(target)).norm())
         pixel = (apart or 1.0) / float(views[0].intrinsics[0, 1, 1])

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -20,13 +20,20 @@ from torch import Tensor
 from dyngs.core.conventions import SH_C0
 from dyngs.core.errors import DyngsError
 from dyngs.export.rigged.surface import fitted_surface
-from dyngs.export.rigged.texture import bake_texels, fill_unseen, frontal_colours, texture_image
+from dyngs.export.rigged.texture import (
+    SEEN,
+    bake_texels,
+    fill_unseen,
+    frontal_colours,
+    texture_image,
+)
 from dyngs.human.avatar.posing import Anchors, Skeleton, heaviest_joints
 from dyngs.human.avatar.scene import HumanScene, avatar_of
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body import BodyTemplate, apply_shape
 from dyngs.human.body.body_reader import load_template
 from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
+from dyngs.human.body.mesh import vertex_normals
 from dyngs.human.body.skinning import (
     apply_transforms,
     axis_angle_to_matrix,
@@ -40,6 +47,7 @@ from dyngs.io.formats.ply import write_ply
 from dyngs.io.formats.splat_file import SplatFile, require_writable
 from dyngs.io.gltf import INDICES, VERTICES, GlbDocument
 from dyngs.io.write import atomic_file
+from dyngs.models.kind import HasBody, capability
 from dyngs.ops.quaternions import shorter_ways
 from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.folder import inputs_of
@@ -47,17 +55,12 @@ from dyngs.runs.folder import inputs_of
 _MOST_ROWS = 4000  # anchors whose places determine the shape; each gives three equations
 
 
-@dataclass(frozen=True)
-class BodyMesh:
-    """A mesh whose vertices are those of a template, doubled at the seams of its atlas."""
+def body_mesh(body: BodyTemplate) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the mesh of a template, whose vertices are doubled at the seams of its atlas: texture
+    coordinates (V, 2), triangles (T, 3) and the template's vertex (V,) that each is a copy of.
 
-    uv: Tensor  # (V, 2) texture coordinates, row of the image = (1 - v) * H
-    faces: Tensor  # (T, 3) int64, counter-clockwise from outside
-    source: Tensor  # (V,) int64 vertex of the template that each is a copy of
-
-
-def body_mesh(body: BodyTemplate) -> BodyMesh:
-    """Return the mesh of a template. Raises DyngsError: it has no texture coordinates."""
+    Raises DyngsError: it has no texture coordinates.
+    """
     if body.uv is None or body.uv_faces is None:
         raise DyngsError(
             f"the body template '{body.name}' has no texture coordinates; train with model.uv=FILE.obj for a mesh"
@@ -65,7 +68,7 @@ def body_mesh(body: BodyTemplate) -> BodyMesh:
     pairs = body.faces.flatten() * len(body.uv) + body.uv_faces.flatten()
     corners, inverse = torch.unique(pairs, return_inverse=True)
     count = len(body.uv)
-    return BodyMesh(body.uv[corners % count], inverse.reshape(-1, 3), corners // count)
+    return body.uv[corners % count], inverse.reshape(-1, 3), corners // count
 
 
 def rest_vertices(scene: HumanScene, body: BodyTemplate) -> Tensor:
@@ -96,20 +99,15 @@ def rest_vertices(scene: HumanScene, body: BodyTemplate) -> Tensor:
     return apply_shape(body, betas.to(body.vertices))[0]
 
 
-def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+def surface_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     """Return outward unit normals (M, 3) at vertices, of the triangles around each, weighted by
     area."""
-    a, b, c = vertices[faces].unbind(1)
-    flat = torch.linalg.cross(b - a, c - a, dim=-1)
-    total = torch.zeros_like(vertices)
-    for k in range(3):
-        total.index_add_(0, faces[:, k], flat)
-    return torch.nn.functional.normalize(total, dim=-1)
+    return torch.from_numpy(vertex_normals(vertices.numpy(), faces.numpy())).float()
 
 
 def anchor_normals(anchors: Anchors, body: BodyTemplate, vertices: Tensor) -> Tensor:
     """Return unit normals (N, 3) of the surface ``vertices`` (M, 3) below the Gaussians at rest."""
-    around = vertex_normals(vertices, body.faces)[body.faces[anchors.face]]
+    around = surface_normals(vertices, body.faces)[body.faces[anchors.face]]
     return torch.nn.functional.normalize((anchors.barycentric[..., None] * around).sum(1), dim=-1)
 
 
@@ -245,7 +243,6 @@ def add_weights(document: GlbDocument, weights: Tensor) -> dict[str, int]:
     return found
 
 
-SUFFIX = ".glb"
 _FINER = 4  # texels of the texture per texel of the model's atlas, along a side
 _LARGEST = 2048  # texels along a side of the largest texture
 _MOST_SAMPLES = 512  # texels along a side of the atlas from which the surface is moved
@@ -260,18 +257,14 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> tupl
     the run of a person, or its template is missing or without texture coordinates.
     """
     scene, body = person_and_template(run, "--format mesh")
-    if path.suffix.lower() != SUFFIX:
-        raise DyngsError(
-            f"{path}: a mesh is written as {SUFFIX}; give --out {path.with_suffix(SUFFIX).name}"
-        )
     inputs_of(run).require_output(path)
     with torch.no_grad():
         vertices = rest_vertices(scene, body)
         normals = anchor_normals(scene.anchors, body, vertices)
         size = texture_size(scene)
         texels = atlas_texels(body, size, vertices)
-        filled = fill_unseen(bake_texels(scene, texels, normals), texels)
-        image = texture_image(filled.rgb, texels)
+        baked = bake_texels(scene, texels, normals)
+        image = texture_image(fill_unseen(baked, texels), texels)
         samples = atlas_texels(body, min(size // 2, _MOST_SAMPLES), vertices)
         surface = fitted_surface(
             scene.gaussians, body, vertices, samples, bake_texels(scene, samples, normals)
@@ -282,21 +275,14 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> tupl
             add_animation(document, scene, rig, surface.vertices, body.weights, played)
     with atomic_file(path) as temporary:
         document.write(temporary)
-    count = max(len(texels), 1)
-    unseen = 100 * (filled.mirrored + filled.spread) / count
+    moved = "that of the template" if surface.margin is None else "moved to the Gaussians"
+    unseen = 100 * float((baked.alpha < SEEN).float().mean())
     notes = [
-        f"texture of {len(image)} x {len(image)}; {unseen:.1f} % of the body is not seen in the Gaussians and "
-        f"has colours from around it, {100 * filled.mirrored / count:.1f} % from its mirror side"
+        f"texture of {len(image)} x {len(image)}; {unseen:.1f} % of the body is not seen in the Gaussians and has "
+        "colours from around it or from its mirror side",
+        f"the surface is {moved}: silhouettes agree at {surface.agreement:.3f} (intersection over union), those of the "
+        f"template as it is at {surface.plain:.3f}",
     ]
-    if surface.margin is None:
-        notes.append(
-            f"the surface is that of the template, whose silhouettes agree best ({surface.plain:.3f})"
-        )
-    else:
-        notes.append(
-            f"the surface is moved to the Gaussians: silhouettes agree at {surface.agreement:.3f} (intersection over "
-            f"union), those of the template at {surface.plain:.3f}"
-        )
     if scene.shapes is not None:
         notes.append("offsets that depend on the pose are left out: glTF's skins have none")
     return (*notes, *scene.left_out)
@@ -309,11 +295,11 @@ def person_and_template(run: LoadedRun, wanted: str) -> tuple[HumanScene, BodyTe
     """
     scene = avatar_of(run.scene)
     model = run.config.model
-    if scene is None or not isinstance(model, HumanModel):
+    if scene is None or capability(model, HasBody) is None:
         raise DyngsError(
-            f"{wanted} needs the run of a person (model.kind=human), this one is {run.config.model.kind}"
+            f"{wanted} needs the run of a person (model.kind=human), this one is {model.kind}"
         )
-    return scene, load_template(model)
+    return scene, load_template(cast(HumanModel, model))
 
 
 def texture_size(scene: HumanScene) -> int:
@@ -331,19 +317,19 @@ def mesh_document(body: BodyTemplate, rig: Rig, vertices: Tensor, image: np.ndar
     from PIL import Image
 
     document = GlbDocument()
-    mesh = body_mesh(body)
-    normals = vertex_normals(vertices, body.faces)[mesh.source]
-    uv = torch.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], dim=1)
-    places = rig.placed(vertices[mesh.source]).float().numpy()
-    kind = np.uint16 if len(mesh.source) < 2**16 - 1 else np.uint32
+    uv, faces, source = body_mesh(body)
+    normals = surface_normals(vertices, body.faces)[source]
+    uv = torch.stack([uv[:, 0], 1 - uv[:, 1]], dim=1)
+    places = rig.placed(vertices[source]).float().numpy()
+    kind = np.uint16 if len(source) < 2**16 - 1 else np.uint32
     primitive = {
         "attributes": {
             "POSITION": document.add_numbers(places, VERTICES, limits=True),
             "NORMAL": document.add_numbers(normals.float().numpy(), VERTICES),
             "TEXCOORD_0": document.add_numbers(uv.float().numpy(), VERTICES),
         }
-        | add_weights(document, body.weights[mesh.source]),
-        "indices": document.add_numbers(mesh.faces.flatten().numpy().astype(kind), INDICES),
+        | add_weights(document, body.weights[source]),
+        "indices": document.add_numbers(faces.flatten().numpy().astype(kind), INDICES),
         "material": 0,
     }
     stream = io.BytesIO()
@@ -362,9 +348,6 @@ def mesh_document(body: BodyTemplate, rig: Rig, vertices: Tensor, image: np.ndar
     return document
 
 
-SUFFIXES = (".ply", ".glb")
-
-
 @torch.no_grad()
 def write_rigged_splats(
     run: LoadedRun, path: Path, played: Played | None = None
@@ -378,15 +361,6 @@ def write_rigged_splats(
     run of a person, or its template is missing.
     """
     scene, body = person_and_template(run, "--joints")
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise DyngsError(
-            f"{path}: joints are written as {' or '.join(SUFFIXES)}; give --out with one of these"
-        )
-    if suffix == ".ply" and played is not None:
-        raise DyngsError(
-            "--motion does not go with --joints in a .ply, which shows the rest pose; write a .glb"
-        )
     inputs_of(run).require_output(path)
     vertices = rest_vertices(scene, body)
     rig = rig_of(scene, vertices)
@@ -406,7 +380,7 @@ def write_rigged_splats(
         log_scales=gaussians.log_scales + float(np.log(rig.scale)),
     )
     require_writable(path, gaussians)
-    if suffix == ".glb":
+    if path.suffix.lower() == ".glb":
         document = GlbDocument()
         primitive = add_gaussians(document, gaussians)
         primitive["attributes"] |= add_weights(document, scene.weights)

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.data.aim import look_at, with_poses
+from dyngs.data.geometry import look_at, with_poses
 from dyngs.export.rigged.texture import SEEN, BakedTexels
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render

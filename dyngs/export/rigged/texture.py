@@ -128,18 +128,8 @@ def _blended(alpha: Tensor, height: Tensor, colours: Tensor) -> tuple[Tensor, Te
     return (fraction[..., None] * colours).sum(1), total, height.gather(1, first)[:, 0]
 
 
-@dataclass(frozen=True)
-class Filled:
-    """Colours (P, 3) of all texels, and how many came from the other side of the body or from
-    neighbours."""
-
-    rgb: Tensor
-    mirrored: int
-    spread: int
-
-
-def fill_unseen(baked: BakedTexels, texels: Texels) -> Filled:
-    """Return colours of all texels: small gaps from around them, else those of the mirror side,
+def fill_unseen(baked: BakedTexels, texels: Texels) -> Tensor:
+    """Return colours (P, 3) of all texels: small gaps from around them, else those of the mirror side,
     else what is nearest.
 
     Texels count as the same surface where their normals agree, so that an arm does not colour the
@@ -150,7 +140,7 @@ def fill_unseen(baked: BakedTexels, texels: Texels) -> Filled:
     missing = torch.nonzero(~seen)[:, 0]
     known = torch.nonzero(seen)[:, 0]
     if not len(missing) or not len(known):
-        return Filled(rgb, 0, 0)
+        return rgb
     places = KDTree(_with_normals(texels.points[known], texels.normals[known]))
     points = texels.points[missing]
     normals = texels.normals[missing]
@@ -165,7 +155,7 @@ def fill_unseen(baked: BakedTexels, texels: Texels) -> Filled:
     beyond, at = places.query(_with_normals(points * flip, normals * flip))
     mirrored = (distance[:, 0] > _GAP) & torch.from_numpy(beyond < _MIRROR)
     rgb[missing[mirrored]] = baked.rgb[known[torch.from_numpy(at)[mirrored]]]
-    return Filled(rgb, int(mirrored.sum()), len(missing) - int(mirrored.sum()))
+    return rgb
 
 
 def texture_image(rgb: Tensor, texels: Texels) -> np.ndarray:

@@ -41,7 +41,7 @@ def in_motion(
         skeleton = playing.learned_skeleton
         floor = float(scene.anchors.points[:, 1].min())
         soles = sole_points(playing.moves_as, skeleton.joints, skeleton.parents, floor)
-        clip, before, after = feet_kept(clip, soles, up_direction(scene.clip), motion.fps)
+        clip, note = feet_kept(clip, soles, up_direction(scene.clip), motion.fps)
         playing = scene.playing(clip)
-        notes = (*notes, before.compared(after))
+        notes = (*notes, note)
     return InMotion(playing.to(person.gaussians.means.device), motion.fps, notes)

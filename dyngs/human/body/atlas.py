@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dyngs.core.errors import DyngsError
 from dyngs.human.body.body import BodyTemplate
+from dyngs.human.body.mesh import grid_points, span
 
 # twice the area over the square of the longest edge at which a triangle counts as degenerate
 _THINNEST = 1e-9
@@ -117,13 +118,9 @@ def _rasterized(
     triangles = np.flatnonzero(usable.cpu().numpy())
     x = corners[triangles, :, 0] * resolution - 0.5
     y = (1 - corners[triangles, :, 1]) * resolution - 0.5
-    left, width = _span(x, resolution)
-    top, height = _span(y, resolution)
-    counts = width * height
-    owner = np.repeat(np.arange(len(triangles)), counts)
-    within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-    column = left[owner] + within % width[owner]
-    row = top[owner] + within // width[owner]
+    left, across = span(x.T, resolution)
+    top, down = span(y.T, resolution)
+    owner, column, row = grid_points(across * down, left, top, across)
     turn = np.sign(
         (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])
     )
@@ -145,14 +142,6 @@ def _rasterized(
     found = (texels.astype(np.int64), triangles[owner[inside][first]].astype(np.int64), barycentric)
     index, faces, coordinates = (torch.from_numpy(x).to(corners_uv.device) for x in found)
     return index, faces, coordinates
-
-
-def _span(ends: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first and the number of texels (T,) whose centres, whole numbers, lie between
-    ``ends`` (T, 3)."""
-    first = np.ceil(ends.min(1)).clip(0, resolution).astype(np.int64)
-    last = np.floor(ends.max(1)).clip(-1, resolution - 1).astype(np.int64)
-    return first, np.maximum(last - first + 1, 0)
 
 
 def _interpolated(barycentric: Tensor, around: Tensor, values: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Body templates of the SMPL family: rest mesh, shape space, joints, skinning weights, and posed
 vertices.
 
-Local letters: T triangles, U UV vertices, B shape and E expression parameters.
+Local letters: T triangles, U UV vertices, B shape parameters.
 """
 
 from __future__ import annotations
@@ -14,14 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError
 from dyngs.core.state import fields_moved_to
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.body.skinning import (
     apply_transforms,
     axis_angle_to_matrix,
     blend_transforms,
-    check_tree,
     joint_transforms,
 )
 
@@ -49,54 +47,16 @@ class BodyTemplate:
     parents: tuple[int, ...]
     joints: Tensor  # (J, 3) at rest, mean shape
     shape_dirs: Tensor | None = None  # (M, 3, B) metres per unit of the shape parameters, or None
-    # (M, 3, E) metres per unit of the expression parameters, or None
-    expression_dirs: Tensor | None = None
     # (J, 3, B) the same for the joints; None with ``shape_dirs``
     joint_shape_dirs: Tensor | None = None
-    # (J, 3, E) the same for the joints; None with ``expression_dirs``
-    joint_expression_dirs: Tensor | None = None
     # (9 (J - 1), 3 M) pose blend shapes, metres per unit of the rotations minus the identity, or
     # None
     pose_dirs: Tensor | None = None
-
-    def __post_init__(self) -> None:
-        """Raises ValueError for shapes that contradict each other, or a parent that does not come
-        before its child."""
-        check_tree(self.parents)
-        m = len(self.vertices)
-        j = len(self.parents)
-        b = self.num_shapes
-        e = self.num_expressions
-        wanted = {
-            "vertices": (m, 3),
-            "faces": (len(self.faces), 3),
-            "uv_faces": (len(self.faces), 3),
-        }
-        wanted |= {"weights": (m, j), "joints": (j, 3), "pose_dirs": (9 * (j - 1), 3 * m)}
-        wanted |= {"shape_dirs": (m, 3, b), "joint_shape_dirs": (j, 3, b)}
-        wanted |= {"expression_dirs": (m, 3, e), "joint_expression_dirs": (j, 3, e)}
-        for name, shape in wanted.items():
-            value = getattr(self, name)
-            if value is not None and tuple(value.shape) != shape:
-                raise ValueError(f"{name} must be {shape}, got {tuple(value.shape)}")
-        pairs = (
-            ("uv", "uv_faces"),
-            ("shape_dirs", "joint_shape_dirs"),
-            ("expression_dirs", "joint_expression_dirs"),
-        )
-        for first, second in pairs:
-            if (getattr(self, first) is None) != (getattr(self, second) is None):
-                raise ValueError(f"{first} and {second} must be given together")
 
     @property
     def num_shapes(self) -> int:
         """Number of shape parameters B; 0 without a shape space."""
         return 0 if self.shape_dirs is None else self.shape_dirs.shape[-1]
-
-    @property
-    def num_expressions(self) -> int:
-        """Number of expression parameters E; 0 without expressions."""
-        return 0 if self.expression_dirs is None else self.expression_dirs.shape[-1]
 
     @cached_property
     def fingerprint(self) -> str:
@@ -119,35 +79,20 @@ class BodyTemplate:
         return fields_moved_to(self, device, dtype)
 
 
-def apply_shape(
-    body: BodyTemplate, betas: Tensor | None, expression: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Return vertices (..., M, 3) and joints (..., J, 3) at rest for shape and expression
-    parameters; differentiable.
+def apply_shape(body: BodyTemplate, betas: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return vertices (..., M, 3) and joints (..., J, 3) at rest for shape parameters;
+    differentiable.
 
-    v = v_mean + S beta + E psi; the joints are linear in the vertices and follow the same formula.
-    Of ``betas`` (..., B) and ``expression`` (..., E) missing ones are 0; None: the mean. Raises
-    DyngsError: a non-zero parameter that the template does not have.
+    v = v_mean + S beta; the joints are linear in the vertices and follow the same formula. Of
+    ``betas`` (..., B) missing ones are 0; None: the mean.
     """
-    vertices = body.vertices
-    joints = body.joints
-    for name, given, dirs, joint_dirs in (
-        ("betas", betas, body.shape_dirs, body.joint_shape_dirs),
-        ("expression", expression, body.expression_dirs, body.joint_expression_dirs),
-    ):
-        if given is None:
-            continue
-        known = 0 if dirs is None else dirs.shape[-1]
-        if given[..., known:].any():
-            raise DyngsError(
-                f"{name}: {given.shape[-1]} numbers given, but the {body.name} body has {known or 'none'}; "
-                "leave out the rest or set them to 0"
-            )
-        if dirs is not None and joint_dirs is not None:
-            used = given[..., :known]
-            vertices = vertices + _blend_shape_offsets(dirs, used)
-            joints = joints + _blend_shape_offsets(joint_dirs, used)
-    return vertices, joints
+    if betas is None or body.shape_dirs is None or body.joint_shape_dirs is None:
+        return body.vertices, body.joints
+    moved = []
+    for rest, dirs in ((body.vertices, body.shape_dirs), (body.joints, body.joint_shape_dirs)):
+        used = dirs[..., : betas.shape[-1]].flatten(0, 1)
+        moved.append(rest + (betas @ used.T).unflatten(-1, (-1, 3)))
+    return moved[0], moved[1]
 
 
 def posed_vertices(
@@ -155,7 +100,6 @@ def posed_vertices(
     poses: Tensor,
     trans: Tensor,
     betas: Tensor | None = None,
-    expression: Tensor | None = None,
     scale: Tensor | None = None,
 ) -> Tensor:
     """Return the vertices (F, M, 3) of F frames, m; differentiable in all arguments (SMPL, Loper et
@@ -163,33 +107,18 @@ def posed_vertices(
 
     v = scale * (sum_j w_j A_j) (v_shaped + P vec(R_1 - 1, ..)) + trans. ``poses`` (F, J, 3) are
     axis-angle relative to the parent joint, rad; ``trans`` (F, 3) m; ``betas`` (B,) or (F, B);
-    ``expression`` (E,) or (F, E); ``scale`` (F,). Raises DyngsError: poses for another number of
-    joints, or parameters that the template does not have.
+    ``scale`` (F,).
     """
-    if poses.ndim != 3 or tuple(poses.shape[1:]) != tuple(body.joints.shape):
-        raise DyngsError(
-            f"poses must be (frames, {len(body.joints)}, 3) for the {body.name} body, got {tuple(poses.shape)}"
-        )
-    vertices, joints = apply_shape(body, betas, expression)
+    vertices, joints = apply_shape(body, betas)
     rotations = axis_angle_to_matrix(poses)
     if body.pose_dirs is not None:
-        features = (
-            rotations[:, 1:] - torch.eye(3, dtype=poses.dtype, device=poses.device)
-        ).flatten(1)
-        vertices = vertices + (features @ body.pose_dirs).unflatten(-1, (-1, 3))
-    posed = apply_transforms(
-        blend_transforms(body.weights, joint_transforms(joints, body.parents, rotations)), vertices
-    )
+        features = rotations[:, 1:] - torch.eye(3, dtype=poses.dtype, device=poses.device)
+        vertices = vertices + (features.flatten(1) @ body.pose_dirs).unflatten(-1, (-1, 3))
+    moves = joint_transforms(joints, body.parents, rotations)
+    posed = apply_transforms(blend_transforms(body.weights, moves), vertices)
     if scale is not None:
         posed = scale[:, None, None] * posed
     return posed + trans[:, None]
-
-
-def _blend_shape_offsets(directions: Tensor, parameters: Tensor) -> Tensor:
-    """Return offsets (..., X, 3): the first n ``directions`` (X, 3, B), weighted by ``parameters``
-    (..., n)."""
-    used = directions[..., : parameters.shape[-1]].flatten(0, 1)
-    return (parameters @ used.T).unflatten(-1, (-1, 3))
 
 
 BONE_UNIT = 0.015

@@ -1,21 +1,21 @@
 """Reader of body templates: SMPL, SMPL-H and SMPL-X in ``.npz`` or ``.pkl``, and the free template.
 
-Local letters: T triangles, n any number.
+Local letters: M vertices, T triangles, U texture coordinates.
 """
 
 from __future__ import annotations
 
-import io
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError, reading, reason
+from dyngs.core.errors import DyngsError, reading
 from dyngs.data.capture import BodyFrames
 from dyngs.human.body.body import BodyTemplate, apply_shape, bone_shapes
 from dyngs.human.keys import HumanModel
@@ -23,107 +23,11 @@ from dyngs.io.fields import read_limited, require_at_most
 from dyngs.io.numpy_files import read_arrays
 from dyngs.io.pickles import read_pickle
 
-_Coordinates = tuple[np.ndarray, np.ndarray]
-"""Texture coordinates (U, 2) in [0, 1] and the triangles (T, 3) that index them."""
-
-
-def require_unit_square(path: Path, uv: np.ndarray) -> np.ndarray:
-    """Return texture coordinates (U, 2), rounding errors clipped; raises DyngsError where they
-    leave [0, 1]."""
-    outside = ~((uv > -1e-4) & (uv < 1 + 1e-4)).all(1)
-    if outside.any():
-        row = int(np.argmax(outside))
-        raise DyngsError(
-            f"{path}: texture coordinate {row} is {uv[row, 0]:g} {uv[row, 1]:g}; they must lie in [0, 1], on one tile"
-        )
-    return uv.clip(0, 1)
-
-
-def read_obj(path: Path, faces: np.ndarray, num_vertices: int) -> _Coordinates:
-    """Read the texture coordinates of an ``.obj``, indexed by the corners of the triangles
-    ``faces`` (T, 3).
-
-    Its triangles may come in any order, as ``f v/vt v/vt v/vt``; ``faces`` (T, 3) are those of the
-    body with ``num_vertices``. Raises DyngsError: the file cannot be read, or belongs to another
-    body.
-    """
-    if path.exists() and not path.is_file():
-        raise DyngsError(f"{path}: is not a file; name the .obj made for this body")
-    try:
-        lines = io.StringIO(read_limited(path).decode("latin-1"))
-    except OSError as error:
-        raise DyngsError(f"{path}: cannot be read ({reason(error)})") from error
-    count = 0
-    uv = []
-    corners = []
-    for number, line in enumerate(lines, 1):
-        if count > num_vertices or len(corners) > len(faces) or len(uv) > 3 * len(faces):
-            break  # it belongs to another body, however long it is
-        kind, *words = line.split() or [""]
-        try:
-            if kind == "v":
-                count += 1
-            elif kind == "vt":
-                uv.append([float(words[0]), float(words[1])])
-            elif kind == "f":
-                one, two, three = words
-                numbers = [
-                    [int(number) for number in word.split("/")[:2]] for word in (one, two, three)
-                ]
-                corners.append(
-                    [
-                        (v - 1 if v > 0 else count + v, t - 1 if t > 0 else len(uv) + t)
-                        for v, t in numbers
-                    ]
-                )
-        except (ValueError, IndexError):
-            raise DyngsError(
-                f"{path}, line {number}: {line.strip()[:60]!r} is not understood; texture coordinates are written "
-                "'vt u v', triangles 'f v/vt v/vt v/vt'"
-            ) from None
-    if count != num_vertices or len(corners) != len(faces):
-        raise DyngsError(
-            f"{path}: has {count} vertices and {len(corners)} triangles, the body has {num_vertices} and {len(faces)}; "
-            "give the .obj made for this body"
-        )
-    found = np.array(corners)
-    if found.min() < 0 or (found.max((0, 1)) >= (count, len(uv))).any():
-        raise DyngsError(f"{path}: a face names a vertex or texture coordinate that does not exist")
-    return require_unit_square(path, np.array(uv)), _matched(
-        path, faces, found[..., 0], found[..., 1]
-    )
-
-
-def _matched(path: Path, faces: np.ndarray, others: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return ``values`` (T, 3) of the corners of ``others``, reordered to the same triangles in
-    ``faces``."""
-    here = np.argsort(faces, axis=1, kind="stable")
-    there = np.argsort(others, axis=1, kind="stable")
-    sorted_here = np.take_along_axis(faces, here, 1)
-    sorted_there = np.take_along_axis(others, there, 1)
-    rows = np.lexsort(sorted_here.T)
-    other_rows = np.lexsort(sorted_there.T)
-    differ = (sorted_here[rows] != sorted_there[other_rows]).any(1)
-    if differ.any():
-        odd = " ".join(str(v + 1) for v in others[other_rows[np.argmax(differ)]])
-        raise DyngsError(
-            f"{path}: the body has no triangle of the vertices {odd}; give the .obj made for this body"
-        )
-    matched = np.empty_like(values)
-    ordered = np.empty_like(values)
-    ordered[rows] = np.take_along_axis(values, there, 1)[other_rows]
-    np.put_along_axis(matched, here, ordered, 1)
-    return matched
-
-
 _SMPL = ("v_template", "f", "weights", "kintree_table", "J_regressor", "shapedirs", "posedirs")
 _TEMPLATE = ("v_template", "f", "weights_idx", "weights_val", "kintree_table", "J")
-_UV = ("vt", "ft")
 _TEMPLATE_SHAPES = ("shapedirs", "J_shapedirs")
 _NAMES = {24: "smpl", 52: "smplh", 55: "smplx"}
-_NO_PARENT = 2**32 - 1  # -1 as an unsigned 32-bit number: the parent of the root in SMPL files
 _MOST_VERTICES = 250_000  # SMPL-X has 10,475; four times as many triangles are allowed
-_LARGEST = 1e10  # a larger number in a body file, in whatever unit, means that the file is damaged
 
 
 def read_body(path: Path, uv: Path | None = None) -> BodyTemplate:
@@ -131,227 +35,173 @@ def read_body(path: Path, uv: Path | None = None) -> BodyTemplate:
     ``.obj`` ``uv``.
 
     The number of joints (24, 52 or 55) tells SMPL, SMPL-H and SMPL-X apart. SMPL-X keeps shape and
-    expression in one array: 300 and the rest, or 10 and 10. A file cannot run code: only numbers,
-    text and arrays are read from a pickle. Raises DyngsError: names the file and what is missing or
-    wrong.
+    expression in one array, of which the shapes are read: 300, or 10 of 20. A file cannot run code:
+    only numbers, text and arrays are read from a pickle. Raises DyngsError: names the file and what
+    is missing or wrong.
     """
-    path = Path(path)
-    if path.is_dir():
-        raise DyngsError(f"{path}: is a folder; name the .npz or .pkl file of one body")
-    if path.suffix.lower() not in (".npz", ".pkl"):
+    suffix = path.suffix.lower()
+    if suffix not in (".npz", ".pkl"):
         raise DyngsError(f"{path}: a body file must end in .npz or .pkl")
-    with reading(path):
-        is_npz = path.suffix.lower() == ".npz"
-        arrays = _Arrays(
-            path,
-            read_arrays(path, lambda names: _wanted(path, names)) if is_npz else _read_pickle(path),
+    with reading(path, "give a body file of SMPL, SMPL-H or SMPL-X"):
+
+        def wanted(names: Collection[str]) -> list[str]:
+            keys = (*_TEMPLATE, *_TEMPLATE_SHAPES) if "weights_idx" in names else _SMPL
+            return [key for key in (*keys, "vt", "ft") if key in names]
+
+        if suffix == ".npz":
+            arrays = read_arrays(path, wanted)
+        else:
+            loaded: Any = read_pickle(path)
+            arrays = {key: np.asarray(loaded[key]) for key in wanted(loaded)}
+        file = _BodyFile(path, arrays)
+        parents = file.parents()
+        count = len(parents)
+        vertices = file.numbers("v_template", None, 3)
+        size = len(vertices)
+        require_at_most(path, size, _MOST_VERTICES, "vertices")
+        faces = file.indices("f", None, 3, below=size)
+        require_at_most(path, len(faces), 4 * _MOST_VERTICES, "triangles")
+        corners = None
+        if uv is not None:
+            corners = read_obj(uv, faces)
+        elif "vt" in arrays or "ft" in arrays:
+            places = _on_unit_square(path, file.numbers("vt", None, 2))
+            corners = (places, file.indices("ft", len(faces), 3, below=len(places)))
+        pose_dirs = None
+        if "weights_idx" in arrays:  # the free template
+            followed = file.indices("weights_idx", size, None, below=count)
+            values = _normalized(path, file.numbers("weights_val", *followed.shape))
+            weights = np.zeros((size, count))
+            np.add.at(weights, (np.arange(size)[:, None], followed), values)
+            joints = file.numbers("J", count, 3)
+            rest = (x.astype(np.float32).astype(np.float64) for x in (vertices, joints, weights))
+            bare, bones, skin = rest
+            dirs, joint_dirs = bone_shapes(bare, bones, parents, skin)
+            if "J_shapedirs" in arrays:  # before the directions of bones
+                own = file.numbers("shapedirs", size, 3, None)
+                own_joints = file.numbers("J_shapedirs", count, 3, own.shape[2])
+                dirs = np.concatenate([own, dirs], axis=2)
+                joint_dirs = np.concatenate([own_joints, joint_dirs], axis=2)
+        else:
+            weights = _normalized(path, file.numbers("weights", size, count))
+            regressor = file.numbers("J_regressor", count, size)
+            joints = regressor @ vertices
+            dirs = file.numbers("shapedirs", size, 3, None)
+            if count == 55:  # expressions come after the shapes
+                dirs = dirs[..., : 10 if dirs.shape[2] == 20 else 300]
+            joint_dirs = np.einsum("jm,mkb->jkb", regressor, dirs, optimize=True)
+            pose_dirs = file.numbers("posedirs", size, 3, 9 * (count - 1)).reshape(3 * size, -1).T
+        return BodyTemplate(
+            name="anny" if "weights_idx" in arrays else _NAMES[count],
+            vertices=_float(vertices),
+            faces=torch.from_numpy(faces),
+            uv=None if corners is None else _float(corners[0]),
+            uv_faces=None if corners is None else torch.from_numpy(corners[1]),
+            weights=_float(weights),
+            parents=parents,
+            joints=_float(joints),
+            shape_dirs=_float(dirs),
+            joint_shape_dirs=_float(joint_dirs),
+            pose_dirs=None if pose_dirs is None else _float(pose_dirs),
         )
-        return _body(arrays, None if uv is None else Path(uv))
-
-
-def _body(arrays: _Arrays, uv: Path | None) -> BodyTemplate:
-    """Return the template of the arrays, with the texture coordinates of the file ``uv``; None:
-    their own."""
-    parents = _parents(arrays)
-    vertices = arrays.floats("v_template", (None, 3))
-    require_at_most(arrays.path, len(vertices), _MOST_VERTICES, "vertices")
-    faces = arrays.indices("f", (None, 3), len(vertices), "vertices")
-    require_at_most(arrays.path, len(faces), 4 * _MOST_VERTICES, "triangles")
-    corners = _own_uv(arrays, len(faces)) if uv is None else read_obj(uv, faces, len(vertices))
-    is_template = "weights_idx" in arrays.values
-    weights, joints = _skin(arrays, vertices, len(parents), is_template)
-    body = BodyTemplate(
-        name="anny" if is_template else _NAMES[len(parents)],
-        vertices=_float(vertices),
-        faces=torch.from_numpy(faces),
-        uv=None if corners is None else _float(corners[0]),
-        uv_faces=None if corners is None else torch.from_numpy(corners[1]),
-        weights=_float(weights),
-        parents=parents,
-        joints=_float(joints),
-    )
-    return _with_shapes(body, arrays) if is_template else _with_blend_shapes(body, arrays)
 
 
 @dataclass(frozen=True)
-class _Arrays:
+class _BodyFile:
     """The arrays of a file under the keys that are needed."""
 
     path: Path
-    values: dict[str, np.ndarray]
+    arrays: dict[str, np.ndarray]
 
-    def floats(self, key: str, shape: tuple[int | None, ...]) -> np.ndarray:
+    def numbers(self, key: str, *shape: int | None) -> np.ndarray:
         """Return the finite float64 numbers at ``key``; None in the shape stands for any positive
         number."""
-        value = self.values[key]
+        value = self.arrays[key]
         if value.dtype.kind not in "biuf":
             raise DyngsError(f"{self.path}: '{key}' must hold numbers, not {value.dtype}")
-        fits = value.ndim == len(shape) and all(
-            n > 0 if w is None else n == w for n, w in zip(value.shape, shape, strict=True)
-        )
-        if not fits:
-            wanted = " x ".join("n" if n is None else str(n) for n in shape)
-            got = " x ".join(map(str, value.shape)) or "one number"
+        wanted = tuple(n if w is None else w for w, n in zip(shape, value.shape, strict=False))
+        if not value.size or len(shape) != value.ndim or wanted != value.shape:
+            expected = " x ".join("n" if n is None else str(n) for n in shape)
             raise DyngsError(
-                f"{self.path}: '{key}' must be {wanted}, is {got}; is it another kind of body?"
+                f"{self.path}: '{key}' must be {expected}, is {' x '.join(map(str, value.shape))}; is it another kind "
+                "of body?"
             )
         with np.errstate(invalid="ignore"):  # signalling NaNs, which are refused just below
             value = value.astype(np.float64)
-        if not (np.abs(value) < _LARGEST).all():
-            raise DyngsError(
-                f"{self.path}: '{key}' holds NaN or huge numbers; copy or export the file again"
-            )
+        if not (np.abs(value) < 1e10).all():
+            raise DyngsError(f"{self.path}: '{key}' holds NaN or huge numbers; export it again")
         return value
 
-    def indices(self, key: str, shape: tuple[int | None, ...], count: int, what: str) -> np.ndarray:
-        """Return the whole numbers at ``key``, int64 in [0, count)."""
-        value = self.floats(key, shape)
-        if not ((value >= 0) & (value < count) & (value % 1 == 0)).all():
-            raise DyngsError(
-                f"{self.path}: '{key}' must hold whole numbers from 0 to {count - 1}, one of {count} {what}"
-            )
+    def indices(self, key: str, *shape: int | None, below: int) -> np.ndarray:
+        """Return the whole numbers at ``key``, int64 in [0, below)."""
+        value = self.numbers(key, *shape)
+        if not ((value >= 0) & (value < below) & (value % 1 == 0)).all():
+            raise DyngsError(f"{self.path}: '{key}' must hold whole numbers from 0 to {below - 1}")
         return value.astype(np.int64)
 
-
-def _skin(
-    arrays: _Arrays, vertices: np.ndarray, joints: int, is_template: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights (M, J) and joints (J, 3): the free template's file holds both, SMPL regresses
-    joints."""
-    count = len(vertices)
-    path = arrays.path
-    if not is_template:
-        weights = arrays.floats("weights", (count, joints))
-        return _normalized(path, "weights", weights), arrays.floats(
-            "J_regressor", (joints, count)
-        ) @ vertices
-    followed = arrays.indices("weights_idx", (count, None), joints, "joints")
-    values = _normalized(path, "weights_val", arrays.floats("weights_val", followed.shape))
-    weights = np.zeros((count, joints))
-    np.add.at(weights, (np.arange(count)[:, None], followed), values)
-    return weights, arrays.floats("J", (joints, 3))
-
-
-def _with_blend_shapes(body: BodyTemplate, arrays: _Arrays) -> BodyTemplate:
-    m, j = body.weights.shape
-    directions = arrays.floats("shapedirs", (m, 3, None))
-    pose_dirs = arrays.floats("posedirs", (m, 3, 9 * (j - 1)))
-    joint_directions = np.einsum(
-        "jm,mkb->jkb", arrays.floats("J_regressor", (j, m)), directions, optimize=True
-    )
-    shapes = count = directions.shape[2]
-    if j == 55:  # only SMPL-X has expressions, after the shapes
-        shapes = 10 if count == 20 else min(count, 300)
-    return replace(
-        body,
-        shape_dirs=_float(directions[..., :shapes]),
-        expression_dirs=_float(directions[..., shapes:]) if shapes < count else None,
-        joint_shape_dirs=_float(joint_directions[..., :shapes]),
-        joint_expression_dirs=_float(joint_directions[..., shapes:]) if shapes < count else None,
-        pose_dirs=_float(pose_dirs.reshape(3 * m, -1).T),
-    )
-
-
-def _with_shapes(body: BodyTemplate, arrays: _Arrays) -> BodyTemplate:
-    """Return the free template with its shape space: directions of the file, if there are any, then
-    those of bones."""
-    vertices, joints, weights = (
-        x.double().numpy() for x in (body.vertices, body.joints, body.weights)
-    )
-    directions, joint_directions = bone_shapes(vertices, joints, body.parents, weights)
-    if set(_TEMPLATE_SHAPES) <= set(arrays.values):
-        m, j = weights.shape
-        own = arrays.floats("shapedirs", (m, 3, None))
-        own_joints = arrays.floats("J_shapedirs", (j, 3, own.shape[2]))
-        directions = np.concatenate([own, directions], axis=2)
-        joint_directions = np.concatenate([own_joints, joint_directions], axis=2)
-    return replace(body, shape_dirs=_float(directions), joint_shape_dirs=_float(joint_directions))
+    def parents(self) -> tuple[int, ...]:
+        """Return the parent of each joint, -1 for the root, the first one."""
+        table = self.numbers("kintree_table", 2, None)
+        count = table.shape[1]
+        if count not in _NAMES:
+            raise DyngsError(
+                f"{self.path}: 'kintree_table' has {count} joints; SMPL has 24, SMPL-H 52, SMPL-X 55"
+            )
+        above = table[0, 1:]
+        rows = np.arange(count)
+        if ((above < 0) | (above >= rows[1:]) | (above % 1 != 0)).any() or (table[1] != rows).any():
+            raise DyngsError(
+                f"{self.path}: 'kintree_table' must number the joints from 0 in its second row, and list parents "
+                "before their children"
+            )
+        return (-1, *(int(parent) for parent in above))
 
 
 def _float(values: np.ndarray) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
-def _normalized(path: Path, key: str, weights: np.ndarray) -> np.ndarray:
+def _normalized(path: Path, weights: np.ndarray) -> np.ndarray:
     """Return the weights with rows that sum to 1 exactly; a file may miss it by half precision."""
     sums = weights.sum(1)
-    bad = (np.abs(sums - 1) > 1e-3) | (weights.min(1) < -1e-6)
-    if bad.any():
-        row = int(np.argmax(bad))
-        lowest = weights[row].min()
-        wrong = f"include {lowest:.4g}" if lowest < -1e-6 else f"sum to {sums[row]:.4g}"
-        raise DyngsError(
-            f"{path}: '{key}' of vertex {row} {wrong}; skinning weights must be non-negative and sum to 1"
-        )
+    if (np.abs(sums - 1) > 1e-3).any() or weights.min() < -1e-6:
+        raise DyngsError(f"{path}: skinning weights must be non-negative and sum to 1")
     return weights / sums[:, None]
 
 
-def _parents(arrays: _Arrays) -> tuple[int, ...]:
-    path = arrays.path
-    where = "'kintree_table'"
-    table = arrays.floats("kintree_table", (2, None))
-    count = table.shape[1]
-    if count not in _NAMES:
-        raise DyngsError(f"{path}: {where} has {count} joints; SMPL has 24, SMPL-H 52, SMPL-X 55")
-    if not np.array_equal(table[1], np.arange(count)):
-        raise DyngsError(
-            f"{path}: {where} must number the joints 0 to {count - 1} in its second row"
-        )
-    parents = np.where(table[0] == _NO_PARENT, -1, table[0])
-    known = (parents >= -1) & (parents < count) & (parents % 1 == 0)
-    if not known.all():
-        joint = int(np.argmin(known))
-        raise DyngsError(
-            f"{path}: {where} gives joint {joint} the parent {table[0][joint]:g}, which does not exist"
-        )
-    tree = [int(parent) for parent in parents]
-    for joint, parent in enumerate(tree):
-        if parent == -1 and joint > 0:
-            raise DyngsError(
-                f"{path}: {where} is not a tree: joint {joint} has no parent; only joint 0 may have none"
-            )
-        if parent >= joint:
-            raise DyngsError(
-                f"{path}: {where} must list parents before their children, but joint {joint} has the parent {parent}"
-            )
-    return tuple(tree)
+def _on_unit_square(path: Path, uv: np.ndarray) -> np.ndarray:
+    """Return texture coordinates (U, 2), rounding errors clipped; raises DyngsError where they
+    leave [0, 1]."""
+    if not ((uv > -1e-4) & (uv < 1 + 1e-4)).all():
+        raise DyngsError(f"{path}: texture coordinates must lie in [0, 1], on one tile")
+    return uv.clip(0, 1)
 
 
-def _own_uv(arrays: _Arrays, triangles: int) -> _Coordinates | None:
-    given = [key for key in _UV if key in arrays.values]
-    if not given:
-        return None
-    if len(given) == 1:
-        other = _UV[1 - _UV.index(given[0])]
-        raise DyngsError(
-            f"{arrays.path}: has '{given[0]}' but not '{other}'; texture coordinates need both"
-        )
-    uv = require_unit_square(arrays.path, arrays.floats("vt", (None, 2)))
-    return uv, arrays.indices("ft", (triangles, 3), len(uv), "texture coordinates")
+def read_obj(path: Path, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Read the texture coordinates (U, 2) of an ``.obj`` and the triangles (T, 3) that index them,
+    in the order of the triangles ``faces`` (T, 3) of a body.
 
-
-def _wanted(path: Path, present: Collection[object]) -> list[str]:
-    needed = _TEMPLATE if "weights_idx" in present else _SMPL
-    missing = [f"'{key}'" for key in needed if key not in present]
-    if missing:
-        raise DyngsError(
-            f"{path}: lacks {', '.join(missing)}; give a body file of SMPL, SMPL-H or SMPL-X"
-        )
-    optional = (*_UV, *_TEMPLATE_SHAPES) if needed is _TEMPLATE else _UV
-    return [*needed, *(key for key in optional if key in present)]
-
-
-def _read_pickle(path: Path) -> dict[str, np.ndarray]:
-    loaded = read_pickle(path)
-    if not isinstance(loaded, dict):
-        raise DyngsError(
-            f"{path}: does not hold a dictionary; give a body file of SMPL, SMPL-H or SMPL-X"
-        )
-    found = {key: loaded[key] for key in _wanted(path, loaded)}
-    for key, value in found.items():
-        if not isinstance(value, np.ndarray) or value.dtype.kind == "O":
-            raise DyngsError(f"{path}: '{key}' is not an array of numbers; export it again")
-    return found
+    Those of the file may come in any order, as ``f v/vt v/vt v/vt``. Raises DyngsError: the file
+    cannot be read, or belongs to another body.
+    """
+    with reading(path, "give the .obj made for this body, with triangles 'f v/vt v/vt v/vt'"):
+        uv = []
+        triangles: dict[tuple[int, ...], dict[int, int]] = {}
+        for line in read_limited(path).decode("latin-1").splitlines():
+            kind, *words = line.split() or [""]
+            if kind == "vt":
+                uv.append([float(word) for word in words[:2]])
+            elif kind == "f":
+                corners = {int(v): int(vt) for v, vt, *_ in (x.split("/") for x in words)}
+                triangles[tuple(sorted(corners))] = corners
+        matched = [
+            [triangles[tuple(sorted(face))][vertex] for vertex in face]
+            for face in (faces + 1).tolist()
+        ]
+        uv_faces = np.array(matched) - 1
+        if uv_faces.min() < 0 or uv_faces.max() >= len(uv):
+            raise DyngsError(f"{path}: a face names a texture coordinate that does not exist")
+        return _on_unit_square(path, np.array(uv)), uv_faces
 
 
 DEFAULT_TEMPLATE = Path(__file__).parent / "files" / "anny_smplx55.npz"

@@ -5,38 +5,13 @@ from __future__ import annotations
 _FINGERS = tuple(
     f"{finger}{i}" for finger in ("index", "middle", "pinky", "ring", "thumb") for i in (1, 2, 3)
 )
+_BODY = """
+pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot right_foot neck
+left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow left_wrist right_wrist jaw left_eye
+right_eye
+"""
 JOINT_NAMES = (
-    *(
-        "pelvis",
-        "left_hip",
-        "right_hip",
-        "spine1",
-        "left_knee",
-        "right_knee",
-        "spine2",
-        "left_ankle",
-        "right_ankle",
-    ),
-    *(
-        "spine3",
-        "left_foot",
-        "right_foot",
-        "neck",
-        "left_collar",
-        "right_collar",
-        "head",
-        "left_shoulder",
-    ),
-    *(
-        "right_shoulder",
-        "left_elbow",
-        "right_elbow",
-        "left_wrist",
-        "right_wrist",
-        "jaw",
-        "left_eye",
-        "right_eye",
-    ),
+    *_BODY.split(),
     *(f"left_{name}" for name in _FINGERS),
     *(f"right_{name}" for name in _FINGERS),
 )

@@ -28,17 +28,15 @@ def rasterize(corners: np.ndarray, width: int, height: int) -> Fragments:
     without perspective. Triangles without area cover nothing; edges belong to both sides.
     """
     x, y, near = np.ascontiguousarray(corners.transpose(2, 1, 0))
-    (left, across), (top, down) = _span(x, width), _span(y, height)
+    left, across = span(x, width)
+    top, down = span(y, height)
     some = np.flatnonzero(across * down)  # of small images most triangles have no grid point at all
     (x0, x1, x2), (y0, y1, y2), left, across, top, down = (
         v[..., some] for v in (x, y, left, across, top, down)
     )
     area = (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0)
     counts = np.where(area != 0, across * down, 0)
-    owner = np.repeat(np.arange(len(some)), counts)
-    within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-    column = left[owner] + within % across[owner]
-    row = top[owner] + within // across[owner]
+    owner, column, row = grid_points(counts, left, top, across)
     right = column - x0[owner]
     below = row - y0[owner]
     second = (right * (y2 - y0)[owner] - below * (x2 - x0)[owner]) / area[owner]
@@ -80,7 +78,17 @@ def normalized(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
-def _span(ends: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+def grid_points(
+    counts: np.ndarray, left: np.ndarray, top: np.ndarray, across: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return triangle, column and row of the grid points in the boxes of T triangles, ``counts`` of
+    them each, ``across`` in a row."""
+    owner = np.repeat(np.arange(len(counts)), counts)
+    within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return owner, left[owner] + within % across[owner], top[owner] + within // across[owner]
+
+
+def span(ends: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the first and the number of whole numbers in [0, size) between the ``ends`` (3, T) of
     triangles."""
     first = np.ceil(ends.min(axis=0) - 1e-6).clip(0, size).astype(np.int64)

@@ -53,11 +53,6 @@ class Detection:
         )
 
     @property
-    def middle(self) -> np.ndarray:
-        """(2,) column and row of the middle of the box, pixels."""
-        return (self.box[:2] + self.box[2:]) / 2
-
-    @property
     def height(self) -> float:
         """Of the box, pixels."""
         return float(self.box[3] - self.box[1])
@@ -71,9 +66,9 @@ class Detector(Protocol):
         """What it is called, for messages."""
         ...
 
-    def detect(self, images: Sequence[Path]) -> list[list[Detection]]:
-        """Return the people in each of the images of one camera, which are PNG files of one size in
-        order of time.
+    def detect(self, images: Sequence[Path]) -> list[Detection | None]:
+        """Return the person in each of the images of one camera, which are PNG files of one size in
+        order of time; None where nobody is found.
 
         Raises DyngsError: it cannot be started, or fails.
         """
@@ -114,8 +109,8 @@ class MediaPipe:
             )
         self._python = chosen
 
-    def detect(self, images: Sequence[Path]) -> list[list[Detection]]:
-        """Return at most one person per image; the images must lie in one folder that holds no
+    def detect(self, images: Sequence[Path]) -> list[Detection | None]:
+        """Return the person in each image; the images must lie in one folder that holds no
         others."""
         if not images:
             return []
@@ -161,8 +156,8 @@ def _last_line(said: str) -> str:
     return lines[-1][:200] if lines else "nothing was said"
 
 
-def _read(path: Path) -> list[Detection]:
+def _read(path: Path) -> Detection | None:
     if not path.is_file():
-        return []
+        return None
     arrays = read_arrays(path, lambda _: ("landmarks", "mask"))
-    return [Detection(arrays["landmarks"][list(LANDMARKS)].astype(np.float32), arrays["mask"])]
+    return Detection(arrays["landmarks"][list(LANDMARKS)].astype(np.float32), arrays["mask"])

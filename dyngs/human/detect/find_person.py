@@ -10,7 +10,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,12 +26,11 @@ from dyngs.data.capture import Capture, View, by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.read import is_capture, read_capture
 from dyngs.human.detect.detector import SURE, Detection, Detector, MediaPipe
+from dyngs.human.fit.capture_fit import cheapest_path
 from dyngs.human.fit.fitted_capture import FitInputs, FittedCapture, write_fitted_capture
 from dyngs.io.outputs import make_once, note_source, require_new_folder
 from dyngs.io.write import cache_folder, temporary_folder_beside, write_image, write_text
 
-REACH = 0.6  # distance between following detections of one person, at most, in heights an image
-PATIENCE = 10  # images after which anybody may be the person again
 SWAP = 0.04
 """What a swapped image costs, in heights of the person by which each key point moves: a limb taken
 for the other one in a few images moves them more, and who has turned around stays so for long."""
@@ -41,26 +40,6 @@ _PAIRS = {
     "legs": ((13, 14), (15, 16)),
 }
 """Key points of COCO on the left and on the right."""
-
-
-def followed(images: Sequence[Sequence[Detection]]) -> list[Detection | None]:
-    """Return one person in the images (F) of a camera: the largest that is found first, then who is
-    nearest."""
-    person: list[Detection | None] = []
-    last: Detection | None = None
-    missing = 0
-    for people in images:
-        if last is None or missing > PATIENCE:
-            found = max(people, key=lambda x: x.height, default=None)
-        else:
-            reach = REACH * (missing + 1) * last.height
-            away = [float(np.linalg.norm(x.middle - last.middle)) for x in people]
-            row = int(np.argmin([*away, reach]))
-            found = people[row] if row < len(people) else None
-        person.append(found)
-        missing = missing + 1 if found is None else 0
-        last = last if found is None else found
-    return person
 
 
 def with_sides(person: Sequence[Detection | None]) -> tuple[list[Detection | None], int]:
@@ -94,38 +73,18 @@ def with_sides(person: Sequence[Detection | None]) -> tuple[list[Detection | Non
 def _swapped(points: np.ndarray, pairs: np.ndarray, heights: np.ndarray) -> np.ndarray:
     """Return in which images (F,) bool the ``pairs`` (P, 2) of ``points`` (F, 17, 3) are better
     swapped."""
-    count = len(points)
+    if len(points) < 2:
+        return np.zeros(len(points), bool)
     # (2, F, P, 2, 3): as they are, swapped
     both = np.stack([points[:, pairs], points[:, pairs[:, ::-1]]])
     sure: np.ndarray = np.all(points[:, pairs, 2] > SURE, axis=-1)  # (F, P)
-    best = np.array([0.0, SWAP])
-    came_from = np.zeros((count, 2), int)
-    for t in range(1, count):
-        weights = (sure[t] & sure[t - 1])[None, None, :, None]
-        # (2, 2, P, 2)
-        moved = np.linalg.norm(both[None, :, t, ..., :2] - both[:, None, t - 1, ..., :2], axis=-1)
-        steps = (
-            (moved * weights).sum((2, 3)) / max(heights[t], 1e-6) / max(2 * int(weights.sum()), 1)
-        )
-        total = best[:, None] + steps
-        came_from[t] = total.argmin(0)
-        best = total.min(0) + np.array([0.0, SWAP])
-    states = np.zeros(count, bool)
-    state = int(best.argmin()) if count else 0
-    for t in range(count - 1, -1, -1):
-        states[t], state = bool(state), int(came_from[t, state])
-    return states
-
-
-OFTEN = 0.1  # fraction of the images from which on something is said
-SMALL = 120.0  # height of a person below which an avatar has little to learn from, px
-# sharpness, as a fraction of the clip's median, below which an image is called blurred
-BLURRED = 0.3
-# width of the shoulders, of the person's height, from which on they are seen from the front or
-# behind
-FACING = 0.1
-_SHOULDERS = (5, 6)
-_ANKLES = (15, 16)
+    weights = (sure[1:] & sure[:-1])[..., None]
+    # (2, 2, F - 1, P, 2): from the row's state to the column's
+    moved = np.linalg.norm(both[None, :, 1:, ..., :2] - both[:, None, :-1, ..., :2], axis=-1)
+    units = heights[1:].clip(1e-6) * (2 * weights.sum((1, 2))).clip(1)
+    changes = (moved * weights).sum((3, 4)) / units
+    costs = np.tile([0.0, SWAP], (len(points), 1))
+    return np.array(cheapest_path(costs, changes.transpose(2, 0, 1)), bool)
 
 
 def warnings_of(
@@ -144,20 +103,20 @@ def warnings_of(
     height = float(np.median([x.height for x in detections]))
     cut = sum(_is_cut_off(x, images.shape[1]) for x in detections)
     sharp = np.array([_sharpness(image, x) for image, x in shown])
-    blurred = int((sharp < BLURRED * np.median(sharp)).sum())
+    blurred = int((sharp < 0.3 * np.median(sharp)).sum())
     lines = []
     if count < len(images):
         gone = len(images) - count
         lines.append(
             f"nobody is found in {gone} of {counted(len(images), 'image')}; these are left out"
         )
-    if cut > OFTEN * count:
+    if cut > 0.1 * count:
         lines.append(
             f"the feet are cut off or hidden in {cut} of {counted(count, 'image')}; legs will be a guess there"
         )
-    if height < SMALL:
+    if height < 120:
         lines.append(f"the person is {height:.0f} px high; come nearer or record larger images")
-    if blurred > OFTEN * count:
+    if blurred > 0.1 * count:
         lines.append(f"{counted(blurred, 'image')} blurred; more light, or slower motion, helps")
     if alone and not _turns(detections):
         lines.append("the person never turns around: what the camera never sees will be a guess")
@@ -165,7 +124,7 @@ def warnings_of(
 
 
 def _is_cut_off(person: Detection, height: int) -> bool:
-    ankles = person.keypoints[list(_ANKLES)]
+    ankles = person.keypoints[[15, 16]]
     return bool(
         (ankles[:, 2] < SURE).all()
         or (ankles[:, 1] > height - 2).any()
@@ -182,27 +141,14 @@ def _sharpness(image: np.ndarray, person: Detection) -> float:
 
 def _turns(people: Sequence[Detection]) -> bool:
     """Whether the person is seen from the front and from behind: the left shoulder right of the
-    right one, and left."""
-    left, right = (np.array([x.keypoints[row] for x in people]) for row in _SHOULDERS)
+    right one, and left, by a tenth of their height."""
+    left, right = (np.array([x.keypoints[row] for x in people]) for row in (5, 6))
     sure = (left[:, 2] > SURE) & (right[:, 2] > SURE)
     across = (left[sure, 0] - right[sure, 0]) / np.array([max(x.height, 1.0) for x in people])[sure]
-    return bool((across > FACING).any() and (across < -FACING).any())
+    return bool((across > 0.1).any() and (across < -0.1).any())
 
 
 SIDE = 960  # longest side of the images that a detector sees, px
-
-
-@dataclass(frozen=True)
-class _Camera:
-    """The views of one camera in order of time and their images (F, H, W, 3) uint8."""
-
-    views: tuple[View, ...]
-    images: np.ndarray
-
-    @property
-    def scale(self) -> float:
-        """Pixels of a view per pixel of these images."""
-        return self.views[0].width / self.images.shape[2]
 
 
 def find_person(
@@ -221,76 +167,56 @@ def find_person(
     Raises DyngsError: nobody is found.
     """
     points: dict[str, np.ndarray] = {}
-    cameras = _cameras_of(capture)
-    for index, camera in enumerate(cameras):
-        person, swapped = with_sides(followed(_detected(camera, detector, folder / "frames")))
-        report("cameras in which the person is found", index + 1, len(cameras))
-        where = "" if len(cameras) == 1 else f"camera {camera.views[0].camera_id}: "
+    cameras = [*by_camera(capture.splits).values()]
+    for index, views in enumerate(cameras, 1):
+        # A detector reads files, which only live here.
+        size = target_size(views[0].width, views[0].height, 1.0, SIDE)
+        files = [folder / "frames" / f"{row:06d}.png" for row in range(len(views))]
+        images = np.stack([_shrunk_image(view, size) for view in views])
+        for file, image in zip(files, images, strict=True):
+            write_image(file, image)
+        person, swapped = with_sides(detector.detect(files))
+        for file in files:
+            file.unlink()
+        report("cameras in which the person is found", index, len(cameras))
+        where = "" if len(cameras) == 1 else f"camera {views[0].camera_id}: "
         heights = [x.height for x in person if x is not None]
         if not heights:
             say(f"warning: {where}{detector.name} finds nobody, its images are left out")
-            for view in camera.views:
-                nobody = np.zeros((view.height, view.width), np.uint8)
-                write_image(folder / "masks" / f"{view.name}.png", nobody)
-            continue
-        say(
-            f"{where}{detector.name} finds the person, {np.median(heights):.0f} px high, in {len(heights)} of "
-            f"{counted(len(person), 'image')}; left and right swapped in {counted(swapped, 'image')}"
-        )
-        for warning in warnings_of(camera.images, person, alone=len(cameras) == 1):
-            say(f"warning: {where}{warning}")
-        _write_masks(camera, person, folder / "masks", say)
-        for view, own in zip(camera.views, person, strict=True):
+        else:
+            say(
+                f"{where}{detector.name} finds the person, {np.median(heights):.0f} px high, in {len(heights)} of "
+                f"{counted(len(person), 'image')}; left and right swapped in {counted(swapped, 'image')}"
+            )
+            for warning in warnings_of(images, person, alone=len(cameras) == 1):
+                say(f"warning: {where}{warning}")
+        masks = np.zeros(images.shape[:3], bool)
+        for row, own in enumerate(person):
             if own is not None:
-                points[view.name] = own.keypoints * np.array([camera.scale, camera.scale, 1.0])
+                masks[row] = own.mask > 127
+                scale = views[row].width / size[0]
+                points[views[row].name] = own.keypoints * np.array([scale, scale, 1.0])
+        better = outlined(images, masks) if heights else None
+        if better is not None:
+            common = (better & masks).sum() / max(int((better | masks).sum()), 1)
+            say(
+                f"the camera stands: outlines by its background, which agree with the detector's to {common:.3f} (IoU)"
+            )
+            masks = better
+        for view, mask in zip(views, masks, strict=True):
+            write_image(folder / "masks" / f"{view.name}.png", at_size(mask, view))
     if not points:
         raise DyngsError(
-            f"{capture.root}: {detector.name} finds nobody in {counted(sum(len(x.views) for x in cameras), 'image')}; "
-            "look at them, or give masks of another program to `dyngs data fit` (docs/person.md)"
+            f"{capture.root}: {detector.name} finds nobody in {counted(sum(map(len, cameras)), 'image')}; look at "
+            "them, or give masks of another program to `dyngs data fit` (docs/person.md)"
         )
     _write_keypoints(folder / "keypoints.json", points)
     return FitInputs(keypoints=folder / "keypoints.json", masks=folder / "masks")
 
 
-def _cameras_of(capture: Capture) -> list[_Camera]:
-    cameras = []
-    for views in by_camera(capture.splits).values():
-        size = target_size(views[0].width, views[0].height, 1.0, SIDE)
-        images = [read_image(view.image_path, (view.width, view.height))[..., :3] for view in views]
-        cameras.append(
-            _Camera(
-                tuple(views), np.stack([area_downscale_uint8(x, *size).numpy() for x in images])
-            )
-        )
-    return cameras
-
-
-def _detected(camera: _Camera, detector: Detector, folder: Path) -> list[list[Detection]]:
-    """Return the people in the images, which a detector reads from files that only live here."""
-    files = [folder / f"{row:06d}.png" for row in range(len(camera.images))]
-    try:
-        for file, image in zip(files, camera.images, strict=True):
-            write_image(file, image)
-        return detector.detect(files)
-    finally:
-        for file in files:
-            file.unlink(missing_ok=True)
-
-
-def _write_masks(
-    camera: _Camera, person: Sequence[Detection | None], folder: Path, say: Callable[[str], None]
-) -> None:
-    """Write the masks of all views at their size; nothing where the detector makes no masks."""
-    size = camera.images.shape[1:3]
-    masks = np.stack([np.zeros(size, bool) if x is None else x.mask > 127 for x in person])
-    better = outlined(camera.images, masks)
-    if better is not None:
-        common = (better & masks).sum() / max(int((better | masks).sum()), 1)
-        say(
-            f"the camera stands: outlines by its background, which agree with the detector's to {common:.3f} (IoU)"
-        )
-    for view, mask in zip(camera.views, masks if better is None else better, strict=True):
-        write_image(folder / f"{view.name}.png", at_size(mask, view))
+def _shrunk_image(view: View, size: tuple[int, int]) -> np.ndarray:
+    pixels = read_image(view.image_path, (view.width, view.height))[..., :3]
+    return area_downscale_uint8(pixels, *size).numpy()
 
 
 def _write_keypoints(path: Path, points: dict[str, np.ndarray]) -> None:
@@ -342,7 +268,7 @@ def with_found_person(
     def find() -> None:
         detector = MediaPipe()
         say(f"person:  found first, as by `dyngs data people`, into {folder}")
-        say(write_found_person(data, folder, detector, report, say).summary())
+        say(write_found_person(data, folder, detector, report, say).summary)
 
     make_once(folder, find, say, f"person:  found before, in {folder}")
     note_source(folder, data.root)

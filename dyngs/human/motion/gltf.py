@@ -6,7 +6,7 @@ Local letters: S joints, K keys of a channel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Container, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dyngs.core.errors import reading
-from dyngs.human.motion.motion import (
-    SkeletonMotion,
-    frame_chunks,
-    require_frame_count,
-    sample_times,
-)
+from dyngs.human.motion.motion import SkeletonMotion, require_frame_count, sample_times
 from dyngs.io.fields import require_at_most
 from dyngs.io.gltf import MOST_JOINTS, GltfFile
 
@@ -32,35 +27,10 @@ _VRM_THUMBS = {
 }
 """Names of the thumb's first two bones in VRM 1, and what VRM 0, and all other fingers, call
 these."""
-
-
-@dataclass(frozen=True)
-class _Curve:
-    """Animation curve of one property of a node: K ascending times, s, and K values, or 3 K for a
-    cubic spline."""
-
-    times: np.ndarray
-    values: np.ndarray
-    interpolation: str
-
-
-@dataclass(frozen=True)
-class _Transforms:
-    """Transforms of a node in F frames: linear part and rotation (F, 3, 3), position (F, 3)."""
-
-    linear: np.ndarray
-    rotations: np.ndarray
-    positions: np.ndarray
-
-
-@dataclass(frozen=True)
-class _Rig:
-    """The joints of a file: nodes, names, and inverse bind matrices (an accessor); None: the nodes
-    stand at rest."""
-
-    joints: tuple[int, ...]
-    names: tuple[str, ...]
-    bind: int | None = None
+_Curve = tuple[np.ndarray, np.ndarray, str]
+"""Animation curve of one property of a node: K ascending times, s, K values, or 3 K for a cubic
+spline, and the interpolation."""
+_Curves = dict[tuple[int, str], _Curve]
 
 
 def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> SkeletonMotion:
@@ -70,163 +40,123 @@ def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> Skeleto
     The joints are those of the largest skin, at rest in the bind pose, or without inverse bind
     matrices as the nodes stand. Without a skin all animated nodes are joints, and must show a
     T-pose or an A-pose without animation. ``clip`` names the animation, where several move the
-    joints. Raises DyngsError: no such animation, anything broken or not supported (sparse
-    accessors, meshopt compression, mirrored nodes); names the file.
+    joints. Of a VRM animation (extension VRMC_vrm_animation 1.0), which stands in a T-pose without
+    animation, joints have the names of VRM's humanoid, and the first animation counts unless
+    ``clip`` names another; expressions and the gaze are left out. Raises DyngsError: no such
+    animation, anything broken or not supported (sparse accessors, meshopt compression, mirrored
+    nodes); names the file.
     """
     with reading(path):
         file = GltfFile(path)
-        rig = _skin(file) or _animated_nodes(file, clip)
-        return _motion(file, rig, fps, _chosen(file, _with_ancestors(file, rig.joints), clip))
-
-
-def read_vrm_animation(path: Path, fps: float = 30.0, clip: str | None = None) -> SkeletonMotion:
-    """Read a VRM animation (``.vrma``, extension VRMC_vrm_animation 1.0): the bones have the names
-    of VRM's humanoid.
-
-    Without animation the nodes stand in a T-pose. The first animation counts unless ``clip`` names
-    another. Expressions and the gaze are left out. Raises DyngsError: as ``read_gltf``, or the
-    extension is missing.
-    """
-    with reading(path):
-        file = GltfFile(path)
-        extension = file.json.get("extensions", {}).get("VRMC_vrm_animation")
-        if extension is None:
-            raise file.error("has no VRMC_vrm_animation; a plain glTF animation ends in .glb")
-        bones = extension["humanoid"]["humanBones"]
-        rig = _Rig(
-            tuple(bone["node"] for bone in bones.values()),
-            tuple(_VRM_THUMBS.get(name, name) for name in bones),
+        vrm = _vrm_animation(file)
+        bind = None
+        if vrm is not None:
+            bones = vrm["humanoid"]["humanBones"]
+            joints = [bone["node"] for bone in bones.values()]
+            names = [_VRM_THUMBS.get(name, name) for name in bones]
+        else:
+            if file.json.get("skins"):
+                skin = max(file.json["skins"], key=lambda skin: len(skin["joints"]))
+                joints = skin["joints"]
+                bind = skin.get("inverseBindMatrices")
+            else:
+                joints = _animated_nodes(file, clip)
+            names = [file.nodes[node].get("name", "") for node in joints]
+        require_at_most(path, len(joints), MOST_JOINTS, "joints")
+        chain = _with_ancestors(file, joints)
+        curves = _curves(file, _chosen(file, chain, clip), chain)
+        start = min(times[0] for times, _, _ in curves.values())
+        end = max(times[-1] for times, _, _ in curves.values())
+        require_frame_count(path, float((end - start) * fps), len(chain))
+        times = start + sample_times(end - start, 1.0, fps)
+        rotations, positions = _world_transforms(file, chain, joints, curves, times)
+        if not (np.abs(positions) < 1e9).all():
+            raise file.error("its joints move beyond all bounds; export it again")
+        if bind is None:
+            turned, still = _world_transforms(file, chain, joints, {}, np.zeros(1))
+            rest = still[0]
+            joint_from_rest = turned[0].swapaxes(1, 2)
+        else:
+            matrices = _finite(file, bind, "MAT4").reshape(-1, 4, 4).swapaxes(1, 2)
+            matrices = matrices[: len(joints)]
+            joint_from_rest = _nearest_rotations(file, matrices[:, :3, :3])
+            rest = -np.linalg.solve(matrices[:, :3, :3], matrices[:, :3, 3:])[..., 0]
+        return SkeletonMotion(
+            path, tuple(names), rest, rotations @ joint_from_rest, positions, fps, True
         )
-        chain = _with_ancestors(file, rig.joints)
-        moving = _moving(file, chain)
-        chosen = moving[0] if moving and clip is None else _chosen(file, chain, clip)
-        return _motion(file, rig, fps, chosen)
 
 
-def _skin(file: GltfFile) -> _Rig | None:
-    if not file.json.get("skins"):
-        return None
-    largest = max(file.json["skins"], key=lambda skin: len(skin["joints"]))
-    joints = tuple(largest["joints"])
-    names = tuple(file.nodes[node].get("name", "") for node in joints)
-    return _Rig(joints, names, largest.get("inverseBindMatrices"))
-
-
-def _animated_nodes(file: GltfFile, clip: str | None) -> _Rig:
-    nodes = file.nodes
-    channels = _chosen(file, dict.fromkeys(range(len(nodes))), clip)["channels"]
+def _animated_nodes(file: GltfFile, clip: str | None) -> list[int]:
+    """Return the nodes that the animation moves, and all below them."""
+    channels = _chosen(file, range(len(file.nodes)), clip)["channels"]
     targets = [channel["target"] for channel in channels]
-    waiting = [x["node"] for x in targets if x["path"] in _KINDS and "node" in x]
+    waiting = [target.get("node") for target in targets if target["path"] in _KINDS]
     found: set[int] = set()
     while waiting:
         node = waiting.pop()
-        if node not in found and node < len(nodes):
+        if node is not None and node not in found:
             found.add(node)
-            waiting += nodes[node].get("children", [])
-    joints = tuple(sorted(found))
-    if not joints:
-        raise file.error("its animation moves no node; export it again")
-    return _Rig(joints, tuple(nodes[node].get("name", "") for node in joints))
+            waiting += file.nodes[node].get("children", [])
+    return sorted(found)
 
 
-def _motion(file: GltfFile, rig: _Rig, fps: float, animation: dict[str, Any]) -> SkeletonMotion:
-    joints = rig.joints
-    require_at_most(file.path, len(joints), MOST_JOINTS, "joints")
-    chain = _with_ancestors(file, joints)
-    curves = _curves(file, animation, chain)
-    start = min(c.times[0] for c in curves.values())
-    end = max(c.times[-1] for c in curves.values())
-    require_frame_count(file.path, float((end - start) * fps), len(chain))
-    times = start + sample_times(end - start, 1.0, fps)
-    rotations = np.empty((len(times), len(joints), 3, 3))
-    positions = np.empty((len(times), len(joints), 3))
-    for part in frame_chunks(len(times)):
-        moving = _world_transforms(file, chain, curves, times[part])
-        for i, node in enumerate(joints):
-            rotations[part, i] = moving[node].rotations
-            positions[part, i] = moving[node].positions
-    if not (np.abs(positions) < 1e9).all():
-        raise file.error("its joints move beyond all bounds; export it again")
-    if rig.bind is None:
-        still = _world_transforms(file, chain, {}, np.zeros(1))
-        rest = np.stack([still[node].positions[0] for node in joints])
-        rest_from_joint = np.stack([still[node].rotations[0] for node in joints])
-    else:
-        rest, rest_from_joint = _bind_pose(file, rig.bind, len(joints))
-    for part in frame_chunks(len(times)):
-        rotations[part] = rotations[part] @ rest_from_joint.swapaxes(1, 2)
-    return SkeletonMotion(file.path, rig.names, rest, rotations, positions, fps, world_is_y_up=True)
-
-
-def _with_ancestors(file: GltfFile, joints: tuple[int, ...]) -> dict[int, int | None]:
+def _with_ancestors(file: GltfFile, joints: Sequence[int]) -> dict[int, int | None]:
     """Return the parent of each joint and of all their ancestors, parents first; None for roots."""
-    nodes = file.nodes
     parents: dict[int, int] = {}
-    for i, owner in enumerate(nodes):
-        for child in owner.get("children", []):
-            if child >= len(nodes) or child in parents:
-                raise file.error(f"node {child} is missing or has two parents; export it again")
-            parents[child] = i
+    for i, owner in enumerate(file.nodes):
+        parents.update(dict.fromkeys(owner.get("children", []), i))
     chain: dict[int, int | None] = {}
     for joint in joints:
-        if not 0 <= joint < len(nodes):
-            raise file.error(f"the skin's joint {joint} is missing; export it again")
-        above: list[int] = []
+        above: dict[int, int | None] = {}
         node: int | None = joint
         while node is not None and node not in chain:
-            above.append(node)
-            node = parents.get(node)
-            if len(above) > len(nodes):
+            if node in above:
                 raise file.error(f"node {joint} is its own ancestor; export it again")
-        chain.update((x, parents.get(x)) for x in reversed(above))
+            above[node] = parents.get(node)
+            node = above[node]
+        chain.update(reversed(above.items()))
     return chain
 
 
-def _chosen(file: GltfFile, chain: dict[int, int | None], clip: str | None) -> dict[str, Any]:
-    """Return the animation of that name, or the only one that moves a node of the chain."""
-    moving = _moving(file, chain)
-    named = [a for a in moving if clip in (None, a.get("name", ""))]
-    names = ", ".join(f"{a.get('name', '')!r:.32}" for a in moving[:20])
+def _vrm_animation(file: GltfFile) -> dict[str, Any] | None:
+    return file.json.get("extensions", {}).get("VRMC_vrm_animation")
+
+
+def _chosen(file: GltfFile, nodes: Container[int | None], clip: str | None) -> dict[str, Any]:
+    """Return the animation of that name, or the only one that moves one of the nodes."""
+    moving = [
+        x
+        for x in file.json.get("animations", [])
+        if any(channel["target"].get("node") in nodes for channel in x["channels"])
+    ]
     if not moving:
         raise file.error("no animation moves its joints; export it with the animation")
-    if not named:
-        raise file.error(f"has no animation {clip!r}; it has {names}")
-    if clip is None and len(named) > 1:
-        raise file.error(f"has several animations; choose a clip of {names}")
+    named = [x for x in moving if clip in (None, x.get("name", ""))]
+    if not named or (len(named) > 1 and clip is None and _vrm_animation(file) is None):
+        names = ", ".join(f"{x.get('name', '')!r:.32}" for x in moving[:20])
+        problem = (
+            "several animations; choose a clip of" if named else f"no animation {clip!r}; it has"
+        )
+        raise file.error(f"has {problem} {names}")
     return named[0]
 
 
-def _moving(file: GltfFile, chain: dict[int, int | None]) -> list[dict[str, Any]]:
-    return [
-        animation
-        for animation in file.json.get("animations", [])
-        if any(channel["target"].get("node") in chain for channel in animation["channels"])
-    ]
-
-
-def _curves(
-    file: GltfFile, animation: dict[str, Any], chain: dict[int, int | None]
-) -> dict[tuple[int, str], _Curve]:
-    curves: dict[tuple[int, str], _Curve] = {}
+def _curves(file: GltfFile, animation: dict[str, Any], chain: dict[int, int | None]) -> _Curves:
+    """Return the curves of an animation that move nodes of the chain, by node and property."""
+    curves: _Curves = {}
     for channel in animation["channels"]:
         node = channel["target"].get("node")
         kind = channel["target"]["path"]
         if node not in chain or kind not in _KINDS:
             continue
-        if "matrix" in file.nodes[node]:
-            raise file.error(f"node {node} is animated but has a matrix; export it again")
         sampler = animation["samplers"][channel["sampler"]]
         interpolation = sampler.get("interpolation", "LINEAR")
-        per_key = {"LINEAR": 1, "STEP": 1, "CUBICSPLINE": 3}[interpolation]
+        rows = {"LINEAR": 1, "STEP": 1, "CUBICSPLINE": 3}[interpolation]
         times = _finite(file, sampler["input"], "SCALAR")[:, 0]
         values = _finite(file, sampler["output"], _KINDS[kind])
-        if len(values) != len(times) * per_key:
-            raise file.error(
-                f"a {kind} of node {node} has {len(times)} times but {len(values)} values"
-            )
-        if (np.diff(times) < 0).any():
-            raise file.error(f"the times of a {kind} of node {node} do not ascend; export it again")
-        curves[node, kind] = _Curve(times, values, interpolation)
+        if len(values) != rows * len(times) or (np.diff(times) < 0).any():
+            raise file.error(f"the keys of a {kind} of node {node} are broken; export it again")
+        curves[node, kind] = (times, values, interpolation)
     if not curves:
         raise file.error("its animation moves no joint; choose another clip")
     return curves
@@ -242,99 +172,78 @@ def _finite(file: GltfFile, index: int, kind: str) -> np.ndarray:
 def _world_transforms(
     file: GltfFile,
     chain: dict[int, int | None],
-    curves: dict[tuple[int, str], _Curve],
+    joints: Sequence[int],
+    curves: _Curves,
     times: np.ndarray,
-) -> dict[int, _Transforms]:
-    """Return the transforms of the nodes of the chain in the world at ``times`` (F,)."""
-    placed: dict[int, _Transforms] = {}
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return rotations (F, S, 3, 3) and positions (F, S, 3) of joints in the world at ``times``
+    (F,)."""
+    placed: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for index, parent in chain.items():
-        local = _local(file, index, curves, times)
-        if parent is None:
-            placed[index] = local
-            continue
-        above = placed[parent]
-        position = above.positions + (above.linear @ local.positions[..., None])[..., 0]
-        placed[index] = _Transforms(
-            above.linear @ local.linear, above.rotations @ local.rotations, position
-        )
-    return placed
+        matrix, rotation = _local(file, index, curves, times)
+        if parent is not None:
+            above, turn = placed[parent]
+            matrix = above @ matrix
+            rotation = turn @ rotation
+        placed[index] = (matrix, rotation)
+    rotations = np.stack([placed[node][1] for node in joints], axis=1)
+    return rotations, np.stack([placed[node][0][:, :3, 3] for node in joints], axis=1)
 
 
 def _local(
-    file: GltfFile, index: int, curves: dict[tuple[int, str], _Curve], times: np.ndarray
-) -> _Transforms:
-    """Return the transforms of a node relative to its parent: T R S, or its matrix."""
+    file: GltfFile, index: int, curves: _Curves, times: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the transform (F, 4, 4) of a node relative to its parent, T R S or its matrix, and its
+    rotation (F, 3, 3)."""
     node = file.nodes[index]
-    frames = len(times)
+    matrix = np.tile(np.eye(4), (len(times), 1, 1))
     if "matrix" in node:
-        matrix = np.array(node["matrix"], np.float64).reshape(4, 4).T
-        rotation = _rotation_of(file, matrix[None, :3, :3])
-        still = (matrix[:3, :3], rotation[0], matrix[:3, 3])
-        return _Transforms(*(np.broadcast_to(x, (frames, *x.shape)) for x in still))
-    values: dict[str, np.ndarray] = {}
-    for kind, still_value in _AT_REST.items():
-        curve = curves.get((index, kind))
-        fixed = np.tile(np.array(node.get(kind, still_value), np.float64), (frames, 1))
-        values[kind] = fixed if curve is None else _sampled(file, curve, times)
-    rotation = _rotations(file, values["rotation"]).as_matrix()
+        matrix[:] = np.reshape(node["matrix"], (4, 4)).T
+        return matrix, _nearest_rotations(file, matrix[:, :3, :3])
+    values = {
+        kind: _sampled(curves[index, kind], times)
+        if (index, kind) in curves
+        else np.tile(np.array(node.get(kind, still), np.float64), (len(times), 1))
+        for kind, still in _AT_REST.items()
+    }
     if (values["scale"].prod(axis=1) < 0).any():
         raise file.error(f"node {index} is mirrored; export it without negative scale")
-    return _Transforms(rotation * values["scale"][:, None], rotation, values["translation"])
+    rotation = Rotation.from_quat(values["rotation"]).as_matrix()
+    matrix[:, :3, :3] = rotation * values["scale"][:, None]
+    matrix[:, :3, 3] = values["translation"]
+    return matrix, rotation
 
 
-def _sampled(file: GltfFile, curve: _Curve, times: np.ndarray) -> np.ndarray:
+def _sampled(curve: _Curve, times: np.ndarray) -> np.ndarray:
     """Return values (F, 3) or (F, 4) at ``times`` (F,), clamped to the first and the last key."""
-    # keys are float32: rounding must not miss a step
-    slack = 1e-4 if curve.interpolation == "STEP" else 0.0
-    after = np.searchsorted(curve.times, times + slack, side="right")
+    keys, values, interpolation = curve
+    # Keys are float32: rounding must not miss a step.
+    slack = 1e-4 if interpolation == "STEP" else 0.0
+    after = np.searchsorted(keys, times + slack, side="right")
     before = np.maximum(after - 1, 0)
-    after = np.minimum(after, len(curve.times) - 1)
-    span = curve.times[after] - curve.times[before]
-    fraction = ((times - curve.times[before]) / np.where(span > 0, span, 1.0))[:, None]
-    if curve.interpolation == "CUBICSPLINE":
-        arriving, keys, leaving = curve.values.reshape(len(curve.times), 3, -1).transpose(1, 0, 2)
+    after = np.minimum(after, len(keys) - 1)
+    if interpolation == "STEP":
+        return values[before]
+    span = keys[after] - keys[before]
+    fraction = ((times - keys[before]) / np.where(span > 0, span, 1.0))[:, None]
+    if interpolation == "CUBICSPLINE":
+        arriving, points, leaving = values.reshape(len(keys), 3, -1).transpose(1, 0, 2)
         ease = fraction * fraction * (3 - 2 * fraction)
-        bend = (
-            span[:, None]
-            * fraction
-            * (1 - fraction)
-            * ((1 - fraction) * leaving[before] - fraction * arriving[after])
-        )
-        return keys[before] + ease * (keys[after] - keys[before]) + bend
-    if curve.interpolation == "STEP":
-        return curve.values[before]
-    start = curve.values[before]
-    end = curve.values[after]
+        slopes = (1 - fraction) * leaving[before] - fraction * arriving[after]
+        bend = span[:, None] * fraction * (1 - fraction) * slopes
+        return points[before] + ease * (points[after] - points[before]) + bend
+    start = values[before]
+    end = values[after]
     if start.shape[1] == 3:
         return start + fraction * (end - start)
-    turned = _rotations(file, start)
-    return (
-        turned * Rotation.from_rotvec(fraction * (turned.inv() * _rotations(file, end)).as_rotvec())
-    ).as_quat()
+    first = Rotation.from_quat(start)
+    turn = first.inv() * Rotation.from_quat(end)
+    return (first * Rotation.from_rotvec(fraction * turn.as_rotvec())).as_quat()
 
 
-def _rotations(file: GltfFile, quats: np.ndarray) -> Rotation:
-    largest = np.abs(quats).max(axis=1, keepdims=True)
-    if (largest == 0).any():
-        raise file.error("a rotation is a quaternion of zeros; export it again")
-    return Rotation.from_quat(quats / largest)
-
-
-def _bind_pose(file: GltfFile, index: int, joints: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return joints (S, 3) and rotations rest_from_joint (S, 3, 3) of the bind pose."""
-    matrices = _finite(file, index, "MAT4").reshape(-1, 4, 4).swapaxes(1, 2)[:joints]
-    if len(matrices) < joints:
-        raise file.error(
-            f"has {len(matrices)} inverse bind matrices for {joints} joints; export it again"
-        )
-    joint_from_rest = _rotation_of(file, matrices[:, :3, :3])
-    rest = -np.linalg.solve(matrices[:, :3, :3], matrices[:, :3, 3:])[..., 0]
-    return rest, joint_from_rest.swapaxes(1, 2)
-
-
-def _rotation_of(file: GltfFile, linear: np.ndarray) -> np.ndarray:
+def _nearest_rotations(file: GltfFile, linear: np.ndarray) -> np.ndarray:
     """Return the nearest rotations (S, 3, 3): U V^T of the singular value decomposition U D V^T."""
-    left, stretch, right = np.linalg.svd(linear)
-    if (stretch[:, 2] <= 1e-9 * stretch[:, 0]).any() or (np.linalg.det(left @ right) < 0).any():
+    if not (np.linalg.det(linear) > 0).all():
         raise file.error("a matrix is flat or mirrored; export it without negative scale")
+    left, _, right = np.linalg.svd(linear)
     return left @ right

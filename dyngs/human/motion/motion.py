@@ -29,9 +29,6 @@ UpAxis = Literal["auto", "y", "z"]
 MAX_JOINT_POSES = 5_000_000
 """Limit on joints (at least 55) times frames of a motion: 90,909 frames, or 50 minutes at 30 frames
 per second."""
-_RATES = (1e-3, 1e5)  # frames per second that a file may have
-# frames per block, so that temporary memory does not grow with the length of a motion
-_CHUNK = 1024
 
 
 @dataclass(frozen=True)
@@ -58,45 +55,18 @@ class Motion:
         return replace(self, poses=poses_for_joints(self.poses, count))
 
     def resampled(self, fps: float) -> Motion:
-        """Return the motion at ``fps`` frames per second, from the first frame to at most the last
-        one.
+        """Return the motion at ``fps`` > 0 frames per second, from the first frame to at most the
+        last one.
 
         Rotations are interpolated spherically the shorter way, all else linearly. Nothing is
-        smoothed. Raises DyngsError: ``fps`` is not a positive number, or gives more frames than
-        ``MAX_JOINT_POSES`` allows.
+        smoothed.
         """
-        most = allowed(MAX_JOINT_POSES) / len(JOINT_NAMES)
-        if not len(self) * fps <= most * self.fps:
-            raise DyngsError(
-                f"cannot resample the motion to {fps:g} frames per second, as it would have more than {most:,.0f} "
-                f"frames; ask for 30 or the like, or set {LIMITS_VARIABLE}=N to allow N times as many"
-            )
-        times = sample_times(len(self) - 1, self.fps, fps)
         if fps == self.fps:
             return self
-        parts = [self._interpolated(times[rows], fps) for rows in frame_chunks(len(times))]
-        tensors = {
-            name: torch.cat([getattr(part, name) for part in parts])
-            for name in ("poses", "trans", "scale")
-        }
-        return replace(parts[0], **tensors, notes=self.notes)
-
-    def _interpolated(self, times: np.ndarray, fps: float) -> Motion:
+        times = sample_times(len(self) - 1, self.fps, fps)
         before = np.minimum(times.astype(np.int64), max(len(self) - 2, 0))
         after = np.minimum(before + 1, len(self) - 1)
-        fraction = torch.from_numpy(times - before)
-
-        def linear(values: Tensor) -> Tensor:
-            weight = fraction.to(values).reshape(-1, *[1] * (values.dim() - 1))
-            return torch.lerp(values[before], values[after], weight)
-
-        poses = interpolate_rotations(self.poses[before], self.poses[after], times - before)
-        return Motion(poses, linear(self.trans), self.betas, fps, linear(self.scale))
-
-
-def frame_chunks(count: int) -> list[slice]:
-    """Return slices of at most 1024 frames that cover ``count`` frames."""
-    return [slice(start, min(start + _CHUNK, count)) for start in range(0, count, _CHUNK)]
+        return replace(self, fps=fps, **_between(self, before, after, times - before))
 
 
 def require_frame_count(path: Path, frames: float, joints: int) -> None:
@@ -104,22 +74,21 @@ def require_frame_count(path: Path, frames: float, joints: int) -> None:
 
     Raises DyngsError: it exceeds ``MAX_JOINT_POSES``.
     """
-    amount = frames * max(joints, len(JOINT_NAMES))
+    count = max(joints, len(JOINT_NAMES))
     most = allowed(MAX_JOINT_POSES)
-    if not amount <= most:
-        factor = f"{math.ceil(amount / MAX_JOINT_POSES)}" if amount < 1e15 else "N"
+    if not frames * count <= most:
         raise DyngsError(
-            f"{path}: {frames:.0f} frames of {max(joints, len(JOINT_NAMES))} joints are too many; at most {most:,} "
-            f"poses of joints are read; cut it into shorter pieces, or set {LIMITS_VARIABLE}={factor}"
+            f"{path}: {frames:.0f} frames of {count} joints are too many; at most {most:,} poses of joints are read; "
+            f"cut it into shorter pieces, or set {LIMITS_VARIABLE}=N to allow N times as many"
         )
 
 
 def require_frame_rate(path: Path, fps: float) -> float:
     """Return ``fps`` if it is a plausible frame rate of a motion. Raises DyngsError: it is not."""
-    if not _RATES[0] <= fps <= _RATES[1]:
+    if not 1e-3 <= fps <= 1e5:
         raise DyngsError(
-            f"{path}: {fps:g} frames per second is not the rate of a motion ({_RATES[0]:g} to {_RATES[1]:g}); correct "
-            "its frame rate or frame time"
+            f"{path}: {fps:g} frames per second is not the rate of a motion (0.001 to 100,000); correct its frame rate "
+            "or frame time"
         )
     return fps
 
@@ -128,11 +97,8 @@ def sample_times(last: float, from_fps: float, fps: float) -> np.ndarray:
     """Return times (F,) in [0, last], in frames of ``from_fps``, that are 1 / ``fps`` seconds
     apart.
 
-    The last frame is included if it is missed by at most a thousandth of a frame. Raises
-    DyngsError: ``fps`` is not a positive number.
+    The last frame is included if it is missed by at most a thousandth of a frame.
     """
-    if not 0 < fps < math.inf:
-        raise DyngsError(f"{fps:g} frames per second is not a frame rate; ask for 30 or the like")
     count = math.floor(last / from_fps * fps + 1e-3) + 1
     return np.minimum(np.arange(count) * (from_fps / fps), last)
 
@@ -155,15 +121,36 @@ def poses_for_joints(poses: Tensor, count: int) -> Tensor:
     return wanted
 
 
-def interpolate_rotations(before: Tensor, after: Tensor, fraction: np.ndarray) -> Tensor:
-    """Return axis-angle vectors (F, J, 3) at ``fraction`` (F,) of the way between two: R_a exp(s
-    log(R_a^T R_b))."""
+def compose_rotations(first: Tensor, second: Tensor) -> Tensor:
+    """Return the axis-angle vectors (..., 3) of the products of two rotations, the second one
+    applied before the first one; computed in float64.
+
+    ``second`` (..., 3); ``first`` has the same shape, or is one vector (3,).
+    """
     from scipy.spatial.transform import Rotation
 
-    start = Rotation.from_rotvec(before.reshape(-1, 3).double().cpu().numpy())
-    turn = start.inv() * Rotation.from_rotvec(after.reshape(-1, 3).double().cpu().numpy())
-    part = Rotation.from_rotvec(turn.as_rotvec() * np.repeat(fraction, before.shape[1])[:, None])
-    return torch.from_numpy((start * part).as_rotvec()).to(before).reshape(before.shape)
+    one, other = (
+        Rotation.from_rotvec(x.double().cpu().numpy().reshape(-1, 3)) for x in (first, second)
+    )
+    return torch.from_numpy((one * other).as_rotvec()).to(second).reshape(second.shape)
+
+
+def _between(
+    frames: Motion | MotionClip, before: np.ndarray, after: np.ndarray, fraction: np.ndarray
+) -> dict[str, Tensor]:
+    """Return poses, translations and scales at ``fraction`` (F,) of the way between two rows:
+    rotations R_a exp(s log(R_a^T R_b)), all else linearly."""
+
+    def weight_for(values: Tensor) -> Tensor:
+        return torch.from_numpy(fraction).to(values).reshape(-1, *[1] * (values.dim() - 1))
+
+    start, end = (frames.poses[rows].double() for rows in (before, after))
+    turn = compose_rotations(-start, end)
+    found = {"poses": compose_rotations(start, weight_for(turn) * turn).to(frames.poses)}
+    for name in ("trans", "scale"):
+        values: Tensor = getattr(frames, name)
+        found[name] = torch.lerp(values[before], values[after], weight_for(values))
+    return found
 
 
 @dataclass(frozen=True)
@@ -178,9 +165,6 @@ class SkeletonMotion:
     fps: float  # frames per second
     # whether the world is known to be y up; otherwise it has the axes of the rest pose
     world_is_y_up: bool
-
-
-_SAME_TIME = 1e-9
 
 
 @dataclass(frozen=True)
@@ -209,39 +193,43 @@ class MotionClip:
         """Return the frames at ``rows`` (long, on the CPU, ascending)."""
         return MotionClip(self.times[rows], self.poses[rows], self.trans[rows], self.scale[rows])
 
+    @staticmethod
+    def joined(clips: Sequence[MotionClip]) -> MotionClip:
+        """Return the frames of several clips, one after the other."""
+        rows = [(x.times, x.poses, x.trans, x.scale) for x in clips]
+        return MotionClip(*(torch.cat(parts) for parts in zip(*rows, strict=True)))
+
+    def with_rows(self, rows: Sequence[int], frames: MotionClip) -> MotionClip:
+        """Return the clip with ``frames`` (R of them) in place of its R ``rows``."""
+        index = torch.tensor(rows, device="cpu")
+        names = ("times", "poses", "trans", "scale")
+        pairs = {name: (getattr(self, name), getattr(frames, name)) for name in names}
+        return MotionClip(
+            **{name: x.index_copy(0, index, y.to(x)) for name, (x, y) in pairs.items()}
+        )
+
     def at(self, time: float | None) -> MotionClip:
         """Return a clip of one frame at ``time``, clamped to the clip; None: the first frame.
 
         Between frames rotations are interpolated spherically the shorter way, all else linearly.
         """
         times = self.times
-        moment = (
-            float(times[0]) if time is None else min(max(time, float(times[0])), float(times[-1]))
-        )
-        after = int(torch.searchsorted(times, moment - _SAME_TIME).clamp_max(len(self) - 1))
-        if abs(float(times[after]) - moment) <= _SAME_TIME:
+        first, last = times[[0, -1]].tolist()
+        moment = first if time is None else min(max(time, first), last)
+        after = int(torch.searchsorted(times, moment - 1e-9).clamp_max(len(self) - 1))
+        if abs(float(times[after]) - moment) <= 1e-9:
             return self.select(torch.tensor([after], device="cpu"))
-        before = after - 1
-        fraction = (moment - float(times[before])) / float(times[after] - times[before])
+        fraction = (moment - times[after - 1]) / (times[after] - times[after - 1])
+        rows = (np.array([after - 1]), np.array([after]))
         return MotionClip(
-            times=torch.tensor([moment], dtype=times.dtype, device=times.device),
-            poses=interpolate_rotations(
-                self.poses[before:after], self.poses[after : after + 1], np.array([fraction])
-            ),
-            trans=torch.lerp(self.trans[before], self.trans[after], fraction)[None],
-            scale=torch.lerp(self.scale[before], self.scale[after], fraction)[None],
+            times.new_tensor([moment]), **_between(self, *rows, fraction[None].numpy())
         )
 
 
 def motion_clip(motion: Motion) -> MotionClip:
     """Return the motion as a clip, its frames spread evenly over [0, 1]; place and size stay as
     given."""
-    count = len(motion)
-    times = (
-        torch.from_numpy(np.linspace(0, 1, count))
-        if count > 1
-        else torch.zeros(1, dtype=torch.float64, device="cpu")
-    )
+    times = torch.from_numpy(np.linspace(0, 1, len(motion)))
     return MotionClip(times, motion.poses.float(), motion.trans.float(), motion.scale.float())
 
 
@@ -253,10 +241,14 @@ class CapturedMotion:
     clip: MotionClip
     frames: tuple[int, ...]  # (F,) frame numbers, as views name them
 
-    @property
+    @cached_property
     def rows(self) -> dict[int, int]:
         """The row of the clip that shows each frame."""
         return {frame: min(row, len(self.clip) - 1) for row, frame in enumerate(self.frames)}
+
+    def of_frames(self, frames: Sequence[int]) -> MotionClip:
+        """Return a clip with a row for each of the ``frames``, also of who never moves."""
+        return self.clip.select(torch.tensor([self.rows[x] for x in frames], device="cpu"))
 
     def to(self, *, device: torch.device | str) -> CapturedMotion:
         """Return the motion with its clip on ``device``."""

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from dyngs.core.errors import DyngsError, reading
 from dyngs.human.body.body import BodyTemplate
@@ -21,9 +20,15 @@ from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES, JOINT_PARENTS, SMPLX_ROWS
 from dyngs.human.motion.amass import read_amass
 from dyngs.human.motion.bvh import read_bvh
-from dyngs.human.motion.gltf import read_gltf, read_vrm_animation
-from dyngs.human.motion.motion import Motion, SkeletonMotion, UpAxis, frame_chunks
-from dyngs.human.motion.placement import place_on_floor
+from dyngs.human.motion.gltf import read_gltf
+from dyngs.human.motion.motion import (
+    Motion,
+    SkeletonMotion,
+    UpAxis,
+    require_frame_count,
+    require_frame_rate,
+)
+from dyngs.human.motion.placement import least_rotation, place_on_floor
 
 _OURS = (
     "pelvis spine1 spine2 spine3 neck head *_collar *_shoulder *_elbow *_wrist *_hip *_knee *_ankle *_foot "
@@ -116,10 +121,15 @@ def match_joints(path: Path, names: Sequence[str]) -> dict[str, int]:
     best_rig = ""
     best_rank = (-1, -1)
     for rig, wanted in RIGS.items():
-        for prefix in _prefixes(plain, wanted["pelvis"]):
-            found = _found(
-                wanted, {x.removeprefix(prefix): i for i, x in reversed([*enumerate(plain)])}
-            )
+        ends = [x.removesuffix(end) for x in plain for end in wanted["pelvis"] if x.endswith(end)]
+        for prefix in list(dict.fromkeys(["", *ends]))[:4]:
+            # the first joint of a name, and the first name of a joint count
+            there = {x.removeprefix(prefix): i for i, x in reversed([*enumerate(plain)])}
+            found = {
+                ours: next(there[name] for name in theirs if name in there)
+                for ours, theirs in wanted.items()
+                if not there.keys().isdisjoint(theirs)
+            }
             rank = (
                 sum(name in found for name in _NEEDED),
                 sum(name in found for name in JOINT_NAMES[:22]),
@@ -129,26 +139,11 @@ def match_joints(path: Path, names: Sequence[str]) -> dict[str, int]:
     wanted = RIGS[best_rig]
     missing = [" or ".join(wanted[name]) for name in _NEEDED if name not in best]
     if missing:
-        known = ", ".join(RIGS)
         raise DyngsError(
             f"{path}: unknown joint names; compared with {best_rig}, the most similar rig, it lacks "
-            f"{', '.join(missing)}; rename its joints (known rigs: {known})"
+            f"{', '.join(missing)}; rename its joints (known rigs: {', '.join(RIGS)})"
         )
     return best
-
-
-def _prefixes(names: list[str], pelvis: tuple[str, ...]) -> list[str]:
-    """Return at most four distinct prefixes of a name of the pelvis, the empty one first."""
-    found = [name.removesuffix(end) for name in names for end in pelvis if name.endswith(end)]
-    return list(dict.fromkeys(["", *found]))[:4]
-
-
-def _found(wanted: dict[str, tuple[str, ...]], there: dict[str, int]) -> dict[str, int]:
-    """Return the index of the first name that is present, for each joint that has one."""
-    hits = {
-        ours: [there[name] for name in names if name in there] for ours, names in wanted.items()
-    }
-    return {ours: indices[0] for ours, indices in hits.items() if indices}
 
 
 _FINGERS = ("index", "middle", "pinky", "ring", "thumb")
@@ -171,8 +166,6 @@ _FOLLOWS = {
     "wrist": "elbow",
 }
 """The joint whose alignment a joint of a limb takes if the end of its own bone is unknown."""
-# how near to an axis the left direction of a rest pose must be to be that axis
-_SNAP_COS = np.cos(np.radians(15.0))
 
 
 def retarget(source: SkeletonMotion, body: BodyTemplate) -> Motion:
@@ -195,57 +188,27 @@ def retarget(source: SkeletonMotion, body: BodyTemplate) -> Motion:
     }
     theirs = {name: target_from_rest @ source.rest[i] for name, i in found.items()}
     alignments = _alignments(ours, theirs)
-    to_target = {name: (i, target_from_rest.T @ alignments[name]) for name, i in found.items()}
-    poses = [
-        _axis_angles(_world_rotations(source.rotations[rows], target_from_world, to_target))
-        for rows in frame_chunks(len(source.rotations))
-    ]
+    world = np.empty((len(source.rotations), 55, 3, 3))
+    for i, name in enumerate(JOINT_NAMES):
+        if name in found:
+            own = source.rotations[:, found[name]]
+            world[:, i] = target_from_world @ own @ (target_from_rest.T @ alignments[name])
+        else:
+            world[:, i] = world[:, JOINT_PARENTS[i]]
+    local = world.copy()
+    local[:, 1:] = world[:, JOINT_PARENTS[1:]].swapaxes(2, 3) @ world[:, 1:]
+    poses = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 55, 3)
     first = {name: source.positions[0, i] for name, i in found.items()}
     ratio = _leg_length(ours) / max(_leg_length(first), 1e-9)
     trans = ratio * source.positions[:, found["pelvis"]] @ target_from_world.T - ours["pelvis"]
-    return place_on_floor(
-        Motion(
-            torch.cat(poses),
-            torch.from_numpy(trans).float(),
-            torch.zeros(10, device="cpu"),
-            source.fps,
-            torch.ones(len(trans), device="cpu"),
-        ),
-        body,
+    motion = Motion(
+        poses=torch.from_numpy(poses).float(),
+        trans=torch.from_numpy(trans).float(),
+        betas=torch.zeros(10, device="cpu"),
+        fps=source.fps,
+        scale=torch.ones(len(trans), device="cpu"),
     )
-
-
-def _world_rotations(
-    source_rotations: np.ndarray,
-    target_from_world: np.ndarray,
-    to_target: dict[str, tuple[int, np.ndarray]],
-) -> np.ndarray:
-    """Return the world rotations (F, 55, 3, 3) of our joints from those of the source (F, S, 3, 3).
-
-    ``to_target`` maps our joints that the source has to its index and the rotation that aligns it
-    at rest.
-    """
-    world = np.empty((len(source_rotations), 55, 3, 3))
-    for i, name in enumerate(JOINT_NAMES):
-        if name in to_target:
-            joint, alignment = to_target[name]
-            world[:, i] = target_from_world @ source_rotations[:, joint] @ alignment
-        else:
-            world[:, i] = world[:, JOINT_PARENTS[i]]
-    return world
-
-
-def _axis_angles(world: np.ndarray) -> Tensor:
-    """Return axis-angle vectors (F, 55, 3), float32, relative to the parents, of world rotations
-    (F, 55, 3, 3)."""
-    local = np.concatenate(
-        [world[:, :1], world[:, JOINT_PARENTS[1:]].swapaxes(2, 3) @ world[:, 1:]], axis=1
-    )
-    return (
-        torch.from_numpy(Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec())
-        .float()
-        .reshape(-1, 55, 3)
-    )
+    return place_on_floor(motion, body)
 
 
 def _target_from_rest(source: SkeletonMotion, found: dict[str, int]) -> np.ndarray:
@@ -273,7 +236,7 @@ def _target_from_rest(source: SkeletonMotion, found: dict[str, int]) -> np.ndarr
             f"{source.path}: in its rest pose left and right coincide; export it with a T-pose as rest pose"
         )
     left = left / length
-    if left @ _nearest_axis(left) > _SNAP_COS:
+    if left @ _nearest_axis(left) > np.cos(np.radians(15)):
         left = _nearest_axis(left)
     return np.stack([left, up, np.cross(left, up)])
 
@@ -305,21 +268,6 @@ def _alignments(
     return turns
 
 
-def least_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation (3, 3) from one unit vector to another; half a turn about any
-    axis for opposites."""
-    axis = np.cross(start, end)
-    # accurate near half a turn, unlike the cosine
-    angle = np.arctan2(np.linalg.norm(axis), start @ end)
-    if not axis.any():
-        axis = np.cross(start, np.eye(3)[np.abs(start).argmin()])
-    axis = axis / np.abs(axis).max()  # first, as squares of 1e-200 underflow
-    axis = axis / np.linalg.norm(axis)
-    # the product of nearly opposite vectors is not quite perpendicular
-    axis = axis - start * (start @ axis)
-    return Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
-
-
 def _leg_length(at: dict[str, np.ndarray]) -> float:
     bones = (("hip", "knee"), ("knee", "ankle"))
     return sum(
@@ -329,16 +277,7 @@ def _leg_length(at: dict[str, np.ndarray]) -> float:
     )
 
 
-_KINDS = {
-    ".npz": "an AMASS or SMPL-X .npz",
-    ".bvh": "a .bvh",
-    ".glb": "a .glb",
-    ".gltf": "a .gltf",
-    ".vrma": "a .vrma",
-}
-"""Names of the formats by suffix."""
-# frames per second at which glTF's curves are sampled unless another rate is requested
-_GLTF_FPS = 30.0
+_SUFFIXES = (".npz", ".bvh", ".glb", ".gltf", ".vrma")
 
 
 def read_motion(
@@ -356,10 +295,9 @@ def read_motion(
     rate needs ``fps``. ``up``: see ``read_amass``; ``clip`` names the animation of a glTF file.
     Raises DyngsError: names the file and what is wrong.
     """
-    path, suffix = Path(path), Path(path).suffix.lower()
-    if suffix not in _KINDS:
-        *others, last = _KINDS.values()
-        raise DyngsError(f"{path}: unknown kind of motion; give {', '.join(others)} or {last}")
+    suffix = path.suffix.lower()
+    if suffix not in _SUFFIXES:
+        raise DyngsError(f"{path}: unknown kind of motion; give {', '.join(_SUFFIXES)}")
     if up != "auto" and suffix != ".npz":
         raise DyngsError(
             f"{path}: the up axis can only be chosen for an .npz; that of a {suffix} is known"
@@ -368,6 +306,8 @@ def read_motion(
         raise DyngsError(
             f"{path}: a {suffix} holds one motion without a name; do not ask for '{clip}'"
         )
+    if fps is not None:
+        require_frame_rate(path, fps)
     body = default_template() if body is None else body
     with reading(path):
         if suffix == ".npz":
@@ -375,6 +315,8 @@ def read_motion(
         elif suffix == ".bvh":
             motion = retarget(read_bvh(path), body)
         else:
-            read = read_vrm_animation if suffix == ".vrma" else read_gltf
-            motion = retarget(read(path, _GLTF_FPS if fps is None else fps, clip), body)
-    return motion if fps is None else motion.resampled(fps)
+            motion = retarget(read_gltf(path, fps or 30.0, clip), body)
+    if fps is None:
+        return motion
+    require_frame_count(path, len(motion) * fps / motion.fps, len(JOINT_NAMES))
+    return motion.resampled(fps)

@@ -127,8 +127,6 @@ def person_in(capture: Capture, template: BodyTemplate, images: ImageLoader) -> 
         joints=joints,
         shape_dirs=None,
         joint_shape_dirs=None,
-        expression_dirs=None,
-        joint_expression_dirs=None,
     )
     motion = captured_motion(capture.root, given, capture.splits["train"], joints)
     return Person(capture.root.name, body, motion, images)

@@ -473,7 +473,7 @@ class PosedMesh:
 
 
 def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Path:
-    """Write images of a walking person in the layout that ``dyngs.data.readers.blender`` reads;
+    """Write images of a walking person in the layout that ``dyngs.data.readers.transforms`` reads;
     returns ``out``.
 
     Files: ``images/SPLIT/fFFF_cCC.png`` (RGBA, straight alpha), ``transforms_SPLIT.json`` (OpenGL

@@ -86,7 +86,6 @@ def test_poses_of_the_demo_scene_are_found_from_a_video(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["arc.mp4", "capture"]
     assert sorted(p.name for p in out.iterdir()) == [
         "images",
-        "sfm_report.json",
         "sparse",
         "times.json",
     ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dyngs.data.images.colour_space import BT2020, ColourTags, srgb_encoded, to_srgb
+from dyngs.data.images.video import BT2020, ColourTags, srgb_encoded, to_srgb
 
 PQ, HLG, DISPLAY_P3, BT709 = 16, 18, 12, 1
 

@@ -150,8 +150,6 @@ def test_missing_files(root: Path) -> None:
     [
         ({"pose": None}, "'pose' must be a data set"),
         ({"pose": np.ones((3, 72))}, "'pose' has 3 rows but 'trans' 7"),
-        ({"pose": np.ones((7, 63))}, "'poses' has 63 numbers per frame"),
-        ({"trans": np.full((7, 3), np.nan)}, "'trans' of frame 0 holds NaN"),
         ({"pose": np.zeros((7, 72)), "trans": np.zeros((7, 3))}, "holds no frame"),
     ],
 )

@@ -16,7 +16,7 @@ from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture
-from dyngs.data.readers.phone_apps import read_polycam, read_record3d
+from dyngs.data.readers.photogrammetry import read_polycam, read_record3d
 
 
 def read(root: Path) -> Capture:

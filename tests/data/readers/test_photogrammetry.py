@@ -140,7 +140,7 @@ def test_photos_that_metashape_did_not_align_are_left_out(tmp_path: Path) -> Non
         ),
         (' label="DSC_1.jpg"', ' label="DSC_0.jpg"', "DSC_0.jpg is listed more than once"),
         ('sensor_id="7"', 'sensor_id="8"', r"cameras\.xml: cannot be read .*'8'"),
-        ("DSC_", "IMG_", "no photo in .*images has the name of a camera"),
+        ("DSC_", "IMG_", "no photo in .* has the name of a camera"),
     ],
 )
 def test_damaged_cameras_of_metashape_are_one_line(

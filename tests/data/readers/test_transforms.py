@@ -15,8 +15,13 @@ from dyngs.capture.inspection import format_report, inspect_capture
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import ImageLoader
-from dyngs.data.readers.blender import read_blender, read_nerfstudio
-from dyngs.data.readers.transforms import FrameFile, find_points, read_points
+from dyngs.data.readers.transforms import (
+    FrameFile,
+    find_points,
+    read_blender,
+    read_nerfstudio,
+    read_points,
+)
 from dyngs.io.containment import staying_within
 
 ODD = (

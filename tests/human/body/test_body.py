@@ -15,7 +15,6 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError
 from dyngs.human.body.body import (
     BONE_UNIT,
     SIDED,
@@ -51,7 +50,7 @@ def normal(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def tiny(shapes: int = 3, expressions: int = 2) -> BodyTemplate:
+def tiny(shapes: int = 3) -> BodyTemplate:
     """4 joints in a fork, 6 vertices, all that SMPL-X has; float64."""
     j, m = 4, 6
     return BodyTemplate(
@@ -64,9 +63,7 @@ def tiny(shapes: int = 3, expressions: int = 2) -> BodyTemplate:
         parents=(-1, 0, 1, 0),
         joints=normal(j, 3, seed=2),
         shape_dirs=normal(m, 3, shapes, seed=3),
-        expression_dirs=normal(m, 3, expressions, seed=4),
         joint_shape_dirs=normal(j, 3, shapes, seed=5),
-        joint_expression_dirs=normal(j, 3, expressions, seed=6),
         pose_dirs=0.1 * normal(9 * (j - 1), 3 * m, seed=7),
     )
 
@@ -84,7 +81,7 @@ def test_the_template_is_a_person_of_normal_size_who_faces_forward(template: Bod
         assert template.joints[left, 0] > 0 > template.joints[right, 0]
     assert template.joints[10, 2] > template.joints[7, 2], "toes are in front of the ankles"
     torch.testing.assert_close(template.weights.sum(1), torch.ones(13718))
-    assert (template.num_shapes, template.num_expressions) == (44, 0)
+    assert template.num_shapes == 44
 
 
 def test_its_surface_is_closed_and_faces_outward(template: BodyTemplate) -> None:
@@ -125,30 +122,16 @@ def test_the_mirrored_pose_is_the_mirrored_body(template: BodyTemplate) -> None:
 def test_shape_moves_vertices_and_joints_linearly() -> None:
     body = tiny()
     betas = torch.tensor([0.5, -1, 2]).double()
-    expression = torch.tensor([3.0, -0.25]).double()
-    vertices, joints = apply_shape(body, betas, expression)
+    vertices, joints = apply_shape(body, betas)
+    assert body.shape_dirs is not None
+    assert body.joint_shape_dirs is not None
     expected = body.vertices.clone()
     expected_joints = body.joints.clone()
-    for amounts, dirs, joint_dirs in (
-        (betas, body.shape_dirs, body.joint_shape_dirs),
-        (expression, body.expression_dirs, body.joint_expression_dirs),
-    ):
-        assert dirs is not None
-        assert joint_dirs is not None
-        for i, amount in enumerate(amounts):
-            expected += amount * dirs[:, :, i]
-            expected_joints += amount * joint_dirs[:, :, i]
+    for i, amount in enumerate(betas):
+        expected += amount * body.shape_dirs[:, :, i]
+        expected_joints += amount * body.joint_shape_dirs[:, :, i]
     torch.testing.assert_close(vertices, expected)
     torch.testing.assert_close(joints, expected_joints)
-
-
-def test_parameters_that_the_body_lacks_are_refused(template: BodyTemplate) -> None:
-    with pytest.raises(
-        DyngsError, match=r"^betas: 46 numbers given, but the anny body has 44; .*set them to 0$"
-    ):
-        apply_shape(template, torch.ones(46))
-    with pytest.raises(DyngsError, match=r"^expression: 3 numbers given, but the tiny body has 2;"):
-        apply_shape(tiny(), None, torch.ones(3).double())
 
 
 # --- batches, types, gradients
@@ -172,7 +155,7 @@ def test_pose_blend_shapes_follow_all_rotations_but_the_root() -> None:
 @pytest.mark.parametrize("size", [0.0, 1.0])
 def test_gradients(size: float) -> None:
     body = tiny()
-    given = (size * normal(2, 4, 3), normal(2, 3), normal(3), normal(2, 2), normal(2).exp())
+    given = (size * normal(2, 4, 3), normal(2, 3), normal(3), normal(2).exp())
     assert torch.autograd.gradcheck(
         lambda *x: posed_vertices(body, *x), tuple(x.requires_grad_() for x in given)
     )

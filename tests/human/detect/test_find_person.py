@@ -52,31 +52,27 @@ def clip(tmp_path: Path) -> Path:
 
 
 class Rough:
-    """Finds the person with outlines that are 1 px off, and nobody in image 4; smaller, somebody
-    who stands apart."""
+    """Finds the person with outlines that are 1 px off, and nobody in image 4."""
 
     name = "Rough"
 
-    def __init__(self, beside: bool = False, nobody: bool = False) -> None:
-        self.beside, self.nobody = beside, nobody
+    def __init__(self, nobody: bool = False) -> None:
+        self.nobody = nobody
 
-    def detect(self, images: Sequence[Path]) -> list[list[Detection]]:
+    def detect(self, images: Sequence[Path]) -> list[Detection | None]:
         shown = [read_image(path).shape[:2] for path in images]
         scale = shown[0][0] / HEIGHT
         step = COUNT // len(images)  # frames 0, 4 and 8, or all of them
         numbers = range(0, COUNT, step) if step == 1 else (0, 4, 8)
-        return [[] if self.nobody or n == 4 else self._people(n, scale) for n in numbers]
+        return [None if self.nobody or n == 4 else self._walker(n, scale) for n in numbers]
 
-    def _people(self, number: int, scale: float) -> list[Detection]:
+    def _walker(self, number: int, scale: float) -> Detection:
         grown = (ndimage.binary_dilation, ndimage.binary_erosion)[number % 2](truth(number))
         grown = grown[:: round(1 / scale), :: round(1 / scale)]
         points = person(30 + 10 * number, 90.0).keypoints * np.array(
             [scale, scale, 1.0], np.float32
         )
-        walker = Detection(points.astype(np.float32), (255 * grown).astype(np.uint8))
-        small = np.zeros_like(walker.mask)
-        small[-8:, -8:] = 255
-        return [Detection(person(150, 20.0).keypoints, small), walker] if self.beside else [walker]
+        return Detection(points.astype(np.float32), (255 * grown).astype(np.uint8))
 
 
 def capture_of(clip: Path) -> Capture:
@@ -94,9 +90,7 @@ def test_masks_and_key_points_of_all_views(
 ) -> None:
     monkeypatch.setattr(module, "SIDE", side)
     said: list[str] = []
-    found = find_person(
-        capture_of(clip), Rough(beside=side == 960), tmp_path / "found", report_nothing, said.append
-    )
+    found = find_person(capture_of(clip), Rough(), tmp_path / "found", report_nothing, said.append)
     assert found.masks is not None
     assert found.keypoints is not None
     seen = [number for number in range(COUNT) if number != 4]
@@ -126,7 +120,7 @@ def test_a_camera_in_which_nobody_is_found_is_left_out(clip: Path, tmp_path: Pat
     others = [replace(view, camera_id=1, name=f"other_{view.name}") for view in first]
     detector = Rough()
     once = detector.detect
-    answers = iter([once, lambda images: [[] for _ in images]])
+    answers = iter([once, lambda images: [None for _ in images]])
     detector.detect = lambda images: next(answers)(images)  # type: ignore[method-assign]
     said: list[str] = []
     both = capture.replace(splits={"train": (*first, *others)})
@@ -166,7 +160,7 @@ def test_a_clip_is_looked_at_once(
         assert options.root == clip
         out.mkdir(parents=True)
         made.append(out)
-        return SimpleNamespace(summary=lambda: "fitted")
+        return SimpleNamespace(summary="fitted")
 
     monkeypatch.setattr(module, "write_found_person", write)
     said: list[str] = []

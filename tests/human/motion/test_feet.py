@@ -3,6 +3,8 @@ direction."""
 
 from __future__ import annotations
 
+import re
+
 import pytest
 import torch
 from torch import Tensor
@@ -10,7 +12,7 @@ from torch import Tensor
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.motion.placement import feet_kept, foot_contact, sole_points
+from dyngs.human.motion.placement import feet_kept, floor_contact, sole_points
 
 FPS = 30.0
 BODY = default_template()
@@ -47,13 +49,11 @@ def test_soles_are_on_the_floor_under_the_feet_and_follow_them() -> None:
 
 def test_a_person_who_stands_and_is_pushed_stays_where_it_is() -> None:
     clip = clip_of(steps(20, (0.004, 0.0, 0.003)))
-    kept, before, after = feet_kept(clip, soles_of(clip), Y, FPS)
-    assert before.frames == 20
-    assert before.slide == pytest.approx(0.005, rel=1e-4)
-    assert after.slide < 1e-6
+    kept, note = feet_kept(clip, soles_of(clip), Y, FPS)
+    assert note == (
+        "feet: on the floor in 20 of 20 frames, where they slide 5.0 mm per frame; with the root moved 0.0 mm"
+    )
     torch.testing.assert_close(kept.trans, clip.trans.mean(0).expand(20, 3), rtol=0, atol=1e-5)
-    again = foot_contact(kept, soles_of(kept), Y, FPS)
-    assert again.slide == pytest.approx(after.slide, abs=1e-6), "measured anew"
 
 
 def walk(stride: float, root: float) -> MotionClip:
@@ -82,9 +82,10 @@ def walk(stride: float, root: float) -> MotionClip:
 def test_a_walk_with_a_root_that_is_too_fast_is_slowed_down_to_the_feet() -> None:
     true = walk(0.3, 1.0)
     fast = walk(0.3, 1.3)
-    kept, before, after = feet_kept(fast, soles_of(fast), Y, FPS)
-    assert before.frames > 60
-    assert after.slide < 0.4 * before.slide
+    kept, note = feet_kept(fast, soles_of(fast), Y, FPS)
+    frames, _, before, after = (float(x) for x in re.findall(r"[\d.]+", note))
+    assert frames > 60
+    assert after < 0.4 * before
     length = [float((x.trans[-1] - x.trans[0]).norm()) for x in (true, fast, kept)]
     assert length[1] == pytest.approx(1.3 * length[0], rel=1e-3)
     assert length[2] == pytest.approx(length[0], rel=0.1)
@@ -95,12 +96,11 @@ def test_a_walk_with_a_root_that_is_too_fast_is_slowed_down_to_the_feet() -> Non
 def test_feet_that_sink_into_the_floor_while_other_legs_bend_still_touch_it() -> None:
     trans = steps(150, (0.003, 0.0, 0.0))
     trans[70:110, 1] = -0.1
-    touching = foot_contact(clip_of(trans), soles_of(clip_of(trans)), Y, FPS).touching
+    touching = floor_contact(clip_of(trans), soles_of(clip_of(trans)), Y, FPS)
     assert touching[:38].all(), "a second away"
     assert touching[72:108].all()
     assert touching[142:].all()
     lifted = torch.zeros(150, 3)
     lifted[50:100, 1] = 0.3
-    assert (
-        not foot_contact(clip_of(lifted), soles_of(clip_of(lifted)), Y, FPS).touching[51:99].any()
-    )
+    touching = floor_contact(clip_of(lifted), soles_of(clip_of(lifted)), Y, FPS)
+    assert not touching[51:99].any()

@@ -285,12 +285,12 @@ def test_the_suffix_says_what_a_file_is(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "options", "problem"),
     [
-        ("x.fbx", {}, r"x\.fbx: unknown kind of motion; give an AMASS or SMPL-X \.npz"),
+        ("x.fbx", {}, r"x\.fbx: unknown kind of motion; give \.npz"),
         ("x.bvh", {"up": "z"}, "the up axis can only be chosen for an .npz"),
         ("x.npz", {"clip": "Walk"}, "holds one motion without a name"),
         ("x.bvh", {}, "cannot be read"),
         ("x.glb", {}, "cannot be read"),
-        ("x.npz", {}, "no such file"),
+        ("x.npz", {}, "No such file"),
     ],
 )
 def test_what_cannot_be_read(

@@ -21,7 +21,7 @@ from dyngs.config import DataConfig
 from dyngs.core.conventions import report_nothing
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
-from dyngs.data.aim import look_at
+from dyngs.data.geometry import look_at
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import captures_in, read_capture
 from dyngs.evaluate.report import evaluate_run
