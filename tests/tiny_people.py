@@ -10,8 +10,7 @@ from dyngs.config import Config, DataConfig
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.keys import HumanPredictorModel
-from dyngs.human.predict.ghg.learner import read_person
-from dyngs.human.predict.ghg.network import AtlasPerson
+from dyngs.human.predict.ghg.network import AtlasPerson, read_person
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 
 TINY = HumanOptions(size=32, num_frames=1, num_new=1, num_cameras=8, num_test=1, samples=1)

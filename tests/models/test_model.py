@@ -17,7 +17,7 @@ from dyngs.config.kinds import kind_names, section_of_kind
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
-from dyngs.human.predict.ghg.learner import PersonPredictor, new_network
+from dyngs.human.predict.ghg.network import PersonPredictor, new_network
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, restored_model
 from dyngs.models.kind import HasGaussians, Predicts, capability, kind_of
 from dyngs.models.prediction import Predictor
@@ -48,7 +48,7 @@ TRAINED = {
 }
 """Fixture with a capture for each kind that is trained on one, and other keys of a small run."""
 NETWORKS = {"human_predictor", "gps", "keypoint_nerf", "eg_human_nerf"}
-"""Kinds that predict scenes: tests of training.prediction, gps.learner and human_fields.learner
+"""Kinds that predict scenes: tests of training.prediction, gps.stereo and fields.prediction
 resume them."""
 PREDICTED = {"predicted_field"}
 """Kinds that are not trained: tests/human/predict/fields/test_scene.py."""

@@ -25,7 +25,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.static_scene import Sides, StaticScene
-from dyngs.human.predict.fields.scene import NETWORKS, PredictedField
+from dyngs.human.predict.fields.prediction import NETWORKS, PredictedField
 from dyngs.human.predict.people import PosedBody, Sources
 from dyngs.models.renderable import Renderable
 from dyngs.ops.rays import Space

@@ -26,7 +26,7 @@ class HumanPredictorKind(Predicts):
         return section.source_views
 
     def networks(self) -> tuple[MakeLearner, MakePredictor]:
-        from dyngs.human.predict.ghg.learner import learner, predictor
+        from dyngs.human.predict.ghg.network import learner, predictor
 
         return learner, predictor
 
@@ -41,7 +41,7 @@ class GpsKind(Predicts):
         return 2
 
     def networks(self) -> tuple[MakeLearner, MakePredictor]:
-        from dyngs.human.predict.gps.learner import learner, predictor
+        from dyngs.human.predict.gps.stereo import learner, predictor
 
         return learner, predictor
 
@@ -56,7 +56,7 @@ class FieldPredictorKind(Predicts):
         return section.source_views
 
     def networks(self) -> tuple[MakeLearner, MakePredictor]:
-        from dyngs.human.predict.fields.learner import learner, predictor
+        from dyngs.human.predict.fields.prediction import learner, predictor
 
         return learner, predictor
 
@@ -68,7 +68,7 @@ class PredictedFieldKind(ModelKind):
         return "model.kind=predicted_field is what `dyngs predict` writes, and is not trained"
 
     def functions(self) -> tuple[Start, Restore]:
-        from dyngs.human.predict.fields.scene import PredictedModel, restore
+        from dyngs.human.predict.fields.prediction import PredictedModel, restore
 
         return PredictedModel, restore
 

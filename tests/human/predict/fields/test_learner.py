@@ -18,7 +18,7 @@ from dyngs.api.predict import predict
 from dyngs.api.train import train
 from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.human.predict.fields.scene import PredictedField
+from dyngs.human.predict.fields.prediction import PredictedField
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.training.prediction import network_trainer
 
@@ -136,7 +136,7 @@ def test_a_body_is_fitted_where_none_is_given(
     written."""
     asked: list[Path] = []
     monkeypatch.setattr(
-        "dyngs.human.predict.fields.learner.with_fitted_body",
+        "dyngs.human.predict.fields.prediction.with_fitted_body",
         lambda data, **_: (asked.append(data.root), data)[1],
     )
     person = Path(shutil.copytree(person_of(folder), tmp_path / "bare"))

@@ -12,7 +12,7 @@ import torch
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
 from dyngs.human.predict.fields.keypoint_nerf import KeypointNerf
-from dyngs.human.predict.fields.scene import (
+from dyngs.human.predict.fields.prediction import (
     NETWORKS,
     PredictedField,
     restore,

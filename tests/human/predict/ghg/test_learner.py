@@ -11,14 +11,14 @@ from tiny_people import NET, config, people, person
 
 from dyngs.config import Config
 from dyngs.core.errors import DyngsError
-from dyngs.human.predict.ghg.learner import (
+from dyngs.human.predict.ghg.network import (
     AtlasLearner,
+    AtlasPerson,
     PersonPredictor,
     learner,
     mean_colours,
     new_network,
 )
-from dyngs.human.predict.ghg.network import AtlasPerson
 from dyngs.training.prediction import network_trainer
 
 

@@ -26,8 +26,8 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import captures_in, read_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.human.predict.gps.learner import learner, predictor
 from dyngs.human.predict.gps.rectification import neighbours
+from dyngs.human.predict.gps.stereo import learner, predictor
 from dyngs.human.synthetic.capture import PeopleOptions, write_people
 from dyngs.models.prediction import Predictor
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
