@@ -25,7 +25,6 @@ from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import MotionClip
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs
-from dyngs.study.measure import Subject
 
 KINDS = ("static", *FIELDS, "windowed", "masked", "human")
 MOVING = torch.tensor([1, 4, 5, 8])
