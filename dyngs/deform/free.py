@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dyngs.core.state import Role
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
-from dyngs.deform.fixed_cameras import TimedGaussians
+from dyngs.deform.fixed_cameras.start import TimedGaussians
 from dyngs.deform.keys import COPIES_OF_MOVING, FreeField
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import Parameters

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.bodies.paths import FrameStack, frame_stack_of, one_camera
-from dyngs.deform.fixed_cameras import FixedCameraClip, fixed_camera_clip
+from dyngs.deform.fixed_cameras.hulls import FixedCameraClip, fixed_camera_clip
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.kind import DYNAMIC
 from dyngs.deform.scene import DynamicScene

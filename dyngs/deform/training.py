@@ -22,7 +22,8 @@ from dyngs.deform.bodies.start import Bodies, found_bodies
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, deformed, innermost
 from dyngs.deform.fields import WindowedField, new_field
-from dyngs.deform.fixed_cameras import FixedCameraClip, TimedGaussians, first_motion
+from dyngs.deform.fixed_cameras.hulls import FixedCameraClip
+from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
 from dyngs.deform.free import FreePrimitives, FreeStart, free_start
 from dyngs.deform.keys import DynamicModel, FreeField
 from dyngs.deform.random_gaussians import box_of, random_gaussians, with_gaussians
@@ -191,11 +192,11 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         threshold = min(max(two_group_threshold(found.usual), floor), SURELY_MOVING * floor)
         rows = torch.nonzero(found.usual > threshold)[:, 0]
         first = self._first_motion(now.detach())
-        if not errs and not first:
+        if not errs and not first.moments:
             return None
         bodies = self._first_bodies(now.detach())
         added, start = self._begun(now.detach(), rows, first, bodies)
-        finding = _finding(first) if bodies is None else bodies.finding
+        finding = first.finding if bodies is None else bodies.finding
         result = replace(with_gaussians(now.detach(), added), finding=finding)
         if start is not None:
             result.changes["logit_opacities"][rows] = start.logits.to(rows.device)
@@ -244,24 +245,24 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         self,
         now: Gaussians,
         rows: Tensor,
-        first: Sequence[TimedGaussians],
+        first: FirstMotion,
         bodies: Bodies | None,
     ) -> tuple[Sequence[Gaussians], FreeStart | None]:
         """Return the Gaussians to add when motion begins, and the windows of all that move where
         these have some."""
-        is_explained = first or (bodies and bodies.explain_all)
+        is_explained = first.moments or (bodies and bodies.explain_all)
         count = 0 if is_explained else self.options.num_random_moving
         added = random_gaussians(now, count, self.capture.extent, self._generator)
         if not self._is_free:
             return [added, *(bodies.seeds if bodies else ())], None
         still, others = (x.to(device="cpu") for x in (now.select(rows), added))
-        start = free_start(still, first, others, len(self.times))
+        start = free_start(still, first.moments, others, len(self.times))
         return start.added, start
 
-    def _first_motion(self, still: Gaussians) -> list[TimedGaussians]:
+    def _first_motion(self, still: Gaussians) -> FirstMotion:
         """Return what changes before fixed cameras, for a field that can begin there."""
         if not self._is_free:
-            return []
+            return FirstMotion()
         capture = self.capture
         limit = self.options.num_random_moving
         still = still.to(device="cpu")
@@ -306,11 +307,6 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         tiny = 1e-6 * self.capture.extent
         length = (offsets.means.square().sum(1) + tiny**2).sqrt().mean()
         return {"motion sparsity": length * (self.options.motion_sparsity / self.capture.extent)}
-
-
-def _finding(first: Sequence[TimedGaussians]) -> str | None:
-    count = sum(len(one.gaussians) for one in first)
-    return f"changes before the fixed cameras: {count:,} Gaussians begin there" if first else None
 
 
 def _with_frozen(scene: DynamicScene, mean: Offsets, stays: Tensor) -> DynamicScene:

@@ -11,7 +11,7 @@ from tiny_fields import cloud, stir, tiny_setup
 from dyngs.api.train import train
 from dyngs.config.io import load_config
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
-from dyngs.deform.fixed_cameras import TimedGaussians
+from dyngs.deform.fixed_cameras.start import TimedGaussians
 from dyngs.deform.free import SHORTEST, FreePrimitives, FreeStart, free_start
 from dyngs.deform.keys import FreeField
 from dyngs.evaluate.report import evaluate_run

@@ -21,7 +21,7 @@ from torch import Tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.data.times import static_cameras
-from dyngs.deform.fixed_cameras import shadows
+from dyngs.deform.fixed_cameras.hulls import shadows
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, Shader, render
 

@@ -1,0 +1,1 @@
+"""Motion before cameras that stand still: changes in their images, hulls, and tracks over time."""

@@ -1,0 +1,40 @@
+"""Where motion begins before fixed cameras: nothing, one thing, two."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from static_balls import Ball, Balls, filmed
+from tiny_fields import cloud
+
+from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
+from dyngs.gaussians.rendering import RenderOptions
+
+TIMES = tuple(i / 11 for i in range(12))
+
+
+def started(balls: Balls, count: int = 6, limit: int = 600) -> FirstMotion:
+    return first_motion(filmed(balls, TIMES, count), cloud(50), 1.0, limit, RenderOptions())
+
+
+def crossing(time: float) -> tuple[float, float, float]:
+    return (1.6 * time - 0.8, 0.3, 0.1)
+
+
+def test_one_ball_begins_at_each_time() -> None:
+    found = started(lambda t: [Ball(crossing(t))])
+    assert found.finding is not None
+    assert "found at 12 of 12 times" in found.finding
+    for time in TIMES:
+        now = [one for one in found.moments if one.time == time]
+        center = torch.cat([one.gaussians.means for one in now]).median(0).values
+        assert (center - torch.tensor(crossing(time))).norm() < 0.1
+
+
+@pytest.mark.parametrize(("count", "limit"), [(6, 600), (1, 600), (6, 0)])
+def test_where_nothing_changes_nothing_begins(count: int, limit: int) -> None:
+    """A ball that stands still; one camera, which sees no depth; no Gaussians allowed."""
+    at = (lambda _: (0.0, 0.0, 0.0)) if count == 6 and limit else crossing
+    found = started(lambda t: [Ball(at(t))], count, limit)
+    assert found == FirstMotion()
+    assert found.finding is None
