@@ -86,7 +86,7 @@ MUTATIONS = (
     ("models/schedule.py", "step / options.steps >= fraction", "step / options.steps > fraction", "gaussians/test_schedule.py training/test_clock.py"),
     ("gaussians/schedule.py", "range(period, stop - period + 1, period)", "range(period, stop, period)", "gaussians/test_schedule.py"),
     ("gaussians/schedule.py", "(1 - progress) * math.log(options.lr_means)", "progress * math.log(options.lr_means)", "gaussians/test_schedule.py"),
-    ("training/corrections/exposure.py", "white = truth >= SATURATED", "white = truth >= 9", "training/corrections/test_exposure.py"),
+    ("training/corrections/exposure.py", "composite(view.background) >= SATURATED", "composite(view.background) >= 9", "training/corrections/test_exposure.py"),
     ("evaluate/view_scores.py", "kept = 1 - grown", "kept = (shown)[None, None].float()", "evaluate/test_regions.py"),
     ("evaluate/view_scores.py", "else x & foreground", "else x", "evaluate/test_regions.py"),
     ("evaluate/view_scores.py", "(after - now) / (after - before)", "(now - before) / (after - before)", "evaluate/test_temporal.py"),

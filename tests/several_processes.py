@@ -23,8 +23,8 @@ from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config import Config
 from dyngs.core.errors import DyngsError
+from dyngs.training import new_trainer
 from dyngs.training import processes as module
-from dyngs.training.new_trainer import build
 from dyngs.training.processes import Processes
 from dyngs.training.trainer import StepReport, Trainer
 
@@ -112,7 +112,7 @@ def trained(configs: list[Config], fails: str = "") -> int:
 
 def trained_on_gpu(configs: list[Config]) -> int:
     """As ``trained``, with the scene on the pretended GPU."""
-    build.device_for = lambda _: GPU
+    new_trainer.device_for = lambda _: GPU
     with pretend_gpu():
         return trained(configs)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dyngs.baselines.triangles.patches import Patches, flat_triangles
+from dyngs.baselines.triangles.scene import Patches, flat_triangles
 from dyngs.config import Config
 from dyngs.config.io import load_config
 from dyngs.core.camera import Cameras

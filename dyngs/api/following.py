@@ -19,13 +19,12 @@ import torch
 from safetensors.torch import load, save
 
 from dyngs.config import Config
-from dyngs.core.errors import DyngsError
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.training.events import Event, TopologyChanged
 from dyngs.training.loop import Interrupts, Trainable
-from dyngs.training.new_trainer import build
+from dyngs.training.new_trainer import assemble
 from dyngs.training.processes import EXIT_INTERRUPTED, Processes
 from dyngs.training.trainer import Trainer
 
@@ -113,9 +112,7 @@ def _follow_run(
 ) -> tuple[Order, bytes]:
     bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
     with kernel_threads(config.run.threads or 1), bytewise:
-        trainer = build(config, restored=True)
-        if not isinstance(trainer, Trainer):
-            raise DyngsError("a network is trained by one process; start it without torchrun")
+        trainer = assemble(config, restored=True)
         trainer.join(processes)
         while True:
             order, payload = _heard(processes)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,18 +34,17 @@ from dyngs.core.errors import DyngsError, as_word, counted, show, warn
 from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.outputs import writing
+from dyngs.models.kind import Predicts, capability
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import write_record
 from dyngs.runs.checkpoint import (
     Checkpoint,
-    checkpoint_paths,
     last_good,
     latest_checkpoint,
     remove_old_checkpoints,
     save_checkpoint,
     seconds_at,
-    step_of,
 )
 from dyngs.runs.folder import (
     LOG_NAME,
@@ -74,19 +72,15 @@ from dyngs.training.events import (
 )
 from dyngs.training.limits import require_possible
 from dyngs.training.loop import Editor, Interrupts, Loop, Trainable
-from dyngs.training.memory import memory_forecasts, require_room
-from dyngs.training.new_trainer import build
+from dyngs.training.memory import memory_forecasts
+from dyngs.training.new_trainer import assemble
 from dyngs.training.plan import RunPlan
+from dyngs.training.prediction import network_trainer
 from dyngs.training.processes import Processes
 from dyngs.training.run_log import RunLog
 from dyngs.training.trainer import Trainer
 
 _COUNT = "budget.count"  # Name of the limit's state in a checkpoint
-
-
-@contextmanager
-def _no_progress() -> Iterator[ReportProgress]:
-    yield report_nothing
 
 
 def train(
@@ -95,7 +89,7 @@ def train(
     resume_from: Path | None = None,
     listeners: Sequence[Listener] = (),
     processes: Processes | None = None,
-    progress: Callable[[], AbstractContextManager[ReportProgress]] = _no_progress,
+    progress: Callable[[], AbstractContextManager[ReportProgress]] | None = None,
 ) -> Path:
     """Train and return the run folder.
 
@@ -118,7 +112,7 @@ def train(
             never stopped.
         listeners: are told everything that happens, see ``dyngs.training.events``.
         processes: that this one, the first of them, leads; None: it is alone.
-        progress: shows how far what comes before training is.
+        progress: shows how far what comes before training is; None: nothing does.
 
     Raises:
         DyngsError: bad input, a run folder that already holds a run or that another process writes
@@ -135,11 +129,10 @@ def train(
     if resume_from is None:
         if not (folder / RESOLVED_NAME).is_file():
             inputs_of(config).require_output(folder)
-        with progress() as report:
+        with progress() if progress else nullcontext(report_nothing) as report:
             plan = planned(plan, [find_poses(report), continue_scene])
-    elif not folder.is_dir() or _is_done_and_read_only(config, folder):
-        latest_checkpoint(folder)
-        return folder
+    elif not folder.is_dir():
+        latest_checkpoint(folder)  # raises, and says what is there
     keep_freed_memory()
     bytewise = deterministic(device, config.run.deterministic)
     with writing(folder) as alone, kernel_threads(_num_threads(config, processes)), bytewise:
@@ -159,18 +152,16 @@ def train(
         if resumed is not None:
             total = plan.resolved.total_steps
             if resumed.info.step >= total and not _is_export_pending(plan.resolved, folder):
-                show(
-                    f"{folder}: run already finished ({counted(total, 'step')}). Use train.steps=N to train longer"
-                )
+                show(_about_finished(plan.resolved, folder))
                 return folder
-            resumed.require_settings(plan.resolved)
         watch = Stopwatch()
         images = None
         if resumed is None:
             plan = planned(plan, [run_pilots, find_first_gaussians, set_limits])
-            require_room(plan.resolved)
             if plan.limits.seconds is not None:
-                plan, images = _fit_minutes(plan, watch)
+                plan, message, images = fit_minutes(plan, watch, _built)
+                if message:
+                    show(message)
         else:
             plan = planned(plan, [read_same_capture(folder, resumed), set_limits])
             watch.pause(-seconds_at(folder, resumed.info.step))
@@ -182,45 +173,32 @@ def train(
 
 def _built(
     plan: RunPlan, resumed: Checkpoint | None = None, images: ImageLoader | None = None
-) -> Trainable:
+) -> Any:
     """Return the trainer of a plan, before its first step or where it was ``resumed``."""
-    trainer = build(
-        plan.resolved,
-        plan.capture,
-        restored=resumed is not None,
-        first=plan.first,
-        uncapped=plan.uncapped,
-        images=images,
-    )
+    config = plan.resolved
+    trainer: Any
+    if capability(config.model, Predicts):
+        trainer = network_trainer(config)
+    else:
+        trainer = assemble(
+            config,
+            plan.capture,
+            restored=resumed is not None,
+            first=plan.first,
+            uncapped=plan.uncapped,
+            images=images,
+        )
     if resumed is not None:
         trainer.restore(resumed)
     return trainer
 
 
-def _fit_minutes(plan: RunPlan, watch: Stopwatch) -> tuple[RunPlan, ImageLoader]:
-
-    def build_trainer(plan: RunPlan) -> Trainer[Any]:
-        trainer = _built(plan)
-        assert isinstance(trainer, Trainer)
-        return trainer
-
-    plan, message, images = fit_minutes(plan, lambda: watch.seconds, build_trainer)
-    if message:
-        show(message)
-    return plan, images
-
-
 def _about_finished(config: Config, folder: Path) -> str:
-    again = as_word(folder)
-    longer = (
-        ""
-        if config.prune.is_wanted
-        else f", go on with `dyngs train --resume {again} train.steps=N`"
-    )
-    return (
-        f"{folder} holds just this run, finished, and training again would end with the same bytes: nothing is done; "
-        f"look at it with `dyngs eval {again}`{longer}, or give another run.dir"
-    )
+    run = as_word(folder)
+    longer = f"`dyngs train --resume {run} train.steps=N` trains longer"
+    if config.prune.is_wanted:
+        longer = "give another run.dir to train again"
+    return f"{folder}: run already finished ({counted(config.total_steps, 'step')}); {longer}"
 
 
 class _Run:
@@ -316,10 +294,9 @@ class _Run:
 
     def _save_and_evaluate(self, event: Event) -> None:
         match event:
-            case TotalChanged() if self.loop.trainer.done < event.total:
-                self._save()  # a resumed run goes on from here with the new schedules
-                write_config(self.config, self.folder)
             case TotalChanged():
+                if self.loop.trainer.done < event.total:
+                    self._save()  # a resumed run goes on from here with the new schedules
                 write_config(self.config, self.folder)
             case StepDone():
                 options = self.config.train
@@ -376,21 +353,9 @@ def _show_memory(trainer: Trainer[Any], processes: int) -> None:
     """Show how much memory a run will take, and warn where that is likely to be too much."""
     for forecast in memory_forecasts(trainer, processes):
         show(str(forecast))
-        forecast.require_possible()
         warning = forecast.warning()
         if warning is not None:
             warn(warning)
-
-
-def _is_done_and_read_only(config: Config, folder: Path) -> bool:
-    """Return whether nothing is to be done in the run folder, and nothing can be."""
-    paths = checkpoint_paths(folder)
-    is_done = (
-        bool(paths)
-        and step_of(paths[-1]) >= config.total_steps
-        and not _is_export_pending(config, folder)
-    )
-    return is_done and not os.access(folder, os.W_OK)
 
 
 def _is_export_pending(config: Config, folder: Path) -> bool:

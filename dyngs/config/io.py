@@ -9,7 +9,7 @@ read.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
@@ -25,7 +25,6 @@ from dyngs.config.schema import (
     allowed_values,
     as_written,
     choices_of,
-    config_keys,
     default_kind,
     has_kinds,
     is_kind_of,
@@ -35,7 +34,7 @@ from dyngs.config.schema import (
     section_classes,
 )
 from dyngs.config.yaml_reader import Leaf, read_file, read_override
-from dyngs.core.errors import DyngsError, as_word, printable, reading, require_name
+from dyngs.core.errors import DyngsError, printable, reading, require_name
 from dyngs.io.containment import follows_links_of_runs
 from dyngs.io.outputs import command_for
 from dyngs.io.write import write_text
@@ -100,7 +99,6 @@ REMOVED_MODEL_KEYS: dict[str, dict[str, object]] = {
     },
 }
 """The same for keys of the section ``model`` of one kind."""
-MOST_KEYS = 40  # Of a section that are listed in one line
 _FOLLOW_LINKS = ("data", "follow_links")
 _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
 
@@ -162,44 +160,39 @@ def load_resolved(
         data_root: where the capture lies by now, if it was moved.
     """
     file = path / RESOLVED_NAME if path.is_dir() else path
-    if not file.is_file():
+    found = command_for(path)
+    if not file.is_file() or (file == path and found):
+        hint = f"{found}; then " if found else ""
         raise DyngsError(
-            f"{path}: not a run folder (no {RESOLVED_NAME} there); {_instead(path)}give the folder that `dyngs train` "
-            "wrote"
+            f"{path}: not a run folder (no {RESOLVED_NAME} there); {hint}give the folder that `dyngs train` wrote"
         )
-    if file == path and command_for(path):
-        raise DyngsError(f"{path}: not a run folder; {command_for(path)}")
     layers = _Layers()
     layers.add(read_file(file))
-    if not layers.tree.get("data"):
+    data = layers.tree.get("data")
+    if not data:
         raise DyngsError(
             f"{file}: does not say which capture the run was trained on (data.root); restore the file"
         )
-    if isinstance(layers.tree.get("model"), dict):
-        layers.tree["model"] = without_removed_keys(layers.tree["model"])
-    if isinstance(layers.tree["data"], dict):
-        layers.tree["data"]["follow_links"] = follows_links_of_runs()
-    body = layers.value_at(("data", "body"))
-    if isinstance(body, str):
-        layers.tree["data"]["body"] = str(file.parent.absolute() / body)
-    stored_root = layers.value_at(("data", "root"))
+    stored_root = None
+    if isinstance(data, dict):
+        stored_root = data.get("root")
+        data["follow_links"] = follows_links_of_runs()
+        if isinstance(data.get("body"), str):
+            data["body"] = str(file.parent.absolute() / data["body"])
     layers.add_overrides(overrides)
     config = _validated(layers)
     root = data_root or config.data.root
     if data_root is None and root == Path(str(stored_root)):
         return config
-    return config.model_copy(
-        update={"data": config.data.model_copy(update={"root": root.absolute()})}
-    )
+    data = config.data.model_copy(update={"root": root.absolute()})
+    return config.model_copy(update={"data": data})
 
 
 def without_removed_keys(model: dict[str, object]) -> dict[str, object]:
     """Return the section ``model`` of an earlier version without the keys of
     ``REMOVED_MODEL_KEYS``."""
     removed = REMOVED_MODEL_KEYS.get(str(model.get("kind")), {})
-    return {
-        key: x for key, x in model.items() if key not in removed or not _is_same(x, removed[key])
-    }
+    return {key: x for key, x in model.items() if not _is_removed(key, x, removed)}
 
 
 def save_config(config: Config, path: Path) -> None:
@@ -231,34 +224,20 @@ def find_preset(path: Path) -> Path:
     of the user's own is an error. In a source checkout the package's presets are those in the
     repository's ``configs``.
     """
-    if path.is_file() and command_for(path) is None:
+    found = command_for(path)
+    if path.is_file() and found is None:
         return path
     packaged = packaged_presets()
-    if (
-        path.parent.name in ("", "configs")
-        and path.suffix in ("", ".yaml", ".yml")
-        and path.stem in packaged
-    ):
+    is_bare = path.parent.name in ("", "configs") and path.suffix in ("", ".yaml", ".yml")
+    if is_bare and path.stem in packaged:
         return packaged[path.stem]
-    found = command_for(path)
     if found is not None:
         raise DyngsError(f"{path}: no configuration; {found}")
-    if path.exists() and not path.is_dir():
-        raise DyngsError(f"{path}: not a regular file; give a YAML preset")
     close = get_close_matches(path.stem, packaged, n=1)
     hint = f" (did you mean {close[0]!r}?)" if close else ""
     raise DyngsError(
         f"{path}: no such preset{hint}; the packaged ones are {', '.join(sorted(packaged))}"
     )
-
-
-def _instead(path: Path) -> str:
-    """Return what ``path`` is if it is no run, and the command for it, to be followed by more; may
-    be empty."""
-    if path.stem in packaged_presets() and not path.is_dir():
-        return f"it is a configuration, for `dyngs train {as_word(path)} data.root=FOLDER`; "
-    found = command_for(path)
-    return f"{found}; then " if found else ""
 
 
 def packaged_preset(name: str) -> Path:
@@ -272,10 +251,9 @@ def packaged_preset(name: str) -> Path:
 
 def packaged_presets() -> dict[str, Path]:
     package = Path(__file__).resolve().parents[1]
-    folder = next(
-        (f for f in (package / "configs", package.parent / "configs") if f.is_dir()), None
-    )
-    return {f.stem: f for f in sorted(folder.glob("*.yaml"))} if folder else {}
+    # inside the package, or in a source tree next to it
+    folders = [package / "configs", package.parent / "configs"]
+    return {f.stem: f for folder in folders for f in sorted(folder.glob("*.yaml"))}
 
 
 @dataclass
@@ -311,17 +289,30 @@ class _Layers:
             section.clear()
             self.origins = {k: v for k, v in self.origins.items() if k[: len(keys)] != keys}
 
+    def section_at(self, keys: tuple[str, ...], info: FieldInfo) -> type[BaseModel] | None:
+        """Return the class of the section at ``keys``, of the chosen kind; None: it is a value."""
+        if not is_section(info):
+            return None
+        node = self.value_at(keys)
+        return section_class(info, node.get("kind") if isinstance(node, dict) else None)
+
     def field_at(self, keys: tuple[str, ...]) -> FieldInfo | None:
         """Return the field at ``keys``, in the sections of the chosen kinds; None: no such field."""
-        section: type[BaseModel] = Config
+        section: type[BaseModel] | None = Config
         info: FieldInfo | None = None
         for depth, key in enumerate(keys, 1):
-            info = section.model_fields.get(key)
-            if info is None or not is_section(info):
-                return None
-            node = self.value_at(keys[:depth])
-            section = section_class(info, node.get("kind") if isinstance(node, dict) else None)
+            info = section.model_fields.get(key) if section else None
+            section = self.section_at(keys[:depth], info) if info else None
         return info
+
+    def names(self, section: type[BaseModel], above: tuple[str, ...]) -> Iterator[str]:
+        """Yield the dotted names of all keys in the sections of the chosen kinds."""
+        for key, info in section.model_fields.items():
+            inner = self.section_at((*above, key), info)
+            if inner is None:
+                yield ".".join((*above, key))
+            else:
+                yield from self.names(inner, (*above, key))
 
     def _set(self, leaf: Leaf) -> None:
         keys = leaf.keys
@@ -358,27 +349,17 @@ class _Layers:
         return f"{origin}: " if origin else ""
 
 
-def _is_removed(keys: tuple[str, ...], section: type[BaseModel], written: object) -> bool:
-    """Return whether a section has a key no longer, and its value had no effect."""
-    name = ".".join(keys)
-    if keys[-1] in section.model_fields or name not in REMOVED_KEYS:
+def _is_removed(key: str, written: object, removed: Mapping[str, object]) -> bool:
+    """Return whether ``removed`` has a key with the value that ``written`` in a file means."""
+    if key not in removed:
         return False
-    return _is_same(written, REMOVED_KEYS[name])
-
-
-def _is_same(written: object, value: object) -> bool:
-    """Return whether the text or value ``written`` in a file means ``value``."""
-    if isinstance(value, list):
-        items = written if isinstance(written, list) else []
-        return len(items) == len(value) and all(map(_is_same, items, value))
-    return as_written(written) == as_written(value) or _number(written) == value
-
-
-def _number(written: object) -> float | None:
+    value = removed[key]
+    if as_written(written) == as_written(value):
+        return True
     try:
-        return float(str(written))
+        return float(str(written)) == value
     except ValueError:
-        return None
+        return False
 
 
 def _own_keys(layers: _Layers) -> set[tuple[str, ...]]:
@@ -417,20 +398,29 @@ def _section(
     section: type[BaseModel], given: dict[str, Any], above: tuple[str, ...], layers: _Layers
 ) -> BaseModel:
     """Return the section of the texts in ``given``. Raises DyngsError: the first fault."""
-    values = {key: x for key, x in given.items() if not _is_removed((*above, key), section, x)}
+    prefix = ".".join(above)
+    removed = {name.removeprefix(f"{prefix}."): x for name, x in REMOVED_KEYS.items()}
+    if prefix == "model":
+        removed |= REMOVED_MODEL_KEYS.get(section.model_fields["kind"].default, {})
+    values = {
+        key: x
+        for key, x in given.items()
+        if key in section.model_fields or not _is_removed(key, x, removed)
+    }
     for key in values:
         was_flag = key.startswith("move_") and "moves" in section.model_fields  # see FieldSection
         if key not in section.model_fields and not was_flag:
-            raise DyngsError(
-                layers.origin_of((*above, key)) + _about_unknown(section, (*above, key), layers)
-            )
+            raise DyngsError(_about_unknown(section, (*above, key), layers))
     for name, info in section.model_fields.items():
         keys = (*above, name)
         if not is_section(info):
             continue
         inner = {} if given.get(name) is None else given[name]
         if not isinstance(inner, dict):
-            raise DyngsError(f"{layers.origin_of(keys)}{'.'.join(keys)} {_of_section(info)}")
+            where = layers.origin_of(keys)
+            raise DyngsError(
+                f"{where}{'.'.join(keys)} is a section, not a value; give one of its keys"
+            )
         kind = inner.get("kind") or default_kind(info)
         if has_kinds(info) and not is_kind_of(info, kind):
             where = layers.origin_of((*keys, "kind"))
@@ -460,31 +450,27 @@ def _not_allowed(keys: tuple[str, ...], allowed: str, value: object, choices: li
     return f"{'.'.join(keys)} must be {allowed}, not {printable(as_written(value), 60)}{hint}"
 
 
-def _of_section(info: FieldInfo) -> str:
-    keys = dict.fromkeys(key for variant in section_classes(info) for key in variant.model_fields)
-    rest = ", ... (docs/cli.md has all)" if len(keys) > MOST_KEYS else ""
-    return f"is a section, not a value; its keys: {', '.join([*keys][:MOST_KEYS])}{rest}"
-
-
 def _about_unknown(section: type[BaseModel], keys: tuple[str, ...], layers: _Layers) -> str:
-    """Return which kind has a key that its section does not have, or which keys are similar."""
+    """Return a message about a key that the chosen kinds do not have: which kind has it, or which
+    key is similar."""
     *above, key = keys
     name = ".".join(keys)
+    where = layers.origin_of(keys)
     holder = layers.field_at(tuple(above))
     variants = [] if holder is None else section_classes(holder)
     owners = [x.model_fields["kind"].default for x in variants if key in x.model_fields]
     if owners:
         kind = section.model_fields["kind"].default
-        return f"{name} belongs to {'.'.join(above)}.kind={' or '.join(owners)}, not to {kind}"
-    full = next((k for k in layers.origins if k[: len(keys)] == keys), keys)
-    everything = list(dict.fromkeys(key.name for key in config_keys()))
-    siblings = get_close_matches(key, list(section.model_fields), n=1) if full == keys else []
-    same_word = [x for x in everything if x.split(".")[-1] == full[-1]]
-    close = get_close_matches(".".join(full), same_word if len(keys) > 1 else everything, n=1)
-    found = [".".join((*above, x)) for x in siblings if above] or close[:1] or same_word
-    found = found or get_close_matches(".".join(full), everything, n=1)
-    hint = f"; did you mean {' or '.join(repr(x) for x in found)}?" if found else ""
-    return f"unknown key {printable(repr(name), 60)}{hint}"
+        return (
+            f"{where}{name} belongs to {'.'.join(above)}.kind={' or '.join(owners)}, not to {kind}"
+        )
+    written = ".".join(next((k for k in layers.origins if k[: len(keys)] == keys), keys))
+    known = list(layers.names(Config, ()))
+    last = written.rpartition(".")[2]
+    same = [x for x in known if x.rpartition(".")[2] == last]
+    found = get_close_matches(written, same or known, n=1) or same
+    hint = f"; did you mean {' or '.join(map(repr, found))}?" if found else ""
+    return f"{where}unknown key {printable(repr(name), 60)}{hint}"
 
 
 def _note_requested(

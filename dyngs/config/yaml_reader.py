@@ -14,7 +14,8 @@ from typing import Any
 
 import yaml
 
-from dyngs.core.errors import DyngsError, printable, reason
+from dyngs.core.errors import DyngsError, printable, reading, reason
+from dyngs.io.fields import read_limited
 
 MAX_BYTES = 2**18
 """Largest size of a preset or an override; the longest that we know has 5 KB."""
@@ -37,18 +38,8 @@ class Leaf:
 
 def read_file(path: Path) -> list[Leaf]:
     """Read the values of a file in its order; an empty section is a leaf of value None."""
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-        text = data.decode("utf-8-sig")
-    except OSError as error:
-        raise DyngsError(f"{path}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise DyngsError(f"{path}: not a text file in UTF-8; give a YAML preset") from None
-    if len(data) > MAX_BYTES:
-        raise DyngsError(
-            f"{path}: is larger than {MAX_BYTES // 2**10} KiB, no configuration is; give a YAML preset"
-        )
+    with reading(path, "give a YAML preset in UTF-8"):
+        text = read_limited(path, MAX_BYTES).decode("utf-8-sig")
     root = _root(text, str(path))
     if root is None:
         return []
@@ -74,17 +65,14 @@ def read_override(text: str) -> list[Leaf]:
         node = _root(written, origin)
     except DyngsError:
         return [Leaf(keys, written, origin)]  # a path or a name that happens not to be YAML
-    match node:
-        case yaml.MappingNode(flow_style=True) if node.value:
-            return list(_leaves(node, keys, origin))
-        case yaml.SequenceNode(flow_style=True) | yaml.MappingNode(flow_style=True):
-            return [Leaf(keys, _value(node), origin)]
-        case None:
-            return [Leaf(keys, None, origin)]
-        case _:  # a block such as "10:" only looks like one
-            is_null = isinstance(node, yaml.ScalarNode) and _value(node) is None
-            quoted = isinstance(node, yaml.ScalarNode) and node.style is not None
-            return [Leaf(keys, None if is_null else _value(node) if quoted else written, origin)]
+    if isinstance(node, yaml.MappingNode) and node.flow_style and node.value:
+        return list(_leaves(node, keys, origin))
+    is_flow = isinstance(node, yaml.CollectionNode) and node.flow_style
+    is_quoted = isinstance(node, yaml.ScalarNode) and node.style is not None
+    is_null = node is None or (not is_quoted and node.value in _NULL)
+    # a block such as "10:" only looks like one
+    value = _value(node) if node is not None and (is_flow or is_quoted) else written
+    return [Leaf(keys, None if is_null else value, origin)]
 
 
 def _root(text: str, origin: str) -> yaml.Node | None:

@@ -72,7 +72,7 @@ def nodes_at(positions: Tensor, means: Tensor) -> Nodes:
         numbers = points.detach().double().cpu().numpy()
         return torch.from_numpy(tree.query(numbers, k=range(1, count + 1))[which])
 
-    radii = nearest(positions, 0)[:, 1:].mean(1) if count > 1 else torch.ones(1)
+    radii = nearest(positions, 0)[:, 1:].mean(1) if count > 1 else torch.ones(1, device="cpu")
     floor = max(1e-6 * float(radii.max()), 1e-12)
     followed = nearest(means, 1).to(positions.device)
     return Nodes(positions, radii.clamp_min(floor).to(positions), followed)
@@ -178,7 +178,7 @@ class ControlNodes(DeformationField):
         count = len(buffers["positions"])
         shapes = {"positions": (count, 3), "radii": (count,)}
         for name, shape in shapes.items():
-            require_tensor(name, buffers.get(name, torch.zeros(shape)), shape)
+            require_tensor(name, buffers.get(name, torch.zeros(shape, device="cpu")), shape)
         for name, length in (("followed", self.setup.num_moving), ("neighbours", count)):
             if name in buffers:
                 require_indices(name, buffers[name], (length, None), count)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
-from typing_extensions import assert_never
 
 from dyngs.core.state import Role, State, part_of, prefixed, with_role
 from dyngs.core.tensor_checks import require_positive, require_tensor
@@ -82,17 +82,13 @@ def new_field(
     options: DeformField, setup: FieldSetup, generator: torch.Generator
 ) -> DeformationField:
     """Return an untrained field of the kind asked for: every Gaussian stays where it is."""
-    match options:
-        case HexplaneField():
-            return Hexplane(options, setup, generator)
-        case MlpField():
-            return Mlp(options, setup, generator)
-        case ControlNodesField():
-            return ControlNodes(options, setup, generator)
-        case FreeField():
-            return FreePrimitives(options, setup, generator)
-        case _:
-            assert_never(options)
+    kinds: dict[type, Callable[[Any, FieldSetup, torch.Generator], DeformationField]] = {
+        HexplaneField: Hexplane,
+        MlpField: Mlp,
+        ControlNodesField: ControlNodes,
+        FreeField: FreePrimitives,
+    }
+    return kinds[type(options)](options, setup, generator)
 
 
 def num_values(options: DeformField, num_times: int, num_moving: int = 0) -> int:

@@ -404,12 +404,12 @@ def surface_changes(
     """
     graphs = []
     for one in clips:
-        flat = torch.zeros(len(still), 1, 3, requires_grad=True)
+        flat = torch.zeros(len(still), 1, 3, requires_grad=True, device="cpu")
         blended = render(still.replace(sh=flat), one.camera, options).rgb[0]
         (sums,) = torch.autograd.grad(blended, flat, torch.ones_like(blended), retain_graph=True)
         graphs.append((flat, blended, sums[:, 0, :1]))
     times = sorted({time for one in clips for time in one.times})
-    changes = torch.zeros(len(times), len(still), 3)
+    changes = torch.zeros(len(times), len(still), 3, device="cpu")
     for change, time in zip(changes, times, strict=True):
         seen: list[Tensor] = []
         for one, (flat, blended, weights) in zip(clips, graphs, strict=True):
@@ -432,7 +432,7 @@ def surface_changes(
         TimedGaussians(
             time,
             _recoloured(still.select(size > least), change[size > least], towards),
-            torch.zeros(3),
+            torch.zeros(3, device="cpu"),
         )
         for time, change, size in zip(times, changes, sizes, strict=True)
         if bool((size > least).any())

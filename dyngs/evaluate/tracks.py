@@ -11,8 +11,6 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
 from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
@@ -167,6 +165,9 @@ def _bind(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the rows (P, K) of the ``count`` Gaussians nearest to ``points`` (P, 3), their weights
     (P, K) by opacity, and the points in their axes (P, K, 3)."""
+    from scipy.spatial import KDTree
+    from scipy.spatial.transform import Rotation
+
     # A field may fade Gaussians: of those that are too faint now, the least faint fill up.
     num_opaque = max(count, int((moment.opacities > MIN_OPACITY).sum()))
     opaque = np.argsort(-moment.opacities, kind="stable")[:num_opaque]
@@ -187,6 +188,8 @@ def _carried(
     What lies beside the centre of a Gaussian turns about it: on a ball that rolls, its shift alone
     would not do.
     """
+    from scipy.spatial.transform import Rotation
+
     rotations = Rotation.from_quat(moment.quats[rows.ravel()])
     turned = rotations.apply(arms.reshape(-1, 3)).reshape(arms.shape)
     return (weights[..., None] * (moment.means[rows] + turned)).sum(axis=1)

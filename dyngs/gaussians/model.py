@@ -353,9 +353,10 @@ class GaussianModel(Model[GaussianScene]):
         if not self._scene.gaussians.sh_degree:
             return None
         found = self.colours.measured(step, lambda: self._looks(step))
-        if found is not None and found.rows is not None and found.offsets is not None:
-            self.drop_harmonics(found.rows, found.offsets)
-        return None if found is None else found.text
+        if found is None:
+            return None
+        self.drop_harmonics(~found.keeps, found.offsets)
+        return str(found)
 
     def _looks(self, step: int) -> TrainingLooks:
         images = self._run.images

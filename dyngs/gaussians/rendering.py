@@ -143,14 +143,22 @@ def render(
         )
     projection, opacities = _project(gaussians, cameras, options)
     colors = _colors(gaussians, cameras, projection.radii, options, shader)
-    if options.nonfinite != "trust":
-        colors = _finite_colors(colors, options.nonfinite)
+    # they may overflow though all that they come from is finite
+    if options.nonfinite == "error":
+        check_finite({"colors": colors}, "lower sh, or the weights of the network that colours")
+    elif options.nonfinite == "skip":
+        colors = colors.nan_to_num(0, 0, 0)
     if background is not None:
         background = background.to(colors).expand(len(cameras), 3)
+    # alpha is summed from the weights, one more channel to blend, where it would have fewer than four
+    # digits as 1 - transmittance
+    needs_weights = options.depth == "expected" and options.alpha_min < 1 / 255
     if options.depth != "none":
-        colors, background = _with_depth(
-            colors, projection.depths, background, weights=_needs_weights(options)
-        )
+        depths = projection.depths[..., None]
+        more = [depths, torch.ones_like(depths)] if needs_weights else [depths]
+        colors = torch.cat([colors, *more], dim=-1)
+        if background is not None:
+            background = torch.nn.functional.pad(background, (0, len(more)))
     size = (cameras.width, cameras.height)
     blended = rasterize(
         projection,
@@ -165,29 +173,9 @@ def render(
     if options.depth != "none":
         depth = blended.color[..., 3]
         if options.depth == "expected":
-            alpha = blended.color[..., 4] if _needs_weights(options) else 1 - blended.transmittance
+            alpha = blended.color[..., 4] if needs_weights else 1 - blended.transmittance
             depth = depth / torch.where(alpha > 0, alpha, 1.0)
     return GaussianRendering(blended.color[..., :3], blended.transmittance, depth, projection.radii)
-
-
-def _needs_weights(options: RenderOptions) -> bool:
-    """Return whether alpha is summed from the weights, one more channel to blend, instead of 1 -
-    transmittance.
-
-    Below 1/255 the latter has fewer than four digits left.
-    """
-    return options.depth == "expected" and options.alpha_min < 1 / 255
-
-
-def _with_depth(
-    colors: Tensor, depths: Tensor, background: Tensor | None, *, weights: bool
-) -> tuple[Tensor, Tensor | None]:
-    """Return channels (V, N, D) with depth appended, and 1 if the sum of ``weights`` is wanted, on
-    backgrounds of 0."""
-    more = [depths[..., None]] + ([torch.ones_like(depths)[..., None]] if weights else [])
-    if background is not None:
-        background = torch.nn.functional.pad(background, (0, len(more)))
-    return torch.cat([colors, *more], dim=-1), background
 
 
 def contributions(
@@ -263,15 +251,6 @@ def _colors(
         else min(options.sh_degree, gaussians.sh_degree)
     )
     return evaluate_harmonics(gaussians.means, cameras.centers, gaussians.sh, radii, degree)
-
-
-def _finite_colors(colors: Tensor, policy: str) -> Tensor:
-    """Return ``colors`` with overflow dealt with: they may overflow though all that they come from
-    is finite."""
-    if policy == "error":
-        check_finite({"colors": colors}, "lower sh, or the weights of the network that colours")
-        return colors
-    return torch.where(colors.isfinite(), colors, torch.zeros_like(colors))
 
 
 def _project(

@@ -70,36 +70,26 @@ class StepCheck:
     def __init__(
         self, terms: Mapping[str, Tensor], moved: Mapping[str, Tensor], device: torch.device
     ) -> None:
-        self._terms, self._moved = (
-            tuple(terms),
-            {name: x.detach() for name, x in moved.items() if x.numel()},
-        )
+        self._terms = tuple(terms)
+        self._moved = {name: x.detach() for name, x in moved.items() if x.numel()}
         numbers = [sent(x.detach(), device).double().reshape(1) for x in terms.values()]
         # sums, in which NaN and infinity show: a thirtieth of the time of isfinite
-        numbers += (
-            [torch.stack([x.sum() for x in self._moved.values()]).double()] if self._moved else []
-        )
-        self._read = ReadBack(torch.cat(numbers) if len(numbers) > 1 else numbers[0])
+        numbers += [x.sum().double().reshape(1) for x in self._moved.values()]
+        self._read = ReadBack(torch.cat(numbers))
 
     def loss(self, step: int, image: Image, moves_by: tuple[str, str]) -> float:
         """Return the sum of the terms; waits for them."""
         numbers = self._read.numbers().tolist()
         values = numbers[: len(self._terms)]
-        sums = numbers[len(self._terms) :]
-        suspects = [
-            x
-            for x, total in zip(self._moved.items(), sums, strict=True)
-            if not math.isfinite(total)
-        ]
-        # others only add up to too much
-        broken = [name for name, x in suspects if not bool(x.isfinite().all())]
         where = f"step {step}, view {image.name!r}"
-        if broken:
-            what, section = moves_by
-            raise DyngsError(
-                f"{where}: the {what} makes {', '.join(broken)} at {image.time or 0:g} not finite; lower the rates "
-                f"in {section}"
-            )
+        sums = numbers[len(self._terms) :]
+        for (name, x), total in zip(self._moved.items(), sums, strict=True):
+            # finite numbers may add up to too much
+            if not math.isfinite(total) and not bool(x.isfinite().all()):
+                what, section = moves_by
+                raise DyngsError(
+                    f"{where}: the {what} makes {name} at {image.time or 0:g} not finite; lower the rates in {section}"
+                )
         for name, value in zip(self._terms, values, strict=True):
             if not math.isfinite(value):
                 of_image = "look at that image; lower the rates in optim"

@@ -3,55 +3,27 @@ step draws into."""
 
 from __future__ import annotations
 
-import os
 import re
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from dyngs.config import Config, DefaultStrategy, FixedStrategy, McmcStrategy, RandomInit
+from dyngs.config import Config
 from dyngs.core.conventions import num_sh_terms
-from dyngs.core.errors import DyngsError
 from dyngs.gaussians.schedule import densify_schedule, growth_per_change
-from dyngs.models.kind import kind_of
 from dyngs.ops.device import gpu_memory
 from dyngs.training.trainer import Trainer
 
-
-@dataclass(frozen=True)
-class _Costs:
-    """Bytes and numbers of a forecast, measured on photos of 12 megapixels.
-
-    Attributes:
-        copies: float32 copies of the values of a Gaussian: value, gradient, two moments, and room
-            for three more when their set changes (1.65 kB per Gaussian with 59 values).
-        needed_copies: those that are there in every step.
-        shape_values: of a Gaussian next to its harmonics.
-        drawing: bytes per pixel of the largest image that a step draws into.
-        step: bytes of code and buffers that the first step touches.
-        decoding: bytes per pixel of a file that is decoded.
-        usual_gaussians, usual_changes: Gaussians that photos led to in 7,000 steps, and the changes
-            of their set (docs/benchmarks.md).
-        usual_side: longest side of the images, px, from which that holds.
-    """
-
-    copies: int = 7
-    needed_copies: int = 4
-    shape_values: int = 11
-    drawing: int = 200
-    step: int = 30_000_000
-    decoding: int = 45
-    usual_gaussians: int = 250_000
-    usual_changes: int = 34
-    usual_side: int = 400
-
-
-COSTS = _Costs()
+# float32 copies of the values of a Gaussian: value, gradient, two moments, and room for three more
+# when their set changes (measured: 1.65 kB per Gaussian with 59 values)
+COPIES = 7
+SHAPE_VALUES = 11  # Values of a Gaussian next to its harmonics
+DRAWING = 200  # Bytes per pixel of the largest image that a step draws into
+STEP = 30_000_000  # Bytes of code and buffers that the first step touches
+DECODING = 45  # Bytes per pixel of a file that is decoded, measured on photos of 12 megapixels
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
-_SWAP = "/sys/fs/cgroup/memory.swap.max"
 _USED = ("/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory/memory.usage_in_bytes")
 
 
@@ -65,8 +37,7 @@ class MemoryForecast:
         images: decoded ones, in the cache or on their way to it.
         drawing: what a step draws into.
         gaussians: of ``count`` of them.
-        certain: least that is taken next to the program.
-        free, whole: bytes that may still be taken, and that the machine has; None: unknown.
+        free: bytes that may still be taken; None: unknown.
         largest: bytes of the largest part, a key, its value, and the power of the part's size with
             which that goes: what to lower where it is too much.
     """
@@ -77,9 +48,7 @@ class MemoryForecast:
     drawing: int
     gaussians: int
     count: int
-    certain: int
     free: int | None
-    whole: int | None
     processes: int
     largest: tuple[int, str, float, float]
 
@@ -96,27 +65,16 @@ class MemoryForecast:
         )
 
     def warning(self) -> str | None:
-        """Return a line where that is likely to be more than is there."""
+        """Return a line where that is likely to be more than is there, with the key to lower and a
+        value that makes the run fit."""
         if self.free is None or self.needed <= self.free:
             return None
+        part, key, value, power = self.largest
+        fraction = 1 - (self.needed - 0.95 * self.free) / max(self.processes * part, 1)
+        fits = max(int(value * max(fraction, 0.02) ** power), 1)
         there = f"{_gb(self.free + self.program)} are there"
         needed = _gb(self.program + self.needed)
-        return f"about {needed} GB of {self.place} are needed, and {there}: give {self._advice(self.free)}"
-
-    def require_possible(self) -> None:
-        """Raise where the run certainly needs more than this machine, or its container, has."""
-        needed = self.program + self.processes * self.certain
-        if self.whole is not None and needed > self.whole:
-            raise DyngsError(
-                f"at least {_gb(needed)} GB of {self.place} are needed, and this machine has "
-                f"{_gb(self.whole)}: give {self._advice(self.whole)}"
-            )
-
-    def _advice(self, there: int) -> str:
-        """Return the key to lower, with a value that makes the run fit into ``there`` bytes."""
-        part, key, value, power = self.largest
-        fraction = 1 - (self.needed - 0.95 * there) / max(self.processes * part, 1)
-        return f"{key}={max(int(value * max(fraction, 0.02) ** power), 1)}"
+        return f"about {needed} GB of {self.place} are needed, and {there}: give {key}={fits}"
 
 
 def memory_forecasts(trainer: Trainer[Any], processes: int = 1) -> list[MemoryForecast]:
@@ -130,116 +88,65 @@ def memory_forecasts(trainer: Trainer[Any], processes: int = 1) -> list[MemoryFo
     pixels = max((width * height for width, height in images.sizes), default=0)
     side = max((max(size) for size in images.sizes), default=0)
     files = max((view.width * view.height for view in images.views), default=0)
-    decoded = images.bytes_to_come + (images.decoded_ahead // 2 or 1) * COSTS.decoding * files
-    now = trainer.num_gaussians
-    count = expected_gaussians(config, now, side)
+    decoded = images.bytes_to_come + (images.decoded_ahead // 2 or 1) * DECODING * files
+    count = expected_gaussians(config, trainer.num_gaussians, side)
     gaussians = count * gaussian_bytes(config)
-    needed = 4 * COSTS.needed_copies * now * stored_values(config)
-    drawing = COSTS.step + COSTS.drawing * pixels
+    drawing = STEP + DRAWING * pixels
     largest = max(
         (decoded, "data.cache_mb", 1e-6 * decoded, 1.0),
         (drawing, "data.longest_side", side, 0.5),
         (gaussians, *config.model.size_key(count)),
     )
-    machine = free_memory(), whole_memory(), processes, largest
+    free = free_memory()
     program = resident_memory()
     gpu = gpu_memory(trainer.device)
+    scene = (drawing, gaussians, count)
     if gpu is None:
-        certain = decoded + needed
-        return [
-            MemoryForecast("memory", program, decoded, drawing, gaussians, count, certain, *machine)
-        ]
-    shown = images.bytes_on_gpu
+        return [MemoryForecast("memory", program, decoded, *scene, free, processes, largest)]
     each = -(-processes // max(torch.cuda.device_count(), 1))
-    on_gpu = MemoryForecast(
-        "memory of the GPU", 0, shown, drawing, gaussians, count, needed, *gpu, each, largest
-    )
-    rest = MemoryForecast("memory", program, decoded, COSTS.step, 0, 0, decoded, *machine)
-    return [on_gpu, rest]
-
-
-def require_room(config: Config) -> None:
-    """Raise where the random Gaussians that a run is to begin with cannot fit on this machine."""
-    init = config.init
-    whole = whole_memory()
-    if (
-        not isinstance(init, RandomInit)
-        or whole is None
-        or "init" not in kind_of(config.model).uses
-    ):
-        return
-    each = 4 * COSTS.needed_copies * stored_values(config)
-    if init.num_random * each > whole:
-        raise DyngsError(
-            f"init.num_random={init.num_random}: at least {_gb(init.num_random * each)} GB of memory "
-            f"are needed, and this machine has {_gb(whole)}: give init.num_random={whole // (2 * each)}"
-        )
+    shown = images.bytes_on_gpu
+    return [
+        MemoryForecast("memory of the GPU", 0, shown, *scene, gpu[0], each, largest),
+        MemoryForecast("memory", program, decoded, STEP, 0, 0, free, processes, largest),
+    ]
 
 
 def stored_values(config: Config) -> int:
     """Return the number of values of a Gaussian that are trained, next to those of a field."""
-    return COSTS.shape_values + 3 * num_sh_terms(config.stored_sh_degree)
+    return SHAPE_VALUES + 3 * num_sh_terms(config.stored_sh_degree)
 
 
 def gaussian_bytes(config: Config) -> int:
     """Return the bytes of memory that a Gaussian takes in training, where it moves if anything
     may."""
-    return 4 * COSTS.copies * stored_values(config) + config.model.moving_bytes
+    return 4 * COPIES * stored_values(config) + config.model.moving_bytes
 
 
-def num_changes(config: Config, steps: int | None = None) -> int:
-    """Return how often the set of Gaussians changes in a run, or in its first ``steps``."""
-    strategy = config.strategy
-    if isinstance(strategy, FixedStrategy):
-        return 0
-    schedule = densify_schedule(strategy, config.train.steps, white_background=False)
-    last = min(schedule.stop, config.train.steps if steps is None else steps)
-    return sum(schedule.densifies_at(step) for step in range(1, last + 1))
-
-
-def expected_gaussians(config: Config, now: int, longest_side: int = COSTS.usual_side) -> int:
+def expected_gaussians(config: Config, now: int, longest_side: int = 400) -> int:
     """Return the Gaussians that a run which begins with ``now`` may end with: roughly, before
     anything is seen."""
-    changes = num_changes(config)
-    match config.strategy:
-        case McmcStrategy():
-            grown = now * (1 + growth_per_change(config.train.steps)) ** min(changes, 200)
-        case DefaultStrategy() | FixedStrategy():
-            detail = min(longest_side / COSTS.usual_side, 1.0) ** 0.5
-            factor = changes / COSTS.usual_changes
-            factor = factor if factor < 1 else min(factor, 4.0) ** 0.5
-            grown = COSTS.usual_gaussians * detail * factor
-    most = max(now, round(min(grown, config.strategy.growth_limit)))
+    strategy = config.strategy
+    steps = config.train.steps
+    changes = 0
+    if strategy.stop > 0:
+        schedule = densify_schedule(strategy, steps, white_background=False)
+        last = min(schedule.stop, steps)
+        changes = sum(schedule.densifies_at(step) for step in range(1, last + 1))
+    if strategy.kind == "mcmc":
+        grown = now * (1 + growth_per_change(steps)) ** min(changes, 200)
+    else:
+        # photos of 400 px led to 250,000 Gaussians by the 34 changes of 7,000 steps
+        # (docs/benchmarks.md)
+        factor = changes / 34
+        factor = factor if factor < 1 else min(factor, 4.0) ** 0.5
+        grown = 250_000 * min(longest_side / 400, 1.0) ** 0.5 * factor
+    most = max(now, round(min(grown, strategy.growth_limit)))
     return most + config.model.added_for_motion
 
 
 def resident_memory() -> int:
     """Return the bytes of memory that this process takes; 0 where that is not known."""
     return _kilobytes("/proc/self/status", "VmRSS") or 0
-
-
-def peak_memory() -> int:
-    """Return the largest number of bytes of memory that this process has taken; 0 where that is not
-    known."""
-    if sys.platform == "win32":
-        return 0
-    import resource
-
-    unit = 1 if sys.platform == "darwin" else 1024
-    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-
-def whole_memory() -> int | None:
-    """Return the bytes of memory and swap that this machine, or its container, has at all; None:
-    not known."""
-    found = []
-    memory, swap = (_kilobytes("/proc/meminfo", name) for name in ("MemTotal", "SwapTotal"))
-    if memory is not None and swap is not None:
-        found.append(memory + swap)
-    limits = [_number(_LIMITS[0]), _number(_SWAP)]
-    if None not in limits:
-        found.append(sum(x or 0 for x in limits))
-    return min(found, default=None)
 
 
 def free_memory() -> int | None:
@@ -249,8 +156,6 @@ def free_memory() -> int | None:
     available = _kilobytes("/proc/meminfo", "MemAvailable")
     if available is not None:
         found.append(available)
-    elif hasattr(os, "sysconf") and "SC_AVPHYS_PAGES" in os.sysconf_names:
-        found.append(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     for limit, used in zip(_LIMITS, _USED, strict=True):
         most = _number(limit)
         now = _number(used)

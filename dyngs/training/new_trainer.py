@@ -17,7 +17,7 @@ from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.start import FirstGaussians, surroundings
-from dyngs.models.kind import Moves, Predicts, RunStart, capability, kind_of
+from dyngs.models.kind import Moves, RunStart, kind_of
 from dyngs.models.views import (
     background_colour,
     resolved_background,
@@ -27,11 +27,9 @@ from dyngs.models.views import (
 )
 from dyngs.ops.device import device_for
 from dyngs.training.corrections.camera_refinement import CameraRefinement
-from dyngs.training.corrections.exposure import exposures_of
+from dyngs.training.corrections.exposure import ViewExposures
 from dyngs.training.corrections.robust import RobustMasks
-from dyngs.training.loop import Trainable
 from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
-from dyngs.training.prediction import network_trainer
 from dyngs.training.priors import UsedPriors, used_priors
 from dyngs.training.trainer import Parts, Trainer
 
@@ -45,24 +43,6 @@ EARLY_OPACITY = 0.2
 # fraction of the run; measured as the others, see docs/benchmarks.md#backgrounds
 FULL_OPACITY_FROM = 0.6
 ALIKE_IMAGES = 12  # number of images in which colours are compared with the background
-
-
-def build(
-    config: Config,
-    capture: Capture | None = None,
-    *,
-    restored: bool = False,
-    first: FirstGaussians | None = None,
-    uncapped: Config | None = None,
-    images: ImageLoader | None = None,
-) -> Trainable:
-    """Return what the loop steps; see ``assemble`` for arguments and errors."""
-    network = capability(config.model, Predicts)
-    if network is not None:
-        return network_trainer(config, network)
-    return assemble(
-        config, capture, restored=restored, first=first, uncapped=uncapped, images=images
-    )
 
 
 def assemble(
@@ -94,32 +74,47 @@ def assemble(
         images = ImageLoader(
             capture.splits["train"], config.data, with_maps=True, decoding_threads=usual_threads()
         )
-    priors = _priors(config, capture, images)
+    priors = UsedPriors()
+    kind = kind_of(config.model)
+    if "train.priors" in kind.uses:
+        moves = isinstance(kind, Moves) and len(set(training_times(capture))) > 1
+        priors = used_priors(config, capture, images.views, moves=moves)
     if not priors.masks:
         images = images.without_motion_masks()
     background = resolved_background(config, capture)
     extent = surroundings(capture).extent
-    findings: list[str] = []
-    if capture.has_alpha and config.train.alpha_weight == 0 and background != "random":
-        findings = [
+    findings = [priors.message]
+    published = capture.has_alpha and config.train.alpha_weight == 0 and background != "random"
+    if published and not restored:
+        findings.append(
             f"images are compared on {background} alone, as published (train.alpha_weight=0): {background} surfaces "
             "may be transparent"
-        ]
+        )
     early = _early_opacity(config, capture, images, background)
 
     def parts(config: Config) -> Parts:
         start = RunStart(
             config, uncapped or config, capture, images, background, extent, generator, first
         )
-        model = kind_of(config.model).start(start)
-        # before what asks the images for corrected cameras
-        refinement = _refinement(config, images, extent)
-        robust = _robust(config, capture, images)
-        exposures = exposures_of(config.train, images)
-        weight = config.train.alpha_weight
+        model = kind.start(start)
+        steps = config.train.steps
+        views = images.views
+        refinement = None
+        if config.camera.refine == "always":
+            refinement = CameraRefinement(views, extent, steps)
+            applied_to = refinement.corrections.applied_to
+            images.corrected = lambda index, cameras: applied_to(views[index], cameras)
+        robust = None
+        may_mask = "train.robust" in kind.uses and not isinstance(kind, Moves)
+        if config.train.robust == "always" and may_mask:
+            cameras = training_cameras(views, config.data)
+            robust = RobustMasks(images, cameras, steps, images.corrected)
+        exposures = None
+        if config.train.exposure == "always":
+            exposures = ViewExposures(len(images), steps, images)
         losses = [
             model.colour_loss or ImageLoss(config.train.ssim_weight),
-            SilhouetteLoss(weight, early, FULL_OPACITY_FROM * config.train.steps),
+            SilhouetteLoss(config.train.alpha_weight, early, FULL_OPACITY_FROM * steps),
             PenaltyLoss(),
             *([] if exposures is None else [exposures]),
             priors,
@@ -136,7 +131,7 @@ def assemble(
         background=background,
         extent=extent,
         generator=generator,
-        findings=[*([] if restored else findings), priors.message],
+        findings=findings,
         held_out=held_out,
         device=device_for(config.run.device),
     )
@@ -172,38 +167,6 @@ def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Cap
     for line in [] if quiet else [*lines, *before_training(capture)]:
         warn(line)
     return capture
-
-
-def _priors(config: Config, capture: Capture, images: ImageLoader) -> UsedPriors:
-    """Return the priors of the capture that are used; none for people, whose poses say how they
-    move."""
-    if "train.priors" not in kind_of(config.model).uses:
-        return UsedPriors()
-    moves = capability(config.model, Moves) is not None and len(set(training_times(capture))) > 1
-    return used_priors(config, capture, images.views, moves=moves)
-
-
-def _robust(config: Config, capture: Capture, images: ImageLoader) -> RobustMasks | None:
-    """Return the masks of what disagrees between views of a static scene, if they are requested."""
-    kind = kind_of(config.model)
-    if (
-        config.train.robust != "always"
-        or "train.robust" not in kind.uses
-        or isinstance(kind, Moves)
-    ):
-        return None
-    cameras = training_cameras(capture.splits["train"], config.data)
-    return RobustMasks(images, cameras, config.train.steps, images.corrected)
-
-
-def _refinement(config: Config, images: ImageLoader, size: float) -> CameraRefinement | None:
-    """Return the refinement of the training cameras, if it is requested; ``images`` have corrected
-    cameras then."""
-    if config.camera.refine != "always":
-        return None
-    refinement = CameraRefinement(images.views, size, config.train.steps)
-    images.corrected = refinement.corrections.applied
-    return refinement
 
 
 def _early_opacity(config: Config, capture: Capture, images: ImageLoader, background: str) -> float:

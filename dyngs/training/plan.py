@@ -9,9 +9,8 @@ from typing import Any
 from dyngs.config import Config, TrainConfig
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.capture import Capture
-from dyngs.gaussians.schedule import Rates, learning_rates, means_rate, rates_of
 from dyngs.gaussians.start import FirstGaussians
-from dyngs.models.kind import ExtendsTo, HasGaussians, capability
+from dyngs.models.kind import ExtendsTo, capability
 from dyngs.models.schedule import PUBLISHED_STEPS, Length, scaled
 from dyngs.training.corrections.exposure import WARM_UP
 
@@ -51,10 +50,6 @@ class RunPlan:
     first: FirstGaussians | None = None
     limits: Limits = Limits()
     choices: tuple[Any, ...] = ()
-
-    @property
-    def schedule(self) -> Rates:
-        return rates_of(self.resolved)
 
 
 Stage = Callable[[RunPlan], tuple[RunPlan, str | None]]
@@ -102,19 +97,12 @@ def _require_exposures_stay(config: Config, length: Length) -> None:
 
 def describe_extension(before: Config, after: Config, done: int) -> str:
     """Return a message about the schedules of a run that continues after ``done`` steps."""
-    was = before.train.steps
     steps = after.train.steps
-    line = f"goes on from step {done:,} to {steps:,} instead of {was:,}, on the schedules of {counted(steps, 'step')}"
-    if capability(after.model, HasGaussians) is None:
-        return line
-    then, now = (
-        means_rate(learning_rates(c), rates_of(c).progress(done), 1.0) for c in (before, after)
+    no_limit = "" if before.train.minutes is None else "; train.minutes holds no longer"
+    return (
+        f"goes on from step {done:,} to {steps:,} instead of {before.train.steps:,}, on the schedules of "
+        f"{counted(steps, 'step')}{no_limit}"
     )
-    stop = scaled(after.strategy.stop, steps)
-    grows = after.strategy.growth_limit > 0 and stop > done + 1
-    line += f": the learning rate of positions is {now / then:.3g} times what it was, "
-    line += f"Gaussians are added up to step {stop:,}" if grows else "no more Gaussians are added"
-    return line + ("" if before.train.minutes is None else "; train.minutes holds no longer")
 
 
 def _train(options: TrainConfig, length: Length) -> TrainConfig:

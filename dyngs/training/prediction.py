@@ -13,8 +13,8 @@ from torch import Tensor
 from dyngs.config import Config
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, reading
-from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, settings_of
-from dyngs.models.kind import Predicts
+from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
+from dyngs.models.kind import Predicts, capability
 from dyngs.models.prediction import Learner, load_optimizer, optimizer_state, updated
 from dyngs.training.events import StepReport
 from dyngs.training.trainer import Edit, ViewSampler
@@ -79,7 +79,7 @@ class NetworkTrainer:
         mode = getattr(self.config.model, "rasterize_mode", RasterizeMode.CLASSIC).value
         info = CheckpointInfo(self.done, 1.0, (0.0, 0.0, 0.0), self.learner.background, mode)
         stored = {name: x.detach().cpu() for name, x in tensors.items()}
-        return Checkpoint(info, stored, settings=settings_of(self.config))
+        return Checkpoint(info, stored)
 
     def restore(self, checkpoint: Checkpoint) -> None:
         self.learner.load(checkpoint)
@@ -90,8 +90,10 @@ class NetworkTrainer:
         self.done = checkpoint.info.step
 
 
-def network_trainer(config: Config, network: Predicts) -> NetworkTrainer:
+def network_trainer(config: Config) -> NetworkTrainer:
     """Return the trainer of a network of any kind before the first step."""
+    network = capability(config.model, Predicts)
+    assert network is not None
     generator = torch.Generator().manual_seed(config.run.seed)
     learner = network.networks()[0](config, generator)
     return NetworkTrainer(

@@ -8,6 +8,7 @@ and where each process takes one view, the bytes are those of one process that t
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -32,22 +33,6 @@ EXIT_FAILED = 2
 _NAMES = ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")
 
 
-def numbers_of_torchrun() -> tuple[int, int, int] | None:
-    """Return rank, number of processes, and number of those on this machine; None where
-    ``torchrun`` did not start us.
-
-    Raises:
-        DyngsError: one of the variables is not a number.
-    """
-    if any(name not in os.environ for name in (*_NAMES, "MASTER_ADDR", "MASTER_PORT")):
-        return None
-    try:
-        rank, size, local_size = (int(os.environ[name]) for name in _NAMES)
-    except ValueError:
-        raise DyngsError(f"{', '.join(_NAMES)} must be numbers, as torchrun sets them") from None
-    return rank, size, local_size
-
-
 class Processes:
     """This process and those that it trains with; a context in which they are connected.
 
@@ -65,7 +50,14 @@ class Processes:
     def of_torchrun() -> Processes:
         """Return the processes that ``torchrun`` has started, this one alone without it. Raises
         DyngsError."""
-        return Processes(*(numbers_of_torchrun() or (0, 1, 1)))
+        if any(name not in os.environ for name in (*_NAMES, "MASTER_ADDR", "MASTER_PORT")):
+            return Processes()
+        try:
+            return Processes(*(int(os.environ[name]) for name in _NAMES))
+        except ValueError:
+            raise DyngsError(
+                f"{', '.join(_NAMES)} must be numbers, as torchrun sets them"
+            ) from None
 
     @property
     def is_first(self) -> bool:
@@ -140,14 +132,10 @@ class Processes:
         head = torch.cat([report, counts])
         self.sum_([head])
         report.copy_(head[: len(report)])
-        used = [
-            x
-            for x, count in zip(leaves, head[len(report) :].cpu().tolist(), strict=True)
-            if count > 0
-        ]
-        for x in used:
-            x.grad = torch.zeros_like(x) if x.grad is None else x.grad.contiguous()
-        self.sum_([x.grad for x in used if x.grad is not None])
+        for x, count in zip(leaves, head[len(report) :].cpu().tolist(), strict=True):
+            if count > 0:
+                x.grad = torch.zeros_like(x) if x.grad is None else x.grad.contiguous()
+                self.sum_([x.grad])
 
     def request_stop(self) -> None:
         """Report to rank 0 that this process has received a signal to stop."""
@@ -223,13 +211,7 @@ class Processes:
 
 
 def _checksum(tensors: Mapping[str, Tensor]) -> int:
-    total = 0
-    for name, x in sorted(tensors.items()):
-        values = x.detach().contiguous().reshape(-1)
-        values = values.view(torch.int32) if values.dtype is torch.float32 else values.long()
-        found = len(name) * 31 + x.dim()
-        for start, chunk in enumerate(values.split(CHUNK)):
-            places = torch.arange(1, len(chunk) + 1, device=chunk.device)
-            found += (start + 1) * int((chunk.long() * (2 * places + 1)).sum())
-        total = (total * 1_000_003 + found) % 2**63
-    return total
+    digest = hashlib.sha256()
+    for _, x in sorted(tensors.items()):
+        digest.update(x.detach().cpu().contiguous().numpy().tobytes())
+    return int.from_bytes(digest.digest()[:7], "big")

@@ -61,19 +61,11 @@ class RunLog:
         """Write ``event`` to the log, if it belongs there."""
         match event:
             case StepDone() if event.step % self._every == 0 or event.is_last:
-                self.write(record_of(event))
-            case Evaluated():
-                self.write_scores(event.step, event.split, event.psnr, event.ssim)
-
-    def write(self, record: LogRecord) -> None:
-        """Append the line of a step."""
-        self._append(asdict(record), "train", ("loss", "psnr", "num_gaussians"))
-
-    def write_scores(self, step: int, split: str, psnr: float, ssim: float) -> None:
-        """Append the scores of an evaluation during training."""
-        self._append(
-            {"step": step, "split": split, "psnr": psnr, "ssim": ssim}, split, ("psnr", "ssim")
-        )
+                plotted = ("loss", "psnr", "num_gaussians")
+                self._append(asdict(record_of(event)), "train", plotted)
+            case Evaluated(step, split, psnr, ssim):
+                scores = {"step": step, "split": split, "psnr": psnr, "ssim": ssim}
+                self._append(scores, split, ("psnr", "ssim"))
 
     def _append(self, values: dict[str, Any], group: str, plotted: Sequence[str]) -> None:
         """Append a line and flush, so that a crash loses nothing."""

@@ -7,7 +7,6 @@ import csv
 import json
 import re
 import shutil
-from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -193,7 +192,7 @@ def test_a_model_whose_images_were_shrunk_is_left_out(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(budget_time, "FIT", replace(budget_time.FIT, smallest_side=8))
+    monkeypatch.setattr(budget_time, "SMALLEST_SIDE", 8)
     words = ["compare", str(capture), "--models", "static", "--minutes", "0.001", "--threads", "1"]
     assert main([*words, "init.num_random=100", "--out", str(tmp_path / "out")]) == 2
     said = "static: too few steps fit into 0.001 minutes of training, so its images were shrunk to 8 px"

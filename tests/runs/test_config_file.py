@@ -59,7 +59,7 @@ def test_a_moved_run_needs_no_cache(
     before = evaluate_run(run, "pose")
     capsys.readouterr()
     dyngs.train(config)
-    assert "holds just this run, finished" in capsys.readouterr().out
+    assert "run already finished" in capsys.readouterr().out
     shutil.rmtree(tmp_path / "cache")
     moved = tmp_path / "elsewhere" / "moved"
     moved.parent.mkdir()

@@ -12,8 +12,7 @@ from tiny_people import config, people
 
 from dyngs.api.train import train
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint
-from dyngs.training.new_trainer import build
-from dyngs.training.prediction import NetworkTrainer, rate_at
+from dyngs.training.prediction import NetworkTrainer, network_trainer, rate_at
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +34,7 @@ def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, tmp_path: Path) ->
 def test_a_gradient_too_large_to_square_leaves_the_step_out(folder: Path, tmp_path: Path) -> None:
     """Its length, which is to be cut, is infinite: weights and moments stay as they are, and the
     next step is good."""
-    trainer = build(config(folder, tmp_path))
+    trainer = network_trainer(config(folder, tmp_path))
     assert isinstance(trainer, NetworkTrainer)
     trainer.step()
     for count, factor in enumerate((1e25, float("nan")), 1):

@@ -18,7 +18,6 @@ from dyngs.training.loop import Loop
 from dyngs.training.trainer import Edit, Trainer
 
 REMOVED_FROM = 0.7  # Fraction of the run from which Gaussians beyond the limit are removed
-CLOSE = 0.8  # Fraction of the limit from which the limit counts as having held growth back
 
 
 class CountLimit:
@@ -71,8 +70,6 @@ class CountLimit:
         cost = "it cost nothing"
         if self.before:
             cost = f"{self.before:,} before, {-self.lost:+.2f} dB on training views when they were removed"
-        elif CLOSE * self.most <= count and config.strategy.growth_limit > 0:
-            cost = "it held growth back; what more would bring is not known"
         asked = f"asked for at most {counted(self.most, 'Gaussian')}, got {count:,}"
         return f"{_name(config, self.most)}: {asked}; {cost}"
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from bisect import bisect_left
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,27 +11,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.baselines.triangles.scene import TriangleScene
 from dyngs.compress.measure import storage_plan
 from dyngs.compress.stage import highest, probe_images, quality_of, scores_of
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.core.errors import DyngsError, counted
-from dyngs.gaussians.scene import GaussianScene
-from dyngs.models.checkpoint import CheckpointInfo, restored_model
-from dyngs.models.renderable import Renderable
+from dyngs.models.checkpoint import restored_model
+from dyngs.models.kind import HasGaussians, capability
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.folder import EXPORT_FOLDER, write_config
-from dyngs.runs.stored_file import decoded, drawable, encoded, step_below, write_scene
+from dyngs.runs.stored_file import decoded, encoded, step_below, write_scene
 from dyngs.training.trainer import Trainer
 
 KEPT = 0.7
 """Fraction of the Gaussians that each trial keeps of those of the trial before."""
-FINEST_CHANGE = 2**0.25
-LARGEST_CHANGE = 2.0
-COARSEST = 64.0
-"""Smallest and largest factor on the steps per trial, and the largest in all."""
-_TRIALS = 40
 
 
 @dataclass(frozen=True)
@@ -64,16 +58,6 @@ class SizeReport:
         )
 
 
-@dataclass(frozen=True)
-class _File:
-    """One way to store a run."""
-
-    data: bytes
-    psnr: float
-    num_kept: int
-    coarser: float
-
-
 def has_file(run_dir: Path) -> bool:
     """Return whether a run has its file of limited size."""
     folder = run_dir / EXPORT_FOLDER
@@ -91,27 +75,33 @@ def write_within(trainer: Trainer[Any], run_dir: Path, megabytes: float) -> Size
     """
     full = trainer.checkpoint()
     config = trainer.config
-    scene = trainer.model.scene.to(CPU)
+    scene: Any = trainer.model.scene.to(CPU)
     images = probe_images(trainer)  # files are made on the CPU
     before = quality_of(trainer, scene, images)
     precision, coarseness = storage_plan(config, full, scene, None)
 
-    def stored(kept: GaussianScene | TriangleScene, octaves: Tensor | None) -> _File | None:
-        found = _fitted(full.info, kept, octaves, precision.steps, int(1e6 * megabytes))
+    def stored(kept: Any, octaves: Tensor | None) -> tuple[float, float, bytes, int] | None:
+        """Return PSNR, the factor on the steps, the file and the number kept; None: none fits."""
+
+        def encode(factor: float) -> bytes:
+            steps = {name: step_below(factor * step) for name, step in precision.steps.items()}
+            return encoded(full.info, kept, steps, octaves)
+
+        found = _fitted(encode, int(1e6 * megabytes))
         if found is None:
             return None
-        data, coarser = found
+        data, factor = found
         read = restored_model(decoded(data), config.model)
-        return _File(data, quality_of(trainer, read, images), len(kept), coarser)
+        return quality_of(trainer, read, images), factor, data, len(kept)
 
     chosen = stored(scene, coarseness)
-    if isinstance(scene, GaussianScene) and (chosen is None or chosen.coarser > 1):
+    if capability(config.model, HasGaussians) and (chosen is None or chosen[1] > 1):
         scores = scores_of(trainer).cpu()
         fraction = KEPT
         while fraction * len(scene) >= 1:
             kept = highest(scores, 1 - fraction)
             found = stored(scene.select(kept), None if coarseness is None else coarseness[kept])
-            if chosen is not None and (found is None or found.psnr <= chosen.psnr):
+            if chosen is not None and (found is None or found[0] <= chosen[0]):
                 break
             chosen = found
             fraction = fraction * KEPT
@@ -119,42 +109,18 @@ def write_within(trainer: Trainer[Any], run_dir: Path, megabytes: float) -> Size
         raise DyngsError(
             f"budget.max_mb={megabytes:g}: what is trained does not fit; the run itself is in {run_dir}"
         )
-    write_scene(run_dir / EXPORT_FOLDER / SCENE_FILE, chosen.data)
+    after, factor, data, num_kept = chosen
+    write_scene(run_dir / EXPORT_FOLDER / SCENE_FILE, data)
     write_config(config, run_dir / EXPORT_FOLDER)
-    got = 1e-6 * len(chosen.data)
-    return SizeReport(
-        megabytes, got, before, chosen.psnr, len(scene), chosen.num_kept, chosen.coarser
-    )
+    return SizeReport(megabytes, 1e-6 * len(data), before, after, len(scene), num_kept, factor)
 
 
-def _fitted(
-    info: CheckpointInfo,
-    scene: Renderable,
-    coarseness: Tensor | None,
-    steps: Mapping[str, float],
-    most: int,
-) -> tuple[bytes, float] | None:
-    """Return the bytes of a file of at most ``most``, and the factor on ``steps`` that this took;
-    None: none fits."""
-    num_values = sum(x.numel() for x in drawable(scene).values())
-    factor = 1.0
-    tried = set()
-    fits: tuple[bytes, float] | None = None
-    too_fine = 0.0
-    while factor <= COARSEST and factor not in tried and len(tried) < _TRIALS:
-        tried.add(factor)
-        data = encoded(
-            info, scene, {n: step_below(factor * s) for n, s in steps.items()}, coarseness
-        )
-        if len(data) <= most:
-            fits = data, factor
-        else:
-            too_fine = factor
-        if fits is None:
-            bits = 8 * (len(data) - most) / max(num_values, 1)
-            factor *= min(max(2**bits, FINEST_CHANGE), LARGEST_CHANGE)
-        elif too_fine and fits[1] / too_fine > FINEST_CHANGE:
-            factor = (fits[1] * too_fine) ** 0.5
-        else:
-            break
-    return fits
+def _fitted(encode: Callable[[float], bytes], most: int) -> tuple[bytes, float] | None:
+    """Return the largest file of at most ``most`` bytes, and its factor on the usual steps; None:
+    none fits."""
+    data = encode(1.0)
+    if len(data) <= most:
+        return data, 1.0
+    factors = [2 ** (k / 4) for k in range(1, 25)]
+    at = bisect_left(factors, True, key=lambda factor: len(encode(factor)) <= most)
+    return (encode(factors[at]), factors[at]) if at < len(factors) else None

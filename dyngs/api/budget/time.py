@@ -9,57 +9,33 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from statistics import fmean
 from typing import Any
 
 from dyngs.config import Config
 from dyngs.core.errors import counted
 from dyngs.data.loader import ImageLoader
-from dyngs.models.schedule import scaled
-from dyngs.training.clock import Forecast, cost_between
+from dyngs.training.clock import Forecast, Stopwatch
 from dyngs.training.loop import Loop
-from dyngs.training.memory import gaussian_bytes, num_changes, peak_memory
 from dyngs.training.plan import RunPlan, with_steps
 from dyngs.training.trainer import Edit, Trainer
 
-
-@dataclass(frozen=True)
-class _Fit:
-    """How steps are fitted to a time; fractions are of that time.
-
-    Attributes:
-        fewest: steps that must fit; otherwise the images are shrunk.
-        smallest_side: longest side, px, below which images are not shrunk.
-        aim: fraction that a run is planned to use.
-        steps, warm_up: steps that are measured before training, and those before that.
-        measuring: most that measuring takes.
-        corrected_at: fraction of the steps after which their number is corrected.
-        smallest_change: relative change of the number for which the run is rescaled.
-    """
-
-    fewest: int = 200
-    smallest_side: int = 64
-    aim: float = 0.96
-    steps: int = 20
-    warm_up: int = 2
-    measuring: float = 0.05
-    corrected_at: float = 0.25
-    smallest_change: float = 0.04
-
-
-FIT = _Fit()
+FEWEST = 200  # Steps that must fit; otherwise the images are shrunk
+SMALLEST_SIDE = 64  # Longest side, px, below which images are not shrunk
+AIM = 0.96  # Fraction of the time that a run is planned to use
+WARM_UP = 2  # Steps before those that are measured before training
 
 
 def fit_minutes(
-    plan: RunPlan, used: Callable[[], float], build: Callable[[RunPlan], Trainer[Any]]
+    plan: RunPlan, watch: Stopwatch, build: Callable[[RunPlan], Trainer[Any]]
 ) -> tuple[RunPlan, str | None, ImageLoader]:
     """Return the plan with as many steps as fit into its time, a message, and its training images.
 
-    Where fewer than ``FIT.fewest`` steps fit, the images are halved until they do, or are small.
+    Where fewer than ``FEWEST`` steps fit, the images are halved until they do, or are small.
 
     Args:
-        used: returns the seconds of training so far.
+        watch: seconds of training so far.
         build: returns a new trainer of a plan, which measures and is thrown away.
     """
     seconds = plan.limits.seconds or math.inf
@@ -67,14 +43,14 @@ def fit_minutes(
     message = None
     while True:
         trainer = build(plan)
-        forecast = _measured(trainer, FIT.measuring * seconds)
-        left = FIT.aim * seconds - used()
+        forecast = _measured(trainer, 0.05 * seconds)
+        left = AIM * seconds - watch.seconds
         steps = fitting_steps(forecast, plan.resolved, 0, left, asked)
         side = max(map(max, trainer.images.sizes))
-        if steps >= min(FIT.fewest, asked) or side < 2 * FIT.smallest_side:
+        if steps >= min(FEWEST, asked) or side < 2 * SMALLEST_SIDE:
             break
-        halvings = math.ceil(math.log2(FIT.fewest / max(steps, 1)) / 2)
-        smaller = max(side >> halvings, FIT.smallest_side)
+        halvings = math.ceil(math.log2(FEWEST / max(steps, 1)) / 2)
+        smaller = max(side >> halvings, SMALLEST_SIDE)
         message = (
             f"train.minutes={seconds / 60:g}: {counted(steps, 'step')} would fit at {side} px, so images are "
             f"shrunk to {smaller} px (data.longest_side)"
@@ -89,16 +65,16 @@ def fit_minutes(
 def _measured(trainer: Trainer[Any], seconds: float) -> Forecast:
     """Time a few steps of ``trainer``, for at most ``seconds``, and return a forecast."""
     begun = time.perf_counter()
-    last = min(FIT.warm_up + FIT.steps, trainer.config.train.steps)
+    last = min(WARM_UP + 20, trainer.config.train.steps)
     forecast = _forecast(trainer, begun)
     while trainer.done < last:
         trainer.step()
         now = time.perf_counter()
-        if trainer.done == FIT.warm_up < last:
+        if trainer.done == WARM_UP < last:
             forecast = _forecast(trainer, now)
         else:
             forecast.observe(trainer.config, trainer.done, now, trainer.num_gaussians)
-        if now - begun > seconds and trainer.done != FIT.warm_up:
+        if now - begun > seconds and trainer.done != WARM_UP:
             break
     return forecast
 
@@ -134,8 +110,6 @@ class TimeLimit:
         self.seconds = seconds
         self.most_steps = most_steps
         self._corrects = corrects
-        self._first = 0
-        self._begun = 0.0
         self._forecast: Forecast | None = None
 
     def __call__(self, loop: Loop) -> Edit | None:
@@ -148,19 +122,18 @@ class TimeLimit:
             return None
         if self._forecast is None:  # the first step loads and compiles what others find there
             self._forecast = _forecast(trainer, now)
-            self._first = trainer.num_gaussians
-            self._begun = now
             return None
         self._forecast.observe(config, done, now, trainer.num_gaussians)
         if now + 2 * self._forecast.mean_step > self.seconds:
             return Edit(steps=done)
-        if not self._corrects or done < FIT.corrected_at * loop.total:
+        if not self._corrects or 4 * done < loop.total:
             return None
         self._corrects = False
-        left = FIT.aim * self.seconds - now
+        left = AIM * self.seconds - now
         found = fitting_steps(self._forecast, config, done, left, self.most_steps)
-        is_small = abs(found - loop.total) <= FIT.smallest_change * loop.total
-        if is_small or found <= done or not is_same_phase(config, with_steps(config, found), done):
+        is_small = abs(found - loop.total) <= 0.04 * loop.total
+        new = with_steps(config, found)
+        if is_small or found <= done or events_before(config, done) != events_before(new, done):
             return None
         return Edit(
             f"train.minutes: {found:,} instead of {counted(loop.total, 'step')}", steps=found
@@ -176,44 +149,15 @@ class TimeLimit:
     def cost_of_all(self, loop: Loop) -> str | None:
         """Return what all steps would cost; None where too few were done to tell, or all were."""
         trainer = loop.trainer
-        if self._forecast is None or trainer.done >= self.most_steps:
-            return None
-        assert isinstance(trainer, Trainer)
         steps = self.most_steps
-        config = with_steps(trainer.config, steps)
-        now = trainer.num_gaussians
-        count = self._expected_gaussians(trainer.config, config, trainer.done, now)
-        stop = scaled(config.strategy.stop, steps)
-        more = count - self._first
-        pixels = self._forecast.pixels
-        cost = cost_between(
-            config, 0, steps, pixels, lambda step: self._first + more * min(step / stop, 1.0)
-        )
-        minutes = (self._begun + self._forecast.pace() * cost) / 60
-        peak = peak_memory() + trainer.images.bytes_to_come
-        memory = 1e-6 * (peak + gaussian_bytes(config) * max(count - now, 0))
-        return (
-            f"all {steps:,} steps would take about {minutes:.2g} min and {memory:,.0f} MB of memory, "
-            f"for {counted(count, 'Gaussian')}"
-        )
-
-    def _expected_gaussians(self, was: Config, config: Config, done: int, now: int) -> int:
-        """Return the Gaussians that a run of ``config`` ends with, by what changes have added."""
-        changes = num_changes(was, done)
-        if not changes:
-            return now
-        each = (now - self._first) / changes
-        left = max(num_changes(config) - changes, 0)
-        return max(min(round(now + each * left), config.strategy.growth_limit), now)
+        if self._forecast is None or trainer.done >= steps:
+            return None
+        seconds = self._forecast.seconds(with_steps(trainer.config, steps), steps, 0)
+        return f"all {steps:,} steps would take about {seconds / 60:.2g} min"
 
 
-def is_same_phase(old: Config, new: Config, done: int) -> bool:
-    """Return whether changing ``old`` to ``new`` after ``done`` neither omits nor repeats any
-    one-time event."""
-    return _happened(old, done) == _happened(new, done)
-
-
-def _happened(config: Config, done: int) -> list[bool]:
+def events_before(config: Config, done: int) -> list[bool]:
+    """Return which of the events that happen once in a run have happened after ``done`` steps."""
     steps = config.train.steps
     once = (config.model.moves_after(steps), config.colour.measured_after(steps))
     return [done >= step for step in once if step is not None]

@@ -319,8 +319,6 @@ def space_of(model: FieldModel, cells: int | None, capture: Capture) -> Space:
 
 
 def _space(middle: np.ndarray, half: float, cascades: int, cells: int | None) -> Space:
-    if not (math.isfinite(half) and half > 0 and np.isfinite(middle).all()):
-        raise DyngsError("the cameras of the capture frame no common space: give model.half_extent")
     x, y, z = (float(value) for value in middle)
     return Space((x, y, z), float(half), cascades, cells or (GRID if cascades == 1 else FAR_GRID))
 
@@ -342,11 +340,6 @@ def _cascades(capture: Capture, middle: np.ndarray, half: float) -> int:
         return MOST_CASCADES
     norms = np.abs(capture.points.xyz - middle).max(axis=1) / half
     needed = 1 + math.ceil(math.log2(max(float(np.quantile(norms, 1 - SEEN_FAR)), 1.0)))
-    if needed > MOST_CASCADES + 3:
-        raise DyngsError(
-            f"the points of the capture lie up to {2.0 ** (needed - 1):.0f} times as far away as its cameras are apart "
-            f"and a field holds {2 ** (MOST_CASCADES - 1)} times: give model.half_extent"
-        )
     return min(max(needed + 1, 2), MOST_CASCADES)  # what is behind the points, too
 
 

@@ -1,9 +1,14 @@
-"""Curved triangles as something to draw: a z-buffer whose edges are blended where they are."""
+"""Quadratic Bezier triangles: their surface and colours, how they are drawn, and as a mesh.
+
+They are drawn by a z-buffer whose edges are blended where they are. P triangles; K colours of each:
+at its six control points while ``texture`` is 0, else at the points of a lattice.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -11,13 +16,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from dyngs.baselines.triangles.keys import BgTriangleModel
-from dyngs.baselines.triangles.patches import CORNERS, Patches, evaluated
+from dyngs.baselines.triangles.kind import BgTriangleModel
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import SH_C0
+from dyngs.core.conventions import SH_C0, num_sh_terms
 from dyngs.core.gaussians import storage_order
-from dyngs.core.state import Role, State, StateTensor, prefixed
-from dyngs.core.tensor_checks import require_positive, require_tensor
+from dyngs.core.state import Role, State, prefixed, with_role
+from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.renderable import (
     DrawOptions,
@@ -28,22 +32,124 @@ from dyngs.models.renderable import (
     TimeStep,
     composited,
     fixed_cameras,
+    joined_renderings,
+    single_views,
 )
+from dyngs.models.views import evaluation_background
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.patches import (
+    NUM_POINTS,
     SEGMENTS,
     Places,
     blend_patches,
     lattice,
+    lattice_size,
     outline_crossings,
     patch_values,
     project_points,
     visible_patches,
 )
 
+CORNERS = (0, 3, 5)  # control points 200, 020, 002
+_EDGES = ((0, 3), (0, 5), (3, 5))  # corners that the points 110, 101, 011 lie between
+_BETWEEN = (1, 2, 4)
+MOST_TEXTURE, MOST_DEGREE = 16, 4
+
+
+@dataclass(frozen=True)
+class Patches:
+    """P triangles."""
+
+    points: Tensor  # (P, 6, 3) control points, world
+    colours: Tensor  # (P, K, 3) seen from the middle of all directions
+    # (P, T - 1, 3) of the direction from the camera, added to them; without the constant
+    harmonics: Tensor
+    texture: int = 0  # segments of the lattice of colours; 0: those of the control points
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def sh_degree(self) -> int:
+        return int((self.harmonics.shape[1] + 1) ** 0.5) - 1
+
+    @property
+    def num_values(self) -> int:
+        """Number of values that are learned."""
+        return sum(x.numel() for x in self.tensors.values())
+
+    @property
+    def tensors(self) -> Mapping[str, Tensor]:
+        """All that is learned, by name; a row of each is a triangle."""
+        return {"points": self.points, "colours": self.colours, "harmonics": self.harmonics}
+
+    def colours_at(self, ids: Tensor, uv: Tensor) -> Tensor:
+        """Return (N, 3) colours without harmonics of places (N, 2) on triangles (N,) int32."""
+        return patch_values(self.colours, ids, uv, self.texture)
+
+    def textured(self, segments: int) -> Patches:
+        """Return them with the colours at the points of a lattice."""
+        places, _ = lattice(segments)
+        return replace(self, colours=evaluated(self.colours.detach(), places), texture=segments)
+
+    def state(self) -> State:
+        own = {name: x.detach() for name, x in self.tensors.items()}
+        own["texture"] = torch.tensor([self.texture], device="cpu")
+        return with_role(own, Role.SHARED)
+
+    @staticmethod
+    def restored(stored: Mapping[str, Tensor]) -> Patches:
+        """Return the triangles in a state. Raises KeyError or ValueError where its tensors do not
+        fit."""
+        texture = int(require_indices("texture", stored["texture"], (1,), MOST_TEXTURE + 1))
+        points = require_tensor("points", stored["points"], (None, NUM_POINTS, 3))
+        count = len(points)
+        size = lattice_size(texture) if texture else NUM_POINTS
+        colours = require_tensor("colours", stored["colours"], (count, size, 3))
+        harmonics = require_tensor("harmonics", stored["harmonics"], (count, None, 3))
+        if count == 0 or harmonics.shape[1] + 1 not in {
+            num_sh_terms(n) for n in range(MOST_DEGREE + 1)
+        }:
+            raise ValueError(
+                f"'points' and 'harmonics' are no triangles: {count}, {harmonics.shape[1]} terms"
+            )
+        return Patches(points.clone(), colours.clone(), harmonics.clone(), texture)
+
+
+def evaluated(values: Tensor, places: Tensor) -> Tensor:
+    """Return (P, N, C): quadratic ``values`` (P, 6, C) of every triangle at the same ``places`` (N,
+    2)."""
+    count = len(values)
+    ids = torch.arange(count, dtype=torch.int32, device="cpu").repeat_interleave(len(places))
+    uv = places.to(values.dtype).repeat(count, 1)
+    return patch_values(values, ids, uv).view(count, len(places), values.shape[2])
+
+
+def quarters(values: Tensor) -> Tensor:
+    """Return (4 P, 6, C): quadratic ``values`` (P, 6, C) on the parts that middles of edges cut a
+    triangle into."""
+    places, faces = lattice(2)
+    corners = places[faces]  # (4, 3, 2)
+    middles = torch.stack(
+        [(corners[:, i] + corners[:, j]) / 2 for i, j in ((0, 1), (0, 2), (1, 2))], 1
+    )
+    at = evaluated(values, torch.cat([corners, middles], 1).flatten(0, 1)).view(
+        -1, 6, values.shape[2]
+    )
+    parts = torch.empty_like(at)
+    parts[:, list(CORNERS)] = at[:, :3]
+    for n, (between, (a, b)) in enumerate(zip(_BETWEEN, _EDGES, strict=True)):
+        parts[:, between] = 2 * at[:, 3 + n] - 0.5 * (parts[:, a] + parts[:, b])
+    return parts
+
+
+def flat_triangles(corners: Tensor) -> Tensor:
+    """Return (P, 6, C) control points of flat triangles with ``corners`` (P, 3, C)."""
+    a, b, c = corners.unbind(1)
+    return torch.stack([a, (a + b) / 2, (a + c) / 2, b, (b + c) / 2, c], 1)
+
+
 _ABOVE = 2.0  # Added to harmonics so that the kernel's clamp at 0 does not cut them
-
-
 NEAR = 0.05  # Near plane, in half sides of the scene
 
 
@@ -53,16 +159,6 @@ class TriangleOptions(DrawOptions):
 
     segments: int = SEGMENTS  # of an edge: a triangle is drawn as their square
     supersampling: int = 1  # a pixel is the mean of its square
-
-
-@dataclass(frozen=True)
-class View:
-    """One view as it is drawn."""
-
-    colour: Tensor  # (H, W, 3) before black
-    transmittance: Tensor  # (H, W)
-    depth: Tensor | None  # (H, W) sum of weight times z
-    places: Places  # what each drawn pixel shows
 
 
 @dataclass(frozen=True)
@@ -133,10 +229,8 @@ class TriangleScene(Renderable):
         return self.patches.points.device
 
     def state(self) -> State:
-        unit = torch.tensor([self.unit], dtype=torch.float64, device="cpu")
-        return prefixed(
-            "triangles", self.patches.state() | {"unit": StateTensor(unit, Role.SHARED)}
-        )
+        unit = {"unit": torch.tensor([self.unit], dtype=torch.float64, device="cpu")}
+        return prefixed("triangles", self.patches.state() | with_role(unit, Role.SHARED))
 
     def render(
         self,
@@ -149,11 +243,13 @@ class TriangleScene(Renderable):
         options = self.options if options is None else options
         behind = self.background if background is None else background
         cameras = fixed_cameras(cameras, behind, self.patches.points)
-        views = [self.view(cameras.select(i), options) for i in range(len(cameras))]
-        return rendering_of(views, behind, options)
+        views = single_views(cameras, behind)
+        return joined_renderings([self.drawn(x, options, colour)[0] for x, colour in views])
 
-    def view(self, camera: Cameras, options: TriangleOptions) -> View:
-        """Return what one camera sees; differentiable."""
+    def drawn(
+        self, camera: Cameras, options: TriangleOptions, background: Tensor | None = None
+    ) -> tuple[Rendering, Places]:
+        """Return the image of one camera, differentiable, and what each drawn pixel shows."""
         times = options.supersampling
         patches = self.patches
         camera = camera.to(device=self.device)
@@ -172,14 +268,11 @@ class TriangleScene(Renderable):
             channels = torch.cat([channels, at.depths[:, None]], 1)
         crossings = outline_crossings(patches.points, fine, places)
         image, through = blend_patches(at.means, channels, crossings, places)
-        image = image[0]
-        through = through[0]
         if times > 1:
-            image = avg_pool2d(image.permute(2, 0, 1)[None], times)[0].permute(1, 2, 0)
-            through = avg_pool2d(through[None, None], times)[0, 0]
-        return View(
-            image[..., :3], through, image[..., 3] if options.depth != "none" else None, places
-        )
+            image = avg_pool2d(image.permute(0, 3, 1, 2), times).permute(0, 2, 3, 1)
+            through = avg_pool2d(through[None], times)[0]
+        depth = image[..., 3] if options.depth != "none" else None
+        return composited(image[..., :3], through, depth, options, background), places
 
     def _by_direction(self, camera: Cameras) -> Tensor:
         """Return (P, 3): what harmonics add to the colours of each triangle, seen from
@@ -194,24 +287,16 @@ class TriangleScene(Renderable):
         )
 
 
-def rendering_of(
-    views: list[View], background: Tensor | None, options: TriangleOptions
-) -> Rendering:
-    """Return the images of ``views`` before ``background``; None is black."""
-    rgb = torch.stack([view.colour for view in views])
-    through = torch.stack([view.transmittance for view in views])
-    found = [view.depth for view in views if view.depth is not None]
-    return composited(rgb, through, torch.stack(found) if found else None, options, background)
-
-
 def scene_options(model: BgTriangleModel, unit: float) -> TriangleOptions:
     """Return how triangles of a scene of half side ``unit`` are drawn."""
     return TriangleOptions(near=NEAR * unit, supersampling=model.supersampling)
 
 
-def stored_triangles(checkpoint: Checkpoint) -> tuple[Patches, float]:
-    """Return the triangles and unit of a checkpoint. Raises KeyError or ValueError where its
-    tensors do not fit."""
+def restored_scene(model: BgTriangleModel, checkpoint: Checkpoint) -> TriangleScene:
+    """Return the scene of a checkpoint. Raises KeyError or ValueError where its tensors do not
+    fit."""
     stored = checkpoint.part("triangles")
-    unit = require_positive("unit", require_tensor("unit", stored["unit"], (1,), torch.float64))
-    return Patches.restored(stored), float(unit)
+    unit = require_tensor("unit", stored["unit"], (1,), torch.float64)
+    half = float(require_positive("unit", unit))
+    behind = evaluation_background(checkpoint.info.background, False)[1]
+    return TriangleScene(Patches.restored(stored), half, scene_options(model, half), behind)

@@ -312,23 +312,27 @@ def _frames_of(
     Two passes, so that only one image is held in memory: the first one measures.
     """
     measures = measured(read_frames(video))
-    choice = chosen_frames(measures, options.num_frames or _NUM_FRAMES)
-    if choice.num_frames >= 3 and choice.reach < STILL:
+    numbers, blurred = chosen_frames(measures, options.num_frames or _NUM_FRAMES)
+    reach = measures.away.max(initial=0.0)
+    if len(measures) >= 3 and reach < STILL:
         raise DyngsError(
-            f"{video}: the camera stands still (the image moves by {choice.reach:.2%} of its width), which "
+            f"{video}: the camera stands still (the image moves by {reach:.2%} of its width), which "
             "gives no depth; film while walking sideways around the scene"
         )
-    names = {index: f"frame_{index:05d}.png" for index in choice.numbers}
+    names = {index: f"frame_{index:05d}.png" for index in numbers}
     photos = []
-    for index, rgb in read_numbered_frames(video, choice.numbers):
+    for index, rgb in read_numbered_frames(video, numbers):
         path = capture / "images" / names[index]
         write_image(path, rgb)
         photos.append(Photo(path.name, read_header(path), path.name))
         report("frames of the video", len(photos), len(names))
     seconds = frame_seconds(video, len(measures))
     write_seconds(capture, {name: seconds[index] for index, name in names.items()})
-    notes = [*colour_notes([probe_video(video)]), choice.summary()]
-    return photos, notes, [names[index] for index in choice.blurred]
+    notes = [
+        *colour_notes([probe_video(video)]),
+        f"{len(numbers)} of {len(measures)} frames taken, by motion and sharpness",
+    ]
+    return photos, notes, [names[index] for index in blurred]
 
 
 # Features, and which images are compared

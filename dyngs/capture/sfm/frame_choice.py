@@ -42,30 +42,6 @@ class FrameMeasures:
         return len(self.sharpness)
 
 
-@dataclass(frozen=True)
-class FrameChoice:
-    """Frames taken from a video: their ``numbers``, ascending, of ``num_frames``.
-
-    Attributes:
-        num_static: frames of the video at which nothing had moved since the frame before.
-        blurred: chosen ones much less sharp than the others.
-        reach: largest motion since the first frame, as a fraction of the image's width.
-    """
-
-    numbers: tuple[int, ...]
-    num_frames: int
-    num_static: int
-    blurred: tuple[int, ...]
-    reach: float
-
-    def summary(self) -> str:
-        """The choice in a line."""
-        line = (
-            f"{len(self.numbers)} of {self.num_frames} frames taken, by motion seen and sharpness"
-        )
-        return line + (f"; nothing moves at {self.num_static}" if self.num_static else "")
-
-
 def measured(frames: Iterable[np.ndarray]) -> FrameMeasures:
     """Measure all frames, (H, W, 3) uint8; three small images are held in memory."""
     sharpness = []
@@ -83,8 +59,9 @@ def measured(frames: Iterable[np.ndarray]) -> FrameMeasures:
     return FrameMeasures(np.array(sharpness), motion, most, np.array(away))
 
 
-def chosen_frames(measures: FrameMeasures, wanted: int) -> FrameChoice:
-    """Choose at most ``wanted`` frames: the sharpest in each of as many windows of equal motion.
+def chosen_frames(measures: FrameMeasures, wanted: int) -> tuple[list[int], list[int]]:
+    """Return the numbers of at most ``wanted`` frames, ascending, the sharpest in each of as many
+    windows of equal motion, and those of them that are much less sharp than the others.
 
     A frame counts by the motion since the one before, at most ``_FASTEST`` times the median, and to
     a small part by itself, so that what moves while the camera rests is not lost. Frames that
@@ -112,10 +89,7 @@ def chosen_frames(measures: FrameMeasures, wanted: int) -> FrameChoice:
             numbers.append(int(members[measures.sharpness[members].argmax()]))
     sharp = measures.sharpness[numbers]
     limit = _BLURRED * float(np.median(sharp)) if numbers else 0.0
-    blurred = tuple(number for number, value in zip(numbers, sharp, strict=True) if value < limit)
-    return FrameChoice(
-        tuple(numbers), count, int(still.sum()), blurred, float(measures.away.max(initial=0.0))
-    )
+    return numbers, [number for number, x in zip(numbers, sharp, strict=True) if x < limit]
 
 
 def sharpness_of(rgb: np.ndarray) -> float:

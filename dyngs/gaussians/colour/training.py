@@ -177,16 +177,6 @@ class TrainingLooks:
     background: Tensor
 
 
-@dataclass(frozen=True)
-class HarmonicsDropped:
-    """Gaussians whose harmonics are dropped for good."""
-
-    text: str  # what was found, for people
-    # (N,) bool, those without harmonics from now on; None: all keep theirs
-    rows: Tensor | None = None
-    offsets: Tensor | None = None  # (N, 3) colour to add to their base
-
-
 class ColourTraining:
     """Harmonics as they are stored: nothing to learn next to them."""
 
@@ -211,8 +201,8 @@ class ColourTraining:
         """Return whether training view ``index`` must not be trained on in ``step``."""
         return False
 
-    def measured(self, step: int, looks: Callable[[], TrainingLooks]) -> HarmonicsDropped | None:
-        """Measure, if due after ``step``, whose harmonics improve images, and drop the others."""
+    def measured(self, step: int, looks: Callable[[], TrainingLooks]) -> ViewDependence | None:
+        """Measure, if due after ``step``, whose harmonics improve images; the others are dropped."""
         return None
 
     def frozen_rest(self) -> Tensor | None:
@@ -297,22 +287,20 @@ class AutoTraining(ColourTraining):
         """Return true for every eighth view, until the harmonics are measured on them."""
         return step <= self.measured_after and index in self.held_out
 
-    def measured(self, step: int, looks: Callable[[], TrainingLooks]) -> HarmonicsDropped | None:
+    def measured(self, step: int, looks: Callable[[], TrainingLooks]) -> ViewDependence | None:
         if step != self.measured_after or not self.held_out:
             return None
         views = looks()
         seen = [i for i in views.indices if i not in self.held_out]
         held_out = [i for i in views.indices if i in self.held_out]
         if not seen or not held_out:
-            return HarmonicsDropped(
-                "too few views are trained on as yet to measure where view dependence pays: all harmonics stay"
-            )
+            return None
         judged = list(views.views(held_out))
         found = find_view_dependent(
             views.views(seen), judged, views.options, views.background, self.tolerance
         )
         self.freeze(~found.keeps)
-        return HarmonicsDropped(str(found), ~found.keeps, found.offsets)
+        return found
 
     def freeze(self, frozen: Tensor) -> None:
         """Keep the harmonics of the Gaussians ``frozen`` (N,) zero from now on."""

@@ -10,7 +10,7 @@ contain such a common motion, so that test cameras stay where they are.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
+from dyngs.core.state import tensors_of
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
@@ -59,47 +60,31 @@ class CameraCorrections:
 
     def __init__(self, views: Sequence[View], size: float) -> None:
         self.size = size
-        self._pose_of, self._pose_rows = _numbered([_pose_key(view) for view in views])
-        self._lens_of, self._lens_rows = _numbered([_lens_key(view) for view in views])
-        poses_of_lens = Counter(
-            lens for lens, _ in set(zip(self._lens_of, self._pose_of, strict=True))
-        )
-        self._refines_lens = [poses_of_lens[i] >= MIN_POSES for i in range(len(poses_of_lens))]
-        self.poses = torch.zeros(max(self._pose_of) + 1, 6, device="cpu")
-        self.lenses = torch.zeros(len(poses_of_lens), 3, device="cpu")
-        self._common = common_motions(
-            [views[self._pose_of.index(i)] for i in range(len(self.poses))], size
-        )
+        by_pose = {_pose_key(view): view for view in views}
+        self._poses = _numbered(by_pose)
+        self._lenses = _numbered(_lens_key(view) for view in views)
+        self.poses = torch.zeros(len(self._poses), 6, device="cpu")
+        self.lenses = torch.zeros(len(self._lenses), 3, device="cpu")
+        poses_of_lens = Counter(lens for lens, _ in {(_lens_key(x), _pose_key(x)) for x in views})
+        self._refined = {key for key, count in poses_of_lens.items() if count >= MIN_POSES}
+        self._common = common_motions(list(by_pose.values()), size)
 
-    def rows(self, index: int) -> tuple[int, int | None]:
-        """Return the rows of the pose and of the lens of view ``index``; None where a lens is not
-        refined."""
-        lens = self._lens_of[index]
-        return self._pose_of[index], lens if self._refines_lens[lens] else None
-
-    def applied(self, index: int, cameras: Cameras) -> Cameras:
-        """Return ``cameras``, that of an image of view ``index`` at any scale, corrected."""
-        pose, lens = self.rows(index)
-        return corrected(
-            cameras, self.poses[pose], None if lens is None else self.lenses[lens], self.size
-        )
+    def rows(self, view: View) -> tuple[int | None, int | None]:
+        """Return the rows of the pose and of the lens of a view; None where nothing is known of it,
+        or a lens is not refined."""
+        lens = _lens_key(view)
+        row = self._lenses[lens] if lens in self._refined else None
+        return self._poses.get(_pose_key(view)), row
 
     def applied_to(self, view: View, cameras: Cameras) -> Cameras:
-        """Return ``cameras``, that of an image of any view of the capture, with what is known of
-        it.
+        """Return ``cameras``, that of an image of any view of the capture at any scale, corrected.
 
         A view that was not trained on has the pose of a camera that stands still, or a lens, as
         training found it.
         """
-        pose = self._pose_rows.get(_pose_key(view))
-        lens = self._lens_rows.get(_lens_key(view))
+        pose, lens = self.rows(view)
         own = torch.zeros(6, device="cpu") if pose is None else self.poses[pose]
-        return corrected(
-            cameras,
-            own,
-            None if lens is None or not self._refines_lens[lens] else self.lenses[lens],
-            self.size,
-        )
+        return corrected(cameras, own, None if lens is None else self.lenses[lens], self.size)
 
     def corrected_view(self, view: View) -> View:
         """Return ``view`` with its camera as ``applied_to`` has it, in float64."""
@@ -193,11 +178,9 @@ def _lens_key(view: View) -> Hashable:
     return view.intrinsics.tobytes(), view.width, view.height
 
 
-def _numbered(keys: Sequence[Hashable]) -> tuple[list[int], dict[Hashable, int]]:
-    """Return for each key the number of those equal to it, in order of their first appearance; and
-    by key."""
-    numbers: dict[Hashable, int] = {}
-    return [numbers.setdefault(key, len(numbers)) for key in keys], numbers
+def _numbered(keys: Iterable[Hashable]) -> dict[Hashable, int]:
+    """Return the number of each distinct key, in order of their first appearance."""
+    return {key: number for number, key in enumerate(dict.fromkeys(keys))}
 
 
 class CameraRefinement(Correction):
@@ -207,6 +190,7 @@ class CameraRefinement(Correction):
 
     def __init__(self, views: Sequence[View], size: float, steps: int) -> None:
         self.corrections = CameraCorrections(views, size)
+        self._views = views
         self._steps = steps
         self._adam = AdamState.zero(self._values())
         self._updates = {
@@ -227,28 +211,24 @@ class CameraRefinement(Correction):
         """
         rate = self.rate(step)
         cameras = image.cameras
-        left_out = torch.zeros((), dtype=torch.int64, device="cpu")
         by_pose = cameras.cam_from_world.grad
         by_intrinsics = cameras.intrinsics.grad
         if rate == 0 or by_pose is None or by_intrinsics is None:
             return 0
+        left_out = torch.zeros((), dtype=torch.int64, device="cpu")
         gradients = slopes(cameras, by_pose, by_intrinsics, self.corrections.size)
         rates = (rate, LENS_RATE * rate if step >= LENS_STARTS * self._steps else 0.0)
-        for name, row, gradient, lr in zip(
-            self._values(), self.corrections.rows(index), gradients, rates, strict=True
+        rows = self.corrections.rows(self._views[index])
+        for (name, x), row, gradient, lr in zip(
+            self._values().items(), rows, gradients, rates, strict=True
         ):
-            if row is not None and lr > 0:
-                arrays = self._values()[name], self._adam.exp_avg[name], self._adam.exp_avg_sq[name]
-                x, first, second = (a[row : row + 1] for a in arrays)
-                self._updates[name][row] += 1
-                left_out += adam_step_(
-                    x,
-                    gradient[None].to(x),
-                    first,
-                    second,
-                    lr=lr,
-                    step=int(self._updates[name][row]),
-                )
+            if row is None or lr == 0:
+                continue
+            self._updates[name][row] += 1
+            arrays = (x, self._adam.exp_avg[name], self._adam.exp_avg_sq[name])
+            own, first, second = (array[row : row + 1] for array in arrays)
+            count = int(self._updates[name][row])
+            left_out += adam_step_(own, gradient[None].to(own), first, second, lr=lr, step=count)
         self.corrections.remove_common_motion()
         return left_out
 
@@ -260,22 +240,15 @@ class CameraRefinement(Correction):
         return FIRST_RATE * (LAST_RATE / FIRST_RATE) ** min(progress, 1.0)
 
     def state(self) -> dict[str, Tensor]:
-        state = dict(self._values())
-        for name, updates in self._updates.items():
-            state |= {f"updates.{name}": updates}
-            state |= {
-                f"exp_avg.{name}": self._adam.exp_avg[name],
-                f"exp_avg_sq.{name}": self._adam.exp_avg_sq[name],
-            }
-        return state
+        updates = {f"updates.{name}": x for name, x in self._updates.items()}
+        return self._values() | updates | tensors_of(self._adam.state())
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         for name, x in self._values().items():
             x.copy_(require_tensor(name, state[name], tuple(x.shape), x.dtype))
-            stored = state[f"updates.{name}"]
-            self._updates[name] = require_tensor(
-                f"updates.{name}", stored, (len(x),), torch.int64
-            ).clone()
+            key = f"updates.{name}"
+            updates = require_tensor(key, state[key], (len(x),), torch.int64)
+            self._updates[name] = updates.clone()
         self._adam = AdamState.restored(state, self._values())
 
     def _values(self) -> dict[str, Tensor]:
@@ -306,8 +279,9 @@ def fitted_to_image(
     """
     options = options or scene.options
     truth = image.composite(background)
-    counts = image.mask if weights is None or image.mask is None else weights * image.mask
-    counts = weights if counts is None else counts
+    counts = image.mask if weights is None else weights
+    if weights is not None and image.mask is not None:
+        counts = weights * image.mask
     correction = torch.zeros(1, 6, device=image.cameras.cam_from_world.device)
     first = torch.zeros_like(correction)
     second = torch.zeros_like(correction)
@@ -316,23 +290,14 @@ def fitted_to_image(
     for update in range(1, FIT_UPDATES + 1):
         camera = watched(corrected(image.cameras, correction[0], None, size))
         with torch.enable_grad():
-            rendered = scene.render(camera, image.time, options=options, background=background).rgb[
-                0
-            ]
-            loss = l1_ssim_loss(rendered, truth, FIT_SSIM_WEIGHT, counts)
-            by_pose, by_intrinsics = torch.autograd.grad(
-                loss, [camera.cam_from_world, camera.intrinsics]
-            )
+            drawn = scene.render(camera, image.time, options=options, background=background)
+            loss = l1_ssim_loss(drawn.rgb[0], truth, FIT_SSIM_WEIGHT, counts)
+            leaves = [camera.cam_from_world, camera.intrinsics]
+            by_pose, by_intrinsics = torch.autograd.grad(loss, leaves)
         if float(loss.detach()) < least:
             best = correction.clone()
             least = float(loss.detach())
         rate = FIRST_FIT_RATE * (LAST_FIT_RATE / FIRST_FIT_RATE) ** (update / FIT_UPDATES)
-        adam_step_(
-            correction,
-            slopes(camera, by_pose, by_intrinsics, size)[0][None],
-            first,
-            second,
-            lr=rate,
-            step=update,
-        )
+        slope = slopes(camera, by_pose, by_intrinsics, size)[0][None]
+        adam_step_(correction, slope, first, second, lr=rate, step=update)
     return replace(image, cameras=corrected(image.cameras, best[0], None, size))

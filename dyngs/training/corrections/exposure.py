@@ -18,19 +18,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
-from dyngs.config import TrainConfig
 from dyngs.core.camera import Cameras
 from dyngs.core.state import tensors_of
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.times import evenly_spaced, videos
+from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.network import SATURATED, recoloured
 from dyngs.gaussians.optimizer import AdamState
 from dyngs.models.model import Correction, Look, Loss, RenderedView
@@ -49,37 +47,18 @@ MAX_RATE = 0.01
 MIXING_RATE = 0.05  # Rate of what mixes channels, and of offsets, over that of gains
 GAIN_WEIGHT, MIXING_WEIGHT = 0.3, 1.0
 """Weights of the mean squared deviation from the identity: gains differ, channels hardly mix."""
-# Weight of the mean square of its difference from the images before and after, in a video
-SMOOTH_WEIGHT = 1.0
-
-
-def exposures_of(options: TrainConfig, images: ImageLoader) -> ViewExposures | None:
-    """Return what is learned of the exposures of training views, if that is asked for."""
-    if options.exposure != "always":
-        return None
-    beside: list[list[int]] = [[] for _ in images.views]
-    for order in videos(images.views):
-        for one, next_one in pairwise(order):
-            beside[one].append(next_one)
-            beside[next_one].append(one)
-    return ViewExposures(beside, options.steps, images)
 
 
 class ViewExposures(Loss, Correction):
     """An affine colour per training image, and their Adam.
 
     Args:
-        neighbours: images before and after each in a video.
         images: whose gains are found at once; None: Adam finds them.
     """
 
     name = "exposures"
 
-    def __init__(
-        self, neighbours: Sequence[Sequence[int]], steps: int, images: ImageLoader | None = None
-    ) -> None:
-        count = len(neighbours)
-        self._neighbours = neighbours
+    def __init__(self, count: int, steps: int, images: ImageLoader | None = None) -> None:
         self._steps = steps
         self._begins = round(WARM_UP * steps)
         self._images = images
@@ -113,12 +92,7 @@ class ViewExposures(Loss, Correction):
             return view
         if view.step == self._begins + 1 and self._images is not None:
             self._find_gains(self._images, view)
-        index = view.index
-        beside = self._beside(index)
-        if not int(self._visits[index]) and beside:  # was not looked at, but those next to it
-            with torch.no_grad():
-                self._values[index] = self._values[beside].mean(0)
-        shown = recoloured(self.affine(index), view.image, view.rendering, view.background)
+        shown = recoloured(self.affine(view.index), view.image, view.rendering, view.background)
         # no sensor shows more than white
         white = view.image.composite(view.background) >= SATURATED
         return replace(view, rendered=torch.where(white, shown.clamp_max(1.0), shown))
@@ -127,17 +101,7 @@ class ViewExposures(Loss, Correction):
         return self.penalties(look.index)
 
     def penalties(self, index: int) -> dict[str, Tensor]:
-        value = self._values[index]
-        total = (self._weights * value.square()).mean()
-        beside = self._beside(index)
-        if beside:
-            around = self._values[beside].detach().mean(0)
-            total = total + SMOOTH_WEIGHT * (value - around).square().mean()
-        return {"exposure": total}
-
-    def _beside(self, index: int) -> list[int]:
-        """Return the neighbours of an image that were trained on."""
-        return [i for i in self._neighbours[index] if int(self._visits[i])]
+        return {"exposure": (self._weights * self._values[index].square()).mean()}
 
     def after_backward(self, index: int, step: int, image: Image) -> Count:
         if step <= self._begins:

@@ -96,10 +96,7 @@ def test_images_are_halved_until_enough_steps_fit(
         return real(trainer)
 
     monkeypatch.setattr(Trainer, "step", step)
-    small = {"smallest_side": 4}
-    from dyngs.api.budget import time as module
-
-    monkeypatch.setattr(module, "FIT", module._Fit(**small))
+    monkeypatch.setattr("dyngs.api.budget.time.SMALLEST_SIDE", 4)
     run = train(config_of(still, tmp_path / "run", 0.08))
     assert load_resolved(run).data.longest_side is not None
     assert latest_checkpoint(run).info.step > 10

@@ -52,8 +52,6 @@ def test_a_real_capture_has_cubes_up_to_its_points(still: Capture) -> None:
     assert far.outermost > 60
     assert space_of(NgpModel(), 16, real(still, None)).cascades == MOST_CASCADES
     assert space_of(NgpModel(surroundings="never"), 16, real(still, None)).cascades == 1
-    with pytest.raises(DyngsError, match="times as far away"):
-        space_of(NgpModel(), 16, real(still, 1e6 * directions))
 
 
 def test_one_camera_position_tells_no_depth(still: Capture) -> None:

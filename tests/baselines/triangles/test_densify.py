@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from small_triangles import bent, triangle
 
-from dyngs.baselines.triangles.densify import change, useless
-from dyngs.baselines.triangles.patches import Patches
-from dyngs.baselines.triangles.tallies import Tallies
+from dyngs.baselines.triangles.training import Tallies, change, useless
 
 
 def seen(count: int) -> Tallies:
@@ -30,27 +26,19 @@ def test_a_good_triangle_is_useful_and_others_are_not() -> None:
     points[3, 2] = torch.nan
     tallies = seen(5)
     tallies.seen[4] = 0
-    patches = Patches(points, torch.zeros(5, 6, 3), torch.zeros(5, 0, 3))
-    assert useless(patches, tallies, 1.0).tolist() == [False, True, True, True, True]
+    assert useless(points, tallies, 1.0).tolist() == [False, True, True, True, True]
     hidden = seen(1)
     hidden.cells[0, 3:] = 0
-    assert useless(replace(patches, points=good), hidden, 1.0).tolist() == [True]
+    assert useless(good, hidden, 1.0).tolist() == [True]
     for shown, goes in ((0.4, True), (0.6, False)):
         sliver = seen(1)
         sliver.cells *= shown * 10 / 36  # px of each of the 10 views
-        assert useless(replace(patches, points=good), sliver, 1.0).tolist() == [goes]
+        assert useless(good, sliver, 1.0).tolist() == [goes]
 
 
 def test_those_with_the_largest_gradients_are_split_within_the_limit() -> None:
     patches = bent(6)
-    found = change(patches, seen(6), 1.0, 12, 1)
-    assert found.kept.tolist() == [0, 1, 2, 3]
-    points = found.of("points", patches.points)
-    assert len(points) == 12
-    torch.testing.assert_close(points[:4], patches.points[:4])
-    assert torch.equal(
-        found.of("harmonics", patches.harmonics)[4:8], patches.harmonics[4].expand(4, -1, -1)
-    )
-    moments = found.of_moments("points", torch.ones_like(patches.points))
-    assert moments[:4].min() == 1
-    assert moments[4:].abs().max() == 0
+    kept, added = change(patches, seen(6), 1.0, 12, 1)
+    assert kept.tolist() == [0, 1, 2, 3]
+    assert len(added["points"]) == 8
+    assert torch.equal(added["harmonics"][:4], patches.harmonics[4].expand(4, -1, -1))

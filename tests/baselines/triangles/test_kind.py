@@ -13,7 +13,7 @@ from small_triangles import config_of
 
 import dyngs
 from dyngs.baselines.triangles.scene import TriangleScene
-from dyngs.baselines.triangles.tallies import most_pixels
+from dyngs.baselines.triangles.training import most_pixels
 from dyngs.cli import main
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
@@ -98,10 +98,6 @@ def test_it_is_a_mesh_with_colours(run: Path, tmp_path: Path, suffix: str) -> No
             ["export", "RUN", "--format", "mesh", "--segments", "0", "--out", "OUT/mesh.ply"],
             "1 to 64",
         ),
-        (
-            ["export", "RUN", "--format", "mesh", "--level", "2", "--out", "OUT/mesh.ply"],
-            "radiance field",
-        ),
         (["prune", "RUN", "--out", "OUT/pruned"], "Gaussians"),
         (
             ["train", "data.root=CAPTURE", "model.kind=bg_triangle", "budget.max_gaussians=5"],
@@ -130,7 +126,7 @@ def test_a_capture_that_shows_no_surface_is_refused(
     capture: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Gaussians of images that show nothing need hundreds of steps until they have faded."""
-    monkeypatch.setattr("dyngs.baselines.triangles.first.fused", lambda *_: None)
+    monkeypatch.setattr("dyngs.baselines.triangles.training.fused", lambda *_: None)
     few = ["model.gaussian_steps=2", "run.dir=run"]
     assert main(["train", f"data.root={capture}", "model.kind=bg_triangle", *few]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()[-1:]

@@ -8,7 +8,7 @@ import pytest
 import torch
 from small_triangles import bent
 
-from dyngs.baselines.triangles.patches import Patches, evaluated, quarters
+from dyngs.baselines.triangles.scene import Patches, evaluated, quarters
 from dyngs.core.state import tensors_of
 from dyngs.ops.patches import lattice, patch_values
 

@@ -8,8 +8,7 @@ from dataclasses import replace
 import torch
 from small_triangles import bent, camera, triangle
 
-from dyngs.baselines.triangles.patches import Patches
-from dyngs.baselines.triangles.scene import TriangleOptions, TriangleScene
+from dyngs.baselines.triangles.scene import Patches, TriangleOptions, TriangleScene
 
 RED = torch.tensor([0.8, 0.1, 0.2])
 PLAIN = TriangleOptions()
@@ -53,19 +52,20 @@ def test_harmonics_tell_directions_apart() -> None:
     back = camera()
     # from behind, half a turn about y
     back.cam_from_world[0, 0, 0] = back.cam_from_world[0, 2, 2] = -1
-    front, behind = (TriangleScene(patches, 1.0).view(x, PLAIN) for x in (there, back))
-    assert front.colour.sum() > 0
-    assert behind.colour.sum() > 0
+    front, behind = (TriangleScene(patches, 1.0).render(x) for x in (there, back))
+    assert front.rgb.sum() > 0
+    assert behind.rgb.sum() > 0
     plain = replace(patches, harmonics=torch.zeros_like(patches.harmonics))
     for view, cam in ((front, there), (behind, back)):
-        without = TriangleScene(plain, 1.0).view(cam, PLAIN)
-        change = (view.colour - without.colour)[without.transmittance < 0.01]
+        without = TriangleScene(plain, 1.0).render(cam)
+        change = (view.rgb - without.rgb)[without.transmittance < 0.01]
         assert change.abs().max() > 0.01
 
 
 def test_gradients_reach_everything() -> None:
     patches = bent(4)
-    learned = patches.of({name: x.clone().requires_grad_() for name, x in patches.tensors.items()})
+    leaves = {name: x.clone().requires_grad_() for name, x in patches.tensors.items()}
+    learned = replace(patches, **leaves)
     TriangleScene(learned, 1.0).render(
         camera(), background=torch.ones(3)
     ).rgb.square().sum().backward()

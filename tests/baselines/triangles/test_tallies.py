@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from small_triangles import camera, triangle
 
-from dyngs.baselines.triangles.tallies import Tallies, outlines
+from dyngs.baselines.triangles.training import Tallies, outlines
 from dyngs.ops.patches import Places, visible_patches
 
 BEHIND = triangle((-1, -1, -9), (1, -1, -9), (0, 1, -9))

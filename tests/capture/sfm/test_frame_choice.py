@@ -24,20 +24,20 @@ def _wave(shift: float, width: int = 192) -> np.ndarray:
 
 def test_a_pause_is_skipped_and_frames_are_spread_over_the_motion() -> None:
     shifts = [0, 1, 2, 3, *[4] * 20, 5, 6, 7, 8, 9, 10]
-    choice = chosen_frames(measured(_wave(shift) for shift in shifts), 10)
-    taken = [shifts[number] for number in choice.numbers]
-    assert choice.num_static == 19
+    measures = measured(_wave(shift) for shift in shifts)
+    numbers, _ = chosen_frames(measures, 10)
+    taken = [shifts[number] for number in numbers]
     assert len(set(taken)) == len(taken) == 10
     assert np.diff(taken).max() <= 2
-    assert choice.reach > STILL
+    assert measures.away.max() > STILL
 
 
 def test_the_sharpest_of_a_window_is_taken_and_blur_is_told() -> None:
     sharpness = np.array([1.0, 9.0, 1.0] * 6)
     sharpness[9:12] = 1.0
-    choice = chosen_frames(FrameMeasures(sharpness, *[np.full(18, 0.01)] * 3), 6)
-    assert [number for number in choice.numbers if not 9 <= number < 12] == [1, 4, 7, 13, 16]
-    assert len(choice.blurred) == 1
+    numbers, blurred = chosen_frames(FrameMeasures(sharpness, *[np.full(18, 0.01)] * 3), 6)
+    assert [number for number in numbers if not 9 <= number < 12] == [1, 4, 7, 13, 16]
+    assert len(blurred) == 1
 
 
 def test_noise_of_a_long_clip_is_no_motion_of_the_camera() -> None:
@@ -48,8 +48,8 @@ def test_noise_of_a_long_clip_is_no_motion_of_the_camera() -> None:
     )
     measures = measured(noisy)
     assert measures.motion.sum() > 3 * STILL
-    assert chosen_frames(measures, 20).reach < STILL
-    assert chosen_frames(measured(_wave(shift) for shift in range(4)), 4).reach > STILL
+    assert measures.away.max() < STILL
+    assert measured(_wave(shift) for shift in range(4)).away.max() > STILL
 
 
 def _scenery(width: int = 400) -> np.ndarray:

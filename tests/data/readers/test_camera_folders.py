@@ -302,38 +302,6 @@ def test_folders(llff: Path) -> None:
         assert pixel_of(capture.splits["test"][0], point) == pytest.approx(pixel)
 
 
-def test_smaller_images_scale_the_intrinsics(llff: Path) -> None:
-    write_poses_bounds(llff, 3, size=(64, 48))
-    capture = read(llff)
-    assert len(capture.warnings) == 3, "one for each camera"
-    assert "5 images have another size" in capture.warnings[0]
-    for point, pixel in SIDE_PIXELS:
-        assert pixel_of(capture.splits["test"][0], point) == pytest.approx(pixel)
-
-
-def test_videos_and_frames(tmp_path: Path) -> None:
-    """Only the chosen frames are decoded, and they are found again under another choice of
-    times."""
-    write_poses_bounds(tmp_path, 2)
-    for i in range(2):
-        write_video(tmp_path / f"cam0{i}.mp4", 6)
-    capture = read(tmp_path, frames="::2")
-    assert [(view.name, view.time, view.frame) for view in capture.splits["test"]] == [
-        ("cam00/frame_000000", 0.0, 0),
-        ("cam00/frame_000002", 0.5, 2),
-        ("cam00/frame_000004", 1.0, 4),
-    ]
-    assert len(cached()) == 6
-    for point, pixel in SIDE_PIXELS:
-        assert pixel_of(capture.splits["test"][0], point) == pytest.approx(pixel)
-    everything = read(tmp_path)
-    assert len(cached()) == 12
-    assert [view.time for view in everything.splits["train"]] == pytest.approx(
-        [i / 5 for i in range(6)]
-    )
-    assert everything.warnings == ()
-
-
 def test_a_truncated_video(tmp_path: Path) -> None:
     """An error names it, unless the chosen frames lie before the break."""
     write_poses_bounds(tmp_path, 2)

@@ -125,21 +125,6 @@ def test_largest_of_several_models_is_read(
     assert f"of {len(counts)} models that are not connected, {read} is read" in line
 
 
-def test_largest_of_several_binary_models(tmp_path: Path) -> None:
-    root = write_colmap(tmp_path / "small", count=3)
-    write_colmap(tmp_path / "large", count=7)
-    (tmp_path / "large/sparse/0").rename(root / "sparse/10")
-    shutil.copytree(tmp_path / "large/images", root / "images", dirs_exist_ok=True)
-    assert len(read_colmap(root).splits["train"]) == 7
-
-
-def test_an_unreadable_smaller_model_does_not_matter(tmp_path: Path) -> None:
-    root = write_colmap(tmp_path, "txt")
-    numbered_models(root, 9, 2)
-    (root / "sparse/1/images.txt").write_text("nonsense\n")
-    assert len(read_colmap(root).splits["train"]) == 9
-
-
 @pytest.mark.parametrize(
     "folder", ["colmap/sparse/0", "colmap/sparse", "colmap", "distorted/sparse/0", "sparse/3"]
 )

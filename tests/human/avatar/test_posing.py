@@ -214,7 +214,7 @@ def test_blend_shapes_of_the_template_move_texels_as_its_surface() -> None:
     found = pose_gaussians(
         gaussians, weights, Skeleton(body.joints, body.parents), posing, offsets
     ).means
-    given = (poses[None], posing.trans[None], None, None, posing.scale[None])
+    given = (poses[None], posing.trans[None], None, posing.scale[None])
     mesh, stiff = (posed_vertices(b, *given)[0] for b in (body, replace(body, pose_dirs=None)))
     wanted, without = (
         (anchors.barycentric[..., None] * x[body.faces[anchors.face]]).sum(1) for x in (mesh, stiff)

@@ -83,7 +83,7 @@ def test_points_are_undistorted(tmp_path: Path) -> None:
         ),
         ('{"people": [{"pose_keypoints_2d": [1, 2, null]}]}', "must hold finite numbers"),
         ('{"people": 3}', "a.*json: cannot be read"),
-        ("[1]", "cannot be read"),
+        ("[1]", "must be a JSON object"),
     ],
 )
 def test_what_is_no_openpose_file_is_refused(tmp_path: Path, text: str, wanted: str) -> None:

@@ -104,10 +104,10 @@ def test_a_correction_means_the_same_at_every_scale() -> None:
 def test_a_lens_of_few_poses_stays() -> None:
     few = random_views(MIN_POSES - 1)
     many = random_views(MIN_POSES)
-    assert CameraCorrections(few, SIZE).rows(0) == (0, None)
-    assert CameraCorrections(many, SIZE).rows(0) == (0, 0)
+    assert CameraCorrections(few, SIZE).rows(few[0]) == (0, None)
+    assert CameraCorrections(many, SIZE).rows(many[0]) == (0, 0)
     standing = [replace(many[0], name=f"{i}") for i in range(MIN_POSES)]
-    assert CameraCorrections(standing, SIZE).rows(0) == (0, None)
+    assert CameraCorrections(standing, SIZE).rows(many[0]) == (0, None)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -182,7 +182,7 @@ def test_disturbed_cameras_are_found() -> None:
     errors = []
     for step in range(1, steps + 1):
         index = step % len(views)
-        camera = watched(refinement.corrections.applied(index, camera_of(views[index])))
+        camera = watched(refinement.corrections.applied_to(views[index], camera_of(views[index])))
         error = (points_seen(camera, points.double()) - truth[index]).norm(dim=-1).mean()
         error.backward()
         refinement.after_backward(index, step, image_of(camera))

@@ -33,17 +33,10 @@ def corrected(exposures: ViewExposures, index: int, step: int, image: Image, rgb
     return exposures.after_render(view).rendered
 
 
-def trained_on(
-    gains: tuple[float, ...], beside: list[list[int]] | None = None, hidden: int = -1
-) -> ViewExposures:
-    """Return exposures after training on images of one scene, which learns its brightness, too.
-
-    Args:
-        gains: of the images.
-        beside: neighbours of each in a video.
-        hidden: of which all pixels are masked.
-    """
-    exposures = ViewExposures(beside or [[] for _ in gains], STEPS)
+def trained_on(gains: tuple[float, ...]) -> ViewExposures:
+    """Return exposures after training on images, with ``gains``, of one scene, which learns its
+    brightness, too."""
+    exposures = ViewExposures(len(gains), STEPS)
     scene = (
         0.1 + 0.5 * torch.rand(12, 12, 3, generator=torch.Generator().manual_seed(0))
     ).requires_grad_()
@@ -51,10 +44,9 @@ def trained_on(
     optimizer = torch.optim.Adam([scene], 0.01)
     for step in range(1, STEPS + 1):
         index = step % len(gains)
-        mask = torch.full((12, 12), float(index != hidden))
-        image = Image(f"{index}", None, (gains[index] * given).clamp_max(1), None, mask, None)  # type: ignore[arg-type]
+        image = Image(f"{index}", None, (gains[index] * given).clamp_max(1), None, None, None)  # type: ignore[arg-type]
         rendered = corrected(exposures, index, step, image, scene)
-        loss = ((rendered - image.rgb_premultiplied).abs() * mask[..., None]).mean()
+        loss = (rendered - image.rgb_premultiplied).abs().mean()
         sum(exposures.penalties(index).values(), loss).backward()
         exposures.after_backward(index, step, image)
         optimizer.step()
@@ -74,7 +66,7 @@ def test_images_that_agree_keep_the_identity() -> None:
 
 
 def test_saturated_pixels_are_not_blamed() -> None:
-    exposures = ViewExposures([[]], STEPS)
+    exposures = ViewExposures(1, STEPS)
     step = round(WARM_UP * STEPS) + 1
     white = Image("", None, torch.ones(4, 4, 3), None, None, None)  # type: ignore[arg-type]
     rgb = torch.full((4, 4, 3), 1.4, requires_grad=True)
@@ -84,8 +76,8 @@ def test_saturated_pixels_are_not_blamed() -> None:
 
 @pytest.mark.parametrize("name", ["values", "visits", "exp_avg.values"])
 def test_a_state_of_other_images_is_refused(name: str) -> None:
-    exposures = ViewExposures([[], []], STEPS)
-    other = ViewExposures([[]], STEPS)
+    exposures = ViewExposures(2, STEPS)
+    other = ViewExposures(1, STEPS)
     with pytest.raises(ValueError, match=name):
         exposures.load_state(exposures.state() | {name: other.state()[name]})
 

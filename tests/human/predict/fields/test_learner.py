@@ -20,7 +20,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.human.predict.fields.prediction import PredictedField
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.training.new_trainer import build
+from dyngs.training.prediction import network_trainer
 
 KINDS = sorted(NETWORKS)
 
@@ -47,7 +47,7 @@ def test_a_resumed_run_ends_with_the_same_bytes(run: Path, folder: Path, tmp_pat
 @pytest.mark.parametrize("kind", KINDS)
 def test_training_lowers_the_error(folder: Path, tmp_path: Path, kind: str) -> None:
     """On the same examples: 0.93 and 0.966 of it are left."""
-    trainer = build(field_config(kind, folder, tmp_path / "run", steps=40))
+    trainer = network_trainer(field_config(kind, folder, tmp_path / "run", steps=40))
 
     @torch.no_grad()
     def error() -> float:
@@ -153,4 +153,4 @@ def test_somebody_must_be_seen_from_three_sides(folder: Path, tmp_path: Path) ->
     document = json.loads(file.read_text())
     file.write_text(json.dumps(document | {"frames": document["frames"][:2]}))
     with pytest.raises(DyngsError, match="ann: shows no moment in three views or more"):
-        build(field_config("keypoint_nerf", tmp_path / "set", tmp_path))
+        network_trainer(field_config("keypoint_nerf", tmp_path / "set", tmp_path))

@@ -19,7 +19,7 @@ from dyngs.human.predict.ghg.network import (
     mean_colours,
     new_network,
 )
-from dyngs.training.new_trainer import build
+from dyngs.training.prediction import network_trainer
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,9 @@ def assembled(config: Config) -> AtlasLearner:
 def test_training_lowers_the_loss(folder: Path, tmp_path: Path) -> None:
     """Of the same person, images and background, before and after 20 steps."""
     long = config(folder, tmp_path)
-    trainer = build(long.model_copy(update={"train": long.train.model_copy(update={"steps": 30})}))
+    trainer = network_trainer(
+        long.model_copy(update={"train": long.train.model_copy(update={"steps": 30})})
+    )
     losses = [trainer.step().loss for _ in range(24)]
     assert sum(losses[-8:]) < 0.9 * sum(losses[:8])
     assert trainer.num_gaussians > 500

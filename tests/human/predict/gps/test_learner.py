@@ -31,7 +31,7 @@ from dyngs.human.predict.gps.stereo import learner, predictor
 from dyngs.human.synthetic.capture import PeopleOptions, write_people
 from dyngs.models.prediction import Predictor
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
-from dyngs.training.new_trainer import build
+from dyngs.training.prediction import network_trainer
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, run: Path, tmp_pat
 
 def test_training_lowers_the_errors(folder: Path, tmp_path: Path) -> None:
     """Of depth in the first half, of images in the second, on the same examples."""
-    trainer = build(stereo_config(folder, tmp_path / "run", steps=80))
+    trainer = network_trainer(stereo_config(folder, tmp_path / "run", steps=80))
 
     @torch.no_grad()
     def error(step: int) -> float:
