@@ -100,7 +100,7 @@ def test_it_is_a_mesh_with_colours(run: Path, tmp_path: Path, suffix: str) -> No
         ),
         (
             ["export", "RUN", "--format", "mesh", "--level", "2", "--out", "OUT/mesh.ply"],
-            "radiance field",
+            "--segments",
         ),
         (["prune", "RUN", "--out", "OUT/pruned"], "Gaussians"),
         (
