@@ -98,6 +98,10 @@ def test_it_is_a_mesh_with_colours(run: Path, tmp_path: Path, suffix: str) -> No
             ["export", "RUN", "--format", "mesh", "--segments", "0", "--out", "OUT/mesh.ply"],
             "1 to 64",
         ),
+        (
+            ["export", "RUN", "--format", "mesh", "--level", "2", "--out", "OUT/mesh.ply"],
+            "--segments",
+        ),
         (["prune", "RUN", "--out", "OUT/pruned"], "Gaussians"),
         (
             ["train", "data.root=CAPTURE", "model.kind=bg_triangle", "budget.max_gaussians=5"],
