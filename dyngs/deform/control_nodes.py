@@ -17,7 +17,7 @@ import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -70,7 +70,8 @@ def nodes_at(positions: Tensor, means: Tensor) -> Nodes:
     def nearest(points: Tensor, which: int) -> Tensor:
         """Return (M, count) distances (0) to the nearest nodes, or their indices (1)."""
         numbers = points.detach().double().cpu().numpy()
-        return torch.from_numpy(tree.query(numbers, k=range(1, count + 1))[which])
+        ranks: Any = range(1, count + 1)
+        return torch.from_numpy(tree.query(numbers, k=ranks)[which])
 
     radii = nearest(positions, 0)[:, 1:].mean(1) if count > 1 else torch.ones(1, device="cpu")
     floor = max(1e-6 * float(radii.max()), 1e-12)

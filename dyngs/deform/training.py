@@ -66,7 +66,7 @@ def measure_motion(
     score = torch.zeros_like(longest)
     nothing = torch.zeros_like(gaussians.quats)
     for sample in samples:
-        apart = {
+        apart: dict[str, Tensor] = {
             name: nothing if x is None else x - getattr(mean, name)
             for name, x in vars(sample).items()
         }
@@ -74,9 +74,8 @@ def measure_motion(
         stray = stray + longest * apart["log_scales"].abs().amax(1)
         pixels = stray / px_size + PX_PER_OPACITY * apart["colors"].abs().amax(1)
         if sample.logit_opacities is not None and mean.logit_opacities is not None:
-            now, usual = (
-                (gaussians.logit_opacities + x.logit_opacities).sigmoid() for x in (sample, mean)
-            )
+            now = (gaussians.logit_opacities + sample.logit_opacities).sigmoid()
+            usual = (gaussians.logit_opacities + mean.logit_opacities).sigmoid()
             pixels = pixels + PX_PER_OPACITY * (now - usual).abs()
         score = torch.maximum(score, pixels)
     return score, mean

@@ -65,16 +65,17 @@ def track_scores(
     rows = {name: row for row, name in enumerate(tracks.views.tolist())}
     shown = [x for x in split if x[0].time is not None and x[0].name in rows]
     points, bound_at = _binding(tracks, views)
-    times = sorted({view.time for view, _ in shown if view.time is not None})
+    times = sorted({view.time or 0.0 for view, _ in shown})
     carried = _carried_to(times, scene, points, bound_at, min(CARRIERS, num_opaque))
     errors = []
     motions = []
     for view, cameras in shown:
+        time = view.time or 0.0
         row = rows[view.name]
-        is_shown = tracks.visible[row] & (np.abs(bound_at - view.time) > SAME_TIME)
+        is_shown = tracks.visible[row] & (np.abs(bound_at - time) > SAME_TIME)
         limit = float(np.hypot(cameras.width, cameras.height))
         true = _pixels(tracks.points[tracks.moments[row]][is_shown], cameras)
-        for found, kept in ((carried[view.time], errors), (points, motions)):
+        for found, kept in ((carried[time], errors), (points, motions)):
             distance = np.linalg.norm(_pixels(found[is_shown], cameras) - true, axis=1)
             kept.extend(np.minimum(np.nan_to_num(distance, nan=limit), limit).tolist())
     if not errors:

@@ -227,7 +227,9 @@ def _write_images(
                 colours = depth_to_rgb(frame.depth, frame.alpha, limits)
                 pixels[f"{stem}_depth.png"] = colours
                 pixels[f"{stem}_depth.exr"] = frame.depth * np.float32(opened.frame.scale)
-            for name, image in pixels.items() if out_dir is not None else ():
+            if out_dir is None:
+                continue
+            for name, image in pixels.items():
                 path = out_dir / name
                 inputs.require_output(path)
                 write_image(path, image)

@@ -270,12 +270,13 @@ class _Unpickler(_PythonUnpickler):
             raise ValueError("an array in it has no proper type and shape")
         is_list = dtype.value.kind == "O"
         wanted = _count(shape) * (1 if is_list else dtype.value.itemsize)
-        raw = raw.encode("latin-1") if isinstance(raw, str) else raw  # bytes of Python 2
+        if isinstance(raw, str):  # bytes of Python 2
+            raw = raw.encode("latin-1")
         if not isinstance(raw, list if is_list else bytes) or len(raw) != wanted:
             raise ValueError("an array in it is shorter or longer than its shape")
         self._charge(8 * wanted if is_list else wanted)
         if not is_list:
-            require_text(raw, dtype.value)
+            require_text(bytes(raw), dtype.value)
         # NumPy frees arrays of objects in each other by recursion.
         elif any(isinstance(x, _Array) and (x.layout or x.dtype.kind == "O") for x in raw):
             raise ValueError("arrays in it lie too deep in each other")
@@ -368,7 +369,7 @@ def _loader(name: str) -> tuple[int, Callable[[Any], None]]:
     usual = _PythonUnpickler.dispatch[code]
     # NEWOBJ is a call, too, and a bytearray would be allocated before it is read
     special = {"NEWOBJ": "load_reduce", "BYTEARRAY8": "load_binbytes8"}
-    method = special.get(name, usual.__name__)
+    method = special.get(name, str(usual.__name__))
     return code, getattr(_Unpickler, method)
 
 

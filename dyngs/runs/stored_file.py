@@ -268,7 +268,7 @@ def coding_of(
         return Coding("exact")
     if name in FIXED_STEPS:
         return Coding("grid", FIXED_STEPS[name])
-    if group not in steps:
+    if group is None or group not in steps:
         fits = x.dtype == torch.float32 and x.numel() > FEW and float(x.abs().max()) <= LARGEST_HALF
         return Coding("half" if fits else "exact")
     kind = _KINDS.get(name, "grid")

@@ -125,7 +125,7 @@ def gaussian_bytes(config: Config) -> int:
 def expected_gaussians(config: Config, now: int, longest_side: int = 400) -> int:
     """Return the Gaussians that a run which begins with ``now`` may end with: roughly, before
     anything is seen."""
-    strategy = config.strategy
+    strategy: Any = config.strategy
     steps = config.train.steps
     changes = 0
     if strategy.stop > 0:

@@ -171,7 +171,9 @@ class EditControls:
         hint = "drag its arrows; along the axes of the scene"
         self._box = gui.add_checkbox("Box", False, hint=hint)
         step = 10.0 ** (math.floor(math.log10(2 * extent)) - 2)
-        self._size = gui.add_vector3("Size", tuple(size.tolist()), min=(step,) * 3, step=step)
+        self._size = gui.add_vector3(
+            "Size", tuple(size.tolist()), min=(step, step, step), step=step
+        )
         self._text = gui.add_markdown(self.editing.description)
         pick.on_update(lambda _: self._listen(bool(pick.value)))
         self._box.on_update(lambda _: self._show_box())

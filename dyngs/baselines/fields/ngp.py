@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
@@ -297,7 +298,8 @@ class NgpTraining(FieldTraining):
     betas = (0.9, 0.99)
 
     def __init__(self, run: RunStart) -> None:
-        sizes = SIZES[run.config.model.sizes]
+        model: Any = run.config.model
+        sizes = SIZES[model.sizes]
         camera = run.images[0].cameras
         super().__init__(run, NgpField, sizes.cells, max(camera.width, camera.height))
         num_samples = 1 << sizes.log2_samples

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -57,7 +58,8 @@ class FieldTraining(Model[FieldScene]):
         self, run: RunStart, field_class: type[Field], cells: int | None, pixels: int
     ) -> None:
         self._run = run
-        self._model = model = run.config.model
+        model: Any = run.config.model
+        self._model = model
         self._batch = run.config.train.batch_size
         root = run.config.data.root
         try:

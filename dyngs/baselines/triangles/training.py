@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -342,7 +343,8 @@ class TriangleTraining(Model[TriangleScene]):
         config = run.config
         self._run = run
         self._steps = config.train.steps
-        self._model = model = _within(config.model, config.budget.max_mb)
+        model: Any = config.model
+        self._model = model = _within(model, config.budget.max_mb)
         self._awaits_surface = model.gaussian_steps > 0
         patches, unit = _at_points(run, model)
         behind = evaluation_background(config.data.background, run.capture.has_alpha)[1]

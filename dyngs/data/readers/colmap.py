@@ -77,11 +77,13 @@ def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], 
                 f"{path}: the COLMAP model lacks this file; export the whole model again"
             )
     if is_binary:
-        cameras, images, points = map(
-            _binary_entries, paths, (_next_camera, _next_image, _next_point)
-        )
+        cameras = _binary_entries(paths[0], _next_camera)
+        images = _binary_entries(paths[1], _next_image)
+        points = _binary_entries(paths[2], _next_point)
     else:
-        cameras, images, points = map(_text_entries, paths, (_camera_of, _image_of, _point_of))
+        cameras = _text_entries(paths[0], _camera_of)
+        images = _text_entries(paths[1], _image_of)
+        points = _text_entries(paths[2], _point_of)
     known = dict(cameras)
     lost = next((image for image in images if image.camera not in known), None)
     if lost is not None:

@@ -42,6 +42,7 @@ def read_zju_mocap(root: Path) -> Capture:
     ``BodyFrames.turns``. OpenCV calibrated these cameras, with pixel centres at whole numbers: half
     a pixel is added to the principal point.
     """
+    shots: list[Any]
     if (root / ANNOTATIONS).is_file():
         path = root / ANNOTATIONS
         with reading(path):
@@ -124,7 +125,7 @@ def _single_shots(path: Path) -> list[FrameEntry]:
     return shots
 
 
-def _body(path: Path, numbers: list[int], rows: Sequence[tuple[str, object]]) -> BodyFrames:
+def _body(path: Path, numbers: list[int], rows: Sequence[tuple[str, Any]]) -> BodyFrames:
     """Return the parameters of one dictionary per frame, each with a name for messages."""
     names = [key for key in ("betas", "shapes") if all(key in own for _, own in rows)]
     betas = _column(rows, names[0]) if names else np.zeros(10)

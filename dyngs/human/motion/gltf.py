@@ -82,7 +82,7 @@ def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> Skeleto
             joint_from_rest = _nearest_rotations(file, matrices[:, :3, :3])
             rest = -np.linalg.solve(matrices[:, :3, :3], matrices[:, :3, 3:])[..., 0]
         return SkeletonMotion(
-            path, tuple(names), rest, rotations @ joint_from_rest, positions, fps, True
+            path, tuple(map(str, names)), rest, rotations @ joint_from_rest, positions, fps, True
         )
 
 

@@ -45,7 +45,7 @@ _DEGREE_OF_REST = {3 * (num_sh_terms(degree) - 1): degree for degree in range(MA
 _DC = tuple(f"f_dc_{i}" for i in range(3))
 _SCALE = tuple(f"scale_{i}" for i in range(3))
 _ROT = tuple(f"rot_{i}" for i in range(4))
-_POSITION = ("x", "y", "z")
+_POSITION: tuple[str, ...] = ("x", "y", "z")
 _REQUIRED = (*_POSITION, *_DC, "opacity", *_SCALE, *_ROT)
 # SuperSplat's compressed .ply takes 16 bytes per Gaussian, in chunks of 256 that share their
 # ranges. Elements: chunk (smallest and largest position, logarithm of the scale and colour), vertex
