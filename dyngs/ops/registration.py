@@ -235,8 +235,9 @@ def _shapes_of(kernel: Callable[P, R]) -> Callable[P, R]:
 
 
 def has_kernel(device: torch.device) -> bool:
-    """Return whether the ops are implemented on ``device``; elsewhere plain torch may do."""
-    return device.type == "cpu" or (device.type == "cuda" and has_cuda_core())
+    """Return whether the ops are implemented on ``device``, for shapes alone on "meta"; elsewhere
+    plain torch may do."""
+    return device.type in ("cpu", "meta") or (device.type == "cuda" and has_cuda_core())
 
 
 LARGEST = 3.4e38  # options are computed with in float32
