@@ -1,18 +1,22 @@
-"""The controls of the page: what is shown, the time, the truth, the cameras of the capture, motions
-of a person, camera paths. Each browser has its own."""
+"""The controls of the page: what is shown, the time, the truth, the cameras of the capture, poses
+and motions of a person, camera paths, screenshots. Each browser has its own."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.human.avatar.scene import avatar_of
+from dyngs.human.body.joints import JOINT_NAMES
+from dyngs.human.motion.motion import compose_rotations
 from dyngs.io.write import to_uint8
 from dyngs.runs.opened import Opened
 from dyngs.view.edit import EditControls, can_be_edited
@@ -27,7 +31,9 @@ if TYPE_CHECKING:
     from dyngs.view.server import Browsing
 
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
-AS_CAPTURED, AT_REST = "as captured", "rest pose"
+AS_CAPTURED, AT_REST, BY_SLIDERS = "as captured", "rest pose", "pose by sliders"
+BODY_JOINTS = JOINT_NAMES[:22]
+"""Joints with sliders: the first ones of every body."""
 FILE_NAME = "camera_path.json"
 MOTION_SUFFIXES = (".npz", ".bvh", ".glb", ".gltf", ".vrma")
 HELP = """\
@@ -155,20 +161,45 @@ class Controls:
         divide.on_update(lambda _: session.change(divide=float(divide.value)))
 
     def _add_motions(self, gui: viser.GuiApi) -> None:
-        """Add the motion picker, for files by name."""
+        """Add the motion picker, for files by name, and the sliders of the pose."""
         browsing = self._browsing
-        motion = gui.add_dropdown("Motion", (AS_CAPTURED, AT_REST, *self._motions))
+        motion = gui.add_dropdown("Motion", (AS_CAPTURED, AT_REST, BY_SLIDERS, *self._motions))
+        hint = "in motions of files, feet on the floor do not slide"
+        feet = gui.add_checkbox("Keep feet", False, hint=hint)
+        joint = gui.add_dropdown("Joint", BODY_JOINTS)
+        sliders = [gui.add_slider(axis, -180.0, 180.0, 1.0, 0.0) for axis in "xyz"]
+        angles: dict[str, list[float]] = {}
 
         def work() -> None:
             choice = str(motion.value)
             opened = browsing.loaded
             if choice == AT_REST:
                 opened = opened.at_rest()
+            elif choice == BY_SLIDERS:
+                opened = posed(opened, angles)
             elif choice != AS_CAPTURED:
-                opened = opened.in_motion(self._motions[choice])
+                opened = opened.in_motion(self._motions[choice], keep_feet=bool(feet.value))
             browsing.session.show(opened)
 
-        motion.on_update(lambda _: browsing.session.ask(work))
+        def play(_: Any) -> None:
+            browsing.session.ask(work)
+
+        def pick(_: Any) -> None:
+            shown = angles.get(joint.value, [0.0] * 3)
+            for slider, value in zip(sliders, shown, strict=True):
+                slider.value = value
+
+        def turn(event: Any) -> None:
+            if event.client_id is not None:  # None: by ``pick``
+                angles[joint.value] = [float(slider.value) for slider in sliders]
+                motion.value = BY_SLIDERS
+                play(event)
+
+        motion.on_update(play)
+        feet.on_update(play)
+        joint.on_update(pick)
+        for slider in sliders:
+            slider.on_update(turn)
 
     def _add_path(self, gui: viser.GuiApi) -> None:
         browsing = self._browsing
@@ -213,6 +244,24 @@ def _add_help(gui: viser.GuiApi, opened: Opened) -> None:
     gui.add_markdown(HELP)
     for note in opened.notes:
         gui.add_markdown(f"*{as_text(note)}*")
+
+
+def posed(opened: Opened, angles: Mapping[str, Sequence[float]]) -> Opened:
+    """Return a person in the rest pose with joints rotated by ``angles``: degrees about x, y and z,
+    in this order, by joint."""
+    from scipy.spatial.transform import Rotation
+
+    rest = opened.at_rest()
+    person = avatar_of(rest.renderable)
+    clip = None if person is None else person.played
+    if person is None or clip is None:
+        return rest
+    turns = torch.zeros_like(clip.poses)
+    for name, degrees in angles.items():
+        turned = Rotation.from_euler("xyz", degrees, degrees=True)
+        turns[0, JOINT_NAMES.index(name)] = turns.new_tensor(turned.as_rotvec())
+    poses = compose_rotations(clip.poses, turns)
+    return rest.showing(person.playing(replace(clip, poses=poses)))
 
 
 def motion_files(path: Path | None) -> dict[str, Path]:
