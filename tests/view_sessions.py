@@ -81,6 +81,9 @@ class Page:
     ) -> Control:
         return self._added(label, value)
 
+    def add_vector3(self, label: str, value: tuple[float, ...], **_: Any) -> Control:
+        return self._added(label, value)
+
     def add_button(self, label: str, **_: Any) -> Control:
         return self._added(label, False)
 

@@ -3,6 +3,7 @@ and motions of a person, camera paths, screenshots. Each browser has its own."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from dyngs.human.motion.motion import compose_rotations
 from dyngs.io.write import to_uint8
 from dyngs.runs.opened import Opened
 from dyngs.view.edit import EditControls, can_be_edited
-from dyngs.view.layers import LAYERS, PARTS
+from dyngs.view.layers import LAYERS, PARTS, draw
 from dyngs.view.session import Keyframe, Recording
 from dyngs.view.source import Source
 from dyngs.view.views import centers_of, has_timeline, pose_of, viewpoint_of, views_of
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
     from dyngs.view.server import Browsing
 
+NEAREST = "nearest"
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 AS_CAPTURED, AT_REST, BY_SLIDERS = "as captured", "rest pose", "pose by sliders"
 BODY_JOINTS = JOINT_NAMES[:22]
@@ -130,7 +132,19 @@ class Controls:
             part.on_update(lambda _: session.change(part=part.value))
         else:
             session.change(part="all")
+        screenshot = gui.add_button("Screenshot", hint="as .png, of the size of the window")
+        screenshot.on_click(lambda _: session.ask(self._screenshot))
         gui.add_button("Back to start").on_click(lambda _: self._browsing.go_to(None))
+
+    def _screenshot(self) -> None:
+        """Send what is shown as a .png, in the thread that draws."""
+        from PIL import Image
+
+        session = self._browsing.session
+        stream = io.BytesIO()
+        Image.fromarray(draw(session.opened, session.shot())).save(stream, "png")
+        name = f"{session.opened.name}_{session.time:.3f}.png"
+        self._browsing.client.send_file_download(name, stream.getvalue(), save_immediately=True)
 
     def _add_time(self, gui: viser.GuiApi) -> None:
         session = self._browsing.session
@@ -142,6 +156,8 @@ class Controls:
         play = gui.add_button("Pause" if timeline.playing else "Play")
         play.on_click(lambda _: session.change_timeline(playing=not session.timeline.playing))
         session.on_play = lambda playing: setattr(play, "label", "Pause" if playing else "Play")
+        loop = gui.add_checkbox("Loop", timeline.loops)
+        loop.on_update(lambda _: session.change_timeline(loops=bool(loop.value)))
         hint = "1: as it was filmed"
         speed = gui.add_dropdown("Speed", SPEEDS, initial_value=f"{timeline.speed:g}", hint=hint)
         speed.on_update(lambda _: session.change_timeline(speed=float(speed.value)))
@@ -154,11 +170,22 @@ class Controls:
         cameras.on_update(
             lambda _: self._frusta.show(opened) if cameras.value else self._frusta.remove()
         )
-        hint = "with the nearest image, on the right of the line"
+        hint = "with the true image, on the right of the line"
         compare = gui.add_checkbox("Compare", session.look.comparing, hint=hint)
         compare.on_update(lambda _: self._change(comparing=bool(compare.value)))
         divide = gui.add_slider("Divide", 0.0, 1.0, 0.01, session.look.divide)
         divide.on_update(lambda _: session.change(divide=float(divide.value)))
+        names = (NEAREST, *views_of(opened).names)
+        image = gui.add_dropdown("Image", names)
+        session.change(view=None)
+
+        def choose(_: Any) -> None:
+            index = names.index(image.value) - 1
+            session.change(view=None if index < 0 else index)
+            if index >= 0:
+                self._browsing.go_to(index)
+
+        image.on_update(choose)
 
     def _add_motions(self, gui: viser.GuiApi) -> None:
         """Add the motion picker, for files by name, and the sliders of the pose."""
@@ -234,6 +261,8 @@ class Controls:
         remove.on_click(lambda _: record(keyframes=recording.keyframes[:-1]))
         loop = gui.add_checkbox("Back to the first", False)
         loop.on_update(lambda _: record(loops=bool(loop.value)))
+        preview = gui.add_button("Preview")
+        preview.on_click(lambda _: session.preview(recording) if len(recording) else None)
         hint = f"{FILE_NAME}, for: dyngs render RUN --path {FILE_NAME}"
         gui.add_button("Save path", hint=hint).on_click(save)
 

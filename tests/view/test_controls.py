@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from moving_scene import write_moving_run
+from PIL import Image
 from scene_kinds import scene_of_kind
 from view_sessions import Page, looking_at_balls, opened_at
 
 from dyngs.human.body.joints import SMPLX_ROWS
-from dyngs.runs.opened import Opened
+from dyngs.runs.opened import Opened, open_run
 from dyngs.view.controls import BODY_JOINTS, BY_SLIDERS, Controls, posed
+from dyngs.view.layers import draw
 from dyngs.view.source import Source
+from dyngs.view.views import views_of
 
 
 def page_of(opened: Opened | None = None, motions: dict[str, Path] | None = None) -> Page:
@@ -64,3 +70,30 @@ def test_feet_are_kept_in_motions_of_files(monkeypatch: pytest.MonkeyPatch) -> N
     page.set("Motion", "walk.npz")
     page.set("Keep feet", True)
     assert asked == [(Path("walk.npz"), False), (Path("walk.npz"), True)]
+
+
+def test_a_screenshot_is_what_is_shown() -> None:
+    page = page_of()
+    page.set("What", "alpha")
+    page.set("Screenshot")
+    ((name, data),) = page.files.items()
+    assert name == "balls_0.000.png"
+    shown = draw(page.session.opened, page.session.shot())
+    assert np.array_equal(np.asarray(Image.open(io.BytesIO(data))), shown)
+
+
+def test_an_image_is_chosen_by_name(tmp_path: Path) -> None:
+    page = page_of(open_run(write_moving_run(tmp_path)))
+    assert page.session.shot().view is None
+    page.set("Compare", True)
+    nearest = page.session.shot().view
+    assert nearest is not None
+    names = views_of(page.session.opened).names
+    other = (nearest + 1) % len(names)
+    page.set("Image", names[other])
+    assert page.session.shot().view == other
+    assert page.went_to == [other]
+    page.set("Image", "nearest")
+    assert page.session.shot().view == nearest
+    page.set("Loop", False)
+    assert not page.session.timeline.loops
