@@ -294,7 +294,7 @@ class Session:
         size = _scaled(full, math.sqrt(self._area / math.prod(full))) if is_moving else full
         self._is_stale = False
         self._is_refined = True  # if it fails, it is not tried again
-        image = draw(self.opened, self.shot(size))
+        image = draw(self.opened, replace(self.shot(size), is_moving=is_moving))
         if not self.closed:
             self._send(Sent(image, not is_moving, self._clock() - start))
         now = self._clock()
