@@ -435,7 +435,13 @@ READERS: dict[str, Reader] = {
     "presets": Reader({"preset": files.write_preset}, read_a_preset),
     "overrides": Reader({"lines": files.write_overrides}, read_override_lines, names_file=False),
     "camera_paths": Reader(
-        {"frames": files.write_frames_path, "keyframes": files.write_keyframes}, read_a_path
+        {
+            "frames": files.write_frames_path,
+            "keyframes": files.write_keyframes,
+            "nerfstudio": files.write_nerfstudio_path,
+            "3dgs": files.write_3dgs_cameras,
+        },
+        read_a_path,
     ),
     "points": Reader({"point": files.write_measurement}, read_a_point),
     "options": Reader({"words": files.write_words}, read_option_values, names_file=False),

@@ -385,6 +385,20 @@ def write_keyframes(root: Path) -> None:
     (root / "a.json").write_text(json.dumps(document))
 
 
+def write_nerfstudio_path(root: Path) -> None:
+    """Write a camera_path.json of nerfstudio."""
+    view = {"camera_to_world": np.eye(4).ravel().tolist(), "fov": 50.0, "render_time": 0.5}
+    document = {"camera_type": "perspective", "render_width": 20, "render_height": 14, "fps": 12}
+    (root / "a.json").write_text(json.dumps({**document, "camera_path": [view, view]}))
+
+
+def write_3dgs_cameras(root: Path) -> None:
+    """Write a cameras.json of 3DGS."""
+    place = {"position": [0.0, 0.0, -4.0], "rotation": np.eye(3).tolist()}
+    view = {"width": 20, "height": 14, "fx": 20.0, "fy": 20.0, **place}
+    (root / "a.json").write_text(json.dumps([view, view]))
+
+
 def write_measurement(root: Path) -> None:
     """Write a measured point of ``dyngs tradeoff``."""
     from dataclasses import asdict

@@ -33,6 +33,9 @@ def add_parser(commands: args.Commands) -> None:
     add_serving_arguments(parser)
     about = "motion file for a person, or a folder of them"
     parser.add_argument("--motion", type=args.input_path, metavar="PATH", help=about)
+    args.add_most_drawn(
+        parser, "of a large still scene: so many are drawn at most while anything moves"
+    )
     args.add_up(parser)
     args.add_threads(parser)
     args.add_device(parser)
@@ -66,7 +69,8 @@ def run(arguments: argparse.Namespace) -> int:
     motions = motion_files(arguments.motion)
     device = args.computing_device(arguments.device)
     root = args.data_root(arguments)
-    source = open_source(arguments.source, arguments.up, device, root)
+    most = arguments.max_gaussians_drawn
+    source = open_source(arguments.source, arguments.up, device, root, most)
     first = first_of(source)
     if motions and first.person is None:
         raise DyngsError(

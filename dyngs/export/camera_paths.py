@@ -1,5 +1,5 @@
-"""Camera paths for rendering: their scene times, JSON files (docs/camera_paths.md), and
-the interpolation of keyframes."""
+"""Camera paths for rendering: their scene times, JSON files (docs/camera_paths.md) of dyngs and of
+other programs, and the interpolation of keyframes."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, printable
-from dyngs.data.geometry import cam_from_opengl, checked_pose, pinhole_matrix
-from dyngs.io.fields import float_array, is_number, read_json_object, require_at_most
+from dyngs.data.geometry import cam_from_opengl, checked_pose, inverse_rigid, pinhole_matrix
+from dyngs.io.fields import entry, float_array, is_number, numbers_of, read_json, require_at_most
 
 _MAX_FRAMES = 100_000
 """A longer path is taken for a typing mistake."""
@@ -119,7 +119,7 @@ def read_path(
     Raises:
         DyngsError: names the file, the frame and the key that is missing or wrong.
     """
-    document = read_json_object(file, "a camera path is a JSON object; see docs/camera_paths.md")
+    document, notes = _as_document(read_json(file), file)
     if size is not None:
         document = {"w": size[0], "h": size[1]} | document
     (name, *others) = [key for key in ("frames", "keyframes") if key in document] or ["frames"]
@@ -140,6 +140,8 @@ def read_path(
     for i, frame in enumerate(frames):
         where = f"{file}: {name}[{i}]"
         pose = _read_pose(frame, where)
+        if any(frame.get(key) != first.get(key) for key in ("w", "h")):
+            raise DyngsError(f"{where}: all images of a path must have one size; this one differs")
         if world_offset is not None:
             pose[:3, 3] += pose[:3, :3] @ world_offset
         poses.append(pose)
@@ -150,8 +152,54 @@ def read_path(
         keys, num_frames = _with_seconds(keys, document, fps, file)
         keys = interpolate_keyframes(keys, np.arange(num_frames) / fps)
     poses, matrices = (torch.from_numpy(x).float() for x in (keys.cam_from_world, keys.intrinsics))
-    path = CameraPath(Cameras(poses, matrices, width, height), fps)
+    path = CameraPath(Cameras(poses, matrices, width, height), fps, notes=notes)
     return path if keys.times is None else with_times(path, keys.times.tolist())
+
+
+def _as_document(found: Any, file: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return the JSON of a path as a document of our own, and notes: also of nerfstudio's
+    camera_path.json and transforms.json, and of 3DGS's cameras.json."""
+    if isinstance(found, list):
+        return {"frames": [_frame_of_3dgs(x, f"{file}: [{i}]") for i, x in enumerate(found)]}, ()
+    if not isinstance(found, dict):
+        raise DyngsError(f"{file}: a camera path is a JSON object; see docs/camera_paths.md")
+    kind = str(found.get("camera_type", found.get("camera_model")))
+    panoramic = ("fisheye", "equirectangular", "spherical", "omni", "vr180")
+    if any(name in kind.lower() for name in panoramic):
+        raise DyngsError(f"{file}: cameras of a path are pinholes, not {printable(kind, 40)}")
+    if "camera_path" in found:
+        return _of_nerfstudio(found, file), (
+            "nerfstudio's path is taken to be in the coordinates of the capture; its viewer may have turned, shifted "
+            "and scaled them (dataparser_transforms.json)",
+        )
+    is_bent = any(found.get(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    return found, ("the lens distortion is left out",) if is_bent else ()
+
+
+def _of_nerfstudio(found: dict[str, Any], file: Path) -> dict[str, Any]:
+    """Return the document of a camera_path.json, whose fields of view are vertical, in degrees."""
+    height = _number(found, "render_height", file, 1, 65536)
+    views = found["camera_path"]
+    frames = []
+    for i, view in enumerate(views if isinstance(views, list) else []):
+        where = f"{file}: camera_path[{i}]"
+        pose = entry(where, view, "camera_to_world")
+        half = math.radians(_number(view, "fov", where, 0.01, 179)) / 2
+        frame = {"transform_matrix": pose, "fl_x": 0.5 * height / math.tan(half)}
+        frames.append(frame | {"time": view["render_time"]} if "render_time" in view else frame)
+    size = {"width": found.get("render_width"), "height": height}
+    return {**size, "fps": found.get("fps", 30.0), "frames": frames}
+
+
+def _frame_of_3dgs(view: object, where: str) -> dict[str, Any]:
+    """Return a frame of a cameras.json, which holds places and rotations of cameras in the
+    world."""
+    pose = np.eye(4)
+    pose[:3, :3] = numbers_of(f"{where}: 'rotation'", entry(where, view, "rotation"), (3, 3))
+    pose[:3, 3] = numbers_of(f"{where}: 'position'", entry(where, view, "position"), (3,))
+    names = {"w": "width", "h": "height", "fl_x": "fx", "fl_y": "fy"}
+    others = {key: entry(where, view, name) for key, name in names.items()}
+    return {"cam_from_world": inverse_rigid(pose), **others}
 
 
 def _read_pose(frame: object, where: str) -> np.ndarray:
@@ -161,6 +209,8 @@ def _read_pose(frame: object, where: str) -> np.ndarray:
     if len(given) != 1:
         raise DyngsError(f"{where} needs exactly one of 'cam_from_world' and 'transform_matrix'")
     matrix = float_array(fields[given[0]])
+    if matrix is not None and matrix.shape in ((12,), (16,)):
+        matrix = matrix.reshape(-1, 4)
     pose, _ = checked_pose(np.zeros(0) if matrix is None else matrix, f"{where}: '{given[0]}'")
     return cam_from_opengl(pose) if given[0] == "transform_matrix" else pose
 
@@ -238,11 +288,13 @@ class Keyframes:
 def _with_seconds(
     keys: Keyframes, document: dict[str, Any], fps: float, file: Path
 ) -> tuple[Keyframes, int]:
-    """Return keyframes with seconds and period, and the number of frames, by 'at', 'seconds',
-    'loop'."""
+    """Return keyframes with seconds and period, and the number of frames, by 'at', 'num_frames',
+    'seconds', 'loop'."""
     loops = document.get("loop") is True
     num_frames = None
-    if "seconds" in document:
+    if "num_frames" in document:
+        num_frames = int(_number(document, "num_frames", file, 1, _MAX_FRAMES))
+    elif "seconds" in document:
         num_frames = max(1, round(_number(document, "seconds", file, 1e-3, 1e6) * fps))
     count = len(keys.cam_from_world)
     at = _numbers_of_all(document["keyframes"], "at", 1e6, f"{file}: keyframes")

@@ -35,18 +35,23 @@ LARGEST = 1e30
 
 
 def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict[str, Any]:
-    """Read the JSON object in ``path``, UTF-8, 16 or 32. ``what``: the error for anything else."""
+    """Read the JSON object in ``path``. ``what``: the error for anything else."""
+    fields = read_json(path)
+    if not isinstance(fields, dict):
+        raise DyngsError(f"{path}: {what}")
+    return fields
+
+
+def read_json(path: Path) -> Any:
+    """Read the JSON in ``path``, UTF-8, 16 or 32. Raises DyngsError."""
     with reading(path, "it must be a JSON file; copy or export it again"):
         try:
-            fields = json.loads(read_limited(inside(path)))
+            return json.loads(read_limited(inside(path)))
         except json.JSONDecodeError as error:
             where = f"{path}, line {error.lineno} column {error.colno}"
             raise DyngsError(
                 f"{where}: broken JSON ({error.msg}); copy or export it again"
             ) from error
-    if not isinstance(fields, dict):
-        raise DyngsError(f"{path}: {what}")
-    return fields
 
 
 def read_text(path: Path) -> str:

@@ -1,22 +1,27 @@
-"""The controls of the page: what is shown, the time, the truth, the cameras of the capture, motions
-of a person, camera paths. Each browser has its own."""
+"""The controls of the page: what is shown, the time, the truth, the cameras of the capture, poses
+and motions of a person, camera paths, screenshots. Each browser has its own."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import io
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.human.avatar.scene import avatar_of
+from dyngs.human.body.joints import JOINT_NAMES
+from dyngs.human.motion.motion import compose_rotations
 from dyngs.io.write import to_uint8
 from dyngs.runs.opened import Opened
 from dyngs.view.edit import EditControls, can_be_edited
-from dyngs.view.layers import LAYERS, PARTS
+from dyngs.view.layers import LAYERS, PARTS, draw
 from dyngs.view.session import Keyframe, Recording
 from dyngs.view.source import Source
 from dyngs.view.views import centers_of, has_timeline, pose_of, viewpoint_of, views_of
@@ -26,8 +31,11 @@ if TYPE_CHECKING:
 
     from dyngs.view.server import Browsing
 
+NEAREST = "nearest"
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
-AS_CAPTURED, AT_REST = "as captured", "rest pose"
+AS_CAPTURED, AT_REST, BY_SLIDERS = "as captured", "rest pose", "pose by sliders"
+BODY_JOINTS = JOINT_NAMES[:22]
+"""Joints with sliders: the first ones of every body."""
 FILE_NAME = "camera_path.json"
 MOTION_SUFFIXES = (".npz", ".bvh", ".glb", ".gltf", ".vrma")
 HELP = """\
@@ -124,7 +132,19 @@ class Controls:
             part.on_update(lambda _: session.change(part=part.value))
         else:
             session.change(part="all")
+        screenshot = gui.add_button("Screenshot", hint="as .png, of the size of the window")
+        screenshot.on_click(lambda _: session.ask(self._screenshot))
         gui.add_button("Back to start").on_click(lambda _: self._browsing.go_to(None))
+
+    def _screenshot(self) -> None:
+        """Send what is shown as a .png, in the thread that draws."""
+        from PIL import Image
+
+        session = self._browsing.session
+        stream = io.BytesIO()
+        Image.fromarray(draw(session.opened, session.shot())).save(stream, "png")
+        name = f"{session.opened.name}_{session.time:.3f}.png"
+        self._browsing.client.send_file_download(name, stream.getvalue(), save_immediately=True)
 
     def _add_time(self, gui: viser.GuiApi) -> None:
         session = self._browsing.session
@@ -136,6 +156,8 @@ class Controls:
         play = gui.add_button("Pause" if timeline.playing else "Play")
         play.on_click(lambda _: session.change_timeline(playing=not session.timeline.playing))
         session.on_play = lambda playing: setattr(play, "label", "Pause" if playing else "Play")
+        loop = gui.add_checkbox("Loop", timeline.loops)
+        loop.on_update(lambda _: session.change_timeline(loops=bool(loop.value)))
         hint = "1: as it was filmed"
         speed = gui.add_dropdown("Speed", SPEEDS, initial_value=f"{timeline.speed:g}", hint=hint)
         speed.on_update(lambda _: session.change_timeline(speed=float(speed.value)))
@@ -148,27 +170,63 @@ class Controls:
         cameras.on_update(
             lambda _: self._frusta.show(opened) if cameras.value else self._frusta.remove()
         )
-        hint = "with the nearest image, on the right of the line"
+        hint = "with the true image, on the right of the line"
         compare = gui.add_checkbox("Compare", session.look.comparing, hint=hint)
         compare.on_update(lambda _: self._change(comparing=bool(compare.value)))
         divide = gui.add_slider("Divide", 0.0, 1.0, 0.01, session.look.divide)
         divide.on_update(lambda _: session.change(divide=float(divide.value)))
+        names = (NEAREST, *views_of(opened).names)
+        image = gui.add_dropdown("Image", names)
+        session.change(view=None)
+
+        def choose(_: Any) -> None:
+            index = names.index(image.value) - 1
+            session.change(view=None if index < 0 else index)
+            if index >= 0:
+                self._browsing.go_to(index)
+
+        image.on_update(choose)
 
     def _add_motions(self, gui: viser.GuiApi) -> None:
-        """Add the motion picker, for files by name."""
+        """Add the motion picker, for files by name, and the sliders of the pose."""
         browsing = self._browsing
-        motion = gui.add_dropdown("Motion", (AS_CAPTURED, AT_REST, *self._motions))
+        motion = gui.add_dropdown("Motion", (AS_CAPTURED, AT_REST, BY_SLIDERS, *self._motions))
+        hint = "in motions of files, feet on the floor do not slide"
+        feet = gui.add_checkbox("Keep feet", False, hint=hint)
+        joint = gui.add_dropdown("Joint", BODY_JOINTS)
+        sliders = [gui.add_slider(axis, -180.0, 180.0, 1.0, 0.0) for axis in "xyz"]
+        angles: dict[str, list[float]] = {}
 
         def work() -> None:
             choice = str(motion.value)
             opened = browsing.loaded
             if choice == AT_REST:
                 opened = opened.at_rest()
+            elif choice == BY_SLIDERS:
+                opened = posed(opened, angles)
             elif choice != AS_CAPTURED:
-                opened = opened.in_motion(self._motions[choice])
+                opened = opened.in_motion(self._motions[choice], keep_feet=bool(feet.value))
             browsing.session.show(opened)
 
-        motion.on_update(lambda _: browsing.session.ask(work))
+        def play(_: Any) -> None:
+            browsing.session.ask(work)
+
+        def pick(_: Any) -> None:
+            shown = angles.get(joint.value, [0.0] * 3)
+            for slider, value in zip(sliders, shown, strict=True):
+                slider.value = value
+
+        def turn(event: Any) -> None:
+            if event.client_id is not None:  # None: by ``pick``
+                angles[joint.value] = [float(slider.value) for slider in sliders]
+                motion.value = BY_SLIDERS
+                play(event)
+
+        motion.on_update(play)
+        feet.on_update(play)
+        joint.on_update(pick)
+        for slider in sliders:
+            slider.on_update(turn)
 
     def _add_path(self, gui: viser.GuiApi) -> None:
         browsing = self._browsing
@@ -203,6 +261,8 @@ class Controls:
         remove.on_click(lambda _: record(keyframes=recording.keyframes[:-1]))
         loop = gui.add_checkbox("Back to the first", False)
         loop.on_update(lambda _: record(loops=bool(loop.value)))
+        preview = gui.add_button("Preview")
+        preview.on_click(lambda _: session.preview(recording) if len(recording) else None)
         hint = f"{FILE_NAME}, for: dyngs render RUN --path {FILE_NAME}"
         gui.add_button("Save path", hint=hint).on_click(save)
 
@@ -213,6 +273,24 @@ def _add_help(gui: viser.GuiApi, opened: Opened) -> None:
     gui.add_markdown(HELP)
     for note in opened.notes:
         gui.add_markdown(f"*{as_text(note)}*")
+
+
+def posed(opened: Opened, angles: Mapping[str, Sequence[float]]) -> Opened:
+    """Return a person in the rest pose with joints rotated by ``angles``: degrees about x, y and z,
+    in this order, by joint."""
+    from scipy.spatial.transform import Rotation
+
+    rest = opened.at_rest()
+    person = avatar_of(rest.renderable)
+    clip = None if person is None else person.played
+    if person is None or clip is None:
+        return rest
+    turns = torch.zeros_like(clip.poses)
+    for name, degrees in angles.items():
+        turned = Rotation.from_euler("xyz", degrees, degrees=True)
+        turns[0, JOINT_NAMES.index(name)] = turns.new_tensor(turned.as_rotvec())
+    poses = compose_rotations(clip.poses, turns)
+    return rest.showing(person.playing(replace(clip, poses=poses)))
 
 
 def motion_files(path: Path | None) -> dict[str, Path]:

@@ -11,6 +11,7 @@ import torch
 from dyngs.core.camera import Cameras
 from dyngs.export.camera_paths import resize_cameras
 from dyngs.export.images import color_map, depth_to_rgb
+from dyngs.gaussians.levels import LevelScene
 from dyngs.io.write import to_uint8
 from dyngs.models.renderable import Rendering, TimeStep
 from dyngs.runs.opened import Opened
@@ -32,6 +33,7 @@ class Shot:
         view: the view of the capture whose camera, time and truth are shown instead; None: no
             truth.
         divide: fraction of the width that shows the render; the truth is on the right of it.
+        is_moving: it is one of many, drawn in levels of detail where ``coarser`` has made them.
     """
 
     camera: Cameras
@@ -40,6 +42,7 @@ class Shot:
     part: Part = "all"
     view: int | None = None
     divide: float = 1.0
+    is_moving: bool = False
 
 
 def draw(opened: Opened, shot: Shot) -> np.ndarray:
@@ -93,10 +96,21 @@ def _layer(opened: Opened, shot: Shot) -> np.ndarray:
     return to_uint8(pixels.clamp(0, 1).cpu().numpy())
 
 
+def coarser(opened: Opened, most: int) -> Opened:
+    """Return a still scene of which at most ``most`` Gaussians are drawn while anything moves.
+    Raises DyngsError."""
+    opened = opened.noted(f"while anything moves, at most {most:,} Gaussians are drawn")
+    opened.once("levels", lambda: LevelScene.of(opened.renderable, most))
+    return opened
+
+
 def _rendering(opened: Opened, shot: Shot, **options: Any) -> Rendering:
     """Return a rendering, on the CPU; the scene at the last time is kept."""
     part = shot.part
     scene = opened.renderable
+    levels: LevelScene | None = opened.once("levels", lambda: None)
+    if levels is not None and shot.is_moving and part == "all" and not options:
+        return levels.render(shot.camera).to(device="cpu")
     if part != "all":
         scene = opened.once(part, lambda: opened.scene.part(part))
     kept: dict[str, tuple[float | None, TimeStep]] = opened.once("time steps", dict)

@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.geometry import checked_pose
-from dyngs.export.camera_paths import resize_cameras
+from dyngs.export.camera_paths import Keyframes, interpolate_keyframes, resize_cameras
 from dyngs.runs.opened import Opened
 from dyngs.view.layers import Layer, Part, Shot, draw
 from dyngs.view.views import camera_at, nearest_view, views_of
@@ -52,12 +53,14 @@ class Eye:
 class Timeline:
     """The time that is shown: ``time`` in [0, 1] when the clock read ``since``.
 
-    Where it is ``playing``, it takes ``seconds`` / ``speed`` from 0 to 1, where it begins again.
+    Where it is ``playing``, it takes ``seconds`` / ``speed`` from 0 to 1, where it begins again or
+    stops.
     """
 
     time: float = 0.0
     since: float = 0.0
     playing: bool = False
+    loops: bool = True
     speed: float = 1.0
     seconds: float = 4.0
 
@@ -66,11 +69,17 @@ class Timeline:
         if not self.playing:
             return self.time
         passed = max(clock - self.since, 0.0) * self.speed / max(self.seconds, 1e-6)
+        if not self.loops:
+            return min(self.time + passed, 1.0)
         return (self.time + passed) % 1.0 if passed else self.time
 
     def changed(self, clock: float, **changes: bool | float) -> Timeline:
-        """Return the timeline with other attributes; the time does not jump."""
-        return replace(self, **{"time": self.at(clock), "since": clock, **changes})  # type: ignore[arg-type]
+        """Return the timeline with other attributes; the time does not jump, but it plays from 0
+        where it has ended."""
+        now = self.at(clock)
+        if changes.get("playing") and now == 1.0:
+            now = 0.0
+        return replace(self, **{"time": now, "since": clock, **changes})  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -80,11 +89,13 @@ class Display:
     Attributes:
         layer, part, divide: as in ``Shot``.
         comparing: show the truth next to the render.
+        view: index of the view that is compared with; None: the nearest.
     """
 
     layer: Layer = "colour"
     part: Part = "all"
     comparing: bool = False
+    view: int | None = None
     divide: float = 0.5
 
 
@@ -112,6 +123,20 @@ class Recording:
     def duration(self) -> float:
         """Seconds of the path; those after the last keyframe count only in a loop."""
         return sum(key.seconds for key in self.keyframes[: None if self.loops else -1])
+
+    def at(self, seconds: float, size: tuple[int, int]) -> tuple[Cameras, float]:
+        """Return the camera, for images of ``size``, px, and the time of the scene after
+        ``seconds`` of the path."""
+        cameras = [resize_cameras(key.camera, *size) for key in self.keyframes]
+        poses = np.concatenate([camera.cam_from_world.numpy() for camera in cameras])
+        matrices = np.concatenate([camera.intrinsics.numpy() for camera in cameras])
+        starts = np.cumsum([0.0, *(key.seconds for key in self.keyframes[:-1])])
+        times = np.array([key.time or 0.0 for key in self.keyframes])
+        keys = Keyframes(poses, matrices, starts, times, self.duration if self.loops else None)
+        made = interpolate_keyframes(keys, np.array([seconds]))
+        pose, matrix = (torch.from_numpy(x).float() for x in (made.cam_from_world, made.intrinsics))
+        time = 0.0 if made.times is None else float(made.times[0])
+        return Cameras(pose, matrix, *size), time
 
     def document(self, size: tuple[int, int], fps: float, opened: Opened) -> str:
         """Return the path as JSON that ``dyngs render --path`` reads (docs/camera_paths.md), in the
@@ -167,6 +192,7 @@ class Session:
         self._is_refined = (
             False  # whether the image that is shown is full, and of what is there now
         )
+        self._preview: tuple[Recording, float] | None = None  # a path, and when it began
         self.on_change: Callable[[], None] = lambda: None
         self.on_play: Callable[[bool], None] = lambda playing: None
         self.on_error: Callable[[str], None] = lambda message: None
@@ -203,6 +229,11 @@ class Session:
         self.opened = opened
         self.change_timeline(seconds=opened.seconds)
 
+    def preview(self, recording: Recording) -> None:
+        """Show what a path with keyframes sees, once."""
+        self._preview = recording, self._clock()
+        self._note_change()
+
     def take(self, opened: Opened, *, refreshes: bool) -> None:
         """Look at a newer state of the scene; ``refreshes``: draw it, as large, even if nothing
         else has changed."""
@@ -228,7 +259,7 @@ class Session:
         has_truth = look.comparing or look.layer == "error"
         if eye is None or not has_truth or not len(views_of(opened)):
             return None
-        return nearest_view(opened, eye.camera(), self.time)
+        return nearest_view(opened, eye.camera(), self.time) if look.view is None else look.view
 
     def due(self) -> float | None:
         """Return in how many seconds something is to be drawn; 0: now, None: not before something
@@ -253,13 +284,17 @@ class Session:
             self._jobs.popleft()()
             return
         start = self._drawn_at = self._clock()
+        if self._preview is not None and start > self._preview[1] + self._preview[0].duration:
+            self._preview = None
+        if self.timeline.playing and not self.timeline.loops and self.time == 1.0:
+            self.change_timeline(playing=False)
         version = self._changed_at
         is_moving = self._is_moving or start < version + STILL_AFTER
         full = self._full_size
         size = _scaled(full, math.sqrt(self._area / math.prod(full))) if is_moving else full
         self._is_stale = False
         self._is_refined = True  # if it fails, it is not tried again
-        image = draw(self.opened, self.shot(size))
+        image = draw(self.opened, replace(self.shot(size), is_moving=is_moving))
         if not self.closed:
             self._send(Sent(image, not is_moving, self._clock() - start))
         now = self._clock()
@@ -273,15 +308,22 @@ class Session:
         if self.eye is None:
             raise ValueError("there is no camera yet")
         look = self.look
+        size = size or self._full_size
+        camera = self.eye.camera(size)
         view = self.shown_view
-        time = None if self.opened.renderable.is_static else self.time
+        time = self.time
+        if self._preview is not None:
+            recording, start = self._preview
+            camera, time = recording.at(self._clock() - start, size)
+            view = None
         layer = "colour" if look.layer == "error" and view is None else look.layer
-        camera = self.eye.camera(size or self._full_size)
-        return Shot(camera, time, layer, look.part, view, look.divide if look.comparing else 1.0)
+        shown = None if self.opened.renderable.is_static else time
+        return Shot(camera, shown, layer, look.part, view, look.divide if look.comparing else 1.0)
 
     @property
     def _is_moving(self) -> bool:
-        return self.timeline.playing and not self.opened.renderable.is_static
+        is_playing = self.timeline.playing and not self.opened.renderable.is_static
+        return is_playing or self._preview is not None
 
     @property
     def _full_size(self) -> tuple[int, int]:

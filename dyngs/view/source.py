@@ -15,6 +15,7 @@ from dyngs.io.outputs import command_for
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.opened import Opened, open_scene
+from dyngs.view.layers import coarser
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ def open_source(
     up: str | None = None,
     device: torch.device = CPU,
     data_root: Path | None = None,
+    most: int | None = None,
 ) -> Source:
     """Return what is to be seen of a run, a file or a folder of runs; the first scene is not loaded
     yet.
@@ -37,6 +39,7 @@ def open_source(
     Args:
         up, data_root: as in ``open_to_view``.
         device: draws the scenes.
+        most: Gaussians of a still scene that are drawn at most while anything moves; None: all.
 
     Raises:
         DyngsError: nothing is there, or a folder without runs.
@@ -52,7 +55,8 @@ def open_source(
         raise DyngsError(f"{path}: no runs there; {instead}give a run, a file, or a folder of runs")
 
     def load(name: str) -> Opened:
-        return open_to_view(runs[name], name, up, data_root).to(device)
+        opened = open_to_view(runs[name], name, up, data_root).to(device)
+        return opened if most is None else coarser(opened, most)
 
     return Source(tuple(runs), load)
 

@@ -1,8 +1,9 @@
-"""Files of camera paths, cameras between keyframes, and times."""
+"""Files of camera paths, our own and of other programs, cameras between keyframes, and times."""
 
 from __future__ import annotations
 
 import json
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -60,6 +61,65 @@ def test_the_examples_of_the_documentation_are_read(tmp_path: Path) -> None:
     assert torch.equal(keys.cameras.cam_from_world[0], keys.cameras.cam_from_world[59])
 
 
+# Paths of other programs: the cameras that each program means.
+
+WIDTH, HEIGHT, FOCAL = 96, 72, 80.0
+EYES = [
+    look_at(np.array([3 * math.cos(a), 3 * math.sin(a), 1 + 0.2 * a]), np.zeros(3), UP)
+    for a in (0.1, 0.9, 2.0)
+]
+"""Camera to world, OpenCV's axes."""
+OPENGL = [eye @ np.diag([1.0, -1, -1, 1]) for eye in EYES]
+FOV = math.degrees(2 * math.atan(HEIGHT / 2 / FOCAL))
+
+
+def nerfstudio(**more: Any) -> dict[str, Any]:
+    views = [
+        {"camera_to_world": pose.ravel().tolist(), "fov": FOV, "render_time": 0.25 * i}
+        for i, pose in enumerate(OPENGL)
+    ]
+    size = {"camera_type": "perspective", "render_width": WIDTH, "render_height": HEIGHT}
+    others = {"seconds": 0.25, "default_fov": 50, "keyframes": [{"fov": FOV}]}
+    return size | others | {"fps": 12, "camera_path": views} | more
+
+
+def of_3dgs(i: int, **more: Any) -> dict[str, Any]:
+    place = {"position": EYES[i][:3, 3].tolist(), "rotation": EYES[i][:3, :3].tolist()}
+    return {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "fy": FOCAL} | place | more
+
+
+def transforms(poses: list[Any] = OPENGL, **more: Any) -> dict[str, Any]:
+    frames = [{"transform_matrix": pose.tolist()} for pose in poses]
+    return {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "frames": frames} | more
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        pytest.param(nerfstudio(), id="camera_path.json"),
+        pytest.param([of_3dgs(i) for i in range(3)], id="cameras.json"),
+        pytest.param(transforms(k1=0.1), id="transforms.json"),
+        pytest.param(transforms([pose[:3].ravel() for pose in OPENGL]), id="12 numbers"),
+    ],
+)
+def test_cameras_are_those_that_were_meant(document: Any, tmp_path: Path) -> None:
+    offset = np.array([10.0, -20.0, 5.0])
+    path = read_path(written(tmp_path, document), offset)
+    cameras = path.cameras
+    assert (cameras.width, cameras.height) == (WIDTH, HEIGHT)
+    eyes = np.stack(EYES)
+    eyes[:, :3, 3] -= offset
+    np.testing.assert_allclose(cameras.cam_from_world.numpy(), np.linalg.inv(eyes), atol=1e-5)
+    wanted = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
+    np.testing.assert_allclose(cameras.intrinsics.numpy(), [wanted] * 3, atol=1e-4)
+    if "camera_path" in document:
+        assert (path.fps, path.times) == (12.0, (0.0, 0.25, 0.5))
+        assert "dataparser_transforms.json" in path.notes[0]
+    else:
+        assert (path.fps, path.times) == (30.0, None)
+        assert bool(path.notes) == ("k1" in document)
+
+
 # Keyframes in files.
 
 
@@ -77,6 +137,7 @@ def keyed(keys: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
     [
         (keyed([key(0), key(1), key(2)]), np.linspace(0, 2, 21)),
         (keyed([key(0), key(1), key(2)], seconds=0.5), [0, 0.5, 1, 1.5, 2]),
+        (keyed([key(0), key(1), key(2)], num_frames=5), [0, 0.5, 1, 1.5, 2]),
         (keyed([key(0, at=0.1), key(1, at=0.3)]), [0, 0, 0.5, 1]),
         (keyed([key(0, at=0.1), key(1, at=0.3)], seconds=0.6), [0, 0, 0.5, 1, 1, 1]),
         (keyed([key(0, at=0), key(1, at=0.1), key(0, at=0.2)], loop=True, seconds=0.3), [0, 1, 0]),
@@ -118,6 +179,15 @@ SPINE = keyed([key(0), key(1)])
         (GOOD | {"frames": [FRAME | {"time": "late"}]}, "'time'"),
         (GOOD | {"keyframes": [FRAME]}, "one non-empty list"),
         (GOOD | {"frames": [FRAME, FRAME | {"time": 0.5}]}, r"frames\[0\]: 'time' is missing"),
+        ({"path": [{"R": [0, 0, 0, 1], "T": [0.5, 0.5, 0.5]}]}, "one non-empty list"),
+        (nerfstudio(camera_type="equirectangular"), "equirectangular"),
+        (nerfstudio(camera_path=[{"camera_to_world": [1] * 16, "fov": "wide"}]), "'fov' is 'wide'"),
+        (nerfstudio(camera_path=[3]), "must be a dictionary"),
+        (nerfstudio(camera_path=3), "one non-empty list"),
+        ([3], "must be a dictionary"),
+        ([of_3dgs(0, position=[1, 2, math.nan])], "'position' must hold 3"),
+        ([of_3dgs(0), of_3dgs(1, width=7)], "must have one size"),
+        (transforms(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE"),
         ("frames", "a camera path is a JSON object"),
         (keyed([key(0, time=0.1), key(1)]), r"keyframes\[1\]: 'time' is missing"),
         (keyed([key(0, at=2), key(1, at=2)]), "a later second"),

@@ -17,17 +17,23 @@ from moving_scene import (
     write_moving_run,
 )
 from pretend_gpu import GPU, pretend_gpu
-from view_sessions import balls, looking_at_balls
+from splat_scenes import cloud
+from view_sessions import balls, looking_at_balls, opened_at
 
 from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 from dyngs.data.geometry import look_at
 from dyngs.export.images import render_frame
+from dyngs.gaussians import levels
+from dyngs.gaussians.levels import LevelScene
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.runs.opened import Opened, open_run, open_scene
 from dyngs.view.controls import Frusta
 from dyngs.view.layers import (
     LAYERS,
     PARTS,
     Shot,
+    coarser,
     draw,
 )
 from dyngs.view.views import (
@@ -65,6 +71,27 @@ def test_a_gpu_draws_every_layer_alike(run: Opened, layer: str) -> None:
         found = [draw(there, shot) for shot in shots]
     for a, b in zip(found, expected, strict=True):
         assert np.array_equal(a, b)
+
+
+def test_many_gaussians_are_drawn_in_levels_while_anything_moves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(levels, "BLOCK", 16)
+    whole = opened_at(StaticScene(gaussians=cloud(2000)))
+    opened = coarser(whole, 300)
+    shot = Shot(camera(80, 56))
+    moving = replace(shot, is_moving=True)
+    assert "at most 300 Gaussians" in opened.notes[-1]
+    few = render_frame(LevelScene.of(whole.renderable, 300), camera(80, 56), None).rgb
+    coarse = draw(opened, moving)
+    assert np.abs(coarse / 255.0 - few).max() <= 0.5 / 255 + 1e-6
+    assert not np.array_equal(coarse, draw(whole, shot))
+    assert np.array_equal(draw(whole, moving), draw(whole, shot))
+    assert np.array_equal(draw(opened, shot), draw(whole, shot))
+    edited = opened.showing(opened.scene.select(torch.arange(1000)))
+    assert np.array_equal(draw(edited, moving), draw(edited, shot))
+    with pytest.raises(DyngsError, match="for still scenes"):
+        coarser(balls(), 300)
 
 
 def test_the_moment_of_a_time_is_computed_once() -> None:

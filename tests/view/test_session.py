@@ -123,6 +123,41 @@ def test_a_playing_scene_is_drawn_on_and_on_and_a_still_one_is_not() -> None:
     assert still.session.due() is None
 
 
+def test_a_scene_without_a_loop_stops_at_its_end_and_plays_again_from_its_start() -> None:
+    looked = Looked()
+    looked.session.move(eye())
+    looked.session.change_timeline(playing=True, loops=False)
+    looked.after(looked.session.opened.seconds + 1)
+    looked.after(1)
+    assert looked.session.time == 1.0
+    assert not looked.session.timeline.playing
+    assert looked.session.due() is None
+    looked.session.change_timeline(playing=True)
+    assert looked.session.time == 0.0
+
+
+def test_a_preview_shows_the_recorded_cameras_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    shots: list[Shot] = []
+    monkeypatch.setattr(
+        session, "draw", lambda opened, shot: shots.append(shot) or draw(opened, shot)
+    )
+    looked = Looked()
+    looked.session.move(eye())
+    keys = (Keyframe(at_depth(4), 0.2, 2.0), Keyframe(at_depth(8), 0.6, 1.0))
+    looked.session.preview(Recording(keys))
+    looked.clock.now += 1.0
+    looked.session.draw_next()
+    assert shots[-1].time == pytest.approx(0.4)
+    assert float(shots[-1].camera.cam_from_world[0, 2, 3]) == pytest.approx(6, abs=1e-3)
+    looked.after(1.1)
+    looked.after(1)
+    assert looked.session.due() is None
+    assert shots[-1].time == 0.0
+    assert looked.session.eye is not None
+    own = looked.session.eye.camera((400, 300))
+    assert torch.equal(shots[-1].camera.cam_from_world, own.cam_from_world)
+
+
 def test_jobs_and_who_has_gone() -> None:
     looked = Looked()
     done = list[int]()
