@@ -191,6 +191,22 @@ def render_scene(
     return (rgba * 255.0 + 0.5).astype(np.uint8).reshape(size, size, 4)
 
 
+def render_things(
+    scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3
+) -> np.ndarray:
+    """(size, size) uint8: which thing that moves a pixel of ``render_scene`` shows, 1 the first; 0
+    none.
+
+    Of several in one pixel the one that most samples see; light does not count.
+    """
+    directions = sampled_rays(world_from_cam, size, samples).reshape(-1, 3)
+    nearest, distance = nearest_things(scene, f32(world_from_cam[:3, 3]), directions)
+    things = np.where(np.isfinite(distance), nearest, -1).reshape(samples**2, -1)
+    nothing = np.zeros(size * size, np.int64)
+    counts = [nothing, *((things == index).sum(axis=0) for index in scene.movers)]
+    return np.argmax(counts, axis=0).astype(np.uint8).reshape(size, size)
+
+
 def is_seen(scene: Scene, points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
     """(R,) bool: points (R, 3) on surfaces that a camera sees, somewhere in its image or not."""
     origin = world_from_cam[:3, 3]
@@ -672,8 +688,11 @@ def write_dynamic_capture(
     hemisphere, or by one on an arc, which a fixed camera in its middle tests. Fixed cameras each
     take all times: ``camAA/frame_BBBB.png``, frames with ``camera``; test has one of its own.
 
-    ``true_tracks.npz`` holds the tracks of points on what moves (``TrueTracks``).
-    Raises DyngsError: no images requested, ``out`` holds something already, or cannot be written.
+    ``things/`` holds labels of what moves for each image (``render_things``), and
+    ``true_tracks.npz`` the tracks of points on it (``TrueTracks``). Frames of test name
+    their labels (``instance_mask_path``), those of train do not: training would take them as a
+    prior. Raises DyngsError: no images requested, ``out`` holds something already,
+    or cannot be written.
     """
     if min(options.size, options.num_times, options.num_cameras, options.samples) < 1:
         raise DyngsError(
@@ -722,6 +741,10 @@ def write_split(
             frame["camera"] = shot.camera
         if shot.time is not None:
             frame["time"] = shot.time
+            things = render_things(scene, shot.world_from_cam, options.size, options.samples)
+            write_image(out / "things" / f"{shot.name}.png", things)
+            if split != "train":
+                frame["instance_mask_path"] = f"./things/{shot.name}.png"
         frames.append(frame | {"transform_matrix": shot.world_from_cam.tolist()})
     transforms = {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
     write_text(out / f"transforms_{split}.json", json.dumps(transforms, indent=1) + "\n")
