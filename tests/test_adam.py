@@ -37,8 +37,7 @@ def stepped(steps: int) -> tuple[AdamState, dict[str, Tensor]]:
 
 
 def stepped_along(last_axis: bool, adam: AdamState, name: str, x: Tensor, step: int) -> Count:
-    update = adam.update_along_last_axis(name, x, 0.1) if last_axis else adam.update(name, x, 0.1)
-    return adam.steps_([update], step=step)
+    return adam.steps_([adam.update(name, x, 0.1, along_last_axis=last_axis)], step=step)
 
 
 @pytest.mark.parametrize("along_last_axis", [False, True])

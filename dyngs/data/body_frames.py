@@ -117,12 +117,14 @@ def rows_of(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
     """Return (V,) the row of ``body`` for each view, by frame number; each must have one with
     parameters."""
     rows = {number: row for row, number in enumerate(body.frames)}
+    unnumbered = next((view.image_path for view in views if view.frame is None), None)
+    if unnumbered is not None:
+        raise DyngsError(f"{where}: {unnumbered} has no frame number; give each image its 'frame'")
     lacking = sorted({frame_number(view) for view in views} - rows.keys())
     if lacking:
         raise DyngsError(
             f"{where}: no body parameters for {len(lacking)} frames that have images ({first_few(lacking)}); the "
-            f"file has {len(rows)} frames from {body.frames[0]} to {body.frames[-1]}; add them, remove the images, or "
-            "give each image its 'frame'"
+            f"file has {len(rows)} frames from {body.frames[0]} to {body.frames[-1]}; add them or remove the images"
         )
     return np.array([rows[frame_number(view)] for view in views], dtype=np.int64)
 

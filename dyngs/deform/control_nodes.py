@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from dyngs.core.state import Role, State, StateTensor, moved_to, part_of, prefixed
-from dyngs.core.tensor_checks import require_indices, require_tensor
+from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.deform.field import (
     MAX_KEY_TIMES,
     DeformationField,
@@ -177,9 +177,9 @@ class ControlNodes(DeformationField):
     def restored(self, tensors: Mapping[str, Tensor]) -> ControlNodes:
         buffers = part_of(tensors, "buffers")
         count = len(buffers["positions"])
-        shapes = {"positions": (count, 3), "radii": (count,)}
-        for name, shape in shapes.items():
-            require_tensor(name, buffers.get(name, torch.zeros(shape, device="cpu")), shape)
+        require_tensor("positions", buffers["positions"], (count, 3))
+        if "radii" in buffers or "followed" in buffers:
+            require_positive("radii", require_tensor("radii", buffers["radii"], (count,)))
         for name, length in (("followed", self.setup.num_moving), ("neighbours", count)):
             if name in buffers:
                 require_indices(name, buffers[name], (length, None), count)

@@ -83,7 +83,7 @@ def assemble(
         images = images.without_motion_masks()
     background = resolved_background(config, capture)
     extent = surroundings(capture).extent
-    findings = [priors.message]
+    findings = [priors.message] if priors.message else []
     published = capture.has_alpha and config.train.alpha_weight == 0 and background != "random"
     if published and not restored:
         findings.append(

@@ -179,7 +179,8 @@ def test_what_is_there_for_a_while_is_masked_only_while_it_is_not() -> None:
     """Between key times, too: three of ten training times are key times, and none of the Gaussians
     is there at them."""
     centers = torch.tensor([2, 3, 6, 7]) / 9
-    start = FreeStart(torch.zeros(0), (), centers, torch.full((4,), 0.03))
+    spans = torch.full((4,), 0.03)
+    start = FreeStart(torch.zeros(0), (), centers, spans, torch.zeros(4, 3))
     field = FreePrimitives(FreeField(), tiny_setup(4), torch.Generator()).started(start)
     times = tuple(k / 9 for k in range(10))
     scene = DynamicScene(gaussians=cloud(5), seen_at=times, field=field, moving=torch.arange(4))

@@ -442,7 +442,10 @@ def test_missing_files(root: Path) -> None:
     ("change", "line"),
     [
         ({"poses": np.zeros((3, 63))}, r"body_train\.npz: 'poses' has 63 numbers per frame"),
-        ({"trans": np.zeros((2, 3))}, r"body_train\.npz: 'trans' has 2 rows for 3 frames"),
+        (
+            {"trans": np.zeros((2, 3))},
+            r"body_train\.npz: 'trans' must hold as many numbers for each of 3 frames",
+        ),
         ({"trans": np.full((3, 3), np.nan)}, r"body_train\.npz: 'trans' of frame 0 holds NaN"),
         ({"scale": -1.0}, r"body_train\.npz: 'scale' must be positive"),
         ({"betas": None}, r"body_train\.npz: the key 'betas' is missing"),
