@@ -6,6 +6,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from dyngs.api.scene_file import write_scene_file
@@ -16,7 +17,7 @@ from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, show
 from dyngs.data.read import require_folder
 from dyngs.io.outputs import new_folder
-from dyngs.models.checkpoint import Checkpoint, read_capture_of
+from dyngs.models.checkpoint import Checkpoint, read_capture_of, settings_of
 from dyngs.models.kind import HasGaussians, capability
 from dyngs.ops.device import deterministic, device_for, keep_freed_memory
 from dyngs.ops.native import kernel_threads, num_cores
@@ -58,7 +59,7 @@ def prune_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
     require_folder(config.data.root)
     with new_folder(out, require_empty) as started:
         _copy_start(run_dir, started)
-        save_checkpoint(started, start, 0.0)
+        save_checkpoint(started, replace(start, settings=settings_of(config)), 0.0)
         write_config(config, started)
     train(config, resume_from=out)
     write_scene_file(out, file_of(out))
@@ -115,7 +116,8 @@ def prune_within(
     with new_folder(out, require_empty) as started:
         _copy_start(run_dir, started)
         seconds = seconds_at(run_dir, start.info.step) + time.perf_counter() - begun
-        save_checkpoint(started, chosen.checkpoint, seconds)
+        smaller = replace(chosen.checkpoint, settings=settings_of(chosen.config))
+        save_checkpoint(started, smaller, seconds)
         write_config(chosen.config, started)
         write_scene(started / EXPORT_FOLDER / SCENE_FILE, data)
         write_config(chosen.config, started / EXPORT_FOLDER)

@@ -163,6 +163,7 @@ def train(
                 if message:
                     show(message)
         else:
+            resumed.require_settings(plan.resolved)
             plan = planned(plan, [read_same_capture(folder, resumed), set_limits])
             watch.pause(-seconds_at(folder, resumed.info.step))
         trainer = _built(plan, resumed, images)

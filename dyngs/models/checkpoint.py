@@ -10,7 +10,7 @@ from typing import Any
 
 from torch import Tensor
 
-from dyngs.config import DataConfig
+from dyngs.config import Config, DataConfig
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, reading
 from dyngs.core.section import ModelSection
@@ -26,6 +26,30 @@ OTHER_CONFIG = "was its config changed? Otherwise train anew"
 
 _MAX_STEP = 2**53
 _BACKGROUNDS = ("white", "black", "random")
+
+_SETTINGS = (
+    "model.kind",
+    "model.sh_degree",
+    "model.deform.kind",
+    "colour.kind",
+    "strategy.kind",
+    "camera.refine",
+    "train.robust",
+    "train.exposure",
+)
+"""Keys of the configuration that decide what a checkpoint holds."""
+
+
+def settings_of(config: Config) -> dict[str, Any]:
+    """Return the settings that decide what a checkpoint holds, by dotted key; None where a section
+    has no such key."""
+    found = {}
+    for name in _SETTINGS:
+        value: Any = config
+        for key in name.split("."):
+            value = getattr(value, key, None)
+        found[name] = value
+    return found
 
 
 @dataclass(frozen=True)
@@ -79,10 +103,23 @@ class Checkpoint:
     tensors: dict[str, Tensor]
     # of the file that it was read from; None: of none
     path: Path | None = field(default=None, compare=False)
+    # ``settings_of`` its trainer; empty: not known
+    settings: dict[str, Any] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
         return f"the checkpoint of step {self.info.step}" if self.path is None else str(self.path)
+
+    def require_settings(self, config: Config) -> None:
+        """Raise where ``config`` has another value of a setting that decided what the checkpoint
+        holds."""
+        for name, now in settings_of(config).items():
+            before = self.settings.get(name, now)
+            if before != now:
+                raise DyngsError(
+                    f"{self.name}: was trained with {name}={before}, but config.yaml has {name}={now}; "
+                    "change it back, or train anew"
+                )
 
     def part(self, prefix: str) -> dict[str, Tensor]:
         """Return the tensors whose names start with ``prefix.``, without it."""

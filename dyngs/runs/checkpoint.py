@@ -88,7 +88,8 @@ def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float)
     # Its time first: a checkpoint whose time is lost by a kill between the two would go on as if it
     # had taken none.
     _write_seconds(run_dir, checkpoint.info.step, seconds_train)
-    write_tensors(path, _KIND, tensors, asdict(checkpoint.info), ", then `dyngs train --resume`")
+    header = asdict(checkpoint.info) | {"settings": checkpoint.settings}
+    write_tensors(path, _KIND, tensors, header, ", then `dyngs train --resume`")
     remove_old_checkpoints(run_dir)
     return path
 
@@ -98,7 +99,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
     is."""
     header, tensors = read_tensors(path, _KIND, _instead_of(path))
     with reading(path, _instead_of(path).removeprefix("; ")):
-        return Checkpoint(info_of(header), tensors, path)
+        return Checkpoint(info_of(header), tensors, path, dict(header.get("settings", {})))
 
 
 def latest_checkpoint(run_dir: Path) -> Checkpoint:
@@ -130,6 +131,7 @@ def load_run(run_dir: Path, data_root: Path | None = None) -> LoadedRun:
         if has_only_scene_file(run_dir)
         else latest_checkpoint(run_dir)
     )
+    checkpoint.require_settings(config)
     scene = restored_model(checkpoint, config.model)
     step = checkpoint.info.step
     return LoadedRun(config, scene, step, seconds_at(run_dir, step), checkpoint.info)

@@ -13,7 +13,7 @@ from torch import Tensor
 from dyngs.config import Config
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, reading
-from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
+from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, settings_of
 from dyngs.models.kind import Predicts, capability
 from dyngs.models.prediction import Learner, load_optimizer, optimizer_state, updated
 from dyngs.training.events import StepReport
@@ -79,7 +79,7 @@ class NetworkTrainer:
         mode = getattr(self.config.model, "rasterize_mode", RasterizeMode.CLASSIC).value
         info = CheckpointInfo(self.done, 1.0, (0.0, 0.0, 0.0), self.learner.background, mode)
         stored = {name: x.detach().cpu() for name, x in tensors.items()}
-        return Checkpoint(info, stored)
+        return Checkpoint(info, stored, settings=settings_of(self.config))
 
     def restore(self, checkpoint: Checkpoint) -> None:
         self.learner.load(checkpoint)

@@ -20,7 +20,7 @@ from dyngs.core.state import Role, prefixed, tensors_of, with_role
 from dyngs.core.tensor_checks import require_indices
 from dyngs.data.capture import Capture
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo
+from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, settings_of
 from dyngs.models.model import Correction, Look, Loss, Model, RenderedView
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
@@ -287,7 +287,7 @@ class Trainer(Generic[M]):
             state |= prefixed(name, with_role(part.state(), Role.TRAINING))
         state |= with_role({"rng": self.generator.get_state()}, Role.TRAINING)
         tensors = {name: x.cpu() for name, x in tensors_of(state).items()}
-        return Checkpoint(self.info, tensors)
+        return Checkpoint(self.info, tensors, settings=settings_of(self.config))
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go back to where ``checkpoint`` was taken."""

@@ -215,21 +215,36 @@ def test_a_resumed_run_refuses_another_capture(
 
 
 @pytest.mark.parametrize(
-    ("before", "after"),
+    ("before", "after", "said"),
     [
-        ("  refine: never\n", "  refine: always\n"),
-        ("  exposure: never\n", "  exposure: always\n"),
+        (
+            "  kind: static\n",
+            "  kind: dynamic\n",
+            "model.kind=static, but config.yaml has model.kind=dynamic",
+        ),
+        (
+            "  sh_degree: 2\n",
+            "  sh_degree: 1\n",
+            "model.sh_degree=2, but config.yaml has model.sh_degree=1",
+        ),
+        (
+            "  refine: never\n",
+            "  refine: always\n",
+            "camera.refine=never, but config.yaml has camera.refine=always",
+        ),
+        ("  exposure: never\n", "  exposure: always\n", "train.exposure=never, but config.yaml"),
     ],
 )
 def test_an_edited_configuration_that_contradicts_the_checkpoint_is_refused(
-    before: str, after: str, interrupted: Path, capsys: pytest.CaptureFixture[str]
+    before: str, after: str, said: str, interrupted: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = interrupted / RESOLVED_NAME
     text = file.read_text()
     assert text.count(before) == 1
     file.write_text(text.replace(before, after))
-    assert main(["train", "--resume", str(interrupted)]) == 2
-    assert "was its config changed?" in capsys.readouterr().err
+    for words in (["train", "--resume", str(interrupted)], ["eval", str(interrupted)]):
+        assert main(words) == 2
+        assert said in capsys.readouterr().err
 
 
 def test_a_folder_that_is_removed_loses_nothing_but_its_log(capture: Path, tmp_path: Path) -> None:
