@@ -28,7 +28,7 @@ from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError, printable, show
 from dyngs.core.section import CutOff
 from dyngs.core.state import tensors_of
-from dyngs.models.checkpoint import read_capture_of, restored_model
+from dyngs.models.checkpoint import read_capture_of, restored_model, settings_of
 from dyngs.models.kind import HasGaussians, Moves, capability
 from dyngs.ops.device import device_for
 from dyngs.ops.native import kernel_threads, num_cores
@@ -301,7 +301,7 @@ class Tradeoff:
                 checkpoint = trainer.checkpoint()
         # optimizer, sampler and random state are left out
         tensors = tensors_of(restored_model(checkpoint, config.model).state())
-        checkpoint = replace(checkpoint, tensors=tensors)
+        checkpoint = replace(checkpoint, tensors=tensors, settings=settings_of(config))
         save_checkpoint(folder, checkpoint, seconds_at(source, checkpoint.info.step))
         write_config(config, folder)  # marks the folder as complete
 
