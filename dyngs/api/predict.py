@@ -122,9 +122,9 @@ def write_run(
     config = config.model_copy(
         update={"run": config.run.model_copy(update={"name": out.name, "dir": out})}
     )
-    # whether maps are used is for a training to find
-    unjudged = config.train.model_copy(update={"priors": ()})
-    trainer = assemble(config.model_copy(update={"train": unjudged}), restored=True)
+    # a run that takes no step needs no priors
+    without_priors = config.train.model_copy(update={"priors": ()})
+    trainer = assemble(config.model_copy(update={"train": without_priors}), restored=True)
     predictor.begin(trainer.model, scene, config)
     with new_folder(out, require_empty) as started:
         write_config(config, started)

@@ -58,8 +58,7 @@ class PruneChoice:
 
 
 def apply_choice(trainer: GaussianTrainer, choice: PruneChoice, scores: Tensor) -> None:
-    """Take away what ``choice`` says from the scene of ``trainer``, which is at the end of its
-    run."""
+    """Prune the scene of ``trainer``, after its last step, as ``choice`` specifies."""
     config: Config = trainer.config
     colour = config.colour
     if choice.harmonics:
@@ -135,7 +134,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Promise:
-    """What is told of the candidate that a search chooses."""
+    """Scores of the candidate that a search chooses."""
 
     asked: float  # largest loss on the views held out, dB
     # mean PSNR on ``views`` of the run: as it is, where those are new to it; else fine-tuned like

@@ -68,6 +68,11 @@ def _at_points(run: RunStart, model: BgTriangleModel) -> tuple[Patches, float]:
     first = initial_gaussians(surroundings(run.capture), run.config.init, values, 0, run.generator)
     ends = first.means.quantile(torch.tensor([INNER, 1 - INNER], device="cpu"), dim=0)
     unit = float((ends[1] - ends[0]).max()) / 2
+    if not unit > 0:
+        raise DyngsError(
+            f"{run.config.data.root}: the {len(first.means)} first points are all in one place; "
+            "give init.kind=random"
+        )
     radius = first.log_scales.exp().amax(1).clamp(max=unit / 2) * RADIUS
     axes = torch.randn((len(first.means), 2, 3), generator=run.generator, device="cpu")
     one = torch.nn.functional.normalize(axes[:, 0], dim=1)

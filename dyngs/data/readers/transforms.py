@@ -69,7 +69,12 @@ def _as_bytes(values: np.ndarray) -> np.ndarray:
     """Return colours as bytes, from the range that their type and their largest value suggest."""
     if values.dtype == np.uint8:
         return values
-    scale = 255.0 if values.dtype.kind == "f" and np.nanmax(values, initial=0) <= 1 else 1.0
+    largest = values[np.isfinite(values)].max(initial=0)
+    scale = 1.0
+    if values.dtype.kind == "f" and largest <= 1:
+        scale = 255.0
+    elif largest > 255:
+        scale = 1 / 257  # 16 bits
     scaled = np.nan_to_num(scale * values.astype(np.float64), nan=GREY)
     return np.clip(scaled + 0.5, 0, 255).astype(np.uint8)
 

@@ -114,8 +114,8 @@ class _BodyFile:
     arrays: dict[str, np.ndarray]
 
     def numbers(self, key: str, *shape: int | None) -> np.ndarray:
-        """Return the finite float64 numbers at ``key``; None in the shape stands for any positive
-        number."""
+        """Return the finite float64 numbers at ``key``; None in the shape matches any positive
+        size."""
         value = self.arrays[key]
         if value.dtype.kind not in "biuf":
             raise DyngsError(f"{self.path}: '{key}' must hold numbers, not {value.dtype}")

@@ -3,6 +3,7 @@ refused, in a line."""
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +125,15 @@ def test_what_does_not_go_is_refused(
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     assert said in lines[0]
+
+
+def test_points_in_one_place_are_refused(capture: Path, tmp_path: Path) -> None:
+    same = tmp_path / "capture"
+    shutil.copytree(capture, same)
+    trimesh.PointCloud(np.zeros((20, 3))).export(same / "points3d.ply")
+    more = ("model.gaussian_steps=0", f"run.dir={tmp_path / 'run'}")
+    with pytest.raises(DyngsError, match="first points are all in one place; give init.kind"):
+        dyngs.train(config_of(same, *more))
 
 
 def test_a_capture_that_shows_no_surface_is_refused(

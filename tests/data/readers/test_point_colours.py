@@ -49,6 +49,7 @@ CASES = {
     "short names": three("r g b", COLOURS),
     "short names, floats to 1": three("r g b", (COLOURS / 255).astype(np.float32)),
     "capitals": three("Red Green Blue", COLOURS),
+    "16 bits": three("red green blue", COLOURS.astype(np.uint16) * 257),
     "bytes in 16 bits": three("red green blue", COLOURS.astype(np.uint16)),
 }
 

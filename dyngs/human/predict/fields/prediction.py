@@ -325,7 +325,7 @@ def predictor(
     """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
     body is fitted.
 
-    ``say`` and ``report`` are told of that fit.
+    ``say`` and ``report`` receive the messages and the progress of that fit.
     """
     model: Any = config.model
     network = NETWORKS[model.kind](torch.Generator())
