@@ -586,7 +586,7 @@ def read_body_json(root: Path) -> Capture:
     parameters of its own. Parameters and cameras share one world; unlike with AMASS files nothing
     is rotated to make it y up.
     """
-    capture = read_blender(root)  # whose points are of no use: people begin on a template
+    capture = read_blender(root)  # its points are not used: people begin on a template
     splits = dict(capture.splits)
     warnings = capture.warnings
     path = root / "transforms_pose.json"

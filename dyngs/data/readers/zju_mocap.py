@@ -92,6 +92,7 @@ def read_zju_mocap(root: Path) -> Capture:
 
 
 def _annotated_shots(path: Path) -> list[FrameEntry]:
+    """Return the frames of all cameras that ``annots.npy`` lists."""
     fields: Any = read_pickled_array(inside(path))
     cams = fields["cams"]
     calibrations = []
@@ -113,6 +114,7 @@ def _annotated_shots(path: Path) -> list[FrameEntry]:
 
 
 def _single_shots(path: Path) -> list[FrameEntry]:
+    """Return the frames of the one camera in ``cameras.pkl``."""
     shots = []
     for name, own in sorted(_by_name(path).items()):
         where = f"{path}, {name}"

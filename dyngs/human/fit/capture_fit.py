@@ -241,7 +241,7 @@ Observations = Callable[[int], ObservedFrame | None]
 
 
 def in_turn(frames: Mapping[int, ObservedFrame]) -> Observations:
-    """Return observations of three views of each frame, other ones each time."""
+    """Return a function that observes a frame by three of its views, the next three at each call."""
     turns = Counter[int]()
 
     def look(row: int) -> ObservedFrame | None:
