@@ -468,7 +468,9 @@ def _about_unknown(section: type[BaseModel], keys: tuple[str, ...], layers: _Lay
     known = list(layers.names(Config, ()))
     last = written.rpartition(".")[2]
     same = [x for x in known if x.rpartition(".")[2] == last]
-    found = get_close_matches(written, same or known, n=1) or same
+    # the section alone makes keys alike, so the last word must be close, too
+    close = get_close_matches(written, same or known, n=1)
+    found = [x for x in close if get_close_matches(last, [x.rpartition(".")[2]])] or same
     hint = f"; did you mean {' or '.join(map(repr, found))}?" if found else ""
     return f"{where}unknown key {printable(repr(name), 60)}{hint}"
 
