@@ -171,7 +171,7 @@ def require_overrides(*overrides: str) -> None:
 
 def require_valid(command: Command, arguments: argparse.Namespace) -> None:
     """Check what a command names besides options: keys, variations, times, presets, files."""
-    from dyngs.export.camera_paths import parse_times, path_file
+    from dyngs.export.camera_paths import parse_times, camera_path_file
     from dyngs.study.tradeoff import parse_goal, parse_requirements, parse_variations
 
     for word in command.words:
@@ -192,7 +192,7 @@ def require_valid(command: Command, arguments: argparse.Namespace) -> None:
     if getattr(arguments, "times", None) is not None:
         parse_times(arguments.times)
     if getattr(arguments, "path", None) is not None and command.verb == "render":
-        path_file(arguments.path)
+        camera_path_file(arguments.path)
 
 
 def test_commands_parse_with_valid_configuration(
