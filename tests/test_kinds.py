@@ -36,7 +36,7 @@ from dyngs.io.write import write_image
 from dyngs.models.static_section import StaticModel
 from dyngs.models.views import training_times
 from dyngs.training.losses import SilhouetteLoss
-from dyngs.training.new_trainer import build_trainer, with_points
+from dyngs.training.new_trainer import build_trainer, add_initial_points
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +134,7 @@ def test_points_are_triangulated_where_several_cameras_show_a_moment(tmp_path: P
     options = DynamicOptions(size=96, num_times=2, num_cameras=8, num_test=0, samples=1)
     root = write_dynamic_capture("room", tmp_path / "room", options)
     config = _dynamic(root, init=PointsInit(num_random=7))
-    found = with_points(read_capture(config.data), config).points
+    found = add_initial_points(read_capture(config.data), config).points
     assert found is not None
     assert len(build_trainer(config).model.scene) == len(found.xyz) > 7
     without = config.model_copy(update={"init": PointsInit(num_random=7, triangulate=0)})

@@ -234,7 +234,7 @@ def _motion(config: Config, capture: Capture) -> Choice | None:
         return None
     given = 60 * (config.train.minutes or math.inf)
     begun = time.monotonic()
-    capture = add_initial_points(capture, config, log_messages_off=True)
+    capture = add_initial_points(capture, config, log_messages=False)
     show(f"pilot runs of {counted(MOTION.steps, 'step')}, compared on held-out training views:")
     choice = _compared(
         "model.kind=dynamic",

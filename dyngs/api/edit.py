@@ -238,7 +238,7 @@ def _written(found: EditSource, out: Path, edits: Edits, tell: Tell) -> EditedFi
         )
     if moving and edits.time is None:
         tell(
-            f"time 0 of a moving scene is used; choose with --time T, or write all times with "
+            "time 0 of a moving scene is used; choose with --time T, or write all times with "
             f"--out {out.stem}{FOURDGS_SUFFIX}"
         )
     splat = found.at(edits.time or 0.0)

@@ -147,7 +147,7 @@ def prepare_capture(config: Config) -> Capture:
 
 
 def add_initial_points(
-    capture: Capture, config: Config, *, log_messages_off: bool = False
+    capture: Capture, config: Config, *, log_messages: bool = True
 ) -> Capture:
     """Return ``capture`` as ``prepared`` does, for a kind whose Gaussians begin at points; others
     need none."""
@@ -166,7 +166,7 @@ def add_initial_points(
                 if why is None
                 else [f"init.kind=random draws points around the origin, but {why}: give auto"]
             )
-    for line in [] if log_messages_off else [*lines, *before_training(capture)]:
+    for line in [*lines, *before_training(capture)] if log_messages else []:
         warn(line)
     return capture
 

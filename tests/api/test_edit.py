@@ -108,7 +108,7 @@ def test_a_moving_run(tmp_path: Path) -> None:
     told = []
     frame = Edits(frame=Frame(scale=3.0, up=(0.0, -1.0, 0.0)))
     edit_scene(run, tmp_path / "a.ply", frame, tell=told.append)
-    assert "this is time 0 of a moving scene" in told[0]
+    assert "time 0 of a moving scene" in told[0]
     edit_scene(run, tmp_path / "a.ply", replace(frame, time=0.75), tell=told.append)
     rows = list(MOVING_ROWS)
     moved = read_splats(tmp_path / "a.ply").gaussians.means[rows, 0]

@@ -36,7 +36,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr, ssim
-from dyngs.export.html import numbers
+from dyngs.export.html import scene_data
 from dyngs.export.html.page import (
     ELEMENT,
     MOST_VIEWS,
@@ -270,7 +270,7 @@ def test_a_long_clip_is_fetched_as_it_is_played(
 ) -> None:
     scene = scene_of_kind("hexplane")
     view = large(onlooker())
-    monkeypatch.setattr(numbers, "CHUNK_BYTES", 60)
+    monkeypatch.setattr(scene_data, "CHUNK_BYTES", 60)
     scene = replace(scene, background=torch.ones(3))
     written = write_page_folder(
         replace(opened_scene(scene), stated_up="-y"), tmp_path / "clip", views=(view,)

@@ -33,7 +33,7 @@ from dyngs.view.server import (
     free_port,
     is_loopback,
     link_to,
-    quiet,
+    silence_viser,
 )
 from dyngs.view.session import Keyframe, Recording
 from dyngs.view.source import open_source
@@ -309,7 +309,7 @@ def test_the_server_asks_the_gate() -> None:
     from websockets.sync.client import connect
 
     port = free_port("127.0.0.1", None)
-    with enforce_access(AccessPolicy("secret")), quiet():
+    with enforce_access(AccessPolicy("secret")), silence_viser():
         server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
     version = f"viser-v{viser.__version__}"
     try:
@@ -326,7 +326,7 @@ def test_the_server_asks_the_gate() -> None:
         with connect(socket_at, additional_headers=cookie, subprotocols=[version]) as opened_socket:  # type: ignore[list-item]
             assert opened_socket.recv(timeout=5)
     finally:
-        with quiet():
+        with silence_viser():
             server.stop()
     assert link_to("::1", 80) == "http://[::1]:80/"
     assert link_to("box", 80, "secret") == "http://box:80/?token=secret"
