@@ -205,7 +205,7 @@ def person(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three cameras, three frames of 32 px."""
     folder = tmp_path_factory.mktemp("capture") / "person"
     return write_human_capture(
-        folder, HumanOptions(size=32, num_frames=3, num_new=2, num_cameras=3, num_test=1)
+        folder, HumanOptions(size=32, num_frames=3, num_pose_frames=2, num_cameras=3, num_test=1)
     )
 
 
@@ -248,8 +248,8 @@ def colmap_root(tmp_path: Path) -> Path:
 @pytest.fixture
 def short_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bodies are fitted to captures in two steps, on squares of 32 px."""
-    effort = FitEffort(side=32, steps=2, visits=0)
-    for name in ("fit_capture", "placed_clip"):
+    effort = FitEffort(side=32, steps=2, draws_per_frame=0)
+    for name in ("fit_capture", "place_new_poses"):
         monkeypatch.setattr(
             fitted_capture, name, partial(getattr(fitted_capture, name), effort=effort)
         )

@@ -31,7 +31,7 @@ from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced, static_cameras
 from dyngs.gaussians.colour.network import fitted_affine, recoloured
-from dyngs.human.avatar.scene import avatar_of
+from dyngs.human.avatar.scene import as_human_scene
 from dyngs.models.renderable import DrawOptions, Renderable, Rendering
 from dyngs.models.views import background_colour
 from dyngs.ops.device import finish
@@ -278,7 +278,7 @@ def score_views(
                 empty = mask is not None and not bool((mask > 0).any())
                 why = "its mask ignores every pixel" if empty else "the image holds NaN or Inf"
                 raise DyngsError(f"view {image.name!r}: {name} is not finite, {why}")
-        if avatar_of(scene) is not None:
+        if as_human_scene(scene) is not None:
             values |= person_scores(image, rendering, background, lpips)
         values |= right_half_scores(image, rendering, background)
         values |= background_scores(image, rendering, background)

@@ -28,7 +28,7 @@ from dyngs.export.rigged.texture import (
     texture_image,
 )
 from dyngs.human.avatar.posing import Anchors, Skeleton, heaviest_joints
-from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.human.avatar.scene import HumanScene, as_human_scene
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body import BodyTemplate, apply_shape
 from dyngs.human.body.body_reader import load_template
@@ -41,7 +41,7 @@ from dyngs.human.body.skinning import (
     joint_transforms,
 )
 from dyngs.human.keys import HumanModel
-from dyngs.human.motion.placement import upright
+from dyngs.human.motion.placement import rotate_clip_to_y_up
 from dyngs.io.formats.gltf import EXTENSION, add_gaussians
 from dyngs.io.formats.ply import write_ply
 from dyngs.io.formats.splat_file import SplatFile, require_writable
@@ -172,7 +172,7 @@ def add_animation(
     """
     joints = rig.skeleton.joints
     parents = rig.skeleton.parents
-    clip = upright(scene.moves_as, scene.clip, joints)
+    clip = rotate_clip_to_y_up(scene.played_clip, scene.clip, joints)
     frames = torch.linspace(0, len(clip) - 1, min(len(clip), _FLOOR_FRAMES), device="cpu").long()
     lowest = []
     for row in frames.tolist():
@@ -293,7 +293,7 @@ def person_and_template(run: LoadedRun, wanted: str) -> tuple[HumanScene, BodyTe
 
     Raises DyngsError: the run is not that of a person, or the template cannot be read.
     """
-    scene = avatar_of(run.scene)
+    scene = as_human_scene(run.scene)
     model = run.config.model
     if scene is None or capability(model, HasBody) is None:
         raise DyngsError(

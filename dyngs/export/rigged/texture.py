@@ -86,14 +86,14 @@ def frontal_colours(scene: HumanScene, normals: Tensor) -> Tensor:
     gaussians = scene.gaussians
     seen_along = -normals
     if scene.colour is not None:
-        upright = scene.playing(
+        upright = scene.with_motion(
             rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
         )
         moment = upright.time_step(None)
         shader = upright.shader(moment)
         if shader is not None:
             gaussians = with_harmonics(moment.gaussians, shader).gaussians
-        posing = frame_pose(upright.moves_as, 0)
+        posing = frame_pose(upright.played_clip, 0)
         skeleton = scene.learned_skeleton
         joints = joint_transforms(skeleton.joints, skeleton.parents, posing.rotations)
         linear = blend_transforms(scene.weights, joints)[..., :3]

@@ -182,7 +182,7 @@ class Outfit:
     size: float = 1.0  # of the person, relative to the template
 
 
-def random_outfit(seed: int, is_usual: bool = False) -> Outfit:
+def random_outfit(seed: int, is_everyday: bool = False) -> Outfit:
     """Return the outfit of ``seed``. 0 is the bare template, painted; others have clothes with
     offsets of up to 4 cm, differ in cut and pattern, and are 0.88 to 1.04 times as tall.
 
@@ -190,7 +190,7 @@ def random_outfit(seed: int, is_usual: bool = False) -> Outfit:
     what is mixed up.
     """
     palette = _palette(seed)
-    if is_usual:
+    if is_everyday:
         palette = _usual(palette, np.random.default_rng([seed, 4]))
     if seed == 0:
         return Outfit(palette)
@@ -422,11 +422,11 @@ _TARGET = np.array([0.0, 0.95, 0.0])  # the point that all cameras look at, m
 
 
 @dataclass(frozen=True)
-class Lamp:
+class DirectionalLight:
     """A distant lamp and light from all sides."""
 
     # (3,) direction to the lamp, of any length
-    towards: tuple[float, float, float] = (0.35, 0.75, 0.56)
+    direction: tuple[float, float, float] = (0.35, 0.75, 0.56)
     # sRGB factors by channel, (3,) or one; ambient + diffuse where the surface faces the lamp
     ambient: tuple[float, ...] = (0.6,)
     diffuse: tuple[float, ...] = (0.45,)
@@ -438,7 +438,7 @@ class HumanOptions:
 
     size: int = 128  # width and height in pixels
     num_frames: int = 12  # frames of the walk, for the splits train and test
-    num_new: int = 6  # frames of another motion, the split ``pose``; 0: no such split
+    num_pose_frames: int = 6  # frames of another motion, the split ``pose``; 0: no such split
     num_cameras: int = 8  # training cameras, on a ring around the person
     # test cameras, each midway between two training cameras; 0: neither test nor ``pose``
     num_test: int = 2
@@ -452,7 +452,7 @@ class HumanOptions:
     # alternately low and high, 3.5 m away
     scene_seed: int | None = None
     # left mostly as right, back as front and bare hands, instead of clothes that differ everywhere
-    usual_clothes: bool = False
+    everyday_clothes: bool = False
     with_depth: bool = False  # whether there are depth maps
 
 
@@ -487,11 +487,11 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
             "a synthetic person needs size, frames and cameras of at least 1, a seed of at least 0"
         )
     body, betas = _person(options.body_seed)
-    outfit, clothed, texture = _dressed(body, options.seed, options.usual_clothes)
+    outfit, clothed, texture = _dressed(body, options.seed, options.everyday_clothes)
     train, test = _cameras(options)
     clips = {"train": (options.num_frames, {"train": train, "test": test})}
-    if options.num_new and test:
-        clips["pose"] = options.num_new, {"pose": test}
+    if options.num_pose_frames and test:
+        clips["pose"] = options.num_pose_frames, {"pose": test}
     with new_folder(out) as started:
         for name, (num_frames, splits) in clips.items():
             clip = _clip(body, num_frames, options.scene_seed, name == "pose")
@@ -520,18 +520,18 @@ def _person(seed: int | None) -> tuple[BodyTemplate, Tensor]:
 
 @lru_cache(maxsize=4)  # several captures of a person, of other clips or cameras, are painted once
 def _dressed(
-    body: BodyTemplate, seed: int, usual_clothes: bool
+    body: BodyTemplate, seed: int, everyday_clothes: bool
 ) -> tuple[Outfit, BodyTemplate, np.ndarray]:
     """Return the clothes of ``seed``, the body with them on, and its texture (S, S, 3)."""
-    outfit = random_outfit(seed, usual_clothes)
+    outfit = random_outfit(seed, everyday_clothes)
     return outfit, dress_body(body, outfit), paint_texture(body, outfit)
 
 
-def random_light(seed: int | None) -> Lamp:
+def random_light(seed: int | None) -> DirectionalLight:
     """Return the light of ``seed``, from any side and above, of which three quarters to all reach a
     white surface that faces it; None: ``Lamp()``."""
     if seed is None:
-        return Lamp()
+        return DirectionalLight()
     make = np.random.default_rng([seed, 3])
     azimuth = make.uniform(-np.pi, np.pi)
     height = make.uniform(0.0, 1.2)
@@ -539,7 +539,7 @@ def random_light(seed: int | None) -> Lamp:
     ambient = make.uniform(0.75, 1.05) - diffuse
     tint = 1.0 + make.uniform(-0.06, 0.06) * np.array([1.0, 0.0, -1.0])
     red, green, blue = (float(diffuse * part) for part in tint)
-    return Lamp(
+    return DirectionalLight(
         (float(np.sin(azimuth)), float(height), float(np.cos(azimuth))),
         (float(ambient),),
         (red, green, blue),
@@ -547,7 +547,11 @@ def random_light(seed: int | None) -> Lamp:
 
 
 def render_mesh(
-    mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples: int, light: Lamp = Lamp()
+    mesh: PosedMesh,
+    world_from_cam: np.ndarray,
+    size: int,
+    samples: int,
+    light: DirectionalLight = DirectionalLight(),
 ) -> np.ndarray:
     """Return sRGB values and straight alpha (size, size, 4) in [0, 1], of ``samples`` x ``samples``
     per pixel.
@@ -668,12 +672,12 @@ def _focal(size: int) -> float:
     return float(0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X))
 
 
-def _shaded(mesh: PosedMesh, fragments: Fragments, light: Lamp) -> np.ndarray:
+def _shaded(mesh: PosedMesh, fragments: Fragments, light: DirectionalLight) -> np.ndarray:
     uv = interpolate(fragments.barycentric, mesh.uv[mesh.uv_faces[fragments.faces]])
     normal = normalized(
         interpolate(fragments.barycentric, mesh.normals[mesh.faces[fragments.faces]])
     )
-    facing = np.maximum(normal @ normalized(np.array(light.towards)), 0.0)
+    facing = np.maximum(normal @ normalized(np.array(light.direction)), 0.0)
     received = np.array(light.ambient) + np.array(light.diffuse) * facing[:, None]
     return np.minimum(_sampled(mesh.texture, uv) * received, 1.0)
 
@@ -688,7 +692,7 @@ def _sampled(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     return np.stack(channels, axis=-1)
 
 
-SHARD = 100
+PEOPLE_PER_FOLDER = 100
 """People in a folder."""
 _MOST = 10**6  # People of one seed, so that those of two seeds share nothing
 
@@ -731,7 +735,7 @@ def write_people(
             f"{out}: holds people of other options ({PEOPLE_FILE}); name a new folder, or give the same"
         )
     for number in range(options.people):
-        person = out / f"s{number // SHARD:04d}" / f"p{number:06d}"
+        person = out / f"s{number // PEOPLE_PER_FOLDER:04d}" / f"p{number:06d}"
         if not person.is_dir():
             write_human_capture(person, person_options(options, number))
         report("people", number + 1, options.people)
@@ -744,12 +748,12 @@ def person_options(options: PeopleOptions, number: int) -> HumanOptions:
     return HumanOptions(
         size=options.size,
         num_frames=options.frames,
-        num_new=0,
+        num_pose_frames=0,
         num_cameras=options.cameras,
         num_test=0,
         seed=seed,
         body_seed=seed,
         scene_seed=seed,
-        usual_clothes=number % 2 == 1,
+        everyday_clothes=number % 2 == 1,
         with_depth=True,
     )

@@ -73,15 +73,15 @@ def test_two_clips_of_the_same_pose_give_the_same_image() -> None:
     other = random_clip(6, seed=6)
     for name in ("poses", "trans", "scale"):
         getattr(other, name)[4] = getattr(one, name)[1]
-    first, second = (seen(scene.playing(c).at(t)) for c, t in ((one, 0.5), (other, 0.8)))
+    first, second = (seen(scene.with_motion(c).at(t)) for c, t in ((one, 0.5), (other, 0.8)))
     assert torch.equal(first, second)
-    assert float((first - seen(scene.playing(one).at(0.0))).abs().max()) > 0.05
+    assert float((first - seen(scene.with_motion(one).at(0.0))).abs().max()) > 0.05
     assert float(first.max()) > 0.2
 
 
 def test_baked_corrections_are_those_of_training() -> None:
     trained = stirred()
-    played = reloaded(trained).moves_as
+    played = reloaded(trained).played_clip
     for row in range(len(trained.clip)):
         posing = corrected_pose(trained.learned, trained.clip, row)
         torch.testing.assert_close(

@@ -43,7 +43,7 @@ BUSY = DefaultStrategy(start=1, stop=30_000, every=4, grow=False, prune_opacity=
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture") / "person"
     return write_human_capture(
-        folder, HumanOptions(size=32, num_frames=3, num_new=2, num_cameras=3, num_test=1)
+        folder, HumanOptions(size=32, num_frames=3, num_pose_frames=2, num_cameras=3, num_test=1)
     )
 
 
@@ -102,7 +102,7 @@ def test_training_learns_and_evaluates_on_both_splits(capture: Path, tmp_path: P
     run = load_run(train(config))
     assert isinstance(run.scene, HumanScene)
     assert isinstance(start, HumanScene)
-    assert float((run.scene.moves_as.poses - start.moves_as.poses).abs().max()) > 0
+    assert float((run.scene.played_clip.poses - start.played_clip.poses).abs().max()) > 0
     for split in ("test", "pose"):
         report = evaluate_run(tmp_path / "run", split)
         assert report.psnr > 18
@@ -228,7 +228,7 @@ def turned(capture: Path, out: Path) -> Path:
 def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pose_fit, "STARTS", (10 / 240,))
+    monkeypatch.setattr(pose_fit, "REFIT_STARTS", (10 / 240,))
     config = tiny(turned(capture, tmp_path / "turned"), steps=240)
     trainer = assemble(config)
     lines = [trainer.step().finding or "" for _ in range(16)]
@@ -247,7 +247,7 @@ def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(
 def test_poses_that_views_gain_nothing_from_stay_for_good(
     capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pose_fit, "STARTS", (10 / 240, 14 / 240))
+    monkeypatch.setattr(pose_fit, "REFIT_STARTS", (10 / 240, 14 / 240))
     trainer = assemble(tiny(capture, steps=240))
     given = human(trainer).clip.poses.clone()
     lines = [trainer.step().finding or "" for _ in range(12)]

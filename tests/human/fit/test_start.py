@@ -20,16 +20,16 @@ from dyngs.human.body.body_reader import default_template
 from dyngs.human.fit.capture_fit import (
     STATURE,
     BodyDiscs,
-    Fitting,
+    BodyFit,
     ObservedFrame,
     body_discs,
-    first_poses,
+    estimate_initial_poses,
     likely_headings,
-    place_and_height,
+    locate_person,
     pose_prior,
     standing_clip,
     up_of,
-    usual_pose,
+    usual_pose_statistics,
 )
 from dyngs.human.motion.motion import MotionClip
 
@@ -81,7 +81,7 @@ def ring(count: int, centre: torch.Tensor, distance: float = 4.0) -> Cameras:
 
 def standing(place: torch.Tensor, heading: float, scale: float = 1.0) -> MotionClip:
     """One frame of the usual pose with the pelvis at ``place``."""
-    poses = usual_pose(55)[0][None].clone()
+    poses = usual_pose_statistics(55)[0][None].clone()
     poses[0, 0] = torch.tensor([0.0, heading, 0.0])
     joints = default_template().joints
     time = torch.zeros(1, dtype=torch.float64)
@@ -89,7 +89,7 @@ def standing(place: torch.Tensor, heading: float, scale: float = 1.0) -> MotionC
 
 
 def seen_by(body: BodyDiscs, clip: MotionClip, cameras: Cameras) -> ObservedFrame:
-    fitting = Fitting(clip, body, pose_prior(clip, is_given=True))
+    fitting = BodyFit(clip, body, pose_prior(clip, is_given=True))
     with torch.no_grad():
         alpha = fitting.silhouettes(fitting.start(), 0, cameras)
     return ObservedFrame(cameras, alpha, torch.ones_like(alpha))
@@ -99,7 +99,7 @@ def test_place_and_size_of_who_stands_somewhere(body: BodyDiscs) -> None:
     place = torch.tensor([1.0, 2.0, -3.0])
     seen = seen_by(body, standing(place, 0.3, scale=1.2), ring(4, place))
     assert up_of(seen) == pytest.approx([0, 1, 0], abs=1e-6)
-    found, height = place_and_height(seen, up_of(seen))
+    found, height = locate_person(seen, up_of(seen))
     assert found == pytest.approx(place, abs=0.2)  # the middle of the box is not the pelvis
     assert height == pytest.approx(1.2 * STATURE, rel=0.1)
     clip = standing_clip(torch.zeros(1, dtype=torch.float64), body, up_of(seen), lambda _: seen)
@@ -111,7 +111,7 @@ def test_the_heading_is_found(body: BodyDiscs, monkeypatch: pytest.MonkeyPatch) 
     place = torch.tensor([0.0, 1.0, 0.0])
     heading = 2.0
     seen = seen_by(body, standing(place, heading), ring(3, place))
-    clip = first_poses(torch.zeros(1, dtype=torch.float64), body, lambda _: seen)
+    clip = estimate_initial_poses(torch.zeros(1, dtype=torch.float64), body, lambda _: seen)
     facing = Rotation.from_rotvec(clip.poses[0, 0].double().numpy()).apply([0.0, 0.0, 1.0])
     # few steps, from 45 degrees apart
     assert facing @ np.array([math.sin(heading), 0.0, math.cos(heading)]) > 0.8
@@ -129,7 +129,7 @@ def test_who_turns_before_one_camera_is_followed(
     turns = [0.4 * math.pi + x for x in (0.1, 1.6, 3.1)]
     seen = [with_joints(body, standing(place, turn), camera) for turn in turns]
     times = torch.linspace(0, 1, 3, dtype=torch.float64)
-    clip = first_poses(times, body, seen.__getitem__)
+    clip = estimate_initial_poses(times, body, seen.__getitem__)
     for root, turn in zip(clip.poses[:, 0], turns, strict=True):
         facing = Rotation.from_rotvec(root.double().numpy()).apply([0.0, 0.0, 1.0])
         assert facing @ np.array([math.sin(turn), 0.0, math.cos(turn)]) > 0.8
