@@ -22,7 +22,7 @@ from dyngs.human.fit.fitted_capture import (
     FitInputs,
     ensure_fitted_body,
     read_person_capture,
-    write_body,
+    write_body_file,
     write_fitted_capture,
     write_split,
 )
@@ -209,7 +209,7 @@ def test_a_fit_far_from_the_origin_is_written_exactly(data: DataConfig, tmp_path
     clip = captured_motion(data.root, capture.body["train"], capture.splits["train"], body.joints)
     offset = np.array([500_000.0, 4_600_000.0, 120.0])
     far = capture.replace(world_offset=offset, world_scale=0.25)
-    write_body(tmp_path / "body.npz", clip, body, np.zeros(10), far)
+    write_body_file(tmp_path / "body.npz", clip, body, np.zeros(10), far)
     near = moved(read_body_file(tmp_path / "body.npz"), offset, 4.0)
     np.testing.assert_allclose(near.trans, clip.clip.trans.numpy(), rtol=0, atol=1e-8)
     np.testing.assert_array_equal(near.scale, clip.clip.scale.numpy())
