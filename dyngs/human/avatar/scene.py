@@ -19,7 +19,7 @@ from dyngs.core.tensor_checks import (
 )
 from dyngs.data.capture import Capture, Split
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.colour.network import RestFrame
+from dyngs.gaussians.colour.network import RestPose
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.human.avatar.posing import (
@@ -179,7 +179,7 @@ class HumanScene(GaussianScene, Posable):
         """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable
         in the pose."""
         gaussians = self._posed(posing, self.weights, self.learned_skeleton, self.light)
-        frame = RestFrame(self.gaussians.means, posing.rotations[0])
+        frame = RestPose(self.gaussians.means, posing.rotations[0])
         return GaussianTimeStep(gaussians, time, frame)
 
     def _posed(
