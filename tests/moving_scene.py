@@ -76,8 +76,8 @@ class Lines(DeformationField):
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         return Offsets((2 * time - 1) * chosen(self.parameters["means"], rows)[:, 0])
 
-    def edited(self, edit: TopologyEdit) -> Lines:
-        return self.with_parameters(self.parameters.edited(Role.PER_MOVING, edit))
+    def apply_edit(self, edit: TopologyEdit) -> Lines:
+        return self.with_parameters(self.parameters.apply_edit(Role.PER_MOVING, edit))
 
 
 def row_of_balls(count: int = 5) -> Gaussians:
@@ -110,7 +110,7 @@ def sliding_nodes() -> ControlNodes:
 
 def still_scene(count: int = 5, times: tuple[float, ...] = ()) -> StaticScene:
     """A scene in which nothing moves."""
-    return StaticScene(gaussians=row_of_balls(count), seen_at=times)
+    return StaticScene(gaussians=row_of_balls(count), training_times=times)
 
 
 def moving_scene(
@@ -120,7 +120,7 @@ def moving_scene(
 ) -> DynamicScene:
     """Five balls of which ``rows`` follow ``motion``."""
     return DynamicScene(
-        gaussians=row_of_balls(), seen_at=times, field=motion, moving=torch.tensor(rows)
+        gaussians=row_of_balls(), training_times=times, field=motion, moving=torch.tensor(rows)
     )
 
 

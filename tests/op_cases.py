@@ -13,11 +13,11 @@ from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.ops.adam import adam_step_, seen_rows
-from dyngs.ops.hash_grid import HashLevels, hash_features, known_features
+from dyngs.ops.hash_grid import HashLevels, hash_features, select_features
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.nodes import HEAD_SIZES, node_penalties, spline_motion
 from dyngs.ops.patches import (
-    Places,
+    PatchSamples,
     blend_patches,
     outline_crossings,
     patch_values,
@@ -28,7 +28,7 @@ from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.projection import project
 from dyngs.ops.rasterization import Tally, tally
-from dyngs.ops.rays import Rays, Space, Steps, composite, march, reached
+from dyngs.ops.rays import MarchSteps, Rays, Space, composite, march, reached
 from dyngs.ops.registration import count_nonfinite_op
 from dyngs.ops.shading import shading_inputs
 from dyngs.ops.skinning import add_offsets_, blend_skinning, offset_gradients
@@ -253,10 +253,10 @@ def field_case(count: int, dtype: torch.dtype) -> Case:
     shifts = numbers.uniform(count)
 
     def run(table: Tensor) -> list[Tensor]:
-        samples = march(rays, shifts, space, occupied, Steps(0.05, 0.05, 0.01))
+        samples = march(rays, shifts, space, occupied, MarchSteps(0.05, 0.05, 0.01))
         features = hash_features(samples.coords, table, levels)
         some = torch.arange(0, len(samples), 3)
-        again = known_features(features.detach(), some, samples.coords[some], table, levels)
+        again = select_features(features.detach(), some, samples.coords[some], table, levels)
         densities = features[:, 0].exp()
         which, offsets = reached(densities, samples, 0.1)
         seen = composite(densities, features[:, 1:4].sigmoid(), samples, 0.0)
@@ -277,7 +277,7 @@ def patches_case(count: int, dtype: torch.dtype) -> Case:
     cameras = Cameras(pose, inner, 24, 20)
 
     def run(colours: Tensor, points: Tensor) -> list[Tensor]:
-        places = Places.of(*visible_patches(points, cameras, 0.2))
+        places = PatchSamples.of(*visible_patches(points, cameras, 0.2))
         shown = patch_values(colours, places.ids, places.uv)
         crossings = outline_crossings(points, cameras, places)
         at = patch_values(points, places.ids, places.uv)

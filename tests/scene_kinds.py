@@ -13,7 +13,7 @@ from dyngs.deform.fields import OPEN, WindowedField
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.colour.network import ColourNetwork, box_around
+from dyngs.gaussians.colour.network import ColourNetwork, robust_bounding_box
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.gaussians.visibility import VisibilityMasks
@@ -38,7 +38,7 @@ def scene_of_kind(kind: str) -> GaussianScene:
     clip."""
     std = 0.01 + torch.arange(9.0) / 100
     if kind == "static":
-        return StaticScene(gaussians=cloud(), filter_std=std, seen_at=SEEN_AT)
+        return StaticScene(gaussians=cloud(), filter_std=std, training_times=SEEN_AT)
     if kind == "human":
         return _person()
     masks = None
@@ -51,7 +51,7 @@ def scene_of_kind(kind: str) -> GaussianScene:
         field.edges.data[:] = torch.tensor([[0.1, 0.4], [0.3, 1.2], [-0.1, 0.8], OPEN])
     return DynamicScene(
         gaussians=cloud(),
-        seen_at=SEEN_AT,
+        training_times=SEEN_AT,
         field=field,
         moving=MOVING,
         filter_std=std,
@@ -66,10 +66,10 @@ def restored(kind: str, state: State) -> GaussianScene:
     gaussians = Gaussians.stored(part_of(tensors, "gaussians"))
     own = part_of(tensors, "model")
     if kind == "static":
-        return StaticScene.restored(gaussians, own)
+        return StaticScene.from_state(gaussians, own)
     if kind == "human":
-        return HumanScene.restored(gaussians, own)
-    return DynamicScene.restored(DynamicModel(deform=tiny_options(_field(kind))), gaussians, own)
+        return HumanScene.from_state(gaussians, own)
+    return DynamicScene.from_state(DynamicModel(deform=tiny_options(_field(kind))), gaussians, own)
 
 
 def onlooker() -> Cameras:
@@ -84,12 +84,12 @@ def _field(kind: str) -> str:
 
 def _network() -> ColourNetwork:
     generator = torch.Generator().manual_seed(5)
-    inputs = num_inputs(sees_time=True, sees_normals=True)
+    inputs = num_inputs(uses_time=True, uses_normals=True)
     sizes = ((8, inputs), (3, 8))
     layers = [
         Layer(0.3 * torch.randn(size, generator=generator), torch.zeros(size[0])) for size in sizes
     ]
-    return ColourNetwork(tuple(layers), box_around(cloud().means), True, True)
+    return ColourNetwork(tuple(layers), robust_bounding_box(cloud().means), True, True)
 
 
 def _person() -> HumanScene:

@@ -134,8 +134,10 @@ class ScaledScene(GaussianScene):
         )
         return drawn if drawn.depth is None else replace(drawn, depth=self.scale * drawn.depth)
 
-    def edited(self, edit: TopologyEdit) -> ScaledScene:
-        return replace(self, scene=self.scene.edited(edit), gaussians=self.gaussians.edited(edit))
+    def apply_edit(self, edit: TopologyEdit) -> ScaledScene:
+        return replace(
+            self, scene=self.scene.apply_edit(edit), gaussians=self.gaussians.apply_edit(edit)
+        )
 
     def state(self) -> State:
         return self.scene.state()

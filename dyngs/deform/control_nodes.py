@@ -29,9 +29,9 @@ from dyngs.deform.field import (
     DeformationField,
     FieldSetup,
     Offsets,
-    chosen,
     head_sizes,
     offsets_of,
+    select_rows,
 )
 from dyngs.deform.keys import ControlNodesField
 from dyngs.gaussians import TopologyEdit
@@ -79,7 +79,7 @@ def nodes_at(positions: Tensor, means: Tensor) -> Nodes:
     return Nodes(positions, radii.clamp_min(floor).to(positions), followed)
 
 
-def spread_out(points: Tensor, count: int, taken: Tensor) -> Tensor:
+def farthest_points(points: Tensor, count: int, taken: Tensor) -> Tensor:
     """Return indices of at most ``count`` ``points`` (M, 3), each the farthest from those before it
     and from ``taken``.
 
@@ -120,7 +120,7 @@ def follow(
     return offsets_of(moved, blended, heads)
 
 
-def turned(offsets: Tensor, vectors: Tensor) -> Tensor:
+def rotate_by_offsets(offsets: Tensor, vectors: Tensor) -> Tensor:
     """Return (..., 3) ``vectors`` turned by the rotations identity + ``offsets`` (..., 4), of any
     length."""
     return rotate(offsets + identity_quat(offsets), vectors)
@@ -174,7 +174,7 @@ class ControlNodes(DeformationField):
         self.buffers = {"positions": NOTHING}
         self.parameters = self._untrained(0)
 
-    def restored(self, tensors: Mapping[str, Tensor]) -> ControlNodes:
+    def with_state(self, tensors: Mapping[str, Tensor]) -> ControlNodes:
         buffers = part_of(tensors, "buffers")
         count = len(buffers["positions"])
         require_tensor("positions", buffers["positions"], (count, 3))
@@ -185,7 +185,7 @@ class ControlNodes(DeformationField):
                 require_indices(name, buffers[name], (length, None), count)
         field = copy.copy(self)
         lengths = dict.fromkeys(head_sizes(self.options), count)
-        field.parameters = self._untrained(0).restored(part_of(tensors, "learned"), lengths)
+        field.parameters = self._untrained(0).with_state(part_of(tensors, "learned"), lengths)
         field.buffers = buffers
         return field
 
@@ -200,14 +200,14 @@ class ControlNodes(DeformationField):
     def num_values(self) -> int:
         return self.parameters.num_values + sum(x.numel() for x in self.buffers.values())
 
-    def edited(self, edit: TopologyEdit) -> ControlNodes:
+    def apply_edit(self, edit: TopologyEdit) -> ControlNodes:
         field = copy.copy(self)
         field.buffers = {
             n: edit.apply(x) if n == "followed" else x for n, x in self.buffers.items()
         }
         return field
 
-    def regroup(self) -> None:
+    def invalidate(self) -> None:
         self.buffers.pop("followed", None)
 
     def to(self, device: torch.device | str) -> ControlNodes:
@@ -245,8 +245,8 @@ class ControlNodes(DeformationField):
         self, means: Tensor, rows: Tensor | None, motion: Tensor, values: Tensor
     ) -> Offsets:
         nodes = self.nodes_for(means)
-        nodes = replace(nodes, followed=chosen(nodes.followed, rows))
-        return follow(nodes, chosen(means, rows), motion, values, head_sizes(self.options))
+        nodes = replace(nodes, followed=select_rows(nodes.followed, rows))
+        return follow(nodes, select_rows(means, rows), motion, values, head_sizes(self.options))
 
     def _penalties(self, motion: Tensor) -> dict[str, Tensor]:
         """Return the nodes' acceleration and their neighbours' deviation from rigid motion, in
@@ -316,12 +316,12 @@ class ControlNodes(DeformationField):
         kept = torch.zeros(0, dtype=torch.long, device=means.device)
         if len(old):
             kept = nodes_at(old, means).followed[:, 0].unique()
-        added = spread_out(means, self.options.nodes - len(kept), old[kept])
+        added = farthest_points(means, self.options.nodes - len(kept), old[kept])
         source = torch.cat([kept, torch.zeros(len(added), dtype=torch.long, device=kept.device)])
         is_new = torch.arange(len(source), device=source.device) >= len(kept)
         started = self._motion_at(means[added])
         values = {name: torch.cat([x[kept], started[name]]) for name, x in self._splines().items()}
-        self.parameters = self.parameters.rearranged(values, source, is_new)
+        self.parameters = self.parameters.reorder(values, source, is_new)
         self._assign(torch.cat([old[kept], means[added]]), means)
 
     def _assign(self, positions: Tensor, means: Tensor) -> None:
@@ -346,6 +346,6 @@ class ControlNodes(DeformationField):
             arms = (points[:, None] - nodes.positions[nodes.followed])[:, :, None].expand(
                 -1, -1, self.num_points, -1
             )
-            swing = turned(splines["quats"][nodes.followed], arms) - arms
+            swing = rotate_by_offsets(splines["quats"][nodes.followed], arms) - arms
             started["means"] = started["means"] + torch.einsum("mb,mbpd->mpd", weights, swing)
         return started

@@ -42,7 +42,7 @@ from dyngs.models.checkpoint import OTHER_CONFIG, read_capture_of
 from dyngs.models.kind import Moves, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
-from dyngs.ops.device import CPU, device_for
+from dyngs.ops.device import CPU, select_device
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
@@ -231,7 +231,7 @@ def evaluate_run(
     that refined its cameras. ``data_root``: where the capture lies by now. ``capture``: of the run,
     if it was read already.
     """
-    draws_on = device_for(device)
+    draws_on = select_device(device)
     inputs_of(run_dir).require_output(report_path(run_dir, split))
     if refine_poses and split == "train":
         raise DyngsError(

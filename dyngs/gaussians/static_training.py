@@ -16,11 +16,16 @@ from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate
+from dyngs.gaussians.initialization import (
+    build_colour_training,
+    build_densifier,
+    build_filter_update,
+    load_or_create_gaussians,
+)
 from dyngs.gaussians.model import GaussianModel, SceneTraining
 from dyngs.gaussians.optimizer import FrozenMask
 from dyngs.gaussians.rendering import contributions
-from dyngs.gaussians.scene import drawn_as_trained
-from dyngs.gaussians.start import colours_of, densifier_of, filter_update, first_gaussians
+from dyngs.gaussians.scene import restore_appearance
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
@@ -32,7 +37,7 @@ SURVEYED = 200
 
 
 @dataclass(frozen=True)
-class SmallRemoval:
+class SmallGaussianPruning:
     """Removal, once, of Gaussians that amount to less than ``pixels`` in every one of some views.
 
     What a Gaussian amounts to is its blending weight, summed over an image: 1 for a pixel that
@@ -58,18 +63,20 @@ class SmallRemoval:
             f"{len(scene) - int(kept.sum()):,} of {len(scene):,} Gaussians are removed: each makes up less than "
             f"{self.pixels:g} px of every training view (strategy.prune_pixels)"
         )
-        return EditResult(TopologyEdit.select(kept), finding=text)
+        return EditResult(TopologyEdit.select(kept), message=text)
 
 
-def small_removal(run: RunStart) -> SmallRemoval:
+def build_small_pruning(run: RunStart) -> SmallGaussianPruning:
     """Return when and by which views Gaussians of a run are removed: when no more are added."""
     config = run.config
     strategy = run.config.strategy
     if not (isinstance(strategy, DefaultStrategy) and strategy.prune_pixels > 0):
-        return SmallRemoval()
+        return SmallGaussianPruning()
     views = run.capture.splits["train"]
     cameras = training_cameras([views[i] for i in evenly_spaced(len(views), SURVEYED)], config.data)
-    return SmallRemoval(scaled(strategy.stop, config.train.steps), strategy.prune_pixels, cameras)
+    return SmallGaussianPruning(
+        scaled(strategy.stop, config.train.steps), strategy.prune_pixels, cameras
+    )
 
 
 class StaticTraining(SceneTraining[StaticScene]):
@@ -81,12 +88,12 @@ class StaticTraining(SceneTraining[StaticScene]):
     def __init__(
         self,
         update: FilterUpdate,
-        removal: SmallRemoval = SmallRemoval(),
-        still: FrozenMask | None = None,
+        removal: SmallGaussianPruning = SmallGaussianPruning(),
+        frozen_mask: FrozenMask | None = None,
     ) -> None:
-        self._update, self._removal, self._still = update, removal, still
+        self._update, self._removal, self._still = update, removal, frozen_mask
 
-    def still(self) -> FrozenMask | None:
+    def frozen_mask(self) -> FrozenMask | None:
         return self._still
 
     def follow(self, edit: TopologyEdit) -> None:
@@ -105,18 +112,18 @@ class StaticTraining(SceneTraining[StaticScene]):
             return replace(scene, filter_std=self._update.of(scene.gaussians))
         return scene
 
-    def revised(self, scene: StaticScene, step: int) -> tuple[StaticScene, EditResult] | None:
+    def edit_scene(self, scene: StaticScene, step: int) -> tuple[StaticScene, EditResult] | None:
         rows = None if self._still is None else self._still.rows
         result = self._removal.edit(scene, rows) if step == self._removal.step else None
         if result is None or result.edit is None:
             return None
-        return scene.edited(result.edit), result
+        return scene.apply_edit(result.edit), result
 
-    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
+    def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
         if self._still is not None and "frozen" in tensors:
             frozen = require_tensor("frozen", tensors["frozen"], (len(gaussians),), torch.bool)
             self._still = replace(self._still, rows=frozen.to(gaussians.means.device))
-        return StaticScene.restored(gaussians, tensors)
+        return StaticScene.from_state(gaussians, tensors)
 
 
 def _still(run: RunStart) -> FrozenMask | None:
@@ -127,15 +134,17 @@ def _still(run: RunStart) -> FrozenMask | None:
 
 def start(run: RunStart) -> GaussianModel:
     """Return the model of a static scene before its first step."""
-    gaussians = first_gaussians(run)
-    colours = colours_of(run, gaussians, sees_time=False)
-    training = StaticTraining(filter_update(run), small_removal(run), _still(run))
-    return GaussianModel(run, training.first_scene(gaussians), training, densifier_of(run), colours)
+    gaussians = load_or_create_gaussians(run)
+    colours = build_colour_training(run, gaussians, uses_time=False)
+    training = StaticTraining(build_filter_update(run), build_small_pruning(run), _still(run))
+    return GaussianModel(
+        run, training.first_scene(gaussians), training, build_densifier(run), colours
+    )
 
 
 def restore(model: SceneModel, checkpoint: Checkpoint) -> StaticScene:
     """Return the scene of a checkpoint."""
-    scene = StaticScene.restored(
+    scene = StaticScene.from_state(
         Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
     )
-    return drawn_as_trained(scene, model, checkpoint)
+    return restore_appearance(scene, model, checkpoint)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import cloud, stirred_field, tiny_setup
 from torch import Tensor
 
-from dyngs.deform.field import DeformationField, Offsets, deformed
+from dyngs.deform.field import DeformationField, Offsets, apply_offsets
 from dyngs.deform.training import PX_PER_OPACITY, bake_, measure_motion
 from dyngs.gaussians.optimizer import Parameters
 
@@ -40,7 +40,7 @@ def score(script: Callable[[Tensor, float], Offsets], px_size: Tensor | None = N
     return measure_motion(Scripted(script), gaussians, TIMES, size)[0]
 
 
-def still(means: Tensor) -> Tensor:
+def static(means: Tensor) -> Tensor:
     return torch.zeros_like(means)
 
 
@@ -60,10 +60,10 @@ def test_turning_and_growing_count_by_the_size_of_the_gaussian() -> None:
     longest = cloud(4).scales.amax(1)
 
     def turn(means: Tensor, t: float) -> Offsets:
-        return Offsets(still(means), filled(len(means), 0.0, 0.0, 0.0, 0.01 * (2 * t - 1)))
+        return Offsets(static(means), filled(len(means), 0.0, 0.0, 0.0, 0.01 * (2 * t - 1)))
 
     def growth(means: Tensor, t: float) -> Offsets:
-        return Offsets(still(means), None, filled(len(means), 0.0, 0.1 * (2 * t - 1), 0.0))
+        return Offsets(static(means), None, filled(len(means), 0.0, 0.1 * (2 * t - 1), 0.0))
 
     torch.testing.assert_close(score(turn), 0.02 * longest)
     torch.testing.assert_close(score(growth), 0.1 * longest)
@@ -73,10 +73,10 @@ def test_opacity_and_colour_count_whatever_the_size_of_a_pixel() -> None:
     gaussians = cloud(4)
 
     def fade(means: Tensor, t: float) -> Offsets:
-        return Offsets(still(means), logit_opacities=torch.full((len(means),), 2 * t - 1))
+        return Offsets(static(means), logit_opacities=torch.full((len(means),), 2 * t - 1))
 
     def blush(means: Tensor, t: float) -> Offsets:
-        return Offsets(still(means), colors=filled(len(means), 0.1 * (2 * t - 1), 0.0, 0.05 * t))
+        return Offsets(static(means), colors=filled(len(means), 0.1 * (2 * t - 1), 0.0, 0.05 * t))
 
     px_size = torch.tensor([0.01, 0.1, 1.0, 0.3])
     logits = gaussians.logit_opacities
@@ -96,7 +96,7 @@ def test_baking_freezes_at_the_mean(everything: bool) -> None:
     samples = [field.offsets(gaussians.means, t).means.detach() for t in TIMES]
     torch.testing.assert_close(mean.means, torch.stack(samples).mean(0))
     rows = torch.tensor([1, 4, 8])
-    expected = deformed(gaussians, mean.select(rows), rows)
+    expected = apply_offsets(gaussians, mean.select(rows), rows)
     baked = gaussians.replace(
         **{k: x.clone().requires_grad_() for k, x in gaussians.tensors().items()}
     )

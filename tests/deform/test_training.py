@@ -35,7 +35,7 @@ from dyngs.deform.schedule import DeformSchedule
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import GaussianOptimizer
 from dyngs.gaussians.rendering import render
-from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.schedule import RateSchedule
 
 # --- phases
 # -----------------------------------------------------------------------------------------------------------
@@ -61,7 +61,7 @@ ERRORS = (0.01, 0.3, 0.02, 0.35, 0.03, 0.0, 0.31, 0.02, 0.01)
 
 def test_what_a_still_model_cannot_explain_moves() -> None:
     """And only after the last step of the coarse phase."""
-    run = new_run(flat_cloud(), still_errors=lambda _: alike(torch.tensor(ERRORS)))
+    run = new_run(flat_cloud(), static_errors=lambda _: alike(torch.tensor(ERRORS)))
     result = run.grow(FINE)
     assert run.scene.rows.tolist() == [1, 3, 6]
     assert run.scene.num_moving == 3
@@ -97,7 +97,7 @@ def test_small_errors_are_no_motion(
     gaussians = flat_cloud()
     run = new_run(
         gaussians,
-        still_errors=lambda _: alike(torch.tensor(errors)),
+        static_errors=lambda _: alike(torch.tensor(errors)),
         motion_threshold=motion_threshold,
         num_random_moving=5,
     )
@@ -120,7 +120,7 @@ def test_random_gaussians_move_too(kind: str) -> None:
     gaussians = flat_cloud()
     run = new_run(
         gaussians,
-        still_errors=lambda _: alike(torch.tensor(ERRORS)),
+        static_errors=lambda _: alike(torch.tensor(ERRORS)),
         num_random_moving=4,
         deform=tiny_options(kind),
     )
@@ -160,7 +160,7 @@ def test_motion_is_learned_from_images(kind: str) -> None:
     )
     steps = 150
     run = begun(gaussians, times=TIMES[::3], deform=options, motion_sparsity=0.0)
-    run.training.schedule = DeformSchedule(0, 0, 0, 0, (), Rates(steps))
+    run.training.schedule = DeformSchedule(0, 0, 0, 0, (), RateSchedule(steps))
     shift = torch.tensor([0.3, 0.0, 0.0])
     times = [(7 * i % 11) / 10 for i in range(steps)]
     for step, time in enumerate(times, start=1):
@@ -193,11 +193,11 @@ def test_where_cameras_stay_nothing_moves_that_images_show_still(
     in_place: bool, kept: list[int]
 ) -> None:
     """Four move by far, the fourth least; the images say of two that they are like the median."""
-    still = 0.2 * DynamicModel().motion_threshold
+    static = 0.2 * DynamicModel().motion_threshold
     moving = 0.3 * DynamicModel().motion_threshold
-    errors = alike(torch.tensor([still, moving, moving, moving]))
+    errors = alike(torch.tensor([static, moving, moving, moving]))
     gaussians = flat_cloud(4)
-    run = begun(gaussians, still_errors=lambda _: errors, cameras_stay=in_place)
+    run = begun(gaussians, static_errors=lambda _: errors, has_fixed_cameras=in_place)
     move(run, torch.tensor([0.1, 0.0, 0.1, 0.1]))
     run.after_step(SPLIT)
     assert run.scene.rows.tolist() == kept
@@ -318,14 +318,14 @@ def test_state_goes_round(kind: str, phase: str) -> None:
         run.after_step(SPLIT)
     other = new_run(gaussians, deform=deform)
     stored = {name: x.clone() for name, x in run.model_state.items()}
-    other.scene = other.training.restored(gaussians, stored)
+    other.scene = other.training.restore(gaussians, stored)
     assert other.model_state.keys() == run.model_state.keys()
     assert all(torch.equal(x, other.model_state[name]) for name, x in run.model_state.items())
     assert other.scene.num_moving == run.scene.num_moving
     for time in (0.0, 0.4):
         for name, x in run.drawn_at(time).tensors().items():
             assert torch.equal(x, other.drawn_at(time).tensors()[name]), name
-    assert other.training.restored(gaussians, {}).field is None
+    assert other.training.restore(gaussians, {}).field is None
 
 
 # --- fixed cameras
@@ -341,12 +341,12 @@ def test_motion_begins_where_fixed_cameras_see_changes() -> None:
     begin = partial(
         new_run, flat_cloud(), times, deform=FreeField(), num_random_moving=800, full=FINE + 20
     )
-    run = begin(still_errors=lambda _: errors, motion_threshold=0.1, time_window=0.2)
-    run.training.capture = replace(run.training.capture, standing=lambda: footage)
+    run = begin(static_errors=lambda _: errors, motion_threshold=0.1, time_window=0.2)
+    run.training.capture = replace(run.training.capture, fixed_clips=lambda: footage)
     result = run.grow(FINE)
     assert result is not None
-    assert result.finding is not None
-    assert "found at 8 of 8 times" in result.finding
+    assert result.message is not None
+    assert "found at 8 of 8 times" in result.message
     assert run.training.trains_on(0.0, FINE + 1)
     copies = 3 * len(times)  # of the static Gaussians that move: one for each time
     assert copies < run.scene.num_moving <= copies + 2 * 800
@@ -355,5 +355,5 @@ def test_motion_begins_where_fixed_cameras_see_changes() -> None:
         ball = now.means[now.opacities > 0.5]
         assert len(ball) > 50
         assert (ball.median(0).values - torch.tensor([0.0, 0.1, 1.6 * time - 0.8])).norm() < 0.1
-    scene = begin().training.restored(run.scene.gaussians, run.model_state)
+    scene = begin().training.restore(run.scene.gaussians, run.model_state)
     torch.testing.assert_close(scene.at(0.3).means, run.scene.at(0.3).means)

@@ -9,12 +9,12 @@ import pytest
 import torch
 from seen_ball import HIGH, LOW, RADIUS, views
 
-from dyngs.gaussians.surface import Mesh, colours_of, fused, simplified
+from dyngs.gaussians.surface import Mesh, fuse_depths, sample_colours, simplify_mesh
 
 
 @cache
 def ball() -> Mesh:
-    found = fused(views(), LOW, HIGH, 40)
+    found = fuse_depths(views(), LOW, HIGH, 40)
     assert found is not None
     return found
 
@@ -31,7 +31,7 @@ def test_the_surface_is_where_all_views_see_it() -> None:
 
 @pytest.mark.parametrize("most", [40, 300, 10**6])
 def test_it_has_as_few_triangles_as_asked_for(most: int) -> None:
-    mesh = simplified(ball(), most)
+    mesh = simplify_mesh(ball(), most)
     assert min(most, len(ball().faces)) / 3 < len(mesh.faces) <= most
     assert np.abs(radii(mesh) - RADIUS).max() < 0.3
     assert (np.diff(np.sort(mesh.faces, axis=1), axis=1) > 0).all()
@@ -53,7 +53,7 @@ def test_joined_vertices_lie_where_planes_meet() -> None:
         for s in (-1, 1)
     ]
     faces = np.concatenate([flat + k * 441 for k in range(6)])
-    mesh = simplified(Mesh(np.concatenate(sides) + 1e-3, faces), 100)
+    mesh = simplify_mesh(Mesh(np.concatenate(sides) + 1e-3, faces), 100)
     for x in (-1, 1):
         for y in (-1, 1):
             distance = np.linalg.norm(mesh.vertices - np.array([x, y, 1]), axis=1).min()
@@ -62,7 +62,7 @@ def test_joined_vertices_lie_where_planes_meet() -> None:
 
 def test_colours_are_those_of_the_views_that_show_a_point() -> None:
     points = torch.tensor([[RADIUS, 0.0, 0.0], [-RADIUS, 0.0, 0.0], [0.0, 0.0, 9.0]])
-    colours = colours_of(views(), points, 0.1)
+    colours = sample_colours(views(), points, 0.1)
     torch.testing.assert_close(colours[0], torch.tensor([1.0, 0, 0]), atol=0.02, rtol=0)
     torch.testing.assert_close(colours[1], torch.zeros(3), atol=0.02, rtol=0)
     torch.testing.assert_close(colours[2], torch.full((3,), 0.5))

@@ -30,7 +30,7 @@ def _stored(optimizer: GaussianOptimizer) -> dict[str, torch.Tensor]:
 
 def _restored(tensors: dict[str, torch.Tensor]) -> GaussianOptimizer:
     parameters = Gaussians(**part_of(tensors, "gaussians"))
-    return GaussianOptimizer(_gaussians(2, seed=9), OptimConfig()).restored(parameters, tensors)
+    return GaussianOptimizer(_gaussians(2, seed=9), OptimConfig()).with_state(parameters, tensors)
 
 
 def _set_gradients(
@@ -47,11 +47,11 @@ def test_gaussians_that_rest_are_left_alone_where_they_are_not_seen() -> None:
     """Of two that are not seen only the one that rests; one that is seen moves, be it at rest else
     or not."""
     optimizer = GaussianOptimizer(_gaussians(5), OptimConfig())
-    resting = torch.tensor([0, 3])
+    skip_unseen_rows = torch.tensor([0, 3])
     for step in (1, 2):
         before = _stored(optimizer)
         _set_gradients(optimizer, step, unseen=[1, 3] if step == 2 else [])
-        optimizer.step(step, 0.1, resting=resting)
+        optimizer.step(step, 0.1, skip_unseen_rows=skip_unseen_rows)
     for name, x in _stored(optimizer).items():
         if "." in name and name.startswith(("gaussians", "exp_avg.")):
             changed = (x != before[name]).flatten(1).any(1) if x.ndim > 1 else x != before[name]
@@ -63,7 +63,7 @@ def test_of_frozen_gaussians_only_the_base_colour_learns() -> None:
     frozen = torch.tensor([False, True, True, False])
     before = optimizer.parameters.sh.detach().clone()
     _set_gradients(optimizer, 1)
-    optimizer.step(1, 0.1, frozen_rest=frozen)
+    optimizer.step(1, 0.1, frozen_harmonics=frozen)
     changed = optimizer.parameters.sh.detach() != before
     assert changed[:, 0].all()
     assert changed[:, 1:].flatten(1).any(1).tolist() == [True, False, False, True]
@@ -79,7 +79,7 @@ def test_dropped_harmonics_stay_zero(frozen: tuple[bool, ...]) -> None:
     before = _stored(optimizer)
     rows = torch.tensor(frozen)
     base = torch.full((3, 3), 0.7)
-    optimizer.drop_rest(base, rows)
+    optimizer.drop_harmonics(base, rows)
     after = _stored(optimizer)
     assert torch.equal(after["gaussians.sh"][rows, 0], base[rows])
     assert not after["gaussians.sh"][rows, 1:].any()
@@ -94,7 +94,7 @@ def test_dropped_harmonics_stay_zero(frozen: tuple[bool, ...]) -> None:
     for each in (optimizer, other):
         for x in each.parameters.tensors().values():
             x.grad = torch.ones_like(x)
-        each.step(2, 0.1, frozen_rest=rows)
+        each.step(2, 0.1, frozen_harmonics=rows)
         assert not each.parameters.sh[rows, 1:].any()
     assert torch.equal(optimizer.parameters.sh, other.parameters.sh)
 

@@ -76,8 +76,8 @@ class _LiftedScene(GaussianScene):
             self.gaussians.replace(means=self.gaussians.means + torch.tensor([0.0, 0.0, 0.1])), time
         )
 
-    def edited(self, edit: TopologyEdit) -> _LiftedScene:
-        return replace(self, gaussians=self.gaussians.edited(edit))
+    def apply_edit(self, edit: TopologyEdit) -> _LiftedScene:
+        return replace(self, gaussians=self.gaussians.apply_edit(edit))
 
     def _model_state(self) -> State:
         return {}
@@ -110,7 +110,7 @@ class _Lifted(SceneTraining[_LiftedScene]):
     def after_step(self, scene: _LiftedScene, step: int, edited: bool) -> _LiftedScene:
         return scene
 
-    def revised(self, scene: _LiftedScene, step: int) -> tuple[_LiftedScene, EditResult] | None:
+    def edit_scene(self, scene: _LiftedScene, step: int) -> tuple[_LiftedScene, EditResult] | None:
         return None
 
     def window(self, step: int) -> tuple[float, float]:
@@ -121,7 +121,7 @@ class _Lifted(SceneTraining[_LiftedScene]):
 
     def follow(self, edit: TopologyEdit) -> None: ...
 
-    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> _LiftedScene:
+    def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> _LiftedScene:
         self.steps = tensors["steps"].tolist()
         return _LiftedScene(gaussians=gaussians)
 
@@ -132,7 +132,7 @@ class _Lifted(SceneTraining[_LiftedScene]):
 def _trained_by(trainer: GaussianTrainer, training: SceneTraining[Any]) -> GaussianTrainer:
     """``trainer`` with its Gaussians in a scene of another kind."""
     trainer.model.training = training
-    trainer.model.exchange(_LiftedScene(gaussians=trainer.model.scene.gaussians))
+    trainer.model.replace_scene(_LiftedScene(gaussians=trainer.model.scene.gaussians))
     return trainer
 
 

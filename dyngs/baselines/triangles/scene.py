@@ -40,7 +40,7 @@ from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.patches import (
     NUM_POINTS,
     SEGMENTS,
-    Places,
+    PatchSamples,
     blend_patches,
     lattice,
     lattice_size,
@@ -87,10 +87,12 @@ class Patches:
         """Return (N, 3) colours without harmonics of places (N, 2) on triangles (N,) int32."""
         return patch_values(self.colours, ids, uv, self.texture)
 
-    def textured(self, segments: int) -> Patches:
+    def with_texture(self, segments: int) -> Patches:
         """Return them with the colours at the points of a lattice."""
         places, _ = lattice(segments)
-        return replace(self, colours=evaluated(self.colours.detach(), places), texture=segments)
+        return replace(
+            self, colours=evaluate_patches(self.colours.detach(), places), texture=segments
+        )
 
     def state(self) -> State:
         own = {name: x.detach() for name, x in self.tensors.items()}
@@ -98,7 +100,7 @@ class Patches:
         return with_role(own, Role.SHARED)
 
     @staticmethod
-    def restored(stored: Mapping[str, Tensor]) -> Patches:
+    def from_state(stored: Mapping[str, Tensor]) -> Patches:
         """Return the triangles in a state. Raises KeyError or ValueError where its tensors do not
         fit."""
         texture = int(require_indices("texture", stored["texture"], (1,), MOST_TEXTURE + 1))
@@ -116,7 +118,7 @@ class Patches:
         return Patches(points.clone(), colours.clone(), harmonics.clone(), texture)
 
 
-def evaluated(values: Tensor, places: Tensor) -> Tensor:
+def evaluate_patches(values: Tensor, places: Tensor) -> Tensor:
     """Return (P, N, C): quadratic ``values`` (P, 6, C) of every triangle at the same ``places`` (N,
     2)."""
     count = len(values)
@@ -125,7 +127,7 @@ def evaluated(values: Tensor, places: Tensor) -> Tensor:
     return patch_values(values, ids, uv).view(count, len(places), values.shape[2])
 
 
-def quarters(values: Tensor) -> Tensor:
+def subdivide(values: Tensor) -> Tensor:
     """Return (4 P, 6, C): quadratic ``values`` (P, 6, C) on the parts that middles of edges cut a
     triangle into."""
     places, faces = lattice(2)
@@ -133,7 +135,7 @@ def quarters(values: Tensor) -> Tensor:
     middles = torch.stack(
         [(corners[:, i] + corners[:, j]) / 2 for i, j in ((0, 1), (0, 2), (1, 2))], 1
     )
-    at = evaluated(values, torch.cat([corners, middles], 1).flatten(0, 1)).view(
+    at = evaluate_patches(values, torch.cat([corners, middles], 1).flatten(0, 1)).view(
         -1, 6, values.shape[2]
     )
     parts = torch.empty_like(at)
@@ -185,7 +187,7 @@ class TriangleScene(Renderable):
         patches = self.patches
         count = options.segments or max(SEGMENTS, patches.texture)
         places, faces = lattice(count)
-        vertices = evaluated(patches.points, places)
+        vertices = evaluate_patches(patches.points, places)
         ids = torch.arange(len(patches), dtype=torch.int32, device="cpu").repeat_interleave(
             len(places)
         )
@@ -248,13 +250,13 @@ class TriangleScene(Renderable):
 
     def drawn(
         self, camera: Cameras, options: TriangleOptions, background: Tensor | None = None
-    ) -> tuple[Rendering, Places]:
+    ) -> tuple[Rendering, PatchSamples]:
         """Return the image of one camera, differentiable, and what each drawn pixel shows."""
         times = options.supersampling
         patches = self.patches
         camera = camera.to(device=self.device)
         fine = camera.scaled(times)
-        places = Places.of(
+        places = PatchSamples.of(
             *visible_patches(patches.points.detach(), fine, options.near, options.segments)
         )
         at = project_points(
@@ -292,11 +294,11 @@ def scene_options(model: BgTriangleModel, unit: float) -> TriangleOptions:
     return TriangleOptions(near=NEAR * unit, supersampling=model.supersampling)
 
 
-def restored_scene(model: BgTriangleModel, checkpoint: Checkpoint) -> TriangleScene:
+def restore_scene(model: BgTriangleModel, checkpoint: Checkpoint) -> TriangleScene:
     """Return the scene of a checkpoint. Raises KeyError or ValueError where its tensors do not
     fit."""
     stored = checkpoint.part("triangles")
     unit = require_tensor("unit", stored["unit"], (1,), torch.float64)
     half = float(require_positive("unit", unit))
     behind = evaluation_background(checkpoint.info.background, False)[1]
-    return TriangleScene(Patches.restored(stored), half, scene_options(model, half), behind)
+    return TriangleScene(Patches.from_state(stored), half, scene_options(model, half), behind)

@@ -290,8 +290,8 @@ def _add_network(network: ColourNetwork, lists: Lists) -> dict[str, Any]:
             "width": width,
             "first": first,
             "box": network.box.flatten().tolist(),
-            "time": network.sees_time,
-            "normals": network.sees_normals,
+            "time": network.uses_time,
+            "normals": network.uses_normals,
         }
     }
 

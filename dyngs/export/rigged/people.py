@@ -48,7 +48,7 @@ from dyngs.io.formats.splat_file import SplatFile, require_writable
 from dyngs.io.gltf import INDICES, VERTICES, GlbDocument
 from dyngs.io.write import atomic_file
 from dyngs.models.kind import HasBody, capability
-from dyngs.ops.quaternions import shorter_ways
+from dyngs.ops.quaternions import align_quat_signs
 from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.folder import inputs_of
 
@@ -184,7 +184,7 @@ def add_animation(
     root = root - np.array([middle[0], min(lowest), middle[2]])
     poses = clip.poses.double().numpy()
     quats = Rotation.from_rotvec(poses.reshape(-1, 3)).as_quat().reshape(*poses.shape[:2], 4)
-    quats = shorter_ways(quats)
+    quats = align_quat_signs(quats)
     scale = clip.scale.double().numpy() / rig.scale
     channels = [(0, "translation", root)]
     if np.abs(scale - 1).max() > _STILL:  # not of a person who keeps the size

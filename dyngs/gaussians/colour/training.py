@@ -43,20 +43,20 @@ class MeasuredView:
 class ViewDependence:
     """The Gaussians whose view dependence is worth its cost."""
 
-    keeps: Tensor  # (N,) bool, Gaussians whose harmonics stay
+    kept_harmonics: Tensor  # (N,) bool, Gaussians whose harmonics stay
     offsets: Tensor  # (N, 3) colour to add to the base of the others
     # worth_all, worth_kept: dB on the held-out views that the harmonics of all, of the kept ones
     # bring
-    worth_all: float
-    worth_kept: float
+    gain_all: float
+    gain_kept: float
 
     def __str__(self) -> str:
-        fraction = float(self.keeps.float().mean()) if len(self.keeps) else 0.0
+        fraction = float(self.kept_harmonics.float().mean()) if len(self.kept_harmonics) else 0.0
         if fraction == 0:
-            return f"view dependence does not pay ({self.worth_all:+.2f} dB on held-out training views): none is stored"
+            return f"view dependence does not pay ({self.gain_all:+.2f} dB on held-out training views): none is stored"
         return (
-            f"view dependence pays for {fraction:.0%} of the Gaussians: {self.worth_kept:+.2f} dB on held-out training "
-            f"views (for all of them: {self.worth_all:+.2f} dB)"
+            f"view dependence pays for {fraction:.0%} of the Gaussians: {self.gain_kept:+.2f} dB on held-out training "
+            f"views (for all of them: {self.gain_all:+.2f} dB)"
         )
 
 
@@ -84,14 +84,17 @@ def find_view_dependent(
         (slope,) = torch.autograd.grad(_squared_error(view, means, half, options, background), half)
         worths -= slope
     without, with_all = (math.fsum(column) for column in zip(*errors, strict=True))
-    keeps = first_worthwhile(changes, worths, without, tolerance)
+    kept_harmonics = select_worthwhile(changes, worths, without, tolerance)
     kept = math.fsum(
-        _squared_error(x, means, keeps.float(), options, background).item() for x in held_out
+        _squared_error(x, means, kept_harmonics.float(), options, background).item()
+        for x in held_out
     )
-    return ViewDependence(keeps, means, _decibels(without, with_all), _decibels(without, kept))
+    return ViewDependence(
+        kept_harmonics, means, _decibels(without, with_all), _decibels(without, kept)
+    )
 
 
-def first_worthwhile(changes: Tensor, worths: Tensor, without: float, tolerance: float) -> Tensor:
+def select_worthwhile(changes: Tensor, worths: Tensor, without: float, tolerance: float) -> Tensor:
     """Return (N,) bool, the fewest rows, by descending ``changes``, that bring all but
     ``tolerance`` of the gain.
 
@@ -104,9 +107,9 @@ def first_worthwhile(changes: Tensor, worths: Tensor, without: float, tolerance:
         [torch.zeros(1, device=worths.device), worths[order].double().cumsum(0)]
     )
     enough = errors <= errors.clamp_min(1e-12).min() * 10 ** (tolerance / 10)
-    keeps = torch.zeros(len(changes), dtype=torch.bool, device=changes.device)
-    keeps[order[: int(enough.int().argmax())]] = True
-    return keeps
+    kept_harmonics = torch.zeros(len(changes), dtype=torch.bool, device=changes.device)
+    kept_harmonics[order[: int(enough.int().argmax())]] = True
+    return kept_harmonics
 
 
 def _mean_and_change(seen: Iterable[MeasuredView], options: RenderOptions) -> tuple[Tensor, Tensor]:
@@ -168,7 +171,7 @@ _HELD_OUT = 5  # Index, in each eight views, of the one that is held out
 
 
 @dataclass(frozen=True)
-class TrainingLooks:
+class MeasurementViews:
     """The training views as the scene is drawn for them now."""
 
     indices: Sequence[int]  # of the views that may be trained on
@@ -189,7 +192,7 @@ class ColourTraining:
         return None
 
     @property
-    def learned(self) -> Parameters | None:
+    def network_parameters(self) -> Parameters | None:
         return None
 
     def penalties(self, gaussians: Gaussians) -> dict[str, Tensor]:
@@ -201,11 +204,13 @@ class ColourTraining:
         """Return whether training view ``index`` must not be trained on in ``step``."""
         return False
 
-    def measured(self, step: int, looks: Callable[[], TrainingLooks]) -> ViewDependence | None:
+    def measure_harmonics(
+        self, step: int, looks: Callable[[], MeasurementViews]
+    ) -> ViewDependence | None:
         """Measure, if due after ``step``, whose harmonics improve images; the others are dropped."""
         return None
 
-    def frozen_rest(self) -> Tensor | None:
+    def frozen_harmonics(self) -> Tensor | None:
         """Return (N,) bool, Gaussians whose harmonics stay zero but for the base colour; None: of
         none."""
         return None
@@ -238,11 +243,11 @@ class NetworkTraining(ColourTraining):
         box: Tensor,
         generator: torch.Generator,
         *,
-        sees_time: bool,
+        uses_time: bool,
     ) -> None:
         super().__init__(options)
-        self.options, self.steps, self.box, self.sees_time = options, steps, box, sees_time
-        inputs = num_inputs(sees_time=sees_time, sees_normals=True)
+        self.options, self.steps, self.box, self.uses_time = options, steps, box, uses_time
+        inputs = num_inputs(uses_time=uses_time, uses_normals=True)
         values = _start_values([inputs, *[options.width] * options.depth, 3], generator)
         self.parameters = Parameters(values, dict.fromkeys(values, options.lr))
 
@@ -252,10 +257,10 @@ class NetworkTraining(ColourTraining):
         layers = (
             Layer(self.parameters[f"weight{i}"], self.parameters[f"bias{i}"]) for i in range(count)
         )
-        return ColourNetwork(tuple(layers), self.box, self.sees_time, sees_normals=True)
+        return ColourNetwork(tuple(layers), self.box, self.uses_time, uses_normals=True)
 
     @property
-    def learned(self) -> Parameters:
+    def network_parameters(self) -> Parameters:
         return self.parameters
 
     def optimize(self, step: int) -> Count:
@@ -269,7 +274,7 @@ class NetworkTraining(ColourTraining):
 
     def restore(self, tensors: Mapping[str, Tensor], count: int) -> None:
         self.box = require_tensor("box", tensors["box"], (2, 3), None)
-        self.parameters = self.parameters.restored(tensors)
+        self.parameters = self.parameters.with_state(tensors)
 
 
 class AutoTraining(ColourTraining):
@@ -287,7 +292,9 @@ class AutoTraining(ColourTraining):
         """Return true for every eighth view, until the harmonics are measured on them."""
         return step <= self.measured_after and index in self.held_out
 
-    def measured(self, step: int, looks: Callable[[], TrainingLooks]) -> ViewDependence | None:
+    def measure_harmonics(
+        self, step: int, looks: Callable[[], MeasurementViews]
+    ) -> ViewDependence | None:
         if step != self.measured_after or not self.held_out:
             return None
         views = looks()
@@ -299,14 +306,14 @@ class AutoTraining(ColourTraining):
         found = find_view_dependent(
             views.views(seen), judged, views.options, views.background, self.tolerance
         )
-        self.freeze(~found.keeps)
+        self.freeze(~found.kept_harmonics)
         return found
 
     def freeze(self, frozen: Tensor) -> None:
         """Keep the harmonics of the Gaussians ``frozen`` (N,) zero from now on."""
         self._frozen = None if bool(frozen.all()) else frozen
 
-    def frozen_rest(self) -> Tensor | None:
+    def frozen_harmonics(self) -> Tensor | None:
         return self._frozen
 
     def follow(self, edit: TopologyEdit) -> None:

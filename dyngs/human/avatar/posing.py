@@ -24,10 +24,10 @@ from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.joints import JOINT_NAMES, mirrored_joints
 from dyngs.human.body.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.motion.motion import MotionClip
-from dyngs.ops.device import sent
+from dyngs.ops.device import copy_async
 from dyngs.ops.harmonics import lit
 from dyngs.ops.posing import pose_by_joints
-from dyngs.ops.quaternions import quats_of, rotation_matrices
+from dyngs.ops.quaternions import quats_from_matrices, rotation_matrices
 
 # message of files that cannot hold it
 LEFT_OUT = "the learned light is left out: colours are those in even light"
@@ -154,7 +154,7 @@ def blended_rotations(weights: Tensor, transforms: Tensor) -> Tensor:
 
     Each has the sign in which it is nearer to that of the heaviest joint: their sum never vanishes.
     """
-    quats = quats_of(transforms[..., :3])
+    quats = quats_from_matrices(transforms[..., :3])
     signs = torch.where(quats @ quats.T < 0, -1.0, 1.0).to(weights)
     return rotation_matrices((weights * signs[weights.argmax(1)]) @ quats)
 
@@ -256,7 +256,7 @@ def texel_gaussians(
     opacity = torch.where(height == min(heights), _LOWEST_OPACITY, _UPPER_OPACITY)
     gaussians = Gaussians(
         means=anchors.points.clone(),
-        quats=quats_of(texels.frames)[rows],
+        quats=quats_from_matrices(texels.frames)[rows],
         log_scales=size.log()[:, None] + ratios,
         logit_opacities=(opacity / (1 - opacity)).log().to(size),
         sh=size.new_zeros(len(rows), num_sh_terms(sh_degree), 3),
@@ -456,7 +456,9 @@ def share_sides(learned: Parameters) -> None:
     """
     gradient = learned["joints"].grad
     if gradient is not None:
-        mirrored = sent(torch.tensor(mirrored_joints(len(gradient)), device="cpu"), gradient.device)
+        mirrored = copy_async(
+            torch.tensor(mirrored_joints(len(gradient)), device="cpu"), gradient.device
+        )
         other = gradient.index_select(0, mirrored)
         other[:, 0].neg_()
         gradient.add_(other).div_(2)

@@ -19,7 +19,7 @@ from dyngs.core.tensor_checks import (
 )
 from dyngs.data.capture import Capture, Split
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.colour.network import RestFrame
+from dyngs.gaussians.colour.network import RestPose
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.human.avatar.posing import (
@@ -63,7 +63,7 @@ class HumanScene(GaussianScene, Posable):
     seen: Tensor | None = None
 
     @staticmethod
-    def restored(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
+    def from_state(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
         """Return the scene of what ``state`` returned, playing the clip of training. Raises
         KeyError or ValueError."""
         tensors = dict(tensors)
@@ -85,7 +85,7 @@ class HumanScene(GaussianScene, Posable):
             anchors=anchors,
             skeleton=skeleton,
             clip=clip,
-            learned=new_corrections(clip, skeleton, anchors, learned.get("normals")).restored(
+            learned=new_corrections(clip, skeleton, anchors, learned.get("normals")).with_state(
                 learned
             ),
             shapes=shapes,
@@ -179,7 +179,7 @@ class HumanScene(GaussianScene, Posable):
         """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable
         in the pose."""
         gaussians = self._posed(posing, self.weights, self.learned_skeleton, self.light)
-        frame = RestFrame(self.gaussians.means, posing.rotations[0])
+        frame = RestPose(self.gaussians.means, posing.rotations[0])
         return GaussianTimeStep(gaussians, time, frame)
 
     def _posed(
@@ -206,12 +206,12 @@ class HumanScene(GaussianScene, Posable):
         """Return (N, J) skinning weights of the template."""
         return skinning_weights(self.anchors, len(self.skeleton.joints))
 
-    def edited(self, edit: TopologyEdit) -> HumanScene:
+    def apply_edit(self, edit: TopologyEdit) -> HumanScene:
         return replace(
             self,
-            gaussians=self.gaussians.edited(edit),
+            gaussians=self.gaussians.apply_edit(edit),
             anchors=self.anchors.select(edit.source),
-            learned=self.learned.edited(Role.PER_GAUSSIAN, edit),
+            learned=self.learned.apply_edit(Role.PER_GAUSSIAN, edit),
             seen=None if self.seen is None else self.seen[edit.source],
         )
 

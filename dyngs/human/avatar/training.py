@@ -18,10 +18,10 @@ from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.gaussians.colour.network import RestFrame
+from dyngs.gaussians.colour.network import RestPose
 from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.scene import GaussianTimeStep
-from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.schedule import RateSchedule
 from dyngs.human.avatar.observations import (
     HARDLY,
     filled,
@@ -45,7 +45,7 @@ from dyngs.models.kind import RunStart
 from dyngs.models.model import Look, Loss
 from dyngs.models.views import background_colour
 from dyngs.ops.adam import Count
-from dyngs.ops.device import sent
+from dyngs.ops.device import copy_async
 from dyngs.ops.loss import l1_ssim_loss
 
 REACH = 2  # distance from the mask up to which images are compared as they were taken, px
@@ -99,7 +99,7 @@ class OutlineLoss(Loss):
         if plate is not None and alpha is not None and truth.shape == plate[0].shape:
             photo = self._photos[look.index].rgb_premultiplied
             colours, known, photo, behind = (
-                sent(x, rendered.device) for x in (*plate, photo, self._behind)
+                copy_async(x, rendered.device) for x in (*plate, photo, self._behind)
             )
             use = (known & _near(alpha))[..., None]
             seen = look.drawn.rendering.transmittance[0][..., None]
@@ -226,7 +226,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         self,
         options: HumanModel,
         frames: Sequence[int],
-        rates: Rates,
+        rates: RateSchedule,
         views: Sequence[tuple[Cameras, int]] = (),
         outlines: OutlineLoss | None = None,
         refit: PoseRefit | None = None,
@@ -279,7 +279,7 @@ class HumanTraining(SceneTraining[HumanScene]):
             strain, uneven = strains(rest.means, moved.means, anchors.points, near, scale)
             penalties["rigidity"] = PARAMS.rigidity * strain / CENTIMETRE**2
             penalties["smoothness"] = PARAMS.smoothness * uneven / CENTIMETRE**2
-        frame = RestFrame(rest.means, posing.rotations[0])
+        frame = RestPose(rest.means, posing.rotations[0])
         return GaussianTimeStep(moved, image.time, frame, penalties)
 
     def optimize(self, scene: HumanScene, step: int) -> Count:
@@ -298,7 +298,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         """Return the corrections."""
         return scene.learned.leaves
 
-    def revised(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
+    def edit_scene(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
         """Return the scene, and after the last step new values for what the images hardly show.
 
         After the first step with a line about outlines, if there is one. In between poses may be
@@ -335,14 +335,14 @@ class HumanTraining(SceneTraining[HumanScene]):
         """Find out anew who the neighbours are."""
         self._near = self._images = None
 
-    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
+    def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
         self.follow()
         if "refines_from" in tensors:  # the run may have become longer since
             self._has_refined = True
             self.refines_from = min(self.refines_from, int(tensors["refines_from"]))
         if self._refit is not None:
             self._refit.goes_on = "poses_stay" not in tensors
-        return HumanScene.restored(gaussians, tensors)
+        return HumanScene.from_state(gaussians, tensors)
 
     def state(self) -> State:
         kept = {}

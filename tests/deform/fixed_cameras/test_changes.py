@@ -9,12 +9,12 @@ import torch
 from static_balls import BLACK, Ball, cameras, drawn, filmed
 
 from dyngs.data.loader import Image
-from dyngs.deform.fixed_cameras.hulls import LONGEST_SIDE, changes, fixed_camera_clip
+from dyngs.deform.fixed_cameras.hulls import LONGEST_SIDE, build_fixed_camera_clip, changes
 
 TIMES = tuple(i / 8 for i in range(9))
 
 
-def still(noise: float = 0.0, count: int = 9) -> np.ndarray:
+def static(noise: float = 0.0, count: int = 9) -> np.ndarray:
     """Images (T, H, W, 3) of one camera, nothing moves."""
     shown = [drawn(cameras(1)[0], [], noise, seed) for seed in range(count)]
     return (255 * torch.stack(shown)).round().to(torch.uint8).numpy()
@@ -22,7 +22,7 @@ def still(noise: float = 0.0, count: int = 9) -> np.ndarray:
 
 def with_patch(factor: tuple[float, float, float], at: int = 0) -> np.ndarray:
     """The same with the light in a square changed in the image ``at``."""
-    images = still().copy()
+    images = static().copy()
     images[at, 20:40, 20:40] = (
         (images[at, 20:40, 20:40] * np.array(factor)).clip(0, 255).astype(np.uint8)
     )
@@ -62,12 +62,12 @@ def test_large_images_are_shrunk_and_masks_kept() -> None:
         Image("view", large, torch.full((10, width, 3), 0.1 * i), None, mask, i / 2)
         for i in range(3)
     ]
-    one = fixed_camera_clip(images, BLACK)
+    one = build_fixed_camera_clip(images, BLACK)
     assert one.images.shape == (3, 5, LONGEST_SIDE, 3)
     assert not one.counted[:, :, :10].any()
     assert one.counted[:, :, 10:].all()
     assert not one.changed[:, :, :10].any()
     assert one.times == (0.0, 0.5, 1.0)
-    assert fixed_camera_clip(images, BLACK, total=8000).images.shape[2] == LONGEST_SIDE // 2
+    assert build_fixed_camera_clip(images, BLACK, total=8000).images.shape[2] == LONGEST_SIDE // 2
     with pytest.raises(ValueError, match="no images"):
-        fixed_camera_clip([], BLACK)
+        build_fixed_camera_clip([], BLACK)

@@ -60,7 +60,7 @@ from dyngs.models.renderable import (
     fixed_cameras,
 )
 from dyngs.models.views import evaluation_background
-from dyngs.ops.device import CPU, device_for
+from dyngs.ops.device import CPU, select_device
 
 NETWORKS: dict[str, Callable[[torch.Generator], FieldNetwork]] = {
     "keypoint_nerf": KeypointNerf,
@@ -164,7 +164,7 @@ class PredictedModel(Model[PredictedField]):
         self._section = run.config.model
         self._scene: PredictedField | None = None
 
-    def begin_with(self, scene: PredictedField) -> None:
+    def start_from(self, scene: PredictedField) -> None:
         self._scene = scene
 
     @property
@@ -237,7 +237,7 @@ class FieldPredictor(Predictor[FieldNetwork]):
         return self.config.model_copy(update={"data": data, "model": model})
 
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
-        model.begin_with(scene)
+        model.start_from(scene)
 
 
 class FieldLearner(Learner[FieldNetwork]):
@@ -310,7 +310,7 @@ def _part(image: Image, generator: torch.Generator) -> Image:
 
 def learner(config: Config, generator: torch.Generator) -> FieldLearner:
     """Return a network before the first step."""
-    device = device_for(config.run.device)
+    device = select_device(config.run.device)
     network = NETWORKS[config.model.kind](generator).to(device)
     return FieldLearner(config, network, captures_in(config.data), device)
 
