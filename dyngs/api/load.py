@@ -110,7 +110,7 @@ class ScaledScene(GaussianScene):
     def time_step(self, time: float | None) -> _ScaledTimeStep:
         inner = self.scene.time_step(time)
         return _ScaledTimeStep(
-            _scaled(inner.gaussians, self.scale), inner.time, inner.frame, inner=inner
+            _scaled(inner.gaussians, self.scale), inner.time, inner.rest_pose, inner=inner
         )
 
     def render(

@@ -73,7 +73,7 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
     config = run.config
     capture = run.capture
     images = run.images
-    views = capture.freeze_steps["train"]
+    views = capture.splits["train"]
     _, background = evaluation_background(config.data.background, capture.has_alpha)
     divisor = image_divisor(config.train, deform_schedule(model, rate_schedule(config)).coarse_end)
     looked_at = select_comparison_views(views)

@@ -189,11 +189,11 @@ def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> 
 # ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("filtered", [False, True])
-def test_a_run_of_one_step(capture: Path, apply_filter: bool) -> None:
+@pytest.mark.parametrize("is_filtered", [False, True])
+def test_a_run_of_one_step(capture: Path, is_filtered: bool) -> None:
     """It ends as motion begins: with a field that is the identity, for the random Gaussians too,
     and filtered."""
-    config = busy_config(capture, capture, "hexplane", filter_3d=apply_filter)
+    config = busy_config(capture, capture, "hexplane", filter_3d=is_filtered)
     config = config.model_copy(update={"train": TrainConfig(steps=1)})
     trainer = assemble(config)
     trainer.step()

@@ -60,10 +60,10 @@ def test_times_after_the_clip_are_its_end(time: float) -> None:
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
-@pytest.mark.parametrize("filtered", [False, True])
-def test_what_moves_and_what_is_still_make_the_scene(kind: str, apply_filter: bool) -> None:
+@pytest.mark.parametrize("is_filtered", [False, True])
+def test_what_moves_and_what_is_still_make_the_scene(kind: str, is_filtered: bool) -> None:
     """Together, in their order, at each time."""
-    scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if apply_filter else None)
+    scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if is_filtered else None)
     moving = scene.part("moving")
     static = scene.part("still")
     others = torch.tensor([0, 2, 3, 6, 7])
@@ -104,11 +104,11 @@ def test_from_a_checkpoint(kind: str, rows: Tensor | None) -> None:
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
-@pytest.mark.parametrize("filtered", [False, True])
-def test_masks_show_the_same_of_fewer(kind: str, apply_filter: bool) -> None:
+@pytest.mark.parametrize("is_filtered", [False, True])
+def test_masks_show_the_same_of_fewer(kind: str, is_filtered: bool) -> None:
     """Before, between and after key times, in any order of times; parts and sizes are those of all
     Gaussians."""
-    scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if apply_filter else None)
+    scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if is_filtered else None)
     seen = torch.rand(3, 9, generator=torch.Generator().manual_seed(1)) < 0.4
     masked = replace(scene, masks=VisibilityMasks.pack((0.0, 0.5, 1.0), seen))
     for time, active in (

@@ -305,12 +305,12 @@ class HumanTraining(SceneTraining[HumanScene]):
         fitted again.
         """
         if step == 1 and self._finding is not None:
-            return scene, EditResult(None, finding=self._finding)
+            return scene, EditResult(None, message=self._finding)
         if step == self.rates.steps:
             has_views = self.options.fill_unseen and self.views and len(scene)
             return self._filled(scene, step) if has_views else None
         found = None if self._refit is None else self._refit.edit_scene(scene, step)
-        return None if found is None else (found[0], EditResult(None, finding=found[1] or None))
+        return None if found is None else (found[0], EditResult(None, message=found[1] or None))
 
     def _filled(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult]:
         shown = [self.views[i] for i in evenly_spaced(len(self.views), PARAMS.views)]
@@ -329,7 +329,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         hardly = float((trust < HARDLY).float().mean())
         line = f"{hardly:.0%} of the surface is hardly seen: filled from the other side of the body and from around it"
         finding = line if hardly >= PARAMS.worth_telling else None
-        return replace(scene, seen=trust), EditResult(None, changes, finding=finding)
+        return replace(scene, seen=trust), EditResult(None, changes, message=finding)
 
     def follow(self, edit: TopologyEdit | None = None) -> None:
         """Find out anew who the neighbours are."""
