@@ -180,7 +180,7 @@ def render_frame_stack(
             "static": drawn.rgb[0],
             "depths": depth,
             "alphas": own_alpha,
-            "still_alphas": alpha,
+            "static_alphas": alpha,
         }
         camera = {
             "poses": small.cameras.cam_from_world[0].double(),
