@@ -84,7 +84,7 @@ def bare_scene(
         anchors=anchors,
         skeleton=skeleton,
         clip=clip,
-        learned=learned.restored(values),
+        learned=learned.with_state(values),
     )
 
 

@@ -24,7 +24,7 @@ from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.joints import JOINT_NAMES, mirrored_joints
 from dyngs.human.body.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.motion.motion import MotionClip
-from dyngs.ops.device import sent
+from dyngs.ops.device import copy_async
 from dyngs.ops.harmonics import lit
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.quaternions import quats_from_matrices, rotation_matrices
@@ -456,7 +456,9 @@ def symmetrize_joint_gradients(learned: Parameters) -> None:
     """
     gradient = learned["joints"].grad
     if gradient is not None:
-        mirrored = sent(torch.tensor(mirrored_joints(len(gradient)), device="cpu"), gradient.device)
+        mirrored = copy_async(
+            torch.tensor(mirrored_joints(len(gradient)), device="cpu"), gradient.device
+        )
         other = gradient.index_select(0, mirrored)
         other[:, 0].neg_()
         gradient.add_(other).div_(2)

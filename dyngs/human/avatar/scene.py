@@ -63,7 +63,7 @@ class HumanScene(GaussianScene, Posable):
     seen: Tensor | None = None
 
     @staticmethod
-    def restored(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
+    def from_state(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
         """Return the scene of what ``state`` returned, playing the clip of training. Raises
         KeyError or ValueError."""
         tensors = dict(tensors)
@@ -85,7 +85,7 @@ class HumanScene(GaussianScene, Posable):
             anchors=anchors,
             skeleton=skeleton,
             clip=clip,
-            learned=new_corrections(clip, skeleton, anchors, learned.get("normals")).restored(
+            learned=new_corrections(clip, skeleton, anchors, learned.get("normals")).with_state(
                 learned
             ),
             shapes=shapes,
@@ -208,12 +208,12 @@ class HumanScene(GaussianScene, Posable):
         """Return (N, J) skinning weights of the template."""
         return skinning_weights(self.anchors, len(self.skeleton.joints))
 
-    def edited(self, edit: TopologyEdit) -> HumanScene:
+    def apply_edit(self, edit: TopologyEdit) -> HumanScene:
         return replace(
             self,
-            gaussians=self.gaussians.edited(edit),
+            gaussians=self.gaussians.apply_edit(edit),
             anchors=self.anchors.select(edit.source),
-            learned=self.learned.edited(Role.PER_GAUSSIAN, edit),
+            learned=self.learned.apply_edit(Role.PER_GAUSSIAN, edit),
             seen=None if self.seen is None else self.seen[edit.source],
         )
 

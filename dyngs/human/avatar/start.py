@@ -10,6 +10,7 @@ from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.initialization import build_colour_training, build_densifier
 from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.scene import restore_appearance
 from dyngs.gaussians.schedule import rate_schedule
@@ -67,7 +68,7 @@ def start(run: RunStart) -> GaussianModel:
 
 def restore(model: HumanModel, checkpoint: Checkpoint) -> HumanScene:
     """Return the scene of a checkpoint."""
-    scene = HumanScene.restored(
+    scene = HumanScene.from_state(
         Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
     )
     return restore_appearance(scene, model, checkpoint)

@@ -45,7 +45,7 @@ from dyngs.models.kind import RunStart
 from dyngs.models.model import Look, Loss
 from dyngs.models.views import background_colour
 from dyngs.ops.adam import Count
-from dyngs.ops.device import sent
+from dyngs.ops.device import copy_async
 from dyngs.ops.loss import l1_ssim_loss
 
 OUTLINE_REACH_PX = (
@@ -101,7 +101,7 @@ class OutlineLoss(Loss):
         if plate is not None and alpha is not None and truth.shape == plate[0].shape:
             photo = self._photos[look.index].rgb_premultiplied
             colours, known, photo, behind = (
-                sent(x, rendered.device) for x in (*plate, photo, self._behind)
+                copy_async(x, rendered.device) for x in (*plate, photo, self._behind)
             )
             use = (known & _near_silhouette(alpha))[..., None]
             seen = look.drawn.rendering.transmittance[0][..., None]
@@ -309,12 +309,12 @@ class HumanTraining(SceneTraining[HumanScene]):
         fitted again.
         """
         if step == 1 and self._finding is not None:
-            return scene, EditResult(None, finding=self._finding)
+            return scene, EditResult(None, message=self._finding)
         if step == self.rates.steps:
             has_views = self.options.fill_unseen and self.views and len(scene)
             return self._filled(scene, step) if has_views else None
         found = None if self._refit is None else self._refit.edit_scene(scene, step)
-        return None if found is None else (found[0], EditResult(None, finding=found[1] or None))
+        return None if found is None else (found[0], EditResult(None, message=found[1] or None))
 
     def _filled(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult]:
         shown = [self.views[i] for i in evenly_spaced(len(self.views), PARAMS.views)]
@@ -339,7 +339,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         """Find out anew who the neighbours are."""
         self._neighbours = self._mirror_images = None
 
-    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
+    def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
         self.follow()
         if "refines_from" in tensors:  # the run may have become longer since
             self._has_refined = True

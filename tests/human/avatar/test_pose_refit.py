@@ -33,7 +33,7 @@ def trained_on(scene: HumanScene) -> HumanScene:
     it."""
     clip = disturbed(scene).replacement_clip
     assert clip is not None
-    copied = scene.learned.restored({name: x.tensor for name, x in scene.learned.state().items()})
+    copied = scene.learned.with_state({name: x.tensor for name, x in scene.learned.state().items()})
     return replace(scene, clip=clip, learned=copied)
 
 

@@ -57,7 +57,7 @@ def stirred() -> HumanScene:
 
 def reloaded(scene: HumanScene) -> HumanScene:
     """The scene of what is stored of it."""
-    return HumanScene.restored(scene.gaussians, part_of(tensors_of(scene.state()), "model"))
+    return HumanScene.from_state(scene.gaussians, part_of(tensors_of(scene.state()), "model"))
 
 
 def seen(gaussians: Gaussians) -> Tensor:

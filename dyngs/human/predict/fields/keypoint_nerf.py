@@ -37,7 +37,7 @@ from dyngs.human.predict.fields.network import (
 )
 from dyngs.human.predict.people import NUM_KEY_POINTS, PosedBody, Sources
 from dyngs.models.volume import kept_samples, rays_of, reached_samples, thinned_samples
-from dyngs.ops.rays import Rays, Samples, Space, Steps, composite, march
+from dyngs.ops.rays import MarchSteps, Rays, Samples, Space, composite, march
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class KeypointNerf(FieldNetwork):
         (R,)."""
         seen = known.seen
         space, occupied = known.own
-        samples = march(rays, shifts, space, occupied, Steps(NEAR, PARAMS.step))
+        samples = march(rays, shifts, space, occupied, MarchSteps(NEAR, PARAMS.step))
         learns = torch.is_grad_enabled()
         with torch.no_grad():  # which samples are worth it takes their densities alone
             shown = seen.alpha(places(samples, space)) > PARAMS.visible

@@ -538,7 +538,9 @@ class PersonPredictor(Predictor[AtlasNetwork]):
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
         assert isinstance(config.model, HumanModel)
         frames = self._person.person.motion.frames
-        model.start_from(scene, HumanTraining(config.model, frames, RateSchedule(config.train.steps)))
+        model.start_from(
+            scene, HumanTraining(config.model, frames, RateSchedule(config.train.steps))
+        )
 
     def _scene(self, maps: TexelMaps) -> HumanScene:
         return predict_avatar(self._person, maps, self.mean, self.network)

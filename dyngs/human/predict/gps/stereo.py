@@ -40,7 +40,7 @@ from dyngs.data.times import distinct_times
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.scene import render_options
-from dyngs.gaussians.static_scene import Sides, StaticScene
+from dyngs.gaussians.static_scene import StaticScene, ViewSides
 from dyngs.gaussians.static_training import StaticTraining
 from dyngs.human.predict.gps.rectification import (
     MAX_ANGLE,
@@ -338,7 +338,7 @@ class GpsPredictor(Predictor[GpsNetwork]):
             )
         return StaticScene(
             gaussians=gaussians,
-            sides=Sides.joined(found, centers) if len(pairs) > 1 else None,
+            sides=ViewSides.joined(found, centers) if len(pairs) > 1 else None,
             options=render_options(self.config.model),
             background=self.background,
         )
