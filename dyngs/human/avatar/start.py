@@ -14,7 +14,6 @@ from dyngs.gaussians.initialization import build_colour_training, build_densifie
 from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.scene import restore_appearance
 from dyngs.gaussians.schedule import rate_schedule
-from dyngs.gaussians.initialization import colours_of, build_densifier
 from dyngs.human.avatar.observations import colour_from_images
 from dyngs.human.avatar.pose_fit import PoseRefit
 from dyngs.human.avatar.posing import (
@@ -47,7 +46,7 @@ def start(run: RunStart) -> GaussianModel:
     model = config.model
     assert isinstance(model, HumanModel)
     scene, motion = initialize_human_scene(config, model, run.capture, run.images)
-    colours = colours_of(run, scene.gaussians, uses_time=False)
+    colours = build_colour_training(run, scene.gaussians, uses_time=False)
     filmed = run.capture.splits["train"]
     cameras = training_cameras(filmed, config.data)
     views = [(camera, view.frame or 0) for camera, view in zip(cameras, filmed, strict=True)]

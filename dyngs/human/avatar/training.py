@@ -332,8 +332,8 @@ class HumanTraining(SceneTraining[HumanScene]):
             changes = filled(gaussians, scene.anchors, scene.template_weights(), middle, trust)
         hardly = float((trust < LOW_CONFIDENCE).float().mean())
         line = f"{hardly:.0%} of the surface is hardly seen: filled from the other side of the body and from around it"
-        finding = line if hardly >= PARAMS.min_reported_fraction else None
-        return replace(scene, seen=trust), EditResult(None, changes, finding=finding)
+        message = line if hardly >= PARAMS.min_reported_fraction else None
+        return replace(scene, seen=trust), EditResult(None, changes, message=message)
 
     def follow(self, edit: TopologyEdit | None = None) -> None:
         """Find out anew who the neighbours are."""
@@ -346,7 +346,7 @@ class HumanTraining(SceneTraining[HumanScene]):
             self.refines_from = min(self.refines_from, int(tensors["refines_from"]))
         if self._refit is not None:
             self._refit.is_active = "poses_stay" not in tensors
-        return HumanScene.restored(gaussians, tensors)
+        return HumanScene.from_state(gaussians, tensors)
 
     def state(self) -> State:
         kept = {}
