@@ -32,8 +32,8 @@ from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import view_size
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.keys import FreeField
-from dyngs.deform.static_errors import group_fixed_cameras, changed_fraction
-from dyngs.gaussians.colour.network import fit_affine_colour, apply_affine_colour
+from dyngs.deform.static_errors import changed_fraction, group_fixed_cameras
+from dyngs.gaussians.colour.network import apply_affine_colour, fit_affine_colour
 from dyngs.io.write import write_text
 from dyngs.models.kind import HasGaussians, Moves, capability, kind_of
 from dyngs.models.renderable import Rendering

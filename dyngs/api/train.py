@@ -35,7 +35,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.outputs import writing
 from dyngs.models.kind import Predicts, capability
-from dyngs.ops.device import deterministic, select_device, keep_freed_memory
+from dyngs.ops.device import deterministic, keep_freed_memory, select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import write_record
 from dyngs.runs.checkpoint import (

@@ -88,7 +88,10 @@ def score_fitted_poses(
     if avatar is not None:
         outlined = all(images[i].alpha is not None for i in range(len(images)))
         found: dict[str, Any] = {}
-        for name, comparison in (("own_poses", IMAGES), ("silhouette_poses", SILHOUETTES)):
+        for name, comparison in (
+            ("own_poses", IMAGE_COMPARISON),
+            ("silhouette_poses", SILHOUETTE_COMPARISON),
+        ):
             if name == "silhouette_poses" and not outlined:
                 continue
             fitted, updates = fit_poses_to_images(avatar, images, background, comparison)

@@ -69,7 +69,7 @@ def write_sog_levels(folder: Path, splat: SplatFile) -> tuple[int, ...]:
     Raises DyngsError: the folder holds something, or cannot be written.
     """
     require_new_folder(folder)
-    levels = levels_of(splat.gaussians).levels[: COARSEST + 1]
+    levels = build_levels(splat.gaussians).levels[: COARSEST + 1]
     counts = tuple(len(level) for level in levels)
     names: list[str] = []
     with new_folder(folder) as started:

@@ -15,6 +15,7 @@ from dyngs.data.loader import ImageLoader, usual_threads
 from dyngs.data.read import read_capture, require_images
 from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
+from dyngs.gaussians.initialization import InitialGaussians, scene_geometry
 from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.initialization import InitialGaussians, surroundings
 from dyngs.models.kind import Moves, RunStart, kind_of
@@ -146,9 +147,7 @@ def prepare_capture(config: Config) -> Capture:
     return add_initial_points(require_images(read_capture(config.data)), config)
 
 
-def add_initial_points(
-    capture: Capture, config: Config, *, log_messages: bool = True
-) -> Capture:
+def add_initial_points(capture: Capture, config: Config, *, log_messages: bool = True) -> Capture:
     """Return ``capture`` as ``prepared`` does, for a kind whose Gaussians begin at points; others
     need none."""
     lines: list[str] = []

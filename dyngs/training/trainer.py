@@ -26,7 +26,7 @@ from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour
 from dyngs.ops.adam import Count
-from dyngs.ops.device import CPU, sent
+from dyngs.ops.device import CPU, copy_async
 from dyngs.training.events import StepReport
 from dyngs.training.losses import StepCheck
 from dyngs.training.plan import with_steps
@@ -201,7 +201,7 @@ class Trainer(Generic[M]):
         image = self._image(index, step)
         for correction in self.corrections:
             image = correction.before_render(image)
-        background = sent(background_colour(self.background, self.generator), self.device)
+        background = copy_async(background_colour(self.background, self.generator), self.device)
         depth = any(loss.needs_depth(image) for loss in self.losses)
         drawn = self.model.draw(image, step, background, depth=depth)
         view = RenderedView(

@@ -292,7 +292,7 @@ def pose_person(opened: Opened, angles: Mapping[str, Sequence[float]]) -> Opened
         turned = Rotation.from_euler("xyz", degrees, degrees=True)
         turns[0, JOINT_NAMES.index(name)] = turns.new_tensor(turned.as_rotvec())
     poses = compose_rotations(clip.poses, turns)
-    return rest.showing(person.playing(replace(clip, poses=poses)))
+    return rest.showing(person.with_motion(replace(clip, poses=poses)))
 
 
 def motion_files(path: Path | None) -> dict[str, Path]:

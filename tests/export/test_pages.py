@@ -91,7 +91,7 @@ def test_a_page_shows_what_dyngs_draws(kind: str, browser: Browser, tmp_path: Pa
 @pytest.mark.parametrize(("texture", "degree"), [(0, 0), (1, 1), (3, 4)])
 def test_triangles(texture: int, degree: int, browser: Browser, tmp_path: Path) -> None:
     patches = bent(12, seed=1, degree=degree)
-    patches = patches.textured(texture) if texture else patches
+    patches = patches.with_texture(texture) if texture else patches
     varied = patches.colours + 0.2 * torch.randn(
         patches.colours.shape, generator=torch.Generator().manual_seed(2)
     )

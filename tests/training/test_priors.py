@@ -59,7 +59,10 @@ def scene(speed: float) -> DynamicScene:
     gaussians = gaussians.replace(means=gaussians.means.clone().requires_grad_())
     field = Sliding(speed=speed, setup=SETUP)
     return DynamicScene(
-        gaussians=gaussians, seen_at=(0.0, 1.0), field=field, moving=torch.tensor(MOVING_ROWS)
+        gaussians=gaussians,
+        training_times=(0.0, 1.0),
+        field=field,
+        moving=torch.tensor(MOVING_ROWS),
     )
 
 

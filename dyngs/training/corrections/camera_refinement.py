@@ -251,7 +251,7 @@ class CameraRefinement(Correction):
             key = f"updates.{name}"
             updates = require_tensor(key, state[key], (len(x),), torch.int64)
             self._updates[name] = updates.clone()
-        self._adam = AdamState.restored(state, self._values())
+        self._adam = AdamState.from_state(state, self._values())
 
     def _values(self) -> dict[str, Tensor]:
         return {POSES: self.corrections.poses, LENSES: self.corrections.lenses}

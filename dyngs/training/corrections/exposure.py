@@ -97,7 +97,9 @@ class ViewExposures(Loss, Correction):
             return view
         if view.step == self._begins + 1 and self._images is not None:
             self._find_gains(self._images, view)
-        shown = apply_affine_colour(self.affine(view.index), view.image, view.rendering, view.background)
+        shown = apply_affine_colour(
+            self.affine(view.index), view.image, view.rendering, view.background
+        )
         # no sensor shows more than white
         white = view.image.composite(view.background) >= SATURATED
         return replace(view, rendered=torch.where(white, shown.clamp_max(1.0), shown))
@@ -131,7 +133,7 @@ class ViewExposures(Loss, Correction):
     def load_state(self, state: dict[str, Tensor]) -> None:
         visits = require_tensor("visits", state["visits"], self._visits.shape, torch.int64)
         values = require_tensor("values", state["values"], self._values.shape, torch.float32)
-        self._adam = AdamState.restored(state, {"values": values})
+        self._adam = AdamState.from_state(state, {"values": values})
         self._visits, self._values = visits.clone(), values.clone().requires_grad_()
 
 

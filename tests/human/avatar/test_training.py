@@ -228,7 +228,7 @@ def turned(capture: Path, out: Path) -> Path:
 def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pose_fit, "STARTS", (10 / 240,))
+    monkeypatch.setattr(pose_fit, "REFIT_STARTS", (10 / 240,))
     config = tiny(turned(capture, tmp_path / "turned"), steps=240)
     trainer = build_trainer(config)
     lines = [trainer.step().message or "" for _ in range(16)]
@@ -247,7 +247,7 @@ def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(
 def test_poses_that_views_gain_nothing_from_stay_for_good(
     capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pose_fit, "STARTS", (10 / 240, 14 / 240))
+    monkeypatch.setattr(pose_fit, "REFIT_STARTS", (10 / 240, 14 / 240))
     trainer = build_trainer(tiny(capture, steps=240))
     given = human(trainer).clip.poses.clone()
     lines = [trainer.step().message or "" for _ in range(12)]
