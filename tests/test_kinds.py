@@ -36,7 +36,7 @@ from dyngs.io.write import write_image
 from dyngs.models.static_section import StaticModel
 from dyngs.models.views import training_times
 from dyngs.training.losses import SilhouetteLoss
-from dyngs.training.new_trainer import build_trainer, add_initial_points
+from dyngs.training.new_trainer import add_initial_points, build_trainer
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from dyngs.core.gaussians import Gaussians
 from dyngs.deform.bodies.field import BodyField, find_body_field
 from dyngs.deform.scene import field_scene_of
 from dyngs.gaussians.colour.network import bake_harmonics
-from dyngs.gaussians.levels import MERGED, levels_of
+from dyngs.gaussians.levels import MERGED
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
     SOG_INDEX,
@@ -53,7 +53,7 @@ from dyngs.io.formats.splat_file import (
 from dyngs.io.gltf import GlbDocument
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import atomic_file
-from dyngs.ops.quaternions import rotation_matrices, align_quat_signs, unit_quats
+from dyngs.ops.quaternions import align_quat_signs, rotation_matrices, unit_quats
 from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import Opened
 

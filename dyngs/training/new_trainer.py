@@ -15,9 +15,8 @@ from dyngs.data.loader import ImageLoader, usual_threads
 from dyngs.data.read import read_capture, require_images
 from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
-from dyngs.gaussians.initialization import InitialGaussians, scene_geometry
-from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.initialization import InitialGaussians, surroundings
+from dyngs.gaussians.model import GaussianModel
 from dyngs.models.kind import Moves, RunStart, kind_of
 from dyngs.models.views import (
     background_colour,

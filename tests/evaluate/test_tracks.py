@@ -23,7 +23,7 @@ from dyngs.data.synthetic.captures import DynamicOptions, SceneName, write_dynam
 from dyngs.data.tracks import TrueTracks, read_true_tracks
 from dyngs.deform.bodies.field import BodyField, BodyRestPose
 from dyngs.deform.field import FieldSetup
-from dyngs.deform.free import FreePrimitives, FreeInitialization
+from dyngs.deform.free import FreeInitialization, FreePrimitives
 from dyngs.deform.keys import FreeField
 from dyngs.deform.scene import DynamicScene
 from dyngs.evaluate.tracks import NO_TRACKS, NONE_OPAQUE, NONE_SEEN, track_scores

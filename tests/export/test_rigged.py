@@ -60,7 +60,6 @@ from dyngs.human.body.skinning import (
     joint_transforms,
 )
 from dyngs.human.motion.gltf import read_gltf
-from dyngs.human.motion.placement import rotate_clip_to_y_up
 from dyngs.io.formats.formats import read_splats
 from dyngs.runs.checkpoint import load_run
 

@@ -41,7 +41,6 @@ from dyngs.human.body.skinning import (
     joint_transforms,
 )
 from dyngs.human.keys import HumanModel
-from dyngs.human.motion.placement import rotate_clip_to_y_up
 from dyngs.io.formats.gltf import EXTENSION, add_gaussians
 from dyngs.io.formats.ply import write_ply
 from dyngs.io.formats.splat_file import SplatFile, require_writable
