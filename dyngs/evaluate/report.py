@@ -35,7 +35,7 @@ from dyngs.evaluate.view_scores import (
     time_renders,
 )
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
-from dyngs.human.avatar.pose_fit import fit_poses_to_images
+from dyngs.human.avatar.pose_fit import IMAGE_COMPARISON, SILHOUETTE_COMPARISON, fit_poses_to_images
 from dyngs.human.avatar.scene import as_human_scene
 from dyngs.io.write import write_text
 from dyngs.models.checkpoint import OTHER_CONFIG, read_capture_of

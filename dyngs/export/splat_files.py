@@ -19,7 +19,7 @@ from dyngs.core.gaussians import Gaussians
 from dyngs.deform.bodies.field import BodyField, find_body_field
 from dyngs.deform.scene import field_scene_of
 from dyngs.gaussians.colour.network import bake_harmonics
-from dyngs.gaussians.levels import MERGED
+from dyngs.gaussians.levels import MERGED, build_levels
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
     SOG_INDEX,

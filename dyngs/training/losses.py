@@ -12,7 +12,7 @@ from torch import Tensor
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image
 from dyngs.models.model import Look, Loss
-from dyngs.ops.device import AsyncReadback
+from dyngs.ops.device import AsyncReadback, copy_async
 from dyngs.ops.loss import l1_ssim_loss
 
 

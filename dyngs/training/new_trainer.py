@@ -15,7 +15,7 @@ from dyngs.data.loader import ImageLoader, usual_threads
 from dyngs.data.read import read_capture, require_images
 from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
-from dyngs.gaussians.initialization import InitialGaussians, surroundings
+from dyngs.gaussians.initialization import InitialGaussians, scene_geometry
 from dyngs.gaussians.model import GaussianModel
 from dyngs.models.kind import Moves, RunStart, kind_of
 from dyngs.models.views import (
@@ -82,7 +82,7 @@ def build_trainer(
     if not priors.masks:
         images = images.without_motion_masks()
     background = resolved_background(config, capture)
-    extent = surroundings(capture).extent
+    extent = scene_geometry(capture).extent
     messages = [priors.message] if priors.message else []
     published = capture.has_alpha and config.train.alpha_weight == 0 and background != "random"
     if published and not restored:

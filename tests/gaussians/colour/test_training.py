@@ -186,8 +186,8 @@ def test_harmonics_that_do_not_pay_are_dropped(seven_views: Path, name: str) -> 
     for step in range(1, 41):
         report = trainer.step()
         counts.add(len(trainer.model.scene.gaussians))
-        if report.finding is not None:
-            findings[step] = report.finding
+        if report.message is not None:
+            messages[step] = report.message
             dropped = trainer.model.colours.frozen_harmonics()
         if step <= MEASURED_AFTER:
             seen.add(report.image.name)
