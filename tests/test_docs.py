@@ -171,7 +171,7 @@ def require_overrides(*overrides: str) -> None:
 
 def require_valid(command: Command, arguments: argparse.Namespace) -> None:
     """Check what a command names besides options: keys, variations, times, presets, files."""
-    from dyngs.export.camera_paths import parse_times, camera_path_file
+    from dyngs.export.camera_paths import camera_path_file, parse_times
     from dyngs.study.tradeoff import parse_goal, parse_requirements, parse_variations
 
     for word in command.words:
