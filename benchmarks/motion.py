@@ -59,8 +59,8 @@ from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.gaussians.schedule import Rates
-from dyngs.gaussians.start import StartValues, initial_gaussians, surroundings
+from dyngs.gaussians.schedule import RateSchedule
+from dyngs.gaussians.initialization import InitialValues, initial_gaussians, surroundings
 from dyngs.gaussians.static_training import StaticTraining
 from dyngs.models.static_section import StaticModel
 from dyngs.models.views import training_cameras, training_times
@@ -176,7 +176,7 @@ class OracleTraining(StaticTraining):
 
     def __init__(self, steps: int) -> None:
         super().__init__(FilterUpdate())
-        self._rates = Rates(steps)
+        self._rates = RateSchedule(steps)
 
     def optimize(self, scene: GaussianScene, step: int) -> Count:
         assert isinstance(scene, DynamicScene)
@@ -195,7 +195,7 @@ def oracle(name: SceneName, config: Config, seed: int = 0) -> GaussianTrainer:
     points, colours, labels = surface_points(name, capture.splits["train"], seed)
     start = replace(surroundings(capture), points=points, points_rgb=colours)
     generator = torch.Generator().manual_seed(seed)
-    values = StartValues.for_strategy(config.strategy)
+    values = InitialValues.for_strategy(config.strategy)
     gaussians = initial_gaussians(start, PointsInit(), values, model.sh_degree, generator)
     moving = torch.nonzero(labels >= scene_at(name, REST).movers.start)[:, 0]
     times = tuple(sorted(set(training_times(capture))))
@@ -206,7 +206,7 @@ def oracle(name: SceneName, config: Config, seed: int = 0) -> GaussianTrainer:
         field=TrueMotion(name, labels[moving], setup),
         moving=moving,
     )
-    trainer.model.begin_with(scene, OracleTraining(config.train.steps))
+    trainer.model.start_from(scene, OracleTraining(config.train.steps))
     return trainer
 
 

@@ -112,7 +112,7 @@ def trained(configs: list[Config], fails: str = "") -> int:
 
 def trained_on_gpu(configs: list[Config]) -> int:
     """As ``trained``, with the scene on the pretended GPU."""
-    new_trainer.device_for = lambda _: GPU
+    new_trainer.select_device = lambda _: GPU
     with pretend_gpu():
         return trained(configs)
 

@@ -45,7 +45,7 @@ from dyngs.io.formats.similarity import UNMOVED, Similarity, axis_of
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.outputs import new_folder
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.ops.device import deterministic, device_for
+from dyngs.ops.device import deterministic, select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import RECORD_NAME
 from dyngs.runs.checkpoint import (
@@ -317,7 +317,7 @@ def _part(config: Config, run_dir: Path, rows: Tensor) -> Checkpoint:
     """Return the last checkpoint of a run with the Gaussians ``rows`` (N,) only."""
     with (
         kernel_threads(config.run.threads or num_cores()),
-        deterministic(device_for(config.run.device), True),
+        deterministic(select_device(config.run.device), True),
     ):
         trainer = at_end(config, run_dir)
         kept = torch.zeros(trainer.num_gaussians, dtype=torch.bool, device=trainer.device)

@@ -20,7 +20,7 @@ from safetensors.torch import load, save
 
 from dyngs.config import Config
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
-from dyngs.ops.device import deterministic, device_for, keep_freed_memory
+from dyngs.ops.device import deterministic, select_device, keep_freed_memory
 from dyngs.ops.native import kernel_threads
 from dyngs.training.events import Event, TopologyChanged
 from dyngs.training.loop import Interrupts, Trainable
@@ -110,7 +110,7 @@ def follow(processes: Processes) -> bool:
 def _follow_run(
     processes: Processes, config: Config, interrupts: Interrupts
 ) -> tuple[Order, bytes]:
-    bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
+    bytewise = deterministic(select_device(config.run.device), config.run.deterministic)
     with kernel_threads(config.run.threads or 1), bytewise:
         trainer = assemble(config, restored=True)
         trainer.join(processes)

@@ -35,7 +35,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.outputs import writing
 from dyngs.models.kind import Predicts, capability
-from dyngs.ops.device import deterministic, device_for, keep_freed_memory
+from dyngs.ops.device import deterministic, select_device, keep_freed_memory
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import write_record
 from dyngs.runs.checkpoint import (
@@ -125,7 +125,7 @@ def train(
     processes = processes or Processes()
     plan = planned(RunPlan(config, config), [share_views(processes)])
     require_possible(plan.resolved)
-    device = device_for(config.run.device)
+    device = select_device(config.run.device)
     if resume_from is None:
         if not (folder / RESOLVED_NAME).is_file():
             inputs_of(config).require_output(folder)

@@ -487,7 +487,7 @@ def _has_surface(arguments: argparse.Namespace) -> bool:
 def _export_surface(arguments: argparse.Namespace) -> None:
     """Write the surface of a scene, at several times one file each."""
     from dyngs.export.surface_file import upright_surface, write_surface
-    from dyngs.gaussians.surface import num_holes
+    from dyngs.gaussians.surface import count_holes
     from dyngs.models.renderable import SurfaceOptions
 
     out: Path = arguments.out or arguments.run_dir / ("mesh" if arguments.times else "mesh.ply")
@@ -504,7 +504,7 @@ def _export_surface(arguments: argparse.Namespace) -> None:
     for i, time in enumerate(_times(arguments) or (0.0,)):
         path = out / f"mesh_{i:04d}.ply" if arguments.times else out
         surface = write_surface(opened, path, time=time, options=options, how=how)
-        holes = num_holes(surface)
+        holes = count_holes(surface)
         closed = "closed" if holes == 0 else f"open at {counted(holes, 'place')}"
         faces = counted(len(surface.faces), "triangle")
         print_notes((f"{faces} with colours of {len(surface.vertices):,} vertices, {closed}",))

@@ -84,7 +84,7 @@ def _drop_harmonics(trainer: GaussianTrainer, tolerance: float) -> None:
         _looks(trainer, seen, background), looks, trainer.model.options, background, tolerance
     )
     trainer.model.drop_harmonics(~found.keeps, found.offsets)
-    trainer.model.keep_plain(
+    trainer.model.freeze_plain_harmonics(
         ~found.keeps, AutoColour(opacity_entropy=trainer.config.colour.opacity_entropy)
     )
 
@@ -323,4 +323,4 @@ class Search:
     def _restart(self) -> None:
         trainer = self.trainer
         trainer.begin_again(self._config, self.start)
-        trainer.model.exchange(trainer.model.scene.unmasked())
+        trainer.model.replace_scene(trainer.model.scene.without_masks())

@@ -35,14 +35,14 @@ from dyngs.evaluate.view_scores import (
     temporal_scores,
 )
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
-from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, fitted_to_images
-from dyngs.human.avatar.scene import avatar_of
+from dyngs.human.avatar.pose_fit import IMAGES, SILHOUETTES, fit_poses_to_images
+from dyngs.human.avatar.scene import as_human_scene
 from dyngs.io.write import write_text
 from dyngs.models.checkpoint import OTHER_CONFIG, read_capture_of
 from dyngs.models.kind import Moves, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
-from dyngs.ops.device import CPU, device_for
+from dyngs.ops.device import CPU, select_device
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
@@ -84,14 +84,14 @@ def scores_from_own_poses(
     "silhouette_poses" are fitted to the silhouettes alone. The scene stays as it is.
     """
     background = drawing.background
-    avatar = avatar_of(drawing.scene)
+    avatar = as_human_scene(drawing.scene)
     if avatar is not None:
         outlined = all(images[i].alpha is not None for i in range(len(images)))
         found: dict[str, Any] = {}
         for name, comparison in (("own_poses", IMAGES), ("silhouette_poses", SILHOUETTES)):
             if name == "silhouette_poses" and not outlined:
                 continue
-            fitted, updates = fitted_to_images(avatar, images, background, comparison)
+            fitted, updates = fit_poses_to_images(avatar, images, background, comparison)
             each = (images[i] for i in range(len(images)))
             views, _ = score_views(fitted, each, drawing.options, background, lpips)
             found[name] = PoseScores(
@@ -231,7 +231,7 @@ def evaluate_run(
     that refined its cameras. ``data_root``: where the capture lies by now. ``capture``: of the run,
     if it was read already.
     """
-    draws_on = device_for(device)
+    draws_on = select_device(device)
     inputs_of(run_dir).require_output(report_path(run_dir, split))
     if refine_poses and split == "train":
         raise DyngsError(

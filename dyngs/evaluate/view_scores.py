@@ -30,11 +30,11 @@ from dyngs.data.capture import View
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced, static_cameras
-from dyngs.gaussians.colour.network import fitted_affine, recoloured
-from dyngs.human.avatar.scene import avatar_of
+from dyngs.gaussians.colour.network import fit_affine_colour, apply_affine_colour
+from dyngs.human.avatar.scene import as_human_scene
 from dyngs.models.renderable import DrawOptions, Renderable, Rendering
 from dyngs.models.views import background_colour
-from dyngs.ops.device import finish
+from dyngs.ops.device import synchronize
 
 REGION_METRICS = ("psnr_foreground", "psnr_moving", "psnr_static")
 
@@ -185,7 +185,7 @@ def seconds_in_turn(
         for turn in range(len(drawings)):
             row = (column + turn) % len(drawings)
             start = time.perf_counter()
-            finish(drawings[row].image(image.cameras, image.time).device)
+            synchronize(drawings[row].image(image.cameras, image.time).device)
             seconds[row, column] = time.perf_counter() - start
     return seconds
 
@@ -278,7 +278,7 @@ def score_views(
                 empty = mask is not None and not bool((mask > 0).any())
                 why = "its mask ignores every pixel" if empty else "the image holds NaN or Inf"
                 raise DyngsError(f"view {image.name!r}: {name} is not finite, {why}")
-        if avatar_of(scene) is not None:
+        if as_human_scene(scene) is not None:
             values |= person_scores(image, rendering, background, lpips)
         values |= right_half_scores(image, rendering, background)
         values |= background_scores(image, rendering, background)
@@ -344,8 +344,8 @@ def right_half_scores(image: Image, rendering: Rendering, background: Tensor) ->
     counts = left + 1 if image.mask is None else image.mask
     if not all(bool((half > 0).any()) for half in (counts[:, :middle], counts[:, middle:])):
         return {}
-    affine = fitted_affine([(image, rendering)], background, left)
-    fitted = recoloured(affine, image, rendering, background)
+    affine = fit_affine_colour([(image, rendering)], background, left)
+    fitted = apply_affine_colour(affine, image, rendering, background)
     return {
         "psnr_right": psnr(rendering.rgb[0][:, middle:], truth[:, middle:], mask),
         "psnr_right_fitted": psnr(fitted[:, middle:], truth[:, middle:], mask),
@@ -373,15 +373,15 @@ def _timed_render(
     """Return the rendering, the seconds it took, and the seconds of these for deformation."""
     with torch.no_grad():
         device = scene.device
-        finish(device)
+        synchronize(device)
         start = time.perf_counter()
         moment = scene.time_step(image.time)
-        finish(device)
-        deformed = time.perf_counter()
+        synchronize(device)
+        apply_offsets = time.perf_counter()
         rendering = scene.render(image.cameras, moment, options=options, background=background)
-        finish(device)
+        synchronize(device)
         end = time.perf_counter()
-    return rendering, end - start, deformed - start
+    return rendering, end - start, apply_offsets - start
 
 
 @dataclass(frozen=True)

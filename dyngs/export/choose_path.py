@@ -23,7 +23,7 @@ from dyngs.export.camera_paths import (
 from dyngs.export.images import file_stems
 from dyngs.export.orbits import frame_orbit_for_points, orbit_path, path_along, spiral_path
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.human.avatar.scene import avatar_of
+from dyngs.human.avatar.scene import as_human_scene
 from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.io.formats.similarity import AXES
 from dyngs.models.renderable import Renderable
@@ -149,7 +149,7 @@ def in_front_of(opened: Opened, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras
     front."""
     ring = orbit_around(opened, _RING, size)
     front = 0
-    person = avatar_of(opened.renderable)
+    person = as_human_scene(opened.renderable)
     if person is not None:
         facing = axis_angle_to_matrix(person.clip.poses[0, 0])[:, 2]
         front = int((ring.centers @ facing).argmax())

@@ -20,7 +20,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.export.camera_paths import CameraPath, pick_cameras
 from dyngs.export.orbits import frame_orbit_for_points
 from dyngs.export.video import video_writer
-from dyngs.gaussians.rendering import drawing_options, render, splat_options
+from dyngs.gaussians.rendering import file_render_options, render, splat_options
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import Written, read_splats
 from dyngs.io.formats.similarity import AXES
@@ -349,7 +349,7 @@ def compare_splats(splat: SplatFile, written: Written) -> float:
     """
     cameras = _around(splat)
     moved = written.splat.frame.after(splat.frame.inverse())
-    options = drawing_options(splat)
+    options = file_render_options(splat)
     black = torch.zeros_like(splat.gaussians.means[0])
     with torch.no_grad():
         wanted = render(splat.gaussians, cameras, options, background=black).rgb

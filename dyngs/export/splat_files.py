@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from dyngs.core.conventions import SH_C0
 from dyngs.core.errors import DyngsError, counted
 from dyngs.core.gaussians import Gaussians
-from dyngs.deform.bodies.field import BodyField, bodies_of
+from dyngs.deform.bodies.field import BodyField, find_body_field
 from dyngs.deform.scene import field_scene_of
-from dyngs.gaussians.colour.network import with_harmonics
+from dyngs.gaussians.colour.network import bake_harmonics
 from dyngs.gaussians.levels import MERGED, levels_of
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
@@ -53,7 +53,7 @@ from dyngs.io.formats.splat_file import (
 from dyngs.io.gltf import GlbDocument
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import atomic_file
-from dyngs.ops.quaternions import rotation_matrices, shorter_ways, unit_quats
+from dyngs.ops.quaternions import rotation_matrices, align_quat_signs, unit_quats
 from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import Opened
 
@@ -283,7 +283,7 @@ def splats_at(
     if not scene.is_static:
         comments.append(f"dyngs time {time!r}")
     if shader is not None:
-        baked = with_harmonics(gaussians, shader)
+        baked = bake_harmonics(gaussians, shader)
         gaussians = baked.gaussians
         comments.append(f"colours: harmonics fitted to a network, rms error {baked.error:.4f}")
     x, y, z = opened.info.world_offset
@@ -325,7 +325,7 @@ def tracks_of(
     ids = torch.arange(len(scene), device="cpu")
     ids = ids[moves] if part == "moving" else ids
     kind = np.float32 if frame == UNMOVED else np.float64
-    whole = scene.unmasked()
+    whole = scene.without_masks()
     positions = np.empty((len(ids), len(times), 3), kind)
     for k, time in enumerate(times):
         positions[:, k] = whole.at(time).means[ids].numpy()
@@ -435,12 +435,12 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
     """
     inputs_of(opened).require_output(path)
     scene = field_scene_of(opened.scene)
-    field = None if scene is None else bodies_of(scene.field)
+    field = None if scene is None else find_body_field(scene.field)
     if scene is None or field is None:
         raise DyngsError(
             "--bodies: no body that turns was found in this run; leave it out, or give --times A:B:N"
         )
-    scene = scene.unmasked()  # the rows of the labels
+    scene = scene.without_masks()  # the rows of the labels
     splat = splats_at(opened, scene, time, how)
     require_writable(path, splat.gaussians)
     gaussians = splat.gaussians.replace(quats=unit_rotations(splat.gaussians.quats))
@@ -466,7 +466,7 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
             node["translation"] = place.tolist()
             turned = Rotation.from_quat(turns[1:, body]) * Rotation.from_quat(turns[0, body]).inv()
             channels.append((len(nodes), "translation", places[1:, body]))
-            channels.append((len(nodes), "rotation", shorter_ways(turned.as_quat())))
+            channels.append((len(nodes), "rotation", align_quat_signs(turned.as_quat())))
         meshes.append({"name": name, "primitives": [add_gaussians(document, own)]})
         nodes.append(node)
     document.add_animation("motion", moments * opened.seconds, channels)

@@ -15,7 +15,7 @@ from dyngs.baselines.fields.scene import space_of
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
 from dyngs.export.splat_files import AS_THEY_ARE, Writing, writing_of
-from dyngs.gaussians.surface import opaque_box, surface_of
+from dyngs.gaussians.surface import opaque_box, extract_surface
 from dyngs.io.formats.ply import double_ply
 from dyngs.io.formats.similarity import Similarity, far_offset
 from dyngs.io.write import atomic_file
@@ -111,4 +111,4 @@ def _fused_surface(opened: Opened, time: float, cells: int | None) -> Surface:
         common = torch.maximum(box[0], cube[0]), torch.minimum(box[1], cube[1])
         shares_much = bool((common[1] - common[0] > 0.1 * space.half).all())
         box = common if shares_much else cube
-    return surface_of(scene, cameras, box, time, cells=cells)
+    return extract_surface(scene, cameras, box, time, cells=cells)

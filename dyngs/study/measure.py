@@ -22,7 +22,7 @@ from dyngs.io.write import write_image
 from dyngs.models.checkpoint import read_capture_of
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background
-from dyngs.ops.device import device_for
+from dyngs.ops.device import select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.checkpoint import SCENE_FILE, has_only_scene_file, load_run
 from dyngs.runs.opened import scene_of_split, split_views
@@ -165,7 +165,7 @@ class Bench:
         """Return how the scene in a folder is drawn, and the images of the run that it is compared
         with."""
         run = load_run(run_dir)
-        device = device_for(self.device)
+        device = select_device(self.device)
         capture = read_capture_of(run.config.data, run.info)
         views = split_views(capture, self.split)
         loader = images_of_split(capture, views, run_dir, run)

@@ -30,7 +30,7 @@ from dyngs.core.section import CutOff
 from dyngs.core.state import tensors_of
 from dyngs.models.checkpoint import read_capture_of, restored_model, settings_of
 from dyngs.models.kind import HasGaussians, Moves, capability
-from dyngs.ops.device import device_for
+from dyngs.ops.device import select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
@@ -229,7 +229,7 @@ class Tradeoff:
             "checkpoint": newest.name,
             "sha256": hashlib.sha256(newest.read_bytes()).hexdigest(),
             "split": self.split,
-            "device": device_for(self.device).type,
+            "device": select_device(self.device).type,
         }
         require_same_study(self.out, source, ("sha256", "split", "device"))
         singles = [Variant(), *single_changes(self.settings, own, self.finetune)]

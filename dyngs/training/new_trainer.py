@@ -16,7 +16,7 @@ from dyngs.data.read import read_capture, require_images
 from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.model import GaussianModel
-from dyngs.gaussians.start import FirstGaussians, surroundings
+from dyngs.gaussians.initialization import InitialGaussians, surroundings
 from dyngs.models.kind import Moves, RunStart, kind_of
 from dyngs.models.views import (
     background_colour,
@@ -25,7 +25,7 @@ from dyngs.models.views import (
     training_cameras,
     training_times,
 )
-from dyngs.ops.device import device_for
+from dyngs.ops.device import select_device
 from dyngs.training.corrections.camera_refinement import CameraRefinement
 from dyngs.training.corrections.exposure import ViewExposures
 from dyngs.training.corrections.robust import RobustMasks
@@ -52,7 +52,7 @@ def assemble(
     restored: bool = False,
     images: ImageLoader | None = None,
     held_out: frozenset[int] = frozenset(),
-    first: FirstGaussians | None = None,
+    first: InitialGaussians | None = None,
     uncapped: Config | None = None,
 ) -> Trainer[Any]:
     """Return the trainer of a scene: its model begun, nothing trained.
@@ -133,7 +133,7 @@ def assemble(
         generator=generator,
         findings=findings,
         held_out=held_out,
-        device=device_for(config.run.device),
+        device=select_device(config.run.device),
     )
 
 

@@ -241,14 +241,14 @@ class Trainer(Generic[M]):
             self._rescale(edit.steps)
         if edit.config is not None:
             self.config = edit.config
-            model.draw_as(edit.config.model)
+            model.set_render_options(edit.config.model)
         if edit.stops_growing:
-            model.exchange(model.scene.unmasked())
+            model.replace_scene(model.scene.without_masks())
             model.stop_growing()
         if edit.kept is not None:
             model.keep(edit.kept, self.done)
         if edit.masks is not None:
-            model.exchange(replace(model.scene, masks=edit.masks))
+            model.replace_scene(replace(model.scene, masks=edit.masks))
 
     def _rescale(self, steps: int) -> None:
         config = with_steps(self.config, steps)

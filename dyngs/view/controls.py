@@ -15,7 +15,7 @@ import torch
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.human.avatar.scene import avatar_of
+from dyngs.human.avatar.scene import as_human_scene
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.motion import compose_rotations
 from dyngs.io.write import to_uint8
@@ -281,7 +281,7 @@ def posed(opened: Opened, angles: Mapping[str, Sequence[float]]) -> Opened:
     from scipy.spatial.transform import Rotation
 
     rest = opened.at_rest()
-    person = avatar_of(rest.renderable)
+    person = as_human_scene(rest.renderable)
     clip = None if person is None else person.played
     if person is None or clip is None:
         return rest

@@ -16,7 +16,7 @@ from dyngs.data.capture import View
 from dyngs.data.geometry import inverse_rigid, look_at_point, pinhole_matrix, world_from_cam
 from dyngs.data.loader import ImageLoader
 from dyngs.export.choose_path import orbit_around, points_at
-from dyngs.human.avatar.scene import avatar_of
+from dyngs.human.avatar.scene import as_human_scene
 from dyngs.models.views import training_cameras
 from dyngs.runs.opened import Opened, scene_of_split
 
@@ -99,7 +99,7 @@ def viewpoint_of(opened: Opened) -> Viewpoint:
 def _viewpoint(opened: Opened) -> Viewpoint:
     shown = views_of(opened)
     cameras = opened.cameras
-    person = avatar_of(opened.renderable)
+    person = as_human_scene(opened.renderable)
     if len(shown) and cameras is not None:
         start = shown.cameras[0]
         center = look_at_point(cameras)

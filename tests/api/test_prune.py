@@ -82,7 +82,7 @@ def test_on_a_gpu_it_is_the_same(
     briefly = ("prune.steps=1", "run.threads=1")
     expected = prune_within(run_dir, tmp_path / "here", 3.0, briefly, silent)
     here = compared([run_dir, file_of(tmp_path / "here")], 1)
-    monkeypatch.setattr("dyngs.training.new_trainer.device_for", lambda _: GPU)
+    monkeypatch.setattr("dyngs.training.new_trainer.select_device", lambda _: GPU)
     with pretend_gpu():
         found = prune_within(run_dir, tmp_path / "there", 3.0, briefly, silent)
         there = compared([run_dir, file_of(tmp_path / "there")], 1, GPU)

@@ -11,7 +11,7 @@ from tiny_fields import busy_config
 
 from dyngs.compress.search import PruneChoice, apply_choice
 from dyngs.config import Config
-from dyngs.gaussians.scene import restored_scene
+from dyngs.gaussians.scene import restore_scene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
@@ -49,7 +49,7 @@ def test_everything_that_a_choice_says(trainer: Trainer) -> None:
     assert len(scene) == count - count // 2
     assert (scene.options.alpha_min, trainer.model.options.alpha_min) == (0.02, 0.02)
     assert not bool(scene.gaussians.sh[:, 1:].any())
-    again = restored_scene(trainer.checkpoint(), trainer.config.model)
+    again = restore_scene(trainer.checkpoint(), trainer.config.model)
     assert torch.equal(again.at(0.4).means, scene.at(0.4).means)
     assert str(choice) == "50.0% of the Gaussians, alphas below 0.02, harmonics worth 100 dB"
     assert (trainer.config.colour.kind, trainer.config.prune.fraction) == ("auto", 0.5)

@@ -45,7 +45,7 @@ def trainer(still: Path) -> Trainer:
     tensors["means"][-1] = before
     tensors["log_scales"][-1] = -4.0
     tensors["logit_opacities"][-1] = 1.0
-    trainer.model.begin_with(
+    trainer.model.start_from(
         trainer.model.scene.with_gaussians(Gaussians(**tensors)), trainer.model.training
     )
     return trainer

@@ -24,12 +24,12 @@ from dyngs.config import TrainConfig
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
 from dyngs.deform.control_nodes import ControlNodes
-from dyngs.deform.field import DeformationField, Offsets, deformed
+from dyngs.deform.field import DeformationField, Offsets, apply_offsets
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.networks import Hexplane
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import TopologyEdit
-from dyngs.gaussians.scene import restored_scene
+from dyngs.gaussians.scene import restore_scene
 from dyngs.training.new_trainer import assemble
 from dyngs.training.trainer import Trainer
 
@@ -110,7 +110,7 @@ def test_no_moving_gaussians(kind: str) -> None:
     assert {name: tuple(x.shape) for name, x in vars(offsets).items()} == {
         "means": (0, 3), "quats": (0, 4), "log_scales": (0, 3), "logit_opacities": (0,), "colors": (0, 3)
     }  # fmt: skip
-    moved = deformed(gaussians, offsets, torch.zeros(0, dtype=torch.long))
+    moved = apply_offsets(gaussians, offsets, torch.zeros(0, dtype=torch.long))
     assert all(torch.equal(x, gaussians.tensors()[name]) for name, x in moved.tensors().items())
     if moved.means.requires_grad:
         moved.means.sum().backward()
@@ -128,8 +128,8 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
     assert isinstance(scene, DynamicScene)
     assert scene.field is not None
     field = scene.field.edited(two)
-    field.regroup()
-    trainer.model.exchange(replace(scene, moving=two.source, field=field))
+    field.invalidate()
+    trainer.model.replace_scene(replace(scene, moving=two.source, field=field))
     trainer.step()
     keep = torch.ones(len(trainer.model.scene), dtype=torch.bool)
     keep[trainer.model.scene.rows] = False
@@ -190,14 +190,14 @@ def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> 
 
 
 @pytest.mark.parametrize("filtered", [False, True])
-def test_a_run_of_one_step(capture: Path, filtered: bool) -> None:
+def test_a_run_of_one_step(capture: Path, apply_filter: bool) -> None:
     """It ends as motion begins: with a field that is the identity, for the random Gaussians too,
     and filtered."""
-    config = busy_config(capture, capture, "hexplane", filter_3d=filtered)
+    config = busy_config(capture, capture, "hexplane", filter_3d=apply_filter)
     config = config.model_copy(update={"train": TrainConfig(steps=1)})
     trainer = assemble(config)
     trainer.step()
-    scene = restored_scene(trainer.checkpoint(), config.model)
+    scene = restore_scene(trainer.checkpoint(), config.model)
     assert not scene.is_static
     assert len(scene) == 60 + 12
     assert torch.equal(scene.at(0.3).means, scene.gaussians.means)

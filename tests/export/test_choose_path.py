@@ -178,7 +178,7 @@ def directions(centers: torch.Tensor) -> np.ndarray:
 
 
 def test_who_was_filmed_from_one_side_is_seen_from_all(tmp_path: Path) -> None:
-    options = HumanOptions(size=32, num_frames=2, num_new=0, num_cameras=1, num_test=1, samples=1)
+    options = HumanOptions(size=32, num_frames=2, num_pose_frames=0, num_cameras=1, num_test=1, samples=1)
     root = write_human_capture(tmp_path / "person", options)
     run = RunConfig(threads=1, dir=tmp_path / "run")
     folder = train(

@@ -17,7 +17,7 @@ from scene_kinds import scene_of_kind
 from dyngs.deform.field import Offsets
 from dyngs.export import html
 from dyngs.export.html.numbers import CHUNK, Lists, add_scene, fitted_curves
-from dyngs.human.avatar.scene import avatar_of
+from dyngs.human.avatar.scene import as_human_scene
 from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.ops.quaternions import rotation_matrices
 
@@ -48,9 +48,9 @@ def test_rotations_of_a_clip_begin_with_their_scalar_part() -> None:
     lists = Lists()
     add_scene(scene, lists, 0.01)
     found = torch.from_numpy(read(lists, "clip_quats").reshape(-1, 4))
-    person = avatar_of(scene)
+    person = as_human_scene(scene)
     assert person is not None
-    wanted = axis_angle_to_matrix(person.moves_as.poses.reshape(-1, 3)).double()
+    wanted = axis_angle_to_matrix(person.played_clip.poses.reshape(-1, 3)).double()
     torch.testing.assert_close(rotation_matrices(found.double()), wanted, rtol=0, atol=1e-3)
 
 

@@ -134,7 +134,7 @@ def test_the_skin_moves_vertices_as_our_own_skinning_does(tmp_path: Path, scale:
     found = written(tmp_path / "x.glb", scene)
     _, _, source = body_mesh(body)
     skeleton = scene.learned_skeleton
-    clip = upright(scene.moves_as, scene.clip, skeleton.joints)
+    clip = upright(scene.played_clip, scene.clip, skeleton.joints)
     lowest = []
     shifts = []
     for frame in range(4):
@@ -158,7 +158,7 @@ def test_our_reader_of_motions_finds_the_same_motion(tmp_path: Path) -> None:
     written(tmp_path / "x.glb", scene)
     found = read_gltf(tmp_path / "x.glb", fps=10.0)
     assert found.names == JOINT_NAMES
-    clip = upright(scene.moves_as, scene.clip, scene.learned_skeleton.joints)
+    clip = upright(scene.played_clip, scene.clip, scene.learned_skeleton.joints)
     skeleton = scene.learned_skeleton
     for frame in range(4):
         world = joint_transforms(
@@ -268,8 +268,8 @@ def test_the_skin_moves_gaussians_as_the_avatar_does(tmp_path: Path) -> None:
     assert "viewers may show the rest pose" in notes[0]
     found = SkinnedGlb(tmp_path / "ann.glb")
     assert found.primitive["mode"] == 0
-    turned = upright(scene.moves_as, scene.clip, scene.learned_skeleton.joints)
-    torch.testing.assert_close(turned.poses, scene.moves_as.poses, atol=1e-5, rtol=0)
+    turned = upright(scene.played_clip, scene.clip, scene.learned_skeleton.joints)
+    torch.testing.assert_close(turned.poses, scene.played_clip.poses, atol=1e-5, rtol=0)
     for frame, time in enumerate((0.0, 0.5, 1.0)):
         difference = found.posed(frame) - scene.at(time).means.numpy()
         np.testing.assert_allclose(difference, np.tile(difference[0], (len(scene), 1)), atol=1e-5)

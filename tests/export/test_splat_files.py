@@ -30,7 +30,7 @@ from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, Lens, PointCloud
 from dyngs.data.read import read_capture
-from dyngs.deform.bodies.field import BodyField, BodyRest
+from dyngs.deform.bodies.field import BodyField, BodyRestPose
 from dyngs.deform.fields import WindowedField
 from dyngs.deform.scene import DynamicScene
 from dyngs.export.cameras import NAME, write_cameras
@@ -243,7 +243,7 @@ def rolling(tmp_path_factory: pytest.TempPathFactory) -> Opened:
     way = torch.linspace(0, 1, 9)
     places = torch.stack([2 * way - 1, 0.25 * way**2, 0 * way], dim=1)
     labels = torch.zeros(len(MOVING_ROWS), dtype=torch.long)
-    rest = BodyRest(torch.tensor([[0.1, 0.2, 0.0]]), torch.ones(1), labels)
+    rest = BodyRestPose(torch.tensor([[0.1, 0.2, 0.0]]), torch.ones(1), labels)
     field = BodyField(sliding_nodes(), rest, {"places": places[None], "quats": quats[None]})
     assert isinstance(opened.scene, DynamicScene)
     return opened.showing(replace(opened.scene, field=WindowedField(field, len(MOVING_ROWS))))

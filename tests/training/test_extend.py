@@ -26,7 +26,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.schedule import deform_schedule
-from dyngs.gaussians.schedule import Rates, active_sh_degree
+from dyngs.gaussians.schedule import RateSchedule, active_sh_degree
 from dyngs.human.keys import HumanModel
 from dyngs.human.synthetic.capture import write_human_capture
 from dyngs.models.schedule import image_divisor
@@ -154,7 +154,7 @@ def test_what_has_begun_keeps_its_step() -> None:
         time_window=0.1, time_window_grows_from=0.4, time_window_full_at=0.6, motion_from=0.35
     )
     config = Config(data=DataConfig(root=Path("x")), model=model, train=options)
-    old = deform_schedule(model, Rates(1000))
+    old = deform_schedule(model, RateSchedule(1000))
     assert old.fine == 350
     for done in (360, 500, 700, 1000):
         for steps in (done + 10, 1050, 9000):
@@ -164,7 +164,7 @@ def test_what_has_begun_keeps_its_step() -> None:
                 continue
             new = with_length(config, done, steps)
             assert isinstance(new.model, DynamicModel)
-            now = deform_schedule(new.model, Rates(steps))
+            now = deform_schedule(new.model, RateSchedule(steps))
             assert now.fine == (350 if steps < 9000 else 1000)
             assert image_divisor(new.train, done) <= image_divisor(options, done)
             assert active_sh_degree(new.train, done, 3) >= active_sh_degree(options, done, 3)
@@ -186,4 +186,4 @@ def test_what_a_shorter_run_would_have_begun_by_now_begins_next() -> None:
     config = Config(data=DataConfig(root=Path("x")), model=model, train=TrainConfig(steps=10_000))
     new = with_length(config, 4000, 5000)
     assert isinstance(new.model, DynamicModel)
-    assert deform_schedule(new.model, Rates(5000)).fine == 4001
+    assert deform_schedule(new.model, RateSchedule(5000)).fine == 4001

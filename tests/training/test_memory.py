@@ -57,7 +57,7 @@ def test_a_run_is_forecast_before_it_begins(still: Path) -> None:
 def test_on_a_gpu_the_scene_is_forecast_there_and_the_rest_here(
     still: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dyngs.training.new_trainer.device_for", lambda _: GPU)
+    monkeypatch.setattr("dyngs.training.new_trainer.select_device", lambda _: GPU)
     monkeypatch.setattr(memory, "gpu_memory", lambda _: (3 * GB, 8 * GB))
     with pretend_gpu():
         gpu, machine = memory_forecasts(assemble(config_of(still)))

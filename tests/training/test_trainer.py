@@ -110,7 +110,7 @@ class _Lifted(SceneTraining[_LiftedScene]):
     def after_step(self, scene: _LiftedScene, step: int, edited: bool) -> _LiftedScene:
         return scene
 
-    def revised(self, scene: _LiftedScene, step: int) -> tuple[_LiftedScene, EditResult] | None:
+    def edit_scene(self, scene: _LiftedScene, step: int) -> tuple[_LiftedScene, EditResult] | None:
         return None
 
     def window(self, step: int) -> tuple[float, float]:
@@ -132,7 +132,7 @@ class _Lifted(SceneTraining[_LiftedScene]):
 def _trained_by(trainer: GaussianTrainer, training: SceneTraining[Any]) -> GaussianTrainer:
     """``trainer`` with its Gaussians in a scene of another kind."""
     trainer.model.training = training
-    trainer.model.exchange(_LiftedScene(gaussians=trainer.model.scene.gaussians))
+    trainer.model.replace_scene(_LiftedScene(gaussians=trainer.model.scene.gaussians))
     return trainer
 
 

@@ -30,8 +30,8 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork
 from dyngs.gaussians.levels import BLOCK, MERGED, PIXELS, Block, Levels
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.human.avatar.posing import frame_pose, rest_offsets
-from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.human.avatar.posing import frame_pose, pose_blend_offsets
+from dyngs.human.avatar.scene import HumanScene, as_human_scene
 from dyngs.ops.nodes import SPAN
 
 BONES = 8  # bones that a Gaussian follows on the page
@@ -101,7 +101,7 @@ def add_scene(scene: GaussianScene, lists: Lists, tolerance: float) -> dict[str,
 
     ``tolerance``: world units that a place may be off where motion is fitted.
     """
-    person = avatar_of(scene)
+    person = as_human_scene(scene)
     moved = field_scene_of(scene)
     gaussians = scene.gaussians
     if person is not None:
@@ -244,7 +244,7 @@ def _add_splines(
 def _add_person(scene: HumanScene, order: Tensor, lists: Lists, tolerance: float) -> dict[str, Any]:
     from scipy.spatial.transform import Rotation
 
-    clip = scene.moves_as
+    clip = scene.played_clip
     skeleton = scene.learned_skeleton
     top = scene.weights[order].topk(min(BONES, scene.weights.shape[1]), dim=1)
     more = BONES - top.values.shape[1]
@@ -261,7 +261,7 @@ def _add_person(scene: HumanScene, order: Tensor, lists: Lists, tolerance: float
     if scene.shapes is not None:
 
         def offsets(time: float) -> Offsets:
-            found = rest_offsets(scene.anchors, frame_pose(clip.at(time), 0), scene.shapes)
+            found = pose_blend_offsets(scene.anchors, frame_pose(clip.at(time), 0), scene.shapes)
             return Offsets(torch.zeros_like(scene.gaussians.means) if found is None else found)
 
         heads, error = fitted_curves(offsets, len(clip), tolerance)
@@ -290,8 +290,8 @@ def _add_network(network: ColourNetwork, lists: Lists) -> dict[str, Any]:
             "width": width,
             "first": first,
             "box": network.box.flatten().tolist(),
-            "time": network.sees_time,
-            "normals": network.sees_normals,
+            "time": network.uses_time,
+            "normals": network.uses_normals,
         }
     }
 

@@ -21,7 +21,7 @@ from dyngs.export.choose_path import in_front_of, orbit_around, points_at, view_
 from dyngs.export.html.numbers import Lists, add_levels, add_scene, block_files
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.human.avatar.scene import avatar_of
+from dyngs.human.avatar.scene import as_human_scene
 from dyngs.io.formats.similarity import AXES
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import write_text
@@ -139,7 +139,7 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
     if any(opened.world_offset):
         offset = " ".join(f"{x:.12g}" for x in opened.world_offset)
         notes.append(f"the scene is far from the origin: {offset} is subtracted from its positions")
-    person = avatar_of(opened.renderable)
+    person = as_human_scene(opened.renderable)
     if person is not None:
         notes += person.left_out
     curves = header.get("curves", {})

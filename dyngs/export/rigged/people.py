@@ -28,7 +28,7 @@ from dyngs.export.rigged.texture import (
     texture_image,
 )
 from dyngs.human.avatar.posing import Anchors, Skeleton, heaviest_joints
-from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.human.avatar.scene import HumanScene, as_human_scene
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body import BodyTemplate, apply_shape
 from dyngs.human.body.body_reader import load_template
@@ -48,7 +48,7 @@ from dyngs.io.formats.splat_file import SplatFile, require_writable
 from dyngs.io.gltf import INDICES, VERTICES, GlbDocument
 from dyngs.io.write import atomic_file
 from dyngs.models.kind import HasBody, capability
-from dyngs.ops.quaternions import shorter_ways
+from dyngs.ops.quaternions import align_quat_signs
 from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.folder import inputs_of
 
@@ -172,7 +172,7 @@ def add_animation(
     """
     joints = rig.skeleton.joints
     parents = rig.skeleton.parents
-    clip = upright(scene.moves_as, scene.clip, joints)
+    clip = upright(scene.played_clip, scene.clip, joints)
     frames = torch.linspace(0, len(clip) - 1, min(len(clip), _FLOOR_FRAMES), device="cpu").long()
     lowest = []
     for row in frames.tolist():
@@ -184,7 +184,7 @@ def add_animation(
     root = root - np.array([middle[0], min(lowest), middle[2]])
     poses = clip.poses.double().numpy()
     quats = Rotation.from_rotvec(poses.reshape(-1, 3)).as_quat().reshape(*poses.shape[:2], 4)
-    quats = shorter_ways(quats)
+    quats = align_quat_signs(quats)
     scale = clip.scale.double().numpy() / rig.scale
     channels = [(0, "translation", root)]
     if np.abs(scale - 1).max() > _STILL:  # not of a person who keeps the size
@@ -293,7 +293,7 @@ def person_and_template(run: LoadedRun, wanted: str) -> tuple[HumanScene, BodyTe
 
     Raises DyngsError: the run is not that of a person, or the template cannot be read.
     """
-    scene = avatar_of(run.scene)
+    scene = as_human_scene(run.scene)
     model = run.config.model
     if scene is None or capability(model, HasBody) is None:
         raise DyngsError(

@@ -29,7 +29,7 @@ from dyngs.core.state import tensors_of
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
-from dyngs.gaussians.colour.network import SATURATED, recoloured
+from dyngs.gaussians.colour.network import SATURATED, apply_affine_colour
 from dyngs.gaussians.optimizer import AdamState
 from dyngs.models.model import Correction, Look, Loss, RenderedView
 from dyngs.models.renderable import Rendering
@@ -92,7 +92,7 @@ class ViewExposures(Loss, Correction):
             return view
         if view.step == self._begins + 1 and self._images is not None:
             self._find_gains(self._images, view)
-        shown = recoloured(self.affine(view.index), view.image, view.rendering, view.background)
+        shown = apply_affine_colour(self.affine(view.index), view.image, view.rendering, view.background)
         # no sensor shows more than white
         white = view.image.composite(view.background) >= SATURATED
         return replace(view, rendered=torch.where(white, shown.clamp_max(1.0), shown))

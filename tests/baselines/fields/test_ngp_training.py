@@ -10,7 +10,7 @@ import pytest
 import torch
 from small_fields import NGP, config_of
 
-from dyngs.baselines.fields.ngp import NgpField, NgpTraining, seen_cells
+from dyngs.baselines.fields.ngp import NgpField, NgpTraining, cells_in_view
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import ImageLoader
@@ -70,7 +70,7 @@ def test_cells_that_no_camera_sees_are_never_occupied(capture: Path) -> None:
     config = config_of(capture, *NGP, "model.surroundings=always")
     trainer = assemble(config)
     field = trainer.model.scene.field
-    seen = seen_cells(field.space, trainer.capture.splits["train"])
+    seen = cells_in_view(field.space, trainer.capture.splits["train"])
     assert torch.equal(field.occupied, seen)
     assert not bool(seen.all())
     for _ in range(34):

@@ -25,7 +25,7 @@ from dyngs.config import (
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
-from dyngs.gaussians.scene import restored_scene
+from dyngs.gaussians.scene import restore_scene
 from dyngs.human.avatar import pose_fit
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.joints import mirrored_joints
@@ -43,7 +43,7 @@ BUSY = DefaultStrategy(start=1, stop=30_000, every=4, grow=False, prune_opacity=
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture") / "person"
     return write_human_capture(
-        folder, HumanOptions(size=32, num_frames=3, num_new=2, num_cameras=3, num_test=1)
+        folder, HumanOptions(size=32, num_frames=3, num_pose_frames=2, num_cameras=3, num_test=1)
     )
 
 
@@ -98,11 +98,11 @@ def test_a_seed_decides_every_byte_and_resuming_changes_none(capture: Path) -> N
 
 def test_training_learns_and_evaluates_on_both_splits(capture: Path, tmp_path: Path) -> None:
     config = tiny(capture, tmp_path / "run", steps=60)
-    start = restored_scene(assemble(config).checkpoint(), config.model)
+    start = restore_scene(assemble(config).checkpoint(), config.model)
     run = load_run(train(config))
     assert isinstance(run.scene, HumanScene)
     assert isinstance(start, HumanScene)
-    assert float((run.scene.moves_as.poses - start.moves_as.poses).abs().max()) > 0
+    assert float((run.scene.played_clip.poses - start.played_clip.poses).abs().max()) > 0
     for split in ("test", "pose"):
         report = evaluate_run(tmp_path / "run", split)
         assert report.psnr > 18
@@ -121,7 +121,7 @@ def test_what_is_played_back_is_what_was_trained(
     tensors_after(trainer, 8)
     image = trainer.images[4]
     drawn = trainer.model.training.time_step(trainer.model.scene, image, trainer.done + 1).gaussians
-    scene = restored_scene(trainer.checkpoint(), trainer.config.model)
+    scene = restore_scene(trainer.checkpoint(), trainer.config.model)
     played = scene.at(image.time)
     torch.testing.assert_close(played.means, drawn.means.detach(), rtol=0, atol=1e-5)
     torch.testing.assert_close(
