@@ -40,9 +40,9 @@ from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
-from dyngs.training.corrections.camera_refinement import fitted_to_image
+from dyngs.training.corrections.camera_refinement import fit_camera_to_image
 from dyngs.training.loop import Interrupts
-from dyngs.training.new_trainer import GaussianTrainer, assemble, with_points
+from dyngs.training.new_trainer import GaussianTrainer, add_initial_points, build_trainer
 
 Pair = tuple[GaussianTrainer, GaussianTrainer]
 Score = Callable[[Pair, int], list[float]]
@@ -234,7 +234,7 @@ def _motion(config: Config, capture: Capture) -> Choice | None:
         return None
     given = 60 * (config.train.minutes or math.inf)
     begun = time.monotonic()
-    capture = with_points(capture, config, quiet=True)
+    capture = add_initial_points(capture, config, log_messages=False)
     show(f"pilot runs of {counted(MOTION.steps, 'step')}, compared on held-out training views:")
     choice = _compared(
         "model.kind=dynamic",
@@ -275,7 +275,7 @@ def _with_settings(
                 found.append((f"{section}.{key}=always", section, always, score))
     if moving and config.colour == ShColour() and not config.colour.model_fields_set:
         found.append(("colour.kind=network", "colour", lambda _: NetworkColour(), plain))
-    capture = with_points(capture, config)
+    capture = add_initial_points(capture, config)
     views = capture.splits["train"]
     folds = _held_out(views)
     steps, first_side = _affordable(config, views[0], len(found), len(folds))
@@ -337,7 +337,7 @@ def _trained(
 
     Its last step is left out: in it, a model at rest would begin to move.
     """
-    trainer = assemble(config, capture, held_out=held_out, first=first_of(config, capture))
+    trainer = build_trainer(config, capture, held_out=held_out, first=first_of(config, capture))
     last = config.train.steps - 1
     with Interrupts() as interrupts:
         while trainer.done < last and time.monotonic() < deadline:
@@ -483,7 +483,7 @@ def after_pose_fit(pair: Pair, index: int) -> list[float]:
         right = 1 - left if image.mask is None else (1 - left) * image.mask
         scene = trainer.model.scene
         options = trainer.model.options
-        fitted = fitted_to_image(
+        fitted = fit_camera_to_image(
             scene, image, background, trainer.extent, options=options, weights=left
         )
         rgb = _rendered(trainer, fitted).rgb[0]

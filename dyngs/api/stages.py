@@ -20,8 +20,15 @@ from dyngs.models.views import training_times
 from dyngs.runs.capture_record import require_same_capture
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.folder import ASKED_NAME, EXPORT_FOLDER
-from dyngs.training.limits import most_gaussians, within_cap
-from dyngs.training.plan import Limits, RunPlan, Stage, describe_extension, with_length, with_steps
+from dyngs.training.limits import apply_gaussian_cap, gaussian_limit
+from dyngs.training.plan import (
+    Limits,
+    RunPlan,
+    Stage,
+    describe_extension,
+    extend_config,
+    with_steps,
+)
 from dyngs.training.processes import Processes
 
 
@@ -49,7 +56,7 @@ def share_views(processes: Processes) -> Stage:
         if config.train.batch_size == 1:
             train = config.train.model_copy(update={"batch_size": processes.size})
             config = config.model_copy(update={"train": train})
-        processes.share(config.train.batch_size)
+        processes.views_of_process(config.train.batch_size)
         return replace(plan, resolved=config), None
 
     return stage
@@ -144,11 +151,11 @@ def set_limits(plan: RunPlan) -> tuple[RunPlan, None]:
     minutes = config.train.minutes
     num_times = 0 if plan.capture is None else len(set(training_times(plan.capture)))
     limits = Limits(
-        gaussians=most_gaussians(config, num_times),
+        gaussians=gaussian_limit(config, num_times),
         megabytes=config.budget.max_mb,
         seconds=None if minutes is None else 60 * minutes,
     )
-    capped = within_cap(config, limits.gaussians)
+    capped = apply_gaussian_cap(config, limits.gaussians)
     return replace(plan, resolved=capped, uncapped=config, limits=limits), None
 
 
@@ -169,13 +176,13 @@ def extend_run(folder: Path, resumed: Checkpoint | None) -> Stage:
             )
         require_folder(stored.data.root)
         done = resumed.info.step
-        longer = with_length(stored, done, steps)
+        longer = extend_config(stored, done, steps)
         if stored.budget.max_mb is not None:
             # otherwise a run that is stopped now would take it for its own
             (folder / EXPORT_FOLDER / SCENE_FILE).unlink(missing_ok=True)
         save_config(longer, folder / RESOLVED_NAME)
         (folder / ASKED_NAME).unlink(missing_ok=True)  # what was requested now is what is there
-        config = with_length(with_steps(config, stored.train.steps), done, steps)
+        config = extend_config(with_steps(config, stored.train.steps), done, steps)
         return replace(plan, requested=longer, resolved=config), describe_extension(
             stored, longer, done
         )

@@ -34,9 +34,9 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.renderable import Posable
 from dyngs.models.views import background_colour
-from dyngs.ops.device import sent
+from dyngs.ops.device import copy_async
 from dyngs.training.new_trainer import GaussianTrainer
-from dyngs.training.trainer import Edit
+from dyngs.training.trainer import TrainingEdit
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def apply_choice(trainer: GaussianTrainer, choice: PruneChoice, scores: Tensor) 
         model = model.model_copy(update={"alpha_min": choice.alpha_min})
     prune = config.prune.model_copy(update={"fraction": choice.fraction})
     changed = {"model": model, "colour": colour, "prune": prune}
-    trainer.apply(Edit(config=config.model_copy(update=changed)))
+    trainer.apply(TrainingEdit(config=config.model_copy(update=changed)))
     trainer.apply(removal(trainer, scores if choice.fraction else None))
     if choice.harmonics:
         _drop_harmonics(trainer, choice.harmonics)
@@ -78,7 +78,7 @@ def _drop_harmonics(trainer: GaussianTrainer, tolerance: float) -> None:
     usable = [i for i in range(len(trainer.images)) if i not in trainer.held_out]
     judged = usable[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY] or usable[:1]
     seen = [i for i in usable if i not in judged] or judged
-    background = sent(background_colour(trainer.background), trainer.device)
+    background = copy_async(background_colour(trainer.background), trainer.device)
     looks = list(_looks(trainer, judged, background))
     found = find_view_dependent(
         _looks(trainer, seen, background), looks, trainer.model.options, background, tolerance
@@ -322,5 +322,5 @@ class Search:
 
     def _restart(self) -> None:
         trainer = self.trainer
-        trainer.begin_again(self._config, self.start)
+        trainer.restart(self._config, self.start)
         trainer.model.replace_scene(trainer.model.scene.without_masks())

@@ -14,7 +14,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
 from dyngs.export.camera_paths import (
     CameraPath,
-    path_file,
+    camera_path_file,
     pick_cameras,
     read_path,
     resize_cameras,
@@ -75,7 +75,7 @@ def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
     if options.path is None:
         path = _fixed_camera(opened, options)
     else:
-        file = path_file(options.path)
+        file = camera_path_file(options.path)
         if file is None:
             path = _placed(opened, options.path, options)
         else:
@@ -97,7 +97,7 @@ def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
     return replace(path, notes=notes, fps=path.fps if opened.fps is None else opened.fps)
 
 
-def view_to_show(capture: Capture, name: str | None = None, split: str | None = None) -> View:
+def select_view(capture: Capture, name: str | None = None, split: str | None = None) -> View:
     """Return the view called ``name``, by default the first one.
 
     ``name``: of a view, of its image as written by ``dyngs render RUN``, or its number in the
@@ -121,7 +121,9 @@ def view_to_show(capture: Capture, name: str | None = None, split: str | None = 
     )
 
 
-def orbit_around(opened: Opened, count: int, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
+def orbit_cameras_around(
+    opened: Opened, count: int, size: tuple[int, int] = DEFAULT_SIZE
+) -> Cameras:
     """Return ``count`` cameras with images of ``size`` on a circle around a scene, a person in all
     of their motion.
 
@@ -130,7 +132,7 @@ def orbit_around(opened: Opened, count: int, size: tuple[int, int] = DEFAULT_SIZ
     scene = opened.renderable
     moves = opened.person is not None and not scene.is_static
     times = np.linspace(0, 1, 8).tolist() if moves else [None]
-    means = torch.cat([points_at(scene, time) for time in times]).cpu().numpy()
+    means = torch.cat([framing_points(scene, time) for time in times]).cpu().numpy()
     x, y, z = AXES["z"] if opened.up is None else opened.up[0].tolist()
     least = 0.0
     if isinstance(scene, GaussianScene):
@@ -138,16 +140,16 @@ def orbit_around(opened: Opened, count: int, size: tuple[int, int] = DEFAULT_SIZ
     return frame_orbit_for_points(means, count, size, (x, y, z), least)
 
 
-def points_at(scene: Renderable, time: float | None = None) -> Tensor:
+def framing_points(scene: Renderable, time: float | None = None) -> Tensor:
     """Return the points (K, 3) that a camera is placed by: the Gaussians, or the corners of the box
     of all else."""
     return scene.at(time).means if isinstance(scene, GaussianScene) else scene.bounds
 
 
-def in_front_of(opened: Opened, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
+def frontal_cameras(opened: Opened, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
     """Return three neighbours on a circle around a scene, of which the second sees a person's
     front."""
-    ring = orbit_around(opened, _RING, size)
+    ring = orbit_cameras_around(opened, _RING, size)
     front = 0
     person = as_human_scene(opened.renderable)
     if person is not None:
@@ -159,9 +161,9 @@ def in_front_of(opened: Opened, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras
 def _fixed_camera(opened: Opened, options: PathOptions) -> CameraPath:
     times = opened.renderable.times
     if opened.captured is None:
-        camera = in_front_of(opened, options.size or DEFAULT_SIZE).select(1)
+        camera = frontal_cameras(opened, options.size or DEFAULT_SIZE).select(1)
     else:
-        view = view_to_show(opened.capture, options.view, options.split)
+        view = select_view(opened.capture, options.view, options.split)
         (camera,) = training_cameras([view], opened.config.data)
         times = (view.time or 0.0,) if opened.fps is None else times
     times = times if options.times is None else options.times
@@ -177,8 +179,8 @@ def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
     if opened.captured is None:
         size = options.size or DEFAULT_SIZE
         if name == "orbit":
-            return CameraPath(orbit_around(opened, frames, size))
-        return CameraPath(spiral_path(in_front_of(opened, size), frames))
+            return CameraPath(orbit_cameras_around(opened, frames, size))
+        return CameraPath(spiral_path(frontal_cameras(opened, size), frames))
     views = opened.capture.splits["train"]
     cameras = cameras_for_paths(views, opened.config.data)
     if name == "spiral":
@@ -190,7 +192,7 @@ def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
     path, is_all_around = orbit_path(cameras, frames, up)
     if opened.person is None or is_all_around:
         return path
-    around = orbit_around(opened, frames, (cameras.width, cameras.height))
+    around = orbit_cameras_around(opened, frames, (cameras.width, cameras.height))
     return CameraPath(
         around, notes=("the person was filmed from one side: the orbit goes all around them",)
     )

@@ -19,7 +19,7 @@ from dyngs.core.gaussians import Gaussians
 from dyngs.deform.bodies.field import BodyField, find_body_field
 from dyngs.deform.scene import field_scene_of
 from dyngs.gaussians.colour.network import bake_harmonics
-from dyngs.gaussians.levels import MERGED, levels_of
+from dyngs.gaussians.levels import MERGED, build_levels
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
     SOG_INDEX,
@@ -53,7 +53,7 @@ from dyngs.io.formats.splat_file import (
 from dyngs.io.gltf import GlbDocument
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import atomic_file
-from dyngs.ops.quaternions import rotation_matrices, align_quat_signs, unit_quats
+from dyngs.ops.quaternions import align_quat_signs, rotation_matrices, unit_quats
 from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import Opened
 
@@ -69,7 +69,7 @@ def write_sog_levels(folder: Path, splat: SplatFile) -> tuple[int, ...]:
     Raises DyngsError: the folder holds something, or cannot be written.
     """
     require_new_folder(folder)
-    levels = levels_of(splat.gaussians).levels[: COARSEST + 1]
+    levels = build_levels(splat.gaussians).levels[: COARSEST + 1]
     counts = tuple(len(level) for level in levels)
     names: list[str] = []
     with new_folder(folder) as started:
@@ -132,7 +132,7 @@ Part = Literal["all", "moving", "still"]
 
 
 @dataclass(frozen=True)
-class Writing:
+class WriteOptions:
     """How Gaussians are written."""
 
     # unit quaternion wxyz, from the axes of the capture, or of the frame of an edited run, to those
@@ -144,16 +144,16 @@ class Writing:
     edit: Similarity = UNMOVED  # made after ``turn``, and stored so that it can be undone
 
 
-AS_THEY_ARE = Writing()
+DEFAULT_WRITE_OPTIONS = WriteOptions()
 
 
-def writing_of(
+def choose_write_options(
     opened: Opened,
     target: str,
     up: str | None = None,
     from_up: str | None = None,
     sh_degree: int | None = None,
-) -> tuple[Writing, str]:
+) -> tuple[WriteOptions, str]:
     """Return how a scene is written, and a line about which way is up in the file.
 
     ``target``: axis that viewers of the format take for up. ``up``: axis requested instead; "keep":
@@ -165,23 +165,23 @@ def writing_of(
     if up == "keep" or (edited is not None and edited.fixed and up is None):
         own = None if edited is None else edited.up
         known = "" if own is None else f", {own} up"
-        return Writing(
+        return WriteOptions(
             up=own, sh_degree=sh_degree
         ), f"axes are those of the {frame.removesuffix('ed run')}{known}"
-    found = up_of(opened) if from_up is None else (axis_of(from_up), "--from-up")
+    found = find_up_direction(opened) if from_up is None else (axis_of(from_up), "--from-up")
     if found is None:
         line = "nothing says which way is up in this run, so axes are those of the capture; --from-up=AXIS tells it"
-        return Writing(sh_degree=sh_degree), line
+        return WriteOptions(sh_degree=sh_degree), line
     direction, who = found
     wanted = target if up is None else up
     here = next((name for name, axis in AXES.items() if axis == direction), "a slanted direction")
     turned = f"turned, it was {here} in the {frame}"
     turned = f"the axes of the {frame} are kept" if here == wanted else turned
-    how = Writing(turn_between(direction, axis_of(wanted)), wanted, sh_degree)
+    how = WriteOptions(turn_between(direction, axis_of(wanted)), wanted, sh_degree)
     return how, f"up is {wanted} in the file ({turned}, says {who})"
 
 
-def up_of(opened: Opened) -> tuple[tuple[float, ...], str] | None:
+def find_up_direction(opened: Opened) -> tuple[tuple[float, ...], str] | None:
     """Return the direction (3,) that is up and what says so: an axis where one is within 30
     degrees; None: nothing.
 
@@ -198,7 +198,11 @@ def up_of(opened: Opened) -> tuple[tuple[float, ...], str] | None:
 
 
 def write_run_splats(
-    opened: Opened, path: Path, time: float = 0.0, part: Part = "all", how: Writing = AS_THEY_ARE
+    opened: Opened,
+    path: Path,
+    time: float = 0.0,
+    part: Part = "all",
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> Written:
     """Write a run at a time in [0, 1] as a file of Gaussians; its suffix names the format.
 
@@ -216,7 +220,7 @@ def write_run_sequence(
     folder: Path,
     times: Sequence[float],
     part: Part = "all",
-    how: Writing = AS_THEY_ARE,
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
     suffix: str = ".ply",
 ) -> list[Written]:
     """Write a sequence ``frame_0000.ply`` and so on, one file per time in [0, 1], for players.
@@ -242,7 +246,11 @@ def write_run_sequence(
 
 
 def write_run_levels(
-    opened: Opened, folder: Path, time: float = 0.0, part: Part = "all", how: Writing = AS_THEY_ARE
+    opened: Opened,
+    folder: Path,
+    time: float = 0.0,
+    part: Part = "all",
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Write a run at a time as a new folder of .sog in levels of detail; return Gaussians by level,
     and notes.
@@ -267,7 +275,7 @@ def scene_part(scene: GaussianScene, part: Part) -> GaussianScene:
 
 
 def splats_at(
-    opened: Opened, scene: GaussianScene, time: float, how: Writing = AS_THEY_ARE
+    opened: Opened, scene: GaussianScene, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
 ) -> SplatFile:
     """Return what a file of Gaussians is to hold of a scene at one time, in the axes that are asked
     for.
@@ -347,17 +355,17 @@ def write_tracks(path: Path, tracks: Tracks) -> Path:
     return path
 
 
-SUFFIX = ".4dgs"
-UP = "-y"
-FPS = 30.0
+FOURDGS_SUFFIX = ".4dgs"
+FOURDGS_UP = "-y"
+FOURDGS_FPS = 30.0
 
 
-def write_moving(
+def write_4dgs(
     opened: Opened,
     path: Path,
     times: Sequence[float],
     part: Part = "all",
-    how: Writing = AS_THEY_ARE,
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> tuple[tuple[SplatFile, ...], tuple[str, ...]]:
     """Write a run at T >= 1 times in [0, 1] as one .4dgs, each shown for 1/30 s; return what it is
     meant to hold at each time, and notes about what the format could not hold.
@@ -368,7 +376,7 @@ def write_moving(
     model, delta, files = _fourdgs(path)
     scene = scene_part(opened.scene, part)
     splats = tuple(splats_at(opened, scene, time, how) for time in times)
-    duration = len(times) / FPS
+    duration = len(times) / FOURDGS_FPS
     samples = []
     for i, splat in enumerate(splats):
         gaussians = splat.gaussians
@@ -380,19 +388,19 @@ def write_moving(
             rotations=unit_rotations(gaussians.quats).numpy()[:, [1, 2, 3, 0]],
             colors=rgba.numpy(),
             motions=np.zeros((n, 3), np.float32),
-            mu_t=np.full(n, i / FPS, np.float32),
+            mu_t=np.full(n, i / FOURDGS_FPS, np.float32),
             # standard deviation in time: a Gaussian never fades
             sigma_t=np.full(n, 1e4 * duration, np.float32),
             win_lo=np.zeros(n, np.float32),
             win_hi=np.full(n, duration, np.float32),
         )
-        samples.append(delta.Sample(t0=i / FPS, ids=np.arange(n), gaussians=states))
+        samples.append(delta.Sample(t0=i / FOURDGS_FPS, ids=np.arange(n), gaussians=states))
     options = delta.KeyframeDeltaOptions(keyframe_every=8)
     data = files.write_sequence(samples, duration, kd=options, profile="fine", library="dyngs")
     with atomic_file(path) as temporary:
         temporary.write_bytes(data)
     notes = (
-        f"{counted(len(times), 'time')}, each shown for 1/{FPS:.0f} s",
+        f"{counted(len(times), 'time')}, each shown for 1/{FOURDGS_FPS:.0f} s",
         *offset_notes(splats[0], "4dgs cannot state it"),
     )
     if any(bool(splat.gaussians.sh[:, 1:].any()) for splat in splats):
@@ -400,14 +408,14 @@ def write_moving(
     return splats, notes
 
 
-def read_moment(path: Path, index: int) -> SplatFile:
+def read_4dgs_frame(path: Path, index: int) -> SplatFile:
     """Return what a .4dgs that dyngs wrote shows at its time number ``index``, read by the package
     fourdgs.
 
     Raises DyngsError: the package is missing, or values that are not finite.
     """
     _, _, files = _fourdgs(path)
-    found = files.render_at(files.decode_streamed(path.read_bytes()), (index + 0.5) / FPS)
+    found = files.render_at(files.decode_streamed(path.read_bytes()), (index + 0.5) / FOURDGS_FPS)
     sh = ((found["rgb"] - 0.5) / SH_C0)[:, None]
     quats = found["rotations"][:, [3, 0, 1, 2]]
     gaussians = from_linear(found["centers"], quats, found["scales"], found["opacity"], sh)
@@ -426,7 +434,9 @@ def _fourdgs(path: Path) -> tuple[Any, Any, Any]:
 
 
 @torch.no_grad()
-def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY_ARE) -> Written:
+def write_rigid_bodies(
+    opened: Opened, path: Path, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
+) -> Written:
     """Write a run at a time in [0, 1] as .glb: a node for each body, with its motion as an
     animation, one for the rest.
 

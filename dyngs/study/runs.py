@@ -24,13 +24,13 @@ from dyngs.training.events import Listener
 
 T = TypeVar("T")
 R = TypeVar("R")
-AS_STORED = ConfigDict(extra="forbid", allow_inf_nan=False)
+STORED_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
 """How the dataclasses of results are read: nothing else, and only numbers."""
 STUDY_FILE = "study.json"
 """What a study is about, in its folder."""
 
 
-def finished(config: Config, out: Path, listeners: Sequence[Listener] = ()) -> Path:
+def train_to_end(config: Config, out: Path, listeners: Sequence[Listener] = ()) -> Path:
     """Train the run in folder ``out`` to its end, from its last checkpoint if there is one; return
     ``out``.
 
@@ -43,7 +43,7 @@ def finished(config: Config, out: Path, listeners: Sequence[Listener] = ()) -> P
     return train(begun.model_copy(update={"run": run}), resume_from=out, listeners=listeners)
 
 
-def done_in_turn(
+def run_tasks(
     do: Callable[[T], R], tasks: Sequence[T], ray_cores: int | None = None
 ) -> Iterator[tuple[T, R | DyngsError]]:
     """Yield each task and what ``do`` makes of it, or why it cannot, as they end.
@@ -100,7 +100,9 @@ def write_stored(path: Path, values: Mapping[str, Any] | Sequence[Any]) -> None:
     write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
 
 
-def require_same_study(out: Path, facts: Mapping[str, object], compared: Sequence[str]) -> None:
+def require_same_study(
+    out: Path, facts: Mapping[str, object], compared_keys: Sequence[str]
+) -> None:
     """Store the facts of a study in its folder ``out``, or compare them with those stored there.
 
     Raises:
@@ -115,7 +117,7 @@ def require_same_study(out: Path, facts: Mapping[str, object], compared: Sequenc
         known = json.loads(read_limited(path))
         differing = [
             f"{key} is {_shown(known.get(key))} there and {_shown(here[key])} here"
-            for key in compared
+            for key in compared_keys
             if known.get(key) != here[key]
         ]
     if differing:

@@ -15,8 +15,8 @@ from dyngs.data.loader import ImageLoader, usual_threads
 from dyngs.data.read import read_capture, require_images
 from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
+from dyngs.gaussians.initialization import InitialGaussians, scene_geometry
 from dyngs.gaussians.model import GaussianModel
-from dyngs.gaussians.initialization import InitialGaussians, surroundings
 from dyngs.models.kind import Moves, RunStart, kind_of
 from dyngs.models.views import (
     background_colour,
@@ -30,8 +30,8 @@ from dyngs.training.corrections.camera_refinement import CameraRefinement
 from dyngs.training.corrections.exposure import ViewExposures
 from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
-from dyngs.training.priors import UsedPriors, used_priors
-from dyngs.training.trainer import Parts, Trainer
+from dyngs.training.priors import PriorLosses, load_priors
+from dyngs.training.trainer import Trainer, TrainerParts
 
 GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
 
@@ -45,7 +45,7 @@ FULL_OPACITY_FROM = 0.6
 ALIKE_IMAGES = 12  # number of images in which colours are compared with the background
 
 
-def assemble(
+def build_trainer(
     config: Config,
     capture: Capture | None = None,
     *,
@@ -68,31 +68,31 @@ def assemble(
             may end with; None: the same.
     """
     if capture is None:
-        capture = read_capture(config.data) if restored else prepared(config)
+        capture = read_capture(config.data) if restored else prepare_capture(config)
     generator = torch.Generator().manual_seed(config.run.seed)
     if images is None:
         images = ImageLoader(
             capture.splits["train"], config.data, with_maps=True, decoding_threads=usual_threads()
         )
-    priors = UsedPriors()
+    priors = PriorLosses()
     kind = kind_of(config.model)
     if "train.priors" in kind.uses:
         moves = isinstance(kind, Moves) and len(set(training_times(capture))) > 1
-        priors = used_priors(config, capture, images.views, moves=moves)
+        priors = load_priors(config, capture, images.views, moves=moves)
     if not priors.masks:
         images = images.without_motion_masks()
     background = resolved_background(config, capture)
-    extent = surroundings(capture).extent
-    findings = [priors.message] if priors.message else []
+    extent = scene_geometry(capture).extent
+    messages = [priors.message] if priors.message else []
     published = capture.has_alpha and config.train.alpha_weight == 0 and background != "random"
     if published and not restored:
-        findings.append(
+        messages.append(
             f"images are compared on {background} alone, as published (train.alpha_weight=0): {background} surfaces "
             "may be transparent"
         )
     early = _early_opacity(config, capture, images, background)
 
-    def parts(config: Config) -> Parts:
+    def parts(config: Config) -> TrainerParts:
         start = RunStart(
             config, uncapped or config, capture, images, background, extent, generator, first
         )
@@ -102,8 +102,8 @@ def assemble(
         refinement = None
         if config.camera.refine == "always":
             refinement = CameraRefinement(views, extent, steps)
-            applied_to = refinement.corrections.applied_to
-            images.corrected = lambda index, cameras: applied_to(views[index], cameras)
+            correct_cameras = refinement.corrections.correct_cameras
+            images.corrected = lambda index, cameras: correct_cameras(views[index], cameras)
         robust = None
         may_mask = "train.robust" in kind.uses and not isinstance(kind, Moves)
         if config.train.robust == "always" and may_mask:
@@ -121,32 +121,32 @@ def assemble(
             RegularizerLoss(),
         ]
         found = (robust, exposures, refinement)
-        return Parts(model, losses, [x for x in found if x is not None])
+        return TrainerParts(model, losses, [x for x in found if x is not None])
 
     return Trainer(
         config=config,
-        parts_of=parts,
+        build_parts=parts,
         capture=capture,
         images=images,
         background=background,
         extent=extent,
         generator=generator,
-        findings=findings,
+        pending_messages=messages,
         held_out=held_out,
         device=select_device(config.run.device),
     )
 
 
-def prepared(config: Config) -> Capture:
+def prepare_capture(config: Config) -> Capture:
     """Return the capture of a run with the points that its scene begins with, see
     ``with_first_points``.
 
     Problems of the capture and the source of its points are logged.
     """
-    return with_points(require_images(read_capture(config.data)), config)
+    return add_initial_points(require_images(read_capture(config.data)), config)
 
 
-def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Capture:
+def add_initial_points(capture: Capture, config: Config, *, log_messages: bool = True) -> Capture:
     """Return ``capture`` as ``prepared`` does, for a kind whose Gaussians begin at points; others
     need none."""
     lines: list[str] = []
@@ -164,7 +164,7 @@ def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Cap
                 if why is None
                 else [f"init.kind=random draws points around the origin, but {why}: give auto"]
             )
-    for line in [] if quiet else [*lines, *before_training(capture)]:
+    for line in [*lines, *before_training(capture)] if log_messages else []:
         warn(line)
     return capture
 

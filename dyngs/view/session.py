@@ -22,11 +22,11 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.geometry import checked_pose
 from dyngs.export.camera_paths import Keyframes, interpolate_keyframes, resize_cameras
 from dyngs.runs.opened import Opened
-from dyngs.view.layers import Layer, Part, Shot, draw
+from dyngs.view.layers import Layer, Part, ViewRequest, draw
 from dyngs.view.views import camera_at, nearest_view, views_of
 
 _LOG = logging.getLogger(__name__)
-STILL_AFTER = 0.2
+REFINE_DELAY = 0.2
 """Seconds without change after which the image is refined."""
 _SMALLEST_AREA = 320 * 240
 """Pixels of an image at least: where Gaussians take all the time, a smaller one would hardly come
@@ -35,7 +35,7 @@ _LONGEST_SIDE = 1600  # px of an image at most
 
 
 @dataclass(frozen=True)
-class Eye:
+class BrowserCamera:
     """The camera of a browser: wxyz and position as in ``camera_at``, vertical field of view in
     rad, window in px."""
 
@@ -87,7 +87,7 @@ class Display:
     """What is shown.
 
     Attributes:
-        layer, part, divide: as in ``Shot``.
+        layer, part, divide: as in ``ViewRequest``.
         comparing: show the truth next to the render.
         view: index of the view that is compared with; None: the nearest.
     """
@@ -159,7 +159,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Sent:
+class SentImage:
     """An image for the browser: (H, W, 3) uint8, whether it is a refined one, and the seconds that
     it took."""
 
@@ -179,7 +179,7 @@ class Session:
     def __init__(
         self,
         opened: Opened,
-        send: Callable[[Sent], None],
+        send: Callable[[SentImage], None],
         target: float = 1 / 14,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -196,22 +196,22 @@ class Session:
         self.on_change: Callable[[], None] = lambda: None
         self.on_play: Callable[[bool], None] = lambda playing: None
         self.on_error: Callable[[str], None] = lambda message: None
-        self.opened, self.look = opened, Display()
-        self.eye: Eye | None = None
+        self.opened, self.display = opened, Display()
+        self.browser_camera: BrowserCamera | None = None
         self.timeline = Timeline(seconds=opened.seconds)
         self.closed = False
         self.failure: str | None = None
 
-    def move(self, eye: Eye) -> None:
+    def move(self, browser_camera: BrowserCamera) -> None:
         """Look from ``eye`` from now on."""
-        if eye != self.eye:
-            self.eye = eye
+        if browser_camera != self.browser_camera:
+            self.browser_camera = browser_camera
             self._note_change()
 
     def change(self, **changes: Any) -> None:
         """Show something else: attributes of ``Display``."""
         with self._lock:
-            self.look = replace(self.look, **changes)
+            self.display = replace(self.display, **changes)
         self._note_change()
 
     def set_time(self, time: float) -> None:
@@ -234,13 +234,13 @@ class Session:
         self._preview = recording, self._clock()
         self._note_change()
 
-    def take(self, opened: Opened, *, refreshes: bool) -> None:
+    def update_scene(self, opened: Opened, *, refreshes: bool) -> None:
         """Look at a newer state of the scene; ``refreshes``: draw it, as large, even if nothing
         else has changed."""
         self.opened = opened
         self._is_stale |= refreshes
 
-    def ask(self, job: Callable[[], None]) -> None:
+    def submit_job(self, job: Callable[[], None]) -> None:
         """Have ``job`` run by the thread that draws, before the next image."""
         self._jobs.append(job)
         self.on_change()
@@ -253,18 +253,22 @@ class Session:
     @property
     def shown_view(self) -> int | None:
         """Index of the view whose truth is shown; None without any."""
-        look = self.look
-        eye = self.eye
+        display = self.display
+        browser_camera = self.browser_camera
         opened = self.opened
-        has_truth = look.comparing or look.layer == "error"
-        if eye is None or not has_truth or not len(views_of(opened)):
+        has_truth = display.comparing or display.layer == "error"
+        if browser_camera is None or not has_truth or not len(views_of(opened)):
             return None
-        return nearest_view(opened, eye.camera(), self.time) if look.view is None else look.view
+        return (
+            nearest_view(opened, browser_camera.camera(), self.time)
+            if display.view is None
+            else display.view
+        )
 
     def due(self) -> float | None:
         """Return in how many seconds something is to be drawn; 0: now, None: not before something
         changes."""
-        if self.closed or self.eye is None:
+        if self.closed or self.browser_camera is None:
             return None
         if self._jobs:
             return 0.0
@@ -273,12 +277,12 @@ class Session:
         if self._is_moving or self._is_stale:
             return soonest
         if not self._is_refined:
-            return max(soonest, self._changed_at + STILL_AFTER - now)
+            return max(soonest, self._changed_at + REFINE_DELAY - now)
         return None
 
     def draw_next(self) -> None:
         """Do what is due: a job, or the next image."""
-        if self.closed or self.eye is None:
+        if self.closed or self.browser_camera is None:
             return
         if self._jobs:
             self._jobs.popleft()()
@@ -289,36 +293,38 @@ class Session:
         if self.timeline.playing and not self.timeline.loops and self.time == 1.0:
             self.change_timeline(playing=False)
         version = self._changed_at
-        is_moving = self._is_moving or start < version + STILL_AFTER
+        is_moving = self._is_moving or start < version + REFINE_DELAY
         full = self._full_size
         size = _scaled(full, math.sqrt(self._area / math.prod(full))) if is_moving else full
         self._is_stale = False
         self._is_refined = True  # if it fails, it is not tried again
-        image = draw(self.opened, replace(self.shot(size), is_moving=is_moving))
+        image = draw(self.opened, replace(self.view_request(size), is_moving=is_moving))
         if not self.closed:
-            self._send(Sent(image, not is_moving, self._clock() - start))
+            self._send(SentImage(image, not is_moving, self._clock() - start))
         now = self._clock()
         if is_moving:
             factor = min(max(self._target / max(now - start, 1e-9), 0.5), 2.0)
             self._area = max(math.prod(size) * math.sqrt(factor), _SMALLEST_AREA)
         self._is_refined = not is_moving and version == self._changed_at
 
-    def shot(self, size: tuple[int, int] | None = None) -> Shot:
+    def view_request(self, size: tuple[int, int] | None = None) -> ViewRequest:
         """Return what is shown now as an image of ``size``; None: that of the window."""
-        if self.eye is None:
+        if self.browser_camera is None:
             raise ValueError("there is no camera yet")
-        look = self.look
+        display = self.display
         size = size or self._full_size
-        camera = self.eye.camera(size)
+        camera = self.browser_camera.camera(size)
         view = self.shown_view
         time = self.time
         if self._preview is not None:
             recording, start = self._preview
             camera, time = recording.at(self._clock() - start, size)
             view = None
-        layer = "colour" if look.layer == "error" and view is None else look.layer
+        layer = "colour" if display.layer == "error" and view is None else display.layer
         shown = None if self.opened.renderable.is_static else time
-        return Shot(camera, shown, layer, look.part, view, look.divide if look.comparing else 1.0)
+        return ViewRequest(
+            camera, shown, layer, display.part, view, display.divide if display.comparing else 1.0
+        )
 
     @property
     def _is_moving(self) -> bool:
@@ -327,7 +333,7 @@ class Session:
 
     @property
     def _full_size(self) -> tuple[int, int]:
-        size = (640, 480) if self.eye is None else self.eye.size
+        size = (640, 480) if self.browser_camera is None else self.browser_camera.size
         return _scaled(size, _LONGEST_SIDE / max(size))
 
     def _note_change(self) -> None:
@@ -343,7 +349,7 @@ def _scaled(size: tuple[int, int], factor: float) -> tuple[int, int]:
     return width, height
 
 
-class Drawer:
+class RenderScheduler:
     """The one thread that draws for all browsers: whoever waits longest is next, and gets the
     newest state. What went wrong for one session goes to its ``on_error``, the others go on.
     """

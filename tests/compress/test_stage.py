@@ -34,7 +34,7 @@ from dyngs.gaussians.densify import Densifier
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -66,7 +66,7 @@ def final_bytes(run_dir: Path) -> bytes:
 
 def trained(config: Config) -> Trainer:
     """A trainer at the end of ``train.steps``."""
-    trainer = assemble(config)
+    trainer = build_trainer(config)
     while trainer.done < config.train.steps:
         trainer.step()
     return trainer
@@ -183,7 +183,9 @@ def test_what_is_there_for_a_while_is_masked_only_while_it_is_not() -> None:
     start = FreeInitialization(torch.zeros(0), (), centers, spans, torch.zeros(4, 3))
     field = FreePrimitives(FreeField(), tiny_setup(4), torch.Generator()).started(start)
     times = tuple(k / 9 for k in range(10))
-    scene = DynamicScene(gaussians=cloud(5), seen_at=times, field=field, moving=torch.arange(4))
+    scene = DynamicScene(
+        gaussians=cloud(5), training_times=times, field=field, moving=torch.arange(4)
+    )
     keys = (times[0], times[5], times[9])
     masks = VisibilityMasks.pack(keys, there_after(scene, keys, 1 / 255))
     assert masks.seen.sum(0).tolist() == [1, 1, 1, 1, 3]

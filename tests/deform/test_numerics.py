@@ -30,7 +30,7 @@ from dyngs.deform.networks import Hexplane
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.scene import restore_scene
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -49,12 +49,12 @@ def values(offsets: Offsets) -> Tensor:
 
 def scene_of(rows: Tensor, field: DeformationField) -> DynamicScene:
     """The cloud, ``rows`` of which a field moves."""
-    return DynamicScene(gaussians=cloud(), seen_at=(0.0, 1.0), field=field, moving=rows)
+    return DynamicScene(gaussians=cloud(), training_times=(0.0, 1.0), field=field, moving=rows)
 
 
 def fine_trainer(capture: Path, kind: str, **model: object) -> Trainer:
     """After ten steps, eight of them without motion."""
-    trainer = assemble(busy_config(capture, capture, kind, **model))
+    trainer = build_trainer(busy_config(capture, capture, kind, **model))
     for _ in range(10):
         trainer.step()
     return trainer
@@ -86,7 +86,7 @@ def test_two_training_times(tmp_path: Path, kind: str) -> None:
     model = config.model.model_copy(
         update={"deform": config.model.deform.model_copy(update=automatic)}
     )
-    trainer = assemble(config.model_copy(update={"model": model}))
+    trainer = build_trainer(config.model_copy(update={"model": model}))
     seen = {trainer.step().image.time for _ in range(12)}
     assert seen == {0.0, 1.0}
     assert isinstance(trainer.model.scene, DynamicScene)
@@ -127,19 +127,19 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
     two = TopologyEdit.select(torch.tensor([0, 3]))
     assert isinstance(scene, DynamicScene)
     assert scene.field is not None
-    field = scene.field.edited(two)
+    field = scene.field.apply_edit(two)
     field.invalidate()
     trainer.model.replace_scene(replace(scene, moving=two.source, field=field))
     trainer.step()
     keep = torch.ones(len(trainer.model.scene), dtype=torch.bool)
     keep[trainer.model.scene.rows] = False
     assert not keep.all()
-    trainer.model.densifier = assemble(trainer.config).model.densifier
+    trainer.model.densifier = build_trainer(trainer.config).model.densifier
     trainer.model.keep(keep, trainer.done)
     for _ in range(2):
         assert trainer.step().loss > 0
         assert trainer.num_moving == 0
-    other = assemble(trainer.config)
+    other = build_trainer(trainer.config)
     other.restore(trainer.checkpoint())
     assert other.step().loss == trainer.step().loss
 
@@ -189,13 +189,13 @@ def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> 
 # ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("filtered", [False, True])
-def test_a_run_of_one_step(capture: Path, apply_filter: bool) -> None:
+@pytest.mark.parametrize("is_filtered", [False, True])
+def test_a_run_of_one_step(capture: Path, is_filtered: bool) -> None:
     """It ends as motion begins: with a field that is the identity, for the random Gaussians too,
     and filtered."""
-    config = busy_config(capture, capture, "hexplane", filter_3d=apply_filter)
+    config = busy_config(capture, capture, "hexplane", filter_3d=is_filtered)
     config = config.model_copy(update={"train": TrainConfig(steps=1)})
-    trainer = assemble(config)
+    trainer = build_trainer(config)
     trainer.step()
     scene = restore_scene(trainer.checkpoint(), config.model)
     assert not scene.is_static

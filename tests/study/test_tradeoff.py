@@ -23,17 +23,17 @@ from dyngs.study.tradeoff import (
     Row,
     Tradeoff,
     Variant,
-    choose,
+    build_rows,
+    choose_variant,
     combinations,
+    current_settings,
+    db_per_doubling,
     exchange_rates,
-    own_settings,
     pareto_mask,
     parse_goal,
     parse_requirements,
     parse_variations,
-    single_changes,
-    slope,
-    table_rows,
+    single_setting_variants,
 )
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -125,7 +125,7 @@ def test_the_folder_of_a_variant_is_drawn_as_it_was_measured(found: Found, study
 def test_masks_that_a_run_has_stay(found: Found, study: Tradeoff, tmp_path: Path) -> None:
     run = study.out / "training" / Variant(mask_times=3, finetune=2).slug
     masked = replace(study, run_dir=run, out=tmp_path)
-    assert own_settings(run)["mask_times"] == 3
+    assert current_settings(run)["mask_times"] == 3
     for variant in (Variant(prune=0.5), Variant(prune=0.5, finetune=1)):
         scene = load_run(masked.folder(variant)).scene
         assert scene.masks is not None
@@ -134,7 +134,7 @@ def test_masks_that_a_run_has_stay(found: Found, study: Tradeoff, tmp_path: Path
 
 def test_a_stored_run_cannot_be_varied(found: Found, study: Tradeoff) -> None:
     with pytest.raises(DyngsError, match=r"only scene\.dyngs is there; give the run that it"):
-        own_settings(study.folder(Variant(storage=2.0)))
+        current_settings(study.folder(Variant(storage=2.0)))
 
 
 def test_a_damaged_point_says_what_to_do(found: Found, tmp_path: Path) -> None:
@@ -180,14 +180,14 @@ def test_the_setting_of_a_variant() -> None:
 
 
 def test_single_changes_differ_from_the_run() -> None:
-    names = [v.name for v in single_changes(parse_variations([]), OWN, 0)]
+    names = [v.name for v in single_setting_variants(parse_variations([]), OWN, 0)]
     assert len(names) == len(set(names))
     assert {"sh_degree=0", "sh_degree=1", "mask_times=16", "prune=0.3"} <= set(names)
     assert not {"sh_degree=2", "mask_times=6"} & set(names)
     still = {"sh_degree": 0, "storage": None}
-    fewer = [v.name for v in single_changes(parse_variations([]), still, 0)]
+    fewer = [v.name for v in single_setting_variants(parse_variations([]), still, 0)]
     assert fewer == ["storage=auto", "storage=1", "storage=3"]
-    tuned = single_changes(parse_variations(["prune=0.5", "sh_degree=0"]), OWN, 7)
+    tuned = single_setting_variants(parse_variations(["prune=0.5", "sh_degree=0"]), OWN, 7)
     assert tuned == [Variant(prune=0.5), Variant(prune=0.5, finetune=7), Variant(sh_degree=0)]
 
 
@@ -236,14 +236,14 @@ def test_every_point_is_on_the_front_or_beaten_by_one_that_is(goals: list[tuple[
 
 def test_speed_size_and_quality_count() -> None:
     points = [BASE, measured(29.0, 2.0, 4.0), measured(28.0, 2.0, 8.0)]
-    assert [row["on_front"] for row in table_rows(points)] == [True, True, False]
+    assert [row["on_front"] for row in build_rows(points)] == [True, True, False]
 
 
 @given(st.floats(-3, 3), st.lists(st.integers(1, 4), min_size=1, max_size=5))
 def test_slope_of_points_on_a_line_is_that_line(per_doubling: float, doublings: list[int]) -> None:
     points = [(per_doubling * k, 2.0**k) for k in doublings]
-    assert slope(points) == pytest.approx(per_doubling, abs=1e-9)
-    assert slope([(1.0, 1.01), (2.0, 1.0)]) is None
+    assert db_per_doubling(points) == pytest.approx(per_doubling, abs=1e-9)
+    assert db_per_doubling([(1.0, 1.01), (2.0, 1.0)]) is None
 
 
 def test_exchange_rates_are_those_of_single_settings() -> None:
@@ -317,9 +317,9 @@ def test_what_is_no_condition_is_refused(text: str, message: str) -> None:
 
 def test_the_best_of_what_qualifies() -> None:
     asked = parse_requirements("psnr>=30")
-    assert choose(ROWS, asked, parse_goal("mb", smallest=True)) == 1
-    assert choose(ROWS, asked, Requirement("psnr", False)) == 0
-    assert choose(ROWS, (), Requirement("fps", False)) == 2
+    assert choose_variant(ROWS, asked, parse_goal("mb", smallest=True)) == 1
+    assert choose_variant(ROWS, asked, Requirement("psnr", False)) == 0
+    assert choose_variant(ROWS, (), Requirement("fps", False)) == 2
 
 
 @pytest.mark.parametrize(
@@ -336,4 +336,4 @@ def test_the_best_of_what_qualifies() -> None:
 )
 def test_what_is_missed_is_named(asked: str, message: str) -> None:
     with pytest.raises(DyngsError, match=message):
-        choose(ROWS, parse_requirements(asked), Requirement("mb", True))
+        choose_variant(ROWS, parse_requirements(asked), Requirement("mb", True))

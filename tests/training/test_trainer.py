@@ -32,7 +32,7 @@ from dyngs.io.tensor_file import write_tensors
 from dyngs.io.write import write_image
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import _KIND, load_checkpoint
-from dyngs.training.new_trainer import GaussianTrainer, assemble
+from dyngs.training.new_trainer import GaussianTrainer, build_trainer
 from dyngs.training.trainer import ViewSampler
 
 
@@ -44,7 +44,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _trainer(capture: Path, **data: object) -> GaussianTrainer:
-    return assemble(
+    return build_trainer(
         Config(
             data=DataConfig(root=capture, **data),  # type: ignore[arg-type]
             model=StaticModel(sh_degree=1),
@@ -76,8 +76,8 @@ class _LiftedScene(GaussianScene):
             self.gaussians.replace(means=self.gaussians.means + torch.tensor([0.0, 0.0, 0.1])), time
         )
 
-    def edited(self, edit: TopologyEdit) -> _LiftedScene:
-        return replace(self, gaussians=self.gaussians.edited(edit))
+    def apply_edit(self, edit: TopologyEdit) -> _LiftedScene:
+        return replace(self, gaussians=self.gaussians.apply_edit(edit))
 
     def _model_state(self) -> State:
         return {}
@@ -121,7 +121,7 @@ class _Lifted(SceneTraining[_LiftedScene]):
 
     def follow(self, edit: TopologyEdit) -> None: ...
 
-    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> _LiftedScene:
+    def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> _LiftedScene:
         self.steps = tensors["steps"].tolist()
         return _LiftedScene(gaussians=gaussians)
 

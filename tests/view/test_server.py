@@ -23,17 +23,17 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import ssim
 from dyngs.view.server import (
     COOKIE,
-    Browsing,
-    Gate,
-    Serving,
+    AccessPolicy,
+    BrowserConnection,
+    ServerOptions,
     Viewer,
-    as_text,
+    access_policy_for,
+    enforce_access,
+    escape_markdown,
     free_port,
-    gate_for,
-    guarded,
     is_loopback,
     link_to,
-    quiet,
+    silence_viser,
 )
 from dyngs.view.session import Keyframe, Recording
 from dyngs.view.source import open_source
@@ -62,7 +62,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def viewer(run: Path) -> Iterator[Viewer]:
     source = open_source(run)
-    with Viewer(source, source.load(source.names[0]), Serving()) as viewer:
+    with Viewer(source, source.load(source.names[0]), ServerOptions()) as viewer:
         yield viewer
 
 
@@ -73,38 +73,44 @@ def until(is_so: Callable[[], bool], page: Page | None = None, seconds: float = 
         page.driven.wait_for_timeout(50) if page is not None else time.sleep(0.05)
 
 
-def opened(viewer: Viewer, browser: Browser) -> tuple[Page, Browsing]:
+def opened(viewer: Viewer, browser: Browser) -> tuple[Page, BrowserConnection]:
     """A page whose image is complete."""
-    known = viewer.browsing
+    known = viewer.connections
     # viser draws fewer pixels where the browser is slow
     page = browser.open(f"{viewer.link}?fixedDpr=1", *SIZE)
-    until(lambda: len(viewer.browsing) > len(known), page)
-    (browsing,) = [one for one in viewer.browsing if one not in known]
-    settle(page, browsing)
-    return page, browsing
+    until(lambda: len(viewer.connections) > len(known), page)
+    (connection,) = [one for one in viewer.connections if one not in known]
+    settle(page, connection)
+    return page, connection
 
 
-def settle(page: Page, browsing: Browsing) -> None:
+def settle(page: Page, connection: BrowserConnection) -> None:
     """Wait until the controls are in their place, nothing is left to be drawn, and the page has
     shown it."""
-    until(lambda: browsing.session.eye is not None and browsing.session.eye.size[0] < SIZE[0], page)
-    until(lambda: browsing.num_sent > 0 and browsing.session.due() is None, page)
+    until(
+        lambda: (
+            connection.session.browser_camera is not None
+            and connection.session.browser_camera.size[0] < SIZE[0]
+        ),
+        page,
+    )
+    until(lambda: connection.num_sent > 0 and connection.session.due() is None, page)
     page.driven.wait_for_timeout(600)
     for close in page.driven.locator(".mantine-Notification-closeButton").all():
         close.click()  # viser says, before the image, that there is no GPU
-    until(lambda: browsing.session.due() is None, page)
+    until(lambda: connection.session.due() is None, page)
     # no longer dimmed, as before it is connected
     until(lambda: bool((page.screenshot()[-5, 300] >= 254).all()), page)
 
 
-def rendered(run: Path, browsing: Browsing, folder: Path) -> np.ndarray:
+def rendered(run: Path, connection: BrowserConnection, folder: Path) -> np.ndarray:
     """What ``dyngs render`` draws along the path that the page would save."""
-    session = browsing.session
-    assert session.eye is not None
-    recording = Recording((Keyframe(session.eye.camera(), session.time),))
+    session = connection.session
+    assert session.browser_camera is not None
+    recording = Recording((Keyframe(session.browser_camera.camera(), session.time),))
     folder.mkdir()
     path = folder / "path.json"
-    path.write_text(recording.document(session.eye.size, 30.0, session.opened))
+    path.write_text(recording.document(session.browser_camera.size, 30.0, session.opened))
     assert main(["render", str(run), "--path", str(path), "--out", str(folder / "out")]) == 0
     return np.asarray(Image.open(folder / "out" / "frame_0000.png").convert("RGB"))
 
@@ -117,17 +123,17 @@ def likeness(one: np.ndarray, other: np.ndarray) -> float:
 def test_the_page_shows_what_render_draws_at_every_time(
     viewer: Viewer, browser: Browser, run: Path, tmp_path: Path
 ) -> None:
-    page, browsing = opened(viewer, browser)
+    page, connection = opened(viewer, browser)
     first = page.screenshot()
-    truth = rendered(run, browsing, tmp_path / "first")
+    truth = rendered(run, connection, tmp_path / "first")
     assert likeness(first[SEEN], truth[SEEN]) > 0.95
     slider = page.driven.get_by_role("slider").first
     slider.focus()
     page.press("End")
-    until(lambda: browsing.session.time == 1.0, page)
-    settle(page, browsing)
+    until(lambda: connection.session.time == 1.0, page)
+    settle(page, connection)
     last = page.screenshot()
-    later = rendered(run, browsing, tmp_path / "last")
+    later = rendered(run, connection, tmp_path / "last")
     assert likeness(last[SEEN], later[SEEN]) > 0.95
     assert likeness(last[SEEN], first[SEEN]) < likeness(last[SEEN], later[SEEN])
     assert np.abs(later[SEEN].astype(int) - truth[SEEN]).mean() > 0.1  # something has moved
@@ -142,25 +148,28 @@ def test_two_browsers_have_cameras_of_their_own_and_one_may_go(
 ) -> None:
     (one, first), (two, second) = opened(viewer, browser), opened(viewer, browser)
     threads = threading.active_count()
-    before = second.session.eye
+    before = second.session.browser_camera
     one.drag((300, 300), (380, 330))
-    until(lambda: first.session.eye is not None and first.session.eye != before, one)
+    until(
+        lambda: first.session.browser_camera is not None and first.session.browser_camera != before,
+        one,
+    )
     assert before is not None
-    assert second.session.eye is not None
-    assert second.session.eye.position == pytest.approx(before.position)
+    assert second.session.browser_camera is not None
+    assert second.session.browser_camera.position == pytest.approx(before.position)
     for page in (one, two):
         page.click("text=Play")
     sent = second.num_sent
     until(lambda: second.num_sent > sent + 3, two)
     one.close()  # while it gets images
-    until(lambda: len(viewer.browsing) == 1, two)
+    until(lambda: len(viewer.connections) == 1, two)
     sent = second.num_sent
     until(lambda: second.num_sent > sent + 3, two)
     assert viewer.drawer.sessions == (second.session,)
     assert first.session.closed
     assert two.errors == []
     two.close()
-    until(lambda: not viewer.browsing)
+    until(lambda: not viewer.connections)
     assert viewer.drawer.sessions == ()
     assert threading.active_count() <= threads + 2  # viser's pool may have grown
 
@@ -203,13 +212,13 @@ def test_texts_of_strangers_are_shown_and_never_run(browser: Browser, tmp_path: 
     )
     for folder, wanted in ((run, "truth: "), (other, "without the capture")):
         source = open_source(folder)
-        with Viewer(source, source.load(source.names[0]), Serving()) as viewer:
+        with Viewer(source, source.load(source.names[0]), ServerOptions()) as viewer:
             page = browser.open(viewer.link, *SIZE)
-            until(lambda viewer=viewer: any(one.num_sent for one in viewer.browsing), page)
-            (browsing,) = viewer.browsing
+            until(lambda viewer=viewer: any(one.num_sent for one in viewer.connections), page)
+            (connection,) = viewer.connections
             if folder == run:
-                browsing.session.change(comparing=True)
-                browsing.notify(SCRIPT, FRAME)
+                connection.session.change(comparing=True)
+                connection.notify(SCRIPT, FRAME)
             else:
                 page.click("text=Help")
             until(
@@ -236,7 +245,7 @@ def test_texts_of_strangers_are_shown_and_never_run(browser: Browser, tmp_path: 
 
 
 def test_with_a_token_only_who_has_it_may() -> None:
-    gate = Gate("secret")
+    gate = AccessPolicy("secret")
     other = {"Host": "box:8080"}
     assert gate.refusal("/?token=secret", other) is None
     assert gate.refusal("/", other | {"Cookie": f"a=b; {COOKIE}=secret"}) is None
@@ -251,15 +260,15 @@ def test_with_a_token_only_who_has_it_may() -> None:
         assert gate.refusal(path, headers) is not None
     assert "HttpOnly" in (gate.cookie("/?token=secret") or "")
     assert gate.cookie("/") is None
-    assert Gate().cookie("/?token=x") is None
+    assert AccessPolicy().cookie("/?token=x") is None
 
 
 def test_only_a_server_for_others_has_a_token() -> None:
     assert [is_loopback(host) for host in ("localhost", "127.0.0.1", "::1")] == [True] * 3
     assert [is_loopback(host) for host in ("0.0.0.0", "::", "192.168.1.7", "box")] == [False] * 4
-    assert gate_for("127.0.0.1").token is None
-    first = gate_for("0.0.0.0").token
-    second = gate_for("0.0.0.0").token
+    assert access_policy_for("127.0.0.1").token is None
+    first = access_policy_for("0.0.0.0").token
+    second = access_policy_for("0.0.0.0").token
     assert first is not None
     assert len(first) >= 24
     assert first != second
@@ -291,7 +300,7 @@ def test_a_free_port_is_found_and_a_taken_one_refused() -> None:
 def test_this_machine_may_open_the_page_and_pages_of_others_may_not(
     host: str, more: dict[str, str], is_let_in: bool
 ) -> None:
-    assert (Gate().refusal("/", {"Host": host} | more) is None) == is_let_in
+    assert (AccessPolicy().refusal("/", {"Host": host} | more) is None) == is_let_in
 
 
 def test_the_server_asks_the_gate() -> None:
@@ -300,7 +309,7 @@ def test_the_server_asks_the_gate() -> None:
     from websockets.sync.client import connect
 
     port = free_port("127.0.0.1", None)
-    with guarded(Gate("secret")), quiet():
+    with enforce_access(AccessPolicy("secret")), silence_viser():
         server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
     version = f"viser-v{viser.__version__}"
     try:
@@ -317,7 +326,7 @@ def test_the_server_asks_the_gate() -> None:
         with connect(socket_at, additional_headers=cookie, subprotocols=[version]) as opened_socket:  # type: ignore[list-item]
             assert opened_socket.recv(timeout=5)
     finally:
-        with quiet():
+        with silence_viser():
             server.stop()
     assert link_to("::1", 80) == "http://[::1]:80/"
     assert link_to("box", 80, "secret") == "http://box:80/?token=secret"
@@ -327,6 +336,6 @@ def test_the_server_asks_the_gate() -> None:
 @pytest.mark.parametrize("text", ["Größe 12", "a_b*c <i>x</i> [y](z) &lt;", string.punctuation])
 def test_every_mark_of_others_is_escaped_and_nothing_else(text: str) -> None:
     shown = "".join(f"\\{c}" if c in string.punctuation else c for c in text)
-    assert as_text(text) == shown.replace("\\@", "\u200b\\@")
-    assert as_text("a\n\n<b>\x1b") == r"a \<b\>\\x1b"
-    assert as_text("http://x.y WWW.x") == "http\u200b\\:\\/\\/x\\.y WWW\u200b\\.x"
+    assert escape_markdown(text) == shown.replace("\\@", "\u200b\\@")
+    assert escape_markdown("a\n\n<b>\x1b") == r"a \<b\>\\x1b"
+    assert escape_markdown("http://x.y WWW.x") == "http\u200b\\:\\/\\/x\\.y WWW\u200b\\.x"

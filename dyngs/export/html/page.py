@@ -17,8 +17,13 @@ from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import counted
 from dyngs.data.geometry import look_at_point
-from dyngs.export.choose_path import in_front_of, orbit_around, points_at, view_to_show
-from dyngs.export.html.numbers import Lists, add_levels, add_scene, block_files
+from dyngs.export.choose_path import (
+    framing_points,
+    frontal_cameras,
+    orbit_cameras_around,
+    select_view,
+)
+from dyngs.export.html.scene_data import PackedArrays, add_levels, add_scene, block_files
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.human.avatar.scene import as_human_scene
@@ -30,7 +35,7 @@ from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import Opened
 
 
-def filled(page: str, pieces: Mapping[str, str]) -> str:
+def fill_template(page: str, pieces: Mapping[str, str]) -> str:
     """Return ``page`` with each ``{{name}}`` replaced by the piece of that name; pieces are not
     looked into."""
     first, *rest = page.split("{{")
@@ -85,14 +90,14 @@ def write_page(
     the capture, or around the scene.
     """
     inputs_of(opened).require_output(path)
-    lists = Lists()
+    lists = PackedArrays()
     header = _header(opened, time, views, lists)
     text = _assembled(opened, header, lists, title)
     write_text(path, text)
     return WrittenPage(path, len(text.encode()), header, _notes(opened, header))
 
 
-def write_folder(
+def write_page_folder(
     opened: Opened,
     folder: Path,
     *,
@@ -109,7 +114,7 @@ def write_folder(
     DyngsError: ``most`` of another scene, or a folder that exists already.
     """
     require_new_folder(folder)
-    lists = Lists(chunked=True)
+    lists = PackedArrays(chunked=True)
     if most is not None or opened.renderable.has_levels:
         levelled = LevelScene.of(opened.renderable, most)
         colour = levelled.scene.colour
@@ -150,7 +155,9 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _header(opened: Opened, time: float, views: Sequence[Cameras], lists: Lists) -> dict[str, Any]:
+def _header(
+    opened: Opened, time: float, views: Sequence[Cameras], lists: PackedArrays
+) -> dict[str, Any]:
     views, target = _beginning(opened, views)
     found = opened.renderable.page_lists()
     if found is not None:
@@ -173,14 +180,14 @@ def _beginning(opened: Opened, views: Sequence[Cameras]) -> tuple[Sequence[Camer
         distinct = {view.cam_from_world.tobytes(): view for view in capture.splits["train"][::-1]}
         others = list(distinct.values())[::-1]
         rows = np.linspace(0, len(others) - 1, min(len(others), MOST_VIEWS)).round().astype(int)
-        chosen = (view_to_show(capture), *(others[i] for i in rows))
+        chosen = (select_view(capture), *(others[i] for i in rows))
         return training_cameras(chosen, opened.config.data), look_at_point(cameras).tolist()
-    target = np.median(points_at(opened.renderable).cpu().numpy(), axis=0)
+    target = np.median(framing_points(opened.renderable).cpu().numpy(), axis=0)
     if not views:
-        ring = orbit_around(opened, _RING)
+        ring = orbit_cameras_around(opened, _RING)
         views = [ring.select(i) for i in range(_RING)]
         if opened.person is not None:
-            views = [in_front_of(opened).select(1), *views]
+            views = [frontal_cameras(opened).select(1), *views]
             target = look_at_point(ring)
     return views, target.tolist()
 
@@ -218,15 +225,17 @@ def _view(camera: Cameras) -> dict[str, Any]:
     }
 
 
-def _assembled(opened: Opened, header: dict[str, Any], lists: Lists, title: str | None) -> str:
+def _assembled(
+    opened: Opened, header: dict[str, Any], lists: PackedArrays, title: str | None
+) -> str:
     """Return the text of the page. All that stems from a run is escaped; scripts are allowed by
     their hash alone."""
     if title is None:
         title = opened.name if opened.captured is not None else Path(opened.name).stem
     red, green, blue = (round(255 * min(max(x, 0.0), 1.0)) for x in header["background"])
-    style = text_of("page.css").replace("{{background}}", f"rgb({red}, {green}, {blue})")
+    style = read_asset("page.css").replace("{{background}}", f"rgb({red}, {green}, {blue})")
     script = element_script()
-    page = text_of("page.html")
+    page = read_asset("page.html")
     fetches = "levels" in header or "chunk" in header.get("curves", {})
     fixed = {
         "style": style,
@@ -240,7 +249,9 @@ def _assembled(opened: Opened, header: dict[str, Any], lists: Lists, title: str 
     }
     size = len(page) + sum(len(x) for x in fixed.values())
     about = counted(header["count"], "triangle" if "texture" in header else "Gaussian")
-    return filled(page, fixed | {"about": about + ("" if fetches else f", {size / 1e6:.1f} MB")})
+    return fill_template(
+        page, fixed | {"about": about + ("" if fetches else f", {size / 1e6:.1f} MB")}
+    )
 
 
 SCRIPTS = (
@@ -261,13 +272,16 @@ SHADERS += ("harmonics.glsl", "triangles.vert.glsl", "triangles.frag.glsl")
 def element_script() -> str:
     """Return the script: it needs nothing else, leaves no other name behind, and is ASCII, as pages
     may be of any."""
-    texts = {"STYLE": text_of("scene.css"), "SHADERS": {name: text_of(name) for name in SHADERS}}
+    texts = {
+        "STYLE": read_asset("scene.css"),
+        "SHADERS": {name: read_asset(name) for name in SHADERS},
+    }
     constants = [f"const {name} = {script_safe(value)};" for name, value in texts.items()]
-    parts = "\n".join([*constants, *map(text_of, SCRIPTS)])
+    parts = "\n".join([*constants, *map(read_asset, SCRIPTS)])
     script = f'// <dyngs-scene src="PAGE">: a scene of dyngs (Apache-2.0).\n(() => {{\n"use strict";\n{parts}}})();\n'
     return script.encode("ascii", "backslashreplace").decode("ascii")
 
 
-def text_of(name: str) -> str:
+def read_asset(name: str) -> str:
     """Return a file of this folder."""
     return (Path(__file__).parent / name).read_text(encoding="utf-8")
