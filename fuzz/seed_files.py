@@ -16,7 +16,7 @@ from tiny_fields import stirred_field
 
 from dyngs.config import Config, DataConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, save_config
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
 from dyngs.deform.keys import DynamicModel
@@ -29,7 +29,7 @@ from dyngs.io.formats.splat_file import SplatFile, with_degree
 from dyngs.io.tensor_file import write_tensors
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
-from dyngs.runs.stored_file import encoded
+from dyngs.runs.stored_file import encode_scene
 
 _INFO = CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")
 
@@ -262,7 +262,7 @@ def write_scene_file_still(root: Path) -> None:
         Config(data=DataConfig.model_validate({"root": "capture"}), model=model),
         root / RESOLVED_NAME,
     )
-    (root / "scene.dyngs").write_bytes(encoded(_scene_info(), _scene(_gaussians(), model), {}))
+    (root / "scene.dyngs").write_bytes(encode_scene(_scene_info(), _scene(_gaussians(), model), {}))
 
 
 def write_scene_file_moving(root: Path) -> None:
@@ -273,7 +273,9 @@ def write_scene_file_moving(root: Path) -> None:
         f"gaussians.{name}": 0.01
         for name in ("means", "quats", "log_scales", "logit_opacities", "sh_base")
     }
-    (root / "scene.dyngs").write_bytes(encoded(_scene_info(), _scene(tensors, config.model), steps))
+    (root / "scene.dyngs").write_bytes(
+        encode_scene(_scene_info(), _scene(tensors, config.model), steps)
+    )
 
 
 def write_person(root: Path) -> None:
@@ -442,7 +444,7 @@ def _moving(kind: str) -> tuple[Config, dict[str, torch.Tensor]]:
         data=DataConfig.model_validate({"root": "capture"}),
         model=DynamicModel(deform=tiny_options(kind)),
     )
-    state = tensors_of(field_state(stirred_field(kind, num_moving=2)))
+    state = strip_roles(field_state(stirred_field(kind, num_moving=2)))
     tensors = _gaussians() | {f"model.field.{name}": x.contiguous() for name, x in state.items()}
     tensors["model.rows"] = torch.tensor([1, 3])
     return config, tensors | {"model.times": torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)}

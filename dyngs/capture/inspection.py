@@ -16,7 +16,13 @@ import numpy as np
 from dyngs.capture.sfm.frame_choice import STANDS, displaced_by, measured, shrunk
 from dyngs.capture.sfm.several_videos import VIDEOS_FILE, CameraVideo, open_video, read_given
 from dyngs.config import DataConfig
-from dyngs.core.errors import DyngsError, as_word, counted, printable, reading
+from dyngs.core.errors import (
+    DyngsError,
+    format_count,
+    format_one_line,
+    quote_path,
+    wrap_read_errors,
+)
 from dyngs.data.body_frames import about_pelvis
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry import (
@@ -270,7 +276,7 @@ def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectRep
     )
     try:
         capture = read_capture(options, decode_videos=deep)
-        with reading(options.root, "`dyngs --debug` shows where"):
+        with wrap_read_errors(options.root, "`dyngs --debug` shows where"):
             report = report_on(capture, deep)
     except DyngsError as error:
         return InspectReport(options.root, None, (), (str(error), *links))
@@ -290,7 +296,7 @@ def format_report(report: InspectReport) -> str:
         lines.append("nothing suspicious")
     else:
         lines.append(f"suspicious ({len(report.problems)}):")
-        lines += [f"  - {printable(problem)}" for problem in report.problems]
+        lines += [f"  - {format_one_line(problem)}" for problem in report.problems]
     return "\n".join(lines)
 
 
@@ -350,10 +356,10 @@ def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:
         "" if capture.span in (None, (0.0, 1.0)) else f" ({_range(capture.span)} in the files)"
     )
     yield "times", f"{len(times)} in {_range(times)}{written}"
-    cameras = counted(len({view.camera_id for view in views}), "camera")
+    cameras = format_count(len({view.camera_id for view in views}), "camera")
     yield (
         "sequence",
-        f"{cameras} x {counted(len(times), 'time')}, {counted(len(views), 'image')}",
+        f"{cameras} x {format_count(len(times), 'time')}, {format_count(len(views), 'image')}",
     )
     if capture.fps is not None:
         yield "frame rate", f"{capture.fps:.6g} per second"
@@ -464,7 +470,7 @@ def video_report(path: Path) -> str:
         facts, stands = video_facts(video)
         moving += [] if stands else [video.name]
         lines += [f"video {video.path}", *_aligned(facts)]
-    where = as_word(videos[0].path if len(videos) == 1 else path)
+    where = quote_path(videos[0].path if len(videos) == 1 else path)
     if len(videos) == 1 and moving:
         lines.append(
             f"next: dyngs train static data.root={where}     # nothing but the camera moves"
@@ -508,7 +514,7 @@ def video_facts(video: CameraVideo) -> tuple[dict[str, str], bool]:
         "frames": f"{len(video.seconds)} in {video.seconds[-1] + 1 / video.rate:.2f} s, {rate}",
         "colours": video.info.colours,
         "sound": "yes" if has_sound else "none",
-        "sharpness": counted(blurred, "blurred frame"),
+        "sharpness": format_count(blurred, "blurred frame"),
         "camera": f"moves by up to {displaced:.1%} of its width, {np.median(measures.motion):.2%} from frame to frame",
     }
     stands = displaced <= STANDS

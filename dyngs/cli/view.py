@@ -33,7 +33,7 @@ def add_parser(commands: args.Commands) -> None:
     add_serving_arguments(parser)
     about = "motion file for a person, or a folder of them"
     parser.add_argument("--motion", type=args.input_path, metavar="PATH", help=about)
-    args.add_most_drawn(
+    args.add_max_gaussians_drawn(
         parser, "of a large still scene: so many are drawn at most while anything moves"
     )
     args.add_up(parser)
@@ -46,7 +46,7 @@ def add_serving_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of how the page is served."""
     about = "address to listen on (default: this machine only); others get a link with a token"
     parser.add_argument("--host", default="127.0.0.1", help=about)
-    kind = args.whole("a port", 1, 65535)
+    kind = args.integer_type("a port", 1, 65535)
     parser.add_argument(
         "--port", type=kind, metavar="N", help="port (default: 8080, or the next that is free)"
     )

@@ -10,16 +10,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.compress.search import evenly_held_out, unseen_images
-from dyngs.compress.stage import importance, quality_of, scoring_views
+from dyngs.compress.search import held_out_indices, validation_images
+from dyngs.compress.stage import mean_psnr, measure_importance, scoring_views
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import depths_and_contributions
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.models.checkpoint import read_capture_of
-from dyngs.models.kind import HasGaussians, capability, kind_of
+from dyngs.models.checkpoint import read_run_capture
+from dyngs.models.kind import HasGaussians, capability, find_kind
 from dyngs.ops.device import deterministic, select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.checkpoint import has_only_scene_file, latest_checkpoint, load_run
@@ -46,14 +46,14 @@ def remove_floaters(loop: Loop) -> TrainingEdit | None:
     options = trainer.config.train
     if trainer.done != options.steps or not options.remove_floaters:
         return None
-    is_still = "init.scene" in kind_of(trainer.config.model).uses
+    is_still = "init.scene" in find_kind(trainer.config.model).uses
     if not is_still or len(trainer.images) < FEWEST_VIEWS:
         return None
-    found = floaters(trainer)
+    found = find_floaters(trainer)
     count = int(found.sum())
     if not count:
         return None
-    before = counted(len(found), "Gaussian")
+    before = format_count(len(found), "Gaussian")
     message = f"{count:,} of {before} hang close before single cameras"
     if count > MOST * len(found):
         return TrainingEdit(f"{message}: too many to be floaters, none is removed")
@@ -61,7 +61,7 @@ def remove_floaters(loop: Loop) -> TrainingEdit | None:
 
 
 @torch.no_grad()
-def floaters(trainer: GaussianTrainer) -> Tensor:
+def find_floaters(trainer: GaussianTrainer) -> Tensor:
     """Return (N,) bool which Gaussians of a static scene are floaters, by all of its training
     views."""
     gaussians = trainer.model.scene.gaussians.detach()
@@ -96,21 +96,21 @@ _TRIALS = 6  # of a bisection
 Tell = Callable[[str], None]
 
 
-def by_shape(gaussians: Gaussians, opacities: Tensor) -> dict[str, Tensor]:
+def classify_shapes(gaussians: Gaussians, opacities: Tensor) -> dict[str, Tensor]:
     """Return (N,) bool by kind: what scales, opacities (N,) and distances alone say of
     Gaussians."""
     ordered = gaussians.scales.sort(dim=1, descending=True).values
     longest = ordered[:, 0]
     second = ordered[:, 1]
     return {
-        "lone": lone(gaussians.means),
+        "lone": find_isolated(gaussians.means),
         "veils": (opacities < VEIL) & (longest > LARGE * longest.median()),
         "faint": opacities < FAINT,
         "needles": longest > NEEDLE * second.clamp_min(torch.finfo(second.dtype).tiny),
     }
 
 
-def lone(means: Tensor) -> Tensor:
+def find_isolated(means: Tensor) -> Tensor:
     """Return (N,) bool: whose fourth neighbour is ``LONE`` times as far as that of most Gaussians
     (N, 3)."""
     from scipy.spatial import KDTree
@@ -124,26 +124,27 @@ def lone(means: Tensor) -> Tensor:
     return (distance > LONE * distance.median()).to(means.device)
 
 
-def cleaned_file(gaussians: Gaussians, tell: Tell) -> Tensor:
+def clean_file(gaussians: Gaussians, tell: Tell) -> Tensor:
     """Return (N,) bool which Gaussians stay of a scene without cameras: all but what is faint, a
     needle or alone."""
-    found = by_shape(gaussians, gaussians.opacities)
+    found = classify_shapes(gaussians, gaussians.opacities)
     gone = torch.zeros_like(found["faint"])
     for kind in ("faint", "needles", "lone"):
-        tell(f"clean: {kind}: {counted(int((found[kind] & ~gone).sum()), 'Gaussian')}")
+        tell(f"clean: {kind}: {format_count(int((found[kind] & ~gone).sum()), 'Gaussian')}")
         gone |= found[kind]
     if bool(gone.all()):
         raise DyngsError(
             "--clean: nothing would be left; this scene consists of needles, or of what hardly shows"
         )
     tell(
-        f"clean: {int(gone.sum()):,} of {counted(len(gone), 'Gaussian')} go; without the cameras of a run neither what "
+        f"clean: {int(gone.sum()):,} of {format_count(len(gone), 'Gaussian')} go; without the "
+        "cameras of a run neither what "
         "no camera saw nor what this costs can be measured"
     )
     return ~gone
 
 
-def cleaned_run(
+def clean_run(
     run_dir: Path, max_loss: float, threads: int, data_root: Path | None, tell: Tell
 ) -> Tensor:
     """Return (N,) bool which Gaussians of a run stay; what goes, and what it costs, is told.
@@ -161,37 +162,39 @@ def cleaned_run(
         deterministic(select_device(config.run.device), True),
         torch.no_grad(),
     ):
-        trainer = at_end(config, run_dir)
-        unseen = unseen_images(trainer)
-        held = () if unseen else evenly_held_out(len(trainer.images))
+        trainer = restore_final_trainer(config, run_dir)
+        unseen = validation_images(trainer)
+        held = () if unseen else held_out_indices(len(trainer.images))
         if not unseen and not held:
             raise DyngsError(
                 f"{run_dir}: --clean needs two views or more, of which one judges what it costs"
             )
         images = unseen or [trainer.images[i] for i in held]
         scene: GaussianScene = trainer.model.scene.without_masks()
-        before = quality_of(trainer, scene, images)
-        trained_before = quality_of(trainer, scene)
+        before = mean_psnr(trainer, scene, images)
+        trained_before = mean_psnr(trainer, scene)
 
         def losses(kept: Tensor) -> tuple[float, float]:
             """Return the losses of mean PSNR, dB: of the views held out, and of 16 training views
             as well, because few views may be kind by chance."""
             left = scene.select(kept)
-            loss = before - quality_of(trainer, left, images)
-            return loss, max(loss, trained_before - quality_of(trainer, left))
+            loss = before - mean_psnr(trainer, left, images)
+            return loss, max(loss, trained_before - mean_psnr(trainer, left))
 
         kept = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
-        for kind, rows in suspects_of(trainer, held).items():
-            kept = taken(kept, kind, rows, lambda left: losses(left)[1] <= max_loss, tell)
+        for kind, rows in find_removal_candidates(trainer, held).items():
+            kept = remove_within_loss(
+                kept, kind, rows, lambda left: losses(left)[1] <= max_loss, tell
+            )
         loss, worst = losses(kept)
-        views = counted(len(images), "validation view" if unseen else "training view")
-        gone = f"clean: {int((~kept).sum()):,} of {counted(len(kept), 'Gaussian')} go"
+        views = format_count(len(images), "validation view" if unseen else "training view")
+        gone = f"clean: {int((~kept).sum()):,} of {format_count(len(kept), 'Gaussian')} go"
         cost = f"{before:.2f} -> {before - loss:.2f} dB ({-loss:+.3f}) on {views} held out"
         tell(f"{gone}; {cost}; {max(worst, 0):.3f} of {max_loss:g} dB lost, with training views")
         return kept.cpu()
 
 
-def taken(
+def remove_within_loss(
     kept: Tensor, kind: str, rows: Tensor, may_stay: Callable[[Tensor], bool], tell: Tell
 ) -> Tensor:
     """Return (N,) bool: ``kept`` without the first of ``rows`` (K,), all or as many as bisection
@@ -212,16 +215,16 @@ def taken(
             high = count
         count = (low + high) // 2
     if len(rows):
-        tell(f"clean: {kind}: {low:,} of {counted(len(rows), 'Gaussian')} go")
+        tell(f"clean: {kind}: {low:,} of {format_count(len(rows), 'Gaussian')} go")
     return left
 
 
-def at_end(config: Config, run_dir: Path) -> GaussianTrainer:
+def restore_final_trainer(config: Config, run_dir: Path) -> GaussianTrainer:
     """Return the trainer of a run where it ended; without checkpoints with nothing but its
     scene."""
     run = load_run(run_dir, config.data.root)
     trainer: GaussianTrainer = build_trainer(
-        config, read_capture_of(config.data, run.info), restored=True
+        config, read_run_capture(config.data, run.info), restored=True
     )
     if has_only_scene_file(run_dir):
         scene = run.scene.to(trainer.device)
@@ -232,7 +235,7 @@ def at_end(config: Config, run_dir: Path) -> GaussianTrainer:
     return trainer
 
 
-def suspects_of(trainer: GaussianTrainer, held: Sequence[int]) -> dict[str, Tensor]:
+def find_removal_candidates(trainer: GaussianTrainer, held: Sequence[int]) -> dict[str, Tensor]:
     """Return the rows (K,) that may go, by kind, the most harmless first; of each first those that
     contribute least to all training views not ``held``."""
     scene: GaussianScene = trainer.model.scene.without_masks()
@@ -240,12 +243,12 @@ def suspects_of(trainer: GaussianTrainer, held: Sequence[int]) -> dict[str, Tens
     if scene.is_static:
         cameras = trainer.images.cameras()
         views = replace(views, cameras=[cameras[i] for i in range(len(cameras)) if i not in held])
-    found = importance(views, slopes=False)
+    found = measure_importance(views, slopes=False)
     contribution = found.contribution
     kinds = {"never seen": contribution <= 0}
     if scene.is_static and len(trainer.images) >= FEWEST_VIEWS:
-        kinds["floaters"] = floaters(trainer)
-    shapes = by_shape(scene.at(None), found.opacities.amax(0))
+        kinds["floaters"] = find_floaters(trainer)
+    shapes = classify_shapes(scene.at(None), found.opacities.amax(0))
     kinds |= {kind: shapes[kind] for kind in ("lone", "faint", "veils", "needles")}
     order = torch.sort(contribution, stable=True).indices
     return {kind: order[is_one[order]] for kind, is_one in kinds.items()}

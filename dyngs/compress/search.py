@@ -23,10 +23,16 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.compress.measure import coarsest_file
-from dyngs.compress.stage import PROBED_VIEWS, probe_images, quality_of, removal, scores_of
+from dyngs.compress.measure import find_coarsest_file
+from dyngs.compress.stage import (
+    PROBED_VIEWS,
+    build_removal_edit,
+    importance_scores,
+    mean_psnr,
+    probe_images,
+)
 from dyngs.config import AutoColour, Config
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.training import HELD_OUT_EVERY, MeasuredView, find_view_dependent
@@ -69,7 +75,7 @@ def apply_choice(trainer: GaussianTrainer, choice: PruneChoice, scores: Tensor) 
     prune = config.prune.model_copy(update={"fraction": choice.fraction})
     changed = {"model": model, "colour": colour, "prune": prune}
     trainer.apply(TrainingEdit(config=config.model_copy(update=changed)))
-    trainer.apply(removal(trainer, scores if choice.fraction else None))
+    trainer.apply(build_removal_edit(trainer, scores if choice.fraction else None))
     if choice.harmonics:
         _drop_harmonics(trainer, choice.harmonics)
 
@@ -133,7 +139,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Promise:
+class PruneResult:
     """Scores of the candidate that a search chooses."""
 
     asked: float  # largest loss on the views held out, dB
@@ -155,14 +161,14 @@ class Promise:
         return f"taken away: {self.choice}; {kept}; {self.trials} trials"
 
 
-def evenly_held_out(count: int) -> tuple[int, ...]:
+def held_out_indices(count: int) -> tuple[int, ...]:
     """Return the indices of those of ``count`` training views that are held out, evenly spread;
     none of one view."""
     chosen = min(max(1, round(HELD_OUT_FRACTION * count)), MOST_HELD_OUT) if count > 1 else 0
     return tuple((2 * i + 1) * count // (2 * chosen) for i in range(chosen))
 
 
-def unseen_images(trainer: GaussianTrainer) -> list[Image]:
+def validation_images(trainer: GaussianTrainer) -> list[Image]:
     """Return at most ``MOST_HELD_OUT`` images of the split `val`, which no training sees; of people
     none.
 
@@ -194,11 +200,11 @@ class Search:
         unseen: Sequence[Image] = (),
     ) -> None:
         self.trainer, self.start, self.tell = trainer, start, tell
-        self.held_out = () if unseen else evenly_held_out(len(trainer.images))
+        self.held_out = () if unseen else held_out_indices(len(trainer.images))
         self.trials = 0
         self._config = trainer.config
         trainer.hold_out(self.held_out)
-        self._scores = scores_of(trainer, trainer.config.prune)
+        self._scores = importance_scores(trainer, trainer.config.prune)
         self._truths = (
             list(unseen) or [trainer.images[i] for i in self.held_out] or probe_images(trainer)
         )
@@ -206,7 +212,7 @@ class Search:
         self._others = [others[i] for i in evenly_spaced(len(others), PROBED_VIEWS)]
         self.views = "its only training view"
         if unseen:
-            self.views = f"{counted(len(unseen), 'view')} never trained on"
+            self.views = f"{format_count(len(unseen), 'view')} never trained on"
         elif self.held_out:
             self.views = f"{len(self.held_out)} training views held out"
         self._is_fair = bool(unseen)
@@ -234,7 +240,7 @@ class Search:
         how = "" if self._is_fair else ", fine-tuned on the others"
         count = len(self._scores)
         self.tell(
-            f"as it is{how}: {counted(count, 'Gaussian')}, {self._reference:.2f} dB on {self.views}"
+            f"as it is{how}: {format_count(count, 'Gaussian')}, {self._reference:.2f} dB on {self.views}"
         )
         has_harmonics = bool(self.start.tensors["gaussians.sh"][:, 1:].any())
         alpha_min = self._config.model.alpha_min
@@ -252,7 +258,7 @@ class Search:
             accepted += [] if found is None else [found]
         return accepted
 
-    def run(self, max_loss: float) -> tuple[Candidate, bytes, Promise]:
+    def run(self, max_loss: float) -> tuple[Candidate, bytes, PruneResult]:
         """Return the smallest accepted candidate whose file keeps the promise, and that file,
         rounded as far as it may.
 
@@ -260,12 +266,12 @@ class Search:
         """
         for candidate in reversed(self.accepted(max_loss)):
             least = candidate.psnr - max(max_loss - candidate.worst, SMALLEST_FILE_LOSS)
-            file = coarsest_file(candidate.config, candidate.checkpoint, self._quality, least)
+            file = find_coarsest_file(candidate.config, candidate.checkpoint, self._quality, least)
             if file is not None:
                 before = candidate.psnr + candidate.loss
                 choice = candidate.choice
                 data, after = file
-                promise = Promise(max_loss, before, after, choice, self.views, self.trials)
+                promise = PruneResult(max_loss, before, after, choice, self.views, self.trials)
                 return candidate, data, promise
             self.tell(f"without {candidate.choice}: the file loses more than {max_loss:g} dB")
         raise DyngsError(
@@ -273,14 +279,14 @@ class Search:
         )
 
     def _quality(self, scene: GaussianScene) -> float:
-        return quality_of(self.trainer, scene, self._truths, alpha_min=scene.options.alpha_min)
+        return mean_psnr(self.trainer, scene, self._truths, alpha_min=scene.options.alpha_min)
 
     def _measured(self) -> tuple[float, float]:
         """Return the PSNR of the scene of the trainer on views held out, and on others."""
         scene = self.trainer.model.scene
         others = [self.trainer.images[i] for i in self._others]
-        held_out = quality_of(self.trainer, scene, self._truths)
-        return held_out, quality_of(self.trainer, scene, others)
+        held_out = mean_psnr(self.trainer, scene, self._truths)
+        return held_out, mean_psnr(self.trainer, scene, others)
 
     def _bisected(self, levels: Sequence[PruneChoice], allowed: float) -> Candidate | None:
         """Return the last of ``levels`` that loses at most ``allowed``, as if all before it did."""
@@ -291,7 +297,7 @@ class Search:
             tried = self._tried(choice)
             keeps = tried.worst <= allowed
             self.tell(
-                f"trial {self.trials}: without {tried.choice}: {counted(tried.num_gaussians, 'Gaussian')}, "
+                f"trial {self.trials}: without {tried.choice}: {format_count(tried.num_gaussians, 'Gaussian')}, "
                 f"{-tried.loss:+.2f} dB, {-tried.trained_loss:+.2f} on views trained on, "
                 f"{'kept' if keeps else f'more than {allowed:.2f} dB lost'}"
             )

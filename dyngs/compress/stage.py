@@ -23,7 +23,7 @@ from torch import Tensor
 
 from dyngs.config import PruneConfig
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import counted
+from dyngs.core.errors import format_count
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
@@ -31,7 +31,7 @@ from dyngs.deform.scene import field_scene_of
 from dyngs.gaussians.rendering import RenderOptions, contributions, sensitivities
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.models.kind import Moves, capability
+from dyngs.models.kind import HasMotion, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
 from dyngs.ops.device import copy_async
@@ -97,7 +97,7 @@ def _neighbours(x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def importance(views: ScoringViews, *, slopes: bool) -> Importance:
+def measure_importance(views: ScoringViews, *, slopes: bool) -> Importance:
     """Return the contribution of each Gaussian to the images of ``views``; ``slopes`` cost the
     larger half."""
     scene = views.scene
@@ -129,7 +129,7 @@ def importance(views: ScoringViews, *, slopes: bool) -> Importance:
     )
 
 
-def highest(scores: Tensor, fraction: float) -> Tensor:
+def select_highest(scores: Tensor, fraction: float) -> Tensor:
     """Return (N,) bool: all but the lowest ``fraction`` of ``scores`` (N,), at least one; of equal
     ones the first."""
     count = min(max(1, math.ceil(len(scores) * (1 - fraction) - 1e-9)), len(scores))
@@ -154,22 +154,24 @@ def prune_stage(loop: Loop) -> TrainingEdit | None:
     config = trainer.config
     if trainer.done != config.train.steps or trainer.done >= loop.total:
         return None
-    return pruning(trainer)
+    return build_pruning_edit(trainer)
 
 
 @torch.no_grad()
-def pruning(trainer: GaussianTrainer) -> TrainingEdit:
+def build_pruning_edit(trainer: GaussianTrainer) -> TrainingEdit:
     """Return the edit that prunes and masks the Gaussians of ``trainer`` by its config."""
     scene = trainer.model.scene.without_masks()
     options = trainer.config.prune
-    edit = removal(trainer, scores_of(trainer, options) if options.fraction > 0 else None)
+    edit = build_removal_edit(
+        trainer, importance_scores(trainer, options) if options.fraction > 0 else None
+    )
     message = f"pruned: {len(scene):,} -> "
     if edit.kept is None:
         return replace(
-            edit, message=f"{message}{counted(len(scene), 'Gaussian')}{_let_through(edit)}"
+            edit, message=f"{message}{format_count(len(scene), 'Gaussian')}{_let_through(edit)}"
         )
-    gain = quality_of(trainer, scene.select(edit.kept)) - quality_of(trainer, scene)
-    left = counted(int(edit.kept.sum()), "Gaussian")
+    gain = mean_psnr(trainer, scene.select(edit.kept)) - mean_psnr(trainer, scene)
+    left = format_count(int(edit.kept.sum()), "Gaussian")
     cost = f"{gain:+.2f} dB before it is trained again"
     return replace(edit, message=f"{message}{left}, {cost}{_let_through(edit)}")
 
@@ -184,26 +186,26 @@ def _let_through(edit: TrainingEdit) -> str:
 
 
 @torch.no_grad()
-def removal(trainer: GaussianTrainer, scores: Tensor | None) -> TrainingEdit:
+def build_removal_edit(trainer: GaussianTrainer, scores: Tensor | None) -> TrainingEdit:
     """Return the edit that leaves all but the fraction ``prune.fraction`` with the lowest ``scores``
     (N,), and masks them if requested; from then on their number stays."""
     options = trainer.config.prune
     whole = trainer.model.scene.without_masks()
-    kept = None if scores is None else highest(scores, options.fraction)
+    kept = None if scores is None else select_highest(scores, options.fraction)
     masks = None
-    moves = capability(trainer.config.model, Moves) is not None and not whole.is_static
+    moves = capability(trainer.config.model, HasMotion) is not None and not whole.is_static
     if options.mask_times > 1 and moves:
         masks = _masks(trainer, whole, kept)
     return TrainingEdit(kept=kept, masks=masks, stops_densification=True)
 
 
 @torch.no_grad()
-def scores_of(trainer: GaussianTrainer, options: PruneConfig | None = None) -> Tensor:
+def importance_scores(trainer: GaussianTrainer, options: PruneConfig | None = None) -> Tensor:
     """Return (N,) how much each Gaussian matters now, by the score of ``options``; None: the first
     of docs/prune.md."""
     score = (options or PruneConfig()).score
     scene = trainer.model.scene.without_masks()
-    found = importance(scoring_views(trainer, scene), slopes=score == "sensitivity")
+    found = measure_importance(scoring_views(trainer, scene), slopes=score == "sensitivity")
     match score:
         case "variation":
             return found.variation
@@ -245,7 +247,7 @@ def probe_images(trainer: Trainer[Any]) -> list[Image]:
 
 
 @torch.no_grad()
-def quality_of(
+def mean_psnr(
     trainer: Trainer[Any],
     scene: Renderable,
     images: Sequence[Image] | None = None,
@@ -273,15 +275,15 @@ def _masks(trainer: GaussianTrainer, scene: GaussianScene, kept: Tensor | None) 
     last = len(scene.times) - 1
     count = min(options.mask_times, len(scene.times))
     times = [scene.times[round(k * last / (count - 1))] for k in range(count)]
-    fractions = importance(scoring_views(trainer, scene, times), slopes=False).fractions
+    fractions = measure_importance(scoring_views(trainer, scene, times), slopes=False).fractions
     seen = fractions > MASKED_BELOW
     moved = field_scene_of(scene)
     if moved is not None and moved.field is not None and moved.field.can_fade:
-        seen |= there_after(scene, times, trainer.model.options.alpha_min).to(seen.device)
+        seen |= visible_between_times(scene, times, trainer.model.options.alpha_min).to(seen.device)
     return VisibilityMasks.pack(tuple(times), seen if kept is None else seen[:, kept])
 
 
-def there_after(scene: GaussianScene, times: Sequence[float], alpha_min: float) -> Tensor:
+def visible_between_times(scene: GaussianScene, times: Sequence[float], alpha_min: float) -> Tensor:
     """Return (K, N) bool: which Gaussians are more opaque than ``alpha_min`` between one of K key
     times and the next.
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dyngs.core.initialisation import glorot
-from dyngs.core.state import State, moved_to, part_of, prefixed
+from dyngs.core.state import State, add_prefix, move_to_device, select_prefix
 from dyngs.deform.keys import FieldSection
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import Parameters
@@ -134,7 +134,7 @@ class DeformationField:
 
     def state(self) -> State:
         """Return the state that ``restored`` needs, without the setup."""
-        return prefixed("learned", self.parameters.state())
+        return add_prefix("learned", self.parameters.state())
 
     def with_state(self: F, tensors: Mapping[str, Tensor]) -> F:
         """Return the field of a state that ``state`` returned, with the options and the setup of
@@ -143,11 +143,11 @@ class DeformationField:
         Raises KeyError or ValueError: a tensor is missing, or is not as a field of these options
         has it.
         """
-        return self.with_parameters(self.parameters.with_state(part_of(tensors, "learned")))
+        return self.with_parameters(self.parameters.with_state(select_prefix(tensors, "learned")))
 
     def to(self: F, device: torch.device | str) -> F:
         field = self.with_parameters(self.parameters.to(device))
-        field.setup = moved_to(self.setup, device)
+        field.setup = move_to_device(self.setup, device)
         return field
 
     def with_parameters(self: F, parameters: Parameters) -> F:

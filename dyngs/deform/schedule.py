@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from dyngs.core.errors import DyngsError
 from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians.schedule import RateSchedule
-from dyngs.models.schedule import Length
+from dyngs.models.schedule import LengthChange
 
 SPLITS = (0.1, 0.3, 0.5)
 """Steps at which static Gaussians are frozen, as fractions of the part of the run that sees all
@@ -42,7 +42,7 @@ def deform_schedule(model: DynamicModel, rates: RateSchedule) -> DeformSchedule:
     nothing.
     """
     steps = rates.steps
-    coarse_end = model.moves_after(steps)
+    coarse_end = model.motion_start_step(steps)
     window_grows_from = max(coarse_end, round(model.time_window_grows_from * steps))
     window_full_at = max(window_grows_from, round(model.time_window_full_at * steps))
     decay_from = window_full_at if model.time_window < 1 else coarse_end
@@ -57,7 +57,7 @@ def deform_schedule(model: DynamicModel, rates: RateSchedule) -> DeformSchedule:
     )
 
 
-def extended(model: DynamicModel, length: Length) -> DynamicModel:
+def extend_schedules(model: DynamicModel, length: LengthChange) -> DynamicModel:
     """Return the section for a run of another length; phases that have begun keep their step.
 
     Raises DyngsError: its motion began too early for that length.
@@ -70,7 +70,7 @@ def extended(model: DynamicModel, length: Length) -> DynamicModel:
             "time_window_full_at": length.kept(old.window_full_at),
         }
     changed = model.model_copy(update=fractions)
-    motion_start = changed.moves_after(length.steps)
+    motion_start = changed.motion_start_step(length.steps)
     if old.coarse_end <= length.done < motion_start:
         raise DyngsError(
             f"train.steps={length.steps}: motion began after step {old.coarse_end:,}, but a run of "
@@ -79,7 +79,7 @@ def extended(model: DynamicModel, length: Length) -> DynamicModel:
     return changed
 
 
-def _motion_from(old: DeformSchedule, model: DynamicModel, length: Length) -> float:
+def _motion_from(old: DeformSchedule, model: DynamicModel, length: LengthChange) -> float:
     """Return the share after which motion is learned: the step where it began, else one that is
     still to come."""
     if length.done >= old.coarse_end:

@@ -21,12 +21,12 @@ from dyngs.ops.adam import Count
 S_co = TypeVar("S_co", bound=Renderable, covariant=True)
 
 
-def nothing() -> None:
+def do_nothing() -> None:
     """Do nothing."""
 
 
 @dataclass(frozen=True)
-class Drawn:
+class RenderOutput:
     """A training image as a model draws it."""
 
     rendering: Rendering  # of the image's camera
@@ -35,20 +35,20 @@ class Drawn:
     # tensors that something learned has moved, by name: one that is not finite would not be drawn,
     # so that a diverging field could go unseen; empty: nothing was
     moved: Mapping[str, Tensor] = field(default_factory=dict)
-    after_backward: Callable[[], None] = nothing  # takes in gradients once they are there
+    after_backward: Callable[[], None] = do_nothing  # takes in gradients once they are there
     # what the rendering is compared with where that is only some pixels of the image; None: the
     # whole image
     image: Image | None = None
 
 
 @dataclass(frozen=True)
-class Updated:
+class UpdateResult:
     """What an update has done."""
 
     bad: Count = 0  # number of rows left out because their gradient was not finite
     finding: str | None = None  # lines about what was found out, or None
     # there are other rows now: several processes must have come to the same
-    is_rearranged: bool = False
+    topology_changed: bool = False
 
 
 class Model(ABC, Generic[S_co]):
@@ -59,7 +59,7 @@ class Model(ABC, Generic[S_co]):
             for messages.
     """
 
-    moves_by: tuple[str, str] = ("", "")
+    deformation_name: tuple[str, str] = ("", "")
 
     @property
     @abstractmethod
@@ -67,11 +67,13 @@ class Model(ABC, Generic[S_co]):
         """What is trained, as it is now."""
 
     @abstractmethod
-    def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+    def draw(
+        self, image: Image, step: int, background: Tensor, *, depth: bool = False
+    ) -> RenderOutput:
         """Return how ``image`` is drawn in ``step`` before ``background`` (3,), differentiable."""
 
     @abstractmethod
-    def update(self, step: int) -> Updated:
+    def update(self, step: int) -> UpdateResult:
         """Change what is learned by the gradients that are there, and drop them."""
 
     @property
@@ -108,7 +110,7 @@ class Model(ABC, Generic[S_co]):
         may."""
         return True
 
-    def holds_out(self, index: int, step: int) -> bool:
+    def is_held_out(self, index: int, step: int) -> bool:
         """Return whether training view ``index`` must not be trained on in ``step``."""
         return False
 
@@ -136,13 +138,13 @@ class Model(ABC, Generic[S_co]):
 
 
 @dataclass(frozen=True)
-class Look:
+class LossInput:
     """A training image next to its rendering, for terms of the loss."""
 
     index: int  # of the view
     step: int
     image: Image  # what was trained on, with a mask of the pixels that count
-    drawn: Drawn
+    drawn: RenderOutput
     # rendered, truth: (H, W, 3) that are compared, on the same background
     rendered: Tensor
     truth: Tensor
@@ -157,7 +159,7 @@ class Loss:
         """Return whether ``image`` must be drawn with its depth."""
         return False
 
-    def __call__(self, look: Look) -> Mapping[str, Tensor]:
+    def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
         """Return differentiable scalars, weighted, by name."""
         raise NotImplementedError
 

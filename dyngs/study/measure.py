@@ -12,14 +12,14 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field, TypeAdapter
 
-from dyngs.core.errors import counted, show
+from dyngs.core.errors import format_count, log_info
 from dyngs.core.metrics import load_lpips
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.report import load_split_images
 from dyngs.evaluate.view_scores import Regions, SceneRenderer, score_views, time_renders
 from dyngs.io.write import write_image
-from dyngs.models.checkpoint import read_capture_of
+from dyngs.models.checkpoint import read_run_capture
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background
 from dyngs.ops.device import select_device
@@ -166,7 +166,7 @@ class SceneMeasurer:
         with."""
         run = load_run(run_dir)
         device = select_device(self.device)
-        capture = read_capture_of(run.config.data, run.info)
+        capture = read_run_capture(run.config.data, run.info)
         views = split_views(capture, self.split)
         loader = load_split_images(capture, views, run_dir, run)
         loader.device = device
@@ -184,7 +184,7 @@ class SceneMeasurer:
             groups = [[]]
         for group in groups:
             together = [0, *group]
-            show(f"timing {counted(len(together), 'scene')} in turn")
+            log_info(f"timing {format_count(len(together), 'scene')} in turn")
             drawn = [self._drawn(study_scenes[i].run_dir, study_scenes[i].make()) for i in together]
             loader = drawn[0][1]
             images = [loader[i] for i in evenly_spaced(len(loader), self.timed_views)]

@@ -11,10 +11,10 @@ from moving_scene import write_moving_run
 from pretend_gpu import GPU, pretend_gpu
 from tiny_fields import busy_config, write_tiny_capture
 
-from dyngs.api.prune import file_of, prune_run, prune_within
+from dyngs.api.prune import export_folder, prune_run, prune_to_loss
 from dyngs.api.train import train
-from dyngs.compress.search import evenly_held_out
-from dyngs.compress.stage import quality_of
+from dyngs.compress.search import held_out_indices
+from dyngs.compress.stage import mean_psnr
 from dyngs.config import PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
@@ -59,7 +59,7 @@ def test_it_is_the_stage_of_training_afterwards(run_dir: Path, tmp_path: Path) -
     assert checkpoint_paths(small)[-1].read_bytes() == checkpoint_paths(whole)[-1].read_bytes()
     assert load_run(run_dir).step == 24, "the first run is as it was"
     assert (small / "log.jsonl").read_text().count("\n") >= 30
-    assert len(load_run(file_of(small)).scene) == len(load_run(small).scene)
+    assert len(load_run(export_folder(small)).scene) == len(load_run(small).scene)
 
 
 @pytest.mark.usefixtures("few_candidates")
@@ -67,7 +67,7 @@ def test_a_pruned_run_can_be_pruned(run_dir: Path, tmp_path: Path) -> None:
     once = prune_run(run_dir, tmp_path / "once", ASKED)
     twice = prune_run(once, tmp_path / "twice", ("prune.fraction=0.5", "prune.steps=2"))
     thrice = tmp_path / "thrice"
-    prune_within(twice, thrice, 50.0, BRIEFLY, silent)
+    prune_to_loss(twice, thrice, 50.0, BRIEFLY, silent)
     sizes = [len(load_run(folder).scene) for folder in (run_dir, once, twice, thrice)]
     assert sizes[0] > sizes[1] > sizes[2] > sizes[3]
     assert load_run(twice).step == 32
@@ -80,14 +80,14 @@ def test_on_a_gpu_it_is_the_same(
 ) -> None:
     """The search, of few candidates, its file, and the comparison with the run before."""
     briefly = ("prune.steps=1", "run.threads=1")
-    expected = prune_within(run_dir, tmp_path / "here", 3.0, briefly, silent)
-    here = compared([run_dir, file_of(tmp_path / "here")], 1)
+    expected = prune_to_loss(run_dir, tmp_path / "here", 3.0, briefly, silent)
+    here = compare_runs([run_dir, export_folder(tmp_path / "here")], 1)
     monkeypatch.setattr("dyngs.training.new_trainer.select_device", lambda _: GPU)
     with pretend_gpu():
-        found = prune_within(run_dir, tmp_path / "there", 3.0, briefly, silent)
-        there = compare_runs([run_dir, file_of(tmp_path / "there")], 1, GPU)
+        found = prune_to_loss(run_dir, tmp_path / "there", 3.0, briefly, silent)
+        there = compare_runs([run_dir, export_folder(tmp_path / "there")], 1, GPU)
     assert found == expected
-    files = [file_of(tmp_path / name) / SCENE_FILE for name in ("there", "here")]
+    files = [export_folder(tmp_path / name) / SCENE_FILE for name in ("there", "here")]
     assert files[0].read_bytes() == files[1].read_bytes()
     assert [replace(x, fps=1) for x in there] == [replace(x, fps=1) for x in here]
 
@@ -97,21 +97,21 @@ def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
     told: list[str] = []
     folder = tmp_path / "a"
     first, again = (
-        prune_within(run_dir, tmp_path / name, 1.0, BRIEFLY, told.append) for name in ("a", "b")
+        prune_to_loss(run_dir, tmp_path / name, 1.0, BRIEFLY, told.append) for name in ("a", "b")
     )
     assert first == again
     assert told[: len(told) // 2] == told[len(told) // 2 :]
-    for path in (checkpoint_paths(folder)[-1], file_of(folder) / SCENE_FILE):
+    for path in (checkpoint_paths(folder)[-1], export_folder(folder) / SCENE_FILE):
         assert path.read_bytes() == (tmp_path / "b" / path.relative_to(folder)).read_bytes()
     assert first.before - first.after <= 1.0
     config = load_resolved(folder)
     trainer = build_trainer(config, restored=True)
     trainer.restore(latest_checkpoint(folder))
-    shown = [trainer.images[i] for i in evenly_held_out(len(trainer.images))]
-    assert quality_of(trainer, load_run(file_of(folder)).scene, shown) == pytest.approx(
+    shown = [trainer.images[i] for i in held_out_indices(len(trainer.images))]
+    assert mean_psnr(trainer, load_run(export_folder(folder)).scene, shown) == pytest.approx(
         first.after, abs=1e-4
     )
-    before, after = compare_runs([run_dir, file_of(folder)], 1)
+    before, after = compare_runs([run_dir, export_folder(folder)], 1)
     assert after.num_gaussians < before.num_gaussians
     assert after.stored is not None
     assert after.stored < before.megabytes
@@ -146,6 +146,6 @@ def test_what_cannot_be_done_is_refused(tmp_path: Path) -> None:
         (tmp_path / "new", ["model.alpha_min=0.1"], "losses are counted from RUN as it is"),
     ):
         with pytest.raises(DyngsError, match=message):
-            prune_within(run_dir, out, 0.2, overrides)
+            prune_to_loss(run_dir, out, 0.2, overrides)
     assert not (tmp_path / "new").exists()
     assert (taken / "file").read_text() == "mine"

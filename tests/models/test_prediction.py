@@ -13,24 +13,24 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import View
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.models.prediction import (
+    find_views,
     load_optimizer,
     load_weights,
-    named_views,
     optimizer_state,
-    updated,
+    optimizer_step,
 )
 
 
 def test_views_by_name() -> None:
     """In the order given; of the view, or of its file."""
     views = [View(f"a/{i}", Path(f"a/{i}.png"), np.eye(4), np.eye(3), 8, 8) for i in range(6)]
-    assert named_views("ann", views, ["5.png", "a/2"]) == [5, 2]
+    assert find_views("ann", views, ["5.png", "a/2"]) == [5, 2]
     with pytest.raises(
         DyngsError, match="ann: no training view is named 'nobody'; the first is 'a/0'"
     ):
-        named_views("ann", views, ["nobody"])
+        find_views("ann", views, ["nobody"])
     with pytest.raises(DyngsError, match="named twice"):
-        named_views("ann", views, ["5.png", "a/5"])
+        find_views("ann", views, ["5.png", "a/5"])
 
 
 def stored(network: nn.Module) -> Checkpoint:
@@ -52,7 +52,7 @@ def test_what_has_had_no_gradient_has_no_moments() -> None:
     networks[1].load_state_dict(networks[0].state_dict())
     optimizers = [torch.optim.AdamW(network.parameters()) for network in networks]
     data = torch.ones(1, 3)
-    assert updated(optimizers[0], networks[0], networks[0][0](data).sum(), 1e-3)
+    assert optimizer_step(optimizers[0], networks[0], networks[0][0](data).sum(), 1e-3)
     networks[1].load_state_dict(networks[0].state_dict())
     state = optimizer_state(optimizers[0], networks[0])
     assert sorted(state) == [
@@ -60,7 +60,7 @@ def test_what_has_had_no_gradient_has_no_moments() -> None:
     ]
     load_optimizer(optimizers[1], networks[1], state)
     for network, optimizer in zip(networks, optimizers, strict=True):
-        assert updated(
+        assert optimizer_step(
             optimizer, network, sum(layer(data).square().sum() for layer in network), 1e-3
         )
     assert all(torch.equal(a, b) for a, b in zip(*(n.parameters() for n in networks), strict=True))

@@ -17,8 +17,8 @@ from torch import Tensor
 from dyngs.baselines.fields.kind import FieldModel
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import Role, State, prefixed, with_role
-from dyngs.core.tensor_checks import require_moments, require_tensor
+from dyngs.core.state import Role, State, add_prefix, with_role
+from dyngs.core.tensor_checks import require_tensor, require_times
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import focus_point, fraction_in_front, inverse_rigid
 from dyngs.data.scene_space import extent_of
@@ -30,11 +30,11 @@ from dyngs.models.renderable import (
     Surface,
     SurfaceOptions,
     TimeStep,
-    composited,
+    composite_background,
     fixed_cameras,
 )
 from dyngs.models.views import evaluation_background
-from dyngs.models.volume import rays_of
+from dyngs.models.volume import camera_rays
 from dyngs.ops.perceptron import Layer, perceptron
 from dyngs.ops.rays import Rays, Space
 
@@ -229,7 +229,7 @@ class FieldScene(Renderable):
         own = {"space": torch.tensor(numbers, dtype=torch.float64, device="cpu")}
         if self.training_times:
             own["times"] = torch.tensor(self.training_times, dtype=torch.float64, device="cpu")
-        return prefixed("field", with_role(own, Role.SHARED) | self.field.state())
+        return add_prefix("field", with_role(own, Role.SHARED) | self.field.state())
 
     def render(
         self,
@@ -247,14 +247,14 @@ class FieldScene(Renderable):
             self._view(cameras.select(i), now.time or 0.0, options) for i in range(len(cameras))
         ]
         rgb, through, depth = (torch.stack(x) for x in zip(*views, strict=True))
-        return composited(rgb, through, depth, options, behind)
+        return composite_background(rgb, through, depth, options, behind)
 
     def _view(
         self, camera: Cameras, time: float, options: DrawOptions
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return colours before black (H, W, 3), transmittance (H, W) and the sum of weight times z
         (H, W)."""
-        rays, z = rays_of(camera)
+        rays, z = camera_rays(camera)
         parts = []
         for begin in range(0, len(rays), CHUNK):
             chosen = slice(begin, begin + CHUNK)
@@ -277,7 +277,7 @@ def restore_scene(
         raise ValueError(f"'space' is no space: {numbers}")
     space = Space((x, y, z), half, int(cascades), int(cells))
     field = field_class.from_state(model, space, stored)
-    times = require_moments("times", stored["times"]).tolist() if "times" in stored else ()
+    times = require_times("times", stored["times"]).tolist() if "times" in stored else ()
     behind = evaluation_background(checkpoint.info.background, False)[1]
     return FieldScene(field, tuple(times), DrawOptions(near=NEAR * half), behind)
 

@@ -12,15 +12,15 @@ from torch import Tensor
 
 from dyngs.baselines.fields.scene import NEAR, Field, FieldScene, restore_scene, space_of
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import State, prefixed
+from dyngs.core.state import State, add_prefix
 from dyngs.data.loader import Image
 from dyngs.gaussians.optimizer import AdamState
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import RunStart
-from dyngs.models.model import Drawn, Look, Loss, Model, Updated
+from dyngs.models.kind import StartContext
+from dyngs.models.model import Loss, LossInput, Model, RenderOutput, UpdateResult
 from dyngs.models.renderable import DrawOptions, Rendering
 from dyngs.models.views import evaluation_background, training_times
-from dyngs.models.volume import rays_of
+from dyngs.models.volume import camera_rays
 from dyngs.ops.adam import seen_rows
 from dyngs.ops.device import copy_async
 
@@ -31,7 +31,7 @@ class ColourLoss(Loss):
     def __init__(self, function: Callable[[Tensor, Tensor], Tensor]) -> None:
         self._function = function
 
-    def __call__(self, look: Look) -> Mapping[str, Tensor]:
+    def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
         return {"image": masked_mean(self._function(look.rendered, look.truth), look.image.mask)}
 
 
@@ -55,7 +55,7 @@ class FieldTraining(Model[FieldScene]):
     betas = (0.9, 0.999)  # How slowly Adam forgets
 
     def __init__(
-        self, run: RunStart, field_class: type[Field], cells: int | None, pixels: int
+        self, run: StartContext, field_class: type[Field], cells: int | None, pixels: int
     ) -> None:
         self._run = run
         model: Any = run.config.model
@@ -108,7 +108,9 @@ class FieldTraining(Model[FieldScene]):
     def rate(self, step: int) -> float:
         """Return the learning rate in ``step``."""
 
-    def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+    def draw(
+        self, image: Image, step: int, background: Tensor, *, depth: bool = False
+    ) -> RenderOutput:
         generator = self._run.generator
         device = background.device
         field = self._scene.field
@@ -119,7 +121,7 @@ class FieldTraining(Model[FieldScene]):
             (len(pixels), field.num_random_values), generator=generator, device="cpu"
         )
         pixels = copy_async(pixels, device)
-        rays, z = rays_of(camera, pixels)
+        rays, z = camera_rays(camera, pixels)
         near = self._scene.options.near
         seen = field.seen(rays, image.time or 0.0, near=near, shifts=copy_async(shifts, device))
         self.count(len(rays), seen.num_samples)
@@ -134,22 +136,22 @@ class FieldTraining(Model[FieldScene]):
         if depth:
             far = (seen.depth * z / (1 - seen.transmittance).clamp_min(1e-9))[None, None]
         rendering = Rendering(rgb[None, None], seen.transmittance[None, None], far)
-        return Drawn(rendering, penalties, image=part)
+        return RenderOutput(rendering, penalties, image=part)
 
     def count(self, num_rays: int, num_samples: int) -> None:
         """Note how many samples the rays of an image needed."""
 
-    def update(self, step: int) -> Updated:
+    def update(self, step: int) -> UpdateResult:
         rate = self.rate(step)
         updates = []
         for name, x in self._scene.field.parameters.items():
             # rows of a hash grid that no sample touched stay as they are
             rows = seen_rows(x.grad) if name == "table" and x.grad is not None else None
             updates.append(self._adam.update(name, x, rate, rows))
-        return Updated(self._adam.steps_(updates, step=step, betas=self.betas))
+        return UpdateResult(self._adam.steps_(updates, step=step, betas=self.betas))
 
     def state(self) -> State:
-        return self._scene.state() | prefixed("adam", self._adam.state())
+        return self._scene.state() | add_prefix("adam", self._adam.state())
 
     def restore(self, checkpoint: Checkpoint) -> None:
         self._learn(restore_scene(type(self._scene.field), self._model, checkpoint))
