@@ -44,7 +44,7 @@ must be finite."""
 class RenderOptions(DrawOptions):
     """Settings of a render, next to those of ``DrawOptions``.
 
-    Example::
+    Example:
 
         import dyngs
 
@@ -117,7 +117,7 @@ def render(
     Differentiable in the Gaussians, the poses and intrinsics of the cameras, the background, the
     probe and what the shader computes.
 
-    Example::
+    Example:
 
         import torch
 
@@ -191,7 +191,7 @@ def contributions(
     """Return the (V, N) sums over pixels of each Gaussian's blending weight: its fraction of every
     image.
 
-    Example::
+    Example:
 
         import torch
 

@@ -48,7 +48,7 @@ class GaussianTimeStep(TimeStep):
 class GaussianScene(Renderable):
     """N Gaussians at any time.
 
-    Example::
+    Example:
 
         import dyngs
 
