@@ -51,7 +51,7 @@ MUTATIONS = (
     ("gaussians/densify.py", "opaque = parameters.opacities >=", "opaque = parameters.opacities >", "gaussians/test_densify.py"),
     ("gaussians/densify.py", "& (scale <= max_scale)", "& (scale < max_scale)", "gaussians/test_densify.py"),
     ("gaussians/densify.py", "score >= options.grad_threshold", "score > options.grad_threshold", "gaussians/test_densify.py"),
-    ("gaussians/densify.py", "large = scale > DENSE_FRACTION * reach", "large = scale >= DENSE_FRACTION * reach", "gaussians/test_densify.py"),
+    ("gaussians/densify.py", "large = scale > DENSE_FRACTION * reference_length", "large = scale >= DENSE_FRACTION * reference_length", "gaussians/test_densify.py"),
     ("gaussians/densify.py", "wanted & large & (scale / SPLIT_SHRINK <= max_scale)", "wanted & large", "gaussians/test_densify.py"),
     ("gaussians/densify.py", "wanted & large & (scale / SPLIT_SHRINK <= max_scale)", "wanted & large & (scale <= max_scale)", "gaussians/test_densify.py"),
     ("gaussians/densify.py", "wanted & ~large & survives", "wanted & ~large", "gaussians/test_densify.py"),

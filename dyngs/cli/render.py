@@ -197,7 +197,9 @@ def _coarser(arguments: argparse.Namespace, opened: Opened) -> Opened:
     from dyngs.gaussians.levels import LevelScene
 
     most: int | None = arguments.max_gaussians_drawn
-    return opened if most is None else opened.showing(LevelScene.of(opened.renderable, most))
+    return (
+        opened if most is None else opened.showing(LevelScene.from_scene(opened.renderable, most))
+    )
 
 
 def _path_options(arguments: argparse.Namespace) -> PathOptions:

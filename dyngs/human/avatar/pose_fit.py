@@ -291,7 +291,7 @@ class PoseRefit:
         since = [step - start for start in self._starts if start <= step]
         if not self.goes_on or not since or since[-1] > len(self._groups) or not self.suits(scene):
             return None
-        scene.changed()
+        scene.clear_caches()
         if since[-1] > 0:
             return self.refitted(scene, since[-1] - 1), ""
         gain, move = self.tried(scene)
