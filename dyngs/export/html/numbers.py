@@ -406,4 +406,4 @@ def _curves_of_nodes(field: ControlNodes, means: Tensor) -> Curves:
     followed, fractions = (
         torch.nn.functional.pad(x, more) for x in (nodes.followed, nodes.weights(means))
     )
-    return Curves(_fit(field.at, field.num_pieces), nodes.positions, followed, fractions)
+    return Curves(_fit(field.offsets_of_nodes, field.num_pieces), nodes.positions, followed, fractions)
