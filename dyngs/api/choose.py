@@ -40,9 +40,9 @@ from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
-from dyngs.training.corrections.camera_refinement import fitted_to_image
+from dyngs.training.corrections.camera_refinement import fit_camera_to_image
 from dyngs.training.loop import Interrupts
-from dyngs.training.new_trainer import GaussianTrainer, assemble, with_points
+from dyngs.training.new_trainer import GaussianTrainer, build_trainer, with_points
 
 Pair = tuple[GaussianTrainer, GaussianTrainer]
 Score = Callable[[Pair, int], list[float]]
@@ -337,7 +337,7 @@ def _trained(
 
     Its last step is left out: in it, a model at rest would begin to move.
     """
-    trainer = assemble(config, capture, held_out=held_out, first=first_of(config, capture))
+    trainer = build_trainer(config, capture, held_out=held_out, first=first_of(config, capture))
     last = config.train.steps - 1
     with Interrupts() as interrupts:
         while trainer.done < last and time.monotonic() < deadline:
@@ -483,7 +483,7 @@ def after_pose_fit(pair: Pair, index: int) -> list[float]:
         right = 1 - left if image.mask is None else (1 - left) * image.mask
         scene = trainer.model.scene
         options = trainer.model.options
-        fitted = fitted_to_image(
+        fitted = fit_camera_to_image(
             scene, image, background, trainer.extent, options=options, weights=left
         )
         rgb = _rendered(trainer, fitted).rgb[0]

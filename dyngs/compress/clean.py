@@ -24,8 +24,8 @@ from dyngs.ops.device import deterministic, select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.checkpoint import has_only_scene_file, latest_checkpoint, load_run
 from dyngs.training.loop import Loop
-from dyngs.training.new_trainer import GaussianTrainer, assemble
-from dyngs.training.trainer import Edit, Trainer
+from dyngs.training.new_trainer import GaussianTrainer, build_trainer
+from dyngs.training.trainer import TrainingEdit, Trainer
 
 MAIN_FRACTION = 0.5  # Fraction of the weight of a Gaussian that must lie in one view
 # Depth of a Gaussian in that view, over the median depth of the view, below which it is near
@@ -39,7 +39,7 @@ FEWEST_VIEWS, MOST = 20, 0.01
 view only."""
 
 
-def remove_floaters(loop: Loop) -> Edit | None:
+def remove_floaters(loop: Loop) -> TrainingEdit | None:
     """Editor that removes floaters when training ends, if that is requested; static scenes only."""
     trainer = loop.trainer
     assert isinstance(trainer, Trainer)
@@ -56,8 +56,8 @@ def remove_floaters(loop: Loop) -> Edit | None:
     before = counted(len(found), "Gaussian")
     message = f"{count:,} of {before} hang close before single cameras"
     if count > MOST * len(found):
-        return Edit(f"{message}: too many to be floaters, none is removed")
-    return Edit(f"{message}: removed (train.remove_floaters)", ~found)
+        return TrainingEdit(f"{message}: too many to be floaters, none is removed")
+    return TrainingEdit(f"{message}: removed (train.remove_floaters)", ~found)
 
 
 @torch.no_grad()
@@ -220,7 +220,7 @@ def at_end(config: Config, run_dir: Path) -> GaussianTrainer:
     """Return the trainer of a run where it ended; without checkpoints with nothing but its
     scene."""
     run = load_run(run_dir, config.data.root)
-    trainer: GaussianTrainer = assemble(
+    trainer: GaussianTrainer = build_trainer(
         config, read_capture_of(config.data, run.info), restored=True
     )
     if has_only_scene_file(run_dir):

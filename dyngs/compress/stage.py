@@ -37,7 +37,7 @@ from dyngs.models.views import background_colour
 from dyngs.ops.device import copy_async
 from dyngs.training.loop import Loop
 from dyngs.training.new_trainer import GaussianTrainer
-from dyngs.training.trainer import Edit, Trainer
+from dyngs.training.trainer import TrainingEdit, Trainer
 
 # Slope of the hyperbolic tangent: second differences of a profile are small numbers
 STEEPNESS = 4.0
@@ -147,7 +147,7 @@ MASKED_BELOW = 0.5
 (docs/prune.md)."""
 
 
-def prune_stage(loop: Loop) -> Edit | None:
+def prune_stage(loop: Loop) -> TrainingEdit | None:
     """Editor that prunes and masks when training ends and fine-tuning begins."""
     trainer = loop.trainer
     assert isinstance(trainer, Trainer)
@@ -158,7 +158,7 @@ def prune_stage(loop: Loop) -> Edit | None:
 
 
 @torch.no_grad()
-def pruning(trainer: GaussianTrainer) -> Edit:
+def pruning(trainer: GaussianTrainer) -> TrainingEdit:
     """Return the edit that prunes and masks the Gaussians of ``trainer`` by its config."""
     scene = trainer.model.scene.without_masks()
     options = trainer.config.prune
@@ -174,7 +174,7 @@ def pruning(trainer: GaussianTrainer) -> Edit:
     return replace(edit, message=f"{message}{left}, {cost}{_let_through(edit)}")
 
 
-def _let_through(edit: Edit) -> str:
+def _let_through(edit: TrainingEdit) -> str:
     masks = edit.masks
     if masks is None:
         return ""
@@ -184,7 +184,7 @@ def _let_through(edit: Edit) -> str:
 
 
 @torch.no_grad()
-def removal(trainer: GaussianTrainer, scores: Tensor | None) -> Edit:
+def removal(trainer: GaussianTrainer, scores: Tensor | None) -> TrainingEdit:
     """Return the edit that leaves all but the fraction ``prune.fraction`` with the lowest ``scores``
     (N,), and masks them if requested; from then on their number stays."""
     options = trainer.config.prune
@@ -194,7 +194,7 @@ def removal(trainer: GaussianTrainer, scores: Tensor | None) -> Edit:
     moves = capability(trainer.config.model, Moves) is not None and not whole.is_static
     if options.mask_times > 1 and moves:
         masks = _masks(trainer, whole, kept)
-    return Edit(kept=kept, masks=masks, stops_growing=True)
+    return TrainingEdit(kept=kept, masks=masks, stops_densification=True)
 
 
 @torch.no_grad()

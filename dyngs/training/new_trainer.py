@@ -30,8 +30,8 @@ from dyngs.training.corrections.camera_refinement import CameraRefinement
 from dyngs.training.corrections.exposure import ViewExposures
 from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
-from dyngs.training.priors import UsedPriors, used_priors
-from dyngs.training.trainer import Parts, Trainer
+from dyngs.training.priors import PriorLosses, load_priors
+from dyngs.training.trainer import TrainerParts, Trainer
 
 GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
 
@@ -45,7 +45,7 @@ FULL_OPACITY_FROM = 0.6
 ALIKE_IMAGES = 12  # number of images in which colours are compared with the background
 
 
-def assemble(
+def build_trainer(
     config: Config,
     capture: Capture | None = None,
     *,
@@ -74,11 +74,11 @@ def assemble(
         images = ImageLoader(
             capture.splits["train"], config.data, with_maps=True, decoding_threads=usual_threads()
         )
-    priors = UsedPriors()
+    priors = PriorLosses()
     kind = kind_of(config.model)
     if "train.priors" in kind.uses:
         moves = isinstance(kind, Moves) and len(set(training_times(capture))) > 1
-        priors = used_priors(config, capture, images.views, moves=moves)
+        priors = load_priors(config, capture, images.views, moves=moves)
     if not priors.masks:
         images = images.without_motion_masks()
     background = resolved_background(config, capture)
@@ -92,7 +92,7 @@ def assemble(
         )
     early = _early_opacity(config, capture, images, background)
 
-    def parts(config: Config) -> Parts:
+    def parts(config: Config) -> TrainerParts:
         start = RunStart(
             config, uncapped or config, capture, images, background, extent, generator, first
         )
@@ -102,8 +102,8 @@ def assemble(
         refinement = None
         if config.camera.refine == "always":
             refinement = CameraRefinement(views, extent, steps)
-            applied_to = refinement.corrections.applied_to
-            images.corrected = lambda index, cameras: applied_to(views[index], cameras)
+            correct_cameras = refinement.corrections.correct_cameras
+            images.corrected = lambda index, cameras: correct_cameras(views[index], cameras)
         robust = None
         may_mask = "train.robust" in kind.uses and not isinstance(kind, Moves)
         if config.train.robust == "always" and may_mask:
@@ -121,11 +121,11 @@ def assemble(
             RegularizerLoss(),
         ]
         found = (robust, exposures, refinement)
-        return Parts(model, losses, [x for x in found if x is not None])
+        return TrainerParts(model, losses, [x for x in found if x is not None])
 
     return Trainer(
         config=config,
-        parts_of=parts,
+        build_parts=parts,
         capture=capture,
         images=images,
         background=background,

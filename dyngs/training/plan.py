@@ -60,7 +60,7 @@ def with_steps(config: Config, steps: int) -> Config:
     return config.model_copy(update={"train": config.train.model_copy(update={"steps": steps})})
 
 
-def with_length(config: Config, done: int, steps: int) -> Config:
+def extend_config(config: Config, done: int, steps: int) -> Config:
     """Return the configuration with which a run goes on, after ``done`` steps, to ``steps``; no
     limit of time holds.
 

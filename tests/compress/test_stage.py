@@ -34,7 +34,7 @@ from dyngs.gaussians.densify import Densifier
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -66,7 +66,7 @@ def final_bytes(run_dir: Path) -> bytes:
 
 def trained(config: Config) -> Trainer:
     """A trainer at the end of ``train.steps``."""
-    trainer = assemble(config)
+    trainer = build_trainer(config)
     while trainer.done < config.train.steps:
         trainer.step()
     return trainer

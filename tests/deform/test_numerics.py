@@ -30,7 +30,7 @@ from dyngs.deform.networks import Hexplane
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.scene import restore_scene
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -54,7 +54,7 @@ def scene_of(rows: Tensor, field: DeformationField) -> DynamicScene:
 
 def fine_trainer(capture: Path, kind: str, **model: object) -> Trainer:
     """After ten steps, eight of them without motion."""
-    trainer = assemble(busy_config(capture, capture, kind, **model))
+    trainer = build_trainer(busy_config(capture, capture, kind, **model))
     for _ in range(10):
         trainer.step()
     return trainer
@@ -86,7 +86,7 @@ def test_two_training_times(tmp_path: Path, kind: str) -> None:
     model = config.model.model_copy(
         update={"deform": config.model.deform.model_copy(update=automatic)}
     )
-    trainer = assemble(config.model_copy(update={"model": model}))
+    trainer = build_trainer(config.model_copy(update={"model": model}))
     seen = {trainer.step().image.time for _ in range(12)}
     assert seen == {0.0, 1.0}
     assert isinstance(trainer.model.scene, DynamicScene)
@@ -134,12 +134,12 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
     keep = torch.ones(len(trainer.model.scene), dtype=torch.bool)
     keep[trainer.model.scene.rows] = False
     assert not keep.all()
-    trainer.model.densifier = assemble(trainer.config).model.densifier
+    trainer.model.densifier = build_trainer(trainer.config).model.densifier
     trainer.model.select_gaussians(keep, trainer.done)
     for _ in range(2):
         assert trainer.step().loss > 0
         assert trainer.num_moving == 0
-    other = assemble(trainer.config)
+    other = build_trainer(trainer.config)
     other.restore(trainer.checkpoint())
     assert other.step().loss == trainer.step().loss
 
@@ -195,7 +195,7 @@ def test_a_run_of_one_step(capture: Path, is_filtered: bool) -> None:
     and filtered."""
     config = busy_config(capture, capture, "hexplane", filter_3d=is_filtered)
     config = config.model_copy(update={"train": TrainConfig(steps=1)})
-    trainer = assemble(config)
+    trainer = build_trainer(config)
     trainer.step()
     scene = restore_scene(trainer.checkpoint(), config.model)
     assert not scene.is_static

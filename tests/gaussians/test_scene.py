@@ -21,7 +21,7 @@ from dyngs.gaussians.colour.network import restore_colour_network
 from dyngs.gaussians.scene import GaussianScene, restore_scene
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.models.static_section import StaticModel
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 
 TIMES = (None, 0.0, 0.37, 0.5, 1.0)
 
@@ -206,7 +206,7 @@ def test_what_is_trained_is_what_is_loaded(model: str, tmp_path: Path) -> None:
     config = config.model_copy(update={"strategy": FixedStrategy()})
     if model == "static":
         config = config.model_copy(update={"model": StaticModel(sh_degree=1)})
-    trainer = assemble(config)
+    trainer = build_trainer(config)
     for _ in range(11):
         trainer.step()
     loaded = restore_scene(trainer.checkpoint(), config.model)

@@ -32,7 +32,7 @@ from dyngs.io.tensor_file import write_tensors
 from dyngs.io.write import write_image
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import _KIND, load_checkpoint
-from dyngs.training.new_trainer import GaussianTrainer, assemble
+from dyngs.training.new_trainer import GaussianTrainer, build_trainer
 from dyngs.training.trainer import ViewSampler
 
 
@@ -44,7 +44,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _trainer(capture: Path, **data: object) -> GaussianTrainer:
-    return assemble(
+    return build_trainer(
         Config(
             data=DataConfig(root=capture, **data),  # type: ignore[arg-type]
             model=StaticModel(sh_degree=1),

@@ -93,7 +93,7 @@ def frontal_colours(scene: HumanScene, normals: Tensor) -> Tensor:
         shader = upright.shader(moment)
         if shader is not None:
             gaussians = bake_harmonics(moment.gaussians, shader).gaussians
-        posing = frame_pose(upright.moves_as, 0)
+        posing = frame_pose(upright.played_clip, 0)
         skeleton = scene.learned_skeleton
         joints = joint_transforms(skeleton.joints, skeleton.parents, posing.rotations)
         linear = blend_transforms(scene.weights, joints)[..., :3]

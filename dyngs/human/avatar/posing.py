@@ -159,7 +159,7 @@ def blended_rotations(weights: Tensor, transforms: Tensor) -> Tensor:
     return rotation_matrices((weights * signs[weights.argmax(1)]) @ quats)
 
 
-def rest_offsets(
+def pose_blend_offsets(
     anchors: Anchors, posing: BodyPose, shapes: PoseBlendShapes | None
 ) -> Tensor | None:
     """Return the pose-dependent offsets (N, 3) at rest, m; None where the template has none."""

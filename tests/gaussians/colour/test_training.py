@@ -33,7 +33,7 @@ from dyngs.gaussians.colour.training import (
     rate_factor,
 )
 from dyngs.models.static_section import StaticModel
-from dyngs.training.new_trainer import GaussianTrainer, assemble
+from dyngs.training.new_trainer import GaussianTrainer, build_trainer
 
 
 def gaussians() -> Gaussians:
@@ -140,7 +140,7 @@ def seven_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _coloured(
     capture: Path, colour: NetworkColour | AutoColour, strategy: DefaultStrategy | None = None
 ) -> GaussianTrainer:
-    return assemble(
+    return build_trainer(
         Config(
             data=DataConfig(root=capture),
             model=StaticModel(sh_degree=1),

@@ -23,7 +23,7 @@ from dyngs.data.read import captures_in
 from dyngs.data.times import distinct_times
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template, read_body
-from dyngs.human.fit.fitted_capture import with_fitted_body
+from dyngs.human.fit.fitted_capture import ensure_fitted_body
 from dyngs.human.predict.fields.eg_human_nerf import EgHumanNerf
 from dyngs.human.predict.fields.keypoint_nerf import AROUND, KeypointNerf
 from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
@@ -35,7 +35,7 @@ from dyngs.human.predict.people import (
     PosedBody,
     Sources,
     metric,
-    person_of,
+    read_captured_person,
     sources_of,
     window,
 )
@@ -287,7 +287,7 @@ class FieldLearner(Learner[FieldNetwork]):
 
     def _open(self, data: DataConfig) -> Person:
         """Return a person. Raises DyngsError: nobody to learn from."""
-        found = person_of(data, self._template)
+        found = read_captured_person(data, self._template)
         if all(len(ring) <= FEWEST_VIEWS for ring in moments(found.views).values()):
             raise DyngsError(f"{data.root}: shows no moment in three views or more to learn from")
         if self.network.needs_depth and any(view.depth_path is None for view in found.views):
@@ -331,8 +331,8 @@ def predictor(
     network = NETWORKS[model.kind](torch.Generator())
     load_weights(network, checkpoint)
     if model.body is None:
-        data = with_fitted_body(data, only_if_needed=True, say=say, report=report)
-    return FieldPredictor(config, network, person_of(data, template_of(model)), data)
+        data = ensure_fitted_body(data, only_if_needed=True, say=say, report=report)
+    return FieldPredictor(config, network, read_captured_person(data, template_of(model)), data)
 
 
 def template_of(model: FieldPredictorModel) -> BodyTemplate:

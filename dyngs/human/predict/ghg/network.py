@@ -40,10 +40,10 @@ from dyngs.human.body.atlas import Texels, atlas_texels
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import load_template
 from dyngs.human.body.mesh import vertex_normals
-from dyngs.human.fit.fitted_capture import with_fitted_body
+from dyngs.human.fit.fitted_capture import ensure_fitted_body
 from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.human.predict.gps.rectification import spread
-from dyngs.human.predict.people import Person, depths, person_in
+from dyngs.human.predict.people import Person, depths, captured_person
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
 from dyngs.models.prediction import (
     Encoder,
@@ -621,7 +621,7 @@ def predictor(
     model: Any = config.model
     network = new_network(model, torch.Generator())
     mean = load_network(network, checkpoint, model.resolution)
-    data = with_fitted_body(data, human_options(model), only_if_needed=True, say=say, report=report)
+    data = ensure_fitted_body(data, human_options(model), only_if_needed=True, say=say, report=report)
     person = read_person(data, model, load_template(human_options(model)))
     return PersonPredictor(config, network, mean, person, data)
 
@@ -658,7 +658,7 @@ def read_person(data: DataConfig, model: HumanPredictorModel, body: BodyTemplate
     """Return the person of one capture."""
     capture = read_capture(data)
     images = ImageLoader(capture.splits["train"], data)
-    return atlas_person(person_in(capture, body, images), model)
+    return atlas_person(captured_person(capture, body, images), model)
 
 
 def mean_colours(people: list[AtlasPerson], resolution: int) -> Tensor:
