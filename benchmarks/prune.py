@@ -26,7 +26,13 @@ from dyngs.api.prune import file_of, prune_run, prune_within
 from dyngs.api.scene_file import write_scene_file
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.evaluate.report import RunMetrics, compared, evaluate_run, scene_of_split, split_views
+from dyngs.evaluate.report import (
+    RunMetrics,
+    compare_runs,
+    evaluate_run,
+    scene_of_split,
+    split_views,
+)
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.stored_file import drawable, read_scene
@@ -72,7 +78,7 @@ def promises(given: argparse.Namespace) -> None:
             began = time.perf_counter()
             promise = prune_within(given.run_dir, out, most, overrides)
             print(f"\n{promise}\n{time.perf_counter() - began:.0f} s\n", flush=True)
-        before, after = compared([given.run_dir, file_of(out)], given.threads)
+        before, after = compare_runs([given.run_dir, file_of(out)], given.threads)
         print(line(f"{most:g} dB allowed", file_of(out), after, before, given.threads), end="")
         print(stored(file_of(out), given.threads), flush=True)
     print(line("trained", given.run_dir, before, before, given.threads))
@@ -143,7 +149,7 @@ def main() -> None:
         if not checkpoint_paths(out):
             common = ("prune.fraction=0.8", f"run.threads={given.threads}")
             prune_run(given.run_dir, out, (*common, *given.overrides, *asked))
-        before, after = compared([given.run_dir, out], given.threads)
+        before, after = compare_runs([given.run_dir, out], given.threads)
         print(line(name, out, after, before, given.threads), end="", flush=True)
         print(stored(file_of(out), given.threads), flush=True)
     print(line("trained", given.run_dir, before, before, given.threads))

@@ -37,7 +37,7 @@ from dyngs.models.views import background_colour
 from dyngs.ops.device import copy_async
 from dyngs.training.loop import Loop
 from dyngs.training.new_trainer import GaussianTrainer
-from dyngs.training.trainer import TrainingEdit, Trainer
+from dyngs.training.trainer import Trainer, TrainingEdit
 
 # Slope of the hyperbolic tangent: second differences of a profile are small numbers
 STEEPNESS = 4.0

@@ -16,12 +16,12 @@ from dyngs.gaussians.rendering import RenderOptions
 from dyngs.models.model import Drawn, Look, Model
 from dyngs.training.priors import (
     PointTracks,
-    TimedCamera,
     PriorLosses,
+    TimedCamera,
     depth_error,
+    load_priors,
     render_displacements,
     track_error,
-    load_priors,
 )
 
 HERE = camera(32, 24)

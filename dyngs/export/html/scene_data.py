@@ -241,7 +241,9 @@ def _add_splines(
             lists.quantised(name, own, 16 if bits == 16 else 8)
 
 
-def _add_person(scene: HumanScene, order: Tensor, lists: PackedArrays, tolerance: float) -> dict[str, Any]:
+def _add_person(
+    scene: HumanScene, order: Tensor, lists: PackedArrays, tolerance: float
+) -> dict[str, Any]:
     from scipy.spatial.transform import Rotation
 
     clip = scene.played_clip
@@ -339,7 +341,9 @@ class MotionSplines:
 
 
 @torch.no_grad()
-def motion_splines(field: DeformationField, means: Tensor, num_times: int, tolerance: float) -> MotionSplines:
+def motion_splines(
+    field: DeformationField, means: Tensor, num_times: int, tolerance: float
+) -> MotionSplines:
     """Return the motion of ``means`` (M, 3) as splines."""
     match field:
         case WindowedField(others=others):
@@ -401,9 +405,9 @@ def _error(points: Tensor, offsets_at: Callable[[float], Offsets], pieces: int) 
 
 
 def _curves_of_nodes(field: ControlNodes, means: Tensor) -> MotionSplines:
-    nodes = field.update_nodes(means)
+    nodes = field.nodes_for(means)
     more = 0, FOLLOWED - nodes.followed.shape[1]  # of which a Gaussian follows nothing
     followed, fractions = (
         torch.nn.functional.pad(x, more) for x in (nodes.followed, nodes.weights(means))
     )
-    return MotionSplines(_fit(field.offsets_of_nodes, field.num_pieces), nodes.positions, followed, fractions)
+    return MotionSplines(_fit(field.at, field.num_pieces), nodes.positions, followed, fractions)
