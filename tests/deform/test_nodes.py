@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import followed
 from torch import Tensor
 
-from dyngs.deform.control_nodes import Nodes, farthest_points, build_nodes
+from dyngs.deform.control_nodes import Nodes, build_nodes, farthest_points
 from dyngs.deform.field import Offsets
 
 

@@ -197,7 +197,7 @@ def test_harmonics_that_do_not_pay_are_dropped(seven_views: Path, name: str) -> 
     sh = trainer.model.scene.gaussians.sh
     frozen = trainer.model.colours.frozen_harmonics()
     if name == "none pays":
-        assert "view-dependent colour removed" in findings[MEASURED_AFTER]
+        assert "view-dependent colour removed" in messages[MEASURED_AFTER]
         assert sh.shape[1] == 1
     else:
         assert dropped is not None
