@@ -32,7 +32,7 @@ from dyngs.gaussians.rendering import Shader
 from dyngs.gaussians.scene import restore_appearance
 from dyngs.gaussians.schedule import rate_schedule
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import RunStart
+from dyngs.models.kind import StartContext
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background, training_cameras, training_times
 
@@ -43,7 +43,7 @@ STEPS_PER_IMAGE = 50
 SECONDS_PER_IMAGE = 3.0  # seconds of ``train.minutes`` per searched image
 
 
-def start(run: RunStart) -> GaussianModel:
+def start(run: StartContext) -> GaussianModel:
     """Create the model of a dynamic scene before its first step.
 
     Raises DyngsError if the images have no times.
@@ -71,7 +71,7 @@ def restore(model: DynamicModel, checkpoint: Checkpoint) -> DynamicScene:
     return restore_appearance(scene, model, checkpoint)
 
 
-def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining) -> TrainingViews:
+def _training_views(run: StartContext, model: DynamicModel, colours: ColourTraining) -> TrainingViews:
     config = run.config
     capture = run.capture
     images = run.images

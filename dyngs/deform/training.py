@@ -118,7 +118,7 @@ class TrainingViews:
 class DynamicTraining(SceneTraining[DynamicScene]):
     """Training of a dynamic scene, see ``SceneTraining``."""
 
-    moves_by = ("field", "model.deform")
+    deformation_name = ("field", "model.deform")
 
     def __init__(
         self,

@@ -44,7 +44,7 @@ from dyngs.gaussians.schedule import (
     grad_threshold,
     growth_per_change,
 )
-from dyngs.models.kind import RunStart
+from dyngs.models.kind import StartContext
 from dyngs.models.views import training_cameras
 
 START_OPACITY = 0.1
@@ -218,7 +218,7 @@ class InitialGaussians:
     frozen: Tensor | None = None
 
 
-def load_or_create_gaussians(run: RunStart) -> Gaussians:
+def load_or_create_gaussians(run: StartContext) -> Gaussians:
     """Return the Gaussians of the scene that the run continues from, or new initial Gaussians."""
     if run.first is not None:
         return run.first.gaussians
@@ -229,7 +229,7 @@ def load_or_create_gaussians(run: RunStart) -> Gaussians:
 
 
 def build_colour_training(
-    run: RunStart, gaussians: Gaussians, *, uses_time: bool
+    run: StartContext, gaussians: Gaussians, *, uses_time: bool
 ) -> ColourTraining:
     """Build the training of colours for ``colour.kind``."""
     colour = run.config.colour
@@ -246,7 +246,7 @@ def build_colour_training(
             assert_never(colour)
 
 
-def build_densifier(run: RunStart) -> Densifier:
+def build_densifier(run: StartContext) -> Densifier:
     """Build the densification strategy."""
     strategy = run.config.strategy
     steps = run.config.train.steps
@@ -271,7 +271,7 @@ def build_densifier(run: RunStart) -> Densifier:
             assert_never(strategy)
 
 
-def build_filter_update(run: RunStart) -> FilterUpdate:
+def build_filter_update(run: StartContext) -> FilterUpdate:
     """Build the schedule of the 3D filter."""
     config = run.config
     cameras = (

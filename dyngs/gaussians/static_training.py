@@ -28,7 +28,7 @@ from dyngs.gaussians.rendering import contributions
 from dyngs.gaussians.scene import restore_appearance
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import RunStart
+from dyngs.models.kind import StartContext
 from dyngs.models.schedule import scaled
 from dyngs.models.views import training_cameras
 
@@ -72,7 +72,7 @@ class SmallGaussianPruning:
         return EditResult(TopologyEdit.select(kept), message=text)
 
 
-def build_small_pruning(run: RunStart) -> SmallGaussianPruning:
+def build_small_pruning(run: StartContext) -> SmallGaussianPruning:
     """Build the pruning of small Gaussians, due when densification stops."""
     config = run.config
     strategy = run.config.strategy
@@ -96,10 +96,10 @@ class StaticTraining(SceneTraining[StaticScene]):
     def __init__(
         self,
         update: FilterUpdate,
-        pruning: SmallGaussianPruning = SmallGaussianPruning(),
+        build_pruning_edit: SmallGaussianPruning = SmallGaussianPruning(),
         frozen_mask: FrozenMask | None = None,
     ) -> None:
-        self._update, self._pruning, self._build_frozen_mask = update, pruning, frozen_mask
+        self._update, self._pruning, self._build_frozen_mask = update, build_pruning_edit, frozen_mask
 
     def frozen_mask(self) -> FrozenMask | None:
         return self._build_frozen_mask
@@ -138,13 +138,13 @@ class StaticTraining(SceneTraining[StaticScene]):
         return StaticScene.from_state(gaussians, tensors)
 
 
-def _build_frozen_mask(run: RunStart) -> FrozenMask | None:
+def _build_frozen_mask(run: StartContext) -> FrozenMask | None:
     init = run.config.init
     rows = None if run.first is None else run.first.frozen
     return FrozenMask(rows, init.trains == "colour") if isinstance(init, SceneInit) else None
 
 
-def start(run: RunStart) -> GaussianModel:
+def start(run: StartContext) -> GaussianModel:
     """Create the model of a static scene before its first step."""
     gaussians = load_or_create_gaussians(run)
     colours = build_colour_training(run, gaussians, uses_time=False)
