@@ -168,7 +168,7 @@ class ControlNodes(DeformationField):
         self.parameters = self._untrained(0)
 
     def with_state(self, tensors: Mapping[str, Tensor]) -> ControlNodes:
-        buffers = part_of(tensors, "buffers")
+        buffers = select_prefix(tensors, "buffers")
         count = len(buffers["positions"])
         require_tensor("positions", buffers["positions"], (count, 3))
         if "radii" in buffers or "followed" in buffers:
@@ -178,7 +178,7 @@ class ControlNodes(DeformationField):
                 require_indices(name, buffers[name], (length, None), count)
         field = copy.copy(self)
         lengths = dict.fromkeys(head_sizes(self.options), count)
-        field.parameters = self._untrained(0).with_state(part_of(tensors, "learned"), lengths)
+        field.parameters = self._untrained(0).with_state(select_prefix(tensors, "learned"), lengths)
         field.buffers = buffers
         return field
 

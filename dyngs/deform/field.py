@@ -138,7 +138,7 @@ class DeformationField:
 
         Raises KeyError or ValueError for missing or inconsistent tensors.
         """
-        return self.with_parameters(self.parameters.with_state(part_of(tensors, "learned")))
+        return self.with_parameters(self.parameters.with_state(select_prefix(tensors, "learned")))
 
     def to(self: F, device: torch.device | str) -> F:
         field = self.with_parameters(self.parameters.to(device))

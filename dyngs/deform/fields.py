@@ -124,7 +124,7 @@ def restore_field(
         center, require_positive("box", half_size), int(num_times), num_moving, extent
     )
     field = create_field(options, setup, torch.Generator()).with_state(tensors)
-    bodies = part_of(tensors, "bodies")
+    bodies = select_prefix(tensors, "bodies")
     field = BodyField.from_state(field, bodies) if bodies else field
-    windows = part_of(tensors, "windows")
+    windows = select_prefix(tensors, "windows")
     return WindowedField.from_state(field, windows) if windows else field

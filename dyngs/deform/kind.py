@@ -13,7 +13,7 @@ from dyngs.models.kind import HasSchedules, HasSizeLimit, HasMotion
 if TYPE_CHECKING:
     from dyngs.data.capture import Capture
     from dyngs.models.kind import Restore, Start
-    from dyngs.models.schedule import Length
+    from dyngs.models.schedule import LengthChange
 
 
 class DynamicKind(HasSizeLimit, HasMotion, HasSchedules):

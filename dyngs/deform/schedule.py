@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from dyngs.core.errors import DyngsError
 from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians.schedule import RateSchedule
-from dyngs.models.schedule import Length
+from dyngs.models.schedule import LengthChange
 
 FREEZE_FRACTIONS = (0.1, 0.3, 0.5)
 """Steps at which Gaussians are frozen, as fractions of the steps after the window is full."""

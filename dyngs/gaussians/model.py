@@ -173,7 +173,9 @@ class GaussianModel(Model[GaussianScene]):
         )
         return [*leaves, *self.training.leaves(self._scene)]
 
-    def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+    def draw(
+        self, image: Image, step: int, background: Tensor, *, depth: bool = False
+    ) -> RenderOutput:
         scene = self._scene
         densifier = self.densifier
         now = self.training.time_step(scene, image, step)
@@ -196,7 +198,7 @@ class GaussianModel(Model[GaussianScene]):
                 densifier.after_backward(step, signal, rendering.radii, size)
 
         moved = now.gaussians.tensors() if scene.num_moving else {}
-        return Drawn(rendering, now.penalties, moved, after_backward)
+        return RenderOutput(rendering, now.penalties, moved, after_backward)
 
     @property
     def colour_loss(self) -> Loss | None:

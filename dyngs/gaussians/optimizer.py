@@ -230,7 +230,9 @@ class Parameters:
         return restored
 
     def to(self, device: torch.device | str) -> Parameters:
-        moved = Parameters(move_to_device(self.values(), device), self.rates, self.decay, self._roles)
+        moved = Parameters(
+            move_to_device(self.values(), device), self.rates, self.decay, self._roles
+        )
         moved._adam = self._adam.to(device)
         return moved
 

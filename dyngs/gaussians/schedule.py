@@ -10,7 +10,7 @@ from typing_extensions import assert_never
 from dyngs.config import Config, DefaultStrategy, McmcStrategy, OptimConfig, Strategy, TrainConfig
 from dyngs.gaussians.densify import DensifySchedule
 from dyngs.models.kind import HasGaussians, capability
-from dyngs.models.schedule import PUBLISHED_STEPS, scaled
+from dyngs.models.schedule import PUBLISHED_STEPS, scale_step
 
 MIN_START = 100  # densification never starts earlier: the first gradients are noise
 # Steps that opacities need to recover from a reset (learning rate 0.05, from logit -4.6).
@@ -117,7 +117,7 @@ def densify_schedule(
             if reset_every is None:
                 return DensifySchedule(start, stop, every, prune_scale_after=steps)
             recovery = max(MIN_RESET_GAP, round(RESET_FRACTION * steps))
-            period = max(scaled(reset_every, steps), min(reset_every, recovery))
+            period = max(scale_step(reset_every, steps), min(reset_every, recovery))
             resets = tuple(range(period, stop - period + 1, period))
             if white_background and steps >= PUBLISHED_STEPS and start < period:
                 resets = (start, *resets)

@@ -83,7 +83,7 @@ def build_small_pruning(run: StartContext) -> SmallGaussianPruning:
         [views[i] for i in evenly_spaced(len(views), MEASURED_VIEWS)], config.data
     )
     return SmallGaussianPruning(
-        scaled(strategy.stop, config.train.steps), strategy.prune_pixels, cameras
+        scale_step(strategy.stop, config.train.steps), strategy.prune_pixels, cameras
     )
 
 
@@ -99,7 +99,11 @@ class StaticTraining(SceneTraining[StaticScene]):
         build_pruning_edit: SmallGaussianPruning = SmallGaussianPruning(),
         frozen_mask: FrozenMask | None = None,
     ) -> None:
-        self._update, self._pruning, self._build_frozen_mask = update, build_pruning_edit, frozen_mask
+        self._update, self._pruning, self._build_frozen_mask = (
+            update,
+            build_pruning_edit,
+            frozen_mask,
+        )
 
     def frozen_mask(self) -> FrozenMask | None:
         return self._build_frozen_mask

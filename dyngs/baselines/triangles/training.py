@@ -393,7 +393,9 @@ class TriangleTraining(Model[TriangleScene]):
         """Whether textures are learned, and no triangle comes or goes."""
         return self._scene.patches.texture > 0
 
-    def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+    def draw(
+        self, image: Image, step: int, background: Tensor, *, depth: bool = False
+    ) -> RenderOutput:
         if self._awaits_surface:
             self._awaits_surface = False
             patches, unit = _on_surface(self._run, self._model)
@@ -404,7 +406,7 @@ class TriangleTraining(Model[TriangleScene]):
         rendering, places = self._scene.drawn(image.cameras, options, background)
         if not self.is_textured:
             self._now.count(places, image_gradients(image.composite(background)))
-        return Drawn(rendering)
+        return RenderOutput(rendering)
 
     def tallies(self, step: int) -> Sequence[Tensor]:
         return [] if self.is_textured else list(self._now.tensors().values())
@@ -428,7 +430,9 @@ class TriangleTraining(Model[TriangleScene]):
                 self._change(0, 1)  # what is useless goes, and nothing is split
             self._texture()
             count = len(self._scene)
-            return UpdateResult(bad, f"textures are learned from now on, on {count:,} triangles", True)
+            return UpdateResult(
+                bad, f"textures are learned from now on, on {count:,} triangles", True
+            )
         interval = max(LEAST_EVERY, scaled(EVERY, self._steps))
         last = min(scaled(UNTIL, self._steps), self._first_texture)
         if step % interval or step > last:

@@ -188,7 +188,7 @@ class BodyField(OuterField):
             "labels", tensors["labels"], (inner_field.setup.num_moving,), torch.long
         )
         require_indices("labels", labels + 1, (len(labels),), len(centers) + 1)
-        learned = part_of(tensors, "learned")
+        learned = select_prefix(tensors, "learned")
         points = learned["places"].shape[1] if learned["places"].ndim == 3 else 0
         if points < SPAN:
             raise ValueError(f"'places' has {points} control points, and must have at least {SPAN}")
