@@ -9,7 +9,7 @@ from tiny_fields import cloud, stirred_field, tiny_options
 
 from dyngs.core.camera import Cameras
 from dyngs.core.state import State, select_prefix, strip_roles
-from dyngs.deform.fields import OPEN, WindowedField
+from dyngs.deform.fields import OPEN_WINDOW, WindowedField
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
