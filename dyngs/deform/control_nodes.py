@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, State, StateTensor, move_to_device, part_of, add_prefix
+from dyngs.core.state import Role, State, StateTensor, add_prefix, move_to_device, select_prefix
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.deform.field import (
     MAX_KEY_TIMES,

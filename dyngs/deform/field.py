@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dyngs.core.initialisation import glorot
-from dyngs.core.state import State, move_to_device, part_of, add_prefix
+from dyngs.core.state import State, add_prefix, move_to_device, select_prefix
 from dyngs.deform.keys import FieldSection
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import Parameters

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, State, part_of, add_prefix, with_role
+from dyngs.core.state import Role, State, add_prefix, select_prefix, with_role
 from dyngs.core.tensor_checks import require_positive, require_tensor
 from dyngs.deform.bodies.field import BodyField
 from dyngs.deform.control_nodes import ControlNodes

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, State, StateTensor, part_of, add_prefix
+from dyngs.core.state import Role, State, StateTensor, add_prefix, select_prefix
 from dyngs.core.tensor_checks import require_ascending, require_indices
 from dyngs.deform.field import DeformationField, Offsets, apply_offsets
 from dyngs.deform.fields import field_state, restore_field

@@ -60,7 +60,7 @@ def deform_schedule(model: DynamicModel, rates: RateSchedule) -> DeformSchedule:
     )
 
 
-def extend_schedules(model: DynamicModel, length: Length) -> DynamicModel:
+def extend_schedules(model: DynamicModel, length: LengthChange) -> DynamicModel:
     """Return the model section for a run of another length; phases that have started keep their
     step.
 
@@ -83,7 +83,7 @@ def extend_schedules(model: DynamicModel, length: Length) -> DynamicModel:
     return changed
 
 
-def _motion_from(old: DeformSchedule, model: DynamicModel, length: Length) -> float:
+def _motion_from(old: DeformSchedule, model: DynamicModel, length: LengthChange) -> float:
     """Return the fraction of the run after which motion starts, as it was or at the next step."""
     if length.done >= old.coarse_end:
         return length.kept(old.coarse_end)

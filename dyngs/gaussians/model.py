@@ -29,7 +29,7 @@ from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, render_option
 from dyngs.gaussians.schedule import active_sh_degree, learning_rates, means_rate, rate_schedule
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
-from dyngs.models.model import Drawn, Loss, Model, UpdateResult
+from dyngs.models.model import Loss, Model, RenderOutput, UpdateResult
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.adam import Count

@@ -93,7 +93,7 @@ def means_rate(options: OptimConfig, progress: float, extent: float) -> float:
 
 def active_sh_degree(options: TrainConfig, step: int, max_degree: int) -> int:
     """Return the SH degree at ``step``: one more every ``sh_every`` (scaled) steps."""
-    return min(max_degree, step // scaled(options.sh_every, options.steps))
+    return min(max_degree, step // scale_step(options.sh_every, options.steps))
 
 
 def densify_schedule(
@@ -106,8 +106,8 @@ def densify_schedule(
     last reset is one period before densification stops. Full-length runs on a white background
     have one more reset at the start, as published, which removes white floaters.
     """
-    start = max(scaled(strategy.start, steps), min(strategy.start, MIN_START))
-    stop = scaled(strategy.stop, steps)
+    start = max(scale_step(strategy.start, steps), min(strategy.start, MIN_START))
+    stop = scale_step(strategy.stop, steps)
     every = densify_interval(strategy, steps)
     match strategy:
         case McmcStrategy():
@@ -152,5 +152,5 @@ def growth_per_change(steps: int) -> float:
 def filter_steps(strategy: Strategy, steps: int) -> range:
     """Return the steps after which the 3D filter is recomputed: every 100 after densification
     stops."""
-    first = -(-scaled(strategy.stop, steps) // FILTER_EVERY) * FILTER_EVERY
+    first = -(-scale_step(strategy.stop, steps) // FILTER_EVERY) * FILTER_EVERY
     return range(first, steps - FILTER_EVERY + 1, FILTER_EVERY)

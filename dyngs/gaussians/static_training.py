@@ -29,7 +29,7 @@ from dyngs.gaussians.scene import restore_appearance
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
-from dyngs.models.schedule import scaled
+from dyngs.models.schedule import scale_step
 from dyngs.models.views import training_cameras
 
 # Evenly spaced training views in which contributions are measured before pruning.

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dyngs.config import OptimConfig
-from dyngs.core.state import part_of, strip_roles
+from dyngs.core.state import select_prefix, strip_roles
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import GaussianOptimizer
 

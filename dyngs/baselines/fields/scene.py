@@ -18,7 +18,7 @@ from dyngs.baselines.fields.kind import FieldModel
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role, State, add_prefix, with_role
-from dyngs.core.tensor_checks import require_times, require_tensor
+from dyngs.core.tensor_checks import require_tensor, require_times
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import focus_point, fraction_in_front, inverse_rigid
 from dyngs.data.scene_space import extent_of

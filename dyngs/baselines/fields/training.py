@@ -17,7 +17,7 @@ from dyngs.data.loader import Image
 from dyngs.gaussians.optimizer import AdamState
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
-from dyngs.models.model import Drawn, LossInput, Loss, Model, UpdateResult
+from dyngs.models.model import Loss, LossInput, Model, RenderOutput, UpdateResult
 from dyngs.models.renderable import DrawOptions, Rendering
 from dyngs.models.views import evaluation_background, training_times
 from dyngs.models.volume import camera_rays

@@ -33,7 +33,6 @@ from dyngs.models.renderable import (
     composite_background,
     concatenate_renderings,
     fixed_cameras,
-    concatenate_renderings,
     single_views,
 )
 from dyngs.models.views import evaluation_background

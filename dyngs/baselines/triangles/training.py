@@ -27,7 +27,7 @@ from dyngs.config import DefaultStrategy, ShColour
 from dyngs.config.kinds import section_of_kind
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0, num_sh_terms
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.core.state import Role, State, add_prefix, with_role
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image
@@ -52,8 +52,8 @@ from dyngs.gaussians.surface import (
 )
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
-from dyngs.models.model import Drawn, Model, UpdateResult
-from dyngs.models.schedule import scaled
+from dyngs.models.model import Model, RenderOutput, UpdateResult
+from dyngs.models.schedule import scale_step
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.patches import NUM_POINTS, PatchSamples, lattice, lattice_size
@@ -433,8 +433,8 @@ class TriangleTraining(Model[TriangleScene]):
             return UpdateResult(
                 bad, f"textures are learned from now on, on {count:,} triangles", True
             )
-        interval = max(LEAST_EVERY, scaled(EVERY, self._steps))
-        last = min(scaled(UNTIL, self._steps), self._first_texture)
+        interval = max(LEAST_EVERY, scale_step(EVERY, self._steps))
+        last = min(scale_step(UNTIL, self._steps), self._first_texture)
         if step % interval or step > last:
             return UpdateResult(bad)
         self._change(self._model.max_triangles, 1 + (last - step) // interval)
@@ -471,7 +471,7 @@ class TriangleTraining(Model[TriangleScene]):
             return UpdateResult(bad)
         none = {name: x.detach()[:0] for name, x in self._scene.patches.tensors.items()}
         self._exchange(stays.nonzero()[:, 0], none)
-        gone = f"{count - len(self._scene):,} of {counted(count, 'triangle')} are removed"
+        gone = f"{count - len(self._scene):,} of {format_count(count, 'triangle')} are removed"
         return UpdateResult(
             bad, f"{gone}: no training view shows more than {LEAST_SHOWN:g} px of them", True
         )

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, State, StateTensor, move_fields_to, part_of, add_prefix
+from dyngs.core.state import Role, State, StateTensor, add_prefix, move_fields_to, select_prefix
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.deform.field import DeformationField, Offsets, OuterField, select_rows
 from dyngs.gaussians import Gaussians, TopologyEdit
