@@ -171,7 +171,8 @@ def write_moving_run(
     tensors = {f"gaussians.{name}": x.contiguous() for name, x in gaussians.tensors().items()}
     if moves:
         tensors |= {
-            f"model.field.{name}": x for name, x in strip_roles(field_state(sliding_nodes())).items()
+            f"model.field.{name}": x
+            for name, x in strip_roles(field_state(sliding_nodes())).items()
         }
         tensors["model.rows"] = torch.tensor(MOVING_ROWS)
         tensors["model.times"] = torch.tensor(TRAIN_TIMES, dtype=torch.float64)

@@ -40,9 +40,7 @@ def write(
     options: RenderOptions | None = None,
 ) -> WrittenPage:
     scene = replace(scene, options=options or scene.options, background=torch.ones(3))
-    return write_page(
-        replace(wrap_scene(scene), stated_up="-y"), path, title=title, views=(view,)
-    )
+    return write_page(replace(wrap_scene(scene), stated_up="-y"), path, title=title, views=(view,))
 
 
 def shown(page: Page, view: Cameras, time: float, which: int = 0) -> torch.Tensor:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, State, StateTensor, move_to_device, part_of, add_prefix
+from dyngs.core.state import Role, State, StateTensor, add_prefix, move_to_device, select_prefix
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.deform.field import (
     MAX_KEY_TIMES,
@@ -175,7 +175,7 @@ class ControlNodes(DeformationField):
         self.parameters = self._untrained(0)
 
     def with_state(self, tensors: Mapping[str, Tensor]) -> ControlNodes:
-        buffers = part_of(tensors, "buffers")
+        buffers = select_prefix(tensors, "buffers")
         count = len(buffers["positions"])
         require_tensor("positions", buffers["positions"], (count, 3))
         if "radii" in buffers or "followed" in buffers:
@@ -185,7 +185,7 @@ class ControlNodes(DeformationField):
                 require_indices(name, buffers[name], (length, None), count)
         field = copy.copy(self)
         lengths = dict.fromkeys(head_sizes(self.options), count)
-        field.parameters = self._untrained(0).with_state(part_of(tensors, "learned"), lengths)
+        field.parameters = self._untrained(0).with_state(select_prefix(tensors, "learned"), lengths)
         field.buffers = buffers
         return field
 

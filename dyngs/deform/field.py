@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dyngs.core.initialisation import glorot
-from dyngs.core.state import State, move_to_device, part_of, add_prefix
+from dyngs.core.state import State, add_prefix, move_to_device, select_prefix
 from dyngs.deform.keys import FieldSection
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import Parameters
@@ -143,7 +143,7 @@ class DeformationField:
         Raises KeyError or ValueError: a tensor is missing, or is not as a field of these options
         has it.
         """
-        return self.with_parameters(self.parameters.with_state(part_of(tensors, "learned")))
+        return self.with_parameters(self.parameters.with_state(select_prefix(tensors, "learned")))
 
     def to(self: F, device: torch.device | str) -> F:
         field = self.with_parameters(self.parameters.to(device))

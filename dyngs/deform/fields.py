@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, State, part_of, add_prefix, with_role
+from dyngs.core.state import Role, State, add_prefix, select_prefix, with_role
 from dyngs.core.tensor_checks import require_positive, require_tensor
 from dyngs.deform.bodies.field import BodyField
 from dyngs.deform.control_nodes import ControlNodes
@@ -124,7 +124,7 @@ def restore_field(
         center, require_positive("box", half_size), int(num_times), num_moving, extent
     )
     field = create_field(options, setup, torch.Generator()).with_state(tensors)
-    bodies = part_of(tensors, "bodies")
+    bodies = select_prefix(tensors, "bodies")
     field = BodyField.from_state(field, bodies) if bodies else field
-    windows = part_of(tensors, "windows")
+    windows = select_prefix(tensors, "windows")
     return WindowedField.from_state(field, windows) if windows else field

@@ -8,12 +8,12 @@ from dyngs.core.section import SceneModel
 from dyngs.deform.keys import (
     DynamicModel,
 )
-from dyngs.models.kind import HasSchedules, HasSizeLimit, HasMotion
+from dyngs.models.kind import HasMotion, HasSchedules, HasSizeLimit
 
 if TYPE_CHECKING:
     from dyngs.data.capture import Capture
     from dyngs.models.kind import Restore, Start
-    from dyngs.models.schedule import Length
+    from dyngs.models.schedule import LengthChange
 
 
 class DynamicKind(HasSizeLimit, HasMotion, HasSchedules):
@@ -32,7 +32,7 @@ class DynamicKind(HasSizeLimit, HasMotion, HasSchedules):
 
         return start, restore
 
-    def extend_schedules(self, section: DynamicModel, length: Length) -> DynamicModel:
+    def extend_schedules(self, section: DynamicModel, length: LengthChange) -> DynamicModel:
         from dyngs.deform.schedule import extend_schedules
 
         return extend_schedules(section, length)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, State, StateTensor, part_of, add_prefix
+from dyngs.core.state import Role, State, StateTensor, add_prefix, select_prefix
 from dyngs.core.tensor_checks import require_ascending, require_indices
 from dyngs.deform.field import DeformationField, Offsets, apply_offsets
 from dyngs.deform.fields import field_state, restore_field
@@ -36,12 +36,12 @@ class DynamicScene(GaussianScene):
         options: DynamicModel, gaussians: Gaussians, tensors: Mapping[str, Tensor]
     ) -> DynamicScene:
         count = len(gaussians)
-        own = part_of(tensors, "field")
+        own = select_prefix(tensors, "field")
         std = restore_filter(tensors, count)
         times = restore_times(tensors)
         if not own:
             return DynamicScene(gaussians=gaussians, training_times=times, filter_std=std)
-        masks = VisibilityMasks.from_state(part_of(tensors, "masks"), count)
+        masks = VisibilityMasks.from_state(select_prefix(tensors, "masks"), count)
         rows = tensors.get("rows", torch.arange(count, device=gaussians.means.device))
         require_ascending("rows", require_indices("rows", rows, (None,), count))
         field = restore_field(options.deform, own, len(rows))

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from dyngs.core.errors import DyngsError
 from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians.schedule import RateSchedule
-from dyngs.models.schedule import Length
+from dyngs.models.schedule import LengthChange
 
 SPLITS = (0.1, 0.3, 0.5)
 """Steps at which static Gaussians are frozen, as fractions of the part of the run that sees all
@@ -57,7 +57,7 @@ def deform_schedule(model: DynamicModel, rates: RateSchedule) -> DeformSchedule:
     )
 
 
-def extend_schedules(model: DynamicModel, length: Length) -> DynamicModel:
+def extend_schedules(model: DynamicModel, length: LengthChange) -> DynamicModel:
     """Return the section for a run of another length; phases that have begun keep their step.
 
     Raises DyngsError: its motion began too early for that length.
@@ -79,7 +79,7 @@ def extend_schedules(model: DynamicModel, length: Length) -> DynamicModel:
     return changed
 
 
-def _motion_from(old: DeformSchedule, model: DynamicModel, length: Length) -> float:
+def _motion_from(old: DeformSchedule, model: DynamicModel, length: LengthChange) -> float:
     """Return the share after which motion is learned: the step where it began, else one that is
     still to come."""
     if length.done >= old.coarse_end:

@@ -69,7 +69,9 @@ def restore(model: DynamicModel, checkpoint: Checkpoint) -> DynamicScene:
     return restore_appearance(scene, model, checkpoint)
 
 
-def _training_views(run: StartContext, model: DynamicModel, colours: ColourTraining) -> TrainingViews:
+def _training_views(
+    run: StartContext, model: DynamicModel, colours: ColourTraining
+) -> TrainingViews:
     config = run.config
     capture = run.capture
     images = run.images

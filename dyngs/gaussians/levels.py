@@ -25,7 +25,13 @@ from dyngs.core.state import State
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import require_gaussians
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.models.renderable import Renderable, Rendering, TimeStep, concatenate_renderings, single_views
+from dyngs.models.renderable import (
+    Renderable,
+    Rendering,
+    TimeStep,
+    concatenate_renderings,
+    single_views,
+)
 from dyngs.ops.quaternions import quats_from_matrices, rotation_matrices
 
 MERGED = 4  # Gaussians in one of the next level, and blocks below one

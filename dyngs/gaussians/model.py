@@ -30,7 +30,7 @@ from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, render_option
 from dyngs.gaussians.schedule import active_sh_degree, learning_rates, means_rate, rate_schedule
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
-from dyngs.models.model import Drawn, Loss, Model, UpdateResult
+from dyngs.models.model import Loss, Model, RenderOutput, UpdateResult
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.adam import Count
@@ -176,7 +176,9 @@ class GaussianModel(Model[GaussianScene]):
         )
         return [*found, *self.training.leaves(self._scene)]
 
-    def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+    def draw(
+        self, image: Image, step: int, background: Tensor, *, depth: bool = False
+    ) -> RenderOutput:
         scene = self._scene
         densifier = self.densifier
         now = self.training.time_step(scene, image, step)
@@ -199,7 +201,7 @@ class GaussianModel(Model[GaussianScene]):
                 densifier.after_backward(step, signal, rendering.radii, size)
 
         moved = now.gaussians.tensors() if scene.num_moving else {}
-        return Drawn(rendering, now.penalties, moved, after_backward)
+        return RenderOutput(rendering, now.penalties, moved, after_backward)
 
     @property
     def colour_loss(self) -> Loss | None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dyngs.config import OptimConfig
-from dyngs.core.state import Role, State, StateTensor, move_to_device, add_prefix, with_role
+from dyngs.core.state import Role, State, StateTensor, add_prefix, move_to_device, with_role
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.ops.adam import AdamUpdate, Count, adam_steps_, seen_rows
@@ -231,7 +231,9 @@ class Parameters:
         return found
 
     def to(self, device: torch.device | str) -> Parameters:
-        found = Parameters(move_to_device(self.values(), device), self.rates, self.decay, self._roles)
+        found = Parameters(
+            move_to_device(self.values(), device), self.rates, self.decay, self._roles
+        )
         found._adam = self._adam.to(device)
         return found
 

@@ -11,7 +11,7 @@ from typing_extensions import assert_never
 from dyngs.config import Config, DefaultStrategy, McmcStrategy, OptimConfig, Strategy, TrainConfig
 from dyngs.gaussians.densify import DensifySchedule
 from dyngs.models.kind import HasGaussians, capability
-from dyngs.models.schedule import PUBLISHED_STEPS, scaled
+from dyngs.models.schedule import PUBLISHED_STEPS, scale_step
 
 MIN_START = 100  # Densification never starts earlier: the first gradients say little
 # Steps that opacities need to recover from a reset (at a rate of 0.05 from logit -4.6)
@@ -94,7 +94,7 @@ def means_rate(options: OptimConfig, progress: float, extent: float) -> float:
 
 def active_sh_degree(options: TrainConfig, step: int, max_degree: int) -> int:
     """Return the SH degree drawn at ``step``: one more each ``sh_every`` (scaled) steps."""
-    return min(max_degree, step // scaled(options.sh_every, options.steps))
+    return min(max_degree, step // scale_step(options.sh_every, options.steps))
 
 
 def densify_schedule(
@@ -108,8 +108,8 @@ def densify_schedule(
     a white background the published schedule has one more at the start, which clears white
     floaters; in shorter runs it costs more than it brings.
     """
-    start = max(scaled(strategy.start, steps), min(strategy.start, MIN_START))
-    stop = scaled(strategy.stop, steps)
+    start = max(scale_step(strategy.start, steps), min(strategy.start, MIN_START))
+    stop = scale_step(strategy.stop, steps)
     every = steps_between_changes(strategy, steps)
     match strategy:
         case McmcStrategy():
@@ -119,7 +119,7 @@ def densify_schedule(
             if reset_every is None:
                 return DensifySchedule(start, stop, every, prune_scale_after=steps)
             recovery = max(MIN_RESET_GAP, round(RESET_FRACTION * steps))
-            period = max(scaled(reset_every, steps), min(reset_every, recovery))
+            period = max(scale_step(reset_every, steps), min(reset_every, recovery))
             resets = tuple(range(period, stop - period + 1, period))
             if white_background and steps >= PUBLISHED_STEPS and start < period:
                 resets = (start, *resets)
@@ -155,5 +155,5 @@ def growth_per_change(steps: int) -> float:
 def filter_steps(strategy: Strategy, steps: int) -> range:
     """Return the steps after which Mip-Splatting's 3D filter is recomputed: each 100 after
     densification ends."""
-    first = -(-scaled(strategy.stop, steps) // FILTER_EVERY) * FILTER_EVERY
+    first = -(-scale_step(strategy.stop, steps) // FILTER_EVERY) * FILTER_EVERY
     return range(first, steps - FILTER_EVERY + 1, FILTER_EVERY)

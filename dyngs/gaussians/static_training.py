@@ -29,7 +29,7 @@ from dyngs.gaussians.scene import restore_appearance
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
-from dyngs.models.schedule import scaled
+from dyngs.models.schedule import scale_step
 from dyngs.models.views import training_cameras
 
 # Training views, evenly spaced, in which a Gaussian is looked for before it is removed
@@ -75,7 +75,7 @@ def build_small_pruning(run: StartContext) -> SmallGaussianPruning:
     views = run.capture.splits["train"]
     cameras = training_cameras([views[i] for i in evenly_spaced(len(views), SURVEYED)], config.data)
     return SmallGaussianPruning(
-        scaled(strategy.stop, config.train.steps), strategy.prune_pixels, cameras
+        scale_step(strategy.stop, config.train.steps), strategy.prune_pixels, cameras
     )
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, State, StateTensor, move_fields_to, part_of, add_prefix
+from dyngs.core.state import Role, State, StateTensor, add_prefix, move_fields_to, select_prefix
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.deform.field import DeformationField, Offsets, OuterField, select_rows
 from dyngs.gaussians import Gaussians, TopologyEdit
@@ -181,7 +181,7 @@ class BodyField(OuterField):
             "labels", tensors["labels"], (inner_field.setup.num_moving,), torch.long
         )
         require_indices("labels", labels + 1, (len(labels),), len(centers) + 1)
-        learned = part_of(tensors, "learned")
+        learned = select_prefix(tensors, "learned")
         points = learned["places"].shape[1] if learned["places"].ndim == 3 else 0
         if points < SPAN:
             raise ValueError(f"'places' has {points} control points, and must have at least {SPAN}")

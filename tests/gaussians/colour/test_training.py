@@ -52,7 +52,8 @@ def colours(seed: int = 0, **options: object) -> NetworkTraining:
 def stored(learner: NetworkTraining) -> dict[str, Tensor]:
     """What a checkpoint has of colours: of the scene, and of its training."""
     return {
-        name: x.clone() for name, x in strip_roles(learner.network.state() | learner.state()).items()
+        name: x.clone()
+        for name, x in strip_roles(learner.network.state() | learner.state()).items()
     }
 
 
