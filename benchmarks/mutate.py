@@ -73,7 +73,7 @@ MUTATIONS = (
     ("deform/training.py", "2 * longest *", "longest *", "deform/test_motion.py"),
     ("deform/schedule.py", "oldest <= abs(time - MIDDLE) <= newest", "oldest < abs(time - MIDDLE) <= newest", "deform/test_time_window.py"),
     ("deform/schedule.py", "step % 2 == 0", "step % 2 == 1", "deform/test_time_window.py"),
-    ("deform/static_errors.py", "USUAL = 0.7", "USUAL = 0.3", "deform/test_static_errors.py"),
+    ("deform/static_errors.py", "TYPICAL_QUANTILE = 0.7", "TYPICAL_QUANTILE = 0.3", "deform/test_static_errors.py"),
     ("deform/static_errors.py", "gap = gap - gap.flatten(1)", "gap = gap - 0 * gap.flatten(1)", "deform/test_static_errors.py"),
     ("deform/scene.py", "rows = torch.nonzero(descent >= 0)", "rows = torch.nonzero(descent > 0)", "deform/test_scene.py"),
     ("human/avatar/posing.py", "height == min(heights)", "height == max(heights)", "human/avatar/test_anchors.py"),
