@@ -103,7 +103,7 @@ def sliding_nodes() -> ControlNodes:
     points[..., 0] = torch.arange(4) - 1.5  # the spline of these is t - 0.5
     moved = row_of_balls().means[list(MOVING_ROWS)]
     field = ControlNodes(SLIDING, SETUP, torch.Generator())
-    field.nodes_for(moved)
+    field.update_nodes(moved)
     field.parameters["means"].data.copy_(points)
     return field
 

@@ -246,7 +246,7 @@ class Trainer(Generic[M]):
             model.replace_scene(model.scene.without_masks())
             model.stop_growing()
         if edit.kept is not None:
-            model.keep(edit.kept, self.done)
+            model.select_gaussians(edit.kept, self.done)
         if edit.masks is not None:
             model.replace_scene(replace(model.scene, masks=edit.masks))
 
