@@ -2,8 +2,8 @@
 passed to a core.
 
 There is one module per x86-64 level; the newest that the processor runs is imported,
-``DYNGS_ISA=v2|v3|v4`` picks an older one, for tests. That for CUDA GPUs (docs/gpu.md) is imported
-when the first tensor on a GPU comes.
+``DYNGS_ISA=v2|v3|v4`` picks an older one, for tests. The module for CUDA
+GPUs (docs/guides/gpu.md) is imported when the first tensor on a GPU is used.
 """
 
 from __future__ import annotations
