@@ -60,7 +60,7 @@ def test_the_newest_that_the_processor_runs_is_chosen(
             ("v4",),
             "v3",
             None,
-            "dyngs was compiled for processors with AVX-512, which this one lacks; install it again",
+            "dyngs was compiled for processors with AVX-512, which this one lacks; reinstall it",
         ),
         (
             ("v3", "v4"),
@@ -72,9 +72,9 @@ def test_the_newest_that_the_processor_runs_is_chosen(
             ("v2", "v3", "v4"),
             "v3",
             "v4",
-            "DYNGS_ISA=v4: here run v2, v3; unset the variable or choose one of these",
+            "DYNGS_ISA=v4 is not supported here; unset it or use v2, v3",
         ),
-        (("v4",), "v4", "v2", "DYNGS_ISA=v2: here run v4"),
+        (("v4",), "v4", "v2", "DYNGS_ISA=v2 is not supported here; unset it or use v4"),
     ],
 )
 def test_kernels_that_would_crash_are_refused(
@@ -85,7 +85,7 @@ def test_kernels_that_would_crash_are_refused(
 
 
 def test_an_unknown_instruction_set_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(DyngsError, match=r"^DYNGS_ISA=v9: here run v"):
+    with pytest.raises(DyngsError, match=r"^DYNGS_ISA=v9 is not supported here; unset it or use v"):
         imported_with("v9", monkeypatch)
 
 
