@@ -70,7 +70,8 @@ def test_a_gpu_that_can_be_used_is(machine: pytest.MonkeyPatch) -> None:
 def test_a_torch_for_the_cpu_alone(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(torch.version, "cuda", None)
     assert re.search(
-        r"device cuda is not usable: this torch \(.*\) is built without CUDA: install a torch for CUDA", refused()
+        r"device cuda is not usable: this torch \(.*\) is built without CUDA: install a torch for CUDA",
+        refused(),
     )
     assert gpu_status()["GPU"] == "none"
 

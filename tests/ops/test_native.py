@@ -193,12 +193,12 @@ def drawn_after_forks(threads: int) -> list[str]:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks")
-def test_a_fork_of_a_process_with_threads_draws_on_one_and_says_so() -> None:
+def test_fork_of_process_with_threads_uses_one_thread_and_warns() -> None:
     """It used to wait for ever for threads that only the parent has, the second one too, as the
     first fork ends the threads of OpenBLAS; without any, it may start some."""
     told = (
-        "True 1 1 dyngs and torch run on one thread: this process was forked from one that had started threads, which "
-        "it has not got; start processes with multiprocessing's 'spawn' method to use more"
+        "True 1 1 dyngs and torch use one thread: this process was forked from a process with "
+        "threads; use multiprocessing's 'spawn' start method for more threads"
     )
     assert drawn_after_forks(2) == ["True 2 4", told, told]
 
