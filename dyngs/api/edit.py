@@ -32,18 +32,18 @@ from dyngs.export.splat_files import (
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
     all_suffixes,
-    format_of,
+    find_format,
+    format_for_path,
     format_to_read,
-    known_format,
-    moved_file,
     read_splats,
-    turned_file,
-    undone_file,
+    rotate_file,
+    transform_file,
+    undo_transforms,
     write_splats,
 )
-from dyngs.io.formats.similarity import UNMOVED, Similarity, axis_of
+from dyngs.io.formats.similarity import IDENTITY, Similarity, parse_axis
 from dyngs.io.formats.splat_file import SplatFile
-from dyngs.io.outputs import new_folder
+from dyngs.io.outputs import atomic_folder
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.ops.device import deterministic, device_for
 from dyngs.ops.native import kernel_threads, num_cores
@@ -165,7 +165,7 @@ def edit_scene(
     nothing is written.
     """
     moves = out.name.lower().endswith(SUFFIX)
-    if known_format(out) is None and not moves and out.suffix:
+    if find_format(out) is None and not moves and out.suffix:
         wanted = f"give a name in {all_suffixes()} or {SUFFIX}, or without a suffix for a run"
         raise DyngsError(f"{out}: edits end in a file of Gaussians or a run; {wanted}")
     inputs_of(source, *edits.merge, *reads).require_output(out)
@@ -242,16 +242,16 @@ def _written(found: EditSource, out: Path, edits: Edits, tell: Tell) -> EditedFi
     if edits.merge:
         splat = merged(splat, _up(found, edits.frame), edits.merge, tell)
     if edits.undo:
-        if splat.edited == UNMOVED:
+        if splat.edited == IDENTITY:
             raise DyngsError(
                 "--undo: nothing says that this was edited; `dyngs edit` stores it in what it writes"
             )
-        edited = undone_file(splat)
+        edited = undo_transforms(splat)
         tell("the frame is that of before the first edit")
     else:
-        how, up = _frame(found, edits, format_of(out).up, tell)
+        how, up = _frame(found, edits, format_for_path(out).up, tell)
         is_new = edits.has_frame
-        edited = moved_file(splat, how, up) if is_new else turned_file(splat, how.turn, up)
+        edited = transform_file(splat, how, up) if is_new else rotate_file(splat, how.turn, up)
     written = write_splats(out, edited)
     return EditedFile(written.path, compare_splats(splat, written), written.notes)
 
@@ -299,7 +299,7 @@ def _written_run(
         raise DyngsError(
             f"{source}: holds no checkpoint that a part could be taken of; give --out FILE.ply"
         )
-    with new_folder(out, require_empty) as folder:
+    with atomic_folder(out, require_empty) as folder:
         for name in (LOG_NAME, RECORD_NAME, *([SCENE_FILE] if stored else [])):
             if (source / name).is_file():
                 shutil.copyfile(source / name, folder / name)
@@ -366,7 +366,7 @@ def _frame(
         how = frame.similarity(None, ())
         up = found.opened.stated_up
     else:
-        how = frame.similarity(direction, axis_of(wanted))
+        how = frame.similarity(direction, parse_axis(wanted))
         up = None if direction is None else wanted
     about = "nothing says which way is up, so nothing is turned; --up tells it"
     tell(about if up is None else f"up is {up} in what is written")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dyngs.api.choose import choose
 from dyngs.api.first_scene import first_of
-from dyngs.capture.sfm.unposed import with_poses
+from dyngs.capture.sfm.unposed import ensure_poses
 from dyngs.config import AutoColour, FixedStrategy, SceneInit, ShColour
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.core.conventions import ReportProgress
@@ -72,7 +72,7 @@ def find_poses(report: ReportProgress) -> Stage:
         if isinstance(kind, HasBody):
             data = kind.find_body(data, model, show, report)
         else:
-            data = with_poses(data, needs_times=isinstance(kind, Moves), report=report)
+            data = ensure_poses(data, needs_times=isinstance(kind, Moves), report=report)
         if data.root == folder:  # the archive outlives the cache
             data = data.model_copy(update={"root": root})
         message = None if folder == root else f"{root} is unpacked in {folder}"

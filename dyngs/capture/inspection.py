@@ -13,25 +13,35 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.capture.sfm.frame_choice import STANDS, displaced_by, measured, shrunk
-from dyngs.capture.sfm.several_videos import VIDEOS_FILE, CameraVideo, open_video, read_given
+from dyngs.capture.sfm.frame_choice import (
+    FIXED_CAMERA_LIMIT,
+    camera_displacement,
+    measure_frames,
+    small_brightness,
+)
+from dyngs.capture.sfm.several_videos import (
+    VIDEOS_FILE,
+    CameraVideo,
+    open_video,
+    read_video_settings,
+)
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError, as_word, counted, printable, reading
-from dyngs.data.body_frames import about_pelvis
+from dyngs.data.body_frames import merge_root_rotation
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry import (
     camera_center,
+    count_visible_views,
     focus_point,
     fraction_in_front,
-    inverse_rigid,
+    invert_rigid,
     perpendicular,
-    times_seen,
     unit,
 )
 from dyngs.data.images.images import read_header, read_image, read_mask
-from dyngs.data.images.video import opened_video, read_frames, videos_in
+from dyngs.data.images.video import list_videos, open_video_container, read_frames
 from dyngs.data.times import distinct_times, evenly_spaced
-from dyngs.io.containment import inside, leaving_links
+from dyngs.io.containment import check_inside, find_escaping_links
 from dyngs.io.outputs import Inputs
 from dyngs.io.write import write_image
 
@@ -51,10 +61,10 @@ LOOKED_AT = 4  # masks that are read
 MOST_IGNORED = 0.5
 
 
-def before_training(capture: Capture) -> list[str]:
+def check_before_training(capture: Capture) -> list[str]:
     """Return one line for everything about a capture that is likely to spoil a training; only some
     masks are read."""
-    masks, problems = masks_of(capture)
+    masks, problems = describe_masks(capture)
     line = [] if masks is None else [f"masks of {masks}"]
     found = [*capture.warnings, *line, *problems, *time_problems(capture), *scene_problems(capture)]
     return list(dict.fromkeys([*found, *body_problems(capture)]))
@@ -80,7 +90,7 @@ def time_problems(capture: Capture) -> list[str]:
         ]
     if not 3 <= len(views) == count or count * CLOSE_IN_TIME >= FEW_VIEWS:
         return []
-    poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
+    poses = np.stack([invert_rigid(view.cam_from_world) for view in views])
     center = focus_point(poses) if capture.points is None else np.median(capture.points.xyz, axis=0)
     if center is None:
         return []
@@ -101,7 +111,7 @@ def body_problems(capture: Capture) -> list[str]:
         return []
     from scipy.spatial.transform import Rotation  # late: importing it takes a tenth of a second
 
-    body = about_pelvis(body, np.zeros(3) if body.pelvis is None else body.pelvis)
+    body = merge_root_rotation(body, np.zeros(3) if body.pelvis is None else body.pelvis)
     rows = {frame: row for row, frame in enumerate(body.frames)}
     seen = [(rows[v.frame], v) for v in capture.splits.get("train", ()) if v.frame in rows]
     if not seen:
@@ -128,7 +138,7 @@ def scene_problems(capture: Capture) -> list[str]:
     camera sees, .."""
     views = all_views(capture.splits)
     problems = []
-    poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
+    poses = np.stack([invert_rigid(view.cam_from_world) for view in views])
     centers = poses[:, :3, 3]
     spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
     is_static = capture.body is None and all(view.time is None for view in views)
@@ -144,13 +154,13 @@ def scene_problems(capture: Capture) -> list[str]:
     if len(xyz):
         sample = xyz[np.random.default_rng(0).permutation(len(xyz))[:2000]]
         some = [views[index] for index in evenly_spaced(len(views), MAX_VIEWS)]
-        unseen = float((times_seen(sample, some) == 0).mean())
+        unseen = float((count_visible_views(sample, some) == 0).mean())
         if unseen > 0.1:
             problems.append(f"{unseen:.0%} of the points are in no camera's view")
     return problems
 
 
-def listed(lines: Iterable[str]) -> list[str]:
+def limit_messages(lines: Iterable[str]) -> list[str]:
     """Return the lines, and a count of those beyond ``MAX_LINES_PER_KIND``."""
     found = list(lines)
     more = len(found) - MAX_LINES_PER_KIND
@@ -159,7 +169,7 @@ def listed(lines: Iterable[str]) -> list[str]:
     return [*found[:MAX_LINES_PER_KIND], f"... and {more} more like the last one"]
 
 
-def problems_of(capture: Capture, deep: bool) -> list[str]:
+def find_problems(capture: Capture, deep: bool) -> list[str]:
     """Return a line for everything suspicious, next to the capture's own warnings; ``deep``: decode
     every image."""
     views = all_views(capture.splits)
@@ -175,14 +185,14 @@ def problems_of(capture: Capture, deep: bool) -> list[str]:
     same = sum(count for count in poses.values() if count > 1)
     if same:
         problems.append(f"{same} views of a static scene share their pose with another one")
-    problems += listed(
+    problems += limit_messages(
         f"'{view.name}': odd intrinsics for an image of {view.width}x{view.height}: focal lengths "
         f"({view.intrinsics[0, 0]:g}, {view.intrinsics[1, 1]:g}), centre ({view.intrinsics[0, 2]:g}, "
         f"{view.intrinsics[1, 2]:g}) px"
         for view in views
         if not _is_usual_camera(view)
     )
-    problems += [*_image_problems(views, deep), *masks_of(capture)[1]]
+    problems += [*_image_problems(views, deep), *describe_masks(capture)[1]]
     return [*problems, *time_problems(capture), *scene_problems(capture), *body_problems(capture)]
 
 
@@ -207,14 +217,14 @@ def _image_problems(views: Iterable[View], deep: bool) -> list[str]:
             except DyngsError as error:
                 problems.append(str(error))
                 continue
-            if header.size_for(described) != described:
+            if header.size_matching(described) != described:
                 problems.append(
                     f"{path} has {header.width}x{header.height} pixels, its camera says {view.width}x{view.height}"
                 )
-    return listed(problems)
+    return limit_messages(problems)
 
 
-def masks_of(capture: Capture) -> tuple[str | None, list[str]]:
+def describe_masks(capture: Capture) -> tuple[str | None, list[str]]:
     """Return a description of the masks of a capture, None without any, and a line if they ignore
     most of the pixels.
 
@@ -264,22 +274,22 @@ def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectRep
     from dyngs.data.read import read_capture
 
     options = source if isinstance(source, DataConfig) else DataConfig(root=source)
-    links = listed(
+    links = limit_messages(
         f"{path}: a link that leads out of the capture, to {place}"
-        for path, place in leaving_links(options.root)
+        for path, place in find_escaping_links(options.root)
     )
     try:
         capture = read_capture(options, decode_videos=deep)
         with reading(options.root, "`dyngs --debug` shows where"):
-            report = report_on(capture, deep)
+            report = build_report(capture, deep)
     except DyngsError as error:
         return InspectReport(options.root, None, (), (str(error), *links))
     return replace(report, problems=(*links, *report.problems))
 
 
-def report_on(capture: Capture, deep: bool = False) -> InspectReport:
+def build_report(capture: Capture, deep: bool = False) -> InspectReport:
     """Return the report on a capture that has been read; see ``inspect_capture``."""
-    problems = dict.fromkeys([*capture.warnings, *problems_of(capture, deep)])
+    problems = dict.fromkeys([*capture.warnings, *find_problems(capture, deep)])
     return InspectReport(capture.root, capture, tuple(_facts_of(capture)), tuple(problems))
 
 
@@ -314,7 +324,7 @@ def _facts_of(capture: Capture) -> Iterator[tuple[str, str]]:
     yield "field of view", f"{_range(fov_deg)} degrees across"
     yield "lens", _tallied(view.lens.model for view in views)
     yield "alpha", "transparent background" if capture.has_alpha else "none"
-    yield "masks", masks_of(capture)[0] or "none"
+    yield "masks", describe_masks(capture)[0] or "none"
     priors = {
         "depth maps": sum(view.depth_path is not None for view in views),
         "motion masks": sum(view.motion_mask_path is not None for view in views),
@@ -347,7 +357,9 @@ def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:
         return
     times = set(distinct_times(views).values())
     written = (
-        "" if capture.span in (None, (0.0, 1.0)) else f" ({_range(capture.span)} in the files)"
+        ""
+        if capture.file_time_span in (None, (0.0, 1.0))
+        else f" ({_range(capture.file_time_span)} in the files)"
     )
     yield "times", f"{len(times)} in {_range(times)}{written}"
     cameras = counted(len({view.camera_id for view in views}), "camera")
@@ -398,7 +410,7 @@ def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
 
     Inputs((capture.root,)).require_output(out)
     views = [(split, view) for split, views in capture.splits.items() for view in views]
-    poses = np.stack([inverse_rigid(view.cam_from_world) for _, view in views])
+    poses = np.stack([invert_rigid(view.cam_from_world) for _, view in views])
     centers = poses[:, :3, 3]
     up = -poses[:, :3, 1].mean(axis=0)
     up = unit(up) if np.linalg.norm(up) > 1e-3 else np.array([0.0, 0.0, 1.0])
@@ -456,7 +468,8 @@ def video_report(path: Path) -> str:
     """Return a report on a video file, or on the videos of a folder, as lines of text; their frames
     are decoded once."""
     videos = [
-        open_video(inside(video)) for video in ([path] if path.is_file() else videos_in(path))
+        open_video(check_inside(video))
+        for video in ([path] if path.is_file() else list_videos(path))
     ]
     lines = []
     moving = []
@@ -478,7 +491,7 @@ def video_report(path: Path) -> str:
         names = ", ".join(moving[:5])
         lines.append(f"next: take {names} out: of several videos, only fixed cameras get poses")
     else:
-        is_given = read_given(path, [video.name for video in videos])[0] is not None
+        is_given = read_video_settings(path, [video.name for video in videos])[0] is not None
         known = f"as {VIDEOS_FILE} says" if is_given else "found by sound"
         lines.append(f"{len(videos)} fixed cameras; offsets between them: {known}")
         lines.append(f"next: dyngs train dynamic data.root={where}")
@@ -491,12 +504,12 @@ def video_facts(video: CameraVideo) -> tuple[dict[str, str], bool]:
 
     def frames() -> Iterator[np.ndarray]:
         for rgb in islice(read_frames(video.path), min(MAX_FRAMES, len(video.seconds))):
-            small.append(shrunk(rgb))
+            small.append(small_brightness(rgb))
             yield rgb
 
-    measures = measured(frames())
-    displaced = displaced_by(np.stack(small))
-    with opened_video(video.path) as container:
+    measures = measure_frames(frames())
+    displaced = camera_displacement(np.stack(small))
+    with open_video_container(video.path) as container:
         has_sound = len(container.streams.audio) > 0
     gaps = 1000 * np.diff(video.seconds)
     rate = f"{video.rate:.4g} per second"
@@ -511,6 +524,6 @@ def video_facts(video: CameraVideo) -> tuple[dict[str, str], bool]:
         "sharpness": counted(blurred, "blurred frame"),
         "camera": f"moves by up to {displaced:.1%} of its width, {np.median(measures.motion):.2%} from frame to frame",
     }
-    stands = displaced <= STANDS
+    stands = displaced <= FIXED_CAMERA_LIMIT
     facts |= {"camera": "stands still"} if stands else {}
     return {name: value for name, value in facts.items() if value}, stands

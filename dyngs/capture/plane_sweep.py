@@ -20,7 +20,7 @@ from torch.nn.functional import grid_sample, pad
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import PointCloud, View
-from dyngs.data.geometry import camera_center, inverse_rigid, projected
+from dyngs.data.geometry import camera_center, invert_rigid, project_points
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
 
@@ -78,11 +78,11 @@ class _Shot:
     def points_at(self, depth: np.ndarray) -> np.ndarray:
         """Return the points (P, 3) in the world of the finite depths (H, W), row by row."""
         local = (self.rays * depth[..., None])[np.isfinite(depth)]
-        world_from_cam = inverse_rigid(self.cam_from_world)
+        world_from_cam = invert_rigid(self.cam_from_world)
         return local @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
 
 
-def dense_points(
+def sweep_dense_points(
     views: Sequence[View], options: DataConfig, sparse: np.ndarray, count: int, fill: bool = False
 ) -> PointCloud | None:
     """Return at most ``count`` points of surfaces that several views show, at random of all that
@@ -93,7 +93,7 @@ def dense_points(
     pixel that has one. None where hardly any points are found: without texture, neighbours, or
     right poses.
     """
-    groups = neighbours(views, sparse)
+    groups = choose_neighbours(views, sparse)
     needed = sorted({i for group in groups for i in group})
     loader = ImageLoader([views[i] for i in needed], _small(options))
     shots = {i: _shot(loader, k) for k, i in enumerate(needed)}
@@ -109,7 +109,7 @@ def dense_points(
     return _agreed_points(maps, count, MIN_POINTS, fill)
 
 
-def points_of_depth_maps(
+def points_from_depth_maps(
     views: Sequence[View], options: DataConfig, count: int
 ) -> PointCloud | None:
     """Return at most ``count`` points of the depth maps that belong to the images, where several of
@@ -181,7 +181,7 @@ def _gaps_filled(shot: _Shot, depth: np.ndarray) -> np.ndarray:
     return np.where(is_unknown & shot.counts, depth[rows, columns], np.nan)
 
 
-def neighbours(views: Sequence[View], sparse: np.ndarray) -> list[list[int]]:
+def choose_neighbours(views: Sequence[View], sparse: np.ndarray) -> list[list[int]]:
     """Return groups of indices of views: one whose depth is looked for, then up to ``NEIGHBOURS``
     to compare it with.
 
@@ -189,7 +189,7 @@ def neighbours(views: Sequence[View], sparse: np.ndarray) -> list[list[int]]:
     apart nor too large for windows to look alike; a view with fewer than ``MIN_NEIGHBOURS`` of them
     has no group.
     """
-    sees = np.stack([projected(sparse, view)[1] for view in views]).astype(np.float64)
+    sees = np.stack([project_points(sparse, view)[1] for view in views]).astype(np.float64)
     centers = np.stack([camera_center(view.cam_from_world) for view in views])
     groups = []
     for i in evenly_spaced(len(views), MAPS):
@@ -224,7 +224,8 @@ def _depth_range(view: View, sparse: np.ndarray) -> tuple[float, float]:
     """Return the nearest and the farthest depth of the points (P, 3) that lie in the image, but for
     a few."""
     depths = (
-        sparse[projected(sparse, view)[1]] @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3]
+        sparse[project_points(sparse, view)[1]] @ view.cam_from_world[2, :3]
+        + view.cam_from_world[2, 3]
     )
     near, far = np.percentile(depths, _RANGE)
     return float(near), float(far)
@@ -260,7 +261,7 @@ def _mean_of_best_two(correlations: Sequence[Tensor]) -> Tensor:
 def _correlation(shot: _Shot, other: _Shot, inverse: np.ndarray) -> Tensor:
     """Return (D, H, W) normalised correlations of windows of two images, by inverse depth; -1
     outside the other one."""
-    relative = other.cam_from_world @ inverse_rigid(shot.cam_from_world)
+    relative = other.cam_from_world @ invert_rigid(shot.cam_from_world)
     turned = torch.from_numpy(
         np.moveaxis(shot.rays @ (other.intrinsics @ relative[:3, :3]).T, 2, 0).copy()
     ).float()

@@ -43,7 +43,7 @@ from dyngs.cli import (
 from dyngs.cli.arguments import follows_links, require_outputs_apart
 from dyngs.cli.output import print_messages
 from dyngs.core.errors import DyngsError, NoCaptureError, printable, quoted, require_name
-from dyngs.io.containment import following_links_of_runs
+from dyngs.io.containment import allow_run_links
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
@@ -171,7 +171,7 @@ def _dispatch(arguments: list[str]) -> int:
         parser.print_help()
         return 0
     try:
-        with following_links_of_runs(follows_links(getattr(parsed, "overrides", ()))):
+        with allow_run_links(follows_links(getattr(parsed, "overrides", ()))):
             require_outputs_apart(parsed.parser, parsed)
             return parsed.run(parsed)
     except NoCaptureError as error:

@@ -40,17 +40,17 @@ def run(arguments: argparse.Namespace) -> int:
 
     from dyngs.export.images import compare_splats
     from dyngs.io.formats.formats import (
-        format_of,
+        format_for_path,
+        orient_to_axis,
         read_splats,
-        upright,
         write_splats,
     )
 
-    format_of(arguments.target)  # before a large file is read
+    format_for_path(arguments.target)  # before a large file is read
     splat = read_splats(arguments.source, nonfinite="skip")
     if arguments.from_up is not None:
         splat = replace(splat, up=arguments.from_up)
-    rotated = upright(splat, arguments.up, arguments.target)
+    rotated = orient_to_axis(splat, arguments.up, arguments.target)
     said = f"up is {rotated.up} in the file" + (
         f", it was {splat.up}" if rotated.up != splat.up else ", as it was"
     )

@@ -124,7 +124,7 @@ def amount(text: str) -> float:
 def run_compare(arguments: argparse.Namespace) -> int:
     """Train, compare, print the table and write the report; the folder is locked against other
     commands."""
-    from dyngs.io.outputs import writing
+    from dyngs.io.outputs import lock_folder
     from dyngs.runs.folder import inputs_of
     from dyngs.study.compare import ModelComparison
     from dyngs.study.report import Report, can_plot, plot_curves, shown_views, table_of
@@ -150,7 +150,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
     configs, unfit = comparison.configs(arguments.models.split(","))
     for config in configs.values():
         inputs_of(config).require_output(out)
-    with writing(out), results_alone(arguments.json):
+    with lock_folder(out), results_alone(arguments.json):
         comparison.require_same(configs, unfit)
         try:
             results, left_out, curves = comparison.run(configs, arguments.ray)
@@ -191,14 +191,14 @@ def _print_report(report: Report, stem: Path, *, is_json: bool) -> None:
 def run_tradeoff(arguments: argparse.Namespace) -> int:
     """Measure, print and write the tables, and choose a run; the folder is locked against other
     commands."""
-    from dyngs.io.outputs import writing
+    from dyngs.io.outputs import lock_folder
 
     if not arguments.run_dir.is_dir():
         raise DyngsError(
             f"{arguments.run_dir}: not a run folder; give one that `dyngs train` wrote"
         )
     out: Path = arguments.out or arguments.run_dir / "tradeoff"
-    with writing(out):
+    with lock_folder(out):
         return _tradeoff(arguments, out)
 
 

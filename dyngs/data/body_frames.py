@@ -22,21 +22,21 @@ from dyngs.data.capture import (
     Splits,
     View,
     all_views,
-    each_view,
+    map_views,
 )
-from dyngs.io.containment import staying_within
-from dyngs.io.fields import LARGEST, first_few, float_array, numbers_of
+from dyngs.io.containment import restrict_paths_to
+from dyngs.io.fields import LARGEST, as_float_array, first_few, parse_numbers
 from dyngs.io.numpy_files import read_npz
 
 
-def body_frames(
+def build_body_frames(
     where: Path,
     frames: Sequence[int],
     poses: object,
     trans: object,
     betas: object,
     scale: object = 1.0,
-    turns: object = None,
+    origin_rotations: object = None,
 ) -> BodyFrames:
     """Return checked body parameters, sorted by frame; arrays may have any shape with one row per
     frame.
@@ -46,7 +46,7 @@ def body_frames(
 
     Args:
         frames: F distinct numbers.
-        poses: F rows of 72, 156 or 165 numbers; ``trans`` and ``turns``: of 3.
+        poses: F rows of 72, 156 or 165 numbers; ``trans`` and ``origin_rotations``: of 3.
         betas: (B,), or one such row per frame, of which the mean is taken.
         scale: one number, or one per frame.
     """
@@ -68,9 +68,9 @@ def body_frames(
     scales = _rows(where, "scale", scale, frames, 1)
     if not (scales > 0).all():
         raise DyngsError(f"{where}: 'scale' must be positive; export the file again")
-    shape = float_array(betas)
+    shape = as_float_array(betas)
     if shape is not None and (shape.ndim == 1 or len(shape) == 1):
-        shape = numbers_of(f"{where}: 'betas'", shape, None)
+        shape = parse_numbers(f"{where}: 'betas'", shape, None)
     else:
         shape = _rows(where, "betas", betas, frames).mean(axis=0)
     return BodyFrames(
@@ -79,12 +79,14 @@ def body_frames(
         trans=_rows(where, "trans", trans, frames, 3)[order],
         betas=shape,
         scale=scales[order, 0],
-        turns=None if turns is None else _rows(where, "turns", turns, frames, 3)[order],
+        origin_rotations=None
+        if origin_rotations is None
+        else _rows(where, "origin_rotations", origin_rotations, frames, 3)[order],
     )
 
 
-def about_pelvis(body: BodyFrames, pelvis: np.ndarray) -> BodyFrames:
-    """Return the same bodies with ``turns`` merged into the root joint's rotation.
+def merge_root_rotation(body: BodyFrames, pelvis: np.ndarray) -> BodyFrames:
+    """Return the same bodies with ``origin_rotations`` merged into the root joint's rotation.
 
     The pelvis keeps its place in the world, ``scale * turn(j) + trans``, where j is the rest
     position of the fitted body's pelvis if the files say it, else ``pelvis`` (3,), that of the
@@ -94,26 +96,30 @@ def about_pelvis(body: BodyFrames, pelvis: np.ndarray) -> BodyFrames:
     fitted = pelvis if body.pelvis is None else body.pelvis
     poses = body.poses
     turned = fitted
-    if body.turns is not None:
+    if body.origin_rotations is not None:
         from scipy.spatial.transform import Rotation  # late: importing it takes a tenth of a second
 
-        turns = Rotation.from_rotvec(body.turns)
+        turns = Rotation.from_rotvec(body.origin_rotations)
         turned = turns.apply(fitted)
         roots = (turns * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
         poses = np.concatenate([roots[:, None], poses[:, 1:]], axis=1)
     trans = body.trans + body.scale[:, None] * (turned - pelvis)
     return replace(
-        body, poses=poses, trans=trans, turns=None, pelvis=np.asarray(pelvis, dtype=np.float64)
+        body,
+        poses=poses,
+        trans=trans,
+        origin_rotations=None,
+        pelvis=np.asarray(pelvis, dtype=np.float64),
     )
 
 
-def moved(body: BodyFrames, shift: np.ndarray, factor: float) -> BodyFrames:
+def transform_body(body: BodyFrames, shift: np.ndarray, factor: float) -> BodyFrames:
     """Return the bodies of a world in which a point x is ``factor * (x - shift)``, with ``shift``
     (3,)."""
     return replace(body, trans=factor * (body.trans - shift), scale=factor * body.scale)
 
 
-def rows_of(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
+def match_frames(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
     """Return (V,) the row of ``body`` for each view, by frame number; each must have one with
     parameters."""
     rows = {number: row for row, number in enumerate(body.frames)}
@@ -129,7 +135,7 @@ def rows_of(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
     return np.array([rows[frame_number(view)] for view in views], dtype=np.int64)
 
 
-def of_one_clip(body: BodyFrames) -> dict[Split, BodyFrames]:
+def share_body_across_splits(body: BodyFrames) -> dict[Split, BodyFrames]:
     """``Capture.body`` for a capture whose splits all show the same clip."""
     return {"train": body, "val": body, "test": body}
 
@@ -138,7 +144,7 @@ def _rows(
     where: Path, name: str, value: object, frames: Sequence[int], width: int | None = None
 ) -> np.ndarray:
     """(F, width) float64 numbers of at most ``LARGEST``, any width where that is None."""
-    array = float_array(value)
+    array = as_float_array(value)
     if array is None or array.shape[:1] != (len(frames),):
         raise DyngsError(
             f"{where}: '{name}' must hold as many numbers for each of {len(frames)} frames; export the file again"
@@ -174,7 +180,7 @@ def read_body_file(path: Path) -> BodyFrames:
             f"{path}: 'frames' must hold one whole number for each row of 'poses'; export it again"
         )
     frames = [int(number) for number in numbers]
-    body = body_frames(
+    body = build_body_frames(
         path, frames, found["poses"], found["trans"], found["betas"], found.get("scale", 1.0)
     )
     if str(found.get("surface_model_type")) == "anny":
@@ -182,7 +188,7 @@ def read_body_file(path: Path) -> BodyFrames:
     return replace(body, fitted_to=str(found.get("fitted_to", "")))
 
 
-def with_fitted_body(capture: Capture, folder: Path) -> Capture:
+def attach_fitted_body(capture: Capture, folder: Path) -> Capture:
     """Return the capture with the body parameters of ``folder``: ``body_train.npz``, and
     ``body_pose.npz`` if there."""
     if not (folder / "body_train.npz").is_file():
@@ -191,20 +197,20 @@ def with_fitted_body(capture: Capture, folder: Path) -> Capture:
             f"training with data.root={capture.root} into another run.dir"
         )
     with (
-        staying_within(folder, False),
+        restrict_paths_to(folder, False),
         reading(folder, "give a folder that `dyngs data fit` wrote"),
     ):
         train = read_body_file(folder / "body_train.npz")
         body: dict[Split, BodyFrames] = {"train": train, "val": train, "test": train}
         if (folder / "body_pose.npz").is_file():
             body["pose"] = read_body_file(folder / "body_pose.npz")
-    splits = numbered(capture.splits)
+    splits = assign_frame_numbers(capture.splits)
     if "pose" in splits and "pose" not in body:
         splits = {name: views for name, views in splits.items() if name != "pose"}
     return capture.replace(splits=splits, body=body)
 
 
-def number_in_name(where: Path, name: str) -> int:
+def parse_frame_number(where: Path, name: str) -> int:
     """Frame number of ``000123.jpg``, ``frame_000123`` or ``Camera
     (1)_0123_2019-08-23_16.592.jpg``."""
     stem = PurePosixPath(name.replace("\\", "/")).name
@@ -223,11 +229,11 @@ def frame_number(view: View) -> int:
     return -1 if view.frame is None else view.frame
 
 
-def numbered(splits: Splits) -> Splits:
+def assign_frame_numbers(splits: Splits) -> Splits:
     """Return the views with frame numbers; if any has none, all get them by the order of their
     times."""
     views = all_views(splits)
     if all(view.frame is not None for view in views):
         return splits
     order = {time: i for i, time in enumerate(sorted({view.time or 0.0 for view in views}))}
-    return each_view(splits, lambda view: replace(view, frame=order[view.time or 0.0]))
+    return map_views(splits, lambda view: replace(view, frame=order[view.time or 0.0]))

@@ -83,7 +83,7 @@ class View:
         flow_path: optical flow to the view ``flow_to``, the next one of this camera in its file.
         exposure: light let in by the EXIF tags, by ``ImageHeader``: comparable among views of one
             capture.
-        shrunk: how many times smaller the file is than the image that it is a copy of.
+        copy_factor: how many times smaller the file is than the image that it is a copy of.
     """
 
     name: str
@@ -106,7 +106,7 @@ class View:
     flow_path: Path | None = None
     flow_to: str | None = None
     exposure: float | None = None
-    shrunk: int = 1
+    copy_factor: int = 1
 
 
 Splits = dict[Split, tuple[View, ...]]
@@ -118,7 +118,7 @@ def all_views(splits: Mapping[Split, tuple[View, ...]]) -> list[View]:
     return [view for views in splits.values() for view in views]
 
 
-def by_camera(splits: Mapping[Split, tuple[View, ...]]) -> dict[int, list[View]]:
+def group_by_camera(splits: Mapping[Split, tuple[View, ...]]) -> dict[int, list[View]]:
     """Return the views of each camera in order of time, cameras by their numbers."""
     found: dict[int, list[View]] = {}
     for view in sorted(
@@ -128,7 +128,7 @@ def by_camera(splits: Mapping[Split, tuple[View, ...]]) -> dict[int, list[View]]
     return found
 
 
-def each_view(splits: Splits, change: Callable[[View], View]) -> Splits:
+def map_views(splits: Splits, change: Callable[[View], View]) -> Splits:
     """Return the splits with ``change`` of each view."""
     return {name: tuple(map(change, views)) for name, views in splits.items()}
 
@@ -156,7 +156,7 @@ class BodyFrames:
         trans: (F, 3).
         betas: (B,) shape coefficients, in the shape space ``shape_space``.
         scale: (F,) world units per metre of the template, positive.
-        turns: (F, 3) axis-angle, radians, rotation about the template's origin; None for none.
+        origin_rotations: (F, 3) axis-angle, radians, rotation about the template's origin; None for none.
         pelvis: (3,) rest position of the pelvis of the fitted body, None where the files do not
             say.
         shape_space: that of ``betas``: of SMPL's family, or of the free template.
@@ -169,7 +169,7 @@ class BodyFrames:
     trans: np.ndarray
     betas: np.ndarray
     scale: np.ndarray
-    turns: np.ndarray | None = None
+    origin_rotations: np.ndarray | None = None
     pelvis: np.ndarray | None = None
     shape_space: ShapeSpace = "smpl"
     fitted_to: str = ""
@@ -199,8 +199,8 @@ class Capture:
         has_alpha: images carry straight alpha that means "transparent here".
         body: body parameters of each split, by frame number, for captures of people.
         fps: frames per second of the recording.
-        span: first and last time as written in the files, which are 0 and 1 in the views.
-        in_seconds: times in the files are seconds.
+        file_time_span: first and last time as written in the files, which are 0 and 1 in the views.
+        times_in_seconds: times in the files are seconds.
         seconds: from time 0 to time 1.
         tracks_path: 2D tracks, see ``data.tracks``.
         warnings: suspicious findings of the reader, one line each.
@@ -216,8 +216,8 @@ class Capture:
     has_alpha: bool = False
     body: dict[Split, BodyFrames] | None = None
     fps: float | None = None
-    span: tuple[float, float] | None = None
-    in_seconds: bool = False
+    file_time_span: tuple[float, float] | None = None
+    times_in_seconds: bool = False
     seconds: float | None = None
     tracks_path: Path | None = None
     warnings: tuple[str, ...] = ()

@@ -24,10 +24,10 @@ from dyngs.data.images.images import (
     area_downscale,
     area_downscale_uint8,
     check_image,
-    premultiplied,
+    premultiply,
     read_image,
     read_mask,
-    straight_uint8,
+    to_straight_uint8,
 )
 from dyngs.data.images.lens import LensMap, is_pinhole, undistort, undistort_map
 from dyngs.data.read import view_size
@@ -45,7 +45,7 @@ Decoded = dict[str, Tensor]
 where a view has them."""
 
 
-def usual_threads() -> int:
+def default_decoding_threads() -> int:
     """Return how many threads work ahead: one for every two cores of this process, one to four."""
     try:
         cores = len(os.sched_getaffinity(0))
@@ -66,7 +66,7 @@ class Image:
         mask: (H, W) float32, 1 = counts in the loss, 0 = ignore; None where all pixels count.
         time: in [0, 1].
         frame: the view's frame number.
-        moves: (H, W) float32, the fraction of each pixel that moves, by the motion mask.
+        motion_mask: (H, W) float32, the fraction of each pixel that moves, by the motion mask.
         labels: (H, W) int64, which thing moves there, 0 for none; of a motion mask that tells them
             apart.
         depth: (H, W) float32 depth in the unit of its map, 0 where unknown.
@@ -81,7 +81,7 @@ class Image:
     mask: Tensor | None
     time: float | None
     frame: int | None = None
-    moves: Tensor | None = None
+    motion_mask: Tensor | None = None
     labels: Tensor | None = None
     depth: Tensor | None = None
     flow: Tensor | None = None
@@ -103,7 +103,7 @@ class Image:
         """Return the tensors that are there, by name."""
         return {name: x for name, x in vars(self).items() if isinstance(x, Tensor)}
 
-    def shrunk(self, factor: int) -> Image:
+    def downscaled(self, factor: int) -> Image:
         """Return the image with both sides divided by ``factor``, averaged over pixel areas, and
         its camera."""
         if factor == 1:
@@ -113,7 +113,7 @@ class Image:
         small: Any = {}
         for name, values in self.tensors().items():
             if name == "flow":
-                small[name] = image_maps.resized(values, *size)
+                small[name] = image_maps.resize_flow(values, *size)
             elif name in ("depth", "labels"):
                 small[name] = _nearest(values, image_maps.nearest_positions(*size))
             elif name == "rgb_premultiplied":
@@ -169,7 +169,7 @@ class ImageLoader:
     Attributes:
         views: the views, in the order of the images.
         times: times of the views in [0, 1], None where a view has none.
-        corrected: returns the camera of an image, given the index of its view and its camera by the
+        camera_correction: returns the camera of an image, given the index of its view and its camera by the
             capture; None: the latter.
     """
 
@@ -193,7 +193,7 @@ class ImageLoader:
         """
         self.views = tuple(views)
         self.times = tuple(view.time for view in self.views)
-        self.corrected: Callable[[int, Cameras], Cameras] | None = None
+        self.camera_correction: Callable[[int, Cameras], Cameras] | None = None
         self._options = options = options or DataConfig(root=Path())
         self._with_maps = with_maps
         self._device = CPU
@@ -220,7 +220,7 @@ class ImageLoader:
     def device(self, device: torch.device) -> None:
         if device == self._device:
             return
-        self.rest()
+        self.stop_prefetching()
         memory = gpu_memory(device)
         self._device = device
         self._cache = self._on_cpu
@@ -231,8 +231,8 @@ class ImageLoader:
         index = range(len(self))[index]
         return self._given_out(index, self._as_stored(index))
 
-    def shrunk(self, index: int, factor: int) -> Image:
-        """Return ``self[index].shrunk(factor)``; cached for the last factor, where memory is
+    def downscaled(self, index: int, factor: int) -> Image:
+        """Return ``self[index].downscaled(factor)``; cached for the last factor, where memory is
         left."""
         key = (range(len(self))[index], factor)
         with self._lock:
@@ -242,21 +242,21 @@ class ImageLoader:
                 self._factor = factor
             small = self._cache.images.get(key) if factor > 1 else None
         if small is None:
-            small = self._as_stored(key[0]).shrunk(factor)
+            small = self._as_stored(key[0]).downscaled(factor)
             if factor > 1:
                 with self._lock:
                     self._cache.keep(key, small, 0)
         return self._given_out(key[0], small)
 
     def _given_out(self, index: int, image: Image) -> Image:
-        if self.corrected is not None:
-            image = replace(image, cameras=self.corrected(index, image.cameras))
+        if self.camera_correction is not None:
+            image = replace(image, cameras=self.camera_correction(index, image.cameras))
         return image if self._device == CPU else image.to(self._device)
 
     def _as_stored(self, index: int) -> Image:
         view = self.views[index]
         decoded = dict(self._decoded(index))
-        pixels = premultiplied(decoded.pop("pixels"))
+        pixels = premultiply(decoded.pop("pixels"))
         height, width = pixels.shape[:2]
         mask = decoded.pop("mask", None)
         return Image(
@@ -273,11 +273,11 @@ class ImageLoader:
     def cameras(self) -> list[Cameras]:
         """Return the cameras of all images as they are by now, one each; no image is read."""
         found = [_camera_of(view, *size) for view, size in zip(self.views, self.sizes, strict=True)]
-        if self.corrected is not None:
-            found = [self.corrected(i, cameras) for i, cameras in enumerate(found)]
+        if self.camera_correction is not None:
+            found = [self.camera_correction(i, cameras) for i, cameras in enumerate(found)]
         return [cameras.to(device=self.device) for cameras in found]
 
-    def expect(self, indices: Sequence[int]) -> None:
+    def prefetch(self, indices: Sequence[int]) -> None:
         """Begin to decode the images that are requested next, in this order, as far as they are not
         cached."""
         if not self._threads:
@@ -297,8 +297,8 @@ class ImageLoader:
                 if index not in self._pending:
                     self._pending[index] = self._pool.submit(self._on_demand, index)
 
-    def rest(self) -> None:
-        """End the threads that decode ahead; they begin anew with the next ``expect``."""
+    def stop_prefetching(self) -> None:
+        """End the threads that decode ahead; they begin anew with the next ``prefetch``."""
         pool = self._pool
         self._pool = None
         self._pending = {}
@@ -313,8 +313,8 @@ class ImageLoader:
         )
 
     @property
-    def decoded_ahead(self) -> int:
-        """Number of images that ``expect`` decodes ahead; 0 where all are cached."""
+    def num_prefetched(self) -> int:
+        """Number of images that ``prefetch`` decodes ahead; 0 where all are cached."""
         is_whole = all((i, 1) in self._cache.images for i in range(len(self)))
         return 0 if is_whole else 2 * self._threads
 
@@ -324,7 +324,7 @@ class ImageLoader:
         return [view_size(view, self._options) for view in self.views]
 
     @property
-    def bytes_to_come(self) -> int:
+    def pending_bytes(self) -> int:
         """Bytes that images will take, in the cache or decoded ahead, next to those that they take
         now."""
         every = min(self._bytes_of_all() - self.bytes_on_gpu, round(self._on_cpu.room))
@@ -372,7 +372,7 @@ class ImageLoader:
     def _decode(self, view: View) -> Decoded:
         pixels = read_image(view.image_path, (view.width, view.height))
         if view.silhouette is not None:
-            pixels = image_maps.cut_out(pixels, view.silhouette)
+            pixels = image_maps.apply_silhouette(pixels, view.silhouette)
         mask = None
         if view.mask_path is not None:
             mask = read_mask(view.mask_path)
@@ -380,8 +380,8 @@ class ImageLoader:
         size = view_size(view, self._options)
         lens_map = None if is_pinhole(view.lens) else self._lens_map(view)
         if lens_map is not None:
-            small = area_downscale(undistort(premultiplied(pixels), lens_map), *size)
-            pixels = straight_uint8(small)
+            small = area_downscale(undistort(premultiply(pixels), lens_map), *size)
+            pixels = to_straight_uint8(small)
             mask = _undistorted_mask(mask, lens_map)
         elif size != (view.width, view.height):
             pixels = area_downscale_uint8(pixels, *size)
@@ -410,7 +410,7 @@ class ImageLoader:
             moves = (found != 0).float()[..., None]
             if lens_map is not None:
                 moves = undistort(moves, lens_map)
-            maps["moves"] = area_downscale(moves, *size)[..., 0]
+            maps["motion_mask"] = area_downscale(moves, *size)[..., 0]
         if self._with_maps and view.depth_path is not None:
             maps["depth"] = view.depth_scale * at_pixels(image_maps.read_depth(view.depth_path))
             if lens_map is not None:
@@ -456,7 +456,7 @@ def check_files(views: Sequence[View]) -> None:
     for view in views:
         header = check_image(view.image_path)
         _require_size(
-            view, view.image_path, header.size_for((view.width, view.height))[::-1], "image"
+            view, view.image_path, header.size_matching((view.width, view.height))[::-1], "image"
         )
         if view.mask_path is not None:
             mask = check_image(view.mask_path)
@@ -473,7 +473,7 @@ def _require_size(view: View, path: Path, shape: Sequence[int], what: str) -> No
 
 
 def _nearest(values: Tensor, positions: Tensor) -> Tensor:
-    return image_maps.taken_at(values[..., None], positions)[..., 0]
+    return image_maps.sample_nearest(values[..., None], positions)[..., 0]
 
 
 def _undistorted_mask(mask: Tensor | None, lens_map: LensMap) -> Tensor | None:

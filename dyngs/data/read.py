@@ -11,7 +11,7 @@ import numpy as np
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError, NoCaptureError, reading
 from dyngs.data import times
-from dyngs.data.body_frames import with_fitted_body
+from dyngs.data.body_frames import attach_fitted_body
 from dyngs.data.capture import (
     Capture,
     CaptureFormat,
@@ -19,10 +19,10 @@ from dyngs.data.capture import (
     Splits,
     View,
     all_views,
-    each_view,
+    map_views,
 )
-from dyngs.data.geometry import match_size
-from dyngs.data.images.images import header_if_readable, read_header, target_size
+from dyngs.data.geometry import match_intrinsics_to_image
+from dyngs.data.images.images import read_header, target_size, try_read_header
 from dyngs.data.images.video import decode_frames
 from dyngs.data.readers import (
     camera_folders,
@@ -35,16 +35,16 @@ from dyngs.data.readers import (
     zju_mocap,
 )
 from dyngs.data.scene_space import normalise_capture
-from dyngs.io.archive import is_archive, unpacked
-from dyngs.io.containment import inside, staying_within
-from dyngs.io.find import FileFinder, shrunk_folders
-from dyngs.io.outputs import command_for
+from dyngs.io.archive import is_archive, unpack_archive
+from dyngs.io.containment import check_inside, restrict_paths_to
+from dyngs.io.find import FileFinder, downscaled_image_folders
+from dyngs.io.outputs import suggest_command
 
 PEOPLE_FILE = "people.json"
 """In a set whose people lie in shards, folders of folders: the options that they were made with."""
 
 
-def captures_in(data: DataConfig) -> list[DataConfig]:
+def list_captures(data: DataConfig) -> list[DataConfig]:
     """Return the paths of the captures in the folders of ``data.root``, or of its shards, by name.
     No capture is read.
 
@@ -71,7 +71,7 @@ def _folders(root: Path) -> list[Path]:
 def view_size(view: View, options: DataConfig) -> tuple[int, int]:
     """Return the (width, height) of a view in training."""
     return target_size(
-        view.width, view.height, options.downscale / view.shrunk, options.longest_side
+        view.width, view.height, options.downscale / view.copy_factor, options.longest_side
     )
 
 
@@ -84,7 +84,7 @@ def with_smaller_images(
     Copies are not read where an image has no copy or has a mask or depth map, which have its size.
     """
     images = root / "images"
-    copies = shrunk_folders(images)
+    copies = downscaled_image_folders(images)
     views = [view for view in all_views(splits) if view.image_path.is_relative_to(images)]
     if not copies or not views:
         return splits, []
@@ -100,7 +100,7 @@ def with_smaller_images(
             return splits, []
         small[view.name] = copy
     line = f"{copies[number].name} is read in place of images: training takes images of that size or smaller ones"
-    return each_view(splits, lambda view: small.get(view.name, view)), [line]
+    return map_views(splits, lambda view: small.get(view.name, view)), [line]
 
 
 def _shrunk(view: View, path: Path, factor: int) -> View | None:
@@ -108,17 +108,22 @@ def _shrunk(view: View, path: Path, factor: int) -> View | None:
     be."""
     if view.mask_path or view.silhouette or view.depth_path or view.motion_mask_path:
         return None
-    header = header_if_readable(path)
+    header = try_read_header(path)
     described = (view.width, view.height)
-    stored = (0, 0) if header is None else header.size_for(described)
+    stored = (0, 0) if header is None else header.size_matching(described)
     if any(
         abs(factor * small - large) >= factor
         for small, large in zip(stored, described, strict=True)
     ):
         return None
-    intrinsics, size, _ = match_size(view.intrinsics, described, stored, str(path))
+    intrinsics, size, _ = match_intrinsics_to_image(view.intrinsics, described, stored, str(path))
     return replace(
-        view, image_path=path, intrinsics=intrinsics, width=size[0], height=size[1], shrunk=factor
+        view,
+        image_path=path,
+        intrinsics=intrinsics,
+        width=size[0],
+        height=size[1],
+        copy_factor=factor,
     )
 
 
@@ -190,7 +195,7 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
         found = [format for format in FORMATS if format.recognise(root)]
     chosen = _chosen_format(options, found)
     with (
-        staying_within(root, options.follow_links),
+        restrict_paths_to(root, options.follow_links),
         reading(
             root,
             "one of its files is not as it should be (`dyngs --debug` shows where); export it again",
@@ -228,7 +233,7 @@ def capture_folder(root: Path) -> Path:
     """
     if not is_archive(root):
         return root
-    folder: Path = unpacked(root)
+    folder: Path = unpack_archive(root)
     while not _is_recognised(folder):
         inner = list(folder.iterdir())
         if len(inner) != 1 or not inner[0].is_dir():
@@ -247,7 +252,7 @@ def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFo
     folder."""
     if options.format == "auto":
         if not found:
-            known = command_for(options.root, captures=False)
+            known = suggest_command(options.root, captures=False)
             if known is not None:
                 raise DyngsError(f"{options.root}: no capture found; {known}")
             looked_for = "; ".join(f"{format.name}: {format.files}" for format in FORMATS)
@@ -289,7 +294,7 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         warnings=(*warnings, *lacking, *layers, *notes, *copies, *more, *absent),
     )
     return normalise_capture(
-        capture if options.body is None else with_fitted_body(capture, options.body)
+        capture if options.body is None else attach_fitted_body(capture, options.body)
     )
 
 
@@ -338,37 +343,37 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
         )
     if capture.body is not None:
         # people are drawn in the poses of their frames, which are found by their times
-        splits = times.times_of_frames(splits)
+        splits = times.times_from_frame_numbers(splits)
     new_poses = splits.pop("pose", None)
     notes: list[str] = []
     rate = options.frames_per_second
     if options.times == "order":
-        splits, line = times.times_by_name(splits, rate)
+        splits, line = times.times_from_names(splits, rate)
         notes.append(line)
-        capture = replace(capture, in_seconds=rate is not None, fps=rate or capture.fps)
+        capture = replace(capture, times_in_seconds=rate is not None, fps=rate or capture.fps)
     elif rate is not None:
         raise DyngsError(
             f"{capture.root}: data.frames_per_second={rate:g} needs data.times=order, which takes times from the names"
         )
-    splits = times.number_cameras(splits)
+    splits = times.assign_camera_ids(splits)
     if options.train_cameras is not None:
         splits = times.split_by_camera(capture.root, splits, options.train_cameras)
         said = tuple(line for line in capture.warnings if line != zju_mocap.FIRST_HELD_OUT)
         capture = replace(capture, warnings=said)
     written = splits
     # People move by frame number: of their captures, times within [0, 1] are left as they are.
-    splits, scaled = times.unit_times(capture.root, splits, stretch=capture.body is None)
+    splits, scaled = times.normalize_times(capture.root, splits, stretch=capture.body is None)
     if options.frames is not None:
         splits, _ = times.split_by_frames(capture.root, splits, options.frames)
-    splits, constant = times.static_if_constant(splits)
+    splits, constant = times.drop_constant_times(splits)
     notes += [*scaled, *constant, *times.frame_count_warnings(splits)]
     if options.pose_frames is not None:
         capture, splits, new_poses = _with_poses_held_out(
             capture, splits, new_poses, options.pose_frames
         )
-    span = times.span_in_files(written, splits)
+    span = times.file_time_span(written, splits)
     seconds = times.clip_seconds(splits, capture.fps)
-    if capture.in_seconds and span:
+    if capture.times_in_seconds and span:
         seconds = span[1] - span[0]
     if "test" not in splits:
         views = splits["train"]
@@ -382,7 +387,7 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
     splits.setdefault("val", ())
     if new_poses is not None:
         splits["pose"] = new_poses
-    return replace(capture, splits=splits, span=span, seconds=seconds), notes
+    return replace(capture, splits=splits, file_time_span=span, seconds=seconds), notes
 
 
 def _with_poses_held_out(
@@ -408,7 +413,7 @@ def _check_places(view: View) -> None:
     priors = (view.depth_path, view.motion_mask_path, view.flow_path)
     for path in (image, view.mask_path, view.silhouette and view.silhouette.path, *priors):
         if path is not None:
-            inside(path)
+            check_inside(path)
 
 
 def _check_names(root: Path, splits: Splits) -> list[str]:
@@ -466,10 +471,10 @@ def _present_priors(splits: Splits, tracks: Path | None) -> tuple[Splits, Path |
         notes.append(
             f"{len(missing)} of {len(paths)} {kind} are missing and do without, first {min(missing)}"
         )
-        splits = each_view(
+        splits = map_views(
             splits,
             lambda v, at=field, no=missing: replace(v, **{at: None}) if getattr(v, at) in no else v,
         )
-    if tracks is not None and not inside(tracks).is_file():
+    if tracks is not None and not check_inside(tracks).is_file():
         return splits, None, [*notes, f"the tracks {tracks} are missing and are not used"]
     return splits, tracks, notes

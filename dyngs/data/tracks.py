@@ -10,7 +10,7 @@ import numpy as np
 
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
-from dyngs.io.containment import inside
+from dyngs.io.containment import check_inside
 from dyngs.io.numpy_files import read_npz
 from dyngs.io.write import atomic_file
 
@@ -121,7 +121,7 @@ def read_true_tracks(capture: Capture, name: str = TRACKS_FILE) -> TrueTracks | 
     """Return the tracks of a capture in scene coordinates (see ``Capture.world_scale``); None
     without any."""
     path = capture.root / name
-    if not inside(path).is_file():
+    if not check_inside(path).is_file():
         return None
     found = read_npz(path, ("points", "times", "views", "moments", "visible"))
     points, times, views, moments, visible = found.values()

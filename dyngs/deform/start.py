@@ -76,7 +76,7 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
         return None if colours.network is None else colours.network.shader(time)
 
     def errors_of(gaussians_at: Callable[[float], Gaussians]) -> StillErrors:
-        shown = [images.shrunk(i, divisor) for i in looked_at]
+        shown = [images.downscaled(i, divisor) for i in looked_at]
         sure = SURELY_MOVING * model.motion_threshold
         return still_errors(gaussians_at, shown, options, background, shader, sure)
 

@@ -59,7 +59,7 @@ def still_errors(
     ``USUAL`` quantile of e_vi over images in which a Gaussian shows. Else the rendering is expected,
     and both are the mean, weighted by sum_p w_vip: a still model that is not yet right errs too.
     """
-    masked = [x for x in images if x.moves is not None]
+    masked = [x for x in images if x.motion_mask is not None]
     expected = {} if masked else _median_images(images, background)
     looked_at = masked or [x for x in images if _camera_key(x) in expected] or images
     found: list[tuple[Tensor, Tensor]] = []
@@ -67,8 +67,8 @@ def still_errors(
         time = image.time or 0.0
         gaussians = gaussians_at(time).detach()
         truth = image.composite(background)
-        if image.moves is not None:
-            error = (2 * sure * image.moves)[..., None].expand_as(truth)
+        if image.motion_mask is not None:
+            error = (2 * sure * image.motion_mask)[..., None].expand_as(truth)
         elif expected:
             error = expected[_camera_key(image)] - truth
         else:

@@ -121,7 +121,9 @@ def images_of_split(
     images = ImageLoader(views, run.config.data)
     found = found_corrections(run_dir, run, capture.splits["train"])
     if found is not None:
-        images.corrected = lambda index, cameras: found.applied_to(images.views[index], cameras)
+        images.camera_correction = lambda index, cameras: found.applied_to(
+            images.views[index], cameras
+        )
     return images
 
 

@@ -14,8 +14,15 @@ import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, printable
-from dyngs.data.geometry import cam_from_opengl, checked_pose, inverse_rigid, pinhole_matrix
-from dyngs.io.fields import entry, float_array, is_number, numbers_of, read_json, require_at_most
+from dyngs.data.geometry import from_opengl_pose, invert_rigid, pinhole_matrix, validate_pose
+from dyngs.io.fields import (
+    as_float_array,
+    is_number,
+    parse_numbers,
+    read_json,
+    require_at_most,
+    require_key,
+)
 
 _MAX_FRAMES = 100_000
 """A longer path is taken for a typing mistake."""
@@ -183,7 +190,7 @@ def _of_nerfstudio(found: dict[str, Any], file: Path) -> dict[str, Any]:
     frames = []
     for i, view in enumerate(views if isinstance(views, list) else []):
         where = f"{file}: camera_path[{i}]"
-        pose = entry(where, view, "camera_to_world")
+        pose = require_key(where, view, "camera_to_world")
         half = math.radians(_number(view, "fov", where, 0.01, 179)) / 2
         frame = {"transform_matrix": pose, "fl_x": 0.5 * height / math.tan(half)}
         frames.append(frame | {"time": view["render_time"]} if "render_time" in view else frame)
@@ -195,11 +202,13 @@ def _frame_of_3dgs(view: object, where: str) -> dict[str, Any]:
     """Return a frame of a cameras.json, which holds places and rotations of cameras in the
     world."""
     pose = np.eye(4)
-    pose[:3, :3] = numbers_of(f"{where}: 'rotation'", entry(where, view, "rotation"), (3, 3))
-    pose[:3, 3] = numbers_of(f"{where}: 'position'", entry(where, view, "position"), (3,))
+    pose[:3, :3] = parse_numbers(
+        f"{where}: 'rotation'", require_key(where, view, "rotation"), (3, 3)
+    )
+    pose[:3, 3] = parse_numbers(f"{where}: 'position'", require_key(where, view, "position"), (3,))
     names = {"w": "width", "h": "height", "fl_x": "fx", "fl_y": "fy"}
-    others = {key: entry(where, view, name) for key, name in names.items()}
-    return {"cam_from_world": inverse_rigid(pose), **others}
+    others = {key: require_key(where, view, name) for key, name in names.items()}
+    return {"cam_from_world": invert_rigid(pose), **others}
 
 
 def _read_pose(frame: object, where: str) -> np.ndarray:
@@ -208,11 +217,11 @@ def _read_pose(frame: object, where: str) -> np.ndarray:
     given = [key for key in ("cam_from_world", "transform_matrix") if key in fields]
     if len(given) != 1:
         raise DyngsError(f"{where} needs exactly one of 'cam_from_world' and 'transform_matrix'")
-    matrix = float_array(fields[given[0]])
+    matrix = as_float_array(fields[given[0]])
     if matrix is not None and matrix.shape in ((12,), (16,)):
         matrix = matrix.reshape(-1, 4)
-    pose, _ = checked_pose(np.zeros(0) if matrix is None else matrix, f"{where}: '{given[0]}'")
-    return cam_from_opengl(pose) if given[0] == "transform_matrix" else pose
+    pose, _ = validate_pose(np.zeros(0) if matrix is None else matrix, f"{where}: '{given[0]}'")
+    return from_opengl_pose(pose) if given[0] == "transform_matrix" else pose
 
 
 def _read_intrinsics(

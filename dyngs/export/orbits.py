@@ -11,14 +11,14 @@ import torch
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.geometry import (
+    cameras_at_poses,
+    estimate_focus,
     fraction_in_front,
     look_at,
-    look_at_point,
     perpendicular,
     pinhole_matrix,
     unit,
     up_direction,
-    with_poses,
     world_from_cam,
 )
 from dyngs.export.camera_paths import CameraPath
@@ -36,7 +36,7 @@ def orbit_path(
     cameras near. A note says so.
     """
     poses = world_from_cam(cameras)
-    center = look_at_point(cameras)
+    center = estimate_focus(cameras)
     up = up_direction(cameras) if up is None else unit(np.asarray(up, np.float64))
     offsets = poses[:, :3, 3] - center
     heights = offsets @ up
@@ -110,7 +110,7 @@ def _on_circle(
 
 
 def _looking_at(cameras: Cameras, eyes: np.ndarray, target: np.ndarray, up: np.ndarray) -> Cameras:
-    return with_poses(cameras, np.stack([look_at(eye, target, up) for eye in eyes]))
+    return cameras_at_poses(cameras, np.stack([look_at(eye, target, up) for eye in eyes]))
 
 
 def spiral_path(cameras: Cameras, num_frames: int, up: np.ndarray | None = None) -> Cameras:
@@ -121,7 +121,7 @@ def spiral_path(cameras: Cameras, num_frames: int, up: np.ndarray | None = None)
     circles, and moves by half its width along the viewing axis.
     """
     centers = world_from_cam(cameras)[:, :3, 3]
-    target = look_at_point(cameras)
+    target = estimate_focus(cameras)
     up = up_direction(cameras) if up is None else up
     middle = centers.mean(axis=0)
     base = look_at(middle, target, up)[:3, :3]
@@ -194,12 +194,12 @@ def path_along(
         seconds = seconds[order]
         if (np.diff(seconds) > 0).all():
             steps = np.linspace(seconds[0], seconds[-1], num_frames)
-            smooth = with_poses(cameras, _smoothed(poses[order], seconds, steps, up))
+            smooth = cameras_at_poses(cameras, _smoothed(poses[order], seconds, steps, up))
             return CameraPath(smooth, times=tuple(steps.tolist()))
     # Distances of these six numbers are those between the images: place, and viewing direction
     # times the distance of what is looked at.
     centers = poses[:, :3, 3]
-    reach = float(np.linalg.norm(centers - look_at_point(cameras), axis=1).mean())
+    reach = float(np.linalg.norm(centers - estimate_focus(cameras), axis=1).mean())
     features = np.concatenate([centers, reach * poses[:, :3, 2]], axis=1)
     # Nine digits of the largest, so that equal poses are equal in any unit of length.
     features = (features / (float(np.abs(features).max()) or 1.0)).round(9)
@@ -209,7 +209,7 @@ def path_along(
     lengths = np.linalg.norm(np.diff(features[visited], axis=0), axis=1)
     way = np.concatenate([[0.0], np.cumsum(lengths)])
     smooth = _smoothed(poses[visited], way, np.linspace(0, way[-1], num_frames), up)
-    return CameraPath(with_poses(cameras, smooth))
+    return CameraPath(cameras_at_poses(cameras, smooth))
 
 
 def _walk(features: np.ndarray) -> np.ndarray:

@@ -39,7 +39,7 @@ def is_archive(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES and path.is_file()
 
 
-def unpacked(path: Path) -> Path:
+def unpack_archive(path: Path) -> Path:
     """Return the folder in the cache with the files of an archive; the same archive is unpacked
     once.
 

@@ -39,26 +39,26 @@ def _set(variable: ContextVar[Any], value: object) -> Iterator[None]:
         variable.reset(token)
 
 
-def staying_within(root: Path, follow_links: bool = False) -> AbstractContextManager[None]:
+def restrict_paths_to(root: Path, follow_links: bool = False) -> AbstractContextManager[None]:
     """Make ``inside`` refuse paths outside ``root`` in the block; nothing is refused if
     ``follow_links``."""
     return _set(_boundary, None if follow_links else (root, os.path.realpath(root)))
 
 
-def following_links_of_runs(allowed: bool) -> AbstractContextManager[None]:
+def allow_run_links(is_allowed: bool) -> AbstractContextManager[None]:
     """Set whether ``data.follow_links`` holds for runs that are opened in the block.
 
     The user decides this on the command line: the config.yaml of a run may be that of a stranger.
     """
-    return _set(_links_of_runs, allowed)
+    return _set(_links_of_runs, is_allowed)
 
 
-def follows_links_of_runs() -> bool:
-    """Return whether the innermost block of ``following_links_of_runs`` allows it."""
+def run_links_allowed() -> bool:
+    """Return whether the innermost block of ``allow_run_links`` allows it."""
     return _links_of_runs.get()
 
 
-def inside(path: Path) -> Path:
+def check_inside(path: Path) -> Path:
     """Return ``path`` if it may be opened; outside a block of ``staying_within`` any path may."""
     boundary = _boundary.get()
     if boundary is not None and not _is_below(real := os.path.realpath(path), boundary[1]):
@@ -70,7 +70,7 @@ def inside(path: Path) -> Path:
     return path
 
 
-def allowed(most: int) -> int:
+def scaled_limit(most: int) -> int:
     """Return ``most`` times the value of the environment variable ``DYNGS_LIMITS``, 1 if it is not
     set."""
     text = os.environ.get(LIMITS_VARIABLE, "1")
@@ -88,12 +88,12 @@ def allowed(most: int) -> int:
 def require_at_most(where: Path | str, amount: int, most: int, what: str) -> None:
     """Check that a file asks for at most ``most`` of ``what`` (plural), a limit that
     ``DYNGS_LIMITS`` may raise."""
-    if amount > most and amount > allowed(most):
+    if amount > most and amount > scaled_limit(most):
         shown = f"{amount:,}" if amount < 10**18 else "over 10^18"
         factor = math.ceil(amount / most) if amount < 10**18 else "N"
         raise DyngsError(
-            f"{where}: asks for {shown} {what}, of which {allowed(most):,} are read at most; if you trust the file, "
-            f"set the environment variable {LIMITS_VARIABLE}={factor}"
+            f"{where}: {shown} {what} exceed the limit of {scaled_limit(most):,}; "
+            f"if you trust the file, set the environment variable {LIMITS_VARIABLE}={factor}"
         )
 
 
@@ -105,10 +105,10 @@ def check_size(path: Path, width: int, height: int, channels: int = 4) -> None:
 
 def max_decoded_mb() -> int:
     """Return the 2^20 bytes that the largest allowed image takes with four channels of floats."""
-    return allowed(MAX_PIXELS) * 16 // 2**20
+    return scaled_limit(MAX_PIXELS) * 16 // 2**20
 
 
-def leaving_links(root: Path) -> list[tuple[Path, str]]:
+def find_escaping_links(root: Path) -> list[tuple[Path, str]]:
     """List links among the first 100,000 entries below ``root`` that lead out of it, with targets;
     none is followed."""
     real = os.path.realpath(root)

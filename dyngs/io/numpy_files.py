@@ -13,8 +13,8 @@ from typing import IO, Any
 import numpy as np
 
 from dyngs.core.errors import DyngsError, reading
-from dyngs.io.containment import check_size, inside
-from dyngs.io.fields import entry, require_at_most
+from dyngs.io.containment import check_inside, check_size
+from dyngs.io.fields import require_at_most, require_key
 
 MOST_BYTES = 1 << 29
 """Limit on the arrays of one file, each number counted as at least 8 bytes; SMPL-X takes half of
@@ -56,7 +56,7 @@ def read_npy(path: Path) -> np.ndarray:
     # NumPy reads the header as Python text; a damaged one raises nearly anything.
     with (
         reading(path, "it must be a NumPy array of numbers; copy it again"),
-        inside(path).open("rb") as file,
+        check_inside(path).open("rb") as file,
     ):
         return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
 
@@ -64,7 +64,7 @@ def read_npy(path: Path) -> np.ndarray:
 def read_map(path: Path, key: str) -> np.ndarray:
     """Read the numbers of a ``.npy``, or the array ``key`` or else the only one of a ``.npz``, as
     float64."""
-    if not inside(path).is_file():
+    if not check_inside(path).is_file():
         raise DyngsError(f"{path}: no such file; restore it or remove it from the capture")
     if path.suffix.lower() != ".npz":
         return read_npy(path)
@@ -80,13 +80,13 @@ def read_npz(
 ) -> dict[str, np.ndarray]:
     """Read the arrays ``keys`` of a ``.npz`` file, and those of ``optional`` that exist; Python
     objects are refused."""
-    if not inside(path).is_file():
+    if not check_inside(path).is_file():
         raise DyngsError(
             f"{path}: no such file; it should hold the body parameters {', '.join(keys)}"
         )
     found = read_arrays(path, lambda names: [name for name in (*keys, *optional) if name in names])
     for key in keys:
-        entry(path, found, key)
+        require_key(path, found, key)
     return found
 
 
@@ -140,7 +140,7 @@ def _hdf5(path: Path, key: str, rows: int | EllipsisType | None) -> Any:
         raise DyngsError(
             f"{path}: HDF5 files need the package h5py; run pip install 'dyngs[people]'"
         ) from None
-    if not inside(path).is_file():
+    if not check_inside(path).is_file():
         raise DyngsError(f"{path}: no such file; restore it")
     advice = f"'{key}' must be a data set in an HDF5 file; copy the file again"
     with reading(path, advice), h5py.File(path, "r") as file:

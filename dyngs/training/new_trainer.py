@@ -6,14 +6,14 @@ from typing import Any
 
 import torch
 
-from dyngs.capture.initial_points import with_first_points
-from dyngs.capture.inspection import before_training
+from dyngs.capture.initial_points import add_initial_points
+from dyngs.capture.inspection import check_before_training
 from dyngs.config import Config, PointsInit, RandomInit
 from dyngs.core.errors import warn
 from dyngs.data.capture import Capture
-from dyngs.data.loader import ImageLoader, usual_threads
+from dyngs.data.loader import ImageLoader, default_decoding_threads
 from dyngs.data.read import read_capture, require_images
-from dyngs.data.scene_space import cube_half_side, outside_of_cube
+from dyngs.data.scene_space import cube_half_side, cube_mismatch_reason
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.start import FirstGaussians, surroundings
@@ -72,7 +72,10 @@ def assemble(
     generator = torch.Generator().manual_seed(config.run.seed)
     if images is None:
         images = ImageLoader(
-            capture.splits["train"], config.data, with_maps=True, decoding_threads=usual_threads()
+            capture.splits["train"],
+            config.data,
+            with_maps=True,
+            decoding_threads=default_decoding_threads(),
         )
     priors = UsedPriors()
     kind = kind_of(config.model)
@@ -103,12 +106,12 @@ def assemble(
         if config.camera.refine == "always":
             refinement = CameraRefinement(views, extent, steps)
             applied_to = refinement.corrections.applied_to
-            images.corrected = lambda index, cameras: applied_to(views[index], cameras)
+            images.camera_correction = lambda index, cameras: applied_to(views[index], cameras)
         robust = None
         may_mask = "train.robust" in kind.uses and not isinstance(kind, Moves)
         if config.train.robust == "always" and may_mask:
             cameras = training_cameras(views, config.data)
-            robust = RobustMasks(images, cameras, steps, images.corrected)
+            robust = RobustMasks(images, cameras, steps, images.camera_correction)
         exposures = None
         if config.train.exposure == "always":
             exposures = ViewExposures(len(images), steps, images)
@@ -153,10 +156,10 @@ def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Cap
     if "init" in kind_of(config.model).uses:
         init = config.init
         if isinstance(init, PointsInit):
-            capture, lines = with_first_points(capture, config.data, init)
+            capture, lines = add_initial_points(capture, config.data, init)
         elif isinstance(init, RandomInit):
             views = capture.splits["train"]
-            why = outside_of_cube(
+            why = cube_mismatch_reason(
                 views, cube_half_side(init.half_extent, views, capture.world_scale)
             )
             lines = (
@@ -164,7 +167,7 @@ def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Cap
                 if why is None
                 else [f"init.kind=random draws points around the origin, but {why}: give auto"]
             )
-    for line in [] if quiet else [*lines, *before_training(capture)]:
+    for line in [] if quiet else [*lines, *check_before_training(capture)]:
         warn(line)
     return capture
 

@@ -17,10 +17,10 @@ from torch import Tensor
 
 from dyngs.api.edit import write_part
 from dyngs.core.errors import DyngsError, counted
-from dyngs.data.geometry import look_at, perpendicular, with_poses
+from dyngs.data.geometry import cameras_at_poses, look_at, perpendicular
 from dyngs.export.edit.crop import Box, held_by
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.io.formats.similarity import UNMOVED, Similarity
+from dyngs.io.formats.similarity import IDENTITY, Similarity
 from dyngs.runs.opened import Opened
 from dyngs.view.layers import Shot, depth_of
 from dyngs.view.views import camera_at, viewpoint_of
@@ -38,7 +38,7 @@ _EDGES = np.array([(a, b) for a, b in combinations(_CORNERS, 2) if np.abs(a - b)
 def world_of(opened: Opened) -> Similarity:
     """Return the way from a scene to the coordinates that `dyngs edit` means: of a file those of
     the file itself."""
-    return UNMOVED if opened.captured is None else opened.world
+    return IDENTITY if opened.captured is None else opened.world
 
 
 def picked(
@@ -57,7 +57,9 @@ def picked(
         return None  # browsers may send anything
     forward = direction / length
     camera = camera_at((1, 0, 0, 0), origin, 2 * math.atan(0.5 * _SIZE * pixel), (_SIZE, _SIZE))
-    camera = with_poses(camera, look_at(origin, origin + forward, perpendicular(forward))[None])
+    camera = cameras_at_poses(
+        camera, look_at(origin, origin + forward, perpendicular(forward))[None]
+    )
     found = depth_of(opened, Shot(camera, shot.time, part=shot.part))
     depth, alpha = (float(x[_SIZE // 2, _SIZE // 2]) for x in found)
     return origin + depth * forward if alpha >= _SOLID else None

@@ -19,9 +19,9 @@ from toy_plugin import installed
 
 from dyngs.api.budget import time as budget_time
 from dyngs.cli import main
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.evaluate.report import evaluate_run
-from dyngs.io.outputs import LOCK_NAME, writing
+from dyngs.io.outputs import LOCK_NAME, lock_folder
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.study import compare
 from dyngs.study.measure import TRUTH
@@ -33,7 +33,7 @@ OPTIONS = ("--steps", "20", "--threads", "1", "init.num_random=100", "--views", 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("captures") / "box"
-    write_still_capture(folder, StillOptions(size=16, num_train=6, num_test=3, samples=1))
+    write_static_capture(folder, StaticOptions(size=16, num_train=6, num_test=3, samples=1))
     return folder
 
 
@@ -269,7 +269,7 @@ def test_wrong_usage_of_tradeoff_ends_in_one_line(
 def test_two_sweeps_do_not_mix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = write_moving_run(tmp_path)
     out = tmp_path / "out"
-    with writing(out):
+    with lock_folder(out):
         assert main(["tradeoff", str(run), "--out", str(out), "--vary", "prune=0.5"]) == 2
         assert [path.name for path in out.iterdir()] == [LOCK_NAME]
     told = capsys.readouterr().err

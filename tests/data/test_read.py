@@ -20,7 +20,7 @@ from tiny_captures import (
 from tiny_priors import with_priors
 
 from dyngs.api.load import read_capture
-from dyngs.capture.inspection import report_on
+from dyngs.capture.inspection import build_report
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data import readers
@@ -129,8 +129,8 @@ def test_times_are_stretched_to_the_span_of_all_splits(blender_root: Path) -> No
         [0.05 * i for i in range(16)]
     )
     assert capture.warnings == ("times run from 0 to 0.06 and were scaled to [0, 1]",)
-    assert (capture.span, capture.seconds) == ((0.0, 0.06), None)
-    assert dict(report_on(capture).facts)["times"] == "17 in 0 to 1 (0 to 0.06 in the files)"
+    assert (capture.file_time_span, capture.seconds) == ((0.0, 0.06), None)
+    assert dict(build_report(capture).facts)["times"] == "17 in 0 to 1 (0 to 0.06 in the files)"
 
 
 def test_frames_of_any_format_with_times(blender_root: Path) -> None:
@@ -206,18 +206,22 @@ def test_maps_come_with_the_image(tmp_path: Path) -> None:
     assert [view.flow_to for view in images.views] == [None, "a", "b"]
     first = images[0]
     second = images[1]
-    assert first.moves is not None
+    assert first.motion_mask is not None
     assert first.depth is not None
-    assert second.moves is not None
+    assert second.motion_mask is not None
     assert second.flow is not None
-    assert first.moves.shape == first.depth.shape == (4, 6)
-    assert (float(first.moves.max()), float(second.moves.min()), float(first.depth.max())) == (
+    assert first.motion_mask.shape == first.depth.shape == (4, 6)
+    assert (
+        float(first.motion_mask.max()),
+        float(second.motion_mask.min()),
+        float(first.depth.max()),
+    ) == (
         0,
         1,
         2,
     )
     torch.testing.assert_close(second.flow, torch.full((4, 6, 2), 2.0))
-    small = second.shrunk(2)
+    small = second.downscaled(2)
     assert small.flow is not None
     assert small.depth is not None
     assert float(small.flow.max()) == 1

@@ -51,8 +51,8 @@ from dyngs.export.splat_files import (
     writing_of,
 )
 from dyngs.gaussians.rendering import render
-from dyngs.io.formats.formats import read_splats, upright, write_splats
-from dyngs.io.formats.similarity import AXES, Similarity, turn_between
+from dyngs.io.formats.formats import orient_to_axis, read_splats, write_splats
+from dyngs.io.formats.similarity import AXES, Similarity, rotation_between
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.gltf import GltfFile
 from dyngs.runs.opened import Captured, Opened, open_run, opened_scene
@@ -130,7 +130,7 @@ def test_up_is_what_the_cameras_or_the_user_say(near: Opened) -> None:
     assert found is not None
     name = next(name for name, axis in AXES.items() if axis == found[0])
     how, line = writing_of(near, "y")
-    assert how.turn == turn_between(found[0], AXES["y"])
+    assert how.turn == rotation_between(found[0], AXES["y"])
     assert f"it was {name} in the capture" in line or name == "y"
     assert "the axes of the capture are kept" in writing_of(near, name)[1]
     lost = replace(near, captured=Captured(near.config.data, DyngsError("gone")))
@@ -138,7 +138,7 @@ def test_up_is_what_the_cameras_or_the_user_say(near: Opened) -> None:
     how, line = writing_of(lost, "y", sh_degree=2)
     assert (how.turn, how.up, how.sh_degree) == ((1.0, 0.0, 0.0, 0.0), None, 2)
     assert "--from-up=AXIS tells it" in line
-    assert writing_of(lost, "y", from_up="z")[0].turn == turn_between(AXES["z"], AXES["y"])
+    assert writing_of(lost, "y", from_up="z")[0].turn == rotation_between(AXES["z"], AXES["y"])
     assert writing_of(lost, "y", "keep", "z")[0].turn == (1.0, 0.0, 0.0, 0.0)
 
 
@@ -159,14 +159,14 @@ def test_edits_of_every_kind_of_scene_are_exact(kind: str) -> None:
 
 
 def test_a_file_drawn_again_is_compared_with_its_run(near: Opened, tmp_path: Path) -> None:
-    for how in (Writing(), Writing(turn_between(AXES["z"], AXES["-y"]), "-y")):
+    for how in (Writing(), Writing(rotation_between(AXES["z"], AXES["-y"]), "-y")):
         written = write_run_splats(near, tmp_path / "a.ply", 0.7, how=how)
         read = read_splats(written.path)
         assert compare_run(near, near.scene, 0.7, written.splat, read) > 80
         # another time is seen as such
         assert compare_run(near, near.scene, 0.0, written.splat, read) < 40
     splat = SplatFile(cloud(300), up="z")
-    exact = write_splats(tmp_path / "a.ply", upright(splat, None, tmp_path / "a.ply"))
+    exact = write_splats(tmp_path / "a.ply", orient_to_axis(splat, None, tmp_path / "a.ply"))
     assert compare_splats(splat, exact) > 80
     assert compare_splats(splat, write_splats(tmp_path / "a.splat", splat)) < 30
 
@@ -302,7 +302,9 @@ def far_capture(still: Path) -> Capture:
     cloud = PointCloud(random.normal(size=(5, 3)), random.integers(0, 255, (5, 3)).astype(np.uint8))
     splits = {**found.splits, "train": tuple(views)}
     offset = np.array([10.0, 0, -20])
-    return replace(found, splits=splits, points=cloud, world_offset=offset, span=(2.0, 4.0))
+    return replace(
+        found, splits=splits, points=cloud, world_offset=offset, file_time_span=(2.0, 4.0)
+    )
 
 
 def test_a_written_capture_is_read_as_it_was(far_capture: Capture, tmp_path: Path) -> None:

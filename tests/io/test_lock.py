@@ -17,7 +17,7 @@ import pytest
 
 from dyngs.core.errors import DyngsError
 from dyngs.io import outputs
-from dyngs.io.outputs import LOCK_NAME, InUseError, make_once, new_folder, writing
+from dyngs.io.outputs import LOCK_NAME, InUseError, atomic_folder, lock_folder, make_once
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 HOLD = "import sys, time; from pathlib import Path; from dyngs.io.outputs import writing\n"
@@ -42,7 +42,7 @@ def test_the_second_is_told_who_holds_it(tmp_path: Path) -> None:
     with (
         _holder(tmp_path / "run") as process,
         pytest.raises(InUseError) as caught,
-        writing(tmp_path / "run"),
+        lock_folder(tmp_path / "run"),
     ):
         raise AssertionError("both have it")
     told = str(caught.value)
@@ -57,7 +57,7 @@ def test_a_killed_owner_frees_it(tmp_path: Path) -> None:
         process.send_signal(signal.SIGKILL)
         process.wait()
         assert json.loads((run / LOCK_NAME).read_text())["pid"] == process.pid
-        with writing(run) as alone:
+        with lock_folder(run) as alone:
             assert alone
             assert json.loads((run / LOCK_NAME).read_text())["pid"] == os.getpid()
     assert not run.exists() or not list(run.iterdir())
@@ -90,14 +90,14 @@ def test_nothing_is_written_through_links_of_a_run(name: str, tmp_path: Path) ->
     (run / name).symlink_to(tmp_path / "precious")
     with (
         pytest.raises(DyngsError, match=rf"{name}: is a link to .*precious, out of .*run"),
-        writing(run),
+        lock_folder(run),
     ):
         pytest.fail("it may be written to")
     assert list((tmp_path / "precious").iterdir()) == []
     (run / name).unlink()
     (run / "own").mkdir()
     (run / name).symlink_to(run / "own")
-    with writing(run):
+    with lock_folder(run):
         pass
 
 
@@ -129,7 +129,7 @@ def _made_by(
 
 def _publish(folder: Path, content: str) -> None:
     """Make the folder in one piece."""
-    with new_folder(folder) as started:
+    with atomic_folder(folder) as started:
         time.sleep(0.2)
         (started / "x.txt").write_text(content)
 

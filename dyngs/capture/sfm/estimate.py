@@ -24,23 +24,23 @@ from dyngs.capture.sfm.colmap import (
     match_listed,
     quiet_colmap,
 )
-from dyngs.capture.sfm.frame_choice import STILL, chosen_frames, measured
-from dyngs.capture.sfm.photos import Photo, copied, gather_photos, lay_out
+from dyngs.capture.sfm.frame_choice import MIN_CAMERA_MOTION, choose_frames, measure_frames
+from dyngs.capture.sfm.photos import Photo, copy_file, gather_photos, prepare_colmap_images
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.images.images import read_header
 from dyngs.data.images.video import (
-    colour_notes,
+    colour_messages,
     frame_seconds,
     probe_video,
     read_frames,
     read_numbered_frames,
 )
-from dyngs.data.readers.transforms import find_masks, mask_of
+from dyngs.data.readers.transforms import find_mask, find_masks
 from dyngs.data.times import write_seconds
-from dyngs.io.containment import inside, staying_within
+from dyngs.io.containment import check_inside, restrict_paths_to
 from dyngs.io.fields import first_few
-from dyngs.io.outputs import new_folder
+from dyngs.io.outputs import atomic_folder
 from dyngs.io.write import write_image
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ _WELL = 30  # matches of a pair that is looked at
 _MOST_FITTED_PAIRS = 2000
 
 
-def agreement(model: pycolmap.Reconstruction, database: Path, longest_side: int) -> float:
+def pose_agreement(model: pycolmap.Reconstruction, database: Path, longest_side: int) -> float:
     """Return the fraction of well matched pairs, of images with a pose, whose verified matches fit
     the poses."""
     import pycolmap
@@ -90,7 +90,7 @@ def agreement(model: pycolmap.Reconstruction, database: Path, longest_side: int)
     return float(np.mean(fits)) if fits else 1.0
 
 
-def angles_deg(model: pycolmap.Reconstruction) -> np.ndarray:
+def triangulation_angles_deg(model: pycolmap.Reconstruction) -> np.ndarray:
     """Return the largest angle under which each of some 2,000 points is seen from two images, in
     degrees."""
     centres = {i: image.projection_center() for i, image in model.images.items() if image.has_pose}
@@ -104,7 +104,7 @@ def angles_deg(model: pycolmap.Reconstruction) -> np.ndarray:
     return np.array(angles)
 
 
-def flat_fraction(database: Path) -> float:
+def homography_fraction(database: Path) -> float:
     """Return the fraction of well matched pairs that a homography explains: all of them where the
     camera only rotated."""
     import pycolmap
@@ -187,8 +187,8 @@ def estimate_poses(
     if options.masks is not None and not options.masks.is_dir():
         raise DyngsError(f"no such folder of masks: {options.masks}")
     with (
-        new_folder(out) as capture,
-        staying_within(source, options.follow_links or source.is_file()),
+        atomic_folder(out) as capture,
+        restrict_paths_to(source, options.follow_links or source.is_file()),
     ):
         return _posed_in(capture, source, out, options, report)
 
@@ -206,16 +206,16 @@ def _posed_in(
         raise DyngsError(f"{found}; structure from motion needs at least 3, better 30")
     with quiet_colmap():
         masks = options.masks
-        with nullcontext() if masks is None else staying_within(masks, options.follow_links):
+        with nullcontext() if masks is None else restrict_paths_to(masks, options.follow_links):
             task = _laid_out(capture, photos, source.is_file(), options, report)
         find_features(task)
         match_pairs(task, pairs_to_match(task))
-        if flat_fraction(task.database) > _FLAT:
+        if homography_fraction(task.database) > _FLAT:
             raise DyngsError(
                 "the images differ only as if the camera rotated on the spot (or all show one flat surface), which "
                 "gives no depth; walk sideways around the scene by about a quarter of its distance, and keep it in view"
             )
-        model = mapped(task)
+        model = run_mapping(task)
     if model is None:
         raise DyngsError(
             f"no poses could be found for {len(task.names)} images: take sharper ones that overlap by two thirds, move "
@@ -241,15 +241,15 @@ def _laid_out(
     work.mkdir()
     found = {} if options.masks is None else find_masks(options.masks)
     masks = {
-        photo.name: mask for photo in photos if (mask := mask_of(photo.source, found)) is not None
+        photo.name: mask for photo in photos if (mask := find_mask(photo.source, found)) is not None
     }
     if options.masks is not None and not masks:
         raise DyngsError(
             f"{options.masks}: no mask is named as an image is (a.jpg.png, a.jpg or a.png for a.jpg)"
         )
-    names = lay_out(photos, folder, work / "images", masks)
+    names = prepare_colmap_images(photos, folder, work / "images", masks)
     for name, mask in masks.items():
-        copied(inside(mask).resolve(), folder.with_name("masks") / (name + mask.suffix))
+        copy_file(check_inside(mask).resolve(), folder.with_name("masks") / (name + mask.suffix))
     used = work / "masks" if masks else None
     return SfmTask(
         work / "database.db", work / "images", names, photos, options, report, is_video, used
@@ -267,7 +267,7 @@ def _require_depth(model: SfmModel, task: SfmTask) -> None:
             "no lens that there can be fits the matches: most of them are probably on something that moves, as a "
             "person who fills much of the images; give masks of it (--masks), or film what stands"
         )
-    angles = angles_deg(model.reconstruction)
+    angles = triangulation_angles_deg(model.reconstruction)
     angle = float(np.median(angles)) if len(angles) else 0.0
     if angle >= _SMALL_ANGLE_DEG:
         return
@@ -311,10 +311,10 @@ def _frames_of(
 
     Two passes, so that only one image is held in memory: the first one measures.
     """
-    measures = measured(read_frames(video))
-    numbers, blurred = chosen_frames(measures, options.num_frames or _NUM_FRAMES)
+    measures = measure_frames(read_frames(video))
+    numbers, blurred = choose_frames(measures, options.num_frames or _NUM_FRAMES)
     reach = measures.away.max(initial=0.0)
-    if len(measures) >= 3 and reach < STILL:
+    if len(measures) >= 3 and reach < MIN_CAMERA_MOTION:
         raise DyngsError(
             f"{video}: the camera stands still (the image moves by {reach:.2%} of its width), which "
             "gives no depth; film while walking sideways around the scene"
@@ -329,7 +329,7 @@ def _frames_of(
     seconds = frame_seconds(video, len(measures))
     write_seconds(capture, {name: seconds[index] for index, name in names.items()})
     notes = [
-        *colour_notes([probe_video(video)]),
+        *colour_messages([probe_video(video)]),
         f"{len(numbers)} of {len(measures)} frames taken, by motion and sharpness",
     ]
     return photos, notes, [names[index] for index in blurred]
@@ -527,7 +527,7 @@ class SfmModel:
         return float(self.reconstruction.compute_mean_reprojection_error())
 
 
-def mapped(task: SfmTask) -> SfmModel | None:
+def run_mapping(task: SfmTask) -> SfmModel | None:
     """Return the model with most images; None where none could be found.
 
     Global mapping for a video and incremental mapping for photos, where it is as fast and
@@ -542,7 +542,7 @@ def mapped(task: SfmTask) -> SfmModel | None:
     return (
         first
         if first is not None and not _needs_more(first, task)
-        else better(first, _found(task, order[1]))
+        else choose_better_model(first, _found(task, order[1]))
     )
 
 
@@ -557,7 +557,7 @@ def _needs_more(model: SfmModel, task: SfmTask) -> bool:
     return bad or model.error_px > GOOD_ERROR_PX * max(task.side, 1000) / 1000
 
 
-def better(first: SfmModel | None, second: SfmModel | None) -> SfmModel | None:
+def choose_better_model(first: SfmModel | None, second: SfmModel | None) -> SfmModel | None:
     """Return the model with more images whose pairs agree, then the clearly smaller error, else the
     first.
 
@@ -593,7 +593,7 @@ def _found(task: SfmTask, mapper: Mapper) -> SfmModel | None:
     if best is None or best.num_reg_images() < 2:
         return None
     task.report("poses, images", best.num_reg_images(), len(task.names))
-    return SfmModel(best, agreement(best, task.database, task.side))
+    return SfmModel(best, pose_agreement(best, task.database, task.side))
 
 
 def _most_images(models: Iterable[pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:

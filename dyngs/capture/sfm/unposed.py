@@ -9,24 +9,24 @@ from pathlib import Path
 
 from dyngs.capture.sfm.colmap import SfmOptions
 from dyngs.capture.sfm.estimate import estimate_poses
-from dyngs.capture.sfm.photos import digest_of, photos_below
+from dyngs.capture.sfm.photos import digest_files, list_photos
 from dyngs.capture.sfm.several_videos import VIDEOS_FILE, poses_of_videos
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, as_word, counted, reading, show
-from dyngs.data.images.video import VIDEO_SUFFIXES, videos_in
+from dyngs.data.images.video import VIDEO_SUFFIXES, list_videos
 from dyngs.data.read import is_capture
-from dyngs.io.outputs import command_for, make_once, note_source
+from dyngs.io.outputs import make_once, record_source, suggest_command
 from dyngs.io.write import cache_folder
 
 FEWEST_PHOTOS = 3
 
 
-def with_poses(
+def ensure_poses(
     data: DataConfig,
     *,
     needs_times: bool = False,
-    say: Callable[[str], None] = show,
+    log: Callable[[str], None] = show,
     report: ReportProgress = report_nothing,
 ) -> DataConfig:
     """Return the options with a capture that has poses as their folder: the same one, unless it has
@@ -44,7 +44,7 @@ def with_poses(
     if not is_unposed(data):
         return data
     source = data.root / "images" if (data.root / "images").is_dir() else data.root
-    videos = videos_in(source) if is_several_videos(source) else []
+    videos = list_videos(source) if is_several_videos(source) else []
     if videos and not needs_times:
         raise DyngsError(
             f"{source}: holds {len(videos)} videos, which a static scene cannot be made of; give `dyngs train dynamic "
@@ -60,21 +60,21 @@ def with_poses(
     )
     beside = data.root / "masks"
     masks = beside if source != data.root and beside.is_dir() else None
-    digest = digest_of(source, files) + ("" if masks is None else digest_of(masks))
+    digest = digest_files(source, files) + ("" if masks is None else digest_files(masks))
     folder = cache_folder("poses") / f"{re.sub(r'[^A-Za-z0-9-]', '_', source.stem)[:40]}.{digest}"
 
     def estimate() -> None:
-        say(
+        log(
             f"{source} has no poses; they are estimated first, as by `dyngs data sfm`, into {folder}"
         )
         options = SfmOptions(masks=masks, follow_links=data.follow_links)
         if videos:
-            say(poses_of_videos(source, folder, options, report))
+            log(poses_of_videos(source, folder, options, report))
         else:
-            say(estimate_poses(source, folder, options, report).summary())
+            log(estimate_poses(source, folder, options, report).summary())
 
-    make_once(folder, estimate, say, f"{source} has no poses; those of before are in {folder}")
-    note_source(folder, data.root)
+    make_once(folder, estimate, log, f"{source} has no poses; those of before are in {folder}")
+    record_source(folder, data.root)
     return data.model_copy(update={"root": folder})
 
 
@@ -91,10 +91,12 @@ def is_unposed(data: DataConfig) -> bool:
         return False
     if _holds_photos(root):
         return True
-    videos = videos_in(root)
+    videos = list_videos(root)
     if len(videos) == 1:
         raise DyngsError(f"{root}: holds one video; give that: data.root={as_word(videos[0])}")
-    photos = [] if videos or command_for(root, captures=False) is not None else photos_below(root)
+    photos = (
+        [] if videos or suggest_command(root, captures=False) is not None else list_photos(root)
+    )
     if photos:
         raise DyngsError(
             f"{root}: holds {counted(len(photos), 'photo')} and no cameras; a scene needs at least {FEWEST_PHOTOS} "
@@ -105,7 +107,7 @@ def is_unposed(data: DataConfig) -> bool:
 
 def is_several_videos(source: Path) -> bool:
     """Whether ``source`` is a folder of two videos or more, and not of photos."""
-    return source.is_dir() and not _holds_photos(source) and len(videos_in(source)) > 1
+    return source.is_dir() and not _holds_photos(source) and len(list_videos(source)) > 1
 
 
 def is_videos(source: Path) -> bool:
@@ -117,10 +119,10 @@ def is_videos(source: Path) -> bool:
         source.is_dir()
         and not is_capture(source)
         and not _holds_photos(source)
-        and bool(videos_in(source))
+        and bool(list_videos(source))
     )
 
 
 def _holds_photos(folder: Path) -> bool:
     with reading(folder, "choose another folder or change its permissions"):
-        return len(photos_below(folder)) >= FEWEST_PHOTOS
+        return len(list_photos(folder)) >= FEWEST_PHOTOS

@@ -13,8 +13,8 @@ from torch import Tensor
 from dyngs.core.errors import DyngsError, reading
 from dyngs.data.capture import Silhouette, View
 from dyngs.data.images.images import read_image, read_raw
-from dyngs.data.images.lens import LensMap, undistorted_points
-from dyngs.io.containment import check_size, inside
+from dyngs.data.images.lens import LensMap, undistort_points
+from dyngs.io.containment import check_inside, check_size
 from dyngs.io.numpy_files import read_hdf5, read_map
 
 MILLIMETRE = 1e-3  # unit of maps in whole numbers, as in nerfstudio
@@ -76,7 +76,7 @@ def read_flow(path: Path) -> Tensor:
 
 def _read_flo(path: Path) -> np.ndarray:
     """Read width, height and float32 displacements, little endian, row by row."""
-    if not inside(path).is_file():
+    if not check_inside(path).is_file():
         raise DyngsError(f"{path}: no such flow field; restore it or remove it from the capture")
     with (
         reading(path, "it must be a .flo file of Middlebury; export it again"),
@@ -94,7 +94,7 @@ MASKS = "masks"
 """Name of the data set of masks in an HDF5 file."""
 
 
-def cut_out(pixels: Tensor, silhouette: Silhouette) -> Tensor:
+def apply_silhouette(pixels: Tensor, silhouette: Silhouette) -> Tensor:
     """Return the (H, W, 4) uint8 image of the person alone, straight alpha, from ``pixels`` (H, W,
     3 or 4) uint8."""
     alpha = _read_alpha(silhouette)
@@ -149,10 +149,10 @@ def nearest_positions(width: int, height: int, grid: Tensor | None = None) -> Te
     """
     x, y = ((2 * torch.arange(n, device="cpu") + 1) / n - 1 for n in (width, height))
     positions = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
-    return positions if grid is None else taken_at(grid, positions)
+    return positions if grid is None else sample_nearest(grid, positions)
 
 
-def taken_at(values: Tensor, positions: Tensor) -> Tensor:
+def sample_nearest(values: Tensor, positions: Tensor) -> Tensor:
     """Return the (H, W, D) nearest of the ``values`` (h, w, D) at ``positions`` (H, W, 2) in [-1,
     1]."""
     size = values.new_tensor([values.shape[1], values.shape[0]])
@@ -161,11 +161,11 @@ def taken_at(values: Tensor, positions: Tensor) -> Tensor:
     return values[y, x]
 
 
-def resized(flow: Tensor, width: int, height: int) -> Tensor:
+def resize_flow(flow: Tensor, width: int, height: int) -> Tensor:
     """Return the (height, width, 2) flow of a smaller image, in its pixels, from ``flow`` (H, W,
     2)."""
     scale = flow.new_tensor([width / flow.shape[1], height / flow.shape[0]])
-    return taken_at(flow, nearest_positions(width, height)) * scale
+    return sample_nearest(flow, nearest_positions(width, height)) * scale
 
 
 def flow_at(flow: Tensor, view: View, size: tuple[int, int], lens_map: LensMap | None) -> Tensor:
@@ -176,9 +176,9 @@ def flow_at(flow: Tensor, view: View, size: tuple[int, int], lens_map: LensMap |
     no such pixel.
     """
     if lens_map is None:
-        return resized(flow, *size)
+        return resize_flow(flow, *size)
     stored = flow.new_tensor([view.width, view.height])
     start = (nearest_positions(view.width, view.height) + 1) / 2 * stored
     at = (lens_map.grid + 1) / 2 * stored
-    end = undistorted_points(view.lens, view.intrinsics, at + taken_at(flow, lens_map.grid))
-    return resized(torch.where(lens_map.valid[..., None], end - start, torch.nan), *size)
+    end = undistort_points(view.lens, view.intrinsics, at + sample_nearest(flow, lens_map.grid))
+    return resize_flow(torch.where(lens_map.valid[..., None], end - start, torch.nan), *size)

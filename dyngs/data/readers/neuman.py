@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from dyngs.core.errors import DyngsError, reading
-from dyngs.data.body_frames import body_frames, number_in_name, of_one_clip
+from dyngs.data.body_frames import build_body_frames, parse_frame_number, share_body_across_splits
 from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette, Splits, View
-from dyngs.data.geometry import checked_pose
+from dyngs.data.geometry import validate_pose
 from dyngs.data.readers.colmap import is_colmap, read_colmap
 from dyngs.data.readers.transforms import SPLITS
-from dyngs.io.containment import inside
-from dyngs.io.fields import entry, first_few, numbers_of, read_limited
+from dyngs.io.containment import check_inside
+from dyngs.io.fields import first_few, parse_numbers, read_limited, require_key
 from dyngs.io.numpy_files import read_npz
 from dyngs.io.pickles import read_pickle, read_pickled_array
 
@@ -39,7 +39,7 @@ def read_neuman(root: Path) -> Capture:
     capture = read_colmap(root)
     posed = sorted(capture.splits["train"], key=lambda view: view.image_path.name)
     names = [view.image_path.name for view in posed]
-    numbers = [number_in_name(root / "images", name) for name in names]
+    numbers = [parse_frame_number(root / "images", name) for name in names]
     first = min(numbers, default=0)
     last = max(numbers, default=0)
     people: dict[str, View] = {}
@@ -58,7 +58,9 @@ def read_neuman(root: Path) -> Capture:
         with reading(path, "it must hold a row for each posed image"):
             parts = [found[key].reshape(len(names), -1) for key in ("global_orient", "body_pose")]
             poses = np.concatenate(parts, axis=1)
-        body = body_frames(path, numbers, poses, found["transl"], found["betas"], found["scale"])
+        body = build_body_frames(
+            path, numbers, poses, found["transl"], found["betas"], found["scale"]
+        )
     else:
         body = _fitted(root, names, numbers)
     without = [name for name, view in people.items() if view.silhouette is None]
@@ -68,7 +70,7 @@ def read_neuman(root: Path) -> Capture:
     splits, more = _splits(root, people)
     warnings = (*capture.warnings, *notes, *more)
     return capture.replace(
-        format="neuman", splits=splits, body=of_one_clip(body), warnings=warnings
+        format="neuman", splits=splits, body=share_body_across_splits(body), warnings=warnings
     )
 
 
@@ -79,26 +81,26 @@ def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
 
     path = next((root / name for name in FITS if (root / name).is_file()), root / FITS[0])
     with reading(path, "it must hold the body parameters of one person"):
-        fits: Any = read_pickle(inside(path))
+        fits: Any = read_pickle(check_inside(path))
         (fit,) = fits.values()
         poses = fit["pose"]
         betas = fit["betas"]
-    alignments = read_pickled_array(inside(root / ALIGNMENTS))
+    alignments = read_pickled_array(check_inside(root / ALIGNMENTS))
     scales = []
     turns = []
     trans = []
     for name in names:
         where = f"{root / ALIGNMENTS}, {name}"
-        matrix = numbers_of(where, entry(root / ALIGNMENTS, alignments, name), (4, 3)).T
+        matrix = parse_numbers(where, require_key(root / ALIGNMENTS, alignments, name), (4, 3)).T
         scale = float(np.cbrt(np.linalg.det(matrix[:, :3])))
         if scale <= 0:
             raise DyngsError(f"{where}: the alignment is no similarity; export it again")
         rigid = np.concatenate([matrix[:, :3] / scale, matrix[:, 3:]], axis=1)
-        pose, _ = checked_pose(rigid, where)
+        pose, _ = validate_pose(rigid, where)
         scales.append(scale)
         turns.append(Rotation.from_matrix(pose[:3, :3]).as_rotvec())
         trans.append(pose[:3, 3])
-    return body_frames(path, numbers, poses, trans, betas, np.array(scales), turns)
+    return build_body_frames(path, numbers, poses, trans, betas, np.array(scales), turns)
 
 
 def _splits(root: Path, people: dict[str, View]) -> tuple[Splits, list[str]]:
@@ -110,7 +112,7 @@ def _splits(root: Path, people: dict[str, View]) -> tuple[Splits, list[str]]:
         if not path.is_file():
             continue
         with reading(path, "it lists names of images, one a line"):
-            listed = list(dict.fromkeys(read_limited(inside(path)).decode().split()))
+            listed = list(dict.fromkeys(read_limited(check_inside(path)).decode().split()))
         unposed += [name for name in listed if name not in people]
         splits[split] = tuple(people[name] for name in listed if name in people)
     if "train" not in splits:

@@ -15,11 +15,11 @@ import numpy as np
 
 from dyngs.core.errors import DyngsError, counted, reading
 from dyngs.data.capture import Capture, CaptureFormat, PointCloud
-from dyngs.data.geometry import OPENGL_FROM_OPENCV, opengl_from_cam
-from dyngs.data.images.images import SUFFIXES, files_in, read_header
+from dyngs.data.geometry import OPENGL_FROM_OPENCV, to_opengl_pose
+from dyngs.data.images.images import SUFFIXES, list_files, read_header
 from dyngs.data.readers.transforms import FrameEntry, FrameFile, training_capture
-from dyngs.io.containment import inside
-from dyngs.io.fields import entry, first_few, numbers_of, read_json_object
+from dyngs.io.containment import check_inside
+from dyngs.io.fields import first_few, parse_numbers, read_json_object, require_key
 
 _HEAD_BYTES = 4096
 _ADVICE = "export it again"
@@ -78,7 +78,7 @@ def _capture(
 def _exports(root: Path, suffix: str, mark: bytes) -> list[Path]:
     """Return the files of a program: those with ``mark`` in their beginning."""
     found: list[Path] = []
-    for path in files_in(root, (suffix,)):
+    for path in list_files(root, (suffix,)):
         with path.open("rb") as file:
             if mark in file.read(_HEAD_BYTES):
                 found.append(path)
@@ -88,7 +88,7 @@ def _exports(root: Path, suffix: str, mark: bytes) -> list[Path]:
 def _only(files: Sequence[Path]) -> Path:
     if len(files) > 1:
         raise DyngsError(f"{files[0]} and {files[1].name} both hold cameras; move one elsewhere")
-    return inside(files[0])
+    return check_inside(files[0])
 
 
 def _radial(coefficients: Sequence[float]) -> _Fields:
@@ -279,7 +279,7 @@ def read_odm(root: Path) -> Capture:
     points = None
     warnings: list[str] = []
     with reading(path, _ADVICE):
-        content = json.loads(inside(path).read_text(encoding="utf-8-sig"))
+        content = json.loads(check_inside(path).read_text(encoding="utf-8-sig"))
         if path.suffix == ".json":
             model = max(content, key=lambda model: len(model["shots"]))
             if len(content) > 1:
@@ -293,10 +293,10 @@ def read_odm(root: Path) -> Capture:
                 for point in model.get("points", {}).values()
             ]
             if listed:
-                table = numbers_of(f"{path}: points", listed, (len(listed), 6))
+                table = parse_numbers(f"{path}: points", listed, (len(listed), 6))
                 points = PointCloud(table[:, :3], table[:, 3:].clip(0, 255).astype(np.uint8))
         else:
-            lenses = json.loads(inside(root / "cameras.json").read_text(encoding="utf-8-sig"))
+            lenses = json.loads(check_inside(root / "cameras.json").read_text(encoding="utf-8-sig"))
             shots = {
                 feature["properties"]["filename"]: feature["properties"]
                 for feature in content["features"]
@@ -341,7 +341,7 @@ def _odm_camera(path: Path, name: str, shot: _Fields, lenses: dict[str, _Fields]
     pose[:3, 3] = shot["translation"]
     if path.suffix == ".geojson":
         pose[:3, 3] = -pose[:3, :3] @ pose[:3, 3]
-    return {**own, **distortion, "transform_matrix": opengl_from_cam(pose).tolist()}
+    return {**own, **distortion, "transform_matrix": to_opengl_pose(pose).tolist()}
 
 
 ODM_FORMAT = CaptureFormat(
@@ -375,15 +375,16 @@ def read_polycam(root: Path) -> Capture:
     """
     images, cameras = _existing(root, _POLYCAM)[0]
     frames: list[FrameEntry] = []
-    for image in files_in(images, SUFFIXES):
+    for image in list_files(images, SUFFIXES):
         path = cameras / f"{image.stem}.json"
         fields = read_json_object(path)
         own: dict[str, object] = {
-            key: entry(path, fields, name) for key, name in _INTRINSICS.items()
+            key: require_key(path, fields, name) for key, name in _INTRINSICS.items()
         }
         own |= _depth_of(root / "keyframes" / "depth" / f"{image.stem}.png")
         own["transform_matrix"] = [
-            [entry(path, fields, f"t_{row}{column}") for column in range(4)] for row in range(3)
+            [require_key(path, fields, f"t_{row}{column}") for column in range(4)]
+            for row in range(3)
         ]
         frames.append(FrameEntry(str(path), own | {"file_path": str(image)}, image=image))
     return training_capture(root, "polycam", FrameFile(root / "keyframes", frames))
@@ -400,7 +401,7 @@ def _existing(root: Path, places: Sequence[tuple[str, str]]) -> list[tuple[Path,
     return [
         (images, cameras)
         for images, cameras in pairs
-        if cameras.exists() and files_in(images, SUFFIXES)
+        if cameras.exists() and list_files(images, SUFFIXES)
     ]
 
 
@@ -423,14 +424,16 @@ def read_record3d(root: Path) -> Capture:
 
     images, path = _existing(root, _RECORD3D)[0]
     fields = read_json_object(path)
-    poses = numbers_of(f"{path}: poses", entry(path, fields, "poses"), None).reshape(-1, 7)
-    fx, _, _, _, fy, _, cx, cy, _ = numbers_of(f"{path}: K", entry(path, fields, "K"), (9,))
+    poses = parse_numbers(f"{path}: poses", require_key(path, fields, "poses"), None).reshape(-1, 7)
+    fx, _, _, _, fy, _, cx, cy, _ = parse_numbers(
+        f"{path}: K", require_key(path, fields, "K"), (9,)
+    )
     lenses = np.tile((fx, fy, cx, cy), (len(poses), 1))
     own_lenses = fields.get("perFrameIntrinsicCoeffs")
     if own_lenses:
-        lenses = numbers_of(f"{path}: perFrameIntrinsicCoeffs", own_lenses, (len(poses), 4))
+        lenses = parse_numbers(f"{path}: perFrameIntrinsicCoeffs", own_lenses, (len(poses), 4))
     frames: list[FrameEntry] = []
-    for image in files_in(images, SUFFIXES):
+    for image in list_files(images, SUFFIXES):
         if not image.stem.isdecimal():  # a copy, such as "12(1).jpg"
             continue
         number = int(image.stem)

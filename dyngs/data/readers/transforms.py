@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from dyngs.core.errors import DyngsError, reading
-from dyngs.data.body_frames import read_body_file, rows_of
+from dyngs.data.body_frames import match_frames, read_body_file
 from dyngs.data.capture import (
     BodyFrames,
     Capture,
@@ -27,21 +27,21 @@ from dyngs.data.capture import (
     VideoFrame,
     View,
     all_views,
-    each_view,
+    map_views,
 )
 from dyngs.data.geometry import (
     MAX_SIDE,
-    cam_from_opengl,
-    checked_pose,
-    match_size,
+    from_opengl_pose,
+    match_intrinsics_to_image,
     pinhole_matrix,
     repair_warning,
     rescale_warning,
+    validate_pose,
 )
-from dyngs.data.images.images import SUFFIXES, ImageHeader, header_if_readable, read_header
-from dyngs.io.containment import inside
-from dyngs.io.fields import is_number, matrix_of, read_json_object
-from dyngs.io.find import FileFinder, folded
+from dyngs.data.images.images import SUFFIXES, ImageHeader, read_header, try_read_header
+from dyngs.io.containment import check_inside
+from dyngs.io.fields import is_number, parse_matrix, read_json_object
+from dyngs.io.find import FileFinder, normalize_name
 
 GREY = 128
 _NAMES = (
@@ -174,7 +174,7 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
             f"{file.path}: {twice[0]} is listed more than once; remove the duplicate frames"
         )
     headers = [
-        header_if_readable(path) if frame.video is None else None
+        try_read_header(path) if frame.video is None else None
         for frame, path in zip(file.frames, paths, strict=True)
     ]
     # images without a size of their own share the focal length of the file
@@ -190,7 +190,7 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
     return _with_flow_targets(views), repair_warning(repaired) + rescale_warning(rescaled)
 
 
-def tracks_path_of(file: FrameFile) -> Path | None:
+def find_tracks_file(file: FrameFile) -> Path | None:
     """Return the file of 2D tracks that ``tracks_file_path`` names, None without one."""
     frame = FrameEntry(str(file.path), {}, file.fields)
     return _named_file(FileFinder(file.path.parent), frame, "tracks_file_path")
@@ -213,17 +213,17 @@ def _view(
     """Return a view, by how much its rotation was repaired, and whether its intrinsics were
     rescaled."""
     described = _described_size(frame)
-    stored = header.size_for(described) if header else frame.stored
+    stored = header.size_matching(described) if header else frame.stored
     described = described or stored or common
     if described is None:
         described = read_header(path).upright_size  # raises the error
-    intrinsics, size, rescaled = match_size(
+    intrinsics, size, rescaled = match_intrinsics_to_image(
         _intrinsics(frame, *described), described, stored, frame.where
     )
     if frame.own.get("transform_matrix") is None:
         raise DyngsError(f"{frame.where}: the key 'transform_matrix' is missing")
-    matrix = matrix_of(frame.where, "transform_matrix", frame.own["transform_matrix"])
-    pose, error = checked_pose(matrix, frame.where)
+    matrix = parse_matrix(frame.where, "transform_matrix", frame.own["transform_matrix"])
+    pose, error = validate_pose(matrix, frame.where)
     motion_mask = _named_file(files, frame, "motion_mask_path")
     labels = _named_file(files, frame, "instance_mask_path")
     silhouette = _named_file(files, frame, "silhouette_path")
@@ -231,7 +231,7 @@ def _view(
     view = View(
         name=view_name(path, files.root),
         image_path=path,
-        cam_from_world=cam_from_opengl(pose),
+        cam_from_world=from_opengl_pose(pose),
         intrinsics=intrinsics,
         width=size[0],
         height=size[1],
@@ -394,7 +394,7 @@ def find_points(file: FrameFile) -> tuple[PointCloud | None, Path | None, list[s
     root = file.path.parent
     written = file.fields.get(KEY)
     if isinstance(written, str) and written:
-        path = inside(FileFinder(root).find(written))
+        path = check_inside(FileFinder(root).find(written))
         return read_points(path), path, []
     usual = [root / name for name in USUAL_NAMES if (root / name).is_file()]
     there = [path for path in root.iterdir() if path.suffix.lower() == ".ply" and path.is_file()]
@@ -402,7 +402,7 @@ def find_points(file: FrameFile) -> tuple[PointCloud | None, Path | None, list[s
         return None, None, []
     path = (usual or there)[0]
     try:
-        points = read_points(inside(path))
+        points = read_points(check_inside(path))
     except DyngsError as error:
         return None, None, [f"not used as points: {error}"]
     return (points, path, []) if len(points.xyz) else (None, None, [])
@@ -432,23 +432,23 @@ def read_points(path: Path) -> PointCloud:
 def find_masks(folder: Path) -> dict[str, Path]:
     """Map paths below ``folder``, ``folded``, with and without the last extension, to masks."""
     found: dict[str, Path] = {}
-    for path in sorted(inside(folder).rglob("*")) if folder.is_dir() else ():
+    for path in sorted(check_inside(folder).rglob("*")) if folder.is_dir() else ():
         if path.suffix.lower() in SUFFIXES:
             relative = path.relative_to(folder)
-            found[folded(relative.as_posix())] = path
-            found.setdefault(folded(relative.with_suffix("").as_posix()), path)
+            found[normalize_name(relative.as_posix())] = path
+            found.setdefault(normalize_name(relative.with_suffix("").as_posix()), path)
     return found
 
 
-def mask_of(image_name: str, masks: Mapping[str, Path]) -> Path | None:
+def find_mask(image_name: str, masks: Mapping[str, Path]) -> Path | None:
     """Find the mask of ``a/b.jpg``: ``a/b.jpg.png`` or the like, else ``a/b.jpg``, ``a/b.png`` or
     ``a/b.mask.png``."""
     stem = image_name.rpartition(".")[0]
     names = (f"{image_name}.png", image_name, stem, f"{stem}.mask")
-    return next((masks[key] for name in names if (key := folded(name)) in masks), None)
+    return next((masks[key] for name in names if (key := normalize_name(name)) in masks), None)
 
 
-def unmasked_warning(views: list[View], has_masks: bool) -> list[str]:
+def missing_mask_warning(views: list[View], has_masks: bool) -> list[str]:
     """Return a line about the images that have no mask although others have, none if there are
     none."""
     without = [view.name for view in views if view.mask_path is None]
@@ -493,19 +493,19 @@ def _with_masks(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
 
     def with_mask(view: View) -> View:
         found = (
-            mask_of(os.path.relpath(view.image_path, folder), masks) for folder in (images, root)
+            find_mask(os.path.relpath(view.image_path, folder), masks) for folder in (images, root)
         )
         return replace(view, mask_path=next(filter(None, found), None))
 
-    splits = each_view(splits, with_mask)
-    return splits, unmasked_warning(all_views(splits), bool(masks))
+    splits = map_views(splits, with_mask)
+    return splits, missing_mask_warning(all_views(splits), bool(masks))
 
 
 def _capture_of(
     root: Path, format: str, file: FrameFile, splits: Splits, warnings: list[str]
 ) -> Capture:
     points, path, notes = find_points(file)
-    tracks = tracks_path_of(file)
+    tracks = find_tracks_file(file)
     lines = (*warnings, *notes)
     return Capture(
         root, format, splits, points, path, fps=file.fps, tracks_path=tracks, warnings=lines
@@ -615,7 +615,7 @@ def _body_of(root: Path, split: Split, views: tuple[View, ...], train: BodyFrame
             f"{path}: no such file; transforms_pose.json shows another clip, which needs its own parameters"
         )
     body = read_body_file(path) if path.is_file() and split != "train" else train
-    rows_of(path if path.is_file() else root / "body_train.npz", body, views)
+    match_frames(path if path.is_file() else root / "body_train.npz", body, views)
     return body
 
 

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from dyngs.core.conventions import srgb_encoded
 from dyngs.core.errors import DyngsError
 from dyngs.data.tracks import TrueTracks, write_true_tracks
-from dyngs.io.outputs import new_folder
+from dyngs.io.outputs import atomic_folder
 from dyngs.io.write import write_image, write_text
 
 CAMERA_ANGLE_X = 0.6911112070083618
@@ -35,7 +35,9 @@ _LAMP_SIZE = 0.9
 _SKY = (0.46, 0.50, 0.56)
 _GROUND = (0.20, 0.17, 0.15)
 _LAMPLIGHT = (0.80, 0.74, 0.66)
-_SURFACE = 3e-3  # world units by which a surface may seem to lie before one of its own points
+_SURFACE_TOLERANCE = (
+    3e-3  # world units by which a surface may seem to lie before one of its own points
+)
 
 
 @dataclass(frozen=True)
@@ -62,11 +64,11 @@ class PaintedBall:
         """(R, 3) surface points in the paint's axes."""
         return self.normals(points) @ f32(self.turn)
 
-    def placed(self, local: np.ndarray) -> np.ndarray:
+    def to_world(self, local: np.ndarray) -> np.ndarray:
         """(R, 3) surface points, of those in the paint's axes: the inverse of ``local``."""
         return np.float32(self.radius) * local @ f32(self.turn).T + f32(self.center)
 
-    def sampled(self, count: int, random: np.random.Generator) -> np.ndarray:
+    def sample_surface(self, count: int, random: np.random.Generator) -> np.ndarray:
         """(R, 3) points spread evenly over the surface, in the paint's axes."""
         return _unit(random.normal(size=(count, 3))).astype(np.float32)
 
@@ -114,10 +116,10 @@ class PaintedBox:
         turned = (points - f32(self.center)) @ self._axes().T
         return turned / f32(self.half_extents)
 
-    def placed(self, local: np.ndarray) -> np.ndarray:
+    def to_world(self, local: np.ndarray) -> np.ndarray:
         return (local * f32(self.half_extents)) @ self._axes() + f32(self.center)
 
-    def sampled(self, count: int, random: np.random.Generator) -> np.ndarray:
+    def sample_surface(self, count: int, random: np.random.Generator) -> np.ndarray:
         half = np.asarray(self.half_extents)
         areas = half.prod() / half
         local = random.uniform(-1.0, 1.0, (count, 3))
@@ -147,18 +149,18 @@ class Scene:
     """Primitives, z up, lit by a sky and one square lamp, whose size softens the shadows.
 
     Attributes:
-        faint: a neighbour that hides no more than this fraction of a point's sky hides nothing,
+        occlusion_threshold: a neighbour that hides no more than this fraction of a point's sky hides nothing,
             which leaves what is far from a moving thing exactly as it is.
         num_static: the first so many primitives stand still; None: all do.
     """
 
     primitives: tuple[Primitive, ...]
     lamp: tuple[float, float, float] = (2.2, -2.6, 4.4)
-    faint: float = 0.0
+    occlusion_threshold: float = 0.0
     num_static: int | None = None
 
     @property
-    def movers(self) -> range:
+    def moving_indices(self) -> range:
         """Indices of the primitives that move."""
         return range(
             len(self.primitives) if self.num_static is None else self.num_static,
@@ -191,7 +193,7 @@ def render_scene(
     return (rgba * 255.0 + 0.5).astype(np.uint8).reshape(size, size, 4)
 
 
-def render_things(
+def render_motion_labels(
     scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3
 ) -> np.ndarray:
     """(size, size) uint8: which thing that moves a pixel of ``render_scene`` shows, 1 the first; 0
@@ -200,23 +202,23 @@ def render_things(
     Of several in one pixel the one that most samples see; light does not count.
     """
     directions = sampled_rays(world_from_cam, size, samples).reshape(-1, 3)
-    nearest, distance = nearest_things(scene, f32(world_from_cam[:3, 3]), directions)
+    nearest, distance = nearest_primitives(scene, f32(world_from_cam[:3, 3]), directions)
     things = np.where(np.isfinite(distance), nearest, -1).reshape(samples**2, -1)
     nothing = np.zeros(size * size, np.int64)
-    counts = [nothing, *((things == index).sum(axis=0) for index in scene.movers)]
+    counts = [nothing, *((things == index).sum(axis=0) for index in scene.moving_indices)]
     return np.argmax(counts, axis=0).astype(np.uint8).reshape(size, size)
 
 
-def is_seen(scene: Scene, points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
+def is_visible(scene: Scene, points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
     """(R,) bool: points (R, 3) on surfaces that a camera sees, somewhere in its image or not."""
     origin = world_from_cam[:3, 3]
     offset = points - origin
     distance = np.sqrt(_dot(offset, offset))
-    _, nearest = nearest_things(scene, f32(origin), f32(offset / distance[:, None]))
-    return nearest > distance - _SURFACE
+    _, nearest = nearest_primitives(scene, f32(origin), f32(offset / distance[:, None]))
+    return nearest > distance - _SURFACE_TOLERANCE
 
 
-def nearest_things(
+def nearest_primitives(
     scene: Scene, origin: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return, per ray, the primitive that it hits first and the distance to it, inf where it hits
@@ -233,7 +235,7 @@ def trace(
 
     The lamp is at a place (R, 3) of its own for each ray.
     """
-    nearest, distance = nearest_things(scene, origin, directions)
+    nearest, distance = nearest_primitives(scene, origin, directions)
     hit = np.flatnonzero(np.isfinite(distance))
     points = origin + distance[hit, None] * directions[hit]
     rgb = np.zeros((len(hit), 3), np.float32)
@@ -262,8 +264,8 @@ def _shade(
     open_sky = np.ones(len(points), np.float32)
     for other in scene.primitives:
         if other is not primitive:
-            hidden = np.maximum(other.occlusion(points, normals) - scene.faint, 0.0)
-            open_sky *= 1.0 - hidden / (1.0 - scene.faint)
+            hidden = np.maximum(other.occlusion(points, normals) - scene.occlusion_threshold, 0.0)
+            open_sky *= 1.0 - hidden / (1.0 - scene.occlusion_threshold)
             seen = np.flatnonzero(lit)
             lit[seen] = np.isinf(other.intersect(above[seen], to_lamp[seen]))
     upward = (0.5 + 0.5 * normals[:, 2:]).astype(np.float32)
@@ -306,8 +308,8 @@ SceneName = Literal["spin", "room", "roll"]
 
 Rgb = tuple[float, float, float]
 
-_FAINT = 0.05
-"""``Scene.faint`` of the moving scenes: a ball occludes the sky for what is nearer than about four
+_OCCLUSION_THRESHOLD = 0.05
+"""``Scene.occlusion_threshold`` of the moving scenes: a ball occludes the sky for what is nearer than about four
 radii."""
 
 _PLATE_TOP = -0.34
@@ -379,7 +381,7 @@ def _spin(time: float) -> Scene:
                 turn=_rolled(-path_radius * azimuth / radius, azimuth),
             ),
         ),
-        faint=_FAINT,
+        occlusion_threshold=_OCCLUSION_THRESHOLD,
         num_static=2,
     )
 
@@ -430,7 +432,7 @@ def _room(time: float) -> Scene:
             ),
             ball,
         ),
-        faint=_FAINT,
+        occlusion_threshold=_OCCLUSION_THRESHOLD,
         num_static=7,
     )
 
@@ -455,7 +457,11 @@ def _roll(time: float) -> Scene:
         gloss=0.4,
         turn=_rolled(-angle, azimuth),
     )
-    return Scene((_plate((0.74, 0.74, 0.72), (0.22, 0.20, 0.26)), ball), faint=_FAINT, num_static=1)
+    return Scene(
+        (_plate((0.74, 0.74, 0.72), (0.22, 0.20, 0.26)), ball),
+        occlusion_threshold=_OCCLUSION_THRESHOLD,
+        num_static=1,
+    )
 
 
 def _rolled(angle: float, azimuth: float) -> np.ndarray:
@@ -620,7 +626,7 @@ class ImageOptions:
 
 
 @dataclass(frozen=True)
-class StillOptions(ImageOptions):
+class StaticOptions(ImageOptions):
     """Options of a capture of the static scene, with ``num_train`` training images."""
 
     num_train: int = 48
@@ -649,7 +655,7 @@ class DynamicOptions(ImageOptions):
 
 
 @dataclass(frozen=True)
-class SyntheticShot:
+class SyntheticView:
     """One image to render: its path below the root without suffix, the (4, 4) OpenGL pose, the
     time, a fixed camera."""
 
@@ -659,7 +665,7 @@ class SyntheticShot:
     camera: int | None = None
 
 
-def write_still_capture(out: Path, options: StillOptions = StillOptions()) -> Path:
+def write_static_capture(out: Path, options: StaticOptions = StaticOptions()) -> Path:
     """Write images of ``still_life`` in the layout of the NeRF-synthetic scenes; returns ``out``.
 
     Files: ``transforms_SPLIT.json`` (OpenGL camera-to-world) and ``SPLIT/r_000.png`` (RGBA,
@@ -671,9 +677,9 @@ def write_still_capture(out: Path, options: StillOptions = StillOptions()) -> Pa
         "train": hemisphere_cameras(options.num_train, DISTANCE, options.seed),
         "test": orbit_cameras(options.num_test, DISTANCE, elevation_deg=28.0, start_deg=0.0),
     }
-    with new_folder(out) as started:
+    with atomic_folder(out) as started:
         for split, poses in splits.items():
-            shots = [SyntheticShot(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
+            shots = [SyntheticView(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
             write_split(started, split, shots, lambda _: scene, options)
     return out
 
@@ -704,7 +710,7 @@ def write_dynamic_capture(
             "the walls of the room would hide it from cameras all around; choose --style fixed or moving"
         )
     splits = _fixed_shots(options) if style == "fixed" else _single_shots(options, style)
-    with new_folder(out) as started:
+    with atomic_folder(out) as started:
         for split, shots in splits.items():
             write_split(
                 started,
@@ -724,8 +730,8 @@ def write_dynamic_capture(
 def write_split(
     out: Path,
     split: str,
-    shots: Sequence[SyntheticShot],
-    scene_of: Callable[[SyntheticShot], Scene],
+    shots: Sequence[SyntheticView],
+    scene_of: Callable[[SyntheticView], Scene],
     options: ImageOptions,
     is_opaque: bool = False,
 ) -> None:
@@ -741,7 +747,7 @@ def write_split(
             frame["camera"] = shot.camera
         if shot.time is not None:
             frame["time"] = shot.time
-            things = render_things(scene, shot.world_from_cam, options.size, options.samples)
+            things = render_motion_labels(scene, shot.world_from_cam, options.size, options.samples)
             write_image(out / "things" / f"{shot.name}.png", things)
             if split != "train":
                 frame["instance_mask_path"] = f"./things/{shot.name}.png"
@@ -750,7 +756,7 @@ def write_split(
     write_text(out / f"transforms_{split}.json", json.dumps(transforms, indent=1) + "\n")
 
 
-def _single_shots(options: DynamicOptions, style: CaptureStyle) -> dict[str, list[SyntheticShot]]:
+def _single_shots(options: DynamicOptions, style: CaptureStyle) -> dict[str, list[SyntheticView]]:
     """One image per training time, by cameras in random order or on a smooth arc.
 
     Test cameras lie on an orbit; a moving camera is tested by a fixed one in its middle.
@@ -775,14 +781,14 @@ def _single_shots(options: DynamicOptions, style: CaptureStyle) -> dict[str, lis
     between = [(int((i + 0.5) * gaps / count) + 0.5) / gaps for i in range(count)]
     return {
         split: [
-            SyntheticShot(f"{split}/r_{i:03d}", pose, time)
+            SyntheticView(f"{split}/r_{i:03d}", pose, time)
             for i, (pose, time) in enumerate(zip(poses, own, strict=True))
         ]
         for split, poses, own in (("train", train, times), ("test", test, between))
     }
 
 
-def _fixed_shots(options: DynamicOptions) -> dict[str, list[SyntheticShot]]:
+def _fixed_shots(options: DynamicOptions) -> dict[str, list[SyntheticView]]:
     """Fixed cameras on an arc in front, low and high in turn; the test camera in the middle of the
     arc."""
     count = options.num_cameras
@@ -795,7 +801,7 @@ def _fixed_shots(options: DynamicOptions) -> dict[str, list[SyntheticShot]]:
     cameras = {"train": range(count), "test": (count,) if options.num_test else ()}
     return {
         split: [
-            SyntheticShot(f"cam{camera:02d}/frame_{i:04d}", poses[camera], time, camera)
+            SyntheticView(f"cam{camera:02d}/frame_{i:04d}", poses[camera], time, camera)
             for i, time in enumerate(_even_times(options.num_times))
             for camera in own
         ]
@@ -845,7 +851,7 @@ POINTS_PER_THING = 200
 
 
 def true_tracks(
-    scene_of: Callable[[float], Scene], shots: Sequence[SyntheticShot], seed: int = 0
+    scene_of: Callable[[float], Scene], shots: Sequence[SyntheticView], seed: int = 0
 ) -> TrueTracks:
     """Return the tracks of points spread over all that moves in the scene at a time in [0, 1].
 
@@ -855,17 +861,20 @@ def true_tracks(
     times = sorted(set(moments))
     scenes = [scene_of(time) for time in times]
     random = np.random.default_rng(seed)
-    local = {i: scenes[0].primitives[i].sampled(POINTS_PER_THING, random) for i in scenes[0].movers}
+    local = {
+        i: scenes[0].primitives[i].sample_surface(POINTS_PER_THING, random)
+        for i in scenes[0].moving_indices
+    }
     points = np.stack(
         [
-            np.concatenate([scene.primitives[i].placed(x) for i, x in local.items()])
+            np.concatenate([scene.primitives[i].to_world(x) for i, x in local.items()])
             for scene in scenes
         ]
     ).astype(np.float32)
     rows = [times.index(time) for time in moments]
     visible = [
         is_in_image(points[row], shot.world_from_cam)
-        & is_seen(scenes[row], points[row], shot.world_from_cam)
+        & is_visible(scenes[row], points[row], shot.world_from_cam)
         for row, shot in zip(rows, shots, strict=True)
     ]
     return TrueTracks(

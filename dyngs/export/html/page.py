@@ -16,14 +16,14 @@ import numpy as np
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import counted
-from dyngs.data.geometry import look_at_point
+from dyngs.data.geometry import estimate_focus
 from dyngs.export.choose_path import in_front_of, orbit_around, points_at, view_to_show
 from dyngs.export.html.numbers import Lists, add_levels, add_scene, block_files
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.human.avatar.scene import avatar_of
 from dyngs.io.formats.similarity import AXES
-from dyngs.io.outputs import new_folder, require_new_folder
+from dyngs.io.outputs import atomic_folder, require_new_folder
 from dyngs.io.write import write_text
 from dyngs.models.views import training_cameras
 from dyngs.runs.folder import inputs_of
@@ -121,7 +121,7 @@ def write_folder(
         header = _header(opened, time, views, lists)
         parts = ((f"{i}.bin", chunk.deflated()) for i, chunk in enumerate(lists.chunks or ()))
     text = _assembled(opened, header, lists, title)
-    with new_folder(folder) as started:
+    with atomic_folder(folder) as started:
         write_text(started / PAGE, text)
         write_text(started / ELEMENT, element_script())
         for name, data in parts:
@@ -174,14 +174,14 @@ def _beginning(opened: Opened, views: Sequence[Cameras]) -> tuple[Sequence[Camer
         others = list(distinct.values())[::-1]
         rows = np.linspace(0, len(others) - 1, min(len(others), MOST_VIEWS)).round().astype(int)
         chosen = (view_to_show(capture), *(others[i] for i in rows))
-        return training_cameras(chosen, opened.config.data), look_at_point(cameras).tolist()
+        return training_cameras(chosen, opened.config.data), estimate_focus(cameras).tolist()
     target = np.median(points_at(opened.renderable).cpu().numpy(), axis=0)
     if not views:
         ring = orbit_around(opened, _RING)
         views = [ring.select(i) for i in range(_RING)]
         if opened.person is not None:
             views = [in_front_of(opened).select(1), *views]
-            target = look_at_point(ring)
+            target = estimate_focus(ring)
     return views, target.tolist()
 
 

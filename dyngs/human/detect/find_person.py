@@ -16,19 +16,19 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from dyngs.capture.fixed_camera import is_plain_clip, read_fixed_camera
-from dyngs.capture.masks import at_size, outlined
-from dyngs.capture.sfm.photos import digest_of
+from dyngs.capture.fixed_camera import is_image_sequence, read_fixed_camera
+from dyngs.capture.masks import refine_outlines, resize_mask
+from dyngs.capture.sfm.photos import digest_files
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ReportProgress, report_nothing
 from dyngs.core.errors import DyngsError, counted, show
-from dyngs.data.capture import Capture, View, by_camera
+from dyngs.data.capture import Capture, View, group_by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.read import is_capture, read_capture
 from dyngs.human.detect.detector import SURE, Detection, Detector, MediaPipe
 from dyngs.human.fit.capture_fit import cheapest_path
 from dyngs.human.fit.fitted_capture import FitInputs, FittedCapture, write_fitted_capture
-from dyngs.io.outputs import make_once, note_source, require_new_folder
+from dyngs.io.outputs import make_once, record_source, require_new_folder
 from dyngs.io.write import cache_folder, temporary_folder_beside, write_image, write_text
 
 SWAP = 0.04
@@ -156,7 +156,7 @@ def find_person(
     detector: Detector,
     folder: Path,
     report: ReportProgress,
-    say: Callable[[str], None] = show,
+    log: Callable[[str], None] = show,
 ) -> FitInputs:
     """Find a person in all views, write masks and key points to ``folder``, and return where they
     are.
@@ -167,7 +167,7 @@ def find_person(
     Raises DyngsError: nobody is found.
     """
     points: dict[str, np.ndarray] = {}
-    cameras = [*by_camera(capture.splits).values()]
+    cameras = [*group_by_camera(capture.splits).values()]
     for index, views in enumerate(cameras, 1):
         # A detector reads files, which only live here.
         size = target_size(views[0].width, views[0].height, 1.0, SIDE)
@@ -182,29 +182,29 @@ def find_person(
         where = "" if len(cameras) == 1 else f"camera {views[0].camera_id}: "
         heights = [x.height for x in person if x is not None]
         if not heights:
-            say(f"warning: {where}{detector.name} finds nobody, its images are left out")
+            log(f"warning: {where}{detector.name} finds nobody, its images are left out")
         else:
-            say(
+            log(
                 f"{where}{detector.name} finds the person, {np.median(heights):.0f} px high, in {len(heights)} of "
                 f"{counted(len(person), 'image')}; left and right swapped in {counted(swapped, 'image')}"
             )
             for warning in warnings_of(images, person, alone=len(cameras) == 1):
-                say(f"warning: {where}{warning}")
+                log(f"warning: {where}{warning}")
         masks = np.zeros(images.shape[:3], bool)
         for row, own in enumerate(person):
             if own is not None:
                 masks[row] = own.mask > 127
                 scale = views[row].width / size[0]
                 points[views[row].name] = own.keypoints * np.array([scale, scale, 1.0])
-        better = outlined(images, masks) if heights else None
+        better = refine_outlines(images, masks) if heights else None
         if better is not None:
             common = (better & masks).sum() / max(int((better | masks).sum()), 1)
-            say(
+            log(
                 f"the camera stands: outlines by its background, which agree with the detector's to {common:.3f} (IoU)"
             )
             masks = better
         for view, mask in zip(views, masks, strict=True):
-            write_image(folder / "masks" / f"{view.name}.png", at_size(mask, view))
+            write_image(folder / "masks" / f"{view.name}.png", resize_mask(mask, view))
     if not points:
         raise DyngsError(
             f"{capture.root}: {detector.name} finds nobody in {counted(sum(map(len, cameras)), 'image')}; look at "
@@ -234,7 +234,7 @@ def write_found_person(
     out: Path,
     detector: Detector,
     report: ReportProgress = report_nothing,
-    say: Callable[[str], None] = show,
+    log: Callable[[str], None] = show,
 ) -> FittedCapture:
     """Find a person and fit the body to them: write the capture of ``write_fitted_capture`` to the
     new folder ``out``.
@@ -243,18 +243,22 @@ def write_found_person(
     cameras. Raises DyngsError: see ``find_person`` and ``write_fitted_capture``.
     """
     require_new_folder(out)
-    clip = options.format == "auto" and not is_capture(options.root) and is_plain_clip(options.root)
+    clip = (
+        options.format == "auto"
+        and not is_capture(options.root)
+        and is_image_sequence(options.root)
+    )
     folder = temporary_folder_beside(out.with_name(f"{out.name}.found"))
     try:
         capture = read_fixed_camera(options) if clip else read_capture(options)
-        found = find_person(capture, detector, folder, report, say)
+        found = find_person(capture, detector, folder, report, log)
         return write_fitted_capture(options, out, report, found)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def with_found_person(
-    data: DataConfig, *, say: Callable[[str], None] = show, report: ReportProgress = report_nothing
+    data: DataConfig, *, log: Callable[[str], None] = show, report: ReportProgress = report_nothing
 ) -> DataConfig:
     """Return the options with the capture of the person that is found in a clip; the same clip is
     looked at once.
@@ -263,13 +267,13 @@ def with_found_person(
     """
     name = re.sub(r"[^A-Za-z0-9-]", "_", data.root.stem)[:40]
     chosen = hashlib.sha256(repr(data.frames).encode()).hexdigest()[:8]
-    folder = cache_folder("people") / f"{name}.{digest_of(data.root)}{chosen}"
+    folder = cache_folder("people") / f"{name}.{digest_files(data.root)}{chosen}"
 
     def find() -> None:
         detector = MediaPipe()
-        say(f"person:  found first, as by `dyngs data people`, into {folder}")
-        say(write_found_person(data, folder, detector, report, say).summary)
+        log(f"person:  found first, as by `dyngs data people`, into {folder}")
+        log(write_found_person(data, folder, detector, report, log).summary)
 
-    make_once(folder, find, say, f"person:  found before, in {folder}")
-    note_source(folder, data.root)
+    make_once(folder, find, log, f"person:  found before, in {folder}")
+    record_source(folder, data.root)
     return data.model_copy(update={"root": folder, "frames": None})

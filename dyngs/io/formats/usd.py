@@ -23,8 +23,8 @@ from dyngs.core.gaussians import Gaussians
 from dyngs.io.child import python_command
 from dyngs.io.fields import require_at_most
 from dyngs.io.formats import usd_child
-from dyngs.io.formats.similarity import joined, similarity_of_matrix
-from dyngs.io.formats.splat_file import SplatFile, described, from_linear, header_comments
+from dyngs.io.formats.similarity import join_gaussians, similarity_from_matrix
+from dyngs.io.formats.splat_file import SplatFile, from_linear, header_comments, parse_comments
 
 _SECONDS = 600.0  # of wall time; the child has less of processor time
 _NAMES = ("means", "scales", "opacities", "quats", "sh", "degree", "world")
@@ -67,7 +67,9 @@ def read_usd(path: Path) -> SplatFile:
         raise DyngsError(f"{path}: holds no Gaussians ({usd_child.PRIM})")
     found = [_gaussians({name: read[f"{i}.{name}"] for name in _NAMES}) for i in range(count)]
     up = _UP.get(str(read["up"]), "y")
-    return described(SplatFile(joined(found), up=up, comments=tuple(read["comments"].tolist())))
+    return parse_comments(
+        SplatFile(join_gaussians(found), up=up, comments=tuple(read["comments"].tolist()))
+    )
 
 
 def write_usd(path: Path, splat: SplatFile) -> None:
@@ -125,7 +127,7 @@ def _gaussians(arrays: Mapping[str, np.ndarray]) -> Gaussians:
     means = arrays["means"]
     sh = arrays["sh"].reshape(len(means), num_sh_terms(degree), 3)
     found = from_linear(means, arrays["quats"], arrays["scales"], arrays["opacities"], sh)
-    place = similarity_of_matrix(arrays["world"])
+    place = similarity_from_matrix(arrays["world"])
     if place is None:
         raise ValueError("a prim distorts or mirrors its Gaussians; apply its transform first")
     return place.gaussians(found.replace(means=found.means.double()))

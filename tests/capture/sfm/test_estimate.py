@@ -15,7 +15,7 @@ from skimage.transform import ProjectiveTransform, resize_local_mean, warp
 
 from dyngs.api.load import read_capture
 from dyngs.capture.sfm.colmap import SfmOptions
-from dyngs.capture.sfm.estimate import SfmModel, SfmResult, better, estimate_poses
+from dyngs.capture.sfm.estimate import SfmModel, SfmResult, choose_better_model, estimate_poses
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import all_views
 from dyngs.data.synthetic.captures import orbit_cameras, render_scene, still_life
@@ -202,5 +202,5 @@ def test_a_focal_length_of_many_widths_is_no_lens_unless_exif_says_so(
 def test_the_model_with_a_real_lens_is_taken() -> None:
     real = _model(400)
     unreal = _model(6100)
-    assert better(unreal, real) is real
-    assert better(real, unreal) is real
+    assert choose_better_model(unreal, real) is real
+    assert choose_better_model(real, unreal) is real

@@ -15,7 +15,7 @@ from tiny_captures import HEIGHT, WIDTH, pixel_of, write_video
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
-from dyngs.data.images.maps import cut_out
+from dyngs.data.images.maps import apply_silhouette
 from dyngs.data.readers.people_snapshot import FORMAT, read_people_snapshot
 
 h5py = pytest.importorskip("h5py", reason="needs dyngs[people]")
@@ -79,14 +79,16 @@ def test_frames_masks_and_parameters_go_together(root: Path) -> None:
     body: Any = capture.body
     assert body["train"].frames == tuple(range(FRAMES))
     assert body["train"].trans[:, 0].tolist() == [1, 2, 3, 4, 5, 6]
-    assert (body["train"].kind, body["train"].turns, body["train"].betas.tolist()) == (
+    assert (body["train"].kind, body["train"].origin_rotations, body["train"].betas.tolist()) == (
         "smpl",
         None,
         [1] * 10,
     )
     for frame, view in enumerate(views):
         assert view.silhouette is not None
-        alpha = cut_out(torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8), view.silhouette)[..., 3]
+        alpha = apply_silhouette(torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8), view.silhouette)[
+            ..., 3
+        ]
         assert alpha.nonzero().tolist() == [[2, frame]]
 
 

@@ -27,7 +27,7 @@ from dyngs.core.state import fields_moved_to
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.read import captures_in, read_capture
+from dyngs.data.read import list_captures, read_capture
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import RestFrame
 from dyngs.gaussians.scene import GaussianTimeStep, render_options
@@ -598,7 +598,7 @@ def learner(config: Config, generator: torch.Generator) -> AtlasLearner:
     model: Any = config.model
     body = load_template(human_options(model))
     network = new_network(model, generator).to(device)
-    people = [read_person(data, model, body) for data in captures_in(config.data)]
+    people = [read_person(data, model, body) for data in list_captures(config.data)]
     choices = [_choices(person, model.source_views, generator) for person in people]
     mean = mean_colours(people, model.resolution).to(device)
     return AtlasLearner(config, network, people, choices, mean, device)
@@ -608,7 +608,7 @@ def predictor(
     config: Config,
     checkpoint: Checkpoint,
     data: DataConfig,
-    say: Callable[[str], None],
+    log: Callable[[str], None],
     report: ReportProgress,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
@@ -619,7 +619,7 @@ def predictor(
     model: Any = config.model
     network = new_network(model, torch.Generator())
     mean = load_network(network, checkpoint, model.resolution)
-    data = with_fitted_body(data, human_options(model), only_if_needed=True, say=say, report=report)
+    data = with_fitted_body(data, human_options(model), only_if_needed=True, log=log, report=report)
     person = read_person(data, model, load_template(human_options(model)))
     return PersonPredictor(config, network, mean, person, data)
 
