@@ -20,7 +20,7 @@ def test_what_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
         require_at_most(Path("a.x"), 1001, 100, "things")
     monkeypatch.setenv(LIMITS_VARIABLE, "11")
     require_at_most(Path("a.x"), 1001, 100, "things")
-    with pytest.raises(DyngsError, match=r"over 10\^18 things, of which 1,100 .*=N"):
+    with pytest.raises(DyngsError, match=r"over 10\^18 things exceed the limit of 1,100 .*=N"):
         require_at_most(Path("a.x"), 10**5000, 100, "things")
 
 
