@@ -229,9 +229,7 @@ def add_initial_points(
     if capture.points is not None:
         if capture.points_file is not None:
             count = f"{len(capture.points.xyz):,} points"
-            lines.append(
-                f"{capture.points_file.name}: {count}, which the first Gaussians are made from"
-            )
+            lines.append(f"{capture.points_file.name}: {count} used as initial points")
         return _with_dense_points(capture, options, init.dense, lines)
     views = capture.splits["train"]
     is_by_custom = capture.format in AROUND_ORIGIN
@@ -240,13 +238,13 @@ def add_initial_points(
     is_in_cube = is_by_custom and why is None
     if why is not None:
         lines.append(
-            f"the scene does not lie around the origin, where Blender scenes do by custom: {why}"
+            f"the scene is not centred at the origin, as Blender scenes usually are: {why}"
         )
     if is_in_cube and views[0].time is None:
         points = sample_points_in_silhouettes(views, options, init.num_random, half_side)
         if points is not None:
             lines.append(
-                f"{len(points.xyz):,} first points were drawn at random in the silhouettes of the images"
+                f"{len(points.xyz):,} initial points sampled at random inside the silhouettes"
             )
         return capture.replace(points=points), lines
     if init.triangulate == 0:
@@ -256,7 +254,7 @@ def add_initial_points(
     if views[0].time is None and views[0].depth_path is not None:
         points = points_from_depth_maps(views, options, init.num_random)
     if points is not None:
-        lines.append(f"{len(points.xyz):,} first points are from the depth maps")
+        lines.append(f"{len(points.xyz):,} initial points from the depth maps")
     elif (
         views[0].time is None
         or len({view.cam_from_world.tobytes() for view in moment}) >= MIN_IMAGES
@@ -265,7 +263,7 @@ def add_initial_points(
     elif not is_in_cube:
         points = triangulate_clip(views, options)
         if points is not None:
-            lines.append(f"{len(points.xyz):,} points were triangulated over the full clip")
+            lines.append(f"{len(points.xyz):,} initial points triangulated from the whole clip")
     return _with_dense_points(capture.replace(points=points), options, init.dense, lines)
 
 
@@ -285,7 +283,7 @@ def _with_dense_points(
         if points is not None:
             lines = [
                 *lines,
-                f"{len(points.xyz):,} first points are from depth maps by plane sweep (init.dense)",
+                f"{len(points.xyz):,} initial points from plane-sweep depth maps (init.dense)",
             ]
         return capture.replace(points=points), lines
     dense = sweep_dense_points(views, options, points.xyz, count)
@@ -295,7 +293,7 @@ def _with_dense_points(
         np.concatenate([points.xyz, dense.xyz]), np.concatenate([points.rgb, dense.rgb])
     )
     added = (
-        f"{len(dense.xyz):,} points of depth maps were added to {len(points.xyz):,} (init.dense)"
+        f"{len(dense.xyz):,} dense points added to {len(points.xyz):,} initial points (init.dense)"
     )
     return capture.replace(points=both), [*lines, added]
 

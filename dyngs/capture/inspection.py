@@ -85,8 +85,8 @@ def time_problems(capture: Capture) -> list[str]:
         return []
     if len({view.cam_from_world.round(9).tobytes() for view in views}) == 1:
         return [
-            f"one camera that does not move saw all {count} times: a moving scene cannot be reconstructed in 3D from "
-            "that; move the camera or use several"
+            f"a single fixed camera recorded all {count} times: a moving scene cannot be reconstructed from "
+            "one viewpoint; move the camera or use several"
         ]
     if not 3 <= len(views) == count or count * CLOSE_IN_TIME >= FEW_VIEWS:
         return []
@@ -99,8 +99,8 @@ def time_problems(capture: Capture) -> list[str]:
     if not angles.mean() >= WIDE_BASELINE:
         return []
     return [
-        f"{len(views)} images, each at a time of its own, {angles.mean():.0f} degrees apart on average: what moves "
-        "is seen from one side only at each time; expect a static result"
+        f"{len(views)} images at different times, {angles.mean():.0f} degrees apart on average: moving objects "
+        "are seen from one side only at each time; expect a static result"
     ]
 
 
@@ -128,8 +128,8 @@ def body_problems(capture: Capture) -> list[str]:
     middle = round((around[widest] + gaps[widest] / 2) / 90) % 4
     side = ("front", "left side", "back", "right side")[middle]
     return [
-        f"the person's {side} is never seen: all cameras are within {360 - gaps[widest]:.0f} degrees around the body; "
-        "what they do not see will be a guess (turn around once, or use more cameras)"
+        f"the person's {side} is in no image: all cameras are within {360 - gaps[widest]:.0f} degrees around the body; "
+        "the unseen side will be guessed (film a full turn, or use more cameras)"
     ]
 
 
@@ -143,20 +143,20 @@ def scene_problems(capture: Capture) -> list[str]:
     spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
     is_static = capture.body is None and all(view.time is None for view in views)
     if len(poses) > 1 and spread < 1e-9 and is_static:
-        problems.append("all cameras are at one place, so no depth can be found")
+        problems.append("all cameras are at the same position, so depth cannot be estimated")
     xyz = capture.points.xyz if capture.points is not None else np.zeros((0, 3))
     focus = np.median(xyz, axis=0) if len(xyz) else focus_point(poses)
     if focus is not None and fraction_in_front(poses, focus) < 0.5:
         problems.append(
-            f"{1 - fraction_in_front(poses, focus):.0%} of the cameras look away from the scene: are the poses in the "
-            "axes that the format wants (OpenGL camera-to-world for JSON files)?"
+            f"{1 - fraction_in_front(poses, focus):.0%} of the cameras look away from the scene; check the axes of the poses "
+            "(JSON files use OpenGL camera-to-world)"
         )
     if len(xyz):
         sample = xyz[np.random.default_rng(0).permutation(len(xyz))[:2000]]
         some = [views[index] for index in evenly_spaced(len(views), MAX_VIEWS)]
         unseen = float((count_visible_views(sample, some) == 0).mean())
         if unseen > 0.1:
-            problems.append(f"{unseen:.0%} of the points are in no camera's view")
+            problems.append(f"{unseen:.0%} of the points are not visible in any view")
     return problems
 
 
@@ -166,7 +166,7 @@ def limit_messages(lines: Iterable[str]) -> list[str]:
     more = len(found) - MAX_LINES_PER_KIND
     if more <= 0:
         return found
-    return [*found[:MAX_LINES_PER_KIND], f"... and {more} more like the last one"]
+    return [*found[:MAX_LINES_PER_KIND], f"... and {more} more of this kind"]
 
 
 def find_problems(capture: Capture, deep: bool) -> list[str]:
@@ -176,17 +176,15 @@ def find_problems(capture: Capture, deep: bool) -> list[str]:
     train = capture.splits.get("train", ())
     problems = []
     if not capture.splits.get("test"):
-        problems.append(
-            "the split 'test' is empty, so nothing can be measured (see data.test_every)"
-        )
+        problems.append("no test views, so quality cannot be measured (see data.test_every)")
     if len(train) < 3:
-        problems.append(f"only {len(train)} training views; a scene needs some 20 or more")
+        problems.append(f"only {len(train)} training views; use at least 20")
     poses = Counter(view.cam_from_world.round(9).tobytes() for view in views if view.time is None)
     same = sum(count for count in poses.values() if count > 1)
     if same:
-        problems.append(f"{same} views of a static scene share their pose with another one")
+        problems.append(f"{same} views of a static scene have the same pose as another view")
     problems += limit_messages(
-        f"'{view.name}': odd intrinsics for an image of {view.width}x{view.height}: focal lengths "
+        f"'{view.name}': unusual intrinsics for an image of {view.width}x{view.height}: focal lengths "
         f"({view.intrinsics[0, 0]:g}, {view.intrinsics[1, 1]:g}), centre ({view.intrinsics[0, 2]:g}, "
         f"{view.intrinsics[1, 2]:g}) px"
         for view in views
@@ -219,7 +217,7 @@ def _image_problems(views: Iterable[View], deep: bool) -> list[str]:
                 continue
             if header.size_matching(described) != described:
                 problems.append(
-                    f"{path} has {header.width}x{header.height} pixels, its camera says {view.width}x{view.height}"
+                    f"{path} has {header.width}x{header.height} pixels, but its camera is {view.width}x{view.height}"
                 )
     return limit_messages(problems)
 
@@ -234,18 +232,18 @@ def describe_masks(capture: Capture) -> tuple[str | None, list[str]]:
     paths = [view.mask_path for view in views if view.mask_path is not None]
     if not paths:
         return None, []
-    found = f"{len(paths)} of {len(views)} images; white counts, black is ignored"
+    found = f"{len(paths)} of {len(views)} images (white = used, black = ignored)"
     sample = [paths[index] for index in evenly_spaced(len(paths), LOOKED_AT)]
     try:
         ignored = fmean(1 - float(read_mask(path).float().mean()) for path in sample)
     except DyngsError:
         return found, []
-    found += f": {ignored:.0%} of the pixels in {len(sample)} that were read"
+    found += f": {ignored:.0%} of the pixels ignored in {len(sample)} sampled masks"
     if ignored <= MOST_IGNORED:
         return found, []
     return found, [
-        f"masks ignore {ignored:.0%} of the pixels in {len(sample)} that were looked at, first {sample[0]}; white "
-        "(255) counts and black is ignored: are they inverted, or labels?"
+        f"masks ignore {ignored:.0%} of the pixels in {len(sample)} sampled masks, first {sample[0]}; white "
+        "(255) = used, black = ignored: are they inverted, or label images?"
     ]
 
 
@@ -275,12 +273,12 @@ def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectRep
 
     options = source if isinstance(source, DataConfig) else DataConfig(root=source)
     links = limit_messages(
-        f"{path}: a link that leads out of the capture, to {place}"
+        f"{path}: link to {place}, outside the capture"
         for path, place in find_escaping_links(options.root)
     )
     try:
         capture = read_capture(options, decode_videos=deep)
-        with reading(options.root, "`dyngs --debug` shows where"):
+        with reading(options.root, "see `dyngs --debug`"):
             report = build_report(capture, deep)
     except DyngsError as error:
         return InspectReport(options.root, None, (), (str(error), *links))
@@ -297,9 +295,9 @@ def format_report(report: InspectReport) -> str:
     """Return the report as plain text of several lines."""
     lines = [f"capture {report.root}", *_aligned(dict(report.facts))]
     if not report.problems:
-        lines.append("nothing suspicious")
+        lines.append("no problems found")
     else:
-        lines.append(f"suspicious ({len(report.problems)}):")
+        lines.append(f"problems ({len(report.problems)}):")
         lines += [f"  - {printable(problem)}" for problem in report.problems]
     return "\n".join(lines)
 
@@ -479,20 +477,18 @@ def video_report(path: Path) -> str:
         lines += [f"video {video.path}", *_aligned(facts)]
     where = as_word(videos[0].path if len(videos) == 1 else path)
     if len(videos) == 1 and moving:
-        lines.append(
-            f"next: dyngs train static data.root={where}     # nothing but the camera moves"
-        )
-        lines.append(f"      dyngs train dynamic data.root={where}    # something else moves, too")
+        lines.append(f"next: dyngs train static data.root={where}     # only the camera moves")
+        lines.append(f"      dyngs train dynamic data.root={where}    # objects move as well")
     elif len(videos) == 1:
         lines.append(
-            "next: one fixed camera shows no depth; put videos of two or more that ran at once into a folder"
+            "next: one fixed camera gives no depth; put synchronous videos of two or more into a folder"
         )
     elif moving:
         names = ", ".join(moving[:5])
-        lines.append(f"next: take {names} out: of several videos, only fixed cameras get poses")
+        lines.append(f"next: remove {names}: several videos are supported only for fixed cameras")
     else:
         is_given = read_video_settings(path, [video.name for video in videos])[0] is not None
-        known = f"as {VIDEOS_FILE} says" if is_given else "found by sound"
+        known = f"from {VIDEOS_FILE}" if is_given else "estimated from sound"
         lines.append(f"{len(videos)} fixed cameras; offsets between them: {known}")
         lines.append(f"next: dyngs train dynamic data.root={where}")
     return "\n".join(lines)
@@ -514,7 +510,7 @@ def video_facts(video: CameraVideo) -> tuple[dict[str, str], bool]:
     gaps = 1000 * np.diff(video.seconds)
     rate = f"{video.rate:.4g} per second"
     if len(gaps) and gaps.max() > UNEVEN * np.median(gaps):
-        rate = f"variable rate: {gaps.min():.0f} to {gaps.max():.0f} ms between frames (times are kept)"
+        rate = f"variable rate: {gaps.min():.0f} to {gaps.max():.0f} ms between frames"
     blurred = int((measures.sharpness < BLURRED * np.median(measures.sharpness)).sum())
     facts: dict[str, Any] = {
         "size": f"{video.info.width}x{video.info.height}",
@@ -525,5 +521,5 @@ def video_facts(video: CameraVideo) -> tuple[dict[str, str], bool]:
         "camera": f"moves by up to {displaced:.1%} of its width, {np.median(measures.motion):.2%} from frame to frame",
     }
     stands = displaced <= FIXED_CAMERA_LIMIT
-    facts |= {"camera": "stands still"} if stands else {}
+    facts |= {"camera": "fixed"} if stands else {}
     return {name: value for name, value in facts.items() if value}, stands

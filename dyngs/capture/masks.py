@@ -246,8 +246,8 @@ def _disc(radius: int) -> np.ndarray:
 SAMPLES = 41  # images of a camera whose median is the background
 LEAST = 8  # least number of images of a camera
 SIDE = 960  # longest side of the images that are compared, px
-_MOVES = "moves, so there is no background to compare with; give masks of the person (--masks)"
-_ADVICE = "give masks of the person (--masks), or an image of the place without them (--background)"
+_MOVES = "moves, so its background is unknown; give masks of the person (--masks)"
+_ADVICE = "give masks of the person (--masks), or an image of the empty background (--background)"
 
 
 @dataclass(frozen=True)
@@ -304,9 +304,9 @@ def add_background_masks(
         with_plate = number in plates and found[-1].area > 0 and found[-1].on_edges > 0.5
         if not (found[-1].is_clear or with_plate):
             raise DyngsError(
-                f"{camera.where}: nobody stands out from the background, or the person never leaves their place, so "
-                f"that it is not seen ({found[-1].staying:.0%} of the masks are where somebody is most of the time, "
-                f"{found[-1].on_edges:.0%} of their outlines on edges); {_ADVICE}"
+                f"{camera.where}: no person stands out from the background, or the person stays in one place, "
+                f"so that the background is never visible ({found[-1].staying:.0%} of the mask pixels are covered most of the time, "
+                f"{found[-1].on_edges:.0%} of the outlines lie on image edges); {_ADVICE}"
             )
         for view in camera.views:
             name = re.sub(r"[^A-Za-z0-9_-]", "_", view.name)
@@ -316,7 +316,7 @@ def add_background_masks(
             silhouettes[view.name] = Silhouette(target, "white")
     worst = min(found, key=lambda one: one.on_edges)
     log(
-        f"masks by the difference from the background: {worst.on_edges:.0%} of the outlines lie on edges of the "
+        f"masks by background subtraction: {worst.on_edges:.0%} of the outlines lie on image edges, "
         f"images, the person covers {worst.area:.1%} of them"
     )
     splits = map_views(
@@ -337,7 +337,7 @@ def _fixed_cameras(capture: Capture) -> dict[int, _Camera]:
             raise DyngsError(f"{where} {_MOVES}")
         if len(views) < LEAST:
             raise DyngsError(
-                f"{where}: has {len(views)} images, too few for a background; {_ADVICE}"
+                f"{where}: has {len(views)} images, too few to estimate the background; {_ADVICE}"
             )
         size = target_size(first.width, first.height, 1.0, SIDE)
         cameras[number] = _Camera(where, tuple(views), size)
@@ -353,7 +353,7 @@ def _plates(empty: Path, cameras: Mapping[int, _Camera]) -> Mapping[int, Path]:
     missing = sorted(cameras.keys() - plates.keys())
     if missing:
         raise DyngsError(
-            f"{empty}: no background for camera {missing[0]}; give a folder with {missing[0]}.png"
+            f"{empty}: no background image for camera {missing[0]}; add {missing[0]}.png to the folder"
         )
     return plates
 

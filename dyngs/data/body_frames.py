@@ -53,15 +53,17 @@ def build_body_frames(
     order = np.argsort(np.asarray(frames, dtype=np.int64), kind="stable")
     numbers = tuple(int(frames[i]) for i in order)
     if not numbers:
-        raise DyngsError(f"{where}: holds no frame; export the body parameters again")
+        raise DyngsError(f"{where}: no frames found; export the body parameters again")
     if len(set(numbers)) < len(numbers):
         twice = numbers[int(np.argmin(np.diff(numbers)))]
-        raise DyngsError(f"{where}: frame {twice} has body parameters twice; remove one of them")
+        raise DyngsError(
+            f"{where}: frame {twice} has two sets of body parameters; remove one of them"
+        )
     rows = _rows(where, "poses", poses, frames)
     if rows.shape[1] // 3 not in BODY_KINDS or rows.shape[1] % 3:
         wanted = ", ".join(f"{3 * joints} ({kind})" for joints, kind in BODY_KINDS.items())
         raise DyngsError(
-            f"{where}: 'poses' has {rows.shape[1]} numbers per frame; the known bodies have {wanted}"
+            f"{where}: 'poses' has {rows.shape[1]} numbers per frame; supported bodies: {wanted}"
         )
     scale = np.asarray(scale)
     scale = np.full(len(frames), scale.item()) if scale.size == 1 else scale
@@ -157,7 +159,7 @@ def _rows(
     bad = ~(np.abs(array) <= LARGEST).all(axis=1)
     if bad.any():
         raise DyngsError(
-            f"{where}: '{name}' of frame {frames[int(np.argmax(bad))]} holds NaN, infinite or huge numbers; repair or "
+            f"{where}: '{name}' of frame {frames[int(np.argmax(bad))]} contains NaN, infinite or huge values; repair or "
             "remove it"
         )
     return array
@@ -193,8 +195,8 @@ def attach_fitted_body(capture: Capture, folder: Path) -> Capture:
     ``body_pose.npz`` if there."""
     if not (folder / "body_train.npz").is_file():
         raise DyngsError(
-            f"{folder / 'body_train.npz'}: no such file (data.body); a fit that `dyngs train human` made comes back by "
-            f"training with data.root={capture.root} into another run.dir"
+            f"{folder / 'body_train.npz'}: no such file (data.body); to reuse a fit by `dyngs train human`, "
+            f"train with data.root={capture.root} and another run.dir"
         )
     with (
         restrict_paths_to(folder, False),
@@ -219,7 +221,7 @@ def parse_frame_number(where: Path, name: str) -> int:
     )
     if not found:
         raise DyngsError(
-            f"{where}: no frame number in the name {name!r:.80}; call the image 000000.jpg or the like"
+            f"{where}: no frame number in the name {name!r:.80}; rename the image, for example to 000000.jpg"
         )
     return int(found[1])
 

@@ -33,7 +33,7 @@ def validate_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
         )
     if not np.abs(matrix).max() <= LARGEST:
         raise DyngsError(
-            f"{where}: the pose holds NaN, or numbers beyond {LARGEST:g}; remove or repair this frame"
+            f"{where}: the pose contains NaN or values above {LARGEST:g}; remove or repair this frame"
         )
     if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise DyngsError(
@@ -87,7 +87,7 @@ def repair_warning(errors: dict[str, float]) -> list[str]:
         return []
     worst = max(off, key=lambda where: off[where])
     return [
-        f"{len(off)} rotations were not orthonormal and were repaired, the worst by {off[worst]:.1e} ({worst})"
+        f"{len(off)} rotations were not orthonormal and have been repaired, largest error {off[worst]:.1e} ({worst})"
     ]
 
 
@@ -144,8 +144,7 @@ def _check_plausible(intrinsics: np.ndarray, described: tuple[int, int], where: 
     if not (low <= fx <= high and low <= fy <= high and all(abs(x) <= high for x in center)):
         raise DyngsError(
             f"{where}: the focal length ({fx:g}, {fy:g}) px or the principal point ({center[0]:g}, {center[1]:g}) px "
-            f"does not suit an image of {described[0]}x{described[1]}; correct it, or the field of view that it "
-            "follows from"
+            f"is implausible for an image of {described[0]}x{described[1]}; correct it, or the field of view"
         )
 
 
@@ -154,7 +153,7 @@ def rescale_warning(where: list[str]) -> list[str]:
     if not where:
         return []
     return [
-        f"{len(where)} images have another size than their intrinsics, which were rescaled; first {where[0]}"
+        f"{len(where)} images differ in size from their intrinsics, which were rescaled; first {where[0]}"
     ]
 
 
@@ -275,7 +274,7 @@ def cameras_at_poses(cameras: Cameras, poses: np.ndarray) -> Cameras:
 def world_from_cam(cameras: Cameras) -> np.ndarray:
     """Return camera-to-world poses (V, 4, 4), float64."""
     if not len(cameras):
-        raise ValueError("a camera path is placed by at least one camera")
+        raise ValueError("a camera path needs at least one camera")
     return np.linalg.inv(cameras.cam_from_world.detach().cpu().double().numpy())
 
 

@@ -467,7 +467,7 @@ def _require_size(view: View, path: Path, shape: Sequence[int], what: str) -> No
     height, width = shape[:2]
     if (width, height) != (view.width, view.height):
         raise DyngsError(
-            f"{path}: the {what} is {width}x{height}, but its camera says {view.width}x{view.height}; make them the "
+            f"{path}: the {what} is {width}x{height}, but its camera is {view.width}x{view.height}; make them the "
             "same size"
         )
 

@@ -55,7 +55,7 @@ def list_captures(data: DataConfig) -> list[DataConfig]:
     people = [person for shard in shards for person in _folders(shard)]
     if not people:
         raise DyngsError(
-            f"{root}: holds no folders; give one that holds a capture of a person in each of its folders"
+            f"{root}: contains no folders; give a folder with one capture of a person per subfolder"
         )
     return [data.model_copy(update={"root": folder}) for folder in people]
 
@@ -99,7 +99,7 @@ def with_smaller_images(
         if copy is None:
             return splits, []
         small[view.name] = copy
-    line = f"{copies[number].name} is read in place of images: training takes images of that size or smaller ones"
+    line = f"{copies[number].name} is read instead of images, because training uses images of that size or smaller"
     return map_views(splits, lambda view: small.get(view.name, view)), [line]
 
 
@@ -198,13 +198,13 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
         restrict_paths_to(root, options.follow_links),
         reading(
             root,
-            "one of its files is not as it should be (`dyngs --debug` shows where); export it again",
+            "one of its files is invalid (see `dyngs --debug`); export it again",
         ),
     ):
         capture = _finished(chosen.read(root), options, decode_videos)
     others = [other for other in found if other is not chosen and other.name != chosen.extends]
     if options.format == "auto" and others:
-        note = f"read as {chosen.name}, but there is also a {others[0].name} capture; data.format= chooses"
+        note = f"read as {chosen.name}; a {others[0].name} capture is also there, choose with data.format"
         capture = replace(capture, warnings=(note, *capture.warnings))
     return capture
 
@@ -213,9 +213,7 @@ def require_folder(root: Path) -> None:
     """Check that the folder or the archive of a capture exists. Raises NoCaptureError."""
     if not root.is_dir() and not is_archive(root):
         problem = (
-            "is a file; give the folder that holds it"
-            if root.is_file()
-            else "no such folder; check data.root"
+            "is a file; give its folder" if root.is_file() else "no such folder; check data.root"
         )
         raise NoCaptureError(f"{root}: {problem}")
 
@@ -260,9 +258,9 @@ def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFo
         return found[0]
     chosen = next(format for format in FORMATS if format.name == options.format)
     if chosen not in found:
-        also = f"; but there is a {found[0].name} capture" if found else ""
+        also = f"; it contains a {found[0].name} capture" if found else ""
         raise DyngsError(
-            f"{options.root}: no {chosen.name} capture, which would have {chosen.files}{also}"
+            f"{options.root}: no {chosen.name} capture (expected {chosen.files}){also}"
         )
     return chosen
 
@@ -318,16 +316,14 @@ def _without_missing(capture: Capture) -> Capture:
     present: Splits = {}
     for name, views in capture.splits.items():
         present[name] = tuple(view for view in views if not _is_missing(view))
-    lines = [f"{line}; these views are left out" for line in _missing(capture.splits)]
+    lines = [f"{line}; their views are skipped" for line in _missing(capture.splits)]
     return replace(capture, splits=present, warnings=(*capture.warnings, *lines))
 
 
 def require_images(capture: Capture) -> Capture:
     """Return the capture. Raises DyngsError with their number: images are missing."""
     for line in _missing(capture.splits):
-        raise DyngsError(
-            f"{line}; restore them, or train on the others with data.skip_missing=true"
-        )
+        raise DyngsError(f"{line}; restore them, or skip them with data.skip_missing=true")
     return capture
 
 
@@ -353,7 +349,7 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
         capture = replace(capture, times_in_seconds=rate is not None, fps=rate or capture.fps)
     elif rate is not None:
         raise DyngsError(
-            f"{capture.root}: data.frames_per_second={rate:g} needs data.times=order, which takes times from the names"
+            f"{capture.root}: data.frames_per_second={rate:g} needs data.times=order (times from file names)"
         )
     splits = times.assign_camera_ids(splits)
     if options.train_cameras is not None:
@@ -382,7 +378,7 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
         splits["train"] = tuple(view for i, view in enumerate(views) if not every or i % every)
     if not splits["train"]:
         raise DyngsError(
-            f"{capture.root}: no training views are left; change data.frames, data.pose_frames or data.test_every"
+            f"{capture.root}: no training views remain; change data.frames, data.pose_frames or data.test_every"
         )
     splits.setdefault("val", ())
     if new_poses is not None:
@@ -397,7 +393,7 @@ def _with_poses_held_out(
     split pose: those of cameras that only have test views, if there are any."""
     if capture.body is None or new_poses is not None:
         raise DyngsError(
-            f"{capture.root}: data.pose_frames={frames} is for people without a clip of new poses of their own"
+            f"{capture.root}: data.pose_frames={frames} only applies to captures of people without a clip of new poses"
         )
     held, kept = times.split_by_frames(capture.root, splits, frames, "data.pose_frames")
     views = all_views(held)
@@ -421,7 +417,7 @@ def _check_names(root: Path, splits: Splits) -> list[str]:
     for view in all_views(splits):
         if named.setdefault(view.name, view.image_path) != view.image_path:
             raise DyngsError(
-                f"{root}: the images {named[view.name]} and {view.image_path} share the name {view.name}; rename one"
+                f"{root}: the images {named[view.name]} and {view.image_path} share the view name {view.name}; rename one"
             )
     train = {view.image_path for view in splits["train"]}
     leaked = [view.name for view in splits["test"] if view.image_path in train]
@@ -440,7 +436,7 @@ def _first_image(views: tuple[View, ...]) -> tuple[bool, list[str]]:
         except DyngsError:
             continue
         return header.alpha is not None, [
-            f"the layer {header.layer} of EXR images is read"
+            f"EXR layer {header.layer} is used"
         ] if header.layer else []
     return False, []
 
@@ -450,11 +446,7 @@ def _finite_points(points: PointCloud | None) -> tuple[PointCloud | None, list[s
         return None, []
     keep = (np.abs(points.xyz) < FARTHEST).all(axis=1)
     lost = int((~keep).sum())
-    notes = (
-        [f"{lost} points hold NaN, infinite or far too large numbers and are ignored"]
-        if lost
-        else []
-    )
+    notes = [f"{lost} points with NaN, infinite or huge coordinates are ignored"] if lost else []
     points = PointCloud(points.xyz[keep], points.rgb[keep])
     return (points if len(points.xyz) else None), notes
 
@@ -469,12 +461,12 @@ def _present_priors(splits: Splits, tracks: Path | None) -> tuple[Splits, Path |
         if not missing:
             continue
         notes.append(
-            f"{len(missing)} of {len(paths)} {kind} are missing and do without, first {min(missing)}"
+            f"{len(missing)} of {len(paths)} {kind} are missing and ignored, first {min(missing)}"
         )
         splits = map_views(
             splits,
             lambda v, at=field, no=missing: replace(v, **{at: None}) if getattr(v, at) in no else v,
         )
     if tracks is not None and not check_inside(tracks).is_file():
-        return splits, None, [*notes, f"the tracks {tracks} are missing and are not used"]
+        return splits, None, [*notes, f"the tracks {tracks} are missing and ignored"]
     return splits, tracks, notes

@@ -61,7 +61,7 @@ def read_seconds(root: Path) -> dict[str, float]:
     if not path.is_file():
         return {}
     with reading(
-        path, "it needs an object 'seconds' of image names and seconds; see docs/formats.md"
+        path, "it needs an object 'seconds' that maps image names to seconds; see docs/formats.md"
     ):
         seconds: Any = read_json_object(path)["seconds"]
         return {name: float(second) for name, second in seconds.items()}
@@ -88,13 +88,13 @@ def times_from_names(splits: Splits, per_second: float | None = None) -> tuple[S
         }
         times |= {name: time for time, name in found.items()}
     line = f"from {min(times.values(), default=0):g} to {max(times.values(), default=0):g}"
-    line = f"times are the numbers in the names of the images, {line} (data.times=order"
+    line = f"times from the numbers in file names, {line} (data.times=order"
     if len(times) < len(all_views(splits)):
         for seen in folders.values():
             seen.sort(key=lambda view: natural_order(view.image_path.name))
             times |= {view.name: float(position) for position, view in enumerate(seen)}
         first = next(iter(folders.values()))[0].name
-        line = f"times are the order of the names, {first} first (data.times=order"
+        line = f"times from the order of file names, starting with {first} (data.times=order"
     if per_second is not None:
         length = (max(times.values()) - min(times.values())) / per_second
         line += f" at {per_second:g} per second: {length:.4g} s"
@@ -151,7 +151,7 @@ def normalize_times(
     for view in views:
         if not (is_number(view.time) and math.isfinite(view.time)):
             raise DyngsError(
-                f"{root}: the time of {view.name} must be a finite number, as of other images, got {view.time!r:.40}"
+                f"{root}: the time of {view.name} must be a finite number, got {view.time!r:.40}"
             )
     first = min(times)
     last = max(times)
@@ -163,7 +163,7 @@ def normalize_times(
     )
     if within and max(first, 1 - last) < MENTIONED_CHANGE:
         return scaled, []
-    return scaled, [f"times run from {first:g} to {last:g} and were scaled to [0, 1]"]
+    return scaled, [f"times {first:g} to {last:g} scaled to [0, 1]"]
 
 
 def drop_constant_times(splits: Splits) -> tuple[Splits, list[str]]:
@@ -171,7 +171,7 @@ def drop_constant_times(splits: Splits) -> tuple[Splits, list[str]]:
     times = {view.time for view in all_views(splits)}
     if len(times) != 1 or times == {None}:
         return splits, []
-    line = f"all images have time {times.pop():g}: treated as a static scene"
+    line = f"all images have time {times.pop():g}; treated as a static scene"
     return map_views(splits, lambda view: replace(view, time=None)), [line]
 
 
@@ -224,7 +224,7 @@ def parse_frames(text: str, key: str = "data.frames") -> slice:
     parts = [int(part) if part.strip() else None for part in text.split(":")] if is_slice else []
     if not is_slice or parts[2:] == [0]:
         raise DyngsError(
-            f"{key}={printable(repr(text), 60)}: write start:stop or start:stop:step in whole numbers, such as "
+            f"{key}={printable(repr(text), 60)}: must be start:stop or start:stop:step in whole numbers, such as "
             "0:100:2, and a step that is not 0"
         )
     return slice(*parts)
@@ -243,7 +243,9 @@ def split_by_frames(
     times = sorted(set(distinct.values()))
     picked = sorted(times[parse_frames(frames, key)])
     if not picked:
-        raise DyngsError(f"{root}: {key}={frames} picks none of the capture's {len(times)} times")
+        raise DyngsError(
+            f"{root}: {key}={frames} selects none of the {len(times)} times of the capture"
+        )
 
     def at(chosen: Sequence[float]) -> Splits:
         span = (chosen[-1] - chosen[0] if chosen else 0.0) or 1.0

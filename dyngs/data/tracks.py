@@ -45,7 +45,7 @@ def read_tracks(path: Path) -> ImageTracks:
     """Read tracks from a ``.npz`` with the arrays of ``ImageTracks``; positions that are not finite
     are not visible."""
     if not path.is_file():
-        raise DyngsError(f"{path}: no such tracks; restore them or remove tracks_file_path")
+        raise DyngsError(f"{path}: no such file of tracks; restore it or remove tracks_file_path")
     arrays = read_npz(path, ("xy", "visible", "names"))
     xy = arrays["xy"]
     visible = arrays["visible"]
@@ -135,11 +135,9 @@ def read_true_tracks(capture: Capture, name: str = TRACKS_FILE) -> TrueTracks | 
         shapes = ", ".join(f"{name} {x.shape} of {x.dtype}" for name, x in found.items())
         raise DyngsError(
             f"{path}: needs points (T, P, 3), times (T,), views (V,) names, moments (V,) whole numbers and visible "
-            f"(V, P) bool, got {shapes}; write it again, or remove it to do without"
+            f"(V, P) bool, got {shapes}; write it again, or remove it"
         )
     if len(moments) and not (moments.min() >= 0 and moments.max() < len(times)):
-        raise DyngsError(
-            f"{path}: moments must be rows of times; write it again, or remove it to do without"
-        )
+        raise DyngsError(f"{path}: moments must be rows of times; write it again, or remove it")
     points = (points - capture.world_offset) / capture.world_scale
     return TrueTracks(points, times, views, moments, visible)

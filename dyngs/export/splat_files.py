@@ -395,10 +395,12 @@ def write_moving(
         temporary.write_bytes(data)
     notes = (
         f"{counted(len(times), 'time')}, each shown for 1/{FPS:.0f} s",
-        *offset_notes(splats[0], "4dgs cannot state it"),
+        *offset_notes(splats[0], "4dgs cannot store it"),
     )
     if any(bool(splat.gaussians.sh[:, 1:].any()) for splat in splats):
-        notes += ("harmonics above degree 0 are left out: .4dgs holds none of moving Gaussians",)
+        notes += (
+            "SH coefficients above degree 0 are dropped: .4dgs stores none for moving Gaussians",
+        )
     return splats, notes
 
 
@@ -487,7 +489,7 @@ def write_bodies(
     notes = (
         f"bodies: {len(channels) // 2}, which turn for {opened.seconds:.1f} s in the colours of time {time:g}",
         f"all else and shadows stand as at time {time:g}; a sequence has their motion",
-        *offset_notes(splat, "the file states it"),
+        *offset_notes(splat, "stored in the file"),
     )
     return WrittenFile(path, splat, notes)
 

@@ -63,8 +63,8 @@ def check_inside(path: Path) -> Path:
     boundary = _boundary.get()
     if boundary is not None and not _is_below(real := os.path.realpath(path), boundary[1]):
         raise DyngsError(
-            f"{path}: leads to {real}, which lies outside the capture {boundary[0]}; "
-            "copy the file into the capture, or, if you trust it to name files of yours, set data.follow_links=true"
+            f"{path}: points to {real}, outside the capture {boundary[0]}; "
+            "copy the file into the capture or, if you trust the capture, set data.follow_links=true"
         )
     require_regular(path)
     return path
@@ -80,7 +80,7 @@ def scaled_limit(most: int) -> int:
         factor = 0.0
     if not 1 <= factor <= 1e6:
         raise DyngsError(
-            f"{LIMITS_VARIABLE}={text:.20} must be a number from 1 to 1e6: how many times the usual limits hold"
+            f"{LIMITS_VARIABLE}={text:.20} must be a factor from 1 to 1e6 for the default limits"
         )
     return int(most * factor)
 

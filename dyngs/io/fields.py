@@ -50,7 +50,7 @@ def read_json(path: Path) -> Any:
         except json.JSONDecodeError as error:
             where = f"{path}, line {error.lineno} column {error.colno}"
             raise DyngsError(
-                f"{where}: broken JSON ({error.msg}); copy or export it again"
+                f"{where}: invalid JSON ({error.msg}); copy or export it again"
             ) from error
 
 

@@ -32,8 +32,8 @@ def read_arrays(
             than ``MOST_BYTES``.
     """
     if path.exists() and not path.is_file():
-        raise DyngsError(f"{path}: is no file; name a .npz")
-    advice = "it is not a .npz, or a damaged one: copy it again"
+        raise DyngsError(f"{path}: not a file; give a .npz")
+    advice = "not a .npz, or damaged; copy it again"
     with reading(path, advice), path.open("rb") as file, zipfile.ZipFile(file) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         picked = {name: members[name] for name in choose(members)}
@@ -71,7 +71,7 @@ def read_map(path: Path, key: str) -> np.ndarray:
     found = read_arrays(path, lambda names: [key] if key in names or len(names) != 1 else names)
     values = next(iter(found.values()))
     if values.dtype.kind not in "biuf":
-        raise DyngsError(f"{path}: holds no numbers but {values.dtype}; export it again")
+        raise DyngsError(f"{path}: must contain numbers, got {values.dtype}; export it again")
     return values.astype(np.float64)
 
 
@@ -93,7 +93,7 @@ def read_npz(
 def require_text(raw: bytes | bytearray, dtype: np.dtype) -> None:
     """Check that the bytes of an array of text are valid characters; raises ValueError."""
     if dtype.kind == "U" and (np.frombuffer(raw, dtype.byteorder + "u4") > 0x10FFFF).any():
-        raise ValueError("an array of text in it holds what is no text")
+        raise ValueError("an array of text contains invalid characters")
 
 
 def array_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:

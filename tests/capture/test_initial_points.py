@@ -43,7 +43,7 @@ def test_real_points_are_used(shared: Path) -> None:
     capture = read_capture(shared / "clip_duck")
     begun, lines = begin(capture)
     assert begun.points is capture.points
-    assert lines == ["points.ply: 4,773 points, which the first Gaussians are made from"]
+    assert lines == ["points.ply: 4,773 points used as initial points"]
 
 
 RNG = np.random.default_rng(1)
@@ -189,5 +189,5 @@ def test_a_still_blender_scene_begins_in_its_silhouettes(tmp_path: Path) -> None
     begun, lines = add_initial_points(capture, DataConfig(root=root), PointsInit())
     assert begun.points is not None
     assert lines == [
-        f"{len(begun.points.xyz):,} first points were drawn at random in the silhouettes of the images"
+        f"{len(begun.points.xyz):,} initial points sampled at random inside the silhouettes"
     ]

@@ -57,14 +57,14 @@ def with_points(capture: Capture, xyz: np.ndarray) -> Capture:
 def test_few_images_far_apart_are_ill_posed(count: int, degrees: float, says: bool) -> None:
     """Not those of a video, nor many that jump about as in D-NeRF."""
     lines = check_before_training(clip(count, degrees))
-    expected = "12 images, each at a time of its own, 31 degrees apart on average: what moves is seen from one side"
+    expected = "12 images at different times, 31 degrees apart on average: moving objects are seen from one side"
     assert [line.startswith(expected) for line in lines] == [True] * says
 
 
 def test_one_fixed_camera() -> None:
     capture = clip(12, 0.0)
     (line,) = check_before_training(capture)
-    assert "one camera that does not move saw all 12 times" in line
+    assert "a single fixed camera recorded all 12 times" in line
 
 
 def test_points_and_cameras_that_do_not_meet() -> None:
@@ -73,7 +73,8 @@ def test_points_and_cameras_that_do_not_meet() -> None:
     assert check_before_training(with_points(capture, xyz)) == []
     far = with_points(capture, np.concatenate([xyz, xyz[:150] + np.array([0, 0, 50.0])]))
     assert any(
-        "33% of the points are in no camera's view" in line for line in check_before_training(far)
+        "33% of the points are not visible in any view" in line
+        for line in check_before_training(far)
     )
 
 
@@ -204,7 +205,7 @@ def test_a_good_capture_is_quiet(tmp_path: Path) -> None:
     report = build_report(_capture(tmp_path), deep=True)
     assert not report.problems, report.problems
     text = format_report(report)
-    for fact in ("5 train, 1 test", "32x24", "40 px", "43.6 degrees", "200", "nothing suspicious"):
+    for fact in ("5 train, 1 test", "32x24", "40 px", "43.6 degrees", "200", "no problems found"):
         assert fact in text, text
 
 
@@ -212,7 +213,7 @@ def test_a_good_capture_is_quiet(tmp_path: Path) -> None:
     ("changes", "line"),
     [
         ({"image_path": Path("nowhere.png")}, "nowhere.png"),
-        ({"width": 33}, "has 32x24 pixels, its camera says 33x24"),
+        ({"width": 33}, "has 32x24 pixels, but its camera is 33x24"),
         *(
             ({"intrinsics": np.array([[fx, 0, cx], [0, fy, 12], [0, 0, 1]])}, "odd intrinsics")
             for fx, fy, cx in ((40.0, 40.0, 99), (40.0, 80.0, 16), (4e4, 4e4, 16))
@@ -231,8 +232,8 @@ def test_scene_faults(tmp_path: Path) -> None:
     assert build_report(good.replace(warnings=("something odd",))).problems == ("something odd",)
     untested = good.replace(splits={"train": good.splits["train"][:2], "test": ()})
     assert [line.split(",")[0] for line in build_report(untested).problems] == [
-        "the split 'test' is empty",
-        "only 2 training views; a scene needs some 20 or more",
+        "no test views",
+        "only 2 training views; use at least 20",
     ]
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     turned = {
@@ -301,15 +302,15 @@ def test_links_that_leave_the_capture_are_reported(tmp_path: Path) -> None:
     report = inspect_capture(root)
     assert report.capture is not None
     assert report.problems == (
-        f"{root / 'notes'}: a link that leads out of the capture, to {tmp_path.resolve()}",
+        f"{root / 'notes'}: link to {tmp_path.resolve()}, outside the capture",
     )
     image = next((root / "train").iterdir())
     image.rename(tmp_path / "own.png")
     image.symlink_to(tmp_path / "own.png")
     report = inspect_capture(root)
     assert report.capture is None
-    assert "lies outside the capture" in report.problems[0]
-    assert any(f"{image}: a link that leads out" in line for line in report.problems[1:])
+    assert "outside the capture" in report.problems[0]
+    assert any(f"{image}: link to " in line for line in report.problems[1:])
     followed = inspect_capture(DataConfig(root=root, follow_links=True))
     assert followed.capture is not None
 
@@ -341,7 +342,7 @@ def test_cameras_that_stand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert "shows no depth" in video_report(rig / "a.mp4")
     assert main(["data", "inspect", str(rig)]) == 0
     shown = capsys.readouterr().out
-    assert "2 fixed cameras; offsets between them: found by sound" in shown
+    assert "2 fixed cameras; offsets between them: estimated from sound" in shown
     assert f"next: dyngs train dynamic data.root={rig}" in shown
     _turning(rig / "walk.mp4")
-    assert "next: take walk out" in video_report(rig)
+    assert "next: remove walk" in video_report(rig)

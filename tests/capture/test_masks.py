@@ -145,7 +145,7 @@ def test_who_walks_by_gets_masks(tmp_path: Path) -> None:
     assert capture.has_alpha
     assert all(iou_of(mask_of(capture, i), 8, i) > 0.9 for i in range(COUNT))
     assert len(said) == 1
-    assert "of the outlines lie on edges" in said[0]
+    assert "of the outlines lie on image edges" in said[0]
 
 
 def test_who_stays_needs_a_image_of_the_place(tmp_path: Path) -> None:
@@ -163,12 +163,12 @@ def test_who_stays_needs_a_image_of_the_place(tmp_path: Path) -> None:
 
 
 def test_a_camera_that_moves_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match="moves, so there is no background"):
+    with pytest.raises(DyngsError, match="moves, so its background is unknown"):
         add_background_masks(moving_block(tmp_path / "c", 8, turn=2), tmp_path / "m")
     capture = moving_block(tmp_path / "d", 8)
     views = list(capture.splits["train"])
     pose = views[3].cam_from_world.copy()
     pose[0, 3] = 0.1
     views[3] = replace(views[3], cam_from_world=pose)
-    with pytest.raises(DyngsError, match="moves, so there is no background"):
+    with pytest.raises(DyngsError, match="moves, so its background is unknown"):
         add_background_masks(capture.replace(splits={"train": tuple(views)}), tmp_path / "m")

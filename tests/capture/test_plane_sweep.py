@@ -124,7 +124,7 @@ def test_a_still_capture_without_any_points_is_swept(
     begun, lines = add_initial_points(capture, DataConfig(root=tmp_path), PointsInit(dense=2000))
     assert begun.points is not None
     assert len(begun.points.xyz) == 2000
-    assert lines == ["2,000 first points are from depth maps by plane sweep (init.dense)"]
+    assert lines == ["2,000 initial points from plane-sweep depth maps (init.dense)"]
     x, _, z = begun.points.xyz.T
     error = np.abs(z - SLOPE * x)
     assert np.median(error) < 0.01 * DISTANCE

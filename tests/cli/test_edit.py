@@ -54,7 +54,7 @@ def test_options_one_after_another(plain: Path, capsys: Capture) -> None:
     assert "next:    dyngs view a.ply" in said
     assert len(read_splats("a.ply").gaussians) > 400
     assert edit("a.ply", "--crop", "0,0,0", "1.5", "--outside", "--out", "b.spz") == 0
-    assert "spz cannot state how it was edited" in capsys.readouterr().out
+    assert "spz cannot store the edits" in capsys.readouterr().out
     assert edit("a.ply", "--undo", "--out=c.ply") == 0
     assert len(read_splats("c.ply").gaussians) == len(read_splats("a.ply").gaussians)
 

@@ -115,7 +115,7 @@ GOOD: dict[str, Any] = {
     [
         (
             {"poses": np.zeros((4, 87))},
-            "'poses' has 87 numbers per frame; the known bodies have 72",
+            "'poses' has 87 numbers per frame; supported bodies: 72",
         ),
         ({"poses": np.zeros((4, 73))}, "'poses' has 73 numbers per frame"),
         ({"poses": np.zeros((3, 72))}, "'poses' must hold as many numbers for each of 4 frames"),
@@ -126,7 +126,7 @@ GOOD: dict[str, Any] = {
         ({"trans": np.full((4, 3), np.nan)}, "'trans' of frame 0 holds NaN"),
         (
             {"trans": np.full((4, 3), 1e39)},
-            "'trans' of frame 0 holds NaN, infinite or huge numbers",
+            "'trans' of frame 0 contains NaN, infinite or huge values",
         ),
         (
             {"poses": np.where(np.arange(4)[:, None] == 2, np.inf, np.zeros(72))},
@@ -137,9 +137,12 @@ GOOD: dict[str, Any] = {
         ({"betas": np.zeros((3, 10))}, "'betas' must hold as many numbers"),
         ({"scale": -np.ones(4)}, "'scale' must be positive"),
         ({"scale": "big"}, "'scale' must hold as many numbers"),
-        ({"turns": np.zeros((4, 4))}, "'turns' has 4 numbers per frame instead of 3"),
-        ({"frames": [0, 1, 2, 1]}, "frame 1 has body parameters twice"),
-        ({"frames": []}, "holds no frame"),
+        (
+            {"origin_rotations": np.zeros((4, 4))},
+            "'origin_rotations' has 4 numbers per frame instead of 3",
+        ),
+        ({"frames": [0, 1, 2, 1]}, "frame 1 has two sets of body parameters"),
+        ({"frames": []}, "no frames found"),
     ],
 )
 def test_bad_parameters(change: dict[str, Any], line: str) -> None:

@@ -218,7 +218,7 @@ def test_missing_images_are_found_at_once(tmp_path: Path) -> None:
 
 def test_sizes_that_disagree(tmp_path: Path) -> None:
     views = views_of(tmp_path, 1)
-    with pytest.raises(DyngsError, match=r"0\.png: the image is 12x8, but its camera says 12x9"):
+    with pytest.raises(DyngsError, match=r"0\.png: the image is 12x8, but its camera is 12x9"):
         loader((replace(views[0], height=9),))
     write_image(tmp_path / "mask.png", np.full((4, 4, 1), 255, np.uint8))
     with pytest.raises(DyngsError, match=r"mask\.png: the mask is 4x4"):

@@ -128,7 +128,7 @@ def test_times_are_stretched_to_the_span_of_all_splits(blender_root: Path) -> No
     assert sorted(view.time or 0.0 for view in capture.splits["train"]) == pytest.approx(
         [0.05 * i for i in range(16)]
     )
-    assert capture.warnings == ("times run from 0 to 0.06 and were scaled to [0, 1]",)
+    assert capture.warnings == ("times 0 to 0.06 scaled to [0, 1]",)
     assert (capture.file_time_span, capture.seconds) == ((0.0, 0.06), None)
     assert dict(build_report(capture).facts)["times"] == "17 in 0 to 1 (0 to 0.06 in the files)"
 
@@ -167,7 +167,7 @@ def test_dynamic_formats_are_recognised_and_load(tmp_path: Path, form: str) -> N
         loader = ImageLoader(capture.splits["train"], DataConfig(root=tmp_path, downscale=2))
         assert loader[0].rgb_premultiplied.shape == (6, 8, 3)
         assert loader[0].time == capture.splits["train"][0].time
-    with pytest.raises(DyngsError, match=f"no colmap capture.*but there is a {form} capture"):
+    with pytest.raises(DyngsError, match=f"no colmap capture.*it contains a {form} capture"):
         read(tmp_path, format="colmap")
 
 

@@ -68,7 +68,7 @@ def test_scaled_over_all_splits(times: list[float], cut: int) -> None:
         assert (found, notes) == (times, [])
     else:
         assert found == pytest.approx([(time - low) / (high - low) for time in times])
-        assert notes == [f"times run from {low:g} to {high:g} and were scaled to [0, 1]"]
+        assert notes == [f"times {low:g} to {high:g} scaled to [0, 1]"]
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_stretched_to_the_span_of_the_clip(times: list[float], mentioned: bool |
     else:
         span = max(times) - min(times)
         assert times_of(scaled) == pytest.approx([(time - min(times)) / span for time in times])
-        assert [f"times run from {min(times):g} to {max(times):g}" in note for note in notes] == [
+        assert [f"times {min(times):g} to {max(times):g}" in note for note in notes] == [
             True
         ] * mentioned
     assert normalize_times(ROOT, splits, stretch=False) == (splits, [])
@@ -234,7 +234,7 @@ def test_as_python_slices(
     expected = sorted(range(count)[start:stop:step])
     times = [i / max(count - 1, 1) for i in range(count)]
     if not expected:
-        with pytest.raises(DyngsError, match=f"picks none of the capture's {count} times"):
+        with pytest.raises(DyngsError, match=f"selects none of the {count} times"):
             split_by_frames(ROOT, splits(times, []), text)
         return
     kept, others = split_by_frames(ROOT, splits(times, times[:1]), text)

@@ -89,9 +89,7 @@ BAD_NAMES = (
 @pytest.mark.parametrize("name", BAD_NAMES)
 def test_names_that_lead_elsewhere_are_refused(tmp_path: Path, root: Path, name: str) -> None:
     file = packed(tmp_path / "scene.zip", root, more={name: b"evil"})
-    with pytest.raises(
-        DyngsError, match=r"scene\.zip: holds the file .*, which is no name below its folder"
-    ):
+    with pytest.raises(DyngsError, match=r"scene\.zip: unsafe file name .* in the archive"):
         unpack_archive(file)
     assert left() == []
     assert not list(tmp_path.rglob("evil*"))
@@ -115,9 +113,7 @@ def test_bombs_are_refused_before_they_are_unpacked(tmp_path: Path) -> None:
     ):
         for _ in range(160):
             member.write(bytes(2**20))
-    with pytest.raises(
-        DyngsError, match=r"167,772,160 bytes exceed the limit of 134,217,728.*=2$"
-    ):
+    with pytest.raises(DyngsError, match=r"167,772,160 bytes exceed the limit of 134,217,728.*=2$"):
         unpack_archive(file)
     assert left() == []
 

@@ -111,7 +111,7 @@ def test_no_reader_opens_what_lies_outside(kind: str, name: str, tmp_path: Path)
     shutil.move(root / name, tmp_path / "private" / "own")
     (root / name).symlink_to("../" * (name.count("/") + 1) + "private/own")
     with pytest.raises(
-        DyngsError, match=r"private/own.*lies outside the capture.*data\.follow_links=true"
+        DyngsError, match=r"private/own.*outside the capture.*data\.follow_links=true"
     ):
         read(root)
     followed = read(root, follow_links=True)
@@ -130,7 +130,7 @@ def test_paths_that_leave_the_capture(key: str, written: str, tmp_path: Path) ->
     write_image(tmp_path / "own.png", random_pixels(8, 12, 3))
     name = written.format(tmp=tmp_path)
     edit_json(root / "transforms.json", lambda content: content["frames"][1].update({key: name}))
-    with pytest.raises(DyngsError, match=r"own(\.png)?, which lies outside the capture"):
+    with pytest.raises(DyngsError, match=r"own(\.png)?, outside the capture"):
         read(root)
     assert len(read(root, follow_links=True).splits["train"]) == 3
 
@@ -167,7 +167,7 @@ def test_a_folder_whose_name_begins_the_same_is_outside(tmp_path: Path) -> None:
     (tmp_path / "capture").mkdir()
     with restrict_paths_to(tmp_path / "capture"):
         assert check_inside(tmp_path / "capture" / "a.png") == tmp_path / "capture" / "a.png"
-        with pytest.raises(DyngsError, match="lies outside the capture"):
+        with pytest.raises(DyngsError, match="outside the capture"):
             check_inside(tmp_path / "capture2" / "a.png")
     assert check_inside(tmp_path / "capture2" / "a.png"), "without a border"
 

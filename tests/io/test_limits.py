@@ -20,14 +20,14 @@ def test_what_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
         require_at_most(Path("a.x"), 1001, 100, "things")
     monkeypatch.setenv(LIMITS_VARIABLE, "11")
     require_at_most(Path("a.x"), 1001, 100, "things")
-    with pytest.raises(DyngsError, match=r"over 10\^18 things exceed the limit of 1,100 .*=N"):
+    with pytest.raises(DyngsError, match=r"over 10\^18 things exceed the limit of 1,100; .*=N"):
         require_at_most(Path("a.x"), 10**5000, 100, "things")
 
 
 @pytest.mark.parametrize("text", ["", "x", "nan", "0", "-1", "0.5", "inf", "1e300"])
 def test_a_variable_that_means_nothing(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
     monkeypatch.setenv(LIMITS_VARIABLE, text)
-    with pytest.raises(DyngsError, match=r"DYNGS_LIMITS=.* must be a number from 1 to 1e6"):
+    with pytest.raises(DyngsError, match=r"DYNGS_LIMITS=.* must be a factor from 1 to 1e6"):
         scaled_limit(1)
 
 

@@ -20,8 +20,8 @@ from dyngs.io import outputs
 from dyngs.io.outputs import LOCK_NAME, InUseError, atomic_folder, lock_folder, make_once
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-HOLD = "import sys, time; from pathlib import Path; from dyngs.io.outputs import writing\n"
-HOLD += "with writing(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
+HOLD = "import sys, time; from pathlib import Path; from dyngs.io.outputs import lock_folder\n"
+HOLD += "with lock_folder(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
 
 
 @contextmanager
@@ -67,7 +67,7 @@ def test_of_many_that_want_it_at_once_one_has_it(tmp_path: Path) -> None:
     """Also while the lock file is removed and made anew all the time."""
     code = HOLD.partition("\n")[0] + (
         "\nfrom dyngs.core.errors import DyngsError\nfolder, count = Path(sys.argv[1]), 0\nwhile count < 30:\n"
-        "    try:\n        with writing(folder):\n            count += 1\n"
+        "    try:\n        with lock_folder(folder):\n            count += 1\n"
         "            n = int((folder / 'n').read_text()); time.sleep(1e-4); (folder / 'n').write_text(str(n + 1))\n"
         "    except DyngsError: time.sleep(1e-3)\n"
     )

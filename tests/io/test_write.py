@@ -114,9 +114,7 @@ def test_devices_and_pipes_are_refused_and_stay(kind: str, way: str, tmp_path: P
         except OSError:
             pytest.skip("devices cannot be made here")
     before = path.lstat()
-    with pytest.raises(
-        DyngsError, match=r"cannot write .*: it is a device, a pipe or the like; give the name of"
-    ):
+    with pytest.raises(DyngsError, match=r"cannot write .*: not a regular file; give a file name"):
         WAYS[way](path)
     after = path.lstat()
     assert (after.st_ino, after.st_mode) == (before.st_ino, before.st_mode)
@@ -128,9 +126,7 @@ def test_stdout_is_no_file_even_where_it_is_redirected_to_one(name: str) -> None
     """The link in /dev would be replaced; the check writes nothing."""
     if not Path("/proc/self").exists():
         pytest.skip("not Linux")
-    with pytest.raises(
-        DyngsError, match=f"cannot write {name}: it is a device, a pipe or the like"
-    ):
+    with pytest.raises(DyngsError, match=f"cannot write {name}: not a regular file"):
         require_replaceable(Path(name))
 
 

@@ -160,7 +160,7 @@ class SfmResult:
             f"mean error {self.mean_error_px:.2f} px: {self.root}"
         ]
         if self.unregistered:
-            lines.append("no pose for " + first_few(self.unregistered))
+            lines.append("not registered: " + first_few(self.unregistered))
         return "\n".join((*lines, *self.notes))
 
 
@@ -203,7 +203,7 @@ def _posed_in(
         photos, notes = gather_photos(source, capture / "images", out)
     if len(photos) < 3:
         found = "; ".join((f"{source} has {counted(len(photos), 'image')}", *notes))
-        raise DyngsError(f"{found}; structure from motion needs at least 3, better 30")
+        raise DyngsError(f"{found}; structure from motion needs at least 3, ideally 30")
     with quiet_colmap():
         masks = options.masks
         with nullcontext() if masks is None else restrict_paths_to(masks, options.follow_links):
@@ -212,14 +212,14 @@ def _posed_in(
         match_pairs(task, pairs_to_match(task))
         if homography_fraction(task.database) > _FLAT:
             raise DyngsError(
-                "the images differ only as if the camera rotated on the spot (or all show one flat surface), which "
+                "the camera only rotated, or all images show one flat surface, which "
                 "gives no depth; walk sideways around the scene by about a quarter of its distance, and keep it in view"
             )
         model = run_mapping(task)
     if model is None:
         raise DyngsError(
-            f"no poses could be found for {len(task.names)} images: take sharper ones that overlap by two thirds, move "
-            "the camera sideways, do not only rotate it, avoid bare or moving surfaces, or try matching=exhaustive"
+            f"could not estimate poses for {len(task.names)} images: take sharper images that overlap by two thirds, move "
+            "the camera sideways, avoid textureless or moving surfaces, or try matching=exhaustive"
         )
     _require_depth(model, task)
     own = dict(zip(task.names, (photo.name for photo in photos), strict=True))
@@ -245,7 +245,7 @@ def _laid_out(
     }
     if options.masks is not None and not masks:
         raise DyngsError(
-            f"{options.masks}: no mask is named as an image is (a.jpg.png, a.jpg or a.png for a.jpg)"
+            f"{options.masks}: no mask is named after an image (a.jpg.png, a.jpg or a.png for a.jpg)"
         )
     names = prepare_colmap_images(photos, folder, work / "images", masks)
     for name, mask in masks.items():
@@ -264,16 +264,16 @@ def _require_depth(model: SfmModel, task: SfmTask) -> None:
     """Check that points are seen from directions that differ, by a lens that there can be."""
     if not model.has_real_lens:
         raise DyngsError(
-            "no lens that there can be fits the matches: most of them are probably on something that moves, as a "
-            "person who fills much of the images; give masks of it (--masks), or film what stands"
+            "no plausible lens fits the matches: most of them are probably on a moving object, such as a "
+            "person who fills the image; give masks of it (--masks), or film a static scene"
         )
     angles = triangulation_angles_deg(model.reconstruction)
     angle = float(np.median(angles)) if len(angles) else 0.0
     if angle >= _SMALL_ANGLE_DEG:
         return
     raise DyngsError(
-        f"the camera hardly moved: half of the points are seen from directions less than {max(angle, 0.1):.1f} degrees "
-        f"apart, which gives no depth; {_film(task)} while walking sideways by about a quarter of the distance to the "
+        f"the camera hardly moved: the median triangulation angle is {max(angle, 0.1):.1f} degrees, "
+        f"which gives no depth; {_film(task)} while walking sideways by about a quarter of the distance to the "
         "scene"
     )
 
@@ -296,12 +296,12 @@ def _advice(unregistered: Sequence[str], blurred: Sequence[str], is_video: bool)
     if unregistered:
         more = "move slower there" if is_video else "take more photos around them"
         yield (
-            f"{len(unregistered)} images without a pose: {more}, unless things that move fill them, or the camera only "
+            f"{len(unregistered)} images could not be registered: {more}, unless they show mostly moving objects or the camera only "
             "rotated there"
         )
     if blurred:
-        more = "more light or a slower hand" if is_video else "take them again"
-        yield f"{len(blurred)} images are much less sharp than the others ({first_few(blurred)}): {more}"
+        more = "use more light or move slower" if is_video else "take them again"
+        yield f"{len(blurred)} images are blurred ({first_few(blurred)}): {more}"
 
 
 def _frames_of(
@@ -316,7 +316,7 @@ def _frames_of(
     reach = measures.away.max(initial=0.0)
     if len(measures) >= 3 and reach < MIN_CAMERA_MOTION:
         raise DyngsError(
-            f"{video}: the camera stands still (the image moves by {reach:.2%} of its width), which "
+            f"{video}: the camera does not move (the image shifts by {reach:.2%} of its width), which "
             "gives no depth; film while walking sideways around the scene"
         )
     names = {index: f"frame_{index:05d}.png" for index in numbers}
@@ -330,7 +330,7 @@ def _frames_of(
     write_seconds(capture, {name: seconds[index] for index, name in names.items()})
     notes = [
         *colour_messages([probe_video(video)]),
-        f"{len(numbers)} of {len(measures)} frames taken, by motion and sharpness",
+        f"{len(numbers)} of {len(measures)} frames selected by motion and sharpness",
     ]
     return photos, notes, [names[index] for index in blurred]
 

@@ -94,7 +94,7 @@ def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], l
     heif = [file for file in taken if _is_heif(file)]
     if heif and find_spec("pillow_heif") is None:
         raise DyngsError(
-            f"{source}: {len(heif)} photos are HEIC, first {heif[0].name}, which needs the package pillow-heif: "
+            f"{source}: {len(heif)} HEIC photos, first {heif[0].name}, need the package pillow-heif: "
             "pip install 'dyngs[heic]', or convert them to JPEG"
         )
     headers = {photo: _checked(photo) for photo in taken}
@@ -115,7 +115,7 @@ def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], l
     left_out = len(files) - len(taken)
     if left_out:
         known = ", ".join(sorted(PHOTO_SUFFIXES))
-        notes.append(f"{counted(left_out, 'file')} left out, no photos (photos are {known})")
+        notes.append(f"{counted(left_out, 'file')} skipped, not photos ({known})")
     return photos, notes
 
 

@@ -47,13 +47,13 @@ def ensure_poses(
     videos = list_videos(source) if is_several_videos(source) else []
     if videos and not needs_times:
         raise DyngsError(
-            f"{source}: holds {len(videos)} videos, which a static scene cannot be made of; give `dyngs train dynamic "
-            f"data.root={as_word(source)}`, or one video of a camera that moves"
+            f"{source}: holds {len(videos)} videos; a static scene needs one video of a moving camera, several need `dyngs train dynamic "
+            f"data.root={as_word(source)}`"
         )
     if source.is_dir() and not videos and needs_times and data.times == "files":
         raise DyngsError(
-            f"{source}: photos have no times, so nothing can move; give data.times=order if their names are in the "
-            "order of time, a video, or train configs/static.yaml"
+            f"{source}: photos have no times, so a moving scene cannot be trained; set data.times=order if their names are in "
+            "temporal order, give a video, or use `dyngs train static`"
         )
     files = (
         [*videos, *(path for path in [source / VIDEOS_FILE] if path.is_file())] if videos else None
@@ -64,16 +64,14 @@ def ensure_poses(
     folder = cache_folder("poses") / f"{re.sub(r'[^A-Za-z0-9-]', '_', source.stem)[:40]}.{digest}"
 
     def estimate() -> None:
-        log(
-            f"{source} has no poses; they are estimated first, as by `dyngs data sfm`, into {folder}"
-        )
+        log(f"{source} has no poses; estimating them (as `dyngs data sfm` does) into {folder}")
         options = SfmOptions(masks=masks, follow_links=data.follow_links)
         if videos:
             log(poses_of_videos(source, folder, options, report))
         else:
             log(estimate_poses(source, folder, options, report).summary())
 
-    make_once(folder, estimate, log, f"{source} has no poses; those of before are in {folder}")
+    make_once(folder, estimate, log, f"{source} has no poses; using the poses cached in {folder}")
     record_source(folder, data.root)
     return data.model_copy(update={"root": folder})
 
@@ -93,14 +91,16 @@ def is_unposed(data: DataConfig) -> bool:
         return True
     videos = list_videos(root)
     if len(videos) == 1:
-        raise DyngsError(f"{root}: holds one video; give that: data.root={as_word(videos[0])}")
+        raise DyngsError(
+            f"{root}: contains one video; give the video itself: data.root={as_word(videos[0])}"
+        )
     photos = (
         [] if videos or suggest_command(root, captures=False) is not None else list_photos(root)
     )
     if photos:
         raise DyngsError(
-            f"{root}: holds {counted(len(photos), 'photo')} and no cameras; a scene needs at least {FEWEST_PHOTOS} "
-            "photos of it from different places, better 50, or a video"
+            f"{root}: holds {counted(len(photos), 'photo')} but no cameras; a scene needs at least {FEWEST_PHOTOS} "
+            "photos from different positions, ideally 50, or a video"
         )
     return bool(videos)
 

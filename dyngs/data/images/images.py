@@ -239,7 +239,9 @@ def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool
 
 
 def _reading(path: Path) -> AbstractContextManager[None]:
-    return reading(path, "the image is damaged or of an unknown kind; copy or convert it again")
+    return reading(
+        path, "the image is damaged or its format is not supported; copy or convert it again"
+    )
 
 
 def read_raw(path: Path) -> tuple[np.ndarray, bool]:
@@ -269,9 +271,7 @@ def check_image(path: Path) -> ImageHeader:
     if not is_complete and header.format_name == "jpeg":
         read_image(path)
     elif not is_complete:  # not decoded: libpng would print lines of its own
-        raise DyngsError(
-            f"{path}: the image is truncated or damaged (its end is missing); copy it again"
-        )
+        raise DyngsError(f"{path}: the image is truncated; copy it again")
     return header
 
 
@@ -396,12 +396,12 @@ def _exr_layer(path: Path, reader: OpenImageIO.ImageInput) -> ExrLayer | None:
         )
     layers = list_layers(parts)
     if not layers:
-        raise DyngsError(f"{path}: the image is deep, which dyngs does not read; flatten it")
+        raise DyngsError(f"{path}: deep EXR images are not supported; flatten it")
     chosen = layers[0] if len(layers) == 1 else find_beauty_pass(layers)
     if chosen is None:
         raise DyngsError(
-            f"{path}: which layer is the image is not clear; name one rgba, Combined, C or beauty, or save it alone. "
-            f"The file has {first_few([layer.name or 'one without a name' for layer in layers])}"
+            f"{path}: cannot tell which layer is the image; name one rgba, Combined, C or beauty, or save it alone. "
+            f"The file has {first_few([layer.name or 'an unnamed layer' for layer in layers])}"
         )
     reader.seek_subimage(chosen.part, 0)
     return chosen if len(layers) > 1 else None

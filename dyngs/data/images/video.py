@@ -186,7 +186,7 @@ def list_videos(folder: Path) -> list[Path]:
     for path in videos:
         if names.setdefault(path.stem, path) != path:
             raise DyngsError(
-                f"{folder}: {names[path.stem].name} and {path.name} are one camera; remove one of them"
+                f"{folder}: {names[path.stem].name} and {path.name} have the same camera name; remove one of them"
             )
     return videos
 
@@ -226,7 +226,7 @@ def probe_video(path: Path) -> VideoInfo:
     counted."""
     decoded = next(_decoded(path), None)
     if decoded is None:
-        raise _broken(path, 0, "it holds no image")
+        raise _broken(path, 0, "it contains no frame")
     _, first, tags = decoded
     height, width = _rotated_rgb(path, first, tags).shape[:2]
     with _reading(path), open_video_container(path) as container:
@@ -237,12 +237,12 @@ def probe_video(path: Path) -> VideoInfo:
         count = max(stream.frames, len(hidden)) - sum(hidden)
     if count > MAX_FRAMES:
         raise DyngsError(
-            f"{path}: the video has {count:,} frames, of which {MAX_FRAMES:,} are read at most; cut it up"
+            f"{path}: the video has {count:,} frames, more than the limit of {MAX_FRAMES:,}; split it"
         )
     note = tags.conversion
     is_untagged = {tags.primaries, tags.transfer, tags.matrix} == {UNSPECIFIED}
     if is_untagged and _matrix_of(first, tags) == BT709_MATRIX:
-        note = "HD without colour tags is read as BT.709"
+        note = "HD without colour tags, assumed to be BT.709"
     return VideoInfo(width, height, count, fps if math.isfinite(fps) else 0.0, note)
 
 
@@ -343,7 +343,7 @@ def _reading(path: Path) -> AbstractContextManager[None]:
 
 def _broken(path: Path, index: int, why: str) -> DyngsError:
     return DyngsError(
-        f"the video {path} breaks at frame {index} ({why}); copy it again, or choose data.frames without that part"
+        f"cannot decode the video {path} at frame {index} ({why}); copy it again, or exclude that part with data.frames"
     )
 
 
@@ -384,7 +384,7 @@ def _rotated_rgb(path: Path, frame: av.VideoFrame, tags: ColourTags) -> np.ndarr
     matrix = _matrix_of(frame, tags)
     if matrix not in SUPPORTED_MATRICES:  # as that of Dolby Vision without a base layer
         raise DyngsError(
-            f"{path}: its colours have the matrix {matrix} of ITU-T H.273, which dyngs cannot convert; "
+            f"{path}: its colours have the matrix {matrix} of ITU-T H.273, which is not supported; "
             "export the video as SDR, HLG or HDR10"
         )
     # The nearest sample of chroma, as swscale takes it for 8 bits: filters mix colours at edges,

@@ -67,7 +67,7 @@ def open_camera(name: str, path: Path) -> CameraSource:
         digits = re.findall(r"\d+", image.stem)
         if not digits:
             raise DyngsError(
-                f"{image}: no frame number in its name; call it frame_0000{image.suffix} or the like"
+                f"{image}: no frame number in its name; rename it, for example to frame_0000{image.suffix}"
             )
         other = images.setdefault(int(digits[-1]), image)
         if other != image:
@@ -140,10 +140,10 @@ def read_camera_folders(root: Path) -> Capture:
     names = [name for name in sorted(calibrated) if name in found]
     if not names:
         raise DyngsError(
-            f"{path}: no folder or video is named like its cameras ({first_few(sorted(calibrated))})"
+            f"{path}: no folder or video is named after a camera ({first_few(sorted(calibrated))})"
         )
     warnings = [
-        f"{path.name}: {kind} for {first_few(sorted(some.keys() - others.keys()))}, left out"
+        f"{path.name}: {kind} for {first_few(sorted(some.keys() - others.keys()))}, skipped"
         for kind, some, others in (
             ("no folder or video", calibrated, found),
             ("no calibration", found, calibrated),
@@ -205,7 +205,7 @@ def _splits(
         if len(views) < MIN_CAMERAS_TO_HOLD_OUT:
             return {"train": _held_out(views, [])["train"]}, []
         test = [min(views)]
-        notes = [f"{path.name} names no 'test' cameras: the first one, {test[0]}, is held out"]
+        notes = [f"{path.name} lists no 'test' cameras; the first one, {test[0]}, is held out"]
     elif not isinstance(test, list) or not all(isinstance(name, str) for name in test):
         raise DyngsError(f"{path}: 'test' must be a list of camera names")
     unknown = sorted(set(test) - views.keys())
@@ -251,8 +251,8 @@ def read_llff(root: Path) -> Capture:
     names = list(found)
     if len(names) != len(rows):
         raise DyngsError(
-            f"{path}: has poses of {len(rows)} cameras, but {len(names)} videos or folders of frames are there "
-            f"({first_few(names)}); make them the same"
+            f"{path}: has {len(rows)} poses, but there are {len(names)} videos or folders of frames "
+            f"({first_few(names)}); make the numbers equal"
         )
     cameras = [open_camera(name, found[name]) for name in names]
     calibrations = {name: _llff_calibration(row) for name, row in zip(names, rows, strict=True)}

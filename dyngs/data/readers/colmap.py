@@ -74,7 +74,7 @@ def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], 
     for path in paths:
         if not check_inside(path).is_file():
             raise DyngsError(
-                f"{path}: the COLMAP model lacks this file; export the whole model again"
+                f"{path}: file missing from the COLMAP model; export the whole model again"
             )
     if is_binary:
         cameras = _binary_entries(paths[0], _next_camera)
@@ -88,7 +88,7 @@ def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], 
     lost = next((image for image in images if image.camera not in known), None)
     if lost is not None:
         raise DyngsError(
-            f"{paths[1]}: {lost.name} is of camera {lost.camera}, which {paths[0].name} lacks"
+            f"{paths[1]}: {lost.name} refers to camera {lost.camera}, which is not in {paths[0].name}"
         )
     table = np.array(points, np.float64).reshape(-1, 7)
     table = table[np.argsort(table[:, 0], kind="stable")]
@@ -147,7 +147,7 @@ def _text_entries(path: Path, entry_of: Callable[[str], Entry]) -> list[Entry]:
                 may_skip = path.stem == "images"
     if len(entries) < announced:
         raise DyngsError(
-            f"{path}: truncated, holds {len(entries)} of {announced} entries; copy or export it again"
+            f"{path}: truncated after {len(entries)} of {announced} entries; copy or export it again"
         )
     return entries
 
@@ -157,7 +157,9 @@ def _binary_entries(path: Path, next_entry: Callable[[_Binary], Entry]) -> list[
         file = _Binary(path.read_bytes())
         entries = [next_entry(file) for _ in range(file.unpack("<Q")[0])]
         if file.at != len(file.data):
-            raise ValueError(f"its entries end at byte {file.at}, the file at {len(file.data)}")
+            raise ValueError(
+                f"entries end at byte {file.at}, but the file has {len(file.data)} bytes"
+            )
     return entries
 
 
@@ -238,8 +240,8 @@ def find_model(root: Path) -> tuple[Path | None, list[str]]:
         folders, key=lambda folder: max(x.stat().st_size for x in folder.glob("images.*"))
     )
     line = (
-        f"{largest.parent}: of {len(folders)} models that are not connected, {largest.name} is read, which is the "
-        "largest; to read another one, move it out of the capture"
+        f"{largest.parent}: {len(folders)} separate models found; using the largest, {largest.name} "
+        "(to use another one, move it out of the capture)"
     )
     return largest, [line]
 
@@ -271,7 +273,7 @@ def read_colmap(root: Path) -> Capture:
     """
     folder, warnings = find_model(root)
     if folder is None:
-        raise DyngsError(f"{root}: holds no COLMAP model ({FILES})")
+        raise DyngsError(f"{root}: no COLMAP model found ({FILES})")
     cameras, listed, points = read_model(folder)
     images = _images_of(root, folder)
     finder = FileFinder(images)
@@ -337,7 +339,7 @@ def _poses(folder: Path, images: list[ModelImage]) -> tuple[list[np.ndarray], di
         length = float(np.linalg.norm((w, x, y, z)))
         if not abs(length - 1) <= ROTATION_TOLERANCE:  # zeros would be taken for no rotation
             raise DyngsError(
-                f"{where}: the quaternion of its rotation has length {length:.6g}, not 1; export it again"
+                f"{where}: its rotation quaternion has length {length:.6g} instead of 1; export it again"
             )
         rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
         pose, repaired[where] = validate_pose(np.column_stack([rotation, translation]), where)
@@ -358,7 +360,7 @@ def pinhole_and_lens(camera: ModelCamera, where: str) -> tuple[np.ndarray, Lens]
     fy = values[num_focal - 1]
     if not np.isfinite(values).all() or min(fx, fy) <= 0 or min(camera.size) < 1:
         raise DyngsError(
-            f"{where}: its camera needs a positive size and focal length, and finite numbers; export it again"
+            f"{where}: camera size and focal length must be positive and all parameters finite; export it again"
         )
     cx, cy, *coefficients = values[num_focal:]
     if kind == "none" or (kind == "opencv" and not any(coefficients)):
@@ -374,7 +376,7 @@ def _splits(folder: Path, names: list[str], views: list[View]) -> tuple[Splits, 
     path = folder / TEST_LIST
     if not path.is_file():
         return {"train": tuple(views)}, []
-    with reading(path, "it must list names of images, a line each; repair or remove it"):
+    with reading(path, "it must list one image name per line; repair or remove it"):
         text = read_text(path)
     listed = {normalize_name(line.strip()) for line in text.splitlines() if line.strip()}
     unknown = sorted(listed - set(map(normalize_name, names)))

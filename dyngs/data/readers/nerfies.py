@@ -104,7 +104,7 @@ def _image_folder(root: Path) -> Path:
     for folder in sorted(found, key=lambda path: int(path.name[:-1])):
         if list_files(folder, SUFFIXES):
             return folder
-    raise DyngsError(f"{root}: no images in 1x, 2x, 4x or the like; restore one of these folders")
+    raise DyngsError(f"{root}: no images in 1x, 2x, 4x, ...; restore one of these folders")
 
 
 def _camera(path: Path, factor: int, center: np.ndarray, scale: float) -> dict[str, object]:

@@ -94,7 +94,9 @@ def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
         matrix = parse_numbers(where, require_key(root / ALIGNMENTS, alignments, name), (4, 3)).T
         scale = float(np.cbrt(np.linalg.det(matrix[:, :3])))
         if scale <= 0:
-            raise DyngsError(f"{where}: the alignment is no similarity; export it again")
+            raise DyngsError(
+                f"{where}: the alignment is not a similarity transform; export it again"
+            )
         rigid = np.concatenate([matrix[:, :3] / scale, matrix[:, 3:]], axis=1)
         pose, _ = validate_pose(rigid, where)
         scales.append(scale)
@@ -111,7 +113,7 @@ def _splits(root: Path, people: dict[str, View]) -> tuple[Splits, list[str]]:
         path = root / f"{split}_split.txt"
         if not path.is_file():
             continue
-        with reading(path, "it lists names of images, one a line"):
+        with reading(path, "it must list one image name per line"):
             listed = list(dict.fromkeys(read_limited(check_inside(path)).decode().split()))
         unposed += [name for name in listed if name not in people]
         splits[split] = tuple(people[name] for name in listed if name in people)
@@ -121,7 +123,7 @@ def _splits(root: Path, people: dict[str, View]) -> tuple[Splits, list[str]]:
     if not unposed:
         return splits, []
     return splits, [
-        f"{len(unposed)} images of the splits have no pose and are left out: {first_few(unposed)}"
+        f"{len(unposed)} images of the splits have no pose and are skipped: {first_few(unposed)}"
     ]
 
 

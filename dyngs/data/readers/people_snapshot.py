@@ -54,7 +54,7 @@ def read_people_snapshot(root: Path) -> Capture:
     lost = len(camera.images) - len(images)
     if lost:
         warnings.append(
-            f"{video.name}: {lost} of {len(camera.images)} frames lack a mask or a pose and are left out"
+            f"{video.name}: {lost} of {len(camera.images)} frames have no mask or no pose and are skipped"
         )
     own = share_body_across_splits(body)
     fps = video_fps([camera])
@@ -68,7 +68,7 @@ def _video(root: Path) -> Path:
     named = [path for path in found if path.stem == root.resolve().name] or found
     if len(named) != 1:
         what = f"{len(found)} videos" if found else "no video"
-        raise DyngsError(f"{root}: {what} in it; keep one, called {root.resolve().name}.mp4")
+        raise DyngsError(f"{root}: found {what}; keep one, named {root.resolve().name}.mp4")
     return named[0]
 
 

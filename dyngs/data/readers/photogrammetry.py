@@ -66,10 +66,10 @@ def _capture(
             )
     if not frames:
         raise DyngsError(
-            f"{path}: no photo in {root} has the name of a camera with a pose; put the photos there"
+            f"{path}: no photo in {root} is named after a posed camera; copy the photos there"
         )
     count = f"{len(left_out)} of {counted(len(cameras), 'camera')}"
-    line = f"{path.name}: {count} have no pose or no photo and are left out: {first_few(left_out)}"
+    line = f"{path.name}: {count} have no pose or no photo and are skipped: {first_few(left_out)}"
     return training_capture(
         root, format, FrameFile(root / path.name, frames), *([line] if left_out else [])
     )
@@ -87,7 +87,7 @@ def _exports(root: Path, suffix: str, mark: bytes) -> list[Path]:
 
 def _only(files: Sequence[Path]) -> Path:
     if len(files) > 1:
-        raise DyngsError(f"{files[0]} and {files[1].name} both hold cameras; move one elsewhere")
+        raise DyngsError(f"{files[0]} and {files[1].name} both contain cameras; move one elsewhere")
     return check_inside(files[0])
 
 
@@ -100,7 +100,7 @@ def _brown(where: str, k: Sequence[float]) -> _Fields:
     of r^8."""
     if k[3] != 0:
         raise DyngsError(
-            f"{where}: its distortion with k4={k[3]:g} cannot be expressed; export undistorted photos"
+            f"{where}: its distortion with k4={k[3]:g} is not supported; export undistorted photos"
         )
     return _radial(k[:3])
 
@@ -116,9 +116,7 @@ def read_metashape(root: Path) -> Capture:
     with reading(path, _ADVICE):
         content = path.read_bytes()
         if b"<!ENTITY" in content:
-            raise DyngsError(
-                f"{path}: defines entities, which no export of cameras needs; {_ADVICE}"
-            )
+            raise DyngsError(f"{path}: XML entities are not allowed; {_ADVICE}")
         chunk = next(ElementTree.fromstring(content).iter("chunk"))
         sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
         placements: dict[str | None, ElementTree.Element | None] = {}
@@ -284,7 +282,7 @@ def read_odm(root: Path) -> Capture:
             model = max(content, key=lambda model: len(model["shots"]))
             if len(content) > 1:
                 warnings = [
-                    f"{path.name}: the largest of {len(content)} models is read, {len(model['shots'])} photos"
+                    f"{path.name}: using the largest of {len(content)} models ({len(model['shots'])} photos)"
                 ]
             lenses = model["cameras"]
             shots = model["shots"]
@@ -312,13 +310,13 @@ def _odm_camera(path: Path, name: str, shot: _Fields, lenses: dict[str, _Fields]
     where = f"{path}, {name}"
     if "camera" not in shot and len(lenses) > 1:
         raise DyngsError(
-            f"{where}: which of {len(lenses)} cameras took it is not stated; add {_ODM_FILES[0]}"
+            f"{where}: which of {len(lenses)} cameras took this photo is not recorded; add {_ODM_FILES[0]}"
         )
     lens = lenses[shot.get("camera", next(iter(lenses)))]
     kind = lens["projection_type"]
     if kind not in _ODM_LENSES:
         raise DyngsError(
-            f"{where}: photos of projection {kind!r:.40} are not read, only {', '.join(_ODM_LENSES)}"
+            f"{where}: projection {kind!r:.40} is not supported, only {', '.join(_ODM_LENSES)}"
         )
     width = lens["width"]
     height = lens["height"]
@@ -439,7 +437,7 @@ def read_record3d(root: Path) -> Capture:
         number = int(image.stem)
         if number >= len(poses):
             raise DyngsError(
-                f"{image}: has no pose, {path} has {len(poses)}, from number 0 on; export it again"
+                f"{image}: has no pose: {path} has {len(poses)} poses, numbered from 0; export it again"
             )
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat(poses[number, :4]).as_matrix()

@@ -283,7 +283,7 @@ def _below(files: FileFinder, written: str, where: str) -> Path:
     path = files.find(written)
     if not path.name or path == Path(os.path.normpath(files.root)) or "\0" in written:
         raise DyngsError(
-            f"{where}: {written!r:.80} names no file; write the way to it from the capture's folder"
+            f"{where}: {written!r:.80} is not a file path; give the path relative to the capture folder"
         )
     return path
 
@@ -320,7 +320,7 @@ def _intrinsics(frame: FrameEntry, width: int, height: int) -> np.ndarray:
     focal_y = _focal(source, "y", height, frame.where) or focal_x
     if focal_y is None:
         raise DyngsError(
-            f"{frame.where}: no focal length; give fl_x (px) or camera_angle_x (radians)"
+            f"{frame.where}: focal length missing; add fl_x (px) or camera_angle_x (radians)"
         )
     cx = frame.number("cx")
     cy = frame.number("cy")
@@ -368,7 +368,7 @@ def _lens(frame: FrameEntry) -> Lens:
         )
     if k4 and not (k5 or k6 or model == "FULL_OPENCV"):
         raise DyngsError(
-            f"{frame.where}: k4 has no agreed meaning for {model}; use FULL_OPENCV or set it to 0"
+            f"{frame.where}: k4 is ambiguous for {model}; use FULL_OPENCV or set it to 0"
         )
     params = (k1, k2, p1, p2, k3, k4, k5, k6)
     while len(params) > 4 and not params[-1]:
@@ -404,7 +404,7 @@ def find_points(file: FrameFile) -> tuple[PointCloud | None, Path | None, list[s
     try:
         points = read_points(check_inside(path))
     except DyngsError as error:
-        return None, None, [f"not used as points: {error}"]
+        return None, None, [f"initial points not read: {error}"]
     return (points, path, []) if len(points.xyz) else (None, None, [])
 
 
@@ -476,7 +476,7 @@ def read_blender(root: Path) -> Capture:
         splits[name] = tuple(views.values())
         warnings += [f"{path.name}: {note}" for note in notes]
         if not views:
-            warnings.append(f"{path.name}: lists no frames")
+            warnings.append(f"{path.name}: no frames listed")
     splits, notes = _with_masks(root, splits)
     return _capture_of(root, "blender", train, splits, [*warnings, *notes])
 
@@ -561,7 +561,9 @@ def _nerfstudio_splits(file: FrameFile, views: dict[str, View]) -> tuple[Splits,
     if "test" not in splits and "val" in splits:
         splits["test"] = splits.pop("val")
     used = {view.name for kept in splits.values() for view in kept}
-    notes = [f"{len(unknown)} listed images have no frame, first {unknown[0]}"] if unknown else []
+    notes = (
+        [f"{len(unknown)} listed images are not in 'frames', first {unknown[0]}"] if unknown else []
+    )
     if len(used) < len(views):
         notes.append(f"{len(views) - len(used)} frames are in no split and are ignored")
     return splits, notes
@@ -612,7 +614,7 @@ def _body_of(root: Path, split: Split, views: tuple[View, ...], train: BodyFrame
     path = root / f"body_{split}.npz"
     if not path.is_file() and split == "pose":
         raise DyngsError(
-            f"{path}: no such file; transforms_pose.json shows another clip, which needs its own parameters"
+            f"{path}: no such file; transforms_pose.json is a separate clip and needs its own body parameters"
         )
     body = read_body_file(path) if path.is_file() and split != "train" else train
     match_frames(path if path.is_file() else root / "body_train.npz", body, views)

@@ -29,7 +29,7 @@ from dyngs.io.pickles import read_pickle, read_pickled_array
 ANNOTATIONS = "annots.npy"
 CAMERAS = "cameras.pkl"
 MESHES = "mesh_infos.pkl"
-FIRST_HELD_OUT = "no camera is named for testing: the first one is held out"
+FIRST_HELD_OUT = "no test camera given; the first camera is held out"
 
 
 def read_zju_mocap(root: Path) -> Capture:
@@ -192,7 +192,7 @@ def _by_name(path: Path) -> dict[str, dict[str, object]]:
     fields: Any = read_pickle(check_inside(path))
     for name in fields:
         if not re.fullmatch(r"[\w-]+", name):
-            raise DyngsError(f"{path}: {name!r:.80} is no name of an image; export it again")
+            raise DyngsError(f"{path}: {name!r:.80} is not an image name; export it again")
     return fields
 
 

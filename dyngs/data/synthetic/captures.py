@@ -707,7 +707,7 @@ def write_dynamic_capture(
     style = options.style or ("fixed" if name == "room" else "teleport")
     if name == "room" and style == "teleport":
         raise DyngsError(
-            "the walls of the room would hide it from cameras all around; choose --style fixed or moving"
+            "the room's walls block cameras all around it; choose --style fixed or moving"
         )
     splits = _fixed_shots(options) if style == "fixed" else _single_shots(options, style)
     with atomic_folder(out) as started:

@@ -138,7 +138,7 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
         )
     if any(opened.world_offset):
         offset = " ".join(f"{x:.12g}" for x in opened.world_offset)
-        notes.append(f"the scene is far from the origin: {offset} is subtracted from its positions")
+        notes.append(f"the scene is far from the origin: {offset} is subtracted from all positions")
     person = avatar_of(opened.renderable)
     if person is not None:
         notes += person.left_out

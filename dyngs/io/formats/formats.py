@@ -81,7 +81,7 @@ def format_for_path(path: Path) -> Format:
     of them."""
     found = find_format(path)
     if found is None:
-        raise DyngsError(f"{path}: no suffix of a file of Gaussians; use one of {all_suffixes()}")
+        raise DyngsError(f"{path}: unknown file type; use one of {all_suffixes()}")
     return found
 
 
@@ -106,7 +106,7 @@ def format_by_name(name: str) -> Format:
     """Return the format called ``name``. Raises DyngsError if there is none."""
     known = {candidate.name: candidate for candidate in FORMATS}
     if name not in known:
-        raise DyngsError(f"no format {name!r:.30} of Gaussians; use one of {', '.join(known)}")
+        raise DyngsError(f"unknown format {name!r:.30}; use one of {', '.join(known)}")
     return known[name]
 
 
@@ -171,21 +171,21 @@ def limit_to_format(
     require_writable(path, gaussians)
     if sh_degree is not None and sh_degree > own.max_degree:
         raise DyngsError(
-            f"{path}: harmonics of degree {sh_degree}? {own.name} holds at most degree {own.max_degree}"
+            f"{path}: SH degree {sh_degree} is not supported; {own.name} stores at most degree {own.max_degree}"
         )
     degree = min(gaussians.sh_degree, own.max_degree) if sh_degree is None else sh_degree
     if degree < gaussians.sh_degree and bool(gaussians.sh[:, (degree + 1) ** 2 :].any()):
-        why = f"{own.name} holds no more" if sh_degree is None else "as asked for"
-        notes.append(f"harmonics above degree {degree} are left out: {why}")
+        why = f"{own.name} stores no more" if sh_degree is None else "as requested"
+        notes.append(f"SH coefficients above degree {degree} are dropped: {why}")
     if splat.mode is RasterizeMode.ANTIALIASED and not own.stores_render_mode:
         notes.append(
-            f"the scene is antialiased, which {own.name} cannot say: viewers draw thin parts thicker"
+            f"{own.name} cannot store that the scene is antialiased; viewers draw thin parts too thick"
         )
     notes += offset_notes(
-        splat, "the file states it" if own.stores_comments else f"{own.name} cannot state it"
+        splat, "stored in the file" if own.stores_comments else f"{own.name} cannot store it"
     )
     if splat.edited != IDENTITY and not own.stores_comments:
-        notes.append(f"{own.name} cannot state how it was edited: this file cannot be undone")
+        notes.append(f"{own.name} cannot store the edits, so they cannot be undone")
     gaussians = with_sh_degree(gaussians.replace(quats=unit_rotations(gaussians.quats)), degree)
     return replace(splat, gaussians=gaussians), tuple(notes)
 

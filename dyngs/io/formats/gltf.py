@@ -52,12 +52,12 @@ def read_gltf(path: Path) -> SplatFile:
         place = similarity_from_matrix(world)
         if place is None:
             raise file.error(
-                "a node distorts or mirrors its Gaussians; apply its transform before exporting"
+                "a node transform shears or mirrors its Gaussians; apply it before exporting"
             )
         own = _gaussians(file, primitive)
         found.append(place.gaussians(own.replace(means=own.means.double())))
     if not found:
-        raise file.error(f"holds no Gaussians ({EXTENSION})")
+        raise file.error(f"no Gaussians found ({EXTENSION})")
     comments = comments_from_json(file.json["asset"].get("extras"))
     return parse_comments(SplatFile(join_gaussians(found), comments=comments))
 
@@ -113,7 +113,7 @@ def _primitives(file: GltfFile) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
         visited += 1
         if depth > _MOST_DEPTH or visited > _MOST_NODES:
             raise file.error(
-                f"has more than {_MOST_NODES} nodes or {_MOST_DEPTH} of them above one another"
+                f"has more than {_MOST_NODES} nodes, or nodes nested deeper than {_MOST_DEPTH}"
             )
         node = nodes[index]
         world = above @ _matrix(node)
@@ -143,7 +143,7 @@ def _gaussians(file: GltfFile, primitive: dict[str, Any]) -> Gaussians:
     own = primitive["extensions"][EXTENSION]
     if own.get("extensions"):
         raise file.error(
-            f"its Gaussians need {', '.join(own['extensions']):.80}, which is not read"
+            f"its Gaussians need {', '.join(own['extensions']):.80}, which is not supported"
         )
     for key in ("kernel", "colorSpace"):
         if own.get(key) != _PROPERTIES[key]:

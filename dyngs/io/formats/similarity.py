@@ -126,7 +126,7 @@ def similarity_from_numbers(numbers: Sequence[float]) -> Similarity:
     if not (
         np.isfinite(numbers).all() and scale > 0 and abs(a * a + b * b + c * c + d * d - 1) < 1e-3
     ):
-        raise ValueError(f"{numbers} are no similarity")
+        raise ValueError(f"{numbers} is not a similarity transform")
     return Similarity((a, b, c, d), scale, (x, y, z))
 
 

@@ -84,7 +84,7 @@ def move_to_origin(splat: SplatFile) -> SplatFile:
     if not offset.any():
         return replace(splat, gaussians=gaussians)
     x, y, z = offset.tolist()
-    note = f"the scene is far from the origin: {x:.12g} {y:.12g} {z:.12g} is subtracted from its positions"
+    note = f"the scene is far from the origin: {x:.12g} {y:.12g} {z:.12g} is subtracted from all positions"
     near = replace(splat, gaussians=gaussians, file_offset=(x, y, z), notes=(*splat.notes, note))
     if splat.edited != IDENTITY:
         return replace(near, edited=Similarity(shift=(-x, -y, -z)).after(splat.edited))
@@ -102,7 +102,7 @@ def offset_notes(splat: SplatFile, remark: str) -> tuple[str, ...]:
         return ()
     offset = " ".join(f"{x:.12g}" for x in splat.frame.points(np.array(splat.world_offset)))
     return (
-        f"the scene is far from the origin: {offset} is subtracted from its positions ({remark})",
+        f"the scene is far from the origin: {offset} is subtracted from all positions ({remark})",
     )
 
 
@@ -127,9 +127,9 @@ def make_renderable(splat: SplatFile, path: Path, nonfinite: Nonfinite) -> Splat
         if nonfinite == "error":
             raise DyngsError(f"{path}: {bad} have non-finite values (NaN or Inf)")
         gaussians = gaussians.select(good)
-        notes += (f"{bad} are left out: they have non-finite values (NaN or Inf)",)
+        notes += (f"{bad} dropped: non-finite values (NaN or Inf)",)
     if len(gaussians) == 0:
-        raise DyngsError(f"{path}: holds no Gaussians" + (" with finite values" if total else ""))
+        raise DyngsError(f"{path}: no Gaussians" + (" with finite values" if total else ""))
     return replace(splat, gaussians=gaussians, notes=notes)
 
 

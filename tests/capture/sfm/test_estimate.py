@@ -139,7 +139,7 @@ def test_a_camera_that_rotates_on_the_spot_is_refused(tmp_path: Path) -> None:
         seen = np.array([[1.0, 0, 240], [0, 1, 80], [0, 0, 1]]) @ lens @ turn @ np.linalg.inv(lens)
         image = warp(scene, ProjectiveTransform(seen), output_shape=(240, 320))
         write_image(tmp_path / "photos" / f"{i}.png", np.repeat(image[..., None], 3, axis=2))
-    with pytest.raises(DyngsError, match="as if the camera rotated on the spot"):
+    with pytest.raises(DyngsError, match="the camera only rotated"):
         estimate_poses(tmp_path / "photos", tmp_path / "out", FAST)
 
 

@@ -40,7 +40,7 @@ def capture_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_videos(folder / "rig", AZIMUTHS, STARTS, 10.0, 24)
     (folder / "rig" / "videos.json").write_text(json.dumps({"starts": STARTS}))
     said = poses_of_videos(folder / "rig", folder / "out", SfmOptions(num_threads=1))
-    assert "4 of 4 cameras have a pose" in said
+    assert "4 of 4 cameras registered" in said
     assert "as given" in said
     return folder / "out"
 
@@ -86,7 +86,9 @@ def test_a_camera_that_moves_is_refused(tmp_path: Path) -> None:
     with video_writer(tmp_path / "rig" / "walking.mp4", fps=10) as add:
         for i in range(8):
             add(corner(camera(30.0 + 2 * i), 0.0))
-    with pytest.raises(DyngsError, match=r"cameras must stand still, but these move: walking"):
+    with pytest.raises(
+        DyngsError, match=r"cameras of several videos must be fixed, but these move: walking"
+    ):
         poses_of_videos(tmp_path / "rig", tmp_path / "out", SfmOptions(num_threads=1))
     assert not (tmp_path / "out").exists()
 
@@ -108,7 +110,7 @@ def test_starts_and_test_cameras(tmp_path: Path) -> None:
     ("value", "message"),
     [
         *(
-            ({"starts": starts}, r"give the second at which each video begins, for left, right")
+            ({"starts": starts}, r"give the start of each video in seconds, for left, right")
             for starts in (
                 3,
                 {"left": 0},
@@ -234,7 +236,7 @@ def test_frames_of_time_steps() -> None:
         == list(frames[1].values())
         == pytest.approx(0.5 + np.arange(25) / 10)
     )
-    assert "25 time steps of 2.40 s" in line
+    assert "25 time steps over 2.40 s" in line
     together = {"0": 0.0, "1": 0.0}
     frames, _ = frames_at_steps(Path("rig"), _videos((50, 100), (25, 50)), together)
     assert list(frames[0]) == list(range(0, 100, 2))
@@ -243,5 +245,5 @@ def test_frames_of_time_steps() -> None:
     frames, line = frames_at_steps(Path("rig"), _videos((30, 3000), (30, 3000)), together)
     assert len(frames[0]) == 300
     assert "of 3000" in line
-    with pytest.raises(DyngsError, match="share no two time steps"):
+    with pytest.raises(DyngsError, match="do not overlap in time"):
         frames_at_steps(Path("rig"), _videos((10, 20), (10, 20)), {"0": 0.0, "1": 5.0})

@@ -34,7 +34,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     def several(source: Path, out: Path, options: SfmOptions, report: object) -> str:
         sources.append(source)
         write_colmap(out)
-        return "4 of 4 cameras have a pose"
+        return "4 of 4 cameras registered"
 
     monkeypatch.setattr(unposed, "estimate_poses", estimate)
     monkeypatch.setattr(unposed, "poses_of_videos", several)
@@ -96,10 +96,12 @@ def test_what_cannot_work_is_said_before_poses_are_estimated(
         ensure_poses(photos, needs_times=True)
     with pytest.raises(DyngsError, match=r"2 videos.*dyngs train dynamic"):
         ensure_poses(DataConfig(root=_videos(tmp_path / "rig", 2)))
-    with pytest.raises(DyngsError, match=r"one video; give that: data\.root=.*cam0\.mp4"):
+    with pytest.raises(
+        DyngsError, match=r"one video; give the video itself: data\.root=.*cam0\.mp4"
+    ):
         ensure_poses(DataConfig(root=_videos(tmp_path / "single", 1)), needs_times=True)
     with pytest.raises(
-        DyngsError, match=r"two: holds 2 photos and no cameras; a scene needs at least 3 photos"
+        DyngsError, match=r"two: holds 2 photos but no cameras; a scene needs at least 3 photos"
     ):
         ensure_poses(DataConfig(root=_photos(tmp_path / "two", 2)))
     assert asked == []

@@ -148,7 +148,7 @@ def test_broken_json_names_line_and_column(blender_root: Path) -> None:
     path = blender_root / "transforms_train.json"
     path.write_text(json.dumps(json.loads(path.read_text()), indent=1)[:700])
     with pytest.raises(
-        DyngsError, match=r"transforms_train\.json, line \d+ column \d+: broken JSON"
+        DyngsError, match=r"transforms_train\.json, line \d+ column \d+: invalid JSON"
     ):
         read_blender(blender_root)
 
@@ -492,14 +492,16 @@ def test_the_pelvis_lies_inside_the_person(shared: Path, name: str) -> None:
 
 
 def test_frames_are_held_out_where_no_other_clip_was_filmed(root: Path) -> None:
-    with pytest.raises(DyngsError, match=r"data\.pose_frames=2:: is for people without a clip"):
+    with pytest.raises(
+        DyngsError, match=r"data\.pose_frames=2:: only applies to captures of people"
+    ):
         read_capture(DataConfig(root=root, pose_frames="2::"))
     for name in ("transforms_pose.json", "body_pose.npz"):
         (root / name).unlink()
     capture = read_capture(DataConfig(root=root, pose_frames="2::"))
     assert [view.name for view in capture.splits["pose"]] == ["images/test/f2_c2"]
     (root / "body_train.npz").unlink()
-    with pytest.raises(DyngsError, match="is for people without a clip"):
+    with pytest.raises(DyngsError, match="only applies to captures of people"):
         read_capture(DataConfig(root=root, pose_frames="2::"))
 
 

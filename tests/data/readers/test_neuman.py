@@ -135,7 +135,7 @@ def test_splits(root: Path) -> None:
     capture = read_neuman(root)
     frames = {name: [view.frame for view in views] for name, views in capture.splits.items()}
     assert frames == {"train": [0, 2, 3], "val": [4], "test": [1]}
-    assert capture.warnings == ("1 images of the splits have no pose and are left out: 99.jpg",)
+    assert capture.warnings == ("1 images of the splits have no pose and are skipped: 99.jpg",)
     (root / "train_split.txt").unlink()
     assert [view.frame for view in read_neuman(root).splits["train"]] == [0, 2, 3, 5, 6, 7, 8]
     (root / "test_split.txt").write_bytes(b"\xff\xfe")

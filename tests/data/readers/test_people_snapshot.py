@@ -112,7 +112,7 @@ def test_frames_without_mask_or_fit_are_left_out(root: Path) -> None:
     capture = read_people_snapshot(root)
     assert [view.frame for view in capture.splits["train"]] == [0, 2, 3]
     assert capture.warnings == (
-        "female-3-casual.mp4: 3 of 6 frames lack a mask or a pose and are left out",
+        "female-3-casual.mp4: 3 of 6 frames have no mask or no pose and are skipped",
     )
 
 
@@ -120,14 +120,14 @@ def test_smaller_video(root: Path) -> None:
     write_camera(root, width=2 * WIDTH, height=2 * HEIGHT)
     capture = read_people_snapshot(root)
     assert capture.splits["train"][0].intrinsics[0, 0] == 10
-    assert "another size than their intrinsics" in capture.warnings[0]
+    assert "differ in size from their intrinsics" in capture.warnings[0]
 
 
 def test_videos(root: Path) -> None:
     write_video(root / "other.mp4", 2)
     assert len(read_people_snapshot(root).splits["train"]) == FRAMES
     (root / "female-3-casual.mp4").rename(root / "another.mp4")
-    with pytest.raises(DyngsError, match=r"2 videos in it; keep one, called female-3-casual\.mp4"):
+    with pytest.raises(DyngsError, match=r"found 2 videos; keep one, named female-3-casual\.mp4"):
         read_people_snapshot(root)
     (root / "another.mp4").unlink()
     (root / "other.mp4").unlink()

@@ -301,7 +301,7 @@ def test_buffers_elsewhere_are_not_touched(tmp_path: Path, uri: str) -> None:
     (tmp_path / "secret.bin").write_bytes(glb.data)
     document = {**glb.json, "buffers": [{"byteLength": len(glb.data), "uri": uri}]}
     (folder / "x.gltf").write_text(json.dumps(document))
-    with pytest.raises(DyngsError, match="is not a file beside it"):
+    with pytest.raises(DyngsError, match="is not a file next to it"):
         read_gltf(folder / "x.gltf")
 
 

@@ -88,7 +88,7 @@ def test_what_the_format_cannot_say_is_said(kind: Format, tmp_path: Path) -> Non
         file_of(kind, tmp_path), SplatFile(cloud(30, 4), RasterizeMode.ANTIALIASED)
     )
     said = " ".join(written.notes)
-    assert (f"harmonics above degree {kind.max_degree} are left out" in said) == (
+    assert (f"SH coefficients above degree {kind.max_degree} are dropped" in said) == (
         kind.max_degree < 4
     )
     assert ("antialiased" in said) == (not kind.stores_render_mode)
@@ -174,9 +174,9 @@ def test_the_place_of_a_far_scene_is_stored_or_told(kind: Format, tmp_path: Path
     splat = SplatFile(cloud(20, 0), world_offset=FAR, up=kind.up, turned=turn.turn)
     written = write_splats(path, splat)
     line = " ".join(f"{x:.12g}" for x in turn.points(np.array(FAR)))
-    end = "the file states it" if kind.stores_comments else f"{kind.name} cannot state it"
+    end = "stored in the file" if kind.stores_comments else f"{kind.name} cannot store it"
     assert written.notes == (
-        f"the scene is far from the origin: {line} is subtracted from its positions ({end})",
+        f"the scene is far from the origin: {line} is subtracted from all positions ({end})",
     )
     back = read_splats(path)
     if kind.stores_comments:
