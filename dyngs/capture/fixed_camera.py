@@ -67,7 +67,8 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
     )
     if other is not None:
         raise DyngsError(
-            f"{paths[other]}: its size differs from {paths[numbers[0]].name}; give frames of one camera"
+            f"{paths[other]}: its size differs from {paths[numbers[0]].name}; give frames of one "
+            "camera"
         )
     focal = first.focal_px or FOCAL * max(width, height)
     intrinsics = pinhole_matrix(focal, focal, width / 2, height / 2)
@@ -141,7 +142,8 @@ def silhouettes_of(masks: Path, names: Sequence[str]) -> list[Silhouette]:
     missing = [name for name, path in zip(names, own, strict=True) if path is None]
     if missing:
         raise DyngsError(
-            f"{masks}: no mask for {len(missing)} of {len(names)} images, first {missing[0]}; name a mask after its "
-            "image (a.jpg.png, a.jpg or a.png for a.jpg), white where the person is"
+            f"{masks}: no mask for {len(missing)} of {len(names)} images, first {missing[0]}; "
+            "name a mask after its image (a.jpg.png, a.jpg or a.png for a.jpg), white where the "
+            "person is"
         )
     return [Silhouette(path, "white") for path in own if path is not None]

@@ -85,8 +85,8 @@ def time_problems(capture: Capture) -> list[str]:
         return []
     if len({view.cam_from_world.round(9).tobytes() for view in views}) == 1:
         return [
-            f"a single fixed camera recorded all {count} times: a moving scene cannot be reconstructed from "
-            "one viewpoint; move the camera or use several"
+            f"a single fixed camera recorded all {count} times: a moving scene cannot be "
+            "reconstructed from one viewpoint; move the camera or use several"
         ]
     if not 3 <= len(views) == count or count * CLOSE_IN_TIME >= FEW_VIEWS:
         return []
@@ -99,8 +99,8 @@ def time_problems(capture: Capture) -> list[str]:
     if not angles.mean() >= WIDE_BASELINE:
         return []
     return [
-        f"{len(views)} images at different times, {angles.mean():.0f} degrees apart on average: moving objects "
-        "are seen from one side only at each time; expect a static result"
+        f"{len(views)} images at different times, {angles.mean():.0f} degrees apart on average: "
+        "moving objects are seen from one side only at each time; expect a static result"
     ]
 
 
@@ -128,8 +128,9 @@ def body_problems(capture: Capture) -> list[str]:
     middle = round((around[widest] + gaps[widest] / 2) / 90) % 4
     side = ("front", "left side", "back", "right side")[middle]
     return [
-        f"the person's {side} is in no image: all cameras are within {360 - gaps[widest]:.0f} degrees around the body; "
-        "the unseen side will be guessed (film a full turn, or use more cameras)"
+        f"the person's {side} is in no image: all cameras are within {360 - gaps[widest]:.0f} "
+        "degrees around the body; the unseen side will be guessed (film a full turn, or use "
+        "more cameras)"
     ]
 
 
@@ -148,8 +149,8 @@ def scene_problems(capture: Capture) -> list[str]:
     focus = np.median(xyz, axis=0) if len(xyz) else focus_point(poses)
     if focus is not None and fraction_in_front(poses, focus) < 0.5:
         problems.append(
-            f"{1 - fraction_in_front(poses, focus):.0%} of the cameras look away from the scene; check the axes of the poses "
-            "(JSON files use OpenGL camera-to-world)"
+            f"{1 - fraction_in_front(poses, focus):.0%} of the cameras look away from the scene; "
+            "check the axes of the poses (JSON files use OpenGL camera-to-world)"
         )
     if len(xyz):
         sample = xyz[np.random.default_rng(0).permutation(len(xyz))[:2000]]
@@ -217,7 +218,8 @@ def _image_problems(views: Iterable[View], deep: bool) -> list[str]:
                 continue
             if header.size_matching(described) != described:
                 problems.append(
-                    f"{path} has {header.width}x{header.height} pixels, but its camera is {view.width}x{view.height}"
+                    f"{path} has {header.width}x{header.height} pixels, but its camera is "
+                    f"{view.width}x{view.height}"
                 )
     return limit_messages(problems)
 
@@ -242,8 +244,8 @@ def describe_masks(capture: Capture) -> tuple[str | None, list[str]]:
     if ignored <= MOST_IGNORED:
         return found, []
     return found, [
-        f"masks ignore {ignored:.0%} of the pixels in {len(sample)} sampled masks, first {sample[0]}; white "
-        "(255) = used, black = ignored: are they inverted, or label images?"
+        f"masks ignore {ignored:.0%} of the pixels in {len(sample)} sampled masks, first "
+        f"{sample[0]}; white (255) = used, black = ignored: are they inverted, or label images?"
     ]
 
 
@@ -481,7 +483,8 @@ def video_report(path: Path) -> str:
         lines.append(f"      dyngs train dynamic data.root={where}    # objects move as well")
     elif len(videos) == 1:
         lines.append(
-            "next: one fixed camera gives no depth; put synchronous videos of two or more into a folder"
+            "next: one fixed camera gives no depth; put synchronous videos of two or more into a "
+            "folder"
         )
     elif moving:
         names = ", ".join(moving[:5])

@@ -265,8 +265,8 @@ class _Camera:
         pixels = read_image(path, (first.width, first.height))[..., :3]
         if pixels.shape[:2] != (first.height, first.width):
             raise DyngsError(
-                f"{path}: is {pixels.shape[1]}x{pixels.shape[0]}, images of its camera {first.width}x{first.height}; "
-                "take it with the same camera"
+                f"{path}: is {pixels.shape[1]}x{pixels.shape[0]}, images of its camera "
+                f"{first.width}x{first.height}; take it with the same camera"
             )
         return area_downscale_uint8(pixels, *self.size).numpy()
 
@@ -304,9 +304,10 @@ def add_background_masks(
         with_plate = number in plates and found[-1].area > 0 and found[-1].on_edges > 0.5
         if not (found[-1].is_clear or with_plate):
             raise DyngsError(
-                f"{camera.where}: no person stands out from the background, or the person stays in one place, "
-                f"so that the background is never visible ({found[-1].staying:.0%} of the mask pixels are covered most of the time, "
-                f"{found[-1].on_edges:.0%} of the outlines lie on image edges); {_ADVICE}"
+                f"{camera.where}: no person stands out from the background, or the person stays "
+                f"in one place, so that the background is never visible ({found[-1].staying:.0%} "
+                f"of the mask pixels are covered most of the time, {found[-1].on_edges:.0%} of "
+                f"the outlines lie on image edges); {_ADVICE}"
             )
         for view in camera.views:
             name = re.sub(r"[^A-Za-z0-9_-]", "_", view.name)
@@ -316,8 +317,8 @@ def add_background_masks(
             silhouettes[view.name] = Silhouette(target, "white")
     worst = min(found, key=lambda one: one.on_edges)
     log(
-        f"masks by background subtraction: {worst.on_edges:.0%} of the outlines lie on image edges, "
-        f"images, the person covers {worst.area:.1%} of them"
+        f"masks by background subtraction: {worst.on_edges:.0%} of the outlines lie on image "
+        f"edges, images, the person covers {worst.area:.1%} of them"
     )
     splits = map_views(
         capture.splits, lambda view: replace(view, silhouette=silhouettes[view.name])
@@ -353,7 +354,8 @@ def _plates(empty: Path, cameras: Mapping[int, _Camera]) -> Mapping[int, Path]:
     missing = sorted(cameras.keys() - plates.keys())
     if missing:
         raise DyngsError(
-            f"{empty}: no background image for camera {missing[0]}; add {missing[0]}.png to the folder"
+            f"{empty}: no background image for camera {missing[0]}; add {missing[0]}.png to the "
+            "folder"
         )
     return plates
 

@@ -91,7 +91,8 @@ def _checked_members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.
         is_plain = info.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
         if is_link or not is_plain or info.flag_bits & 1:
             raise DyngsError(
-                f"{path}: {name!r:.80} is a link, encrypted, or compressed by an unsupported method; unpack it and give the folder"
+                f"{path}: {name!r:.80} is a link, encrypted, or compressed by an unsupported "
+                "method; unpack it and give the folder"
             )
         found[name] = info
     total = sum(info.file_size for info in found.values())

@@ -63,8 +63,8 @@ def check_inside(path: Path) -> Path:
     boundary = _boundary.get()
     if boundary is not None and not _is_below(real := os.path.realpath(path), boundary[1]):
         raise DyngsError(
-            f"{path}: points to {real}, outside the capture {boundary[0]}; "
-            "copy the file into the capture or, if you trust the capture, set data.follow_links=true"
+            f"{path}: points to {real}, outside the capture {boundary[0]}; copy the file into "
+            "the capture or, if you trust the capture, set data.follow_links=true"
         )
     require_regular(path)
     return path

@@ -77,7 +77,8 @@ class GltfFile:
             accessor = self.json["accessors"][index]
             if accessor["type"] != kind:
                 raise self.error(
-                    f"accessor {index} must hold {kind}, not {accessor['type']!r:.20}; export it again"
+                    f"accessor {index} must hold {kind}, not {accessor['type']!r:.20}; export it "
+                    "again"
                 )
             if "sparse" in accessor:
                 raise self.error(f"accessor {index} is sparse; export it with plain accessors")

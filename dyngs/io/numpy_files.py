@@ -112,7 +112,7 @@ def _array(stream: IO[bytes], before: int, path: Path) -> np.ndarray:
     require_at_most(path, before + _weight(shape, dtype), MOST_BYTES, "bytes of arrays")
     raw = bytearray(stream.read())  # not more than the archive states; a checksum is compared
     if min(shape, default=0) < 0 or len(raw) < math.prod(shape) * dtype.itemsize:
-        raise ValueError("it is shorter than its shape")
+        raise ValueError("its size does not match its shape")
     require_text(raw[: math.prod(shape) * dtype.itemsize], dtype)
     flat = np.frombuffer(raw, dtype, math.prod(shape))
     return flat.reshape(shape, order="F" if by_columns else "C")

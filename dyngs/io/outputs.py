@@ -117,7 +117,8 @@ def require_within_run(out: Path) -> None:
             place = out if out.is_dir() else out.parent
             if not place.resolve().is_relative_to(run.resolve()):
                 raise DyngsError(
-                    f"{out}: is a link to {place.resolve()}, outside the run folder; choose another output"
+                    f"{out}: is a link to {place.resolve()}, outside the run folder; choose "
+                    "another output"
                 )
             return
 
@@ -126,7 +127,7 @@ def require_new_folder(out: Path) -> None:
     """Check that ``out`` does not exist or is an empty folder. Raises DyngsError if it holds
     something or is a file."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise DyngsError(f"{out} already exists; choose a new folder")
+        raise DyngsError(f"{out} exists already; choose a new folder")
 
 
 @contextmanager
@@ -205,7 +206,8 @@ def lock_folder(folder: Path) -> Iterator[bool]:
     links = find_escaping_links(folder)
     if links:
         raise DyngsError(
-            f"{links[0][0]}: is a link to {links[0][1]}, outside the output folder {folder}; remove it"
+            f"{links[0][0]}: is a link to {links[0][1]}, outside the output folder {folder}; "
+            "remove it"
         )
     made = _made(folder)
     try:

@@ -50,7 +50,7 @@ def test_a_file_is_converted_there_and_back(tmp_path: Path, capsys: Capture) -> 
 def test_what_convert_refuses(tmp_path: Path, capsys: Capture) -> None:
     plain = write_splats(tmp_path / "a.ply", SplatFile(cloud(5))).path
     assert "unknown file type; use one of" in refused(capsys, "convert", plain, tmp_path / "b.xyz")
-    assert "exists, which is read" in refused(capsys, "convert", plain, plain)
+    assert "exists, which is an input" in refused(capsys, "convert", plain, plain)
     assert "no such file" in refused(capsys, "convert", tmp_path / "no.ply", tmp_path / "b.ply")
     assert "at most degree 0" in refused(
         capsys, "convert", plain, tmp_path / "b.splat", "--sh-degree", 3

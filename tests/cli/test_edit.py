@@ -95,9 +95,9 @@ def test_what_is_refused(plain: Path, capsys: Capture) -> None:
     before = {path: path.read_bytes() for path in Path().iterdir()}
     refused = [
         (["--out", "a.xyz"], "edits end in a file of Gaussians"),
-        (["--out", "plain.ply"], "exists, which is read"),
-        (["--merge", "half.ply", "--out", "half.ply"], "exists, which is read"),
-        (["--geo", "line.csv", "--out", "line.csv"], "exists, which is read"),
+        (["--out", "plain.ply"], "exists, which is an input"),
+        (["--merge", "half.ply", "--out", "half.ply"], "exists, which is an input"),
+        (["--geo", "line.csv", "--out", "line.csv"], "exists, which is an input"),
         (["--crop", "open.obj"], "give two corners"),
         (["--crop", "50,50,50", "1"], "--crop leaves none"),
         (["--crop", "-1,0,0"], "give two corners"),

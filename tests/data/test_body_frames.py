@@ -123,14 +123,14 @@ GOOD: dict[str, Any] = {
         ({"poses": [[0.0] * 72] * 3 + [[0.0]]}, "'poses' must hold as many numbers"),
         ({"poses": [["a"] * 72] * 4}, "'poses' must hold as many numbers"),
         ({"trans": np.zeros((4, 4))}, "'trans' has 4 numbers per frame instead of 3"),
-        ({"trans": np.full((4, 3), np.nan)}, "'trans' of frame 0 holds NaN"),
+        ({"trans": np.full((4, 3), np.nan)}, "'trans' of frame 0 contains NaN"),
         (
             {"trans": np.full((4, 3), 1e39)},
             "'trans' of frame 0 contains NaN, infinite or huge values",
         ),
         (
             {"poses": np.where(np.arange(4)[:, None] == 2, np.inf, np.zeros(72))},
-            "'poses' of frame 2 holds NaN",
+            "'poses' of frame 2 contains NaN",
         ),
         ({"betas": [0, np.nan]}, "'betas' must hold finite numbers"),
         ({"betas": [0, 1e39]}, "'betas' must hold finite numbers"),
@@ -187,5 +187,5 @@ def test_a_capture_is_read_with_the_fit_that_the_options_name(
     found = read_capture(DataConfig(root=capture.root, body=tmp_path))
     assert found.body is not None
     assert found.body["train"].trans[:, 0].tolist() == [0, 1, 2]
-    with pytest.raises(DyngsError, match=r"body_train\.npz: no such file.* comes back by training"):
+    with pytest.raises(DyngsError, match=r"body_train\.npz: no such file.* to reuse a fit"):
         read_capture(DataConfig(root=capture.root, body=tmp_path / "elsewhere"))

@@ -71,7 +71,7 @@ def test_smallest_copy_that_is_large_enough(
     names = [view.name for view in capture.splits["train"]]
     assert names == [f"images/{i}" for i in range(COUNT)]
     lines = [f"images_{factor} is read instead of images"] if factor > 1 else []
-    assert [line.partition(":")[0] for line in capture.warnings] == lines
+    assert [line.partition(",")[0] for line in capture.warnings] == lines
 
 
 @pytest.mark.parametrize("is_absent", [False, True])

@@ -66,10 +66,10 @@ def test_a_killed_owner_frees_it(tmp_path: Path) -> None:
 def test_of_many_that_want_it_at_once_one_has_it(tmp_path: Path) -> None:
     """Also while the lock file is removed and made anew all the time."""
     code = HOLD.partition("\n")[0] + (
-        "\nfrom dyngs.core.errors import DyngsError\nfolder, count = Path(sys.argv[1]), 0\nwhile count < 30:\n"
-        "    try:\n        with lock_folder(folder):\n            count += 1\n"
-        "            n = int((folder / 'n').read_text()); time.sleep(1e-4); (folder / 'n').write_text(str(n + 1))\n"
-        "    except DyngsError: time.sleep(1e-3)\n"
+        "\nfrom dyngs.core.errors import DyngsError\nfolder, count = Path(sys.argv[1]), 0\nwhile "
+        "count < 30:\n    try:\n        with lock_folder(folder):\n            count += 1\n      "
+        "      n = int((folder / 'n').read_text()); time.sleep(1e-4); (folder / "
+        "'n').write_text(str(n + 1))\n    except DyngsError: time.sleep(1e-3)\n"
     )
     (tmp_path / "n").write_text("0")
     processes = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) for _ in range(3)]
@@ -89,7 +89,7 @@ def test_nothing_is_written_through_links_of_a_run(name: str, tmp_path: Path) ->
     (tmp_path / "precious").mkdir()
     (run / name).symlink_to(tmp_path / "precious")
     with (
-        pytest.raises(DyngsError, match=rf"{name}: is a link to .*precious, out of .*run"),
+        pytest.raises(DyngsError, match=rf"{name}: is a link to .*precious, outside .*run"),
         lock_folder(run),
     ):
         pytest.fail("it may be written to")

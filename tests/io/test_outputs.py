@@ -27,13 +27,13 @@ def test_folders_around_and_within_a_capture(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(root)
     (root / "empty").mkdir()
     for out, reason in (
-        (root, "exists, which is read"),
-        (tmp_path / "link", "exists, which is read"),
-        (root / "images" / "..", "exists, which is read"),
-        (root / "images", "exists in .*, which is read"),
-        (root / "more", "exists, which is read"),
-        (root.parent / "photos" / "2.jpg", "exists in .*photos, which is read"),
-        (tmp_path / "link" / "points.ply", "exists in .*, which is read"),
+        (root, "exists, which is an input"),
+        (tmp_path / "link", "exists, which is an input"),
+        (root / "images" / "..", "exists, which is an input"),
+        (root / "images", "exists in .*, which is an input"),
+        (root / "more", "exists, which is an input"),
+        (root.parent / "photos" / "2.jpg", "exists in .*photos, which is an input"),
+        (tmp_path / "link" / "points.ply", "exists in .*, which is an input"),
     ):
         with pytest.raises(DyngsError, match=reason):
             inputs.require_output(out)
@@ -66,7 +66,7 @@ def test_a_new_folder_appears_complete_or_not_at_all(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["capture"]
     assert (out / "1.jpg").read_text() == "full"
     for taken in (out, out / "1.jpg"):
-        with pytest.raises(DyngsError, match="already exists; choose a new folder"):
+        with pytest.raises(DyngsError, match="exists already; choose a new folder"):
             require_new_folder(taken)
 
 

@@ -131,13 +131,15 @@ def test_stdout_is_no_file_even_where_it_is_redirected_to_one(name: str) -> None
 
 
 WRITERS = (
-    "train static data.root=STILL run.dir=run run.threads=1 train.steps=3 init.kind=random init.num_random=60",
+    "train static data.root=STILL run.dir=run run.threads=1 train.steps=3 init.kind=random "
+    "init.num_random=60",
     "render run --out images --depth",
     "export run --format ply --out files/a.ply",
     "export run --format html --out files/a.html",
     "export run --format dyngs --out stored",
     "edit run --out edited --up -y",
-    "train human data.root=PERSON run.dir=person run.threads=1 train.steps=2 model.resolution=24 model.fit=false",
+    "train human data.root=PERSON run.dir=person run.threads=1 train.steps=2 model.resolution=24 "
+    "model.fit=false",
     "export person --format avatar --out files/person.safetensors",
 )
 """Commands that write files."""

@@ -117,12 +117,12 @@ def test_what_a_run_reads(tmp_path: Path) -> None:
     own = [run / RESOLVED_NAME, *checkpoint_paths(run)]
     for path in own:
         for named in (run, run / "checkpoints" / ".." / ".." / "run"):
-            with pytest.raises(DyngsError, match="which is read"):
+            with pytest.raises(DyngsError, match="which is an input"):
                 inputs_of(named).require_output(path)
     for name in ("splats.ply", "metrics.json", "scene.dyngs"):
         (run / name).write_text("an export")
         inputs_of(run).require_output(run / name)
     checkpoint_paths(run)[0].rename(run / "kept")
     for named in (run, run / "scene.dyngs"):
-        with pytest.raises(DyngsError, match="which is read"):
+        with pytest.raises(DyngsError, match="which is an input"):
             inputs_of(named).require_output(run / "scene.dyngs")

@@ -156,8 +156,8 @@ class SfmResult:
     def summary(self) -> str:
         """The result as lines of text."""
         lines = [
-            f"{self.num_registered} of {self.num_images} images registered, {self.num_points} points, "
-            f"mean error {self.mean_error_px:.2f} px: {self.root}"
+            f"{self.num_registered} of {self.num_images} images registered, {self.num_points} "
+            f"points, mean error {self.mean_error_px:.2f} px: {self.root}"
         ]
         if self.unregistered:
             lines.append("not registered: " + first_few(self.unregistered))
@@ -212,14 +212,16 @@ def _posed_in(
         match_pairs(task, pairs_to_match(task))
         if homography_fraction(task.database) > _FLAT:
             raise DyngsError(
-                "the camera only rotated, or all images show one flat surface, which "
-                "gives no depth; walk sideways around the scene by about a quarter of its distance, and keep it in view"
+                "the camera only rotated, or all images show one flat surface, which gives no "
+                "depth; walk sideways around the scene by about a quarter of its distance, and "
+                "keep it in view"
             )
         model = run_mapping(task)
     if model is None:
         raise DyngsError(
-            f"could not estimate poses for {len(task.names)} images: take sharper images that overlap by two thirds, move "
-            "the camera sideways, avoid textureless or moving surfaces, or try matching=exhaustive"
+            f"could not estimate poses for {len(task.names)} images: take sharper images that "
+            "overlap by two thirds, move the camera sideways, avoid textureless or moving "
+            "surfaces, or try matching=exhaustive"
         )
     _require_depth(model, task)
     own = dict(zip(task.names, (photo.name for photo in photos), strict=True))
@@ -245,7 +247,8 @@ def _laid_out(
     }
     if options.masks is not None and not masks:
         raise DyngsError(
-            f"{options.masks}: no mask is named after an image (a.jpg.png, a.jpg or a.png for a.jpg)"
+            f"{options.masks}: no mask is named after an image (a.jpg.png, a.jpg or a.png for "
+            "a.jpg)"
         )
     names = prepare_colmap_images(photos, folder, work / "images", masks)
     for name, mask in masks.items():
@@ -264,17 +267,18 @@ def _require_depth(model: SfmModel, task: SfmTask) -> None:
     """Check that points are seen from directions that differ, by a lens that there can be."""
     if not model.has_real_lens:
         raise DyngsError(
-            "no plausible lens fits the matches: most of them are probably on a moving object, such as a "
-            "person who fills the image; give masks of it (--masks), or film a static scene"
+            "no plausible lens fits the matches: most of them are probably on a moving object, "
+            "such as a person who fills the image; give masks of it (--masks), or film a static "
+            "scene"
         )
     angles = triangulation_angles_deg(model.reconstruction)
     angle = float(np.median(angles)) if len(angles) else 0.0
     if angle >= _SMALL_ANGLE_DEG:
         return
     raise DyngsError(
-        f"the camera hardly moved: the median triangulation angle is {max(angle, 0.1):.1f} degrees, "
-        f"which gives no depth; {_film(task)} while walking sideways by about a quarter of the distance to the "
-        "scene"
+        f"the camera hardly moved: the median triangulation angle is {max(angle, 0.1):.1f} "
+        f"degrees, which gives no depth; {_film(task)} while walking sideways by about a quarter "
+        "of the distance to the scene"
     )
 
 
@@ -296,8 +300,8 @@ def _advice(unregistered: Sequence[str], blurred: Sequence[str], is_video: bool)
     if unregistered:
         more = "move slower there" if is_video else "take more photos around them"
         yield (
-            f"{len(unregistered)} images could not be registered: {more}, unless they show mostly moving objects or the camera only "
-            "rotated there"
+            f"{len(unregistered)} images could not be registered: {more}, unless they show "
+            "mostly moving objects or the camera only rotated there"
         )
     if blurred:
         more = "use more light or move slower" if is_video else "take them again"
@@ -316,8 +320,8 @@ def _frames_of(
     reach = measures.away.max(initial=0.0)
     if len(measures) >= 3 and reach < MIN_CAMERA_MOTION:
         raise DyngsError(
-            f"{video}: the camera does not move (the image shifts by {reach:.2%} of its width), which "
-            "gives no depth; film while walking sideways around the scene"
+            f"{video}: the camera does not move (the image shifts by {reach:.2%} of its width), "
+            "which gives no depth; film while walking sideways around the scene"
         )
     names = {index: f"frame_{index:05d}.png" for index in numbers}
     photos = []

@@ -94,8 +94,8 @@ def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], l
     heif = [file for file in taken if _is_heif(file)]
     if heif and find_spec("pillow_heif") is None:
         raise DyngsError(
-            f"{source}: {len(heif)} HEIC photos, first {heif[0].name}, need the package pillow-heif: "
-            "pip install 'dyngs[heic]', or convert them to JPEG"
+            f"{source}: {len(heif)} HEIC photos, first {heif[0].name}, need the package "
+            "pillow-heif: pip install 'dyngs[heic]', or convert them to JPEG"
         )
     headers = {photo: _checked(photo) for photo in taken}
     names = _stored_names(

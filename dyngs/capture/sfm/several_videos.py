@@ -108,7 +108,8 @@ def poses_of_videos(
         names = [video.name for video in videos]
         if len(videos) < 2:
             raise DyngsError(
-                f"{source}: holds {len(videos)} videos, but two or more are needed; give a single video as the file itself"
+                f"{source}: holds {len(videos)} videos, but two or more are needed; give a "
+                "single video as the file itself"
             )
         starts, test = read_video_settings(source, names)
         lines = colour_messages(video.info for video in videos)
@@ -172,7 +173,8 @@ def read_video_settings(
     fits = isinstance(starts, dict) and starts.keys() == set(names)
     if not fits or not all(is_number(x) and abs(x) <= MAX_START for x in starts.values()):
         raise DyngsError(
-            f"{path}: give the start of each video in seconds, for {first_few(names)}, got {starts!r:.80}"
+            f"{path}: give the start of each video in seconds, for {first_few(names)}, got "
+            f"{starts!r:.80}"
         )
     return {name: float(second) for name, second in starts.items()}, test
 
@@ -243,9 +245,10 @@ def estimate_starts_by_sound(videos: Sequence[CameraVideo]) -> tuple[dict[str, f
 
 def _unknown(videos: Sequence[CameraVideo], reason: str) -> DyngsError:
     return DyngsError(
-        f"the offsets between the videos are unknown: {reason}; give the start of each video in seconds in "
-        f'{VIDEOS_FILE} next to them, {{"starts": {{"{videos[0].name}": 0, "{videos[1].name}": 0.5, ..}}}}, or '
-        '{"starts": 0} if all start at the same time'
+        f"the offsets between the videos are unknown: {reason}; give the start of each video in "
+        "seconds in "
+        f'{VIDEOS_FILE} next to them, {{"starts": {{"{videos[0].name}": 0, "{videos[1].name}": '
+        f'0.5, ..}}}}, or {{"starts": 0}} if all start at the same time'
     )
 
 
@@ -372,12 +375,13 @@ def _static_images(
     ]
     if moving:
         raise DyngsError(
-            f"{source}: cameras of several videos must be fixed, but these move: {first_few(moving)}; remove them, "
-            "stabilise shaky videos, or train on one moving camera's video alone"
+            f"{source}: cameras of several videos must be fixed, but these move: "
+            f"{first_few(moving)}; remove them, stabilise shaky videos, or train on one moving "
+            "camera's video alone"
         )
     return images, (
-        f"{len(videos)} cameras are fixed (image displacement at most {max(displaced.values()):.2%} of the width, "
-        f"{FIXED_CAMERA_LIMIT:.1%} allowed)"
+        f"{len(videos)} cameras are fixed (image displacement at most "
+        f"{max(displaced.values()):.2%} of the width, {FIXED_CAMERA_LIMIT:.1%} allowed)"
     )
 
 
@@ -411,13 +415,13 @@ def _posed(
     names = set() if model is None else _posed_images(model).keys()
     if model is None or len(names) < 2:
         raise DyngsError(
-            f"could not estimate poses for {len(images)} cameras: neighbouring cameras must overlap, with "
-            "at most 30 degrees between them, and see textured static surfaces; add cameras between them, "
-            "or give the poses in cameras.json (docs/formats.md)"
+            f"could not estimate poses for {len(images)} cameras: neighbouring cameras must "
+            "overlap, with at most 30 degrees between them, and see textured static surfaces; "
+            "add cameras between them, or give the poses in cameras.json (docs/formats.md)"
         )
     line = (
-        f"{len(names)} of {len(images)} cameras registered, {model.num_points3D():,} points, mean error "
-        f"{model.compute_mean_reprojection_error():.2f} px ({lens})"
+        f"{len(names)} of {len(images)} cameras registered, {model.num_points3D():,} points, "
+        f"mean error {model.compute_mean_reprojection_error():.2f} px ({lens})"
     )
     left = [name for name in images if name not in names]
     if left:
@@ -544,8 +548,8 @@ def frames_at_steps(
     steps = clocks[slowest][(clocks[slowest] >= first - slack) & (clocks[slowest] <= last + slack)]
     if len(steps) < 2:
         raise DyngsError(
-            f"{where}: the videos do not overlap in time: the last one starts at {first:.2f} s, the "
-            f"first one ends at {last:.2f} s; check that all show the same event"
+            f"{where}: the videos do not overlap in time: the last one starts at {first:.2f} s, "
+            f"the first one ends at {last:.2f} s; check that all show the same event"
         )
     limit = max(min(MOST_STEPS, MOST_IMAGES // len(clocks)), 2) if most is None else most
     chosen = steps[evenly_spaced(len(steps), limit)]

@@ -47,13 +47,14 @@ def ensure_poses(
     videos = list_videos(source) if is_several_videos(source) else []
     if videos and not needs_times:
         raise DyngsError(
-            f"{source}: holds {len(videos)} videos; a static scene needs one video of a moving camera, several need `dyngs train dynamic "
-            f"data.root={as_word(source)}`"
+            f"{source}: holds {len(videos)} videos; a static scene needs one video of a moving "
+            f"camera, several need `dyngs train dynamic data.root={as_word(source)}`"
         )
     if source.is_dir() and not videos and needs_times and data.times == "files":
         raise DyngsError(
-            f"{source}: photos have no times, so a moving scene cannot be trained; set data.times=order if their names are in "
-            "temporal order, give a video, or use `dyngs train static`"
+            f"{source}: photos have no times, so a moving scene cannot be trained; set "
+            "data.times=order if their names are in temporal order, give a video, or use `dyngs "
+            "train static`"
         )
     files = (
         [*videos, *(path for path in [source / VIDEOS_FILE] if path.is_file())] if videos else None
@@ -99,8 +100,8 @@ def is_unposed(data: DataConfig) -> bool:
     )
     if photos:
         raise DyngsError(
-            f"{root}: holds {counted(len(photos), 'photo')} but no cameras; a scene needs at least {FEWEST_PHOTOS} "
-            "photos from different positions, ideally 50, or a video"
+            f"{root}: holds {counted(len(photos), 'photo')} but no cameras; a scene needs at "
+            f"least {FEWEST_PHOTOS} photos from different positions, ideally 50, or a video"
         )
     return bool(videos)
 

@@ -400,8 +400,9 @@ def _exr_layer(path: Path, reader: OpenImageIO.ImageInput) -> ExrLayer | None:
     chosen = layers[0] if len(layers) == 1 else find_beauty_pass(layers)
     if chosen is None:
         raise DyngsError(
-            f"{path}: cannot tell which layer is the image; name one rgba, Combined, C or beauty, or save it alone. "
-            f"The file has {first_few([layer.name or 'an unnamed layer' for layer in layers])}"
+            f"{path}: cannot tell which layer is the image; name one rgba, Combined, C or "
+            "beauty, or save it alone. The file has "
+            f"{first_few([layer.name or 'an unnamed layer' for layer in layers])}"
         )
     reader.seek_subimage(chosen.part, 0)
     return chosen if len(layers) > 1 else None

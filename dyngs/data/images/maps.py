@@ -100,8 +100,8 @@ def apply_silhouette(pixels: Tensor, silhouette: Silhouette) -> Tensor:
     alpha = _read_alpha(silhouette)
     if alpha.shape != pixels.shape[:2]:
         raise DyngsError(
-            f"{silhouette.path}: the mask is {alpha.shape[1]}x{alpha.shape[0]} but its image is {pixels.shape[1]}x"
-            f"{pixels.shape[0]}; make them the same size"
+            f"{silhouette.path}: the mask is {alpha.shape[1]}x{alpha.shape[0]} but its image is "
+            f"{pixels.shape[1]}x{pixels.shape[0]}; make them the same size"
         )
     if pixels.shape[-1] == 4:
         alpha = (alpha.float() * pixels[..., 3].float() / 255).round().to(torch.uint8)
@@ -121,7 +121,8 @@ def _read_alpha(silhouette: Silhouette) -> Tensor:
         row = read_hdf5(silhouette.path, MASKS, silhouette.row)
         if row.ndim != 2 or row.dtype not in (np.uint8, np.bool_):
             raise DyngsError(
-                f"{silhouette.path}: '{MASKS}' must hold bytes in the shape (F, H, W); export it again"
+                f"{silhouette.path}: '{MASKS}' must hold bytes in the shape (F, H, W); export it "
+                "again"
             )
         levels = torch.as_tensor(row.astype(np.uint8), device="cpu")
     if silhouette.person == "nonzero":

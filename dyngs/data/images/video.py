@@ -90,7 +90,8 @@ class ColourTags:
             return f"HLG is tone-mapped to SDR (white: {_HLG_WHITE:.0%} of the signal; brighter is clipped)"
         if self.transfer == _PQ:
             return (
-                f"PQ is tone-mapped to SDR (white: {_REFERENCE_WHITE:g} cd/m2; brighter is clipped)"
+                f"PQ is tone-mapped to SDR (white: {_REFERENCE_WHITE:g} cd/m2; brighter is "
+                "clipped)"
             )
         name = {BT2020: "BT.2020", _DISPLAY_P3: "Display P3"}.get(self.primaries)
         return f"colours are converted from {name} to BT.709" if name else ""
@@ -186,7 +187,8 @@ def list_videos(folder: Path) -> list[Path]:
     for path in videos:
         if names.setdefault(path.stem, path) != path:
             raise DyngsError(
-                f"{folder}: {names[path.stem].name} and {path.name} have the same camera name; remove one of them"
+                f"{folder}: {names[path.stem].name} and {path.name} have the same camera name; "
+                "remove one of them"
             )
     return videos
 
@@ -237,7 +239,8 @@ def probe_video(path: Path) -> VideoInfo:
         count = max(stream.frames, len(hidden)) - sum(hidden)
     if count > MAX_FRAMES:
         raise DyngsError(
-            f"{path}: the video has {count:,} frames, more than the limit of {MAX_FRAMES:,}; split it"
+            f"{path}: the video has {count:,} frames, more than the limit of {MAX_FRAMES:,}; "
+            "split it"
         )
     note = tags.conversion
     is_untagged = {tags.primaries, tags.transfer, tags.matrix} == {UNSPECIFIED}
@@ -343,7 +346,8 @@ def _reading(path: Path) -> AbstractContextManager[None]:
 
 def _broken(path: Path, index: int, why: str) -> DyngsError:
     return DyngsError(
-        f"cannot decode the video {path} at frame {index} ({why}); copy it again, or exclude that part with data.frames"
+        f"cannot decode the video {path} at frame {index} ({why}); copy it again, or exclude "
+        "that part with data.frames"
     )
 
 
@@ -384,8 +388,8 @@ def _rotated_rgb(path: Path, frame: av.VideoFrame, tags: ColourTags) -> np.ndarr
     matrix = _matrix_of(frame, tags)
     if matrix not in SUPPORTED_MATRICES:  # as that of Dolby Vision without a base layer
         raise DyngsError(
-            f"{path}: its colours have the matrix {matrix} of ITU-T H.273, which is not supported; "
-            "export the video as SDR, HLG or HDR10"
+            f"{path}: its colours have the matrix {matrix} of ITU-T H.273, which is not "
+            "supported; export the video as SDR, HLG or HDR10"
         )
     # The nearest sample of chroma, as swscale takes it for 8 bits: filters mix colours at edges,
     # which the curves of HDR amplify.

@@ -67,12 +67,14 @@ def open_camera(name: str, path: Path) -> CameraSource:
         digits = re.findall(r"\d+", image.stem)
         if not digits:
             raise DyngsError(
-                f"{image}: no frame number in its name; rename it, for example to frame_0000{image.suffix}"
+                f"{image}: no frame number in its name; rename it, for example to "
+                f"frame_0000{image.suffix}"
             )
         other = images.setdefault(int(digits[-1]), image)
         if other != image:
             raise DyngsError(
-                f"{path}: {other.name} and {image.name} have the same frame number; remove one of them"
+                f"{path}: {other.name} and {image.name} have the same frame number; remove one "
+                "of them"
             )
     return CameraSource(name, images)
 
@@ -185,8 +187,8 @@ def _calibration(value: object, where: str) -> dict[str, object]:
     own = {str(key): field for key, field in value.items()}
     if ("transform_matrix" in own) == ("cam_from_world" in own):
         raise DyngsError(
-            f"{where}: give either transform_matrix (OpenGL, camera-to-world) or cam_from_world (OpenCV), not "
-            f"{'both' if 'cam_from_world' in own else 'neither'}"
+            f"{where}: give either transform_matrix (OpenGL, camera-to-world) or cam_from_world "
+            f"(OpenCV), not {'both' if 'cam_from_world' in own else 'neither'}"
         )
     if "cam_from_world" not in own:
         return own
@@ -211,7 +213,8 @@ def _splits(
     unknown = sorted(set(test) - views.keys())
     if unknown:
         raise DyngsError(
-            f"{path}: 'test' names {first_few(unknown)}, but the cameras are {first_few(sorted(views))}"
+            f"{path}: 'test' names {first_few(unknown)}, but the cameras are "
+            f"{first_few(sorted(views))}"
         )
     return _held_out(views, test), notes
 
@@ -251,8 +254,8 @@ def read_llff(root: Path) -> Capture:
     names = list(found)
     if len(names) != len(rows):
         raise DyngsError(
-            f"{path}: has {len(rows)} poses, but there are {len(names)} videos or folders of frames "
-            f"({first_few(names)}); make the numbers equal"
+            f"{path}: has {len(rows)} poses, but there are {len(names)} videos or folders of "
+            f"frames ({first_few(names)}); make the numbers equal"
         )
     cameras = [open_camera(name, found[name]) for name in names]
     calibrations = {name: _llff_calibration(row) for name, row in zip(names, rows, strict=True)}

@@ -88,7 +88,8 @@ def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], 
     lost = next((image for image in images if image.camera not in known), None)
     if lost is not None:
         raise DyngsError(
-            f"{paths[1]}: {lost.name} refers to camera {lost.camera}, which is not in {paths[0].name}"
+            f"{paths[1]}: {lost.name} refers to camera {lost.camera}, which is not in "
+            f"{paths[0].name}"
         )
     table = np.array(points, np.float64).reshape(-1, 7)
     table = table[np.argsort(table[:, 0], kind="stable")]
@@ -147,7 +148,8 @@ def _text_entries(path: Path, entry_of: Callable[[str], Entry]) -> list[Entry]:
                 may_skip = path.stem == "images"
     if len(entries) < announced:
         raise DyngsError(
-            f"{path}: truncated after {len(entries)} of {announced} entries; copy or export it again"
+            f"{path}: truncated after {len(entries)} of {announced} entries; copy or export it "
+            "again"
         )
     return entries
 
@@ -240,8 +242,8 @@ def find_model(root: Path) -> tuple[Path | None, list[str]]:
         folders, key=lambda folder: max(x.stat().st_size for x in folder.glob("images.*"))
     )
     line = (
-        f"{largest.parent}: {len(folders)} separate models found; using the largest, {largest.name} "
-        "(to use another one, move it out of the capture)"
+        f"{largest.parent}: {len(folders)} separate models found; using the largest, "
+        f"{largest.name} (to use another one, move it out of the capture)"
     )
     return largest, [line]
 
@@ -339,7 +341,8 @@ def _poses(folder: Path, images: list[ModelImage]) -> tuple[list[np.ndarray], di
         length = float(np.linalg.norm((w, x, y, z)))
         if not abs(length - 1) <= ROTATION_TOLERANCE:  # zeros would be taken for no rotation
             raise DyngsError(
-                f"{where}: its rotation quaternion has length {length:.6g} instead of 1; export it again"
+                f"{where}: its rotation quaternion has length {length:.6g} instead of 1; export "
+                "it again"
             )
         rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
         pose, repaired[where] = validate_pose(np.column_stack([rotation, translation]), where)
@@ -352,7 +355,8 @@ def pinhole_and_lens(camera: ModelCamera, where: str) -> tuple[np.ndarray, Lens]
     express."""
     if camera.model not in _LENSES:
         raise DyngsError(
-            f"{where}: camera model {camera.model} is not supported; run `colmap image_undistorter` first"
+            f"{where}: camera model {camera.model} is not supported; run `colmap "
+            "image_undistorter` first"
         )
     values = camera.params
     num_focal, kind = _LENSES[camera.model]
@@ -360,7 +364,8 @@ def pinhole_and_lens(camera: ModelCamera, where: str) -> tuple[np.ndarray, Lens]
     fy = values[num_focal - 1]
     if not np.isfinite(values).all() or min(fx, fy) <= 0 or min(camera.size) < 1:
         raise DyngsError(
-            f"{where}: camera size and focal length must be positive and all parameters finite; export it again"
+            f"{where}: camera size and focal length must be positive and all parameters finite; "
+            "export it again"
         )
     cx, cy, *coefficients = values[num_focal:]
     if kind == "none" or (kind == "opencv" and not any(coefficients)):

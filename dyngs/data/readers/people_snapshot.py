@@ -42,7 +42,8 @@ def read_people_snapshot(root: Path) -> Capture:
     images = {number: path for number, path in camera.images.items() if number in usable}
     if not images:
         raise DyngsError(
-            f"{root}: no frame of {video.name} has both a mask and body parameters; restore the HDF5 files"
+            f"{root}: no frame of {video.name} has both a mask and body parameters; restore the "
+            "HDF5 files"
         )
     views, warnings = sequence_views(
         root / CAMERA, [replace(camera, images=images)], {camera.name: _calibration(root / CAMERA)}
@@ -54,7 +55,8 @@ def read_people_snapshot(root: Path) -> Capture:
     lost = len(camera.images) - len(images)
     if lost:
         warnings.append(
-            f"{video.name}: {lost} of {len(camera.images)} frames have no mask or no pose and are skipped"
+            f"{video.name}: {lost} of {len(camera.images)} frames have no mask or no pose and "
+            "are skipped"
         )
     own = share_body_across_splits(body)
     fps = video_fps([camera])

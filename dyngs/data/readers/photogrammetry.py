@@ -158,8 +158,9 @@ def _metashape_lens(path: Path, sensor: ElementTree.Element) -> _Fields:
     kind = sensor.get("type")
     if kind not in ("frame", "fisheye") or not calibrations:
         raise DyngsError(
-            f"{where}: is of type {kind} with {counted(len(calibrations), 'calibration')}; only calibrated frame and "
-            "fisheye sensors are read: convert its photos to those of a frame camera in Metashape"
+            f"{where}: is of type {kind} with {counted(len(calibrations), 'calibration')}; only "
+            "calibrated frame and fisheye sensors are read: convert its photos to those of a "
+            "frame camera in Metashape"
         )
     adjusted = [
         calibration for calibration in calibrations if calibration.get("class") == "adjusted"
@@ -282,7 +283,8 @@ def read_odm(root: Path) -> Capture:
             model = max(content, key=lambda model: len(model["shots"]))
             if len(content) > 1:
                 warnings = [
-                    f"{path.name}: using the largest of {len(content)} models ({len(model['shots'])} photos)"
+                    f"{path.name}: using the largest of {len(content)} models "
+                    f"({len(model['shots'])} photos)"
                 ]
             lenses = model["cameras"]
             shots = model["shots"]
@@ -310,7 +312,8 @@ def _odm_camera(path: Path, name: str, shot: _Fields, lenses: dict[str, _Fields]
     where = f"{path}, {name}"
     if "camera" not in shot and len(lenses) > 1:
         raise DyngsError(
-            f"{where}: which of {len(lenses)} cameras took this photo is not recorded; add {_ODM_FILES[0]}"
+            f"{where}: which of {len(lenses)} cameras took this photo is not recorded; add "
+            f"{_ODM_FILES[0]}"
         )
     lens = lenses[shot.get("camera", next(iter(lenses)))]
     kind = lens["projection_type"]
@@ -437,7 +440,8 @@ def read_record3d(root: Path) -> Capture:
         number = int(image.stem)
         if number >= len(poses):
             raise DyngsError(
-                f"{image}: has no pose: {path} has {len(poses)} poses, numbered from 0; export it again"
+                f"{image}: has no pose: {path} has {len(poses)} poses, numbered from 0; export "
+                "it again"
             )
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat(poses[number, :4]).as_matrix()

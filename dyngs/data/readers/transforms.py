@@ -283,7 +283,8 @@ def _below(files: FileFinder, written: str, where: str) -> Path:
     path = files.find(written)
     if not path.name or path == Path(os.path.normpath(files.root)) or "\0" in written:
         raise DyngsError(
-            f"{where}: {written!r:.80} is not a file path; give the path relative to the capture folder"
+            f"{where}: {written!r:.80} is not a file path; give the path relative to the capture "
+            "folder"
         )
     return path
 
@@ -364,7 +365,8 @@ def _lens(frame: FrameEntry) -> Lens:
         return Lens()
     if model not in ("OPENCV", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE"):
         raise DyngsError(
-            f"{frame.where}: camera_model {model} is not supported; use PINHOLE, OPENCV or OPENCV_FISHEYE"
+            f"{frame.where}: camera_model {model} is not supported; use PINHOLE, OPENCV or "
+            "OPENCV_FISHEYE"
         )
     if k4 and not (k5 or k6 or model == "FULL_OPENCV"):
         raise DyngsError(
@@ -614,7 +616,8 @@ def _body_of(root: Path, split: Split, views: tuple[View, ...], train: BodyFrame
     path = root / f"body_{split}.npz"
     if not path.is_file() and split == "pose":
         raise DyngsError(
-            f"{path}: no such file; transforms_pose.json is a separate clip and needs its own body parameters"
+            f"{path}: no such file; transforms_pose.json is a separate clip and needs its own "
+            "body parameters"
         )
     body = read_body_file(path) if path.is_file() and split != "train" else train
     match_frames(path if path.is_file() else root / "body_train.npz", body, views)

@@ -165,7 +165,8 @@ def _calibration(
     values = parse_numbers(f"{where}: the distortion", lens, None).tolist()
     if len(values) not in (4, 5, 8):
         raise DyngsError(
-            f"{where}: the distortion must have 4, 5 or 8 coefficients, got {len(values)}; export it again"
+            f"{where}: the distortion must have 4, 5 or 8 coefficients, got {len(values)}; "
+            "export it again"
         )
     pose, _ = validate_pose(cam_from_world, where)
     return {

@@ -171,7 +171,8 @@ def limit_to_format(
     require_writable(path, gaussians)
     if sh_degree is not None and sh_degree > own.max_degree:
         raise DyngsError(
-            f"{path}: SH degree {sh_degree} is not supported; {own.name} stores at most degree {own.max_degree}"
+            f"{path}: SH degree {sh_degree} is not supported; {own.name} stores at most degree "
+            f"{own.max_degree}"
         )
     degree = min(gaussians.sh_degree, own.max_degree) if sh_degree is None else sh_degree
     if degree < gaussians.sh_degree and bool(gaussians.sh[:, (degree + 1) ** 2 :].any()):
@@ -179,7 +180,8 @@ def limit_to_format(
         notes.append(f"SH coefficients above degree {degree} are dropped: {why}")
     if splat.mode is RasterizeMode.ANTIALIASED and not own.stores_render_mode:
         notes.append(
-            f"{own.name} cannot store that the scene is antialiased; viewers draw thin parts too thick"
+            f"{own.name} cannot store that the scene is antialiased; viewers draw thin parts too "
+            "thick"
         )
     notes += offset_notes(
         splat, "stored in the file" if own.stores_comments else f"{own.name} cannot store it"

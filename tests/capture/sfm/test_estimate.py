@@ -158,7 +158,7 @@ def test_masks_beside_the_photos_are_read_and_links_out_of_their_folder_are_not(
         estimate_poses(tmp_path / "photos", tmp_path / "out", options)
     (tmp_path / "masks" / "0.png").rename(tmp_path / "private.png")
     (tmp_path / "masks" / "0.png").symlink_to("../private.png")
-    with pytest.raises(DyngsError, match=r"0\.png: leads to .*private\.png"):
+    with pytest.raises(DyngsError, match=r"0\.png: points to .*private\.png"):
         estimate_poses(tmp_path / "photos", tmp_path / "out", options)
 
 

@@ -103,7 +103,9 @@ def test_heic_without_its_package_names_it(tmp_path: Path, monkeypatch: pytest.M
     _save(tmp_path / "photos" / "a.jpg")
     (tmp_path / "photos" / "b.heic").write_bytes(b"photo")
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    with pytest.raises(DyngsError, match=r"1 photos? .*first b\.heic.*pip install 'dyngs\[heic\]'"):
+    with pytest.raises(
+        DyngsError, match=r"1 HEIC photos?, first b\.heic.*pip install 'dyngs\[heic\]'"
+    ):
         _gather(tmp_path)
 
 

@@ -49,7 +49,7 @@ def test_silent_videos_without_offsets_are_refused(tmp_path: Path) -> None:
     write_videos(tmp_path / "rig", {"a": 40.0, "b": 50.0}, {"a": 0.0, "b": 0.2}, 10.0, 6)
     with pytest.raises(
         DyngsError,
-        match=r'a has no sound; give the second .* in videos\.json beside them, {"starts"',
+        match=r'a has no sound; give the start .* in videos\.json next to them, {"starts"',
     ):
         poses_of_videos(tmp_path / "rig", tmp_path / "out", SfmOptions(num_threads=1))
     assert not (tmp_path / "out").exists()
@@ -188,7 +188,7 @@ def test_offsets_of_recordings_with_noise_of_their_own(tmp_path: Path) -> None:
     films = [open_video(_write(tmp_path / f"{i}.mp4", sound)) for i, sound in enumerate(noisy)]
     seconds, line = estimate_starts_by_sound(films)
     assert list(seconds.values()) == pytest.approx(starts, abs=0.015)
-    assert "by the sound (3 of 3 pairs agree" in line
+    assert "from sound (3 of 3 pairs agree" in line
 
 
 def _smooth_noise(rng: np.random.Generator, length: int, bins: int = 6) -> np.ndarray:

@@ -59,7 +59,7 @@ def test_photos_get_poses_once(tmp_path: Path, asked: list[Path]) -> None:
     data = DataConfig(root=_photos(tmp_path / "photos"))
     first = ensure_poses(data, log=said.append)
     assert cache_folder("poses") in first.root.parents
-    assert "estimated first" in said[0]
+    assert "has no poses; estimating them" in said[0]
     assert "3 of 3 images" in said[1]
     assert ensure_poses(data, log=said.append) == first
     assert asked == [tmp_path / "photos"]
@@ -83,7 +83,7 @@ def test_no_output_replaces_the_video_that_a_run_is_made_of(
         assert (
             main(["render", str(tmp_path / "run"), "--path", "along", "--video", str(video)]) == 2
         )
-        assert "clip.mp4: exists, which is read" in capsys.readouterr().err
+        assert "clip.mp4: exists, which is an input" in capsys.readouterr().err
         (data.root / SOURCES_NAME).unlink()  # as a run killed at just that moment leaves it
     assert video.read_bytes() == before
 

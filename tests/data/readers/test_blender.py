@@ -424,7 +424,7 @@ def test_other_splits_may_lack(root: Path) -> None:
 def test_missing_files(root: Path) -> None:
     (root / "body_pose.npz").unlink()
     with pytest.raises(
-        DyngsError, match=r"body_pose\.npz: no such file; transforms_pose\.json shows another clip"
+        DyngsError, match=r"body_pose\.npz: no such file; transforms_pose\.json is a separate clip"
     ):
         read_body_json(root)
     write_body(root / "body_pose.npz", 2)
@@ -446,10 +446,10 @@ def test_missing_files(root: Path) -> None:
             {"trans": np.zeros((2, 3))},
             r"body_train\.npz: 'trans' must hold as many numbers for each of 3 frames",
         ),
-        ({"trans": np.full((3, 3), np.nan)}, r"body_train\.npz: 'trans' of frame 0 holds NaN"),
+        ({"trans": np.full((3, 3), np.nan)}, r"body_train\.npz: 'trans' of frame 0 contains NaN"),
         ({"scale": -1.0}, r"body_train\.npz: 'scale' must be positive"),
         ({"betas": None}, r"body_train\.npz: the key 'betas' is missing"),
-        ({"poses": np.zeros(()), "trans": np.zeros(())}, r"body_train\.npz: holds no frame"),
+        ({"poses": np.zeros(()), "trans": np.zeros(())}, r"body_train\.npz: no frames found"),
         (
             {"poses": np.zeros((2, 165)), "trans": np.zeros((2, 3))},
             r"no body parameters for 1 frames .*\(2\)",

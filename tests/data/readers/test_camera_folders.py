@@ -189,7 +189,7 @@ def test_a_folder_is_preferred_to_its_video(tmp_path: Path) -> None:
         (tmp_path / name).write_text("")
     assert find_cameras(tmp_path) == {"a": tmp_path / "a", "c": tmp_path / "c.mov"}
     (tmp_path / "c.mp4").write_text("")
-    with pytest.raises(DyngsError, match=r"c\.mov and c\.mp4 are one camera"):
+    with pytest.raises(DyngsError, match=r"c\.mov and c\.mp4 have the same camera name"):
         find_cameras(tmp_path)
 
 
@@ -215,7 +215,7 @@ def test_bad_calibration_files(root: Path, text: str, line: str) -> None:
 @pytest.mark.parametrize(
     ("fields", "line"),
     [
-        ({"fl_x": None, "fl_y": None}, "no focal length"),
+        ({"fl_x": None, "fl_y": None}, "focal length missing"),
         ({"fl_x": float("nan")}, "'fl_x' must be a finite number"),
         ({"cam_from_world": np.eye(4).tolist()}, "not both"),
         ({"transform_matrix": np.diag([1, 1, -1, 1]).tolist()}, "mirrored"),
@@ -249,7 +249,7 @@ def test_a_camera_without_images_is_left_out(root: Path) -> None:
     for path in (root / "cam00").iterdir():
         path.unlink()
     capture = read(root)
-    assert capture.warnings == ("cameras.json: no folder or video for cam00, left out",)
+    assert capture.warnings == ("cameras.json: no folder or video for cam00, skipped",)
     assert len(capture.splits["train"]) == 4
 
 
@@ -330,7 +330,7 @@ def test_bad_files(llff: Path) -> None:
         (good[:, :15], "must have 17 columns"),
         (good[:0], "must have 17 columns"),
         (good[0], "must have 17 columns"),
-        (nan, "holds? NaN|finite"),
+        (nan, "contains NaN|finite"),
         (mirrored, "camera cam02: the pose is mirrored"),
         (np.array(["x"]), "must be a NumPy array of numbers"),
         (np.array([[{}] * 17]), "must be a NumPy array of numbers"),

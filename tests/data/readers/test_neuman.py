@@ -187,8 +187,8 @@ def test_bad_fits(root: Path, person: object, line: str) -> None:
     [
         (None, "the key '04.jpg' is missing"),
         (np.zeros((4, 4)), r"04\.jpg must hold 4x3 finite numbers"),
-        (np.zeros((4, 3)), r"04\.jpg: the alignment is no similarity"),
-        (-np.eye(4)[:, :3], r"04\.jpg: the alignment is no similarity"),
+        (np.zeros((4, 3)), r"04\.jpg: the alignment is not a similarity"),
+        (-np.eye(4)[:, :3], r"04\.jpg: the alignment is not a similarity"),
         (np.eye(4)[:, :3] * [1, 2, 3], r"04\.jpg: the pose is not a rotation"),
     ],
 )

@@ -131,7 +131,7 @@ def test_videos(root: Path) -> None:
         read_people_snapshot(root)
     (root / "another.mp4").unlink()
     (root / "other.mp4").unlink()
-    with pytest.raises(DyngsError, match="no video in it"):
+    with pytest.raises(DyngsError, match="found no video"):
         read_people_snapshot(root)
 
 
@@ -152,7 +152,7 @@ def test_missing_files(root: Path) -> None:
     [
         ({"pose": None}, "'pose' must be a data set"),
         ({"pose": np.ones((3, 72))}, "'pose' has 3 rows but 'trans' 7"),
-        ({"pose": np.zeros((7, 72)), "trans": np.zeros((7, 3))}, "holds no frame"),
+        ({"pose": np.zeros((7, 72)), "trans": np.zeros((7, 3))}, "no frames found"),
     ],
 )
 def test_bad_parameters(root: Path, change: dict[str, Any], line: str) -> None:
