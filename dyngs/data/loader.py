@@ -1,4 +1,5 @@
-"""Image loader: images of views as training targets, cached and prefetched in background threads."""
+"""Image loader: images of views as training targets, cached and prefetched in background
+threads."""
 
 from __future__ import annotations
 
@@ -45,7 +46,8 @@ Decoded = dict[str, Tensor]
 
 
 def default_decoding_threads() -> int:
-    """Return the number of decoding threads: one per two cores of this process, from one to four."""
+    """Return the number of decoding threads: one per two cores of this process, from one to
+    four."""
     try:
         cores = len(os.sched_getaffinity(0))
     except AttributeError:  # not on Linux
@@ -224,7 +226,8 @@ class ImageLoader:
         return self._given_out(index, self._as_stored(index))
 
     def downscaled(self, index: int, factor: int) -> Image:
-        """Return ``self[index].downscaled(factor)``; cached for the last factor if memory allows."""
+        """Return ``self[index].downscaled(factor)``; cached for the last factor if memory
+        allows."""
         key = (range(len(self))[index], factor)
         with self._lock:
             if factor != self._factor:

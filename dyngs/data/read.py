@@ -42,8 +42,8 @@ from dyngs.io.find import FileFinder, downscaled_image_folders
 from dyngs.io.outputs import suggest_command
 
 PEOPLE_FILE = "people.json"
-"""File in a set of people with subfolders of folders (shards): the options it was generated with.
-"""
+"""File in a set of people with subfolders of folders (shards): the options it was generated
+with."""
 
 
 def list_captures(data: DataConfig) -> list[DataConfig]:
@@ -57,8 +57,7 @@ def list_captures(data: DataConfig) -> list[DataConfig]:
     people = [person for shard in shards for person in _folders(shard)]
     if not people:
         raise DyngsError(
-            f"{root}: contains no folders; give a folder with one capture of a person per "
-            "subfolder"
+            f"{root}: contains no folders; give a folder with one capture of a person per subfolder"
         )
     return [data.model_copy(update={"root": folder}) for folder in people]
 
@@ -457,7 +456,8 @@ def _finite_points(points: PointCloud | None) -> tuple[PointCloud | None, list[s
 
 
 def _present_priors(splits: Splits, tracks: Path | None) -> tuple[Splits, Path | None, list[str]]:
-    """Remove missing prior files from the splits and tracks; return these and a message per kind."""
+    """Remove missing prior files from the splits and tracks; return these and a message per
+    kind."""
     notes: list[str] = []
     for field, kind in _PRIORS.items():
         paths = [path for view in all_views(splits) if (path := getattr(view, field)) is not None]

@@ -1,4 +1,5 @@
-"""Scene space: depth bounds, the volume that cameras see, and normalisation of scene coordinates."""
+"""Scene space: depth bounds, the volume that cameras see, and normalisation of scene
+coordinates."""
 
 from __future__ import annotations
 
@@ -181,7 +182,8 @@ def _length(capture: Capture, centers: np.ndarray) -> float:
 def change_coordinates(
     capture: Capture, scale: float, offset: Sequence[float] | np.ndarray
 ) -> Capture:
-    """Return the capture in scene coordinates with this ``world_scale`` and ``world_offset`` (3,)."""
+    """Return the capture in scene coordinates with this ``world_scale`` and ``world_offset``
+    (3,)."""
     offset = np.asarray(offset, np.float64)
     if scale == capture.world_scale and (offset == capture.world_offset).all():
         return capture

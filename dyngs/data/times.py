@@ -33,8 +33,8 @@ SAME_POSE = 1e-5
 to rotation entries, and to positions relative to the distance of the farthest camera from the
 mean."""
 MENTIONED_CHANGE = 0.05
-"""Smaller changes of scale are not reported: the last of n times is often written as (n - 1) / n.
-"""
+"""Smaller changes of scale are not reported: the last of n times is often written as (n - 1) /
+n."""
 # Largest ratio of the longest to the shortest gap of evenly spaced times, for rounding in files.
 _EVEN = 1.1
 _DIGITS = re.compile(r"(\d+)")
@@ -211,7 +211,8 @@ def distinct_times(views: Iterable[View]) -> dict[float, float]:
 
 
 def parse_frames(text: str, key: str = "data.frames") -> slice:
-    """Parse ``start:stop`` or ``start:stop:step`` (optional whole numbers), the value of ``key``."""
+    """Parse ``start:stop`` or ``start:stop:step`` (optional whole numbers), the value of
+    ``key``."""
     is_slice = re.fullmatch(r"(\s*([-+]?\d+)?\s*:){1,2}\s*([-+]?\d+)?\s*", text, re.ASCII)
     parts = [int(part) if part.strip() else None for part in text.split(":")] if is_slice else []
     if not is_slice or parts[2:] == [0]:

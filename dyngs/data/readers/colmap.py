@@ -1,4 +1,5 @@
-"""COLMAP models, binary or text: cameras, poses of images, points, masks; no observations."""
+"""Reader of COLMAP models, binary or text: cameras, poses, points and masks, without
+observations."""
 
 from __future__ import annotations
 
@@ -45,7 +46,7 @@ _POINTS_2D = re.compile(r"(?:[-+.\deEnaif]+\s+[-+.\deEnaif]+\s+-?\d+(?:\s+|$))+"
 
 @dataclass(frozen=True)
 class ModelCamera:
-    """A camera: COLMAP's model, (width, height) of its images in pixels, parameters of the lens."""
+    """A COLMAP camera: model name, (width, height) of its images in pixels, parameters."""
 
     model: str
     size: tuple[int, int]
@@ -54,7 +55,7 @@ class ModelCamera:
 
 @dataclass(frozen=True)
 class ModelImage:
-    """A registered image: name as written, number of its camera, and its ``cam_from_world``: wxyz,
+    """A registered image: name as written, camera id, and ``cam_from_world`` as wxyz and
     translation."""
 
     name: str
@@ -63,10 +64,9 @@ class ModelImage:
 
 
 def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], PointCloud]:
-    """Read the cameras, by number, the images, by name, and the points, by id, of the model in a
-    folder.
+    """Read the cameras (by id), images (by name) and points (by id) of the model in a folder.
 
-    Raises DyngsError: a file is missing, truncated or damaged; names it.
+    Raises DyngsError if a file is missing, truncated or damaged.
     """
     is_binary = (folder / "cameras.bin").is_file()
     stems = ("cameras", "images", "points3D")
@@ -124,7 +124,7 @@ def _text_entries(path: Path, entry_of: Callable[[str], Entry]) -> list[Entry]:
     """Parse a text file of a model, one entry per line.
 
     In images.txt the second line of an image, its 2D points, may be empty or missing. Raises
-    DyngsError: a damaged line, or fewer entries than the header ``# Number of ..: N`` announces.
+    DyngsError for a damaged line, or fewer entries than ``# Number of ..: N`` in the header.
     """
     entries: list[Entry] = []
     announced = 0
@@ -167,13 +167,13 @@ def _binary_entries(path: Path, next_entry: Callable[[_Binary], Entry]) -> list[
 
 @dataclass
 class _Binary:
-    """The content of a binary model file, and the place of the next byte that is read."""
+    """Content of a binary model file, and the position of the next byte."""
 
     data: bytes
     at: int = 0
 
     def unpack(self, layout: str) -> tuple:
-        """Return the numbers of the next bytes."""
+        """Return the next values."""
         numbers = struct.unpack_from(layout, self.data, self.at)
         self.at += struct.calcsize(layout)
         return numbers
@@ -203,9 +203,9 @@ def _next_point(file: _Binary) -> array[float]:
 
 
 TEST_LIST = "test.txt"
-"""Names of the images for testing, a line each, in the model's folder (as 3DGS has it)."""
+"""File in the model folder with one test image name per line, as in 3DGS."""
 MODEL_FOLDERS = ("sparse", ".", "colmap/sparse", "colmap", "distorted/sparse")
-"""Folders of models; each may hold several, in folders 0, 1, ... of their own."""
+"""Folders of models; each may contain several, in subfolders 0, 1, ..."""
 FILES = "cameras.bin or cameras.txt in sparse/0, sparse, colmap/sparse/0, distorted/sparse/0 or ."
 # Number of focal lengths and the formula, per camera model. COLMAP orders the coefficients as
 # OpenCV does.
@@ -218,7 +218,8 @@ _LENSES: dict[str, tuple[int, Literal["none", "opencv", "fisheye"]]] = {
 
 
 def model_folders(root: Path) -> list[Path]:
-    """Return the folders of the models of a capture: several are parts that are not connected."""
+    """Return the model folders of a capture; several are unconnected components of one
+    reconstruction."""
     for name in MODEL_FOLDERS:
         base = root / name
         numbered = (
@@ -234,7 +235,8 @@ def model_folders(root: Path) -> list[Path]:
 
 
 def find_model(root: Path) -> tuple[Path | None, list[str]]:
-    """Return the folder of the largest model, by its file of images, and a warning if there are others."""
+    """Return the folder of the largest model (by its images file), and a warning if there are
+    others."""
     folders = model_folders(root)
     if len(folders) < 2:
         return (folders or [None])[0], []
@@ -254,8 +256,8 @@ def is_colmap(root: Path) -> bool:
 
 
 def _is_chosen(root: Path) -> bool:
-    """Whether a folder is a COLMAP capture; nerfstudio's keep the model that their JSON is made
-    from."""
+    """Whether a folder is a COLMAP capture, and not a nerfstudio one that contains its source
+    model."""
     folders = model_folders(root)
     return bool(folders) and not (
         (root / "transforms.json").is_file() and folders[0].is_relative_to(root / "colmap")
@@ -267,11 +269,11 @@ def _holds_model(folder: Path) -> bool:
 
 
 def read_colmap(root: Path) -> Capture:
-    """Read a COLMAP model with images below ``images/``, and with ``masks/`` and ``times.json``
-    where they are.
+    """Read a COLMAP model with images below ``images/`` and, if present, ``masks/`` and
+    ``times.json``.
 
-    Registered images become training views, but for those that ``test.txt`` in the model's folder
-    lists; distorted camera models are kept as ``View.lens``.
+    Registered images become training views, except those listed in ``test.txt`` of the model
+    folder. Distortion is kept in ``View.lens``.
     """
     folder, warnings = find_model(root)
     if folder is None:
@@ -320,7 +322,7 @@ def read_colmap(root: Path) -> Capture:
 
 
 def _images_of(root: Path, model: Path) -> Path:
-    """Return the folder of the images; 3DGS has those of its distorted model in ``input``."""
+    """Return the image folder; 3DGS keeps the images of its distorted model in ``input``."""
     if model.is_relative_to(root / "distorted") and (root / "input").is_dir():
         return root / "input"
     folder = images_folder(root)
@@ -351,8 +353,7 @@ def _poses(folder: Path, images: list[ModelImage]) -> tuple[list[np.ndarray], di
 
 
 def pinhole_and_lens(camera: ModelCamera, where: str) -> tuple[np.ndarray, Lens]:
-    """Return the (3, 3) matrix and the lens of a COLMAP camera, whose model OpenCV's formulas must
-    express."""
+    """Return the (3, 3) intrinsics and the lens of a COLMAP camera, if its model is supported."""
     if camera.model not in _LENSES:
         raise DyngsError(
             f"{where}: camera model {camera.model} is not supported; run `colmap "
@@ -376,8 +377,8 @@ def pinhole_and_lens(camera: ModelCamera, where: str) -> tuple[np.ndarray, Lens]
 
 
 def _splits(folder: Path, names: list[str], views: list[View]) -> tuple[Splits, list[str]]:
-    """Return the views, those listed in ``test.txt`` for testing, and warnings; ``names`` are those
-    of the images."""
+    """Return the splits by ``test.txt`` and warnings; ``names`` are the image names of the
+    views."""
     path = folder / TEST_LIST
     if not path.is_file():
         return {"train": tuple(views)}, []

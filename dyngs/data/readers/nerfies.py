@@ -1,4 +1,4 @@
-"""Reader for Nerfies and HyperNeRF captures: ``dataset.json``, ``metadata.json``, ``camera/`` and
+"""Reader for Nerfies and HyperNeRF: ``dataset.json``, ``metadata.json``, ``camera/`` and
 ``rgb/Nx/``."""
 
 from __future__ import annotations
@@ -20,13 +20,12 @@ from dyngs.io.numpy_files import read_npy
 
 
 def read_nerfies(root: Path) -> Capture:
-    """Read the capture, in the world scaled as ``scene.json`` says, with the largest images that
-    exist.
+    """Read a capture in the scaled world of ``scene.json``, with the largest available images.
 
     Training and test views are ``train_ids`` and ``val_ids`` (without ``val_ids`` every n-th
-    image); the time is ``warp_id`` (or ``time_id``) over the largest one; ``points.npy`` (P, 3), if
-    present, are the sparse points, grey. Cameras (Park et al. 2021): ``orientation`` has the
-    camera's OpenCV axes as rows, ``position`` is its centre.
+    image). The time is ``warp_id`` (or ``time_id``) over the largest one. ``points.npy`` (P, 3)
+    are sparse points, in grey. Cameras (Park et al. 2021): the rows of ``orientation`` are the
+    camera's OpenCV axes, ``position`` is its centre.
     """
     path = root / "dataset.json"
     dataset = read_json_object(path)
@@ -81,7 +80,7 @@ def _ids(path: Path, dataset: dict[str, object], key: str) -> list[str]:
 
 
 def _metadata(path: Path, names: list[str]) -> dict[str, dict[str, Any]]:
-    """Return the entry of each image; its number is checked."""
+    """Return the validated metadata entry of each image."""
     fields: dict[str, Any] = read_json_object(path) if path.is_file() else {}
     found: dict[str, dict[str, Any]] = {}
     for name in names:
@@ -99,7 +98,8 @@ def _numbers(path: Path, fields: dict[str, Any], key: str, shape: tuple[int, ...
 
 
 def _image_folder(root: Path) -> Path:
-    """Return the folder of the largest images: ``1x`` if it holds any, else ``2x`` and so on."""
+    """Return the folder of the largest images: ``1x`` if it contains any, else ``2x`` and so
+    on."""
     found = [path for path in root.glob("*x") if re.fullmatch(r"[1-9]\d{0,3}x", path.name)]
     for folder in sorted(found, key=lambda path: int(path.name[:-1])):
         if list_files(folder, SUFFIXES):

@@ -1,5 +1,5 @@
-"""Reader for NeuMan folders: a COLMAP model, masks, and a body fitted to each image and aligned
-with the model."""
+"""Reader for NeuMan: a COLMAP model, masks, and a body fitted to each image and aligned to the
+model."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ FITS = ("smpl_output_optimized.pkl", "smpl_output_romp.pkl")
 
 
 def read_neuman(root: Path) -> Capture:
-    """Read the capture of one moving camera, posed by COLMAP (Jiang et al. 2022), in the model's
-    world and unit.
+    """Read the capture of one moving camera (Jiang et al. 2022), in the world and unit of its
+    COLMAP model.
 
-    Body parameters, one row per posed image in order of their names:
-    ``4d_humans/smpl_optimized_aligned_scale.npz`` (global_orient, body_pose, betas, transl, scale),
-    else ``smpl_output_optimized.pkl`` or ``smpl_output_romp.pkl`` (pose, betas of one person) with
-    ``alignments.npy`` (image name to a (4, 3) matrix M, ``world = [v 1] M``). Masks in
-    ``segmentations`` under the images' names are black where the person is. Splits are those of
-    ``{train,val,test}_split.txt``, if there.
+    Body parameters have one row per registered image, in order of names:
+    ``4d_humans/smpl_optimized_aligned_scale.npz`` (global_orient, body_pose, betas, transl,
+    scale), else ``smpl_output_optimized.pkl`` or ``smpl_output_romp.pkl`` (pose, betas of one
+    person) with ``alignments.npy`` (image name to a (4, 3) matrix M, ``world = [v 1] M``). Masks
+    in ``segmentations`` have the names of the images and are black on the person. Splits are read
+    from ``{train,val,test}_split.txt``, if present.
     """
     capture = read_colmap(root)
     posed = sorted(capture.splits["train"], key=lambda view: view.image_path.name)
@@ -75,8 +75,7 @@ def read_neuman(root: Path) -> Capture:
 
 
 def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
-    """SMPL fitted in a frame of its own, mapped to the world by the similarity transform of each
-    image."""
+    """Return the SMPL fits mapped to the world by the similarity transform of each image."""
     from scipy.spatial.transform import Rotation  # late: other captures need none of scipy
 
     path = next((root / name for name in FITS if (root / name).is_file()), root / FITS[0])
@@ -106,7 +105,7 @@ def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
 
 
 def _splits(root: Path, people: dict[str, View]) -> tuple[Splits, list[str]]:
-    """Splits by the lists of names, all views for training where there are none; and warnings."""
+    """Return splits by the lists of names (all views for training without lists), and warnings."""
     splits: Splits = {}
     unposed: list[str] = []
     for split in SPLITS:

@@ -1,5 +1,5 @@
-"""Reader for PeopleSnapshot folders: a video of a rotating person, ``camera.pkl``, masks and poses
-in HDF5 files."""
+"""Reader for PeopleSnapshot: a video of a rotating person, ``camera.pkl``, masks and poses in
+HDF5."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ POSE_FILE = "reconstructed_poses.hdf5"
 
 
 def read_people_snapshot(root: Path) -> Capture:
-    """Read the capture of one static camera (Alldieck et al. 2018): frame n of the video is row n
-    of masks and poses.
+    """Read the capture of one fixed camera (Alldieck et al. 2018); frame n is row n of masks and
+    poses.
 
     ``camera.pkl``: camera_f, camera_c (2,) px, camera_k (5,) OpenCV, camera_rt axis-angle and
     camera_t of cam_from_world, width, height. ``masks.hdf5``: masks (F, H, W), 0 is background.
     ``reconstructed_poses.hdf5``: SMPL pose (F, 72), trans (F, 3), betas (10,), in metres. Frames
-    without a mask or parameters are left out. Raises DyngsError: h5py is not installed; anything
-    missing, broken or inconsistent; names the file.
+    without a mask or parameters are skipped. Raises DyngsError if h5py is not installed, or a file
+    is missing, damaged or inconsistent.
     """
     camera = open_camera((video := _video(root)).stem, video)
     body = _body(root / POSE_FILE)
@@ -65,7 +65,7 @@ def read_people_snapshot(root: Path) -> Capture:
 
 
 def _video(root: Path) -> Path:
-    """Find the only video of the folder, or the one named like the folder."""
+    """Return the only video of the folder, or the one named after the folder."""
     found = list_files(root, VIDEO_SUFFIXES)
     named = [path for path in found if path.stem == root.resolve().name] or found
     if len(named) != 1:
@@ -93,7 +93,7 @@ def _calibration(path: Path) -> dict[str, object]:
 
 
 def _body(path: Path) -> BodyFrames:
-    """Body parameters of the fitted frames; rows that are all zero were not fitted."""
+    """Return the body parameters of the fitted frames; rows of zeros were not fitted."""
     poses, trans, betas = (read_hdf5(path, key) for key in ("pose", "trans", "betas"))
     if len(poses) != len(trans):
         raise DyngsError(

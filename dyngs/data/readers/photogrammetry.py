@@ -1,6 +1,5 @@
-"""Readers for cameras that photogrammetry programs export: Metashape, RealityCapture (RealityScan)
-and ODM.
-"""
+"""Readers for exported cameras: Metashape, RealityCapture (RealityScan), ODM, Polycam and
+Record3D."""
 
 from __future__ import annotations
 
@@ -28,8 +27,8 @@ _Fields = dict[str, Any]
 
 
 def _photos_of(root: Path) -> dict[str, Path]:
-    """Return the photos of a capture by name, with and without suffix: those in ``images``, else
-    anywhere below its folder."""
+    """Return the photos of a capture by name and by stem: those in ``images``, else below the
+    root."""
     folder = root / "images" if (root / "images").is_dir() else root
     found: dict[str, Path] = {}
     for path in sorted(folder.rglob("*"), key=lambda path: len(path.parts)):
@@ -40,7 +39,7 @@ def _photos_of(root: Path) -> dict[str, Path]:
 
 
 def _find(photos: dict[str, Path], name: str) -> Path | None:
-    """Return the photo that a program calls ``name``, with or without its folder and suffix."""
+    """Return the photo of this name, with or without folder and suffix."""
     path = PureWindowsPath(name)
     return photos.get(path.name, photos.get(path.stem))
 
@@ -52,8 +51,8 @@ def _capture(
     photos: dict[str, Path],
     cameras: Sequence[tuple[str, _Fields]],
 ) -> Capture:
-    """Return a capture of the cameras, each the name of a photo and its fields, which lack a pose
-    if it has none."""
+    """Return a capture of (photo name, fields); fields without a pose are skipped, with a
+    warning."""
     frames: list[FrameEntry] = []
     left_out: list[str] = []
     for name, fields in cameras:
@@ -76,7 +75,7 @@ def _capture(
 
 
 def _exports(root: Path, suffix: str, mark: bytes) -> list[Path]:
-    """Return the files of a program: those with ``mark`` in their beginning."""
+    """Return the files that contain ``mark`` near their beginning."""
     found: list[Path] = []
     for path in list_files(root, (suffix,)):
         with path.open("rb") as file:
@@ -96,8 +95,7 @@ def _radial(coefficients: Sequence[float]) -> _Fields:
 
 
 def _brown(where: str, k: Sequence[float]) -> _Fields:
-    """Return the radial distortion 1 + k1 r^2 + .. + k3 r^6 in OpenCV's terms, which have no term
-    of r^8."""
+    """Return the radial distortion 1 + k1 r^2 + .. + k3 r^6 for OpenCV, which has no r^8 term."""
     if k[3] != 0:
         raise DyngsError(
             f"{where}: its distortion with k4={k[3]:g} is not supported; export undistorted photos"
@@ -106,10 +104,10 @@ def _brown(where: str, k: Sequence[float]) -> _Fields:
 
 
 def read_metashape(root: Path) -> Capture:
-    """Read the cameras that Metashape exports as .xml, and the photos in its folder.
+    """Read cameras exported from Metashape as .xml, and the photos in the folder.
 
-    ``transform`` of a camera maps OpenCV axes to the chunk; that of its component, or of the chunk,
-    maps to the world.
+    ``transform`` of a camera maps OpenCV axes to the chunk; that of its component, or of the
+    chunk, maps to the world.
     """
     path = _only(_exports(root, ".xml", b"<chunk"))
     cameras: list[tuple[str, _Fields]] = []
@@ -137,7 +135,8 @@ def read_metashape(root: Path) -> Capture:
 
 
 def _placed(transform: ElementTree.Element | None, pose: np.ndarray) -> np.ndarray:
-    """Return a pose in the world: rotated, scaled and shifted as ``transform`` of a chunk says."""
+    """Return a pose in the world, given the ``transform`` (rotation, scale, translation) of its
+    chunk."""
     if transform is None:
         return pose
     rotation = np.array(
@@ -151,8 +150,8 @@ def _placed(transform: ElementTree.Element | None, pose: np.ndarray) -> np.ndarr
 
 
 def _metashape_lens(path: Path, sensor: ElementTree.Element) -> _Fields:
-    """Return the intrinsics of a sensor in px, ``cx`` and ``cy`` from the middle; its p1 and p2 are
-    OpenCV's p2, p1."""
+    """Return the intrinsics of a sensor in px. Its cx, cy are offsets from the centre; its p1, p2
+    are OpenCV's p2, p1."""
     where = f"{path}, sensor {sensor.get('label')}"
     calibrations = sensor.findall("calibration")
     kind = sensor.get("type")
@@ -196,16 +195,16 @@ METASHAPE_FORMAT = CaptureFormat(
 
 _REALITYCAPTURE_MARK = b"#name,x,y,alt,"
 _RENAMED = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}
-"""Columns of RealityScan 2, and what RealityCapture calls them."""
+"""Columns of RealityScan 2, and their names in RealityCapture."""
 
 
 def read_realitycapture(root: Path) -> Capture:
-    """Read RealityCapture's .csv of "internal/external camera parameters", and the photos in its
+    """Read RealityCapture's .csv of "internal/external camera parameters", and the photos in the
     folder.
 
     x points east, y north. Heading is clockwise from north, pitch up from straight down, in
-    degrees. ``f`` is for 36 mm wide film, ``px`` and ``py`` are from the middle, in longer sides.
-    ``t1`` and ``t2`` are OpenCV's p2 and p1.
+    degrees. ``f`` is for 36 mm wide film; ``px`` and ``py`` are offsets from the centre in longer
+    sides. ``t1`` and ``t2`` are OpenCV's p2 and p1.
     """
     path = _only(_exports(root, ".csv", _REALITYCAPTURE_MARK))
     photos = _photos_of(root)
@@ -264,15 +263,15 @@ _ODM_LENSES = {
     "fisheye": "OPENCV_FISHEYE",
     "fisheye_opencv": "OPENCV_FISHEYE",
 }
-"""Projections of OpenSfM, and their names in transforms files."""
+"""Projection types of OpenSfM, and camera models of transforms files."""
 
 
 def read_odm(root: Path) -> Capture:
     """Read ``reconstruction.json`` of ODM or OpenSfM, else ``odm_report/shots.geojson`` and
     ``cameras.json``.
 
-    Rotations are axis-angle, from the world to OpenCV axes. In ``shots.geojson`` the translation is
-    the camera's place.
+    Rotations are axis-angle, from the world to OpenCV axes. In ``shots.geojson`` the translation
+    is the camera position.
     """
     path = next(root / name for name in _ODM_FILES if (root / name).is_file())
     points = None
@@ -368,11 +367,11 @@ _INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width",
 
 
 def read_polycam(root: Path) -> Capture:
-    """Read ``keyframes`` of Polycam's raw data: an image, a camera and, if there, a depth map of
-    the same name each.
+    """Read ``keyframes`` of Polycam's raw data: images, cameras and optional depth maps of the
+    same names.
 
-    Poses are OpenGL camera-to-world, y up. Corrected images have no distortion, corrected cameras
-    closed loops.
+    Poses are OpenGL camera-to-world, y up. Corrected images are undistorted, corrected cameras
+    have loop closure.
     """
     images, cameras = _existing(root, _POLYCAM)[0]
     frames: list[FrameEntry] = []
@@ -396,8 +395,7 @@ def _depth_of(path: Path) -> dict[str, object]:
 
 
 def _existing(root: Path, places: Sequence[tuple[str, str]]) -> list[tuple[Path, Path]]:
-    """Return the folders that hold images, each with its file or folder of cameras, in the order of
-    ``places``."""
+    """Return the (image folder, cameras) pairs among ``places`` that exist, in this order."""
     pairs = [(root / images, root / cameras) for images, cameras in places]
     return [
         (images, cameras)
@@ -415,10 +413,10 @@ POLYCAM_FORMAT = CaptureFormat(
 
 
 def read_record3d(root: Path) -> Capture:
-    """Read ``metadata.json`` and the images ``rgb/NUMBER.jpg`` of Record3D, or those of an unpacked
+    """Read ``metadata.json`` and the images ``rgb/NUMBER.jpg`` of Record3D, or of an unpacked
     ``.r3d``.
 
-    Poses are OpenGL camera-to-world: a quaternion xyzw and the position. ``K`` is written column by
+    Poses are OpenGL camera-to-world: a quaternion xyzw and the position. ``K`` is stored column by
     column.
     """
     from scipy.spatial.transform import Rotation  # late: other captures do not need it

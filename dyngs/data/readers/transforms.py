@@ -1,4 +1,5 @@
-"""Transforms files (Blender, nerfstudio, instant-ngp): frames, views, and coloured point clouds."""
+"""Readers of transforms files (Blender, nerfstudio, instant-ngp), bodies next to them, and .ply
+points."""
 
 from __future__ import annotations
 
@@ -52,8 +53,8 @@ _NAMES = (
 
 
 def point_colours(columns: Mapping[str, np.ndarray], count: int) -> np.ndarray:
-    """Return (P, 3) uint8 colours of ``count`` points, grey where ``columns`` (by property name)
-    hold none."""
+    """Return (P, 3) uint8 colours of ``count`` points from ``columns`` by property name, else
+    grey."""
     known = {
         name.lower(): np.ravel(column)
         for name, column in columns.items()
@@ -66,7 +67,7 @@ def point_colours(columns: Mapping[str, np.ndarray], count: int) -> np.ndarray:
 
 
 def _as_bytes(values: np.ndarray) -> np.ndarray:
-    """Return colours as bytes, from the range that their type and their largest value suggest."""
+    """Return colours as bytes; the value range is inferred from type and maximum."""
     if values.dtype == np.uint8:
         return values
     largest = values[np.isfinite(values)].max(initial=0)
@@ -81,7 +82,7 @@ def _as_bytes(values: np.ndarray) -> np.ndarray:
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 MAX_FPS = 1e6
-"""Higher frame rates are taken for mistakes."""
+"""Higher frame rates are ignored as mistakes."""
 _LARGEST = 1e300
 _LARGEST_INTEGER = 2**53
 _FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
@@ -89,14 +90,13 @@ _FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 
 @dataclass(frozen=True)
 class FrameEntry:
-    """One entry of ``frames``: its ``own`` fields; keys that it lacks are looked up in those of the
-    file, ``shared``.
+    """One entry of ``frames``: its ``own`` fields, with those of the file (``shared``) as
+    defaults.
 
     Attributes:
         where: file and index, for messages.
-        image: the image if ``file_path`` does not name it.
-        video: the video frame that the image is decoded from, if any, and ``stored``, its (width,
-            height).
+        image: the image, if ``file_path`` does not name it.
+        video: the video frame of the image, if any, and ``stored``, its (width, height).
     """
 
     where: str
@@ -111,8 +111,7 @@ class FrameEntry:
         return _number(self.own.get(key, self.shared.get(key)), key, self.where)
 
     def integer(self, key: str) -> int | None:
-        """Return the whole number at ``key`` of this frame alone, None if absent or no whole
-        number."""
+        """Return the integer at ``key`` of this frame alone, None if absent or not an integer."""
         value = self.own.get(key)
         if not is_number(value):
             return None
@@ -136,7 +135,7 @@ class FrameFile:
 
     @property
     def fps(self) -> float | None:
-        """Frames per second as the file says, None where it does not."""
+        """Frames per second stated in the file, else None."""
         fps = self.fields.get("fps")
         return float(fps) if is_number(fps) and 0 < fps < MAX_FPS else None
 
@@ -160,10 +159,10 @@ def read_frame_file(path: Path) -> FrameFile:
 
 
 def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
-    """Return views by ``file_path`` as written in the file, in its order, and warnings.
+    """Return views by ``file_path``, in the order of the file, and warnings.
 
-    Raises DyngsError: missing or wrong fields, impossible poses, sizes that disagree, the same
-    image twice.
+    Raises DyngsError for missing or invalid fields, invalid poses, inconsistent sizes and
+    duplicate images.
     """
     root = file.path.parent
     files = FileFinder(root)
@@ -191,13 +190,13 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
 
 
 def find_tracks_file(file: FrameFile) -> Path | None:
-    """Return the file of 2D tracks that ``tracks_file_path`` names, None without one."""
+    """Return the file of 2D tracks given by ``tracks_file_path``, else None."""
     frame = FrameEntry(str(file.path), {}, file.fields)
     return _named_file(FileFinder(file.path.parent), frame, "tracks_file_path")
 
 
 def view_name(path: Path, root: Path) -> str:
-    """Name of a view: the image's path below ``root`` without extension, safe as a relative file
+    """Return a view name: the image path below ``root`` without extension, safe as a relative file
     name."""
     relative = PurePosixPath(os.path.relpath(path, root).replace(os.sep, "/")).with_suffix("")
     return "/".join(part for part in relative.parts if part not in ("..", "/"))
@@ -210,7 +209,7 @@ def _view(
     header: ImageHeader | None,
     common: tuple[int, int] | None,
 ) -> tuple[View, float, bool]:
-    """Return a view, by how much its rotation was repaired, and whether its intrinsics were
+    """Return a view, the repair error of its rotation, and whether its intrinsics were
     rescaled."""
     described = _described_size(frame)
     stored = header.size_matching(described) if header else frame.stored
@@ -252,8 +251,7 @@ def _view(
 
 
 def _with_flow_targets(views: dict[str, View]) -> dict[str, View]:
-    """Return the views of a file with the next view of the same camera in ``flow_to`` where they
-    have flow."""
+    """Set ``flow_to`` of views with flow to the next view of the same camera."""
     if all(view.flow_path is None for view in views.values()):
         return views
     ordered = sorted(
@@ -290,7 +288,7 @@ def _below(files: FileFinder, written: str, where: str) -> Path:
 
 
 def _image_path(files: FileFinder, frame: FrameEntry) -> Path:
-    """Return the image's file; extensions are tried where none is written, PNG first."""
+    """Return the image file; without an extension the known ones are tried, PNG first."""
     if frame.image is not None:
         return frame.image
     written = frame.own.get("file_path")
@@ -379,19 +377,16 @@ def _lens(frame: FrameEntry) -> Lens:
 
 
 USUAL_NAMES = ("points3d.ply", "points3D.ply", "fused.ply", "points.ply")
-"""Names that 4DGaussians, COLMAP and nerfstudio give to first points, in the order in which they
-are looked for."""
+"""File names of initial points in 4DGaussians, COLMAP and nerfstudio, in order of priority."""
 KEY = "ply_file_path"
 
 
 def find_points(file: FrameFile) -> tuple[PointCloud | None, Path | None, list[str]]:
-    """Return the points that belong to a transforms file, the file that they are from, and
-    warnings.
+    """Return the points that belong to a transforms file, their file, and warnings.
 
-    Those of its key ``ply_file_path``; else of the first of ``USUAL_NAMES`` that is in its folder;
-    else of the only ``.ply`` there. A file that is named nowhere and cannot be read is left out,
-    with a warning. Raises DyngsError: the file that the key names is missing, unreadable, or
-    outside the capture.
+    The file is that of ``ply_file_path``, else the first of ``USUAL_NAMES`` in the folder, else
+    the only ``.ply`` there. An unreadable file that is not named explicitly is ignored with a
+    warning. Raises DyngsError if the named file is missing, unreadable, or outside the capture.
     """
     root = file.path.parent
     written = file.fields.get(KEY)
@@ -411,8 +406,7 @@ def find_points(file: FrameFile) -> tuple[PointCloud | None, Path | None, list[s
 
 
 def read_points(path: Path) -> PointCloud:
-    """Read the points of a ``.ply`` file (through trimesh), with colours as ``point_colours`` finds
-    them."""
+    """Read the points of a ``.ply`` file with trimesh; colours as in ``point_colours``."""
     import trimesh
 
     if not path.is_file():
@@ -432,7 +426,7 @@ def read_points(path: Path) -> PointCloud:
 
 
 def find_masks(folder: Path) -> dict[str, Path]:
-    """Map paths below ``folder``, ``folded``, with and without the last extension, to masks."""
+    """Map the normalised paths of masks below ``folder``, with and without extension, to files."""
     found: dict[str, Path] = {}
     for path in sorted(check_inside(folder).rglob("*")) if folder.is_dir() else ():
         if path.suffix.lower() in SUFFIXES:
@@ -443,7 +437,7 @@ def find_masks(folder: Path) -> dict[str, Path]:
 
 
 def find_mask(image_name: str, masks: Mapping[str, Path]) -> Path | None:
-    """Find the mask of ``a/b.jpg``: ``a/b.jpg.png`` or the like, else ``a/b.jpg``, ``a/b.png`` or
+    """Find the mask of ``a/b.jpg``: ``a/b.jpg.png``, ``a/b.jpg``, ``a/b.png`` or
     ``a/b.mask.png``."""
     stem = image_name.rpartition(".")[0]
     names = (f"{image_name}.png", image_name, stem, f"{stem}.mask")
@@ -451,8 +445,7 @@ def find_mask(image_name: str, masks: Mapping[str, Path]) -> Path | None:
 
 
 def missing_mask_warning(views: list[View], has_masks: bool) -> list[str]:
-    """Return a line about the images that have no mask although others have, none if there are
-    none."""
+    """Return a warning on images without a mask, if other images have one."""
     without = [view.name for view in views if view.mask_path is None]
     return (
         [f"{len(without)} images have no mask, first {without[0]}"] if has_masks and without else []
@@ -460,12 +453,12 @@ def missing_mask_warning(views: list[View], has_masks: bool) -> list[str]:
 
 
 def read_blender(root: Path) -> Capture:
-    """Read ``transforms_{train,val,test}.json`` with OpenGL camera-to-world poses; val and test are
-    optional.
+    """Read ``transforms_{train,val,test}.json`` with OpenGL camera-to-world poses; val and test
+    are optional.
 
     Intrinsics: ``camera_angle_x``, or ``w, h, fl_x, fl_y, cx, cy`` of the file or the frame.
-    Points: see ``find_points``. Masks: ``mask_path`` of the frames, else those in ``masks/`` that
-    are named as images.
+    Points: see ``find_points``. Masks: ``mask_path`` of the frames, else files in ``masks/`` named
+    after the images.
     """
     splits: Splits = {}
     warnings: list[str] = []
@@ -484,8 +477,8 @@ def read_blender(root: Path) -> Capture:
 
 
 def _with_masks(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
-    """Return the views with masks of ``masks/`` where the files name none, and a line about views
-    without one."""
+    """Add masks from ``masks/`` if the files name none; also return a warning on views without
+    one."""
     views = all_views(splits)
     has_people = any(view.silhouette for view in views) or any(root.glob("body_*.npz"))
     if has_people or any(view.mask_path for view in views):
@@ -529,12 +522,12 @@ FORMAT = CaptureFormat(
 
 
 def read_nerfstudio(root: Path) -> Capture:
-    """Read ``transforms.json`` with OpenGL camera-to-world poses and, if there, a ``.ply`` file of
+    """Read ``transforms.json`` with OpenGL camera-to-world poses and an optional ``.ply`` of
     points.
 
-    The lists ``train_filenames``, ``val_filenames`` and ``test_filenames`` decide the splits; a val
-    list without a test list is used for testing. Points and poses are read as they stand:
-    ``applied_transform`` has been applied to both.
+    ``train_filenames``, ``val_filenames`` and ``test_filenames`` define the splits; a val list
+    without a test list becomes test. Points and poses are used as stored: ``applied_transform`` is
+    already applied to both.
     """
     file = read_frame_file(root / "transforms.json")
     views, warnings = read_views(file)
@@ -544,7 +537,8 @@ def read_nerfstudio(root: Path) -> Capture:
 
 
 def _nerfstudio_splits(file: FrameFile, views: dict[str, View]) -> tuple[Splits, list[str]]:
-    """Splits by the lists in the file, all views for training where it has none; and warnings."""
+    """Return splits by the lists in the file (all views for training without lists), and
+    warnings."""
     listed = {name: file.fields.get(f"{name}_filenames") for name in SPLITS}
     if all(value is None for value in listed.values()):
         return {"train": tuple(views.values())}, []
@@ -580,15 +574,15 @@ NERFSTUDIO_FORMAT = CaptureFormat(
 
 
 def read_body_json(root: Path) -> Capture:
-    """Read ``transforms_{train,val,test,pose}.json`` with body parameters; all but the first file
-    are optional.
+    """Read ``transforms_{train,val,test,pose}.json`` with body parameters; all but the first are
+    optional.
 
-    Each split has the parameters of its ``body_SPLIT.npz``: poses (T, 72, 156 or 165), trans (T,
-    3), betas and, if there, scale; row n is for the frame whose ``frame`` is n. Without such a
-    file, val and test show the frames of train. ``surface_model_type`` "anny" says that betas are
-    of the free template's shape space. ``pose`` is another clip, with frame numbers, times and
-    parameters of its own. Parameters and cameras share one world; unlike with AMASS files nothing
-    is rotated to make it y up.
+    The parameters of a split are in ``body_SPLIT.npz``: poses (T, 72, 156 or 165), trans (T, 3),
+    betas and optionally scale; row n belongs to the frame whose ``frame`` is n. Without such a
+    file, val and test use those of train. ``surface_model_type`` "anny" marks betas of the free
+    template's shape space. ``pose`` is a separate clip, with its own frame numbers, times and
+    parameters. Parameters and cameras share one world; unlike AMASS files nothing is rotated to y
+    up.
     """
     capture = read_blender(root)  # its points are not used: people begin on a template
     splits = dict(capture.splits)

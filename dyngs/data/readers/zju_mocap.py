@@ -1,4 +1,4 @@
-"""Reader for ZJU-MoCap folders: ``annots.npy`` of several cameras, or ``cameras.pkl`` and
+"""Reader for ZJU-MoCap: ``annots.npy`` of several cameras, or ``cameras.pkl`` and
 ``mesh_infos.pkl`` of one."""
 
 from __future__ import annotations
@@ -33,19 +33,18 @@ FIRST_HELD_OUT = "no test camera given; the first camera is held out"
 
 
 def read_zju_mocap(root: Path) -> Capture:
-    """Read the capture of a person by several calibrated static cameras or by one; units are
-    metres.
+    """Read the capture of a person by one or several calibrated fixed cameras; units are metres.
 
-    ``annots.npy`` (Peng et al. 2021) holds ``cams`` (K, D, R, T in mm, per camera) and ``ims``
-    (images of all cameras per frame); SMPL parameters lie in ``new_params/N.npy`` or
-    ``params/N.npy``, N being the number in the image's name; masks (labels, 0 is background) in
-    ``mask_cihp``, ``mask`` or ``masks`` under the images' names. Of three cameras or more the first
-    one is for testing. ``cameras.pkl`` and ``mesh_infos.pkl`` (Weng et al. 2022) hold the same per
-    image of ``images/``, in metres; masks (white) lie in ``masks/``.
+    ``annots.npy`` (Peng et al. 2021) contains ``cams`` (K, D, R, T in mm, per camera) and ``ims``
+    (images of all cameras per frame). SMPL parameters are in ``new_params/N.npy`` or
+    ``params/N.npy``, where N is the number in the image name; masks (labels, 0 is background) in
+    ``mask_cihp``, ``mask`` or ``masks`` under the image names. Of three cameras or more the first
+    one is for testing. ``cameras.pkl`` and ``mesh_infos.pkl`` (Weng et al. 2022) contain the same
+    per image of ``images/``, in metres; masks (white) are in ``masks/``.
 
-    Parameters: v = Rh LBS(x; poses) + Th, about the template's origin: kept as
-    ``BodyFrames.origin_rotations``. OpenCV calibrated these cameras, with pixel centres at whole numbers: half
-    a pixel is added to the principal point.
+    Parameters: v = Rh LBS(x; poses) + Th, about the template's origin; Rh becomes
+    ``BodyFrames.origin_rotations``. The cameras were calibrated with OpenCV, whose pixel centres
+    are integers, so half a pixel is added to the principal point.
     """
     shots: list[Any]
     if (root / ANNOTATIONS).is_file():
@@ -99,7 +98,7 @@ def read_zju_mocap(root: Path) -> Capture:
 
 
 def _annotated_shots(path: Path) -> list[FrameEntry]:
-    """Return the frames of all cameras that ``annots.npy`` lists."""
+    """Return the frames of all cameras in ``annots.npy``."""
     fields: Any = read_pickled_array(check_inside(path))
     cams = fields["cams"]
     calibrations = []
@@ -121,7 +120,7 @@ def _annotated_shots(path: Path) -> list[FrameEntry]:
 
 
 def _single_shots(path: Path) -> list[FrameEntry]:
-    """Return the frames of the one camera in ``cameras.pkl``."""
+    """Return the frames of the camera in ``cameras.pkl``."""
     shots = []
     for name, own in sorted(_by_name(path).items()):
         where = f"{path}, {name}"
@@ -137,7 +136,7 @@ def _single_shots(path: Path) -> list[FrameEntry]:
 
 
 def _body(path: Path, numbers: list[int], rows: Sequence[tuple[str, Any]]) -> BodyFrames:
-    """Return the parameters of one dictionary per frame, each with a name for messages."""
+    """Return the body parameters, given a dictionary per frame and its name for messages."""
     names = [key for key in ("betas", "shapes") if all(key in own for _, own in rows)]
     betas = _column(rows, names[0]) if names else np.zeros(10)
     poses = _column(rows, "poses")
@@ -149,8 +148,7 @@ def _body(path: Path, numbers: list[int], rows: Sequence[tuple[str, Any]]) -> Bo
 def _column(
     rows: Sequence[tuple[str, object]], key: str, width: int | None = None
 ) -> list[np.ndarray]:
-    """Finite numbers at ``key`` of each of the named dictionaries, ``width`` of them unless that is
-    None."""
+    """Return the finite numbers at ``key`` of each dictionary, ``width`` of them if given."""
     shape = None if width is None else (width,)
     return [
         parse_numbers(f"{where}: '{key}'", require_key(where, own, key), shape)
@@ -181,8 +179,8 @@ def _calibration(
 
 
 def _mask(root: Path, file: str, folders: Sequence[str]) -> Path | None:
-    """Find the mask ``FOLDER/a/b.png`` of ``a/b.jpg`` or ``images/a/b.jpg``, in the first folder
-    that has it."""
+    """Find the mask ``FOLDER/a/b.png`` of ``a/b.jpg`` or ``images/a/b.jpg`` in the first folder
+    with one."""
     name = PurePosixPath(file.replace("\\", "/")).with_suffix("")
     below = [f"{name}.png", f"{name}.png".removeprefix("images/")]
     candidates = [root / folder / path for folder in folders for path in below]

@@ -121,8 +121,7 @@ def test_photos_that_metashape_did_not_align_are_left_out(tmp_path: Path) -> Non
     capture = read(root)
     assert_same_views(capture, lambda local, _: metashape_frame(local, METASHAPE), indices=[0, 2])
     said = (
-        "cameras.xml: 2 of 4 cameras have no pose or no photo and are skipped: DSC_1.jpg, "
-        "DSC_3.jpg"
+        "cameras.xml: 2 of 4 cameras have no pose or no photo and are skipped: DSC_1.jpg, DSC_3.jpg"
     )
     assert capture.warnings == (said,)
 
