@@ -8,12 +8,12 @@ from tiny_fields import ALL_KINDS as FIELDS
 from tiny_fields import cloud, stirred_field, tiny_options
 
 from dyngs.core.camera import Cameras
-from dyngs.core.state import State, part_of, tensors_of
+from dyngs.core.state import State, part_of, strip_roles
 from dyngs.deform.fields import OPEN, WindowedField
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.colour.network import ColourNetwork, box_around
+from dyngs.gaussians.colour.network import ColourNetwork, robust_bounding_box
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.gaussians.visibility import VisibilityMasks
@@ -62,7 +62,7 @@ def scene_of_kind(kind: str) -> GaussianScene:
 
 def restored(kind: str, state: State) -> GaussianScene:
     """The scene of what is stored, but for its colours."""
-    tensors = {name: x.clone() for name, x in tensors_of(state).items()}
+    tensors = {name: x.clone() for name, x in strip_roles(state).items()}
     gaussians = Gaussians.stored(part_of(tensors, "gaussians"))
     own = part_of(tensors, "model")
     if kind == "static":
@@ -84,12 +84,12 @@ def _field(kind: str) -> str:
 
 def _network() -> ColourNetwork:
     generator = torch.Generator().manual_seed(5)
-    inputs = num_inputs(sees_time=True, sees_normals=True)
+    inputs = num_inputs(uses_time=True, uses_normals=True)
     sizes = ((8, inputs), (3, 8))
     layers = [
         Layer(0.3 * torch.randn(size, generator=generator), torch.zeros(size[0])) for size in sizes
     ]
-    return ColourNetwork(tuple(layers), box_around(cloud().means), True, True)
+    return ColourNetwork(tuple(layers), robust_bounding_box(cloud().means), True, True)
 
 
 def _person() -> HumanScene:

@@ -26,7 +26,7 @@ from dyngs.capture.sfm.several_videos import (
     read_video_settings,
 )
 from dyngs.config import DataConfig
-from dyngs.core.errors import DyngsError, as_word, counted, printable, reading
+from dyngs.core.errors import DyngsError, quote_path, counted, format_one_line, wrap_read_errors
 from dyngs.data.body_frames import merge_root_rotation
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry import (
@@ -280,7 +280,7 @@ def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectRep
     )
     try:
         capture = read_capture(options, decode_videos=deep)
-        with reading(options.root, "see `dyngs --debug`"):
+        with wrap_read_errors(options.root, "see `dyngs --debug`"):
             report = build_report(capture, deep)
     except DyngsError as error:
         return InspectReport(options.root, None, (), (str(error), *links))
@@ -300,7 +300,7 @@ def format_report(report: InspectReport) -> str:
         lines.append("no problems found")
     else:
         lines.append(f"problems ({len(report.problems)}):")
-        lines += [f"  - {printable(problem)}" for problem in report.problems]
+        lines += [f"  - {format_one_line(problem)}" for problem in report.problems]
     return "\n".join(lines)
 
 
@@ -477,7 +477,7 @@ def video_report(path: Path) -> str:
         facts, stands = video_facts(video)
         moving += [] if stands else [video.name]
         lines += [f"video {video.path}", *_aligned(facts)]
-    where = as_word(videos[0].path if len(videos) == 1 else path)
+    where = quote_path(videos[0].path if len(videos) == 1 else path)
     if len(videos) == 1 and moving:
         lines.append(f"next: dyngs train static data.root={where}     # only the camera moves")
         lines.append(f"      dyngs train dynamic data.root={where}    # objects move as well")

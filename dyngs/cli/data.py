@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from dyngs.cli import arguments as args
 from dyngs.cli.output import ProgressBar, print_lines, print_notes
-from dyngs.core.errors import DyngsError, as_word, counted
+from dyngs.core.errors import DyngsError, quote_path, counted
 
 if TYPE_CHECKING:
     from dyngs.human.fit.fitted_capture import KnownAvatar
@@ -267,8 +267,8 @@ def run_sfm(arguments: argparse.Namespace) -> int:
             said = poses_of_videos(images, out, options, report)
         else:
             said = estimate_poses(images, out, options, report).summary()
-    print_lines(f"{said}\nnext: dyngs data inspect {as_word(out)} --image cameras.png")
-    print(f"      dyngs train {'dynamic' if several else 'static'} data.root={as_word(out)}")
+    print_lines(f"{said}\nnext: dyngs data inspect {quote_path(out)} --image cameras.png")
+    print(f"      dyngs train {'dynamic' if several else 'static'} data.root={quote_path(out)}")
     return 0
 
 
@@ -288,21 +288,21 @@ def run_fit(arguments: argparse.Namespace) -> int:
         inputs = FitInputs(**passed, avatar=_avatar_in(arguments.person), template=template)
         result = write_fitted_capture(options, arguments.out, report, inputs)
     files = {"model.body": result.model.body, "model.uv": result.model.uv}
-    keys = "".join(f" {key}={as_word(path)}" for key, path in files.items() if path is not None)
-    print_lines(f"{result.summary}\nnext: dyngs train human data.root={as_word(result.root)}{keys}")
+    keys = "".join(f" {key}={quote_path(path)}" for key, path in files.items() if path is not None)
+    print_lines(f"{result.summary}\nnext: dyngs train human data.root={quote_path(result.root)}{keys}")
     return 0
 
 
 def run_people(arguments: argparse.Namespace) -> int:
     """Find a person and fit a body; print what was found, and the next command."""
     from dyngs.human.detect.detector import MediaPipe
-    from dyngs.human.detect.find_person import write_found_person
+    from dyngs.human.detect.detect_person import write_detected_person
 
     options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.clip})
     detector = MediaPipe(arguments.mediapipe)
     with ProgressBar() as report:
-        result = write_found_person(options, arguments.out, detector, report)
-    print_lines(f"{result.summary}\nnext: dyngs train human data.root={as_word(result.root)}")
+        result = write_detected_person(options, arguments.out, detector, report)
+    print_lines(f"{result.summary}\nnext: dyngs train human data.root={quote_path(result.root)}")
     return 0
 
 
@@ -312,12 +312,12 @@ def _avatar_in(person: Path | None) -> KnownAvatar | None:
 
     if person is None or not (person / RESOLVED_NAME).is_file():
         return None
-    from dyngs.human.avatar.scene import avatar_of
+    from dyngs.human.avatar.scene import as_human_scene
     from dyngs.human.fit.fitted_capture import KnownAvatar
     from dyngs.runs.checkpoint import load_run
 
     run = load_run(person)
-    scene = avatar_of(run.scene)
+    scene = as_human_scene(run.scene)
     return None if scene is None else KnownAvatar(scene, run.config.data.longest_side)
 
 
@@ -385,5 +385,5 @@ def run_synth(arguments: argparse.Namespace) -> int:
         else:
             usual = "fixed" if "num_cameras" in given else None
             synthetic.write_dynamic_capture(scene, out, options(**{"style": usual} | given))
-    print(f"written: {out}\nnext:    dyngs train {preset} data.root={as_word(out)}")
+    print(f"written: {out}\nnext:    dyngs train {preset} data.root={quote_path(out)}")
     return 0

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, State, StateTensor, moved_to, part_of, prefixed
+from dyngs.core.state import Role, State, StateTensor, move_to_device, part_of, add_prefix
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.deform.field import (
     MAX_KEY_TIMES,
@@ -79,7 +79,7 @@ def nodes_at(positions: Tensor, means: Tensor) -> Nodes:
     return Nodes(positions, radii.clamp_min(floor).to(positions), followed)
 
 
-def spread_out(points: Tensor, count: int, taken: Tensor) -> Tensor:
+def farthest_points(points: Tensor, count: int, taken: Tensor) -> Tensor:
     """Return indices of at most ``count`` ``points`` (M, 3), each the farthest from those before it
     and from ``taken``.
 
@@ -194,7 +194,7 @@ class ControlNodes(DeformationField):
         buffers = {
             name: StateTensor(x, own.get(name, Role.SHARED)) for name, x in self.buffers.items()
         }
-        return super().state() | prefixed("buffers", buffers)
+        return super().state() | add_prefix("buffers", buffers)
 
     @property
     def num_values(self) -> int:
@@ -207,12 +207,12 @@ class ControlNodes(DeformationField):
         }
         return field
 
-    def regroup(self) -> None:
+    def invalidate(self) -> None:
         self.buffers.pop("followed", None)
 
     def to(self, device: torch.device | str) -> ControlNodes:
         field = super().to(device)
-        field.buffers = moved_to(self.buffers, device)
+        field.buffers = move_to_device(self.buffers, device)
         return field
 
     @property
@@ -316,12 +316,12 @@ class ControlNodes(DeformationField):
         kept = torch.zeros(0, dtype=torch.long, device=means.device)
         if len(old):
             kept = nodes_at(old, means).followed[:, 0].unique()
-        added = spread_out(means, self.options.nodes - len(kept), old[kept])
+        added = farthest_points(means, self.options.nodes - len(kept), old[kept])
         source = torch.cat([kept, torch.zeros(len(added), dtype=torch.long, device=kept.device)])
         is_new = torch.arange(len(source), device=source.device) >= len(kept)
         started = self._motion_at(means[added])
         values = {name: torch.cat([x[kept], started[name]]) for name, x in self._splines().items()}
-        self.parameters = self.parameters.rearranged(values, source, is_new)
+        self.parameters = self.parameters.reorder(values, source, is_new)
         self._assign(torch.cat([old[kept], means[added]]), means)
 
     def _assign(self, positions: Tensor, means: Tensor) -> None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from dyngs.core.errors import DyngsError
 from dyngs.deform.keys import DynamicModel
-from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.schedule import RateSchedule
 from dyngs.models.schedule import Length
 
 SPLITS = (0.1, 0.3, 0.5)
@@ -31,10 +31,10 @@ class DeformSchedule:
     full: int
     decays: int  # step from which the field's rates fall
     splits: tuple[int, ...]  # steps after which Gaussians that do not move are frozen
-    rates: Rates
+    rates: RateSchedule
 
 
-def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
+def deform_schedule(model: DynamicModel, rates: RateSchedule) -> DeformSchedule:
     """Return the phases of a dynamic model in a run with ``rates``; ``freeze_below_px`` 0 freezes
     nothing.
 
@@ -42,7 +42,7 @@ def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
     nothing.
     """
     steps = rates.steps
-    fine = model.moves_after(steps)
+    fine = model.motion_start_step(steps)
     opens = max(fine, round(model.time_window_grows_from * steps))
     full = max(opens, round(model.time_window_full_at * steps))
     decays = full if model.time_window < 1 else fine
@@ -55,12 +55,12 @@ def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
     return DeformSchedule(fine, opens, full, decays, splits, rates)
 
 
-def extended(model: DynamicModel, length: Length) -> DynamicModel:
+def extend_schedules(model: DynamicModel, length: Length) -> DynamicModel:
     """Return the section for a run of another length; phases that have begun keep their step.
 
     Raises DyngsError: its motion began too early for that length.
     """
-    old = deform_schedule(model, Rates(length.was))
+    old = deform_schedule(model, RateSchedule(length.was))
     fractions = {"motion_from": _motion_from(old, model, length)}
     if length.done >= old.opens:
         fractions |= {
@@ -68,7 +68,7 @@ def extended(model: DynamicModel, length: Length) -> DynamicModel:
             "time_window_full_at": length.kept(old.full),
         }
     changed = model.model_copy(update=fractions)
-    begins = changed.moves_after(length.steps)
+    begins = changed.motion_start_step(length.steps)
     if old.fine <= length.done < begins:
         raise DyngsError(
             f"train.steps={length.steps}: motion began after {old.fine:,} steps, and a run of {length.steps:,} trains "
@@ -82,7 +82,7 @@ def _motion_from(old: DeformSchedule, model: DynamicModel, length: Length) -> fl
     still to come."""
     if length.done >= old.fine:
         return length.kept(old.fine)
-    new = deform_schedule(model, Rates(length.steps))
+    new = deform_schedule(model, RateSchedule(length.steps))
     return length.kept(length.done + 1) if new.fine <= length.done else model.motion_from
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from dyngs.core.conventions import ReportProgress
+from dyngs.core.conventions import ProgressCallback
 from dyngs.human.keys import NO_BODY, HumanModel
-from dyngs.models.kind import HasBody, HasGaussians, InMotion
+from dyngs.models.kind import HasBody, HasGaussians, PlayedMotion
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,21 +34,21 @@ class HumanKind(HasGaussians, HasBody):
         data: DataConfig,
         section: HumanModel,
         log: Callable[[str], None],
-        report: ReportProgress,
+        report: ProgressCallback,
     ) -> DataConfig:
         """Return the options of a capture with a body: found, and fitted to the silhouettes."""
         from dyngs.capture.sfm.unposed import is_unposed
-        from dyngs.human.fit.fitted_capture import with_fitted_body
+        from dyngs.human.fit.fitted_capture import ensure_fitted_body
 
         if is_unposed(data):
-            from dyngs.human.detect.find_person import with_found_person
+            from dyngs.human.detect.detect_person import ensure_detected_person
 
-            data = with_found_person(data, log=log, report=report)
-        return with_fitted_body(
+            data = ensure_detected_person(data, log=log, report=report)
+        return ensure_fitted_body(
             data, section, only_if_needed=not section.fit, log=log, report=report
         )
 
-    def in_motion(
+    def play_motion(
         self,
         section: HumanModel,
         scene: Posable,
@@ -56,10 +56,10 @@ class HumanKind(HasGaussians, HasBody):
         path: Path,
         *,
         keep_feet: bool,
-    ) -> InMotion:
-        from dyngs.human.avatar.in_motion import in_motion
+    ) -> PlayedMotion:
+        from dyngs.human.avatar.play_motion import play_motion
 
-        return in_motion(section, scene, info, path, keep_feet=keep_feet)
+        return play_motion(section, scene, info, path, keep_feet=keep_feet)
 
     def read_person(self, path: Path) -> tuple[HumanModel, Posable, CheckpointInfo]:
         from dyngs.human.avatar.avatar_file import read_avatar

@@ -16,22 +16,22 @@ from dyngs.data.read import read_capture, require_images
 from dyngs.data.scene_space import cube_half_side, cube_mismatch_reason
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.model import GaussianModel
-from dyngs.gaussians.start import FirstGaussians, surroundings
-from dyngs.models.kind import Moves, RunStart, kind_of
+from dyngs.gaussians.initialization import InitialGaussians, surroundings
+from dyngs.models.kind import HasMotion, StartContext, kind_of
 from dyngs.models.views import (
     background_colour,
-    resolved_background,
-    share_alike,
+    resolve_background,
+    background_coloured_fraction,
     training_cameras,
     training_times,
 )
-from dyngs.ops.device import device_for
+from dyngs.ops.device import select_device
 from dyngs.training.corrections.camera_refinement import CameraRefinement
 from dyngs.training.corrections.exposure import ViewExposures
 from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
-from dyngs.training.priors import UsedPriors, used_priors
-from dyngs.training.trainer import Parts, Trainer
+from dyngs.training.priors import PriorLosses, load_priors
+from dyngs.training.trainer import TrainerParts, Trainer
 
 GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
 
@@ -45,14 +45,14 @@ FULL_OPACITY_FROM = 0.6
 ALIKE_IMAGES = 12  # number of images in which colours are compared with the background
 
 
-def assemble(
+def build_trainer(
     config: Config,
     capture: Capture | None = None,
     *,
     restored: bool = False,
     images: ImageLoader | None = None,
     held_out: frozenset[int] = frozenset(),
-    first: FirstGaussians | None = None,
+    first: InitialGaussians | None = None,
     uncapped: Config | None = None,
 ) -> Trainer[Any]:
     """Return the trainer of a scene: its model begun, nothing trained.
@@ -77,14 +77,14 @@ def assemble(
             with_maps=True,
             decoding_threads=default_decoding_threads(),
         )
-    priors = UsedPriors()
+    priors = PriorLosses()
     kind = kind_of(config.model)
     if "train.priors" in kind.uses:
-        moves = isinstance(kind, Moves) and len(set(training_times(capture))) > 1
-        priors = used_priors(config, capture, images.views, moves=moves)
+        moves = isinstance(kind, HasMotion) and len(set(training_times(capture))) > 1
+        priors = load_priors(config, capture, images.views, moves=moves)
     if not priors.masks:
         images = images.without_motion_masks()
-    background = resolved_background(config, capture)
+    background = resolve_background(config, capture)
     extent = surroundings(capture).extent
     findings = [priors.message] if priors.message else []
     published = capture.has_alpha and config.train.alpha_weight == 0 and background != "random"
@@ -95,8 +95,8 @@ def assemble(
         )
     early = _early_opacity(config, capture, images, background)
 
-    def parts(config: Config) -> Parts:
-        start = RunStart(
+    def parts(config: Config) -> TrainerParts:
+        start = StartContext(
             config, uncapped or config, capture, images, background, extent, generator, first
         )
         model = kind.start(start)
@@ -105,10 +105,10 @@ def assemble(
         refinement = None
         if config.camera.refine == "always":
             refinement = CameraRefinement(views, extent, steps)
-            applied_to = refinement.corrections.applied_to
-            images.camera_correction = lambda index, cameras: applied_to(views[index], cameras)
+            correct_cameras = refinement.corrections.correct_cameras
+            images.camera_correction = lambda index, cameras: correct_cameras(views[index], cameras)
         robust = None
-        may_mask = "train.robust" in kind.uses and not isinstance(kind, Moves)
+        may_mask = "train.robust" in kind.uses and not isinstance(kind, HasMotion)
         if config.train.robust == "always" and may_mask:
             cameras = training_cameras(views, config.data)
             robust = RobustMasks(images, cameras, steps, images.camera_correction)
@@ -124,11 +124,11 @@ def assemble(
             RegularizerLoss(),
         ]
         found = (robust, exposures, refinement)
-        return Parts(model, losses, [x for x in found if x is not None])
+        return TrainerParts(model, losses, [x for x in found if x is not None])
 
     return Trainer(
         config=config,
-        parts_of=parts,
+        build_parts=parts,
         capture=capture,
         images=images,
         background=background,
@@ -136,7 +136,7 @@ def assemble(
         generator=generator,
         findings=findings,
         held_out=held_out,
-        device=device_for(config.run.device),
+        device=select_device(config.run.device),
     )
 
 
@@ -186,5 +186,5 @@ def _early_opacity(config: Config, capture: Capture, images: ImageLoader, backgr
     ):
         return 1.0
     shown = (images[i] for i in evenly_spaced(len(images), ALIKE_IMAGES))
-    alike = share_alike(shown, background_colour(background))
+    alike = background_coloured_fraction(shown, background_colour(background))
     return 1.0 if alike is None or alike >= MANY_ALIKE else EARLY_OPACITY

@@ -25,7 +25,7 @@ from dyngs.baselines.fields.scene import (
 )
 from dyngs.baselines.fields.training import FieldTraining
 from dyngs.core.initialisation import glorot
-from dyngs.models.kind import RunStart
+from dyngs.models.kind import StartContext
 from dyngs.ops.perceptron import Layer, perceptron
 from dyngs.ops.rays import Rays, Samples, Space, composite
 
@@ -106,7 +106,7 @@ class NerfField(Field):
         if shifts is None:
             shifts = rays.origins.new_full((len(rays), self.num_shifts), 0.5)
         num_coarse = SIZES[self.model.sizes].coarse
-        distances = evenly(rays, self.space, near, shifts[:, :num_coarse])
+        distances = sample_evenly(rays, self.space, near, shifts[:, :num_coarse])
         coarse, weights = self._through("coarse", rays, distances, time)
         distances = by_weights(distances, weights, shifts[:, num_coarse:])
         fine, _ = self._through("fine", rays, distances, time)
@@ -165,7 +165,7 @@ def crossed(rays: Rays, space: Space, near: float) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def evenly(rays: Rays, space: Space, near: float, shifts: Tensor) -> Tensor:
+def sample_evenly(rays: Rays, space: Space, near: float, shifts: Tensor) -> Tensor:
     """Return distances (R, K) of samples, one in each of K equal parts of the way through the
     space, ascending.
 
@@ -221,7 +221,7 @@ def along(rays: Rays, space: Space, distances: Tensor) -> Samples:
 class NerfTraining(FieldTraining):
     """Training of NeRF: a fixed number of rays, a rate that falls exponentially."""
 
-    def __init__(self, run: RunStart) -> None:
+    def __init__(self, run: StartContext) -> None:
         super().__init__(run, NerfField, 1, 0)
         self._sizes = SIZES[self._model.sizes]
 

@@ -31,16 +31,16 @@ from dyngs.baselines.fields.scene import (
 from dyngs.baselines.fields.training import FieldTraining
 from dyngs.core.errors import DyngsError
 from dyngs.core.initialisation import glorot
-from dyngs.core.state import Role, State, prefixed, with_role
+from dyngs.core.state import Role, State, add_prefix, with_role
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import RunStart
-from dyngs.models.model import Updated
-from dyngs.models.volume import reached_samples, thinned_samples
+from dyngs.models.kind import StartContext
+from dyngs.models.model import UpdateResult
+from dyngs.models.volume import reached_samples, thin_samples
 from dyngs.ops.device import sent
 from dyngs.ops.harmonics import harmonics_basis
-from dyngs.ops.hash_grid import HashLevels, hash_features, known_features
+from dyngs.ops.hash_grid import HashLevels, hash_features, select_features
 from dyngs.ops.rays import Rays, Space, Steps, composite, march
 
 # Features of hidden layers, and of the density network's output, whose first is the density
@@ -174,8 +174,8 @@ class NgpField(Field):
             if shifts is None:
                 samples, which = reached_samples(densities, marched)
             else:
-                samples, which = thinned_samples(densities, marched, shifts[:, 1])
-        features = known_features(features, which, samples.coords, table, self.levels)
+                samples, which = thin_samples(densities, marched, shifts[:, 1])
+        features = select_features(features, which, samples.coords, table, self.levels)
         geometry = self._geometry(features, time)
         basis = harmonics_basis(rays.directions, DIRECTION_DEGREE)
         colours = self._colours(geometry, basis[samples.rays])
@@ -186,7 +186,7 @@ class NgpField(Field):
         coords = self.space.unit(points)
         return self._density(self._geometry(self._features(coords), time), coords)
 
-    def may_hold(self, points: Tensor) -> Tensor:
+    def may_be_occupied(self, points: Tensor) -> Tensor:
         """See ``Field``: what lies in occupied cells, or beyond the innermost cube."""
         n = self.space.cells
         middle = points.new_tensor(self.space.centre)
@@ -245,7 +245,7 @@ def shapes(model: NgpModel, space: Space, pixels: int) -> dict[str, tuple[int, i
     return found
 
 
-def seen_cells(space: Space, views: Sequence[View]) -> Tensor:
+def cells_in_view(space: Space, views: Sequence[View]) -> Tensor:
     """Return bool of ``space.shape``: cells of which a view sees a part, outside of the next
     smaller cube."""
     seen = np.zeros(space.shape, dtype=bool)
@@ -297,7 +297,7 @@ class NgpTraining(FieldTraining):
 
     betas = (0.9, 0.99)
 
-    def __init__(self, run: RunStart) -> None:
+    def __init__(self, run: StartContext) -> None:
         model: Any = run.config.model
         sizes = SIZES[model.sizes]
         camera = run.images[0].cameras
@@ -320,7 +320,7 @@ class NgpTraining(FieldTraining):
     def _find_seen_cells(self) -> None:
         """Find the cells that may be occupied at all; nothing was found in any yet."""
         space = self._field.space
-        seen = seen_cells(space, self._run.capture.splits["train"])
+        seen = cells_in_view(space, self._run.capture.splits["train"])
         if not bool(seen.any()):
             raise DyngsError(
                 f"{self._run.config.data.root}: no training camera sees anything of the cube that the field lies in: "
@@ -348,7 +348,7 @@ class NgpTraining(FieldTraining):
         fallen = sum(step > fraction * self._run.config.train.steps for fraction in DROPS)
         return (self._model.lr or RATE) * rising * DROP**fallen
 
-    def update(self, step: int) -> Updated:
+    def update(self, step: int) -> UpdateResult:
         for name, x in self._field.parameters.items():
             if name != "table" and x.grad is not None:
                 x.grad.add_(x.detach(), alpha=WEIGHT_DECAY)
@@ -410,7 +410,7 @@ class NgpTraining(FieldTraining):
 
     def state(self) -> State:
         own = {"values": self._opacities, "rays": torch.tensor([self._rays], device="cpu")}
-        return super().state() | prefixed("occupancy", with_role(own, Role.TRAINING))
+        return super().state() | add_prefix("occupancy", with_role(own, Role.TRAINING))
 
     def restore(self, checkpoint: Checkpoint) -> None:
         before = self._field.space

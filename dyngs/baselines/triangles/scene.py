@@ -20,7 +20,7 @@ from dyngs.baselines.triangles.kind import BgTriangleModel
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0, num_sh_terms
 from dyngs.core.gaussians import storage_order
-from dyngs.core.state import Role, State, prefixed, with_role
+from dyngs.core.state import Role, State, add_prefix, with_role
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.renderable import (
@@ -32,7 +32,7 @@ from dyngs.models.renderable import (
     TimeStep,
     composited,
     fixed_cameras,
-    joined_renderings,
+    concatenate_renderings,
     single_views,
 )
 from dyngs.models.views import evaluation_background
@@ -40,7 +40,7 @@ from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.patches import (
     NUM_POINTS,
     SEGMENTS,
-    Places,
+    PatchSamples,
     blend_patches,
     lattice,
     lattice_size,
@@ -194,7 +194,7 @@ class TriangleScene(Renderable):
         flat = (faces + first).flatten(0, 1)
         return Surface(vertices.flatten(0, 1).numpy(), flat.numpy(), colours.clamp(0, 1).numpy())
 
-    def page_lists(self) -> tuple[dict[str, Any], dict[str, tuple[Tensor, Literal[8, 16]]]]:
+    def page_data(self) -> tuple[dict[str, Any], dict[str, tuple[Tensor, Literal[8, 16]]]]:
         patches = self.patches
         middles = patches.points.detach()[:, CORNERS].mean(1).float().numpy()
         order = torch.from_numpy(storage_order(middles, np.zeros(0, dtype=np.int64)))
@@ -230,7 +230,7 @@ class TriangleScene(Renderable):
 
     def state(self) -> State:
         unit = {"unit": torch.tensor([self.unit], dtype=torch.float64, device="cpu")}
-        return prefixed("triangles", self.patches.state() | with_role(unit, Role.SHARED))
+        return add_prefix("triangles", self.patches.state() | with_role(unit, Role.SHARED))
 
     def render(
         self,
@@ -244,17 +244,17 @@ class TriangleScene(Renderable):
         behind = self.background if background is None else background
         cameras = fixed_cameras(cameras, behind, self.patches.points)
         views = single_views(cameras, behind)
-        return joined_renderings([self.drawn(x, options, colour)[0] for x, colour in views])
+        return concatenate_renderings([self.drawn(x, options, colour)[0] for x, colour in views])
 
     def drawn(
         self, camera: Cameras, options: TriangleOptions, background: Tensor | None = None
-    ) -> tuple[Rendering, Places]:
+    ) -> tuple[Rendering, PatchSamples]:
         """Return the image of one camera, differentiable, and what each drawn pixel shows."""
         times = options.supersampling
         patches = self.patches
         camera = camera.to(device=self.device)
         fine = camera.scaled(times)
-        places = Places.of(
+        places = PatchSamples.of(
             *visible_patches(patches.points.detach(), fine, options.near, options.segments)
         )
         at = project_points(
@@ -292,7 +292,7 @@ def scene_options(model: BgTriangleModel, unit: float) -> TriangleOptions:
     return TriangleOptions(near=NEAR * unit, supersampling=model.supersampling)
 
 
-def restored_scene(model: BgTriangleModel, checkpoint: Checkpoint) -> TriangleScene:
+def restore_scene(model: BgTriangleModel, checkpoint: Checkpoint) -> TriangleScene:
     """Return the scene of a checkpoint. Raises KeyError or ValueError where its tensors do not
     fit."""
     stored = checkpoint.part("triangles")

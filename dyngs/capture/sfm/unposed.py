@@ -12,8 +12,8 @@ from dyngs.capture.sfm.estimate import estimate_poses
 from dyngs.capture.sfm.photos import digest_files, list_photos
 from dyngs.capture.sfm.several_videos import VIDEOS_FILE, poses_of_videos
 from dyngs.config import DataConfig
-from dyngs.core.conventions import ReportProgress, report_nothing
-from dyngs.core.errors import DyngsError, as_word, counted, reading, show
+from dyngs.core.conventions import ProgressCallback, ignore_progress
+from dyngs.core.errors import DyngsError, quote_path, counted, wrap_read_errors, show
 from dyngs.data.images.video import VIDEO_SUFFIXES, list_videos
 from dyngs.data.read import is_capture
 from dyngs.io.outputs import make_once, record_source, suggest_command
@@ -27,7 +27,7 @@ def ensure_poses(
     *,
     needs_times: bool = False,
     log: Callable[[str], None] = show,
-    report: ReportProgress = report_nothing,
+    report: ProgressCallback = ignore_progress,
 ) -> DataConfig:
     """Return the options with a capture that has poses as their folder: the same one, unless it has
     none.
@@ -48,7 +48,7 @@ def ensure_poses(
     if videos and not needs_times:
         raise DyngsError(
             f"{source}: holds {len(videos)} videos; a static scene needs one video of a moving "
-            f"camera, several need `dyngs train dynamic data.root={as_word(source)}`"
+            f"camera, several need `dyngs train dynamic data.root={quote_path(source)}`"
         )
     if source.is_dir() and not videos and needs_times and data.times == "files":
         raise DyngsError(
@@ -93,7 +93,7 @@ def is_unposed(data: DataConfig) -> bool:
     videos = list_videos(root)
     if len(videos) == 1:
         raise DyngsError(
-            f"{root}: contains one video; give the video itself: data.root={as_word(videos[0])}"
+            f"{root}: contains one video; give the video itself: data.root={quote_path(videos[0])}"
         )
     photos = (
         [] if videos or suggest_command(root, captures=False) is not None else list_photos(root)
@@ -125,5 +125,5 @@ def is_videos(source: Path) -> bool:
 
 
 def _holds_photos(folder: Path) -> bool:
-    with reading(folder, "choose another folder or change its permissions"):
+    with wrap_read_errors(folder, "choose another folder or change its permissions"):
         return len(list_photos(folder)) >= FEWEST_PHOTOS

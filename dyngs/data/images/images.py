@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.core.conventions import srgb_encoded
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.conventions import encode_srgb
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.io.containment import check_inside, check_size, max_decoded_mb
 from dyngs.io.fields import first_few
 from dyngs.io.write import image_error, read_lenient_text
@@ -240,7 +240,7 @@ def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool
 
 
 def _reading(path: Path) -> AbstractContextManager[None]:
-    return reading(
+    return wrap_read_errors(
         path, "the image is damaged or its format is not supported; copy or convert it again"
     )
 
@@ -461,7 +461,7 @@ def _straight_srgb(pixels: np.ndarray, header: ImageHeader) -> np.ndarray:
         pixels[..., :3] = np.where(alpha > 0, pixels[..., :3] / np.maximum(alpha, 1e-6), 0)
     pixels = np.clip(pixels, 0, 1)
     if header.is_float:
-        pixels[..., :3] = srgb_encoded(pixels[..., :3])
+        pixels[..., :3] = encode_srgb(pixels[..., :3])
     return np.round(pixels * 255).astype(np.uint8)
 
 

@@ -10,16 +10,16 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, State, StateTensor, part_of, prefixed, with_role
+from dyngs.core.state import Role, State, StateTensor, part_of, add_prefix, with_role
 from dyngs.core.tensor_checks import (
     require_indices,
-    require_moments,
+    require_times,
     require_positive,
     require_tensor,
 )
 from dyngs.data.capture import Capture, Split
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.colour.network import RestFrame
+from dyngs.gaussians.colour.network import RestPose
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.human.avatar.posing import (
@@ -37,13 +37,13 @@ from dyngs.human.avatar.posing import (
     learned_light,
     new_corrections,
     pose_gaussians,
-    rest_offsets,
+    pose_blend_offsets,
     skinning_weights,
 )
 from dyngs.human.body.joints import SMPLX_ROWS
 from dyngs.human.body.skinning import check_tree
 from dyngs.human.motion.motion import MotionClip, captured_motion, same_bodies
-from dyngs.models.renderable import Posable, Renderable, clamped_time
+from dyngs.models.renderable import Posable, Renderable, clamp_time
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +94,7 @@ class HumanScene(GaussianScene, Posable):
 
     @property
     def times(self) -> tuple[float, ...]:
-        return tuple(self.moves_as.times.tolist())
+        return tuple(self.played_clip.times.tolist())
 
     @property
     def is_static(self) -> bool:
@@ -149,7 +149,7 @@ class HumanScene(GaussianScene, Posable):
         return () if self.light is None else (LEFT_OUT,)
 
     @property
-    def moves_as(self) -> MotionClip:
+    def played_clip(self) -> MotionClip:
         """The clip that is played, with what was learned about the person applied."""
         if "clip" not in self._derived:
             poses = self.learned["poses"].detach()
@@ -166,11 +166,11 @@ class HumanScene(GaussianScene, Posable):
 
         Who keeps one pose is posed once, but for gradients.
         """
-        now = clamped_time(time)
+        now = clamp_time(time)
         kept = self._derived.get("posed")
         if kept is not None and not torch.is_grad_enabled():
             return replace(kept, time=now)
-        posed = self.in_pose(frame_pose(self.moves_as.at(now), 0), now)
+        posed = self.in_pose(frame_pose(self.played_clip.at(now), 0), now)
         if self.is_static and not torch.is_grad_enabled():
             self._derived["posed"] = posed
         return posed
@@ -179,13 +179,13 @@ class HumanScene(GaussianScene, Posable):
         """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable
         in the pose."""
         gaussians = self._posed(posing, self.weights, self.learned_skeleton, self.light)
-        frame = RestFrame(self.gaussians.means, posing.rotations[0])
+        frame = RestPose(self.gaussians.means, posing.rotations[0])
         return GaussianTimeStep(gaussians, time, frame)
 
     def _posed(
         self, posing: BodyPose, weights: Tensor, skeleton: Skeleton, light: Light | None
     ) -> Gaussians:
-        offsets = rest_offsets(self.anchors, posing, self.shapes)
+        offsets = pose_blend_offsets(self.anchors, posing, self.shapes)
         return pose_gaussians(self.gaussians, weights, skeleton, posing, offsets, light)
 
     def in_frame(self, row: int, given_weights: Tensor | None = None) -> tuple[Gaussians, BodyPose]:
@@ -228,7 +228,7 @@ class HumanScene(GaussianScene, Posable):
         """
         return replace(self, played=clip)
 
-    def up_of_body(self) -> Tensor:
+    def body_up_direction(self) -> Tensor:
         from dyngs.human.motion.placement import up_direction  # late: scipy
 
         return up_direction(self.clip)
@@ -251,7 +251,7 @@ class HumanScene(GaussianScene, Posable):
         played = None if self.played is None else there(self.played)
         return replace(self, clip=there(self.clip), played=played)
 
-    def as_filmed(self, capture: Capture, split: Split) -> HumanScene:
+    def for_split(self, capture: Capture, split: Split) -> HumanScene:
         """Return the person as the views of a split show them.
 
         The split pose, and splits with body parameters of their own, have the poses of their files.
@@ -282,8 +282,8 @@ class HumanScene(GaussianScene, Posable):
         it."""
         clip = self.clip
         skeleton = self.skeleton
-        state = prefixed("learned", self.learned.state())
-        state |= prefixed("anchors", with_role(self.anchors.tensors(), Role.PER_GAUSSIAN))
+        state = add_prefix("learned", self.learned.state())
+        state |= add_prefix("anchors", with_role(self.anchors.tensors(), Role.PER_GAUSSIAN))
         if self.seen is not None:
             state["seen"] = StateTensor(self.seen, Role.PER_GAUSSIAN)
         given = {
@@ -320,7 +320,7 @@ def first_scene(
     )
 
 
-def avatar_of(scene: Renderable) -> HumanScene | None:
+def as_human_scene(scene: Renderable) -> HumanScene | None:
     """Return ``scene`` if it is a person, who can be posed; None for any other scene."""
     return scene if isinstance(scene, HumanScene) else None
 
@@ -340,7 +340,7 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
             f"'parents' is {parents.dtype} {tuple(parents.shape)}, not whole numbers ({j},)"
         )
     check_tree(tuple(parents.tolist()))
-    require_moments("clip.times", state["clip.times"])
+    require_times("clip.times", state["clip.times"])
     shapes = {
         "joints": (j, 3),
         "clip.poses": (f, j, 3),

@@ -18,10 +18,10 @@ from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.gaussians.colour.network import RestFrame
+from dyngs.gaussians.colour.network import RestPose
 from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.scene import GaussianTimeStep
-from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.schedule import RateSchedule
 from dyngs.human.avatar.observations import (
     HARDLY,
     filled,
@@ -41,8 +41,8 @@ from dyngs.human.avatar.posing import (
 )
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.keys import HumanModel
-from dyngs.models.kind import RunStart
-from dyngs.models.model import Look, Loss
+from dyngs.models.kind import StartContext
+from dyngs.models.model import LossInput, Loss
 from dyngs.models.views import background_colour
 from dyngs.ops.adam import Count
 from dyngs.ops.device import sent
@@ -91,7 +91,7 @@ class OutlineLoss(Loss):
             "show behind the person"
         )
 
-    def __call__(self, look: Look) -> Mapping[str, Tensor]:
+    def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
         rendered = look.rendered
         truth = look.truth
         plate = self._plates.get(self._photos.views[look.index].camera_id)
@@ -108,7 +108,7 @@ class OutlineLoss(Loss):
         return {"image": l1_ssim_loss(rendered, truth, self._ssim_weight, look.image.mask)}
 
 
-def outline_loss(run: RunStart) -> OutlineLoss | None:
+def outline_loss(run: StartContext) -> OutlineLoss | None:
     """Return how colours are compared near outlines; None where masks come with the images, or no
     camera stands."""
     views = run.images.views
@@ -220,13 +220,13 @@ class HumanTraining(SceneTraining[HumanScene]):
     poses are fitted again.
     """
 
-    moves_by = ("pose", "model")
+    deformation_name = ("pose", "model")
 
     def __init__(
         self,
         options: HumanModel,
         frames: Sequence[int],
-        rates: Rates,
+        rates: RateSchedule,
         views: Sequence[tuple[Cameras, int]] = (),
         outlines: OutlineLoss | None = None,
         refit: PoseRefit | None = None,
@@ -279,7 +279,7 @@ class HumanTraining(SceneTraining[HumanScene]):
             strain, uneven = strains(rest.means, moved.means, anchors.points, near, scale)
             penalties["rigidity"] = PARAMS.rigidity * strain / CENTIMETRE**2
             penalties["smoothness"] = PARAMS.smoothness * uneven / CENTIMETRE**2
-        frame = RestFrame(rest.means, posing.rotations[0])
+        frame = RestPose(rest.means, posing.rotations[0])
         return GaussianTimeStep(moved, image.time, frame, penalties)
 
     def optimize(self, scene: HumanScene, step: int) -> Count:
@@ -298,7 +298,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         """Return the corrections."""
         return scene.learned.leaves
 
-    def revised(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
+    def edit_scene(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
         """Return the scene, and after the last step new values for what the images hardly show.
 
         After the first step with a line about outlines, if there is one. In between poses may be

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.capture import BodyFrames
 from dyngs.human.body.body import BodyTemplate, apply_shape, bone_shapes
 from dyngs.human.keys import HumanModel
@@ -42,7 +42,7 @@ def read_body(path: Path, uv: Path | None = None) -> BodyTemplate:
     suffix = path.suffix.lower()
     if suffix not in (".npz", ".pkl"):
         raise DyngsError(f"{path}: a body file must end in .npz or .pkl")
-    with reading(path, "give a body file of SMPL, SMPL-H or SMPL-X"):
+    with wrap_read_errors(path, "give a body file of SMPL, SMPL-H or SMPL-X"):
 
         def wanted(names: Collection[str]) -> list[str]:
             keys = (*_TEMPLATE, *_TEMPLATE_SHAPES) if "weights_idx" in names else _SMPL
@@ -184,7 +184,7 @@ def read_obj(path: Path, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Those of the file may come in any order, as ``f v/vt v/vt v/vt``. Raises DyngsError: the file
     cannot be read, or belongs to another body.
     """
-    with reading(path, "give the .obj made for this body, with triangles 'f v/vt v/vt v/vt'"):
+    with wrap_read_errors(path, "give the .obj made for this body, with triangles 'f v/vt v/vt v/vt'"):
         uv = []
         triangles: dict[tuple[int, ...], dict[int, int]] = {}
         for line in read_limited(path).decode("latin-1").splitlines():
@@ -253,7 +253,7 @@ def _read_once(
     return read_body(body, uv)
 
 
-def has_same_shapes(body: BodyTemplate, given: BodyFrames) -> bool:
+def has_same_shape_space(body: BodyTemplate, given: BodyFrames) -> bool:
     """Return whether the shape parameters of ``given`` are of the shape space of ``body``, as far
     as the files say.
 
@@ -271,7 +271,7 @@ def rest_shape(body: BodyTemplate, given: BodyFrames) -> tuple[Tensor, Tensor]:
 
     A template with another shape space than that of ``given`` stays as it is.
     """
-    if not has_same_shapes(body, given):
+    if not has_same_shape_space(body, given):
         return body.vertices, body.joints
     with torch.no_grad():
         return apply_shape(body, torch.from_numpy(given.betas).to(body.vertices)[: body.num_shapes])

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES, JOINT_PARENTS, SMPLX_ROWS
@@ -28,7 +28,7 @@ from dyngs.human.motion.motion import (
     require_frame_count,
     require_frame_rate,
 )
-from dyngs.human.motion.placement import least_rotation, place_on_floor
+from dyngs.human.motion.placement import shortest_arc_rotation, place_on_floor
 
 _OURS = (
     "pelvis spine1 spine2 spine3 neck head *_collar *_shoulder *_elbow *_wrist *_hip *_knee *_ankle *_foot "
@@ -262,7 +262,7 @@ def _alignments(
         ]
         lengths = [float(np.linalg.norm(bone)) for bone in bones]
         if min(lengths) > 1e-9:
-            turns[name] = least_rotation(bones[0] / lengths[0], bones[1] / lengths[1])
+            turns[name] = shortest_arc_rotation(bones[0] / lengths[0], bones[1] / lengths[1])
         else:
             turns[name] = turns.get(f"{side}_{_FOLLOWS.get(joint, '')}", np.eye(3))
     return turns
@@ -309,7 +309,7 @@ def read_motion(
     if fps is not None:
         require_frame_rate(path, fps)
     body = default_template() if body is None else body
-    with reading(path):
+    with wrap_read_errors(path):
         if suffix == ".npz":
             motion = read_amass(path, body, up, fps)
         elif suffix == ".bvh":

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.core.state import part_of, tensors_of
+from dyngs.core.state import part_of, strip_roles
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
 from dyngs.human.avatar.posing import (
@@ -57,7 +57,7 @@ def stirred() -> HumanScene:
 
 def reloaded(scene: HumanScene) -> HumanScene:
     """The scene of what is stored of it."""
-    return HumanScene.restored(scene.gaussians, part_of(tensors_of(scene.state()), "model"))
+    return HumanScene.restored(scene.gaussians, part_of(strip_roles(scene.state()), "model"))
 
 
 def seen(gaussians: Gaussians) -> Tensor:
@@ -81,7 +81,7 @@ def test_two_clips_of_the_same_pose_give_the_same_image() -> None:
 
 def test_baked_corrections_are_those_of_training() -> None:
     trained = stirred()
-    played = reloaded(trained).moves_as
+    played = reloaded(trained).played_clip
     for row in range(len(trained.clip)):
         posing = corrected_pose(trained.learned, trained.clip, row)
         torch.testing.assert_close(

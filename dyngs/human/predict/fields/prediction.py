@@ -14,16 +14,16 @@ from torch import Tensor
 
 from dyngs.config import Config, DataConfig
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import ReportProgress
+from dyngs.core.conventions import ProgressCallback
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import Role, State, fields_moved_to, prefixed, with_role
+from dyngs.core.state import Role, State, move_fields_to, add_prefix, with_role
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.data.loader import Image
 from dyngs.data.read import list_captures
 from dyngs.data.times import distinct_times
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template, read_body
-from dyngs.human.fit.fitted_capture import with_fitted_body
+from dyngs.human.fit.fitted_capture import ensure_fitted_body
 from dyngs.human.predict.fields.eg_human_nerf import EgHumanNerf
 from dyngs.human.predict.fields.keypoint_nerf import AROUND, KeypointNerf
 from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
@@ -35,19 +35,19 @@ from dyngs.human.predict.people import (
     PosedBody,
     Sources,
     metric,
-    person_of,
+    read_captured_person,
     sources_of,
     window,
 )
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import RunStart
-from dyngs.models.model import Drawn, Model, Updated
+from dyngs.models.kind import StartContext
+from dyngs.models.model import Drawn, Model, UpdateResult
 from dyngs.models.prediction import (
     Example,
     Learner,
     Predictor,
     image_loss,
-    kept_open,
+    keep_captures_open,
     load_weights,
     random_index,
 )
@@ -60,7 +60,7 @@ from dyngs.models.renderable import (
     fixed_cameras,
 )
 from dyngs.models.views import evaluation_background
-from dyngs.ops.device import CPU, device_for
+from dyngs.ops.device import CPU, select_device
 
 NETWORKS: dict[str, Callable[[torch.Generator], FieldNetwork]] = {
     "keypoint_nerf": KeypointNerf,
@@ -104,7 +104,7 @@ class PredictedField(Renderable):
         tensors |= {f"sources.{name}": x for name, x in vars(self.sources).items()}
         tensors |= {f"body.{name}": x for name, x in vars(self.body).items()}
         tensors["numbers"] = torch.tensor([self.scale], dtype=torch.float64, device="cpu")
-        return prefixed("field", with_role(tensors, Role.SHARED))
+        return add_prefix("field", with_role(tensors, Role.SHARED))
 
     def render(
         self,
@@ -158,13 +158,13 @@ def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedFiel
 class PredictedModel(Model[PredictedField]):
     """What was predicted, in the place of a model in training; to train it is refused."""
 
-    def __init__(self, run: RunStart) -> None:
+    def __init__(self, run: StartContext) -> None:
         assert isinstance(run.config.model, PredictedFieldModel)
         self._run_dir = run.config.run.dir
         self._section = run.config.model
         self._scene: PredictedField | None = None
 
-    def begin_with(self, scene: PredictedField) -> None:
+    def start_from(self, scene: PredictedField) -> None:
         self._scene = scene
 
     @property
@@ -182,8 +182,8 @@ class PredictedModel(Model[PredictedField]):
     def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
         raise self._untrained()
 
-    def update(self, step: int) -> Updated:
-        return Updated(0)
+    def update(self, step: int) -> UpdateResult:
+        return UpdateResult(0)
 
     @property
     def leaves(self) -> Sequence[Tensor]:
@@ -232,12 +232,12 @@ class FieldPredictor(Predictor[FieldNetwork]):
 
     def run_config(self, views: Sequence[int]) -> Config:
         times = distinct_times(self.views).values()
-        data = self.data_of_moment(self.views[views[0]].time, times)
+        data = self.data_at_time(self.views[views[0]].time, times)
         model = PredictedFieldModel.model_validate({"network": self.config.model.kind})
         return self.config.model_copy(update={"data": data, "model": model})
 
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
-        model.begin_with(scene)
+        model.start_from(scene)
 
 
 class FieldLearner(Learner[FieldNetwork]):
@@ -252,16 +252,16 @@ class FieldLearner(Learner[FieldNetwork]):
     ) -> None:
         super().__init__(config, network, [person.root.name for person in people], device)
         self._template = template_of(self.section)
-        self._opened = kept_open(self._open, people)
+        self._opened = keep_captures_open(self._open, people)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
         known = self._opened(person)
         sources, target = self._views(known, generator)
         body, scale = known.body_in(known.views[target])
-        body = fields_moved_to(body, self.device)
-        given = fields_moved_to(sources_of([known.images[i] for i in sources], scale), self.device)
+        body = move_fields_to(body, self.device)
+        given = move_fields_to(sources_of([known.images[i] for i in sources], scale), self.device)
         image = _part(known.images[target], generator).to(self.device)
-        background = self.drawn_background(generator)
+        background = self.sample_background(generator)
         seen = self.network.look(given, body)
         picture = self.network.picture(seen, metric(image.cameras, scale), generator)
         rendered = picture.colour + picture.transmittance[..., None] * background
@@ -287,7 +287,7 @@ class FieldLearner(Learner[FieldNetwork]):
 
     def _open(self, data: DataConfig) -> Person:
         """Return a person. Raises DyngsError: nobody to learn from."""
-        found = person_of(data, self._template)
+        found = read_captured_person(data, self._template)
         if all(len(ring) <= FEWEST_VIEWS for ring in moments(found.views).values()):
             raise DyngsError(f"{data.root}: shows no moment in three views or more to learn from")
         if self.network.needs_depth and any(view.depth_path is None for view in found.views):
@@ -310,7 +310,7 @@ def _part(image: Image, generator: torch.Generator) -> Image:
 
 def learner(config: Config, generator: torch.Generator) -> FieldLearner:
     """Return a network before the first step."""
-    device = device_for(config.run.device)
+    device = select_device(config.run.device)
     network = NETWORKS[config.model.kind](generator).to(device)
     return FieldLearner(config, network, list_captures(config.data), device)
 
@@ -320,7 +320,7 @@ def predictor(
     checkpoint: Checkpoint,
     data: DataConfig,
     log: Callable[[str], None],
-    report: ReportProgress,
+    report: ProgressCallback,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
     body is fitted.
@@ -331,8 +331,8 @@ def predictor(
     network = NETWORKS[model.kind](torch.Generator())
     load_weights(network, checkpoint)
     if model.body is None:
-        data = with_fitted_body(data, only_if_needed=True, log=log, report=report)
-    return FieldPredictor(config, network, person_of(data, template_of(model)), data)
+        data = ensure_fitted_body(data, only_if_needed=True, log=log, report=report)
+    return FieldPredictor(config, network, read_captured_person(data, template_of(model)), data)
 
 
 def template_of(model: FieldPredictorModel) -> BodyTemplate:

@@ -21,17 +21,17 @@ from torch import Tensor, nn
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import SH_C0, ReportProgress, report_nothing
-from dyngs.core.errors import DyngsError, reading
-from dyngs.core.state import fields_moved_to
+from dyngs.core.conventions import SH_C0, ProgressCallback, ignore_progress
+from dyngs.core.errors import DyngsError, wrap_read_errors
+from dyngs.core.state import move_fields_to
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import list_captures, read_capture
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.colour.network import RestFrame
+from dyngs.gaussians.colour.network import RestPose
 from dyngs.gaussians.scene import GaussianTimeStep, render_options
-from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.schedule import RateSchedule
 from dyngs.human.avatar.observations import FACING_EXPONENT, project_points
 from dyngs.human.avatar.posing import BodyPose, Skeleton, pose_blend_shapes, texel_gaussians
 from dyngs.human.avatar.scene import HumanScene, first_scene
@@ -40,26 +40,26 @@ from dyngs.human.body.atlas import Texels, atlas_texels
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import load_template
 from dyngs.human.body.mesh import vertex_normals
-from dyngs.human.fit.fitted_capture import with_fitted_body
+from dyngs.human.fit.fitted_capture import ensure_fitted_body
 from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.human.predict.gps.rectification import spread
-from dyngs.human.predict.people import Person, depths, person_in
-from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
+from dyngs.human.predict.people import Person, depths, captured_person
+from dyngs.models.checkpoint import CONFIG_ADVICE, Checkpoint
 from dyngs.models.prediction import (
     Encoder,
     Example,
     Learner,
     Predictor,
     ResidualBlock,
-    begin_weights,
+    initialize_weights,
     image_loss,
     load_weights,
     random_index,
     updated,
-    upsampled,
+    upsample,
 )
 from dyngs.models.renderable import Renderable
-from dyngs.ops.device import CPU, device_for
+from dyngs.ops.device import CPU, select_device
 from dyngs.ops.quaternions import quat_product, unit_quats
 
 
@@ -365,7 +365,7 @@ class AtlasNetwork(Encoder):
                 nn.Conv2d(WIDTHS[0] + channels, WIDTHS[0], 3, padding=1), nn.SiLU()
             )
             self.heads = nn.Conv2d(WIDTHS[0], scaffolds * sum(HEADS.values()), 1)
-        begin_weights(self, generator)
+        initialize_weights(self, generator)
         nn.init.zeros_(self.heads.weight)
 
     def forward(self, maps: Tensor) -> Tensor:
@@ -374,8 +374,8 @@ class AtlasNetwork(Encoder):
         levels = self.levels(maps[None])
         features = levels.pop()
         for layer in self.up:
-            features = layer(torch.cat([upsampled(features), levels.pop()], dim=1))
-        features = self.last(torch.cat([upsampled(features), maps[None]], dim=1))
+            features = layer(torch.cat([upsample(features), levels.pop()], dim=1))
+        features = self.last(torch.cat([upsample(features), maps[None]], dim=1))
         return self.heads(features)[0].unflatten(0, (self.scaffolds, -1))
 
 
@@ -497,7 +497,7 @@ class PersonPredictor(Predictor[AtlasNetwork]):
         self,
         views: Sequence[int],
         steps: int | None = None,
-        report: ReportProgress = report_nothing,
+        report: ProgressCallback = ignore_progress,
     ) -> int:
         """Train the network until its prediction shows the images better that it is predicted
         from."""
@@ -526,7 +526,7 @@ class PersonPredictor(Predictor[AtlasNetwork]):
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
         assert isinstance(config.model, HumanModel)
         frames = self._person.person.motion.frames
-        model.begin_with(scene, HumanTraining(config.model, frames, Rates(config.train.steps)))
+        model.start_from(scene, HumanTraining(config.model, frames, RateSchedule(config.train.steps)))
 
     def _scene(self, maps: TexelMaps) -> HumanScene:
         return predict_avatar(self._person, maps, self.mean, self.network)
@@ -549,23 +549,23 @@ class AtlasLearner(Learner[AtlasNetwork]):
         self.people = people
         self.choices = choices
         self.mean = mean
-        self._moved = [fields_moved_to(x, device) for x in people]
+        self._moved = [move_fields_to(x, device) for x in people]
         self._maps = cache(self._observed)
 
     def _observed(self, person: int, choice: int) -> TexelMaps:
         maps = self.people[person].observe(self.choices[person][choice])
-        return fields_moved_to(maps, self.device)
+        return move_fields_to(maps, self.device)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
         filmed = self.people[person].person
         choice = random_index(len(self.choices[person]), generator)
         targets = self._targets(filmed, self.choices[person][choice], generator)
-        background = self.drawn_background(generator)
+        background = self.sample_background(generator)
         maps = self._maps(person, choice)
         scene = predict_avatar(self._moved[person], maps, self.mean, self.network)
         row = filmed.motion.rows[-1 if targets[0].frame is None else targets[0].frame]
         gaussians, posing = scene.in_frame(row, scene.given_weights())
-        frame = RestFrame(scene.gaussians.means, posing.rotations[0])
+        frame = RestPose(scene.gaussians.means, posing.rotations[0])
         moment = GaussianTimeStep(gaussians, targets[0].time, frame)
         loss, rendered, truth = _images_error(
             scene, [moment] * len(targets), targets, background, self.config
@@ -594,7 +594,7 @@ class AtlasLearner(Learner[AtlasNetwork]):
 def learner(config: Config, generator: torch.Generator) -> AtlasLearner:
     """Return the network of ``model.kind: human_predictor`` before the first step: captures read,
     nothing trained."""
-    device = device_for(config.run.device)
+    device = select_device(config.run.device)
     model: Any = config.model
     body = load_template(human_options(model))
     network = new_network(model, generator).to(device)
@@ -609,7 +609,7 @@ def predictor(
     checkpoint: Checkpoint,
     data: DataConfig,
     log: Callable[[str], None],
-    report: ReportProgress,
+    report: ProgressCallback,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
     body is fitted.
@@ -619,7 +619,7 @@ def predictor(
     model: Any = config.model
     network = new_network(model, torch.Generator())
     mean = load_network(network, checkpoint, model.resolution)
-    data = with_fitted_body(data, human_options(model), only_if_needed=True, log=log, report=report)
+    data = ensure_fitted_body(data, human_options(model), only_if_needed=True, log=log, report=report)
     person = read_person(data, model, load_template(human_options(model)))
     return PersonPredictor(config, network, mean, person, data)
 
@@ -637,7 +637,7 @@ def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int)
     """Return the mean colours (3, S, S) of a checkpoint, whose weights ``network`` takes; S is the
     ``resolution``."""
     load_weights(network, checkpoint)
-    with reading(checkpoint.name, OTHER_CONFIG):
+    with wrap_read_errors(checkpoint.name, CONFIG_ADVICE):
         mean = checkpoint.tensors["model.mean"]
         return require_tensor("mean", mean, (3, resolution, resolution))
 
@@ -656,7 +656,7 @@ def read_person(data: DataConfig, model: HumanPredictorModel, body: BodyTemplate
     """Return the person of one capture."""
     capture = read_capture(data)
     images = ImageLoader(capture.splits["train"], data)
-    return atlas_person(person_in(capture, body, images), model)
+    return atlas_person(captured_person(capture, body, images), model)
 
 
 def mean_colours(people: list[AtlasPerson], resolution: int) -> Tensor:

@@ -30,9 +30,9 @@ from torch.nn.functional import (
 
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_config, packaged_preset
-from dyngs.core.conventions import SH_C0, ReportProgress
+from dyngs.core.conventions import SH_C0, ProgressCallback
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import fields_moved_to
+from dyngs.core.state import move_fields_to
 from dyngs.data.capture import Capture, all_views
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import list_captures, read_capture
@@ -60,16 +60,16 @@ from dyngs.models.prediction import (
     Learner,
     Predictor,
     ResidualBlock,
-    begin_weights,
+    initialize_weights,
     image_loss,
-    kept_open,
+    keep_captures_open,
     load_weights,
     random_index,
-    upsampled,
+    upsample,
 )
 from dyngs.models.renderable import Renderable
-from dyngs.ops.device import CPU, device_for
-from dyngs.ops.quaternions import quat_product, quats_of, unit_quats
+from dyngs.ops.device import CPU, select_device
+from dyngs.ops.quaternions import quat_product, quats_from_matrices, unit_quats
 
 QUARTER = 4
 """Pixels of the windows per pixel of the sweep."""
@@ -112,10 +112,10 @@ class StereoNetwork(nn.Module):
         (D), ``inside`` (2, 1, H, W) is 1 where the person is.
         """
         fine = self.enter(torch.cat([levels[0], 5 * swept], dim=1))
-        middle = self.down[0](torch.cat([fine, upsampled(levels[1])], dim=1))
-        coarse = self.deep(self.down[1](torch.cat([middle, upsampled(levels[2])], dim=1)))
-        middle = self.up[0](torch.cat([middle, upsampled(coarse)], dim=1))
-        fine = self.up[1](torch.cat([fine, upsampled(middle)], dim=1))
+        middle = self.down[0](torch.cat([fine, upsample(levels[1])], dim=1))
+        coarse = self.deep(self.down[1](torch.cat([middle, upsample(levels[2])], dim=1)))
+        middle = self.up[0](torch.cat([middle, upsample(coarse)], dim=1))
+        fine = self.up[1](torch.cat([fine, upsample(middle)], dim=1))
         change = self.change(fine)
         colours, beside = swept.split(NUM_OFFSETS, dim=1)
         shares = (change[:, 1:] - _COLOUR * colours - _BESIDE * beside).softmax(dim=1)
@@ -231,7 +231,7 @@ class GpsNetwork(nn.Module):
             )
             self.last = nn.Sequential(nn.Conv2d(half + 20, _LAST, 3, padding=1), nn.SiLU())
             self.heads = nn.Conv2d(_LAST, 4 * sum(HEADS.values()), 1)
-        begin_weights(self, generator)
+        initialize_weights(self, generator)
         for layer in (self.heads, self.stereo.change, self.stereo.weights):
             nn.init.zeros_(layer.weight)
 
@@ -249,9 +249,9 @@ class GpsNetwork(nn.Module):
             return offsets, None
         depth = pixel_unshuffle(torch.cat([offsets[-1] / _RANGE * inside, inside], dim=1), 2)
         halves, quarters, eighths = self.depth_encoder(depth)
-        features = self.up[0](torch.cat([fused, quarters, upsampled(eighths)], dim=1))
-        features = self.up[1](torch.cat([upsampled(features), levels[0], halves], dim=1))
-        features = self.last(torch.cat([upsampled(features), images, depth[:, :4]], dim=1))
+        features = self.up[0](torch.cat([fused, quarters, upsample(eighths)], dim=1))
+        features = self.up[1](torch.cat([upsample(features), levels[0], halves], dim=1))
+        features = self.last(torch.cat([upsample(features), images, depth[:, :4]], dim=1))
         return offsets, pixel_shuffle(self.heads(features), 2)
 
 
@@ -274,7 +274,7 @@ def gaussians_of(pair: RectifiedPair, offsets: Tensor, raw: Tensor) -> Gaussians
     opacities = (part["opacity"][:, 0] + _OPACITY_LOGIT).sigmoid() * within
     opacities = opacities.clamp(1e-4, 1 - 1e-4)
     one = part["rotation"].new_tensor([1.0, 0.0, 0.0, 0.0])
-    world_from_rect = quats_of(pair.rect_from_world.T[None])
+    world_from_rect = quats_from_matrices(pair.rect_from_world.T[None])
     rgb = pair.rgb.permute(0, 2, 3, 1)[solid]
     return Gaussians(
         means=pair.points(depth)[solid],
@@ -357,11 +357,11 @@ class GpsPredictor(Predictor[GpsNetwork]):
         )
         shown = all_views({k: x for k, x in self._capture.splits.items() if k != "pose"})
         times = distinct_times(shown).values()
-        data = self.data_of_moment(self.views[views[0]].time, times)
+        data = self.data_at_time(self.views[views[0]].time, times)
         return preset.model_copy(update={"data": data, "model": model})
 
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
-        model.begin_with(scene, StaticTraining(FilterUpdate()))
+        model.start_from(scene, StaticTraining(FilterUpdate()))
 
 
 class GpsLearner(Learner[GpsNetwork]):
@@ -375,16 +375,16 @@ class GpsLearner(Learner[GpsNetwork]):
         device: torch.device = CPU,
     ) -> None:
         super().__init__(config, network, [person.root.name for person in people], device)
-        self._opened = kept_open(_lessons, people)
+        self._opened = keep_captures_open(_lessons, people)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
         images, pairs = self._opened(person)
         pair, between = pairs[random_index(len(pairs), generator)]
         target = between[random_index(len(between), generator)]
-        background = self.drawn_background(generator)
+        background = self.sample_background(generator)
         left, right = (images[i] for i in pair)
         windows = rectified(left, right, self.section.person_px)
-        windows = fields_moved_to(windows, self.device)
+        windows = move_fields_to(windows, self.device)
         only_depth = step <= round(DEPTH_FRACTION * self.config.train.steps)
         offsets, raw = self.network(windows, with_gaussians=not only_depth)
         depth_loss = offset_loss(windows, offsets, DECAY)
@@ -437,7 +437,7 @@ def _picture(pair: RectifiedPair, offsets: Tensor) -> Tensor:
 
 def learner(config: Config, generator: torch.Generator) -> GpsLearner:
     """Return the network of ``model.kind: gps`` before the first step."""
-    device = device_for(config.run.device)
+    device = select_device(config.run.device)
     return GpsLearner(config, GpsNetwork(generator).to(device), list_captures(config.data), device)
 
 
@@ -446,7 +446,7 @@ def predictor(
     checkpoint: Checkpoint,
     data: DataConfig,
     log: Callable[[str], None],
-    report: ReportProgress,
+    report: ProgressCallback,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the capture of ``data``."""
     network = GpsNetwork(torch.Generator())

@@ -20,7 +20,7 @@ from dyngs.capture.fixed_camera import is_image_sequence, read_fixed_camera
 from dyngs.capture.masks import refine_outlines, resize_mask
 from dyngs.capture.sfm.photos import digest_files
 from dyngs.config import DataConfig
-from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, counted, show
 from dyngs.data.capture import Capture, View, group_by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
@@ -151,11 +151,11 @@ def _turns(people: Sequence[Detection]) -> bool:
 SIDE = 960  # longest side of the images that a detector sees, px
 
 
-def find_person(
+def detect_person(
     capture: Capture,
     detector: Detector,
     folder: Path,
-    report: ReportProgress,
+    report: ProgressCallback,
     log: Callable[[str], None] = show,
 ) -> FitInputs:
     """Find a person in all views, write masks and key points to ``folder``, and return where they
@@ -229,11 +229,11 @@ def _write_keypoints(path: Path, points: dict[str, np.ndarray]) -> None:
     write_text(path, json.dumps({"images": images, "annotations": people}) + "\n")
 
 
-def write_found_person(
+def write_detected_person(
     options: DataConfig,
     out: Path,
     detector: Detector,
-    report: ReportProgress = report_nothing,
+    report: ProgressCallback = ignore_progress,
     log: Callable[[str], None] = show,
 ) -> FittedCapture:
     """Find a person and fit the body to them: write the capture of ``write_fitted_capture`` to the
@@ -251,14 +251,14 @@ def write_found_person(
     folder = temporary_folder_beside(out.with_name(f"{out.name}.found"))
     try:
         capture = read_fixed_camera(options) if clip else read_capture(options)
-        found = find_person(capture, detector, folder, report, log)
+        found = detect_person(capture, detector, folder, report, log)
         return write_fitted_capture(options, out, report, found)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def with_found_person(
-    data: DataConfig, *, log: Callable[[str], None] = show, report: ReportProgress = report_nothing
+def ensure_detected_person(
+    data: DataConfig, *, log: Callable[[str], None] = show, report: ProgressCallback = ignore_progress
 ) -> DataConfig:
     """Return the options with the capture of the person that is found in a clip; the same clip is
     looked at once.
@@ -272,7 +272,7 @@ def with_found_person(
     def find() -> None:
         detector = MediaPipe()
         log(f"person:  found first, as by `dyngs data people`, into {folder}")
-        log(write_found_person(data, folder, detector, report, log).summary)
+        log(write_detected_person(data, folder, detector, report, log).summary)
 
     make_once(folder, find, log, f"person:  found before, in {folder}")
     record_source(folder, data.root)
