@@ -23,19 +23,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.api.predict import require_network, trained_network
+from dyngs.api.predict import read_trained_network, require_network
 from dyngs.api.train import train
 from dyngs.cli.output import numbers_table, print_messages, print_tables
 from dyngs.config import DataConfig
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.conventions import ignore_progress
-from dyngs.core.errors import DyngsError, counted, show
+from dyngs.core.errors import DyngsError, format_count, log_info
 from dyngs.core.metrics import psnr, ssim
 from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.read import list_captures, read_capture
-from dyngs.human.predict.gps.rectification import angle, around
-from dyngs.io.outputs import atomic_folder
+from dyngs.data.read import captures_in, read_capture
+from dyngs.human.predict.gps.rectification import angle_between_views, order_around_person
+from dyngs.io.outputs import new_folder
 from dyngs.io.write import write_image, write_text
 from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable
@@ -106,7 +106,7 @@ def compare_people(bench: PeopleBench, out: Path) -> Table:
         raise DyngsError(
             f"two networks are named {twice}; the table needs one name each: rename a run"
         )
-    loaded = [(network.stem, *trained_network(network)) for network in bench.networks]
+    loaded = [(network.stem, *read_trained_network(network)) for network in bench.networks]
     words = [f"data.root={bench.people}", *(f"data.{word}" for word in bench.data)]
     given = load_config(packaged_preset("static"), words).data
     changed = {word.partition("=")[0] for word in bench.data}
@@ -118,7 +118,9 @@ def compare_people(bench: PeopleBench, out: Path) -> Table:
                 own = {key: getattr(given, key) for key in changed}
                 data = config.data.model_copy(update={"root": person.root, "test_every": 0} | own)
                 kind = require_network(config, Path(name))
-                make = partial(kind.networks()[1], config, checkpoint, data, show, ignore_progress)
+                make = partial(
+                    kind.networks()[1], config, checkpoint, data, log_info, ignore_progress
+                )
                 views = make().views
                 methods: dict[str, Method] = {name: partial(_predicted, make, False)}
                 if config.model.kind == "human_predictor":
@@ -139,7 +141,7 @@ def compare_people(bench: PeopleBench, out: Path) -> Table:
                                     label, made, images, count, person.root.name, pictures
                                 )
                     except DyngsError as error:
-                        show(f"{label} left out: {error}")
+                        log_info(f"{label} left out: {error}")
         if not found:
             raise DyngsError(f"{bench.people}: nothing could be predicted")
         table = _table(found, bench.counts)
@@ -158,7 +160,9 @@ def task_of(
     `test` with those of its views, in an arc those between neighbours.
     """
     moment = views[0].frame, views[0].time
-    ring = around(views, [i for i, view in enumerate(views) if (view.frame, view.time) == moment])
+    ring = order_around_person(
+        views, [i for i, view in enumerate(views) if (view.frame, view.time) == moment]
+    )
     step = len(ring) / count if spread else max(1, round(len(ring) * APART / 360))
 
     def at(place: float) -> int:
@@ -171,7 +175,13 @@ def task_of(
     if not spread:
         gaps = [(views[a], views[b]) for a, b in pairwise(sources)]
         found = [
-            x for x in found if any(angle(x, a) + angle(x, b) < 1.3 * angle(a, b) for a, b in gaps)
+            x
+            for x in found
+            if any(
+                angle_between_views(x, a) + angle_between_views(x, b)
+                < 1.3 * angle_between_views(a, b)
+                for a, b in gaps
+            )
         ]
     return sources, found
 
@@ -248,7 +258,7 @@ def _scores(
 def _table(found: Sequence[Score], counts: Sequence[int]) -> Table:
     """Return the table: means over people and views, medians of times."""
     last = ("scene, CPU s", "trained, CPU s", "ms a picture", "MB")
-    head = ["method", *(counted(n, "view") for n in counts), *last]
+    head = ["method", *(format_count(n, "view") for n in counts), *last]
     cells = []
     for name in dict.fromkeys(score.method for score in found):
         own = [score for score in found if score.method == name]

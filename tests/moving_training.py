@@ -12,7 +12,7 @@ from tiny_fields import cloud
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.core.state import part_of, strip_roles
+from dyngs.core.state import select_prefix, strip_roles
 from dyngs.data.loader import Image
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import create_field
@@ -85,7 +85,7 @@ class Run:
         gradients."""
         left_out = self.training.optimize(self.scene, step)
         if result is not None and result.edit is not None:
-            edited = self.scene.edited(result.edit)
+            edited = self.scene.apply_edit(result.edit)
             self.scene = edited.with_gaussians(leaves(edited.gaussians))
         self.scene = self.training.after_step(self.scene, step, result is not None)
         return int(left_out)
@@ -100,7 +100,7 @@ class Run:
     @property
     def model_state(self) -> dict[str, Tensor]:
         """What is stored beside the Gaussians."""
-        return part_of(strip_roles(self.scene.state()), "model")
+        return select_prefix(strip_roles(self.scene.state()), "model")
 
 
 def new_run(

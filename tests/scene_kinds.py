@@ -8,8 +8,8 @@ from tiny_fields import ALL_KINDS as FIELDS
 from tiny_fields import cloud, stirred_field, tiny_options
 
 from dyngs.core.camera import Cameras
-from dyngs.core.state import State, part_of, strip_roles
-from dyngs.deform.fields import OPEN, WindowedField
+from dyngs.core.state import State, select_prefix, strip_roles
+from dyngs.deform.fields import OPEN_WINDOW, WindowedField
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
@@ -38,7 +38,7 @@ def scene_of_kind(kind: str) -> GaussianScene:
     clip."""
     std = 0.01 + torch.arange(9.0) / 100
     if kind == "static":
-        return StaticScene(gaussians=cloud(), filter_std=std, seen_at=SEEN_AT)
+        return StaticScene(gaussians=cloud(), filter_std=std, training_times=SEEN_AT)
     if kind == "human":
         return _person()
     masks = None
@@ -48,10 +48,10 @@ def scene_of_kind(kind: str) -> GaussianScene:
     field = stirred_field(_field(kind), len(MOVING))
     if kind == "windowed":
         field = WindowedField(field, len(MOVING))
-        field.edges.data[:] = torch.tensor([[0.1, 0.4], [0.3, 1.2], [-0.1, 0.8], OPEN])
+        field.edges.data[:] = torch.tensor([[0.1, 0.4], [0.3, 1.2], [-0.1, 0.8], OPEN_WINDOW])
     return DynamicScene(
         gaussians=cloud(),
-        seen_at=SEEN_AT,
+        training_times=SEEN_AT,
         field=field,
         moving=MOVING,
         filter_std=std,
@@ -63,13 +63,13 @@ def scene_of_kind(kind: str) -> GaussianScene:
 def restored(kind: str, state: State) -> GaussianScene:
     """The scene of what is stored, but for its colours."""
     tensors = {name: x.clone() for name, x in strip_roles(state).items()}
-    gaussians = Gaussians.stored(part_of(tensors, "gaussians"))
-    own = part_of(tensors, "model")
+    gaussians = Gaussians.stored(select_prefix(tensors, "gaussians"))
+    own = select_prefix(tensors, "model")
     if kind == "static":
-        return StaticScene.restored(gaussians, own)
+        return StaticScene.from_state(gaussians, own)
     if kind == "human":
-        return HumanScene.restored(gaussians, own)
-    return DynamicScene.restored(DynamicModel(deform=tiny_options(_field(kind))), gaussians, own)
+        return HumanScene.from_state(gaussians, own)
+    return DynamicScene.from_state(DynamicModel(deform=tiny_options(_field(kind))), gaussians, own)
 
 
 def onlooker() -> Cameras:

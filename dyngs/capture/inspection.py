@@ -362,10 +362,10 @@ def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:
         else f" ({_range(capture.file_time_span)} in the files)"
     )
     yield "times", f"{len(times)} in {_range(times)}{written}"
-    cameras = counted(len({view.camera_id for view in views}), "camera")
+    cameras = format_count(len({view.camera_id for view in views}), "camera")
     yield (
         "sequence",
-        f"{cameras} x {counted(len(times), 'time')}, {counted(len(views), 'image')}",
+        f"{cameras} x {format_count(len(times), 'time')}, {format_count(len(views), 'image')}",
     )
     if capture.fps is not None:
         yield "frame rate", f"{capture.fps:.6g} per second"
@@ -520,7 +520,7 @@ def video_facts(video: CameraVideo) -> tuple[dict[str, str], bool]:
         "frames": f"{len(video.seconds)} in {video.seconds[-1] + 1 / video.rate:.2f} s, {rate}",
         "colours": video.info.colours,
         "sound": "yes" if has_sound else "none",
-        "sharpness": counted(blurred, "blurred frame"),
+        "sharpness": format_count(blurred, "blurred frame"),
         "camera": f"moves by up to {displaced:.1%} of its width, {np.median(measures.motion):.2%} from frame to frame",
     }
     stands = displaced <= FIXED_CAMERA_LIMIT

@@ -24,9 +24,15 @@ import torch
 from torch import Tensor
 
 from dyngs.compress.measure import find_coarsest_file
-from dyngs.compress.stage import PROBED_VIEWS, probe_images, quality_of, removal, scores_of
+from dyngs.compress.stage import (
+    PROBED_VIEWS,
+    build_removal_edit,
+    importance_scores,
+    mean_psnr,
+    probe_images,
+)
 from dyngs.config import AutoColour, Config
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.training import HELD_OUT_EVERY, MeasuredView, find_view_dependent
@@ -34,7 +40,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.renderable import Posable
 from dyngs.models.views import background_colour
-from dyngs.ops.device import sent
+from dyngs.ops.device import copy_async
 from dyngs.training.new_trainer import GaussianTrainer
 from dyngs.training.trainer import TrainingEdit
 
@@ -69,7 +75,7 @@ def apply_choice(trainer: GaussianTrainer, choice: PruneChoice, scores: Tensor) 
     prune = config.prune.model_copy(update={"fraction": choice.fraction})
     changed = {"model": model, "colour": colour, "prune": prune}
     trainer.apply(TrainingEdit(config=config.model_copy(update=changed)))
-    trainer.apply(removal(trainer, scores if choice.fraction else None))
+    trainer.apply(build_removal_edit(trainer, scores if choice.fraction else None))
     if choice.harmonics:
         _drop_harmonics(trainer, choice.harmonics)
 
@@ -78,7 +84,7 @@ def _drop_harmonics(trainer: GaussianTrainer, tolerance: float) -> None:
     usable = [i for i in range(len(trainer.images)) if i not in trainer.held_out]
     judged = usable[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY] or usable[:1]
     seen = [i for i in usable if i not in judged] or judged
-    background = sent(background_colour(trainer.background), trainer.device)
+    background = copy_async(background_colour(trainer.background), trainer.device)
     looks = list(_looks(trainer, judged, background))
     found = find_view_dependent(
         _looks(trainer, seen, background), looks, trainer.model.options, background, tolerance
@@ -198,7 +204,7 @@ class Search:
         self.trials = 0
         self._config = trainer.config
         trainer.hold_out(self.held_out)
-        self._scores = scores_of(trainer, trainer.config.prune)
+        self._scores = importance_scores(trainer, trainer.config.prune)
         self._truths = (
             list(unseen) or [trainer.images[i] for i in self.held_out] or probe_images(trainer)
         )
@@ -206,7 +212,7 @@ class Search:
         self._others = [others[i] for i in evenly_spaced(len(others), PROBED_VIEWS)]
         self.views = "its only training view"
         if unseen:
-            self.views = f"{counted(len(unseen), 'view')} never trained on"
+            self.views = f"{format_count(len(unseen), 'view')} never trained on"
         elif self.held_out:
             self.views = f"{len(self.held_out)} training views held out"
         self._is_fair = bool(unseen)
@@ -234,7 +240,7 @@ class Search:
         how = "" if self._is_fair else ", fine-tuned on the others"
         count = len(self._scores)
         self.tell(
-            f"as it is{how}: {counted(count, 'Gaussian')}, {self._reference:.2f} dB on {self.views}"
+            f"as it is{how}: {format_count(count, 'Gaussian')}, {self._reference:.2f} dB on {self.views}"
         )
         has_harmonics = bool(self.start.tensors["gaussians.sh"][:, 1:].any())
         alpha_min = self._config.model.alpha_min
@@ -273,14 +279,14 @@ class Search:
         )
 
     def _quality(self, scene: GaussianScene) -> float:
-        return quality_of(self.trainer, scene, self._truths, alpha_min=scene.options.alpha_min)
+        return mean_psnr(self.trainer, scene, self._truths, alpha_min=scene.options.alpha_min)
 
     def _measured(self) -> tuple[float, float]:
         """Return the PSNR of the scene of the trainer on views held out, and on others."""
         scene = self.trainer.model.scene
         others = [self.trainer.images[i] for i in self._others]
-        held_out = quality_of(self.trainer, scene, self._truths)
-        return held_out, quality_of(self.trainer, scene, others)
+        held_out = mean_psnr(self.trainer, scene, self._truths)
+        return held_out, mean_psnr(self.trainer, scene, others)
 
     def _bisected(self, levels: Sequence[PruneChoice], allowed: float) -> Candidate | None:
         """Return the last of ``levels`` that loses at most ``allowed``, as if all before it did."""
@@ -291,7 +297,7 @@ class Search:
             tried = self._tried(choice)
             keeps = tried.worst <= allowed
             self.tell(
-                f"trial {self.trials}: without {tried.choice}: {counted(tried.num_gaussians, 'Gaussian')}, "
+                f"trial {self.trials}: without {tried.choice}: {format_count(tried.num_gaussians, 'Gaussian')}, "
                 f"{-tried.loss:+.2f} dB, {-tried.trained_loss:+.2f} on views trained on, "
                 f"{'kept' if keeps else f'more than {allowed:.2f} dB lost'}"
             )

@@ -59,7 +59,9 @@ def _section(section: BaseModel, values: dict[str, Any], depth: int) -> Iterator
         about = info.description or ""
         if is_section:
             yield "" if depth == 0 else f"{space}#"
-            about = f"{about}; kind is one of {', '.join(list_kinds(info))}" if list_kinds(info) else ""
+            about = (
+                f"{about}; kind is one of {', '.join(list_kinds(info))}" if list_kinds(info) else ""
+            )
         elif name != "kind":
             about += f" ({allowed_values(info)})"
         yield from (f"{space}# {line}" for line in textwrap.wrap(about, WIDTH - 2 - len(space)))

@@ -32,7 +32,7 @@ from dyngs.data.images.images import (
 )
 from dyngs.data.images.lens import LensMap, is_pinhole, undistort, undistort_map
 from dyngs.data.read import view_size
-from dyngs.ops.device import CPU, gpu_memory, sent
+from dyngs.ops.device import CPU, copy_async, gpu_memory
 
 # A downscaled pixel is kept if the mean of the mask over its area reaches this value.
 FULLY_KEPT = 1 - 1e-4
@@ -342,7 +342,7 @@ class ImageLoader:
         if found is not None:
             return found
         image = self._on_demand(index) if pending is None else pending.result()
-        found = {name: sent(x, self._device) for name, x in image.items()}
+        found = {name: copy_async(x, self._device) for name, x in image.items()}
         size = _num_bytes(found)
         left = sum((i, 1) not in self._cache.images for i in range(len(self))) - 1
         waiting = min(2 * self._threads, left) * size

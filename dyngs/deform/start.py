@@ -1,4 +1,4 @@
-"""The kind of moving scenes: what they begin with, and how they are restored."""
+"""Creation and restoration of dynamic models."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
-from dyngs.deform.bodies.paths import FrameStack, render_frame_stack, one_camera
+from dyngs.deform.bodies.paths import FrameStack, order_moving_camera, render_frame_stack
 from dyngs.deform.fixed_cameras.hulls import FixedCameraClip, build_fixed_camera_clip
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.kind import DYNAMIC
@@ -15,60 +15,71 @@ from dyngs.deform.schedule import deform_schedule
 from dyngs.deform.static_errors import (
     StaticErrors,
     group_fixed_cameras,
-    static_errors,
     select_comparison_views,
+    static_errors,
 )
 from dyngs.deform.training import SURELY_MOVING, DynamicTraining, TrainingViews
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.training import ColourTraining
+from dyngs.gaussians.initialization import (
+    build_colour_training,
+    build_densifier,
+    build_filter_update,
+    load_or_create_gaussians,
+)
 from dyngs.gaussians.model import GaussianModel, training_options
 from dyngs.gaussians.rendering import Shader
 from dyngs.gaussians.scene import restore_appearance
 from dyngs.gaussians.schedule import rate_schedule
-from dyngs.gaussians.initialization import colours_of, build_densifier, build_filter_update, load_or_create_gaussians
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background, training_cameras, training_times
 
-MAX_STANDING = 12  # Fixed cameras from which tracks are found, at most
-MAX_SHOTS = 150  # Images of one moving camera in which bodies are sought, at most
-# Steps of the run for each: those take ten times as long as the search in one image
-STEPS_PER_SHOT = 50
-SECONDS_PER_SHOT = 3.0  # Of train.minutes for each, where that is given, likewise
+MAX_FIXED_CAMERAS = 12  # most fixed cameras in which tracks are searched
+MAX_SEARCHED_IMAGES = 150  # most images of a moving camera in which rigid bodies are searched
+# Training steps per searched image, because the search takes as long as ten steps.
+STEPS_PER_IMAGE = 50
+SECONDS_PER_IMAGE = 3.0  # seconds of ``train.minutes`` per searched image
 
 
 def start(run: StartContext) -> GaussianModel:
-    """Return the model of a moving scene before its first step. Raises DyngsError: there are no
-    times to move in."""
+    """Create the model of a dynamic scene before its first step.
+
+    Raises DyngsError if the images have no times.
+    """
     model = run.config.model
     assert isinstance(model, DynamicModel)
     problem = DYNAMIC.refusal(run.capture)
     if problem is not None:
         raise DyngsError(f"{run.config.data.root}: {problem}")
     gaussians = load_or_create_gaussians(run)
-    colours = colours_of(run, gaussians, uses_time=True)
+    colours = build_colour_training(run, gaussians, uses_time=True)
     schedule = deform_schedule(model, rate_schedule(run.config))
     views = _training_views(run, model, colours)
     training = DynamicTraining(model, schedule, views, build_filter_update(run), run.generator)
-    return GaussianModel(run, training.first_scene(gaussians), training, build_densifier(run), colours)
+    return GaussianModel(
+        run, training.first_scene(gaussians), training, build_densifier(run), colours
+    )
 
 
 def restore(model: DynamicModel, checkpoint: Checkpoint) -> DynamicScene:
-    """Return the scene of a checkpoint."""
-    scene = DynamicScene.restored(
+    """Return the scene in a checkpoint."""
+    scene = DynamicScene.from_state(
         model, Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
     )
     return restore_appearance(scene, model, checkpoint)
 
 
-def _training_views(run: StartContext, model: DynamicModel, colours: ColourTraining) -> TrainingViews:
+def _training_views(
+    run: StartContext, model: DynamicModel, colours: ColourTraining
+) -> TrainingViews:
     config = run.config
     capture = run.capture
     images = run.images
     views = capture.splits["train"]
     _, background = evaluation_background(config.data.background, capture.has_alpha)
-    divisor = image_divisor(config.train, deform_schedule(model, rate_schedule(config)).fine)
+    divisor = image_divisor(config.train, deform_schedule(model, rate_schedule(config)).coarse_end)
     looked_at = select_comparison_views(views)
     options = training_options(run)
 
@@ -76,26 +87,28 @@ def _training_views(run: StartContext, model: DynamicModel, colours: ColourTrain
         return None if colours.network is None else colours.network.shader(time)
 
     def errors_of(gaussians_at: Callable[[float], Gaussians]) -> StaticErrors:
-        shown = [images.downscaled(i, divisor) for i in looked_at]
-        sure = SURELY_MOVING * model.motion_threshold
-        return static_errors(gaussians_at, shown, options, background, shader, sure)
+        shown = [images.shrunk(i, divisor) for i in looked_at]
+        mask_error = SURELY_MOVING * model.motion_threshold
+        return static_errors(gaussians_at, shown, options, background, shader, mask_error)
 
     in_place = group_fixed_cameras(views)
 
-    def standing() -> list[FixedCameraClip]:
-        used = [in_place[i] for i in evenly_spaced(len(in_place), MAX_STANDING)]
+    def fixed_clips() -> list[FixedCameraClip]:
+        used = [in_place[i] for i in evenly_spaced(len(in_place), MAX_FIXED_CAMERAS)]
         total = sum(map(len, used))
-        return [build_fixed_camera_clip((images[i] for i in seen), background, total) for seen in used]
+        return [
+            build_fixed_camera_clip((images[i] for i in seen), background, total) for seen in used
+        ]
 
-    def shots(still: Gaussians) -> FrameStack | None:
-        order = one_camera(views)
-        limit = min(MAX_SHOTS, rate_schedule(config).steps // STEPS_PER_SHOT)
+    def frame_stack(static: Gaussians) -> FrameStack | None:
+        order = order_moving_camera(views)
+        limit = min(MAX_SEARCHED_IMAGES, rate_schedule(config).steps // STEPS_PER_IMAGE)
         if config.train.minutes is not None:
-            limit = min(limit, int(60 * config.train.minutes / SECONDS_PER_SHOT))
+            limit = min(limit, int(60 * config.train.minutes / SECONDS_PER_IMAGE))
         if order is None or limit == 0 or len(set(images.sizes)) > 1:
             return None
         used = (images[order[i]] for i in evenly_spaced(len(order), limit))
-        return render_frame_stack(used, still, options, background, shader)
+        return render_frame_stack(used, static, options, background, shader)
 
     return TrainingViews(
         training_times(capture),
@@ -103,7 +116,7 @@ def _training_views(run: StartContext, model: DynamicModel, colours: ColourTrain
         run.extent,
         errors_of,
         has_fixed_cameras=bool(in_place),
-        standing=standing,
-        shots=shots,
+        fixed_clips=fixed_clips,
+        frame_stack=frame_stack,
         options=options,
     )

@@ -14,15 +14,8 @@ import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, format_one_line
-from dyngs.data.geometry import from_opengl_pose, invert_rigid, pinhole_matrix, validate_pose
-from dyngs.io.fields import (
-    as_float_array,
-    is_number,
-    parse_numbers,
-    read_json,
-    require_at_most,
-    require_key,
-)
+from dyngs.data.geometry import cam_from_opengl, checked_pose, inverse_rigid, pinhole_matrix
+from dyngs.io.fields import entry, float_array, is_number, numbers_of, read_json, require_at_most
 
 _MAX_FRAMES = 100_000
 """A longer path is taken for a typing mistake."""
@@ -109,7 +102,8 @@ def parse_times(text: str) -> tuple[float, ...]:
         start, stop, count = 0.0, 0.0, 0
     if not (math.isfinite(start) and math.isfinite(stop) and 1 <= count <= _MAX_FRAMES):
         raise DyngsError(
-            f"{format_one_line(repr(text), 60)} is no range of times; write START:STOP:COUNT, for instance 0:1:60 for 60 "
+            f"{format_one_line(repr(text), 60)} is no range of times; write START:STOP:COUNT, "
+            "for instance 0:1:60 for 60 "
             "evenly spaced times"
         )
     return tuple(np.linspace(start, stop, count).tolist())

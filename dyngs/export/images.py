@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import ProgressCallback, ignore_progress, encode_srgb
+from dyngs.core.conventions import ProgressCallback, encode_srgb, ignore_progress
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import ImageLoader
@@ -342,7 +342,7 @@ def compare_file_with_run(
     return _compare(wanted, frame.cameras(cameras), read, scene.options.near * frame.scale)
 
 
-def compare_file_with_source(splat: SplatFile, written: WrittenFile) -> float:
+def compare_file_with_source(splat: SplatFile, written: Written) -> float:
     """Return the PSNR, dB, of a file and what it was converted from, seen from an orbit.
 
     Raises DyngsError: the file cannot be read.

@@ -14,12 +14,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from dyngs.core.conventions import SH_C0
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.core.gaussians import Gaussians
 from dyngs.deform.bodies.field import BodyField, find_body_field
 from dyngs.deform.scene import field_scene_of
 from dyngs.gaussians.colour.network import bake_harmonics
-from dyngs.gaussians.levels import MERGED, levels_of
+from dyngs.gaussians.levels import MERGED, build_levels
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
     SOG_INDEX,
@@ -53,7 +53,7 @@ from dyngs.io.formats.splat_file import (
 from dyngs.io.gltf import GlbDocument
 from dyngs.io.outputs import atomic_folder, require_new_folder
 from dyngs.io.write import atomic_file
-from dyngs.ops.quaternions import rotation_matrices, align_quat_signs, unit_quats
+from dyngs.ops.quaternions import align_quat_signs, rotation_matrices, unit_quats
 from dyngs.runs.folder import collect_inputs
 from dyngs.runs.opened import OpenedScene
 
@@ -69,7 +69,7 @@ def write_sog_levels(folder: Path, splat: SplatFile) -> tuple[int, ...]:
     Raises DyngsError: the folder holds something, or cannot be written.
     """
     require_new_folder(folder)
-    levels = levels_of(splat.gaussians).levels[: COARSEST + 1]
+    levels = build_levels(splat.gaussians).levels[: COARSEST + 1]
     counts = tuple(len(level) for level in levels)
     names: list[str] = []
     with atomic_folder(folder) as started:
@@ -168,7 +168,7 @@ def choose_write_options(
         return WriteOptions(
             up=own, sh_degree=sh_degree
         ), f"axes are those of the {frame.removesuffix('ed run')}{known}"
-    found = up_of(opened) if from_up is None else (parse_axis(from_up), "--from-up")
+    found = find_up_direction(opened) if from_up is None else (axis_of(from_up), "--from-up")
     if found is None:
         line = "nothing says which way is up in this run, so axes are those of the capture; --from-up=AXIS tells it"
         return WriteOptions(sh_degree=sh_degree), line
@@ -177,11 +177,11 @@ def choose_write_options(
     here = next((name for name, axis in AXES.items() if axis == direction), "a slanted direction")
     turned = f"turned, it was {here} in the {frame}"
     turned = f"the axes of the {frame} are kept" if here == wanted else turned
-    how = WriteOptions(rotation_between(direction, parse_axis(wanted)), wanted, sh_degree)
+    how = WriteOptions(turn_between(direction, axis_of(wanted)), wanted, sh_degree)
     return how, f"up is {wanted} in the file ({turned}, says {who})"
 
 
-def up_of(opened: OpenedScene) -> tuple[tuple[float, ...], str] | None:
+def find_up_direction(opened: OpenedScene) -> tuple[tuple[float, ...], str] | None:
     """Return the direction (3,) that is up and what says so: an axis where one is within 30
     degrees; None: nothing.
 
@@ -198,8 +198,12 @@ def up_of(opened: OpenedScene) -> tuple[tuple[float, ...], str] | None:
 
 
 def write_run_splats(
-    opened: OpenedScene, path: Path, time: float = 0.0, part: Part = "all", how: WriteOptions = DEFAULT_WRITE_OPTIONS
-) -> WrittenFile:
+    opened: OpenedScene,
+    path: Path,
+    time: float = 0.0,
+    part: Part = "all",
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
+) -> Written:
     """Write a run at a time in [0, 1] as a file of Gaussians; its suffix names the format.
 
     A 3D filter is fused, and colours of a network become harmonics; the header, where the format
@@ -242,7 +246,11 @@ def write_run_sequence(
 
 
 def write_run_levels(
-    opened: OpenedScene, folder: Path, time: float = 0.0, part: Part = "all", how: WriteOptions = DEFAULT_WRITE_OPTIONS
+    opened: OpenedScene,
+    folder: Path,
+    time: float = 0.0,
+    part: Part = "all",
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Write a run at a time as a new folder of .sog in levels of detail; return Gaussians by level,
     and notes.
@@ -267,7 +275,10 @@ def scene_part(scene: GaussianScene, part: Part) -> GaussianScene:
 
 
 def splats_at(
-    opened: OpenedScene, scene: GaussianScene, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
+    opened: OpenedScene,
+    scene: GaussianScene,
+    time: float,
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> SplatFile:
     """Return what a file of Gaussians is to hold of a scene at one time, in the axes that are asked
     for.
@@ -326,7 +337,7 @@ def tracks_of(
         scene_part(scene, "moving")
     ids = torch.arange(len(scene), device="cpu")
     ids = ids[moves] if part == "moving" else ids
-    kind = np.float32 if frame == IDENTITY else np.float64
+    kind = np.float32 if frame == UNMOVED else np.float64
     whole = scene.without_masks()
     positions = np.empty((len(ids), len(times), 3), kind)
     for k, time in enumerate(times):
@@ -349,9 +360,9 @@ def write_tracks(path: Path, tracks: Tracks) -> Path:
     return path
 
 
-SUFFIX = ".4dgs"
-UP = "-y"
-FPS = 30.0
+FOURDGS_SUFFIX = ".4dgs"
+FOURDGS_UP = "-y"
+FOURDGS_FPS = 30.0
 
 
 def write_4dgs(
@@ -370,7 +381,7 @@ def write_4dgs(
     model, delta, files = _fourdgs(path)
     scene = scene_part(opened.scene, part)
     splats = tuple(splats_at(opened, scene, time, how) for time in times)
-    duration = len(times) / FPS
+    duration = len(times) / FOURDGS_FPS
     samples = []
     for i, splat in enumerate(splats):
         gaussians = splat.gaussians
@@ -382,20 +393,20 @@ def write_4dgs(
             rotations=unit_rotations(gaussians.quats).numpy()[:, [1, 2, 3, 0]],
             colors=rgba.numpy(),
             motions=np.zeros((n, 3), np.float32),
-            mu_t=np.full(n, i / FPS, np.float32),
+            mu_t=np.full(n, i / FOURDGS_FPS, np.float32),
             # standard deviation in time: a Gaussian never fades
             sigma_t=np.full(n, 1e4 * duration, np.float32),
             win_lo=np.zeros(n, np.float32),
             win_hi=np.full(n, duration, np.float32),
         )
-        samples.append(delta.Sample(t0=i / FPS, ids=np.arange(n), gaussians=states))
+        samples.append(delta.Sample(t0=i / FOURDGS_FPS, ids=np.arange(n), gaussians=states))
     options = delta.KeyframeDeltaOptions(keyframe_every=8)
     data = files.write_sequence(samples, duration, kd=options, profile="fine", library="dyngs")
     with atomic_file(path) as temporary:
         temporary.write_bytes(data)
     notes = (
-        f"{counted(len(times), 'time')}, each shown for 1/{FPS:.0f} s",
-        *offset_notes(splats[0], "4dgs cannot store it"),
+        f"{format_count(len(times), 'time')}, each shown for 1/{FOURDGS_FPS:.0f} s",
+        *offset_notes(splats[0], "4dgs cannot state it"),
     )
     if any(bool(splat.gaussians.sh[:, 1:].any()) for splat in splats):
         notes += (
@@ -411,7 +422,7 @@ def read_4dgs_frame(path: Path, index: int) -> SplatFile:
     Raises DyngsError: the package is missing, or values that are not finite.
     """
     _, _, files = _fourdgs(path)
-    found = files.render_at(files.decode_streamed(path.read_bytes()), (index + 0.5) / FPS)
+    found = files.render_at(files.decode_streamed(path.read_bytes()), (index + 0.5) / FOURDGS_FPS)
     sh = ((found["rgb"] - 0.5) / SH_C0)[:, None]
     quats = found["rotations"][:, [3, 0, 1, 2]]
     gaussians = from_linear(found["centers"], quats, found["scales"], found["opacity"], sh)
@@ -432,7 +443,7 @@ def _fourdgs(path: Path) -> tuple[Any, Any, Any]:
 @torch.no_grad()
 def write_rigid_bodies(
     opened: OpenedScene, path: Path, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
-) -> WrittenFile:
+) -> Written:
     """Write a run at a time in [0, 1] as .glb: a node for each body, with its motion as an
     animation, one for the rest.
 

@@ -79,7 +79,7 @@ def read_tensors(
             is_there = not isinstance(error, FileNotFoundError)
             advice = "; the file may be intact: keep it and try again" if is_there else ""
         raise DyngsError(
-            f"{path}: cannot be read as {kind.what} ({reason(error)}){advice}"
+            f"{path}: cannot be read as {kind.what} ({describe_error(error)}){advice}"
         ) from error
     if not isinstance(header, dict) or "format" not in header:
         raise DyngsError(f"{path}: not {kind.what} of dyngs{advice}")

@@ -21,7 +21,7 @@ from dyngs.models.checkpoint import CONFIG_ADVICE, Checkpoint
 from dyngs.models.model import Model
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour, evaluation_background
-from dyngs.ops.device import CPU, sent
+from dyngs.ops.device import CPU, copy_async
 from dyngs.ops.loss import l1_ssim_loss
 
 GROUPS = 8
@@ -191,7 +191,7 @@ class Learner(ABC, Generic[N]):
 
     def sample_background(self, generator: torch.Generator) -> Tensor:
         """Return the colour (3,) behind an example."""
-        return sent(background_colour(self.background, generator), self.device)
+        return copy_async(background_colour(self.background, generator), self.device)
 
     @abstractmethod
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
@@ -249,7 +249,7 @@ def image_loss(
     return loss
 
 
-def updated(
+def optimizer_step(
     optimizer: torch.optim.Optimizer, network: nn.Module, loss: Tensor, rate: float
 ) -> bool:
     """Do a step at the learning rate ``rate``; return False, and do none, for gradients that are

@@ -36,7 +36,13 @@ WRITERS = {
     "write_tensors",
     "save_config",
 }
-CHECKS = {"require_output", "require_empty", "require_new_folder", "new_folder", "folder_of_export"}
+CHECKS = {
+    "require_output",
+    "require_empty",
+    "require_new_folder",
+    "new_folder",
+    "open_export_folder",
+}
 ROOMS_BELOW = ("files/", "config/", "runs/", "data/images/", "splats/", "ops/")
 """Rooms of writers that are handed what they write, or that keep the run folder and the caches of
 dyngs itself."""
@@ -59,9 +65,9 @@ UNCHECKED = {
     "data/tracks.py:write_true_tracks": OWN,
     "evaluate/report.py:evaluate_run": "checks it in _require_possible",
     "export/splat_files.py:write_tracks": VALUES,
-    "human/fit/fitted_capture.py:write_body": OWN,
+    "human/fit/fitted_capture.py:write_body_file": OWN,
     "human/fit/fitted_capture.py:write_split": OWN,
-    "human/fit/fitted_capture.py:read_person": OWN,
+    "human/fit/fitted_capture.py:read_person_capture": OWN,
     "human/motion/amass.py:write_amass": VALUES,
     "storage/file.py:write_scene": VALUES,
     "study/runs.py:require_same_study": OWN,
@@ -117,12 +123,12 @@ def test_what_a_run_reads(tmp_path: Path) -> None:
     own = [run / RESOLVED_NAME, *checkpoint_paths(run)]
     for path in own:
         for named in (run, run / "checkpoints" / ".." / ".." / "run"):
-            with pytest.raises(DyngsError, match="which is an input"):
+            with pytest.raises(DyngsError, match="which is read"):
                 collect_inputs(named).require_output(path)
     for name in ("splats.ply", "metrics.json", "scene.dyngs"):
         (run / name).write_text("an export")
         collect_inputs(run).require_output(run / name)
     checkpoint_paths(run)[0].rename(run / "kept")
     for named in (run, run / "scene.dyngs"):
-        with pytest.raises(DyngsError, match="which is an input"):
+        with pytest.raises(DyngsError, match="which is read"):
             collect_inputs(named).require_output(run / "scene.dyngs")

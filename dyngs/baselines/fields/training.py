@@ -17,12 +17,12 @@ from dyngs.data.loader import Image
 from dyngs.gaussians.optimizer import AdamState
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
-from dyngs.models.model import Drawn, LossInput, Loss, Model, UpdateResult
+from dyngs.models.model import Loss, LossInput, Model, RenderOutput, UpdateResult
 from dyngs.models.renderable import DrawOptions, Rendering
 from dyngs.models.views import evaluation_background, training_times
-from dyngs.models.volume import rays_of
+from dyngs.models.volume import camera_rays
 from dyngs.ops.adam import seen_rows
-from dyngs.ops.device import sent
+from dyngs.ops.device import copy_async
 
 
 class ColourLoss(Loss):
@@ -108,18 +108,22 @@ class FieldTraining(Model[FieldScene]):
     def rate(self, step: int) -> float:
         """Return the learning rate in ``step``."""
 
-    def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+    def draw(
+        self, image: Image, step: int, background: Tensor, *, depth: bool = False
+    ) -> RenderOutput:
         generator = self._run.generator
         device = background.device
         field = self._scene.field
         camera = image.cameras.to(device=device)
         count = camera.width * camera.height
         pixels = torch.randint(count, (self.num_rays,), generator=generator, device="cpu")
-        shifts = torch.rand((len(pixels), field.num_shifts), generator=generator, device="cpu")
-        pixels = sent(pixels, device)
-        rays, z = rays_of(camera, pixels)
+        shifts = torch.rand(
+            (len(pixels), field.num_random_values), generator=generator, device="cpu"
+        )
+        pixels = copy_async(pixels, device)
+        rays, z = camera_rays(camera, pixels)
         near = self._scene.options.near
-        seen = field.seen(rays, image.time or 0.0, near=near, shifts=sent(shifts, device))
+        seen = field.seen(rays, image.time or 0.0, near=near, shifts=copy_async(shifts, device))
         self.count(len(rays), seen.num_samples)
         part = part_of(image, pixels)
         rgb = seen.colour + seen.transmittance[:, None] * background
@@ -132,7 +136,7 @@ class FieldTraining(Model[FieldScene]):
         if depth:
             far = (seen.depth * z / (1 - seen.transmittance).clamp_min(1e-9))[None, None]
         rendering = Rendering(rgb[None, None], seen.transmittance[None, None], far)
-        return Drawn(rendering, penalties, image=part)
+        return RenderOutput(rendering, penalties, image=part)
 
     def count(self, num_rays: int, num_samples: int) -> None:
         """Note how many samples the rays of an image needed."""
@@ -152,7 +156,7 @@ class FieldTraining(Model[FieldScene]):
     def restore(self, checkpoint: Checkpoint) -> None:
         self._learn(restore_scene(type(self._scene.field), self._model, checkpoint))
         parameters = self._scene.field.parameters
-        self._adam = AdamState.restored(checkpoint.part("adam"), parameters)
+        self._adam = AdamState.from_state(checkpoint.part("adam"), parameters)
 
     def place(self, device: torch.device) -> None:
         self._learn(self._scene.to(device))

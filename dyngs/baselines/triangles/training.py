@@ -17,37 +17,43 @@ from dyngs.baselines.triangles.scene import (
     Patches,
     TriangleOptions,
     TriangleScene,
-    evaluated,
+    evaluate_patches,
     flat_triangles,
-    quarters,
     restore_scene,
     scene_options,
+    subdivide,
 )
 from dyngs.config import DefaultStrategy, ShColour
 from dyngs.config.kinds import section_of_kind
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0, num_sh_terms
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.core.state import Role, State, add_prefix, with_role
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.training import ColourTraining
-from dyngs.gaussians.model import GaussianModel, SceneTraining
-from dyngs.gaussians.optimizer import AdamState
 from dyngs.gaussians.initialization import (
     InitialValues,
     build_densifier,
-    load_or_create_gaussians,
     initial_gaussians,
-    surroundings,
+    load_or_create_gaussians,
+    scene_geometry,
 )
+from dyngs.gaussians.model import GaussianModel, SceneTraining
+from dyngs.gaussians.optimizer import AdamState
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.gaussians.surface import colours_of, fused, opaque_box, seen_by, simplify_mesh
+from dyngs.gaussians.surface import (
+    fuse_depths,
+    opaque_box,
+    render_depth_view,
+    sample_colours,
+    simplify_mesh,
+)
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
-from dyngs.models.model import Drawn, Model, UpdateResult
-from dyngs.models.schedule import scaled
+from dyngs.models.model import Model, RenderOutput, UpdateResult
+from dyngs.models.schedule import scale_step
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.patches import NUM_POINTS, PatchSamples, lattice, lattice_size
@@ -65,7 +71,9 @@ SURFACE_CELLS = 128  # Along the scene, at most; no more than pixels along an im
 def _at_points(run: StartContext, model: BgTriangleModel) -> tuple[Patches, float]:
     """Return triangles turned at random, and half the side of the scene."""
     values = InitialValues(max_gaussians=min(NUM_FIRST, model.max_triangles))
-    first = initial_gaussians(surroundings(run.capture), run.config.init, values, 0, run.generator)
+    first = initial_gaussians(
+        scene_geometry(run.capture), run.config.init, values, 0, run.generator
+    )
     ends = first.means.quantile(torch.tensor([INNER, 1 - INNER], device="cpu"), dim=0)
     unit = float((ends[1] - ends[0]).max()) / 2
     if not unit > 0:
@@ -100,10 +108,10 @@ def _on_surface(run: StartContext, model: BgTriangleModel) -> tuple[Patches, flo
         for index in evenly_spaced(len(run.images), VIEWS):
             image = _shrunk(run.images[index])
             own = image.composite(torch.zeros(3, device="cpu"))
-            seen.append(replace(seen_by(scene, image.cameras), colour=own))
+            seen.append(replace(render_depth_view(scene, image.cameras), colour=own))
     low, high = opaque_box(scene.gaussians)
     cells = min(SURFACE_CELLS, max(max(one.depth.shape) for one in seen))
-    mesh = fused(seen, low, high, cells)
+    mesh = fuse_depths(seen, low, high, cells)
     mesh = None if mesh is None else simplify_mesh(mesh, min(NUM_FIRST, model.max_triangles))
     if mesh is None or len(mesh.faces) == 0:
         raise DyngsError(
@@ -112,7 +120,7 @@ def _on_surface(run: StartContext, model: BgTriangleModel) -> tuple[Patches, flo
         )
     vertices = torch.from_numpy(mesh.vertices).float()
     faces = torch.from_numpy(mesh.faces)
-    colours = colours_of(seen, vertices, 2 * float((high - low).max()) / cells)
+    colours = sample_colours(seen, vertices, 2 * float((high - low).max()) / cells)
     corners = vertices[faces]
     ends = corners.flatten(0, 1)
     unit = float((ends.amax(0) - ends.amin(0)).max()) / 2
@@ -192,7 +200,7 @@ class TriangleStatistics:
         self.seen += (shown > 0).to(self.seen)
         scale = places.rows.shape[1] // slopes.shape[0]
         fine = interpolate(slopes[None, None], scale_factor=scale)[0, 0] / scale**2
-        inside = fine[places.rows[0] >= 0] * ~outlines(places)
+        inside = fine[places.rows[0] >= 0] * ~near_outline(places)
         self.edges += torch.bincount(ids, weights=inside.double(), minlength=size).to(self.edges)
         u, v = (places.uv * (CELLS - 1)).long().clamp(0, CELLS - 1).unbind(1)
         cell = (ids * CELLS + u) * CELLS + v
@@ -204,7 +212,7 @@ class TriangleStatistics:
         return with_role(self.tensors(), Role.TRAINING)
 
     @staticmethod
-    def restored(stored: Mapping[str, Tensor], count: int) -> TriangleStatistics:
+    def from_state(stored: Mapping[str, Tensor], count: int) -> TriangleStatistics:
         """Return the tallies of ``count`` triangles in a state. Raises KeyError or ValueError."""
         found = TriangleStatistics(count)
         for name, x in found.tensors().items():
@@ -224,7 +232,7 @@ def max_pixels(scene: TriangleScene, cameras: Iterable[Cameras]) -> Tensor:
     return most
 
 
-def outlines(places: PatchSamples) -> Tensor:
+def near_outline(places: PatchSamples) -> Tensor:
     """Return (N,) bool: which places lie within two drawn pixels of an outline, see
     ``blend_patches``."""
     rows = places.rows[0]
@@ -263,11 +271,11 @@ def patch_areas(points: Tensor) -> Tensor:
     """Return (P,) areas of the four flat triangles between corners and middles of the edges, world
     units squared."""
     places, faces = lattice(2)
-    a, b, c = evaluated(points, places)[:, faces].unbind(2)
+    a, b, c = evaluate_patches(points, places)[:, faces].unbind(2)
     return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=-1).sum(1)
 
 
-def useless(points: Tensor, tallies: TriangleStatistics, unit: float) -> Tensor:
+def prunable(points: Tensor, tallies: TriangleStatistics, unit: float) -> Tensor:
     """Return (P,) bool: rarely seen, tiny, needles, mostly hidden, or seen only as slivers between
     others."""
     corners = points[:, CORNERS]
@@ -282,7 +290,7 @@ def useless(points: Tensor, tallies: TriangleStatistics, unit: float) -> Tensor:
     )
 
 
-def change(
+def densify(
     patches: Patches, tallies: TriangleStatistics, unit: float, most: int, rounds: int
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return (K,) the rows that stay, and the rows of each learned tensor that come after them.
@@ -297,7 +305,7 @@ def change(
         rounds: how often triangles are split from now on, this time included.
     """
     points = patches.points.detach()
-    gone = useless(points, tallies, unit)
+    gone = prunable(points, tallies, unit)
     if bool(gone.all()):
         gone = torch.zeros_like(gone)
     left = int((~gone).sum())
@@ -310,11 +318,11 @@ def change(
     score = torch.where(may, gain, -1.0)
     chosen = score.sort(descending=True, stable=True).indices[:count].sort().values
     gone[chosen] = True
-    parts = quarters(points[chosen])
+    parts = subdivide(points[chosen])
     middles = parts.mean(1, keepdim=True)
     added = {
         "points": middles + ENLARGED * (parts - middles),
-        "colours": quarters(patches.colours.detach()[chosen]),
+        "colours": subdivide(patches.colours.detach()[chosen]),
         "harmonics": patches.harmonics.detach()[chosen].repeat_interleave(4, 0),
     }
     return (~gone).nonzero()[:, 0], added
@@ -385,7 +393,9 @@ class TriangleTraining(Model[TriangleScene]):
         """Whether textures are learned, and no triangle comes or goes."""
         return self._scene.patches.texture > 0
 
-    def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+    def draw(
+        self, image: Image, step: int, background: Tensor, *, depth: bool = False
+    ) -> RenderOutput:
         if self._awaits_surface:
             self._awaits_surface = False
             patches, unit = _on_surface(self._run, self._model)
@@ -396,7 +406,7 @@ class TriangleTraining(Model[TriangleScene]):
         rendering, places = self._scene.drawn(image.cameras, options, background)
         if not self.is_textured:
             self._now.count(places, image_gradients(image.composite(background)))
-        return Drawn(rendering)
+        return RenderOutput(rendering)
 
     def tallies(self, step: int) -> Sequence[Tensor]:
         return [] if self.is_textured else list(self._now.tensors().values())
@@ -420,9 +430,11 @@ class TriangleTraining(Model[TriangleScene]):
                 self._change(0, 1)  # what is useless goes, and nothing is split
             self._texture()
             count = len(self._scene)
-            return UpdateResult(bad, f"textures are learned from now on, on {count:,} triangles", True)
-        interval = max(LEAST_EVERY, scaled(EVERY, self._steps))
-        last = min(scaled(UNTIL, self._steps), self._first_texture)
+            return UpdateResult(
+                bad, f"textures are learned from now on, on {count:,} triangles", True
+            )
+        interval = max(LEAST_EVERY, scale_step(EVERY, self._steps))
+        last = min(scale_step(UNTIL, self._steps), self._first_texture)
         if step % interval or step > last:
             return UpdateResult(bad)
         self._change(self._model.max_triangles, 1 + (last - step) // interval)
@@ -444,7 +456,7 @@ class TriangleTraining(Model[TriangleScene]):
     def _texture(self) -> None:
         """Learn textures from now on, with the moments of what stays as it is."""
         before = self._adam
-        self._begin(self._scene.patches.textured(self._model.texture))
+        self._begin(self._scene.patches.with_texture(self._model.texture))
         for name in ("points", "harmonics"):
             self._adam.exp_avg[name] = before.exp_avg[name]
             self._adam.exp_avg_sq[name] = before.exp_avg_sq[name]
@@ -459,7 +471,7 @@ class TriangleTraining(Model[TriangleScene]):
             return UpdateResult(bad)
         none = {name: x.detach()[:0] for name, x in self._scene.patches.tensors.items()}
         self._exchange(stays.nonzero()[:, 0], none)
-        gone = f"{count - len(self._scene):,} of {counted(count, 'triangle')} are removed"
+        gone = f"{count - len(self._scene):,} of {format_count(count, 'triangle')} are removed"
         return UpdateResult(
             bad, f"{gone}: no training view shows more than {LEAST_SHOWN:g} px of them", True
         )
@@ -467,7 +479,7 @@ class TriangleTraining(Model[TriangleScene]):
     def _change(self, most: int, rounds: int) -> None:
         """Remove and split; see ``change``."""
         scene = self._scene
-        self._exchange(*change(scene.patches, self._tallies, scene.unit, most, rounds))
+        self._exchange(*densify(scene.patches, self._tallies, scene.unit, most, rounds))
 
     def _exchange(self, kept: Tensor, added: Mapping[str, Tensor]) -> None:
         """Keep the rows ``kept`` (K,), and add others, whose moments are 0."""
@@ -491,8 +503,8 @@ class TriangleTraining(Model[TriangleScene]):
         self._scene = restore_scene(self._model, checkpoint)
         patches = self._scene.patches
         self._learn(patches)
-        self._adam = AdamState.restored(checkpoint.part("adam"), patches.tensors)
-        self._tallies = TriangleStatistics.restored(checkpoint.part("tallies"), len(patches))
+        self._adam = AdamState.from_state(checkpoint.part("adam"), patches.tensors)
+        self._tallies = TriangleStatistics.from_state(checkpoint.part("tallies"), len(patches))
 
     def place(self, device: torch.device) -> None:
         if device.type != "cpu":

@@ -251,7 +251,7 @@ def probe_video(path: Path) -> VideoInfo:
 def colour_messages(videos: Iterable[VideoInfo]) -> list[str]:
     """Return a message for each kind of colour conversion among the videos of a capture."""
     counts = Counter(video.colours for video in videos if video.colours)
-    return [f"{counted(count, 'video')}: {note}" for note, count in counts.items()]
+    return [f"{format_count(count, 'video')}: {note}" for note, count in counts.items()]
 
 
 def frame_seconds(path: Path, num_frames: int) -> list[float]:
@@ -311,9 +311,9 @@ def _decoded(
         except FFmpegError as error:
             if index == 0:
                 raise DyngsError(
-                    f"cannot read the video {path}: {error.strerror or reason(error)}"
+                    f"cannot read the video {path}: {error.strerror or describe_error(error)}"
                 ) from error
-            raise _broken(path, index, error.strerror or reason(error)) from error
+            raise _broken(path, index, error.strerror or describe_error(error)) from error
 
 
 @contextmanager

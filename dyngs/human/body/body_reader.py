@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.capture import BodyFrames
-from dyngs.human.body.body import BodyTemplate, apply_shape, bone_shapes
+from dyngs.human.body.body import BodyTemplate, apply_shape, bone_shape_directions
 from dyngs.human.keys import HumanModel
 from dyngs.io.fields import read_limited, require_at_most
 from dyngs.io.numpy_files import read_arrays
@@ -76,7 +76,7 @@ def read_body(path: Path, uv: Path | None = None) -> BodyTemplate:
             joints = file.numbers("J", count, 3)
             rest = (x.astype(np.float32).astype(np.float64) for x in (vertices, joints, weights))
             bare, bones, skin = rest
-            dirs, joint_dirs = bone_shapes(bare, bones, parents, skin)
+            dirs, joint_dirs = bone_shape_directions(bare, bones, parents, skin)
             if "J_shapedirs" in arrays:  # before the directions of bones
                 own = file.numbers("shapedirs", size, 3, None)
                 own_joints = file.numbers("J_shapedirs", count, 3, own.shape[2])
@@ -184,7 +184,9 @@ def read_obj(path: Path, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Those of the file may come in any order, as ``f v/vt v/vt v/vt``. Raises DyngsError: the file
     cannot be read, or belongs to another body.
     """
-    with wrap_read_errors(path, "give the .obj made for this body, with triangles 'f v/vt v/vt v/vt'"):
+    with wrap_read_errors(
+        path, "give the .obj made for this body, with triangles 'f v/vt v/vt v/vt'"
+    ):
         uv = []
         triangles: dict[tuple[int, ...], dict[int, int]] = {}
         for line in read_limited(path).decode("latin-1").splitlines():

@@ -21,17 +21,17 @@ from dyngs.capture.masks import refine_outlines, resize_mask
 from dyngs.capture.sfm.photos import digest_files
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ProgressCallback, ignore_progress
-from dyngs.core.errors import DyngsError, counted, show
-from dyngs.data.capture import Capture, View, group_by_camera
+from dyngs.core.errors import DyngsError, format_count, log_info
+from dyngs.data.capture import Capture, View, by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.read import is_capture, read_capture
-from dyngs.human.detect.detector import SURE, Detection, Detector, MediaPipe
-from dyngs.human.fit.capture_fit import cheapest_path
+from dyngs.human.detect.detector import MIN_CONFIDENCE, Detection, Detector, MediaPipe
+from dyngs.human.fit.capture_fit import viterbi_path
 from dyngs.human.fit.fitted_capture import FitInputs, FittedCapture, write_fitted_capture
 from dyngs.io.outputs import make_once, record_source, require_new_folder
 from dyngs.io.write import cache_folder, temporary_folder_beside, write_image, write_text
 
-SWAP = 0.04
+SWAP_COST = 0.04
 """What a swapped image costs, in heights of the person by which each key point moves: a limb taken
 for the other one in a few images moves them more, and who has turned around stays so for long."""
 _PAIRS = {
@@ -42,7 +42,7 @@ _PAIRS = {
 """Key points of COCO on the left and on the right."""
 
 
-def with_sides(person: Sequence[Detection | None]) -> tuple[list[Detection | None], int]:
+def fix_left_right_swaps(person: Sequence[Detection | None]) -> tuple[list[Detection | None], int]:
     """Return the detections of a person (F) with left and right as over time, and in how many
     images that changed.
 
@@ -77,17 +77,17 @@ def _swapped(points: np.ndarray, pairs: np.ndarray, heights: np.ndarray) -> np.n
         return np.zeros(len(points), bool)
     # (2, F, P, 2, 3): as they are, swapped
     both = np.stack([points[:, pairs], points[:, pairs[:, ::-1]]])
-    sure: np.ndarray = np.all(points[:, pairs, 2] > SURE, axis=-1)  # (F, P)
+    sure: np.ndarray = np.all(points[:, pairs, 2] > MIN_CONFIDENCE, axis=-1)  # (F, P)
     weights = (sure[1:] & sure[:-1])[..., None]
     # (2, 2, F - 1, P, 2): from the row's state to the column's
     moved = np.linalg.norm(both[None, :, 1:, ..., :2] - both[:, None, :-1, ..., :2], axis=-1)
     units = heights[1:].clip(1e-6) * (2 * weights.sum((1, 2))).clip(1)
     changes = (moved * weights).sum((3, 4)) / units
-    costs = np.tile([0.0, SWAP], (len(points), 1))
-    return np.array(cheapest_path(costs, changes.transpose(2, 0, 1)), bool)
+    costs = np.tile([0.0, SWAP_COST], (len(points), 1))
+    return np.array(viterbi_path(costs, changes.transpose(2, 0, 1)), bool)
 
 
-def warnings_of(
+def capture_warnings(
     images: np.ndarray, person: Sequence[Detection | None], *, alone: bool = True
 ) -> list[str]:
     """Return lines on what will be bad.
@@ -108,16 +108,18 @@ def warnings_of(
     if count < len(images):
         gone = len(images) - count
         lines.append(
-            f"nobody is found in {gone} of {counted(len(images), 'image')}; these are left out"
+            f"nobody is found in {gone} of {format_count(len(images), 'image')}; these are left out"
         )
     if cut > 0.1 * count:
         lines.append(
-            f"the feet are cut off or hidden in {cut} of {counted(count, 'image')}; legs will be a guess there"
+            f"the feet are cut off or hidden in {cut} of {format_count(count, 'image')}; legs will be a guess there"
         )
     if height < 120:
         lines.append(f"the person is {height:.0f} px high; come nearer or record larger images")
     if blurred > 0.1 * count:
-        lines.append(f"{counted(blurred, 'image')} blurred; more light, or slower motion, helps")
+        lines.append(
+            f"{format_count(blurred, 'image')} blurred; more light, or slower motion, helps"
+        )
     if alone and not _turns(detections):
         lines.append("the person never turns around: what the camera never sees will be a guess")
     return lines
@@ -126,7 +128,7 @@ def warnings_of(
 def _is_cut_off(person: Detection, height: int) -> bool:
     ankles = person.keypoints[[15, 16]]
     return bool(
-        (ankles[:, 2] < SURE).all()
+        (ankles[:, 2] < MIN_CONFIDENCE).all()
         or (ankles[:, 1] > height - 2).any()
         or person.box[3] > height - 1.5
     )
@@ -143,12 +145,12 @@ def _turns(people: Sequence[Detection]) -> bool:
     """Whether the person is seen from the front and from behind: the left shoulder right of the
     right one, and left, by a tenth of their height."""
     left, right = (np.array([x.keypoints[row] for x in people]) for row in (5, 6))
-    sure = (left[:, 2] > SURE) & (right[:, 2] > SURE)
+    sure = (left[:, 2] > MIN_CONFIDENCE) & (right[:, 2] > MIN_CONFIDENCE)
     across = (left[sure, 0] - right[sure, 0]) / np.array([max(x.height, 1.0) for x in people])[sure]
     return bool((across > 0.1).any() and (across < -0.1).any())
 
 
-SIDE = 960  # longest side of the images that a detector sees, px
+DETECTOR_SIDE_PX = 960  # longest side of the images that a detector sees, px
 
 
 def detect_person(
@@ -156,7 +158,7 @@ def detect_person(
     detector: Detector,
     folder: Path,
     report: ProgressCallback,
-    log: Callable[[str], None] = show,
+    say: Callable[[str], None] = log_info,
 ) -> FitInputs:
     """Find a person in all views, write masks and key points to ``folder``, and return where they
     are.
@@ -170,12 +172,12 @@ def detect_person(
     cameras = [*group_by_camera(capture.splits).values()]
     for index, views in enumerate(cameras, 1):
         # A detector reads files, which only live here.
-        size = target_size(views[0].width, views[0].height, 1.0, SIDE)
+        size = target_size(views[0].width, views[0].height, 1.0, DETECTOR_SIDE_PX)
         files = [folder / "frames" / f"{row:06d}.png" for row in range(len(views))]
         images = np.stack([_shrunk_image(view, size) for view in views])
         for file, image in zip(files, images, strict=True):
             write_image(file, image)
-        person, swapped = with_sides(detector.detect(files))
+        person, swapped = fix_left_right_swaps(detector.detect(files))
         for file in files:
             file.unlink()
         report("cameras in which the person is found", index, len(cameras))
@@ -186,10 +188,10 @@ def detect_person(
         else:
             log(
                 f"{where}{detector.name} finds the person, {np.median(heights):.0f} px high, in {len(heights)} of "
-                f"{counted(len(person), 'image')}; left and right swapped in {counted(swapped, 'image')}"
+                f"{format_count(len(person), 'image')}; left and right swapped in {format_count(swapped, 'image')}"
             )
-            for warning in warnings_of(images, person, alone=len(cameras) == 1):
-                log(f"warning: {where}{warning}")
+            for warning in capture_warnings(images, person, alone=len(cameras) == 1):
+                say(f"warning: {where}{warning}")
         masks = np.zeros(images.shape[:3], bool)
         for row, own in enumerate(person):
             if own is not None:
@@ -207,7 +209,7 @@ def detect_person(
             write_image(folder / "masks" / f"{view.name}.png", resize_mask(mask, view))
     if not points:
         raise DyngsError(
-            f"{capture.root}: {detector.name} finds nobody in {counted(sum(map(len, cameras)), 'image')}; look at "
+            f"{capture.root}: {detector.name} finds nobody in {format_count(sum(map(len, cameras)), 'image')}; look at "
             "them, or give masks of another program to `dyngs data fit` (docs/person.md)"
         )
     _write_keypoints(folder / "keypoints.json", points)
@@ -234,13 +236,13 @@ def write_detected_person(
     out: Path,
     detector: Detector,
     report: ProgressCallback = ignore_progress,
-    log: Callable[[str], None] = show,
+    say: Callable[[str], None] = log_info,
 ) -> FittedCapture:
     """Find a person and fit the body to them: write the capture of ``write_fitted_capture`` to the
     new folder ``out``.
 
     ``options.root`` is a video or a folder of the frames of one standing camera, or a capture with
-    cameras. Raises DyngsError: see ``find_person`` and ``write_fitted_capture``.
+    cameras. Raises DyngsError: see ``detect_person`` and ``write_fitted_capture``.
     """
     require_new_folder(out)
     clip = (
@@ -251,14 +253,17 @@ def write_detected_person(
     folder = temporary_folder_beside(out.with_name(f"{out.name}.found"))
     try:
         capture = read_fixed_camera(options) if clip else read_capture(options)
-        found = detect_person(capture, detector, folder, report, log)
+        found = detect_person(capture, detector, folder, report, say)
         return write_fitted_capture(options, out, report, found)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def ensure_detected_person(
-    data: DataConfig, *, log: Callable[[str], None] = show, report: ProgressCallback = ignore_progress
+    data: DataConfig,
+    *,
+    say: Callable[[str], None] = log_info,
+    report: ProgressCallback = ignore_progress,
 ) -> DataConfig:
     """Return the options with the capture of the person that is found in a clip; the same clip is
     looked at once.
@@ -271,8 +276,8 @@ def ensure_detected_person(
 
     def find() -> None:
         detector = MediaPipe()
-        log(f"person:  found first, as by `dyngs data people`, into {folder}")
-        log(write_detected_person(data, folder, detector, report, log).summary)
+        say(f"person:  found first, as by `dyngs data people`, into {folder}")
+        say(write_detected_person(data, folder, detector, report, say).summary)
 
     make_once(folder, find, log, f"person:  found before, in {folder}")
     record_source(folder, data.root)

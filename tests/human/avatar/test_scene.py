@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.core.state import part_of, strip_roles
+from dyngs.core.state import select_prefix, strip_roles
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
 from dyngs.human.avatar.posing import (
@@ -57,7 +57,9 @@ def stirred() -> HumanScene:
 
 def reloaded(scene: HumanScene) -> HumanScene:
     """The scene of what is stored of it."""
-    return HumanScene.restored(scene.gaussians, part_of(strip_roles(scene.state()), "model"))
+    return HumanScene.from_state(
+        scene.gaussians, select_prefix(strip_roles(scene.state()), "model")
+    )
 
 
 def seen(gaussians: Gaussians) -> Tensor:
@@ -73,9 +75,9 @@ def test_two_clips_of_the_same_pose_give_the_same_image() -> None:
     other = random_clip(6, seed=6)
     for name in ("poses", "trans", "scale"):
         getattr(other, name)[4] = getattr(one, name)[1]
-    first, second = (seen(scene.playing(c).at(t)) for c, t in ((one, 0.5), (other, 0.8)))
+    first, second = (seen(scene.with_motion(c).at(t)) for c, t in ((one, 0.5), (other, 0.8)))
     assert torch.equal(first, second)
-    assert float((first - seen(scene.playing(one).at(0.0))).abs().max()) > 0.05
+    assert float((first - seen(scene.with_motion(one).at(0.0))).abs().max()) > 0.05
     assert float(first.max()) > 0.2
 
 

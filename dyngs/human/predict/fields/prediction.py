@@ -16,7 +16,7 @@ from dyngs.config import Config, DataConfig
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import ProgressCallback
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import Role, State, move_fields_to, add_prefix, with_role
+from dyngs.core.state import Role, State, add_prefix, move_fields_to, with_role
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.data.loader import Image
 from dyngs.data.read import list_captures
@@ -27,21 +27,27 @@ from dyngs.human.fit.fitted_capture import ensure_fitted_body
 from dyngs.human.predict.fields.eg_human_nerf import EgHumanNerf
 from dyngs.human.predict.fields.keypoint_nerf import AROUND, KeypointNerf
 from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
-from dyngs.human.predict.gps.rectification import MIN_ANGLE, angle, moments, spread, well_spread
+from dyngs.human.predict.gps.rectification import (
+    MIN_ANGLE,
+    angle_between_views,
+    moments,
+    spread,
+    spread_around_person,
+)
 from dyngs.human.predict.keys import FieldPredictorModel, PredictedFieldModel
 from dyngs.human.predict.people import (
     MULTIPLE,
     Person,
     PosedBody,
     Sources,
+    crop_source_images,
     metric,
     read_captured_person,
-    sources_of,
     window,
 )
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
-from dyngs.models.model import Drawn, Model, UpdateResult
+from dyngs.models.model import Model, RenderOutput, UpdateResult
 from dyngs.models.prediction import (
     Example,
     Learner,
@@ -56,7 +62,7 @@ from dyngs.models.renderable import (
     Renderable,
     Rendering,
     TimeStep,
-    composited,
+    composite_background,
     fixed_cameras,
 )
 from dyngs.models.views import evaluation_background
@@ -125,7 +131,7 @@ class PredictedField(Renderable):
         rgb = torch.stack([view.colour for view in views])
         through = torch.stack([view.transmittance for view in views])
         depth = self.scale * torch.stack([view.depth for view in views])
-        return composited(rgb, through, depth, options, behind)
+        return composite_background(rgb, through, depth, options, behind)
 
 
 def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedField:
@@ -179,7 +185,9 @@ class PredictedModel(Model[PredictedField]):
             "`human` on the capture"
         )
 
-    def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+    def draw(
+        self, image: Image, step: int, background: Tensor, *, depth: bool = False
+    ) -> RenderOutput:
         raise self._untrained()
 
     def update(self, step: int) -> UpdateResult:
@@ -214,20 +222,20 @@ class FieldPredictor(Predictor[FieldNetwork]):
         self._person = person
 
     def chosen(self, count: int) -> list[int]:
-        return well_spread(self.views, count)
+        return spread_around_person(self.views, count)
 
     def predict(self, views: Sequence[int]) -> PredictedField:
         shown = [self.views[i] for i in views]
         first = shown[0]
         if len({(view.frame, view.time) for view in shown}) > 1 or all(
-            angle(first, view) < MIN_ANGLE for view in shown
+            angle_between_views(first, view) < MIN_ANGLE for view in shown
         ):
             raise DyngsError(
                 f"{self.name}: a field is predicted from two views of one moment at least, that look from different "
                 "directions; give --views A,B"
             )
         body, scale = self._person.body_in(first)
-        sources = sources_of([self._person.images[i] for i in views], scale)
+        sources = crop_source_images([self._person.images[i] for i in views], scale)
         return PredictedField(self.network, sources, body, scale, background=self.background)
 
     def run_config(self, views: Sequence[int]) -> Config:
@@ -259,7 +267,9 @@ class FieldLearner(Learner[FieldNetwork]):
         sources, target = self._views(known, generator)
         body, scale = known.body_in(known.views[target])
         body = move_fields_to(body, self.device)
-        given = move_fields_to(sources_of([known.images[i] for i in sources], scale), self.device)
+        given = move_fields_to(
+            crop_source_images([known.images[i] for i in sources], scale), self.device
+        )
         image = _part(known.images[target], generator).to(self.device)
         background = self.sample_background(generator)
         seen = self.network.look(given, body)
@@ -319,7 +329,7 @@ def predictor(
     config: Config,
     checkpoint: Checkpoint,
     data: DataConfig,
-    log: Callable[[str], None],
+    say: Callable[[str], None],
     report: ProgressCallback,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
@@ -331,7 +341,7 @@ def predictor(
     network = NETWORKS[model.kind](torch.Generator())
     load_weights(network, checkpoint)
     if model.body is None:
-        data = ensure_fitted_body(data, only_if_needed=True, log=log, report=report)
+        data = ensure_fitted_body(data, only_if_needed=True, say=say, report=report)
     return FieldPredictor(config, network, read_captured_person(data, template_of(model)), data)
 
 

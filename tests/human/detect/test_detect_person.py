@@ -19,8 +19,12 @@ from dyngs.data.capture import Capture, all_views
 from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.human.detect import detect_person as module
+from dyngs.human.detect.detect_person import (
+    detect_person,
+    ensure_detected_person,
+    write_detected_person,
+)
 from dyngs.human.detect.detector import Detection
-from dyngs.human.detect.detect_person import detect_person, ensure_detected_person, write_detected_person
 from dyngs.human.fit.keypoints import JOINTS, read_keypoints
 from dyngs.io.write import write_image
 from tests.detections import person
@@ -88,9 +92,11 @@ def overlap(folder: Path, number: int) -> float:
 def test_masks_and_key_points_of_all_views(
     clip: Path, tmp_path: Path, side: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "SIDE", side)
+    monkeypatch.setattr(module, "DETECTOR_SIDE_PX", side)
     said: list[str] = []
-    found = detect_person(capture_of(clip), Rough(), tmp_path / "found", ignore_progress, said.append)
+    found = detect_person(
+        capture_of(clip), Rough(), tmp_path / "found", ignore_progress, said.append
+    )
     assert found.masks is not None
     assert found.keypoints is not None
     seen = [number for number in range(COUNT) if number != 4]
@@ -136,7 +142,9 @@ def test_a_capture_of_the_person_comes_out(
 ) -> None:
     monkeypatch.setattr("dyngs.human.fit.capture_fit.STEPS", 2)
     out = tmp_path / "ann"
-    result = write_detected_person(DataConfig(root=clip, frames="0:10:4"), out, Rough(), log=[].append)
+    result = write_detected_person(
+        DataConfig(root=clip, frames="0:10:4"), out, Rough(), say=[].append
+    )
     assert result.root == out
     capture = read_capture(DataConfig(root=out))
     assert capture.body is not None
@@ -146,7 +154,7 @@ def test_a_capture_of_the_person_comes_out(
         "nothing else is left behind"
     )
     with pytest.raises(DyngsError, match=r"exists|not empty"):
-        write_detected_person(DataConfig(root=clip), out, Rough(), log=[].append)
+        write_detected_person(DataConfig(root=clip), out, Rough(), say=[].append)
 
 
 def test_a_clip_is_looked_at_once(
@@ -165,7 +173,7 @@ def test_a_clip_is_looked_at_once(
     monkeypatch.setattr(module, "write_detected_person", write)
     said: list[str] = []
     for frames in ("0:8", "0:8", "0:4"):
-        data = ensure_detected_person(DataConfig(root=clip, frames=frames), log=said.append)
+        data = ensure_detected_person(DataConfig(root=clip, frames=frames), say=said.append)
         assert (data.root, data.frames) == (made[-1], None)
     assert len(made) == 2
     assert [line for line in said if "found before" in line] == [said[2]]
