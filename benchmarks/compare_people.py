@@ -33,9 +33,9 @@ from dyngs.core.errors import DyngsError, format_count, log_info
 from dyngs.core.metrics import psnr, ssim
 from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.read import captures_in, read_capture
+from dyngs.data.read import list_captures, read_capture
 from dyngs.human.predict.gps.rectification import angle_between_views, order_around_person
-from dyngs.io.outputs import new_folder
+from dyngs.io.outputs import atomic_folder
 from dyngs.io.write import write_image, write_text
 from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable

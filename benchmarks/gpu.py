@@ -33,7 +33,7 @@ from dyngs.api.compat import rasterization
 from dyngs.core.camera import Cameras
 from dyngs.export.orbits import frame_orbit_for_points
 from dyngs.io.formats.formats import read_splats
-from dyngs.io.formats.similarity import axis_of
+from dyngs.io.formats.similarity import parse_axis
 from dyngs.ops.device import gpu_unavailable_reason
 
 Rasterize = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]

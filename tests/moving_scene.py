@@ -14,7 +14,7 @@ from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.camera import Cameras
 from dyngs.core.state import Role, strip_roles
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, select_rows
 from dyngs.deform.fields import field_state

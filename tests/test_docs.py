@@ -361,8 +361,8 @@ def test_table_of_packages_repeats_their_docstrings() -> None:
 @pytest.fixture
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Enter a folder with a static capture, ``PATH``, and a run of a moving scene."""
-    write_still_capture(
-        tmp_path / "PATH", StillOptions(size=16, num_train=4, num_test=2, samples=1)
+    write_static_capture(
+        tmp_path / "PATH", StaticOptions(size=16, num_train=4, num_test=2, samples=1)
     )
     (tmp_path / "runs").mkdir()
     write_moving_run(tmp_path / "moving").rename(tmp_path / "runs" / "dance")

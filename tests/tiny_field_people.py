@@ -30,4 +30,4 @@ def field_config(kind: str, folder: Path, run: Path, **train: object) -> Config:
 
 
 def first_person(folder: Path) -> Person:
-    return read_captured_person(captures_in(DataConfig(root=folder))[0], default_template())
+    return read_captured_person(list_captures(DataConfig(root=folder))[0], default_template())

@@ -165,7 +165,7 @@ def edit_scene(
     nothing is written.
     """
     moves = out.name.lower().endswith(FOURDGS_SUFFIX)
-    if known_format(out) is None and not moves and out.suffix:
+    if find_format(out) is None and not moves and out.suffix:
         wanted = (
             f"give a name in {all_suffixes()} or {FOURDGS_SUFFIX}, or without a suffix for a run"
         )

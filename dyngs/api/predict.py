@@ -43,7 +43,7 @@ def predict(
     views: int | tuple[str, ...] | None = None,
     *,
     steps: int | None = None,
-    say: Callable[[str], None] = log_info,
+    log: Callable[[str], None] = log_info,
     report: ProgressCallback = ignore_progress,
 ) -> Prediction:
     """Write the person of ``capture`` as a run folder ``out`` for all commands; ``dyngs train

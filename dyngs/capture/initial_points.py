@@ -210,7 +210,7 @@ AROUND_ORIGIN = ("blender", "body_json")
 """Formats whose scenes lie around the origin by convention."""
 
 
-def add_initial_points(
+def create_initial_points(
     capture: Capture, options: DataConfig, init: PointsInit
 ) -> tuple[Capture, list[str]]:
     """Return the capture with the points that a scene begins with, None for random ones, and lines

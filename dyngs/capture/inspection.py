@@ -26,7 +26,13 @@ from dyngs.capture.sfm.several_videos import (
     read_video_settings,
 )
 from dyngs.config import DataConfig
-from dyngs.core.errors import DyngsError, quote_path, counted, format_one_line, wrap_read_errors
+from dyngs.core.errors import (
+    DyngsError,
+    format_count,
+    format_one_line,
+    quote_path,
+    wrap_read_errors,
+)
 from dyngs.data.body_frames import merge_root_rotation
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry import (

@@ -15,7 +15,7 @@ import torch
 from scipy import ndimage
 
 from dyngs.capture.sfm.frame_choice import FIXED_CAMERA_LIMIT, camera_displacement, small_brightness
-from dyngs.core.errors import DyngsError, show
+from dyngs.core.errors import DyngsError, log_info
 from dyngs.data.capture import Capture, Silhouette, View, group_by_camera, map_views
 from dyngs.data.images.images import (
     SUFFIXES,
@@ -272,7 +272,7 @@ class _Camera:
 
 
 def add_background_masks(
-    capture: Capture, folder: Path, empty: Path | None = None, log: Callable[[str], None] = show
+    capture: Capture, folder: Path, empty: Path | None = None, log: Callable[[str], None] = log_info
 ) -> Capture:
     """Return the capture of fixed cameras with masks of the person, written to ``folder``, which is
     made.

@@ -49,7 +49,7 @@ from dyngs.core.errors import (
     quote_word,
     validate_file_name,
 )
-from dyngs.io.containment import following_links_of_runs
+from dyngs.io.containment import allow_run_links
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130

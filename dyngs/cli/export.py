@@ -443,13 +443,13 @@ def _export_bodies(arguments: argparse.Namespace) -> None:
     """Write a moving scene with its bodies as animated nodes."""
     from dyngs.export.images import compare_file_with_run
     from dyngs.export.splat_files import choose_write_options, write_rigid_bodies
-    from dyngs.io.formats.formats import format_named, read_splats
+    from dyngs.io.formats.formats import format_by_name, read_splats
 
     out = _target(arguments, "bodies.glb")
     opened = _open(arguments)
     time = (_times(arguments) or (0.0,))[0]
     how, line = choose_write_options(
-        opened, format_named("glb").up, arguments.up, arguments.from_up
+        opened, format_by_name("glb").up, arguments.up, arguments.from_up
     )
     written = write_rigid_bodies(opened, out, time, how)
     print_notes((line,))

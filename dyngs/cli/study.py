@@ -124,7 +124,7 @@ def amount(text: str) -> float:
 def run_compare(arguments: argparse.Namespace) -> int:
     """Train, compare, print the table and write the report; the folder is locked against other
     commands."""
-    from dyngs.io.outputs import writing
+    from dyngs.io.outputs import lock_folder
     from dyngs.runs.folder import collect_inputs
     from dyngs.study.compare import ModelComparison
     from dyngs.study.report import Report, build_table, can_plot, page_views, plot_curves
@@ -150,7 +150,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
     configs, unfit = comparison.configs(arguments.models.split(","))
     for config in configs.values():
         collect_inputs(config).require_output(out)
-    with writing(out), redirect_messages(arguments.json):
+    with lock_folder(out), redirect_messages(arguments.json):
         comparison.require_same(configs, unfit)
         try:
             results, left_out, curves = comparison.run(configs, arguments.ray)

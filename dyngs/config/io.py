@@ -35,8 +35,8 @@ from dyngs.config.schema import (
 )
 from dyngs.config.yaml_reader import Leaf, read_file, read_override
 from dyngs.core.errors import DyngsError, format_one_line, validate_file_name, wrap_read_errors
-from dyngs.io.containment import follows_links_of_runs
-from dyngs.io.outputs import command_for
+from dyngs.io.containment import run_links_allowed
+from dyngs.io.outputs import suggest_command
 from dyngs.io.write import write_text
 
 RESOLVED_NAME = "config.yaml"

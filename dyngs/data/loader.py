@@ -96,7 +96,7 @@ class Image:
 
     def to(self, device: torch.device | str) -> Image:
         """Return a copy of the image and its camera on another device."""
-        tensors: Any = {name: sent(x, device) for name, x in self.tensors().items()}
+        tensors: Any = {name: copy_async(x, device) for name, x in self.tensors().items()}
         return replace(self, cameras=self.cameras.to(device=device), **tensors)
 
     def tensors(self) -> dict[str, Tensor]:

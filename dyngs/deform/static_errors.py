@@ -64,8 +64,8 @@ def static_errors(
         time = image.time or 0.0
         gaussians = gaussians_at(time).detach()
         truth = image.composite(background)
-        if image.moves is not None:
-            error = (2 * mask_error * image.moves)[..., None].expand_as(truth)
+        if image.motion_mask is not None:
+            error = (2 * mask_error * image.motion_mask)[..., None].expand_as(truth)
         elif expected:
             error = expected[_camera_key(image)] - truth
         else:

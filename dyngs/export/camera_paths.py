@@ -14,8 +14,15 @@ import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, format_one_line
-from dyngs.data.geometry import cam_from_opengl, checked_pose, inverse_rigid, pinhole_matrix
-from dyngs.io.fields import entry, float_array, is_number, numbers_of, read_json, require_at_most
+from dyngs.data.geometry import from_opengl_pose, invert_rigid, pinhole_matrix, validate_pose
+from dyngs.io.fields import (
+    as_float_array,
+    is_number,
+    parse_numbers,
+    read_json,
+    require_at_most,
+    require_key,
+)
 
 _MAX_FRAMES = 100_000
 """A longer path is taken for a typing mistake."""

@@ -342,7 +342,7 @@ def compare_file_with_run(
     return _compare(wanted, frame.cameras(cameras), read, scene.options.near * frame.scale)
 
 
-def compare_file_with_source(splat: SplatFile, written: Written) -> float:
+def compare_file_with_source(splat: SplatFile, written: WrittenFile) -> float:
     """Return the PSNR, dB, of a file and what it was converted from, seen from an orbit.
 
     Raises DyngsError: the file cannot be read.

@@ -168,7 +168,7 @@ def choose_write_options(
         return WriteOptions(
             up=own, sh_degree=sh_degree
         ), f"axes are those of the {frame.removesuffix('ed run')}{known}"
-    found = find_up_direction(opened) if from_up is None else (axis_of(from_up), "--from-up")
+    found = find_up_direction(opened) if from_up is None else (parse_axis(from_up), "--from-up")
     if found is None:
         line = "nothing says which way is up in this run, so axes are those of the capture; --from-up=AXIS tells it"
         return WriteOptions(sh_degree=sh_degree), line
@@ -177,7 +177,7 @@ def choose_write_options(
     here = next((name for name, axis in AXES.items() if axis == direction), "a slanted direction")
     turned = f"turned, it was {here} in the {frame}"
     turned = f"the axes of the {frame} are kept" if here == wanted else turned
-    how = WriteOptions(turn_between(direction, axis_of(wanted)), wanted, sh_degree)
+    how = WriteOptions(rotation_between(direction, parse_axis(wanted)), wanted, sh_degree)
     return how, f"up is {wanted} in the file ({turned}, says {who})"
 
 
@@ -203,7 +203,7 @@ def write_run_splats(
     time: float = 0.0,
     part: Part = "all",
     how: WriteOptions = DEFAULT_WRITE_OPTIONS,
-) -> Written:
+) -> WrittenFile:
     """Write a run at a time in [0, 1] as a file of Gaussians; its suffix names the format.
 
     A 3D filter is fused, and colours of a network become harmonics; the header, where the format
@@ -337,7 +337,7 @@ def tracks_of(
         scene_part(scene, "moving")
     ids = torch.arange(len(scene), device="cpu")
     ids = ids[moves] if part == "moving" else ids
-    kind = np.float32 if frame == UNMOVED else np.float64
+    kind = np.float32 if frame == IDENTITY else np.float64
     whole = scene.without_masks()
     positions = np.empty((len(ids), len(times), 3), kind)
     for k, time in enumerate(times):
@@ -443,7 +443,7 @@ def _fourdgs(path: Path) -> tuple[Any, Any, Any]:
 @torch.no_grad()
 def write_rigid_bodies(
     opened: OpenedScene, path: Path, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
-) -> Written:
+) -> WrittenFile:
     """Write a run at a time in [0, 1] as .glb: a node for each body, with its motion as an
     animation, one for the rest.
 

@@ -16,8 +16,8 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
 from dyngs.export.splat_files import DEFAULT_WRITE_OPTIONS, WriteOptions, choose_write_options
 from dyngs.gaussians.surface import extract_surface, opaque_box
-from dyngs.io.formats.ply import double_ply
-from dyngs.io.formats.similarity import Similarity, far_offset
+from dyngs.io.formats.ply import encode_ply
+from dyngs.io.formats.similarity import Similarity, origin_offset
 from dyngs.io.write import atomic_file
 from dyngs.models.renderable import Surface, SurfaceOptions
 from dyngs.models.views import training_cameras

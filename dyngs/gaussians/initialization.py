@@ -175,7 +175,7 @@ def _sample_frusta(views: Sequence[View], count: int, generator: torch.Generator
     unit = torch.rand(
         (CANDIDATES_PER_POINT * count, 5), generator=generator, dtype=torch.float64, device="cpu"
     ).numpy()
-    xyz, seen = points_in_frusta(views, unit[:, :4])
+    xyz, seen = sample_points_in_frusta(views, unit[:, :4])
     # The largest u^(1 / weight) are a weighted sample without replacement (Efraimidis and Spirakis
     # 2006).
     order = np.log(np.maximum(unit[:, 4], 1e-300)) / np.maximum(seen, 1) ** 2

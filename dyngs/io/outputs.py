@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dyngs.core.errors import DyngsError, quote_path, require_regular_file, warn
+from dyngs.core.errors import DyngsError, log_warning, quote_path, require_regular_file
 from dyngs.io.containment import find_escaping_links
 from dyngs.io.fields import read_limited
 from dyngs.io.write import remove_quietly, require_replaceable, temporary_folder_beside, write_text
@@ -281,7 +281,7 @@ def _locked(path: Path) -> tuple[int, bool]:
             _lock(file)
         except OSError as error:
             if error.errno in _WITHOUT_LOCKS:
-                warn(
+                log_warning(
                     f"{folder}: this file system has no file locks ({error.strerror}); "
                     "do not run two commands on that folder at the same time"
                 )

@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError, reason, require_regular_file
+from dyngs.core.errors import DyngsError, describe_error, require_regular_file
 from dyngs.io.write import atomic_file, remove_quietly, temporary_folder_beside
 
 

@@ -24,7 +24,7 @@ from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import all_suffixes, format_to_read, read_splats
 from dyngs.io.formats.similarity import AXES, IDENTITY, Similarity
 from dyngs.io.formats.splat_file import Nonfinite, SplatFile
-from dyngs.io.outputs import command_for
+from dyngs.io.outputs import suggest_command
 from dyngs.models.checkpoint import CheckpointInfo, read_run_capture
 from dyngs.models.kind import HasBody, capability
 from dyngs.models.renderable import Posable, Renderable
@@ -299,7 +299,7 @@ def open_scene(
         )
     splat = read_splats(path, nonfinite=nonfinite)
     opened = scene_from_file(splat, path)
-    if splat.edited != UNMOVED:  # then its own frame is the one that people mean
+    if splat.edited != IDENTITY:  # then its own frame is the one that people mean
         return opened
     info = replace(opened.info, world_offset=splat.world_offset)
     return replace(opened, info=info, turned=splat.turned)

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from dyngs.capture.initial_points import add_initial_points
+from dyngs.capture.initial_points import create_initial_points
 from dyngs.capture.inspection import check_before_training
 from dyngs.config import Config, PointsInit, RandomInit
 from dyngs.core.errors import log_warning
@@ -106,7 +106,7 @@ def build_trainer(
         if config.camera.refine == "always":
             refinement = CameraRefinement(views, extent, steps)
             correct_cameras = refinement.corrections.correct_cameras
-            images.corrected = lambda index, cameras: correct_cameras(views[index], cameras)
+            images.camera_correction = lambda index, cameras: correct_cameras(views[index], cameras)
         robust = None
         may_mask = "train.robust" in kind.uses and not isinstance(kind, HasMotion)
         if config.train.robust == "always" and may_mask:
@@ -156,7 +156,7 @@ def add_initial_points(capture: Capture, config: Config, *, log_messages: bool =
     if "init" in find_kind(config.model).uses:
         init = config.init
         if isinstance(init, PointsInit):
-            capture, lines = add_initial_points(capture, config.data, init)
+            capture, lines = create_initial_points(capture, config.data, init)
         elif isinstance(init, RandomInit):
             views = capture.splits["train"]
             why = cube_mismatch_reason(
@@ -167,7 +167,7 @@ def add_initial_points(capture: Capture, config: Config, *, log_messages: bool =
                 if why is None
                 else [f"init.kind=random draws points around the origin, but {why}: give auto"]
             )
-    for line in [*lines, *before_training(capture)] if log_messages else []:
+    for line in [*lines, *check_before_training(capture)] if log_messages else []:
         log_warning(line)
     return capture
 

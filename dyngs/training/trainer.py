@@ -341,10 +341,10 @@ class Trainer(Generic[M]):
         image = self.images.downscaled(index, image_divisor(self.config.train, step))
         if self.images.num_prefetched:
             batch = self.config.train.batch_size
-            count = self.images.decoded_ahead * self.processes.size
+            count = self.images.num_prefetched * self.processes.size
             fraction = self.processes.views_of_process(batch)
             upcoming = self.sampler.peek(count, self._wanted(step))
-            self.images.expect([view for i, view in enumerate(upcoming) if i % batch in fraction])
+            self.images.prefetch([view for i, view in enumerate(upcoming) if i % batch in fraction])
         return image
 
     def _wanted(self, step: int) -> Callable[[int], bool]:

@@ -80,7 +80,7 @@ class TrainingView:
     cannot be had.
     """
 
-    def __init__(self, config: Config, serving: ServerOptions, say: Callable[[str], None]) -> None:
+    def __init__(self, config: Config, serving: ServerOptions, log: Callable[[str], None]) -> None:
         if capability(config.model, PredictsScenes) is not None:
             raise DyngsError(
                 "--view shows scenes, and a network has none; `dyngs predict` makes one"

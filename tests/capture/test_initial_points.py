@@ -13,7 +13,7 @@ from room_surfaces import distances_to_surface
 import dyngs
 from dyngs.capture.initial_points import (
     ENOUGH,
-    add_initial_points,
+    create_initial_points,
     sample_points_in_silhouettes,
     triangulate_clip,
     triangulate_from_views,
@@ -34,7 +34,7 @@ from dyngs.io.write import write_image
 
 
 def begin(capture: Capture, triangulate: int = 24) -> tuple[Capture, list[str]]:
-    return add_initial_points(
+    return create_initial_points(
         capture, DataConfig(root=capture.root), PointsInit(triangulate=triangulate)
     )
 
@@ -186,7 +186,7 @@ def test_a_still_blender_scene_begins_in_its_silhouettes(tmp_path: Path) -> None
         tmp_path / "still", StaticOptions(size=32, num_train=8, num_test=1, samples=1)
     )
     capture = read_capture(root)
-    begun, lines = add_initial_points(capture, DataConfig(root=root), PointsInit())
+    begun, lines = create_initial_points(capture, DataConfig(root=root), PointsInit())
     assert begun.points is not None
     assert lines == [
         f"{len(begun.points.xyz):,} initial points sampled at random inside the silhouettes"

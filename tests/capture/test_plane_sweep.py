@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from dyngs.capture import initial_points
-from dyngs.capture.initial_points import add_initial_points
+from dyngs.capture.initial_points import create_initial_points
 from dyngs.capture.plane_sweep import (
     points_from_depth_maps,
     sweep_dense_points,
@@ -121,7 +121,7 @@ def test_a_still_capture_without_any_points_is_swept(
     monkeypatch.setattr(initial_points, "triangulate_from_views", lambda *_: None)
     views = [replace(view, depth_path=None) for view in _views(tmp_path)]
     capture = Capture(tmp_path, "nerfstudio", {"train": tuple(views)})
-    begun, lines = add_initial_points(capture, DataConfig(root=tmp_path), PointsInit(dense=2000))
+    begun, lines = create_initial_points(capture, DataConfig(root=tmp_path), PointsInit(dense=2000))
     assert begun.points is not None
     assert len(begun.points.xyz) == 2000
     assert lines == ["2,000 initial points from plane-sweep depth maps (init.dense)"]
@@ -130,14 +130,14 @@ def test_a_still_capture_without_any_points_is_swept(
     assert np.median(error) < 0.01 * DISTANCE
     assert np.quantile(error, 0.9) < 0.05 * DISTANCE
     assert (
-        add_initial_points(capture, DataConfig(root=tmp_path), PointsInit(dense=0))[0].points
+        create_initial_points(capture, DataConfig(root=tmp_path), PointsInit(dense=0))[0].points
         is None
     )
     timed = capture.replace(
         splits={"train": tuple(replace(view, time=0.1 * i) for i, view in enumerate(views))}
     )
     assert (
-        add_initial_points(timed, DataConfig(root=tmp_path), PointsInit(dense=2000))[0].points
+        create_initial_points(timed, DataConfig(root=tmp_path), PointsInit(dense=2000))[0].points
         is None
     )
 

@@ -19,7 +19,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.export.camera_paths import read_path
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.io.formats.similarity import UNMOVED, Similarity
+from dyngs.io.formats.similarity import IDENTITY, Similarity
 from dyngs.runs.opened import OpenedScene
 from dyngs.view import session
 from dyngs.view.layers import ViewRequest, draw

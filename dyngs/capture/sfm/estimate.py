@@ -27,7 +27,7 @@ from dyngs.capture.sfm.colmap import (
 from dyngs.capture.sfm.frame_choice import MIN_CAMERA_MOTION, choose_frames, measure_frames
 from dyngs.capture.sfm.photos import Photo, copy_file, gather_photos, prepare_colmap_images
 from dyngs.core.conventions import ProgressCallback, ignore_progress
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.images.images import read_header
 from dyngs.data.images.video import (
     colour_messages,
@@ -202,7 +202,7 @@ def _posed_in(
     else:
         photos, notes = gather_photos(source, capture / "images", out)
     if len(photos) < 3:
-        found = "; ".join((f"{source} has {counted(len(photos), 'image')}", *notes))
+        found = "; ".join((f"{source} has {format_count(len(photos), 'image')}", *notes))
         raise DyngsError(f"{found}; structure from motion needs at least 3, ideally 30")
     with quiet_colmap():
         masks = options.masks
@@ -236,7 +236,11 @@ def _posed_in(
 
 
 def _laid_out(
-    capture: Path, photos: list[Photo], is_video: bool, options: SfmOptions, report: ProgressCallback
+    capture: Path,
+    photos: list[Photo],
+    is_video: bool,
+    options: SfmOptions,
+    report: ProgressCallback,
 ) -> SfmTask:
     folder = capture / "images"
     work = capture / "colmap"

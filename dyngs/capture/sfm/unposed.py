@@ -13,7 +13,7 @@ from dyngs.capture.sfm.photos import digest_files, list_photos
 from dyngs.capture.sfm.several_videos import VIDEOS_FILE, poses_of_videos
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ProgressCallback, ignore_progress
-from dyngs.core.errors import DyngsError, quote_path, counted, wrap_read_errors, show
+from dyngs.core.errors import DyngsError, format_count, log_info, quote_path, wrap_read_errors
 from dyngs.data.images.video import VIDEO_SUFFIXES, list_videos
 from dyngs.data.read import is_capture
 from dyngs.io.outputs import make_once, record_source, suggest_command
@@ -26,7 +26,7 @@ def ensure_poses(
     data: DataConfig,
     *,
     needs_times: bool = False,
-    log: Callable[[str], None] = show,
+    log: Callable[[str], None] = log_info,
     report: ProgressCallback = ignore_progress,
 ) -> DataConfig:
     """Return the options with a capture that has poses as their folder: the same one, unless it has
@@ -100,7 +100,7 @@ def is_unposed(data: DataConfig) -> bool:
     )
     if photos:
         raise DyngsError(
-            f"{root}: holds {counted(len(photos), 'photo')} but no cameras; a scene needs at "
+            f"{root}: holds {format_count(len(photos), 'photo')} but no cameras; a scene needs at "
             f"least {FEWEST_PHOTOS} photos from different positions, ideally 50, or a video"
         )
     return bool(videos)

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from dyngs.core.conventions import decode_srgb, encode_srgb
-from dyngs.core.errors import DyngsError, counted, wrap_read_errors, reason
+from dyngs.core.errors import DyngsError, describe_error, format_count, wrap_read_errors
 from dyngs.data.capture import VideoFrame
 from dyngs.data.images.images import list_files, rotate_upright
 from dyngs.io.containment import check_inside, check_size, require_at_most, scaled_limit

@@ -16,7 +16,7 @@ import numpy as np
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import format_count
-from dyngs.data.geometry import look_at_point
+from dyngs.data.geometry import estimate_focus
 from dyngs.export.choose_path import (
     framing_points,
     frontal_cameras,
@@ -183,14 +183,14 @@ def _beginning(
         others = list(distinct.values())[::-1]
         rows = np.linspace(0, len(others) - 1, min(len(others), MOST_VIEWS)).round().astype(int)
         chosen = (select_view(capture), *(others[i] for i in rows))
-        return training_cameras(chosen, opened.config.data), look_at_point(cameras).tolist()
+        return training_cameras(chosen, opened.config.data), estimate_focus(cameras).tolist()
     target = np.median(framing_points(opened.renderable).cpu().numpy(), axis=0)
     if not views:
         ring = orbit_cameras_around(opened, _RING)
         views = [ring.select(i) for i in range(_RING)]
         if opened.person is not None:
             views = [frontal_cameras(opened).select(1), *views]
-            target = look_at_point(ring)
+            target = estimate_focus(ring)
     return views, target.tolist()
 
 

@@ -145,7 +145,7 @@ def block_numbers(levels: Levels, block: Block, *, with_rest: bool) -> PackedArr
     gaussians = levels.block_gaussians(block)
     rows = torch.arange(BLOCK, device="cpu").clamp_max(len(gaussians) - 1)
     padded = gaussians.select(rows)
-    padded.logit_opacities[len(gaussians) :] = -MOST_LOGIT
+    padded.logit_opacities[len(gaussians) :] = -MAX_LOGIT
     lists = PackedArrays()
     _add_gaussians(padded, lists, with_rest=with_rest)
     return lists

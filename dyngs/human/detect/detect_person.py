@@ -22,7 +22,7 @@ from dyngs.capture.sfm.photos import digest_files
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info
-from dyngs.data.capture import Capture, View, by_camera
+from dyngs.data.capture import Capture, View, group_by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.read import is_capture, read_capture
 from dyngs.human.detect.detector import MIN_CONFIDENCE, Detection, Detector, MediaPipe
@@ -158,7 +158,7 @@ def detect_person(
     detector: Detector,
     folder: Path,
     report: ProgressCallback,
-    say: Callable[[str], None] = log_info,
+    log: Callable[[str], None] = log_info,
 ) -> FitInputs:
     """Find a person in all views, write masks and key points to ``folder``, and return where they
     are.
@@ -191,7 +191,7 @@ def detect_person(
                 f"{format_count(len(person), 'image')}; left and right swapped in {format_count(swapped, 'image')}"
             )
             for warning in capture_warnings(images, person, alone=len(cameras) == 1):
-                say(f"warning: {where}{warning}")
+                log(f"warning: {where}{warning}")
         masks = np.zeros(images.shape[:3], bool)
         for row, own in enumerate(person):
             if own is not None:
@@ -236,7 +236,7 @@ def write_detected_person(
     out: Path,
     detector: Detector,
     report: ProgressCallback = ignore_progress,
-    say: Callable[[str], None] = log_info,
+    log: Callable[[str], None] = log_info,
 ) -> FittedCapture:
     """Find a person and fit the body to them: write the capture of ``write_fitted_capture`` to the
     new folder ``out``.
@@ -253,7 +253,7 @@ def write_detected_person(
     folder = temporary_folder_beside(out.with_name(f"{out.name}.found"))
     try:
         capture = read_fixed_camera(options) if clip else read_capture(options)
-        found = detect_person(capture, detector, folder, report, say)
+        found = detect_person(capture, detector, folder, report, log)
         return write_fitted_capture(options, out, report, found)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -262,7 +262,7 @@ def write_detected_person(
 def ensure_detected_person(
     data: DataConfig,
     *,
-    say: Callable[[str], None] = log_info,
+    log: Callable[[str], None] = log_info,
     report: ProgressCallback = ignore_progress,
 ) -> DataConfig:
     """Return the options with the capture of the person that is found in a clip; the same clip is
@@ -276,8 +276,8 @@ def ensure_detected_person(
 
     def find() -> None:
         detector = MediaPipe()
-        say(f"person:  found first, as by `dyngs data people`, into {folder}")
-        say(write_detected_person(data, folder, detector, report, say).summary)
+        log(f"person:  found first, as by `dyngs data people`, into {folder}")
+        log(write_detected_person(data, folder, detector, report, log).summary)
 
     make_once(folder, find, log, f"person:  found before, in {folder}")
     record_source(folder, data.root)

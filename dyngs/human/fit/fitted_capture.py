@@ -26,7 +26,7 @@ from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info, wrap_read_errors
-from dyngs.data.body_frames import frame_number, numbered, read_body_file
+from dyngs.data.body_frames import assign_frame_numbers, frame_number, read_body_file
 from dyngs.data.capture import BodyFrames, Capture, Split, View
 from dyngs.data.geometry import to_opengl_pose
 from dyngs.data.images.images import to_straight_uint8
@@ -111,10 +111,10 @@ def write_fitted_capture(
     body = load_template(model)
     _require_texels(model, body)
     person = None if given.person is None else read_known_shape(given.person, body)
-    with new_folder(out) as folder:
+    with atomic_folder(out) as folder:
         masks = folder / ".masks"
         capture = read_person_capture(options, given, masks)
-        capture = capture.replace(splits=numbered(capture.splits))
+        capture = capture.replace(splits=assign_frame_numbers(capture.splits))
         views = capture.splits["train"]
         # The fit begins with the shape of a known person, or with that of the capture.
         first = person
@@ -276,7 +276,7 @@ def _at_most(options: DataConfig, longest_side: int) -> DataConfig:
 
 
 def read_person_capture(
-    options: DataConfig, given: FitInputs, work: Path, say: Callable[[str], None] = log_info
+    options: DataConfig, given: FitInputs, work: Path, log: Callable[[str], None] = log_info
 ) -> Capture:
     """Return a capture with silhouettes: of a capture, or a video or a folder of images of one
     fixed camera.
@@ -527,7 +527,7 @@ def ensure_fitted_body(
     model: HumanModel | None = None,
     *,
     only_if_needed: bool = False,
-    say: Callable[[str], None] = log_info,
+    log: Callable[[str], None] = log_info,
     report: ProgressCallback = ignore_progress,
 ) -> DataConfig:
     """Return the options with a fit of a template to the capture; the same capture is fitted once.
@@ -541,7 +541,7 @@ def ensure_fitted_body(
     if data.body is not None:
         path = data.body / _BODY
         if path.is_file() and not has_same_shape_space(load_template(model), read_body_file(path)):
-            say(
+            log(
                 f"body:    {data.body} is a fit of another template: its poses are taken, not its shape"
             )
         return data

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import move_fields_to
-from dyngs.data.body_frames import about_pelvis, rows_of
+from dyngs.data.body_frames import match_frames, merge_root_rotation
 from dyngs.data.capture import BodyFrames, View
 from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.human.body.skinning import axis_angle_to_matrix

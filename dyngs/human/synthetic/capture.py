@@ -492,7 +492,7 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     clips = {"train": (options.num_frames, {"train": train, "test": test})}
     if options.num_pose_frames and test:
         clips["pose"] = options.num_pose_frames, {"pose": test}
-    with new_folder(out) as started:
+    with atomic_folder(out) as started:
         for name, (num_frames, splits) in clips.items():
             clip = _clip(body, num_frames, options.scene_seed, name == "pose")
             motion = replace(

@@ -11,7 +11,7 @@ from scaled_files import FAR
 from splat_scenes import cameras_turned, cloud, seen
 
 from dyngs.export.edit.merge import merge_scenes
-from dyngs.io.formats.formats import upright, write_splats
+from dyngs.io.formats.formats import orient_to_axis, write_splats
 from dyngs.io.formats.similarity import Similarity
 from dyngs.io.formats.splat_file import SplatFile
 

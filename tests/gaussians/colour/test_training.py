@@ -23,7 +23,7 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.core.state import strip_roles
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import restore_colour_network
 from dyngs.gaussians.colour.training import (

@@ -12,7 +12,7 @@ from splat_scenes import AROUND, cloud, seen
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.export.edit.frame import fitted
+from dyngs.export.edit.frame import fit_similarity
 from dyngs.gaussians.filters import apply_filter
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.io.formats.similarity import (

@@ -329,7 +329,7 @@ def predictor(
     config: Config,
     checkpoint: Checkpoint,
     data: DataConfig,
-    say: Callable[[str], None],
+    log: Callable[[str], None],
     report: ProgressCallback,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
@@ -341,7 +341,7 @@ def predictor(
     network = NETWORKS[model.kind](torch.Generator())
     load_weights(network, checkpoint)
     if model.body is None:
-        data = ensure_fitted_body(data, only_if_needed=True, say=say, report=report)
+        data = ensure_fitted_body(data, only_if_needed=True, log=log, report=report)
     return FieldPredictor(config, network, read_captured_person(data, template_of(model)), data)
 
 

@@ -261,7 +261,7 @@ def _at_size(image: Image, person_px: int) -> Image:
             f"{image.name}: shows no silhouette of a person; give it alpha or a mask of the person, see docs/human.md"
         )
     rows = (image.alpha > MIN_ALPHA).any(1).nonzero()
-    return image.shrunk(max(1, int(rows.max() - rows.min() + 1) // person_px))
+    return image.downscaled(max(1, int(rows.max() - rows.min() + 1) // person_px))
 
 
 def _box(image: Image, turn: Tensor) -> Tensor:

@@ -45,7 +45,7 @@ def run(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def read_captured_person(folder: Path) -> Path:
-    return captures_in(DataConfig(root=folder))[0].root
+    return list_captures(DataConfig(root=folder))[0].root
 
 
 def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, run: Path, tmp_path: Path) -> None:
