@@ -168,7 +168,7 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
     bodies are in scene coordinates, see ``scene_space.normalise_capture``. Splits train, val and
     test always exist; val and test may be empty.
 
-    Example::
+    Example:
 
         import dyngs
         from dyngs.data.loader import ImageLoader
