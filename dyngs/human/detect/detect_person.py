@@ -210,7 +210,7 @@ def detect_person(
     if not points:
         raise DyngsError(
             f"{capture.root}: {detector.name} finds nobody in {format_count(sum(map(len, cameras)), 'image')}; look at "
-            "them, or give masks of another program to `dyngs data fit` (docs/person.md)"
+            "them, or give masks of another program to `dyngs data fit` (`dyngs docs people`)"
         )
     _write_keypoints(folder / "keypoints.json", points)
     return FitInputs(keypoints=folder / "keypoints.json", masks=folder / "masks")

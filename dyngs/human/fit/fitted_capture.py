@@ -559,7 +559,7 @@ def ensure_fitted_body(
         if given is None:
             raise DyngsError(
                 f"{data.root}: has neither silhouettes nor body parameters, so no person can be found; add masks of "
-                "the person (docs/person.md)"
+                "the person (`dyngs docs people`)"
             )
         log(f"{data.root}: no silhouettes, so the body parameters are taken as given")
         return data

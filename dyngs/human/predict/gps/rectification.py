@@ -258,7 +258,7 @@ def _at_size(image: Image, person_px: int) -> Image:
     ``person_px``."""
     if image.alpha is None or int((image.alpha > MIN_ALPHA).sum()) < _FEWEST:
         raise DyngsError(
-            f"{image.name}: shows no silhouette of a person; give it alpha or a mask of the person, see docs/human.md"
+            f"{image.name}: shows no silhouette of a person; add alpha or a mask of the person (`dyngs docs people`)"
         )
     rows = (image.alpha > MIN_ALPHA).any(1).nonzero()
     return image.downscaled(max(1, int(rows.max() - rows.min() + 1) // person_px))
