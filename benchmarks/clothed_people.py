@@ -63,8 +63,8 @@ from dyngs.human.body.skinning import (
 )
 from dyngs.human.motion.amass import read_amass, write_amass
 from dyngs.human.motion.motion import Motion
-from dyngs.human.motion.placement import least_rotation
-from dyngs.human.synthetic.capture import Lamp, random_light
+from dyngs.human.motion.placement import shortest_arc_rotation
+from dyngs.human.synthetic.capture import DirectionalLight, random_light
 from dyngs.io.write import write_image, write_text
 
 SAMPLES = 3
@@ -167,7 +167,7 @@ def acted(avatar: Avatar, body: BodyTemplate, motion: Motion) -> Clip:
 
 
 def _aligned(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    return least_rotation(start / np.linalg.norm(start), end / np.linalg.norm(end))
+    return shortest_arc_rotation(start / np.linalg.norm(start), end / np.linalg.norm(end))
 
 
 class Fit:
@@ -306,7 +306,7 @@ class Lens:
 
 
 def draw(
-    avatar: Avatar, posed: tuple[np.ndarray, np.ndarray], pose: np.ndarray, lens: Lens, light: Lamp
+    avatar: Avatar, posed: tuple[np.ndarray, np.ndarray], pose: np.ndarray, lens: Lens, light: DirectionalLight
 ) -> np.ndarray:
     """Return sRGB values and straight alpha (size, size, 4) in [0, 1]: the texture's value times
     the light received."""
@@ -394,7 +394,7 @@ class Shots:
 
 
 def write_split(
-    out: Path, split: str, avatar: Avatar, shots: Shots, lens: Lens, light: Lamp
+    out: Path, split: str, avatar: Avatar, shots: Shots, lens: Lens, light: DirectionalLight
 ) -> list[float]:
     """Write images and JSON of a split; return the overlap of the fit's silhouette with each
     mask."""

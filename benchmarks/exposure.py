@@ -29,7 +29,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import split_views
 from dyngs.evaluate.view_scores import right_half_scores
-from dyngs.gaussians.colour.network import fitted_affine, recoloured
+from dyngs.gaussians.colour.network import fit_affine_colour, apply_affine_colour
 from dyngs.io.write import write_image
 from dyngs.models.views import evaluation_background
 from dyngs.runs.checkpoint import load_run
@@ -73,10 +73,10 @@ def scores(run: Path) -> list[str]:
             image.cameras, image.time, options=options, background=background
         )
         shown.append((image, rendering))
-    one = fitted_affine(shown, background)
+    one = fit_affine_colour(shown, background)
     plain = [psnr(r.rgb[0], p.composite(background), p.mask) for p, r in shown]
     fitted = [
-        psnr(recoloured(one, p, r, background), p.composite(background), p.mask) for p, r in shown
+        psnr(apply_affine_colour(one, p, r, background), p.composite(background), p.mask) for p, r in shown
     ]
     halves = [right_half_scores(p, r, background) for p, r in shown]
     means = [

@@ -34,7 +34,7 @@ from dyngs.core.camera import Cameras
 from dyngs.export.orbits import frame_orbit_for_points
 from dyngs.io.formats.formats import read_splats
 from dyngs.io.formats.similarity import axis_of
-from dyngs.ops.device import why_no_gpu
+from dyngs.ops.device import gpu_unavailable_reason
 
 Rasterize = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 Arguments = dict[str, Any]
@@ -181,7 +181,7 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="+", default=[], metavar="WxH", help="of the image, px")
     parser.add_argument("--repeats", type=int, default=50, metavar="N")
     options = parser.parse_args()
-    reason = why_no_gpu()
+    reason = gpu_unavailable_reason()
     if reason is not None:
         print(f"nothing measured: {reason}")
         return

@@ -24,7 +24,7 @@ from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.ops.adam import adam_step_
-from dyngs.ops.device import why_no_gpu
+from dyngs.ops.device import gpu_unavailable_reason
 from dyngs.ops.hash_grid import HashLevels, hash_features
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.perceptron import Layer, perceptron
@@ -247,7 +247,7 @@ def distance(found: Tensor, wanted: Tensor) -> float:
 @contextmanager
 def gpu() -> Iterator[tuple[str, str]]:
     """Where ops run on a GPU: the device of their tensors, and its name."""
-    reason = why_no_gpu()
+    reason = gpu_unavailable_reason()
     if reason is None:
         yield "cuda", torch.cuda.get_device_name()
         return

@@ -59,15 +59,15 @@ from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.gaussians.schedule import Rates
-from dyngs.gaussians.start import StartValues, initial_gaussians, surroundings
+from dyngs.gaussians.schedule import RateSchedule
+from dyngs.gaussians.initialization import InitialValues, initial_gaussians, surroundings
 from dyngs.gaussians.static_training import StaticTraining
 from dyngs.models.static_section import StaticModel
 from dyngs.models.views import training_cameras, training_times
 from dyngs.ops.adam import Count
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.training.new_trainer import GaussianTrainer, assemble
+from dyngs.training.new_trainer import GaussianTrainer, build_trainer
 
 PRESET = Path(__file__).parents[1] / "configs" / "dynamic.yaml"
 REST = 1.0
@@ -176,7 +176,7 @@ class OracleTraining(StaticTraining):
 
     def __init__(self, steps: int) -> None:
         super().__init__(FilterUpdate())
-        self._rates = Rates(steps)
+        self._rates = RateSchedule(steps)
 
     def optimize(self, scene: GaussianScene, step: int) -> Count:
         assert isinstance(scene, DynamicScene)
@@ -191,11 +191,11 @@ def oracle(name: SceneName, config: Config, seed: int = 0) -> GaussianTrainer:
     sizes = config.train.model_copy(update={"initial_downscale": 1})
     config = config.model_copy(update={"model": model, "init": init, "train": sizes})
     capture = read_capture(config.data)  # in the unit of the files, in which the true motion is
-    trainer = assemble(config, capture)
+    trainer = build_trainer(config, capture)
     points, colours, labels = surface_points(name, capture.splits["train"], seed)
     start = replace(surroundings(capture), points=points, points_rgb=colours)
     generator = torch.Generator().manual_seed(seed)
-    values = StartValues.for_strategy(config.strategy)
+    values = InitialValues.for_strategy(config.strategy)
     gaussians = initial_gaussians(start, PointsInit(), values, model.sh_degree, generator)
     moving = torch.nonzero(labels >= scene_at(name, REST).movers.start)[:, 0]
     times = tuple(sorted(set(training_times(capture))))
@@ -206,7 +206,7 @@ def oracle(name: SceneName, config: Config, seed: int = 0) -> GaussianTrainer:
         field=TrueMotion(name, labels[moving], setup),
         moving=moving,
     )
-    trainer.model.begin_with(scene, OracleTraining(config.train.steps))
+    trainer.model.start_from(scene, OracleTraining(config.train.steps))
     return trainer
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from dyngs.human.body.skinning import apply_transforms, blend_transforms
 from dyngs.ops.native import active_isa, kernel_threads
 from dyngs.ops.posing import pose_by_joints
-from dyngs.ops.quaternions import quats_of, rotation_matrices
+from dyngs.ops.quaternions import quats_from_matrices, rotation_matrices
 
 Results = tuple[Tensor, Tensor, Tensor]
 
@@ -57,7 +57,7 @@ def in_torch(
     half = blended[..., :3] @ (rotation_matrices(quats) * log_scales.exp()[:, None])
     axes, lengths, _ = torch.linalg.svd(half)
     proper = axes * torch.linalg.det(axes)[:, None, None]
-    return apply_transforms(blended, means), quats_of(proper), lengths.log()
+    return apply_transforms(blended, means), quats_from_matrices(proper), lengths.log()
 
 
 def timed(call: Callable[[], object], device: str) -> float:

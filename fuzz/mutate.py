@@ -98,7 +98,7 @@ def _chosen(case: Case, rng: Random) -> str | None:
 
 
 def _folder_changed(case: Case, rng: Random) -> Case:
-    """Remove, rename, exchange or empty a file, or replace it by a folder or a link."""
+    """Remove, rename, replace_scene or empty a file, or replace it by a folder or a link."""
     name = rng.choice(sorted(case.files))
     other = rng.choice(sorted(case.files))
     files = dict(case.files)

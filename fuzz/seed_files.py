@@ -20,7 +20,7 @@ from dyngs.core.state import tensors_of
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
 from dyngs.deform.keys import DynamicModel
-from dyngs.gaussians.scene import GaussianScene, restored_scene
+from dyngs.gaussians.scene import GaussianScene, restore_scene
 from dyngs.human.avatar.avatar_file import _KIND as AVATAR_KIND
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.amass import write_amass
@@ -428,7 +428,7 @@ def _gaussians() -> dict[str, torch.Tensor]:
 
 
 def _scene(tensors: dict[str, torch.Tensor], model: SceneModel) -> GaussianScene:
-    return restored_scene(Checkpoint(_INFO, tensors), model)
+    return restore_scene(Checkpoint(_INFO, tensors), model)
 
 
 def _scene_info() -> CheckpointInfo:

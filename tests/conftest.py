@@ -205,7 +205,7 @@ def person(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three cameras, three frames of 32 px."""
     folder = tmp_path_factory.mktemp("capture") / "person"
     return write_human_capture(
-        folder, HumanOptions(size=32, num_frames=3, num_new=2, num_cameras=3, num_test=1)
+        folder, HumanOptions(size=32, num_frames=3, num_pose_frames=2, num_cameras=3, num_test=1)
     )
 
 

@@ -168,7 +168,7 @@ def contents(kind: str) -> tuple[Tensors, SceneModel]:
         box = torch.stack([torch.zeros(3), torch.ones(3)])
         options = NetworkColour(width=8, depth=2)
         colours = NetworkTraining(
-            options, 10, box, torch.Generator().manual_seed(0), sees_time=True
+            options, 10, box, torch.Generator().manual_seed(0), uses_time=True
         )
         state |= tensors_of(prefixed("colour", colours.network.state() | colours.state()))
     elif kind != "static":

@@ -15,17 +15,17 @@ from dyngs.core.camera import Cameras
 from dyngs.core.state import part_of, tensors_of
 from dyngs.data.loader import Image
 from dyngs.deform.field import FieldSetup
-from dyngs.deform.fields import new_field
+from dyngs.deform.fields import create_field
 from dyngs.deform.keys import ControlNodesField, DynamicModel
 from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.schedule import DeformSchedule
-from dyngs.deform.still_error import StillErrors
+from dyngs.deform.static_errors import StaticErrors
 from dyngs.deform.training import DynamicTraining, TrainingViews
 from dyngs.gaussians import EditResult, Gaussians
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.scene import GaussianTimeStep
-from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.schedule import RateSchedule
 
 FINE, FULL, SPLIT, STEPS = 2, 4, 6, 20
 FOCAL, DISTANCE = 100.0, 3.0
@@ -58,11 +58,11 @@ def leaves(gaussians: Gaussians) -> Gaussians:
     )
 
 
-def alike(errors: Tensor) -> StillErrors:
-    return StillErrors(errors, errors)
+def alike(errors: Tensor) -> StaticErrors:
+    return StaticErrors(errors, errors)
 
 
-def unmeasured(gaussians_at: Callable[[float], Gaussians]) -> StillErrors:
+def unmeasured(gaussians_at: Callable[[float], Gaussians]) -> StaticErrors:
     return alike(torch.zeros(len(gaussians_at(0.0))))
 
 
@@ -91,7 +91,7 @@ class Run:
         return int(left_out)
 
     def grow(self, step: int) -> EditResult | None:
-        grown = self.training.revised(self.scene, step)
+        grown = self.training.edit_scene(self.scene, step)
         if grown is None:
             return None
         self.scene, result = grown
@@ -106,9 +106,9 @@ class Run:
 def new_run(
     gaussians: Gaussians,
     times: tuple[float, ...] = TIMES,
-    still_errors: Callable[[Callable[[float], Gaussians]], StillErrors] = unmeasured,
+    static_errors: Callable[[Callable[[float], Gaussians]], StaticErrors] = unmeasured,
     update: FilterUpdate | None = None,
-    cameras_stay: bool = False,
+    has_fixed_cameras: bool = False,
     full: int = FULL,
     **options: object,
 ) -> Run:
@@ -119,8 +119,8 @@ def new_run(
         "motion_sparsity": 0.0,
         "freeze_below_px": THRESHOLD,
     }
-    capture = TrainingViews(times, [camera()], 1.0, still_errors, cameras_stay)
-    schedule = DeformSchedule(FINE, FINE, full, FINE, (SPLIT,), Rates(STEPS))
+    capture = TrainingViews(times, [camera()], 1.0, static_errors, has_fixed_cameras)
+    schedule = DeformSchedule(FINE, FINE, full, FINE, (SPLIT,), RateSchedule(STEPS))
     model = DynamicModel.model_validate(defaults | options)
     training = DynamicTraining(
         model, schedule, capture, update or FilterUpdate(), torch.Generator()
@@ -135,7 +135,7 @@ def begun(gaussians: Gaussians, **options: object) -> Run:
     """
     run = new_run(gaussians, **options)  # type: ignore[arg-type]
     setup = FieldSetup(*box_of(gaussians, 1.0), len(run.scene.times), len(gaussians), 1.0)
-    made = new_field(run.training.options.deform, setup, torch.Generator().manual_seed(0))
+    made = create_field(run.training.options.deform, setup, torch.Generator().manual_seed(0))
     field = made if "deform" in options else Lines(setup)
     run.scene = replace(run.scene, field=field, moving=torch.arange(len(gaussians)))
     return run

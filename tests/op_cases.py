@@ -13,11 +13,11 @@ from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.ops.adam import adam_step_, seen_rows
-from dyngs.ops.hash_grid import HashLevels, hash_features, known_features
+from dyngs.ops.hash_grid import HashLevels, hash_features, select_features
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.nodes import HEAD_SIZES, node_penalties, spline_motion
 from dyngs.ops.patches import (
-    Places,
+    PatchSamples,
     blend_patches,
     outline_crossings,
     patch_values,
@@ -256,7 +256,7 @@ def field_case(count: int, dtype: torch.dtype) -> Case:
         samples = march(rays, shifts, space, occupied, Steps(0.05, 0.05, 0.01))
         features = hash_features(samples.coords, table, levels)
         some = torch.arange(0, len(samples), 3)
-        again = known_features(features.detach(), some, samples.coords[some], table, levels)
+        again = select_features(features.detach(), some, samples.coords[some], table, levels)
         densities = features[:, 0].exp()
         which, offsets = reached(densities, samples, 0.1)
         seen = composite(densities, features[:, 1:4].sigmoid(), samples, 0.0)
@@ -277,7 +277,7 @@ def patches_case(count: int, dtype: torch.dtype) -> Case:
     cameras = Cameras(pose, inner, 24, 20)
 
     def run(colours: Tensor, points: Tensor) -> list[Tensor]:
-        places = Places.of(*visible_patches(points, cameras, 0.2))
+        places = PatchSamples.of(*visible_patches(points, cameras, 0.2))
         shown = patch_values(colours, places.ids, places.uv)
         crossings = outline_crossings(points, cameras, places)
         at = patch_values(points, places.ids, places.uv)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.ops.patches import Places, lattice
+from dyngs.ops.patches import PatchSamples, lattice
 
 ORDER = (2, 0, 0), (1, 1, 0), (1, 0, 1), (0, 2, 0), (0, 1, 1), (0, 0, 2)
 
@@ -62,7 +62,7 @@ def reference_visible(
     return ids, uv, depth
 
 
-def reference_blend(colours: Tensor, crossings: Tensor, places: Places) -> tuple[Tensor, Tensor]:
+def reference_blend(colours: Tensor, crossings: Tensor, places: PatchSamples) -> tuple[Tensor, Tensor]:
     """As ``blend_patches``, by its definition; what a pixel shows is a row of colours and of how
     much is nothing."""
     views, height, width = places.rows.shape

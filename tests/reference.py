@@ -20,7 +20,7 @@ from dyngs.core.camera import Cameras
 from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.projection import Projection, ProjectionOptions
 from dyngs.ops.quaternions import rotation_matrices
-from dyngs.ops.rasterization import Blended, BlendOptions
+from dyngs.ops.rasterization import BlendedImages, BlendOptions
 
 
 def covariances2d(
@@ -129,7 +129,7 @@ def rasterize(
     *,
     background: Tensor | None = None,
     options: BlendOptions = BlendOptions(),
-) -> Blended:
+) -> BlendedImages:
     """As ``dyngs.ops.rasterization.rasterize``, without probe: a loop over Gaussians, vectorised
     over pixels."""
     raised = colors.new_zeros(*opacities.shape, size[1], size[0])
@@ -162,7 +162,7 @@ def _rasterize(
     raised: Tensor,
     background: Tensor | None,
     options: BlendOptions,
-) -> Blended:
+) -> BlendedImages:
     """As ``rasterize``, with ``raised`` (V, N, H, W) added to each 2D Gaussian's value in each
     pixel."""
     height, width = raised.shape[2:]
@@ -193,7 +193,7 @@ def _rasterize(
             image = image + transmittance[..., None] * background[v]
         images.append(image)
         remains.append(transmittance)
-    return Blended(torch.stack(images), torch.stack(remains))
+    return BlendedImages(torch.stack(images), torch.stack(remains))
 
 
 class Sight(NamedTuple):

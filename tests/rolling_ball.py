@@ -73,7 +73,7 @@ def seen(balls: Sequence[PaintedBall], size: int) -> tuple[FrameStack, np.ndarra
         images=np.stack(images),
         still=np.stack(still),
         alphas=np.zeros((count, size, size)),
-        still_alphas=np.zeros((count, size, size)),
+        static_alphas=np.zeros((count, size, size)),
         depths=np.full((count, size, size), NEVER),
         poses=np.stack([FLIP @ np.linalg.inv(pose) for pose in poses]),
         intrinsics=np.repeat(lens[None], count, axis=0),

@@ -13,7 +13,7 @@ from dyngs.deform.fields import OPEN, WindowedField
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.colour.network import ColourNetwork, box_around
+from dyngs.gaussians.colour.network import ColourNetwork, robust_bounding_box
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.gaussians.visibility import VisibilityMasks
@@ -84,12 +84,12 @@ def _field(kind: str) -> str:
 
 def _network() -> ColourNetwork:
     generator = torch.Generator().manual_seed(5)
-    inputs = num_inputs(sees_time=True, sees_normals=True)
+    inputs = num_inputs(uses_time=True, uses_normals=True)
     sizes = ((8, inputs), (3, 8))
     layers = [
         Layer(0.3 * torch.randn(size, generator=generator), torch.zeros(size[0])) for size in sizes
     ]
-    return ColourNetwork(tuple(layers), box_around(cloud().means), True, True)
+    return ColourNetwork(tuple(layers), robust_bounding_box(cloud().means), True, True)
 
 
 def _person() -> HumanScene:

@@ -15,7 +15,7 @@ from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.ops import harmonics, projection, rasterization
 from dyngs.ops.projection import Projection, ProjectionOptions
-from dyngs.ops.rasterization import Blended, BlendOptions
+from dyngs.ops.rasterization import BlendedImages, BlendOptions
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class Ops:
 
     project: Callable[..., Projection]
     evaluate_harmonics: Callable[..., Tensor]
-    rasterize: Callable[..., Blended]
+    rasterize: Callable[..., BlendedImages]
 
 
 NATIVE = Ops(projection.project, harmonics.evaluate_harmonics, rasterization.rasterize)
@@ -143,7 +143,7 @@ REFERENCE = Ops(reference.project, reference.evaluate_harmonics, reference.raste
 class Drawn:
     projection: Projection
     colors: Tensor
-    blended: Blended
+    blended: BlendedImages
 
 
 def draw(scene: Scene, ops: Ops = NATIVE, limits: Limits = USUAL) -> Drawn:

@@ -11,7 +11,7 @@ import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.deform.fixed_cameras.hulls import FixedCameraClip, fixed_camera_clip
+from dyngs.deform.fixed_cameras.hulls import FixedCameraClip, build_fixed_camera_clip
 
 SIZE, FOCAL = 64, 80.0
 BLACK = torch.zeros(3)
@@ -87,7 +87,7 @@ def filmed(
 ) -> list[FixedCameraClip]:
     """Return the clips of ``count`` cameras."""
     return [
-        fixed_camera_clip(
+        build_fixed_camera_clip(
             (
                 Image("view", camera, drawn(camera, balls(t), noise, 100 * i + j), None, None, t)
                 for j, t in enumerate(times)

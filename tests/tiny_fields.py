@@ -12,7 +12,7 @@ from dyngs.config import Config, DataConfig, DefaultStrategy, RandomInit, RunCon
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.deform.control_nodes import Nodes, follow
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, innermost
-from dyngs.deform.fields import new_field
+from dyngs.deform.fields import create_field
 from dyngs.deform.keys import (
     ControlNodesField,
     DeformField,
@@ -50,7 +50,7 @@ def tiny_setup(num_moving: int = 9, num_times: int = 10) -> FieldSetup:
 def tiny_field(kind: str, num_moving: int = 9, *, everything: bool = True) -> DeformationField:
     """An untrained field."""
     generator = torch.Generator().manual_seed(3)
-    return new_field(tiny_options(kind, everything=everything), tiny_setup(num_moving), generator)
+    return create_field(tiny_options(kind, everything=everything), tiny_setup(num_moving), generator)
 
 
 def stirred_field(

@@ -13,7 +13,7 @@ from dyngs.human.keys import HumanPredictorModel
 from dyngs.human.predict.ghg.network import AtlasPerson, read_person
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 
-TINY = HumanOptions(size=32, num_frames=1, num_new=1, num_cameras=8, num_test=1, samples=1)
+TINY = HumanOptions(size=32, num_frames=1, num_pose_frames=1, num_cameras=8, num_test=1, samples=1)
 NET = HumanPredictorModel(
     sh_degree=0,
     resolution=32,

@@ -15,7 +15,7 @@ from moving_scene import Sliding, camera, moving_scene
 
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.runs.opened import Opened, opened_scene
-from dyngs.view.session import Eye, Sent, Session
+from dyngs.view.session import BrowserCamera, SentImage, Session
 from dyngs.view.views import Viewpoint, pose_of
 
 
@@ -33,12 +33,12 @@ def balls() -> Opened:
     return opened_at(moving_scene(Sliding()))
 
 
-def looking_at_balls(size: tuple[int, int] = (200, 150)) -> tuple[Session, list[Sent]]:
+def looking_at_balls(size: tuple[int, int] = (200, 150)) -> tuple[Session, list[SentImage]]:
     """A session with a camera, and the list of what it sends."""
-    sent: list[Sent] = []
+    sent: list[SentImage] = []
     session = Session(balls(), sent.append)
     wxyz, position = pose_of(camera())
-    session.move(Eye(tuple(wxyz), tuple(position), 0.7, size))
+    session.move(BrowserCamera(tuple(wxyz), tuple(position), 0.7, size))
     return session, sent
 
 

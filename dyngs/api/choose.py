@@ -32,17 +32,17 @@ from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import view_size
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.keys import FreeField
-from dyngs.deform.still_error import cameras_in_place, differing_fraction
-from dyngs.gaussians.colour.network import fitted_affine, recoloured
+from dyngs.deform.static_errors import group_fixed_cameras, changed_fraction
+from dyngs.gaussians.colour.network import fit_affine_colour, apply_affine_colour
 from dyngs.io.write import write_text
 from dyngs.models.kind import HasGaussians, Moves, capability, kind_of
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
-from dyngs.training.corrections.camera_refinement import fitted_to_image
+from dyngs.training.corrections.camera_refinement import fit_camera_to_image
 from dyngs.training.loop import Interrupts
-from dyngs.training.new_trainer import GaussianTrainer, assemble, with_points
+from dyngs.training.new_trainer import GaussianTrainer, build_trainer, with_points
 
 Pair = tuple[GaussianTrainer, GaussianTrainer]
 Score = Callable[[Pair, int], list[float]]
@@ -337,7 +337,7 @@ def _trained(
 
     Its last step is left out: in it, a model at rest would begin to move.
     """
-    trainer = assemble(config, capture, held_out=held_out, first=first_of(config, capture))
+    trainer = build_trainer(config, capture, held_out=held_out, first=first_of(config, capture))
     last = config.train.steps - 1
     with Interrupts() as interrupts:
         while trainer.done < last and time.monotonic() < deadline:
@@ -417,7 +417,7 @@ def _with(config: Config, section: str, **values: object) -> Config:
 def _motion_of_fixed_cameras(capture: Capture, config: Config) -> bool | None:
     """Return whether anything moves before fixed cameras; None where the cameras are not fixed."""
     views = capture.splits["train"]
-    cameras = cameras_in_place(views)
+    cameras = group_fixed_cameras(views)
     if sum(map(len, cameras)) <= 0.9 * len(views):
         return None
     side = min(config.data.longest_side or MOTION.side, MOTION.side)
@@ -428,7 +428,7 @@ def _motion_of_fixed_cameras(capture: Capture, config: Config) -> bool | None:
         [loader[seen[i]].composite(background) for i in evenly_spaced(len(seen), LOOK_TIMES)]
         for seen in used
     ]
-    fraction = differing_fraction(images)
+    fraction = changed_fraction(images)
     moves = fraction > MIN_DIFFERING
     found = "something moves" if moves else "nothing moves, trained as a static scene"
     show(f"{found}: {fraction:.2%} of the pixels of fixed cameras differ from their median")
@@ -483,7 +483,7 @@ def after_pose_fit(pair: Pair, index: int) -> list[float]:
         right = 1 - left if image.mask is None else (1 - left) * image.mask
         scene = trainer.model.scene
         options = trainer.model.options
-        fitted = fitted_to_image(
+        fitted = fit_camera_to_image(
             scene, image, background, trainer.extent, options=options, weights=left
         )
         rgb = _rendered(trainer, fitted).rgb[0]
@@ -509,8 +509,8 @@ def after_colour_fit(pair: Pair, index: int) -> list[float]:
         fitted = rgb.clone()
         light = _chess_board(*rgb.shape[:2])
         for half in (light, ~light):
-            affine = fitted_affine([(image, rendering)], background, half.float())
-            fitted[~half] = recoloured(affine, image, rendering, background)[~half]
+            affine = fit_affine_colour([(image, rendering)], background, half.float())
+            fitted[~half] = apply_affine_colour(affine, image, rendering, background)[~half]
         scores.append(fmean((psnr(rgb, truth, image.mask), psnr(fitted, truth, image.mask))))
     return scores
 
@@ -541,7 +541,7 @@ def _shown(pair: Pair, index: int) -> tuple[Tensor, Tensor | None, list[Tensor]]
         rendering = _rendered(trainer, image)
         rgb = rendering.rgb[0]
         if has_exposures:
-            affine = fitted_affine([(image, rendering)], background)
-            rgb = recoloured(affine, image, rendering, background)
+            affine = fit_affine_colour([(image, rendering)], background)
+            rgb = apply_affine_colour(affine, image, rendering, background)
         shown.append(rgb)
     return image.composite(background), image.mask, shown

@@ -16,18 +16,18 @@ from dyngs.compress.clean import at_end, cleaned_file, cleaned_run
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, counted, show
-from dyngs.export.edit.crop import Region, held_by
+from dyngs.export.edit.crop import Region, gaussians_in_region
 from dyngs.export.edit.frame import Frame, GeoFrame, gps_frame
 from dyngs.export.edit.merge import merged
-from dyngs.export.images import compare_run, compare_splats
+from dyngs.export.images import compare_file_with_run, compare_file_with_source
 from dyngs.export.splat_files import (
     SUFFIX,
     UP,
-    Writing,
-    read_moment,
+    WriteOptions,
+    read_4dgs_frame,
     splats_at,
     up_of,
-    write_moving,
+    write_4dgs,
 )
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
@@ -45,7 +45,7 @@ from dyngs.io.formats.similarity import UNMOVED, Similarity, axis_of
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.outputs import new_folder
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.ops.device import deterministic, device_for
+from dyngs.ops.device import deterministic, select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import RECORD_NAME
 from dyngs.runs.checkpoint import (
@@ -213,7 +213,7 @@ def _cropped(found: EditSource, source: Path, edits: Edits, tell: Tell) -> EditS
     if edits.region is None:
         return found
     scene: GaussianScene = found.opened.scene
-    rows = held_by(edits.region, scene, found.opened.world) ^ edits.outside
+    rows = gaussians_in_region(edits.region, scene, found.opened.world) ^ edits.outside
     count = int(rows.sum())
     if not count:
         points = found.opened.world.points(scene.at(None).means.cpu().numpy())
@@ -253,7 +253,7 @@ def _written(found: EditSource, out: Path, edits: Edits, tell: Tell) -> EditedFi
         is_new = edits.has_frame
         edited = moved_file(splat, how, up) if is_new else turned_file(splat, how.turn, up)
     written = write_splats(out, edited)
-    return EditedFile(written.path, compare_splats(splat, written), written.notes)
+    return EditedFile(written.path, compare_file_with_source(splat, written), written.notes)
 
 
 def _written_moving(found: EditSource, out: Path, edits: Edits, tell: Tell) -> EditedFile:
@@ -265,9 +265,9 @@ def _written_moving(found: EditSource, out: Path, edits: Edits, tell: Tell) -> E
             f"give a name in {all_suffixes()}"
         )
     how, up = _frame(found, edits, UP, tell)
-    writing = Writing(edit=how, up=up) if edits.has_frame else Writing(turn=how.turn, up=up)
-    splats, notes = write_moving(found.opened, out, scene.times, how=writing)
-    redrawn = compare_run(found.opened, scene, scene.times[0], splats[0], read_moment(out, 0))
+    writing = WriteOptions(edit=how, up=up) if edits.has_frame else WriteOptions(turn=how.turn, up=up)
+    splats, notes = write_4dgs(found.opened, out, scene.times, how=writing)
+    redrawn = compare_file_with_run(found.opened, scene, scene.times[0], splats[0], read_4dgs_frame(out, 0))
     return EditedFile(out, redrawn, notes)
 
 
@@ -317,7 +317,7 @@ def _part(config: Config, run_dir: Path, rows: Tensor) -> Checkpoint:
     """Return the last checkpoint of a run with the Gaussians ``rows`` (N,) only."""
     with (
         kernel_threads(config.run.threads or num_cores()),
-        deterministic(device_for(config.run.device), True),
+        deterministic(select_device(config.run.device), True),
     ):
         trainer = at_end(config, run_dir)
         kept = torch.zeros(trainer.num_gaussians, dtype=torch.bool, device=trainer.device)

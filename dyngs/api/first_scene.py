@@ -7,14 +7,14 @@ import torch
 from dyngs.config import Config, SceneInit
 from dyngs.core.errors import DyngsError, counted, warn
 from dyngs.data.capture import Capture
-from dyngs.gaussians.start import FirstGaussians
+from dyngs.gaussians.initialization import InitialGaussians
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.similarity import UNMOVED, Similarity
 from dyngs.io.formats.splat_file import with_degree
 from dyngs.runs.opened import open_scene
 
 
-def first_of(config: Config, capture: Capture) -> FirstGaussians | None:
+def first_of(config: Config, capture: Capture) -> InitialGaussians | None:
     """Return the Gaussians that ``init.scene`` names, as the capture has them; None: the run begins
     with points.
 
@@ -48,4 +48,4 @@ def first_of(config: Config, capture: Capture) -> FirstGaussians | None:
     mode = scene.options.mode
     if mode is not config.model.rasterize_mode:
         warn(f"{init.scene}: was trained with model.rasterize_mode={mode.value}, unlike this run")
-    return FirstGaussians(gaussians, frozen)
+    return InitialGaussians(gaussians, frozen)

@@ -21,7 +21,7 @@ from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
 from dyngs.runs.folder import require_empty, write_config
 from dyngs.runs.network_file import published_network, read_network
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def write_run(
     )
     # a run that takes no step needs no priors
     without_priors = config.train.model_copy(update={"priors": ()})
-    trainer = assemble(config.model_copy(update={"train": without_priors}), restored=True)
+    trainer = build_trainer(config.model_copy(update={"train": without_priors}), restored=True)
     predictor.begin(trainer.model, scene, config)
     with new_folder(out, require_empty) as started:
         write_config(config, started)

@@ -19,7 +19,7 @@ from dyngs.data.read import require_folder
 from dyngs.io.outputs import new_folder
 from dyngs.models.checkpoint import Checkpoint, read_capture_of, settings_of
 from dyngs.models.kind import HasGaussians, capability
-from dyngs.ops.device import deterministic, device_for, keep_freed_memory
+from dyngs.ops.device import deterministic, select_device, keep_freed_memory
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import RECORD_NAME
 from dyngs.runs.checkpoint import (
@@ -31,7 +31,7 @@ from dyngs.runs.checkpoint import (
 )
 from dyngs.runs.folder import EXPORT_FOLDER, FRAME_NAME, LOG_NAME, require_empty, write_config
 from dyngs.runs.stored_file import write_scene
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 
 SEARCH_STEPS = 1000  # Steps of fine-tuning of each candidate, unless ``prune.steps`` says otherwise
 
@@ -108,9 +108,9 @@ def prune_within(
             "model.*: losses are counted from RUN as it is; choose that with --prune R"
         )
     keep_freed_memory()
-    bytewise = deterministic(device_for(config.run.device), config.run.deterministic)
+    bytewise = deterministic(select_device(config.run.device), config.run.deterministic)
     with kernel_threads(config.run.threads or num_cores()), bytewise:
-        trainer = assemble(config, read_capture_of(config.data, start.info), restored=True)
+        trainer = build_trainer(config, read_capture_of(config.data, start.info), restored=True)
         trainer.restore(start)
         chosen, data, promise = Search(trainer, start, tell, unseen_images(trainer)).run(max_loss)
     with new_folder(out, require_empty) as started:

@@ -20,8 +20,8 @@ from dyngs.models.views import training_times
 from dyngs.runs.capture_record import require_same_capture
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.folder import ASKED_NAME, EXPORT_FOLDER
-from dyngs.training.limits import most_gaussians, within_cap
-from dyngs.training.plan import Limits, RunPlan, Stage, describe_extension, with_length, with_steps
+from dyngs.training.limits import gaussian_limit, apply_gaussian_cap
+from dyngs.training.plan import Limits, RunPlan, Stage, describe_extension, extend_config, with_steps
 from dyngs.training.processes import Processes
 
 
@@ -144,11 +144,11 @@ def set_limits(plan: RunPlan) -> tuple[RunPlan, None]:
     minutes = config.train.minutes
     num_times = 0 if plan.capture is None else len(set(training_times(plan.capture)))
     limits = Limits(
-        gaussians=most_gaussians(config, num_times),
+        gaussians=gaussian_limit(config, num_times),
         megabytes=config.budget.max_mb,
         seconds=None if minutes is None else 60 * minutes,
     )
-    capped = within_cap(config, limits.gaussians)
+    capped = apply_gaussian_cap(config, limits.gaussians)
     return replace(plan, resolved=capped, uncapped=config, limits=limits), None
 
 
@@ -169,13 +169,13 @@ def extend_run(folder: Path, resumed: Checkpoint | None) -> Stage:
             )
         require_folder(stored.data.root)
         done = resumed.info.step
-        longer = with_length(stored, done, steps)
+        longer = extend_config(stored, done, steps)
         if stored.budget.max_mb is not None:
             # otherwise a run that is stopped now would take it for its own
             (folder / EXPORT_FOLDER / SCENE_FILE).unlink(missing_ok=True)
         save_config(longer, folder / RESOLVED_NAME)
         (folder / ASKED_NAME).unlink(missing_ok=True)  # what was requested now is what is there
-        config = with_length(with_steps(config, stored.train.steps), done, steps)
+        config = extend_config(with_steps(config, stored.train.steps), done, steps)
         return replace(plan, requested=longer, resolved=config), describe_extension(
             stored, longer, done
         )

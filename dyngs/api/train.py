@@ -35,7 +35,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.outputs import writing
 from dyngs.models.kind import Predicts, capability
-from dyngs.ops.device import deterministic, device_for, keep_freed_memory
+from dyngs.ops.device import deterministic, select_device, keep_freed_memory
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import write_record
 from dyngs.runs.checkpoint import (
@@ -70,10 +70,10 @@ from dyngs.training.events import (
     StepDone,
     TotalChanged,
 )
-from dyngs.training.limits import require_possible
+from dyngs.training.limits import validate_limits
 from dyngs.training.loop import Editor, Interrupts, Loop, Trainable
 from dyngs.training.memory import memory_forecasts
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.plan import RunPlan
 from dyngs.training.prediction import network_trainer
 from dyngs.training.processes import Processes
@@ -124,8 +124,8 @@ def train(
     folder = resume_from or config.run.dir or default_folder(config.run.name)
     processes = processes or Processes()
     plan = planned(RunPlan(config, config), [share_views(processes)])
-    require_possible(plan.resolved)
-    device = device_for(config.run.device)
+    validate_limits(plan.resolved)
+    device = select_device(config.run.device)
     if resume_from is None:
         if not (folder / RESOLVED_NAME).is_file():
             inputs_of(config).require_output(folder)
@@ -154,20 +154,20 @@ def train(
             if resumed.info.step >= total and not _is_export_pending(plan.resolved, folder):
                 show(_about_finished(plan.resolved, folder))
                 return folder
-        watch = Stopwatch()
+        stopwatch = Stopwatch()
         images = None
         if resumed is None:
             plan = planned(plan, [run_pilots, find_first_gaussians, set_limits])
             if plan.limits.seconds is not None:
-                plan, message, images = fit_minutes(plan, watch, _built)
+                plan, message, images = fit_minutes(plan, stopwatch, _built)
                 if message:
                     show(message)
         else:
             resumed.require_settings(plan.resolved)
             plan = planned(plan, [read_same_capture(folder, resumed), set_limits])
-            watch.pause(-seconds_at(folder, resumed.info.step))
+            stopwatch.pause(-seconds_at(folder, resumed.info.step))
         trainer = _built(plan, resumed, images)
-        run = _Run(plan, trainer, folder, resumed, processes=processes, watch=watch)
+        run = _Run(plan, trainer, folder, resumed, processes=processes, stopwatch=stopwatch)
         run.run(listeners)
     return run.folder
 
@@ -181,7 +181,7 @@ def _built(
     if capability(config.model, Predicts):
         trainer = network_trainer(config)
     else:
-        trainer = assemble(
+        trainer = build_trainer(
             config,
             plan.capture,
             restored=resumed is not None,
@@ -217,7 +217,7 @@ class _Run:
         resumed: Checkpoint | None,
         *,
         processes: Processes,
-        watch: Stopwatch,
+        stopwatch: Stopwatch,
     ) -> None:
         config = plan.resolved
         self._plan = plan
@@ -244,14 +244,14 @@ class _Run:
         self.loop = Loop(
             trainer,
             config.total_steps,
-            watch,
+            stopwatch,
             lambda: last_good(self.folder),
             stages=[prune_stage] if isinstance(trainer, Trainer) else [],
             limits=editors,
             before_step=self._leader.before_step,
         )
         self._saved = trainer.done
-        self._save_timer = SaveTimer(config.train.save_minutes, watch.seconds)
+        self._save_timer = SaveTimer(config.train.save_minutes, stopwatch.seconds)
         if resumed is None:
             begin(self.folder, config)
             note_asked(self.folder, plan.requested)
@@ -311,7 +311,7 @@ class _Run:
                     self._evaluate(step)
 
     def _save(self) -> None:
-        begin = self.loop.watch.seconds
+        begin = self.loop.stopwatch.seconds
         checkpoint = self.loop.trainer.checkpoint()
         if self._count is not None:
             kept = {f"{_COUNT}.{name}": x for name, x in self._count.state().items()}
@@ -322,16 +322,16 @@ class _Run:
             except OSError as error:
                 raise DyngsError(f"{self.folder}: cannot be made again: {error}") from error
             write_config(self.config, self.folder)
-        path = save_checkpoint(self.folder, checkpoint, self.loop.watch.seconds)
+        path = save_checkpoint(self.folder, checkpoint, self.loop.stopwatch.seconds)
         self._saved = self.loop.trainer.done
-        self._save_timer.saved(begin, self.loop.watch.seconds)
+        self._save_timer.saved(begin, self.loop.stopwatch.seconds)
         self.loop.emit(Saved(self._saved, path))
 
     def _evaluate(self, step: int) -> None:
         start = time.perf_counter()
         report = evaluate_run(self.folder, "test", capture=self._plan.capture)
         seconds = time.perf_counter() - start
-        self.loop.watch.pause(seconds)
+        self.loop.stopwatch.pause(seconds)
         self.loop.emit(Evaluated(step, "test", report.psnr, report.ssim, seconds))
 
     def _reached(self) -> Iterator[str]:

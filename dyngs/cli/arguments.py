@@ -269,10 +269,10 @@ def computing_device(choice: str) -> torch.device:
 
     Raises DyngsError: ``cuda`` where no GPU can be used.
     """
-    from dyngs.ops.device import device_for, why_on_cpu
+    from dyngs.ops.device import select_device, cpu_fallback_reason
 
-    device = device_for(choice)
-    reason = why_on_cpu(choice)
+    device = select_device(choice)
+    reason = cpu_fallback_reason(choice)
     if reason is not None:
         print(f"dyngs: {reason}", file=sys.stderr)
     return device

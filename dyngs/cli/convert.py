@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Convert the file, and print how much that changes what it shows."""
     from dataclasses import replace
 
-    from dyngs.export.images import compare_splats
+    from dyngs.export.images import compare_file_with_source
     from dyngs.io.formats.formats import (
         format_of,
         read_splats,
@@ -56,6 +56,6 @@ def run(arguments: argparse.Namespace) -> int:
     )
     print_notes((*splat.notes, f"{counted(len(splat.gaussians), 'Gaussian')}; {said}"))
     written = write_splats(arguments.target, rotated, sh_degree=arguments.sh_degree)
-    print_redrawn(written.notes, [compare_splats(splat, written)])
+    print_redrawn(written.notes, [compare_file_with_source(splat, written)])
     print_written(written.path)
     return 0

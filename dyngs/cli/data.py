@@ -296,12 +296,12 @@ def run_fit(arguments: argparse.Namespace) -> int:
 def run_people(arguments: argparse.Namespace) -> int:
     """Find a person and fit a body; print what was found, and the next command."""
     from dyngs.human.detect.detector import MediaPipe
-    from dyngs.human.detect.find_person import write_found_person
+    from dyngs.human.detect.detect_person import write_detected_person
 
     options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.clip})
     detector = MediaPipe(arguments.mediapipe)
     with ProgressBar() as report:
-        result = write_found_person(options, arguments.out, detector, report)
+        result = write_detected_person(options, arguments.out, detector, report)
     print_lines(f"{result.summary}\nnext: dyngs train human data.root={as_word(result.root)}")
     return 0
 
@@ -312,12 +312,12 @@ def _avatar_in(person: Path | None) -> KnownAvatar | None:
 
     if person is None or not (person / RESOLVED_NAME).is_file():
         return None
-    from dyngs.human.avatar.scene import avatar_of
+    from dyngs.human.avatar.scene import as_human_scene
     from dyngs.human.fit.fitted_capture import KnownAvatar
     from dyngs.runs.checkpoint import load_run
 
     run = load_run(person)
-    scene = avatar_of(run.scene)
+    scene = as_human_scene(run.scene)
     return None if scene is None else KnownAvatar(scene, run.config.data.longest_side)
 
 

@@ -99,10 +99,10 @@ def _examine_core() -> Iterator[Check]:
 def _examine_gpu() -> Iterator[Check]:
     """Yield what there is of a CUDA GPU; without one dyngs works, too."""
     try:
-        from dyngs.ops.device import findings, why_no_gpu
+        from dyngs.ops.device import findings, gpu_unavailable_reason
     except (ImportError, DyngsError):
         return
-    reason = why_no_gpu()
+    reason = gpu_unavailable_reason()
     for name, value in findings().items():
         yield Check(name, value)
     if reason is None:

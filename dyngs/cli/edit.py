@@ -111,8 +111,8 @@ def _edits(arguments: argparse.Namespace) -> Edits:
     """Return what the options ask for. Raises DyngsError: they do not go together, or are no points
     or numbers."""
     from dyngs.api.edit import Edits
-    from dyngs.export.edit.crop import region_of
-    from dyngs.export.edit.frame import Frame, direction, geo_frame, number, point, scale_of
+    from dyngs.export.edit.crop import parse_region
+    from dyngs.export.edit.frame import Frame, direction, control_point_frame, number, point, parse_scale
 
     alone = [
         f"--{name}" for name in ("up", "origin", "scale") if getattr(arguments, name) is not None
@@ -131,15 +131,15 @@ def _edits(arguments: argparse.Namespace) -> Edits:
         raise DyngsError(f"--max-loss {max_loss:g}: give the dB that may be lost, 0 or more")
     return Edits(
         max_loss=max_loss if arguments.clean else None,
-        region=None if arguments.crop is None else region_of(arguments.crop),
+        region=None if arguments.crop is None else parse_region(arguments.crop),
         outside=arguments.outside,
         merge=tuple(arguments.merge),
         frame=Frame(
             None if arguments.up is None else direction(arguments.up),
             None if arguments.origin is None else point(arguments.origin, "--origin"),
-            1.0 if arguments.scale is None else scale_of(arguments.scale),
+            1.0 if arguments.scale is None else parse_scale(arguments.scale),
         ),
-        geo=None if arguments.geo in (None, _EXIF) else geo_frame(arguments.geo),
+        geo=None if arguments.geo in (None, _EXIF) else control_point_frame(arguments.geo),
         gps=arguments.geo == _EXIF,
         undo=arguments.undo,
         time=arguments.time,

@@ -252,11 +252,11 @@ def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
 
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
     """Return the requested times, clamped to [0, 1], or None."""
-    from dyngs.export.camera_paths import clamped_times, parse_times
+    from dyngs.export.camera_paths import clamp_times, parse_times
 
     if arguments.times is None and arguments.time is None:
         return None
-    inside, warnings = clamped_times(
+    inside, warnings = clamp_times(
         (arguments.time,) if arguments.times is None else parse_times(arguments.times)
     )
     print_notes((), warnings)
@@ -272,13 +272,13 @@ def _export_splats(
 ) -> list[Path]:
     """Write a sequence if several times of a moving scene are requested, else one file; return the
     paths."""
-    from dyngs.export.images import compare_run
+    from dyngs.export.images import compare_file_with_run
     from dyngs.export.splat_files import (
         scene_part,
         write_run_levels,
         write_run_sequence,
         write_run_splats,
-        writing_of,
+        choose_write_options,
     )
     from dyngs.io.formats.formats import format_named, known_format, read_splats
 
@@ -291,7 +291,7 @@ def _export_splats(
             "the colours of the run are a network; spherical harmonics of degree 3 are fitted to it"
         )
         print_notes((line,))
-    how, line = writing_of(opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
+    how, line = choose_write_options(opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
     out: Path | None = arguments.out
     is_sequence = _is_sequence(arguments)
@@ -324,7 +324,7 @@ def _export_splats(
             path = out / f"{stem}{suffix}" if out.is_dir() else out
         written = [write_run_splats(opened, path, moments[0], part, how)]
     found = [
-        compare_run(opened, scene, moments[i], written[i].splat, read_splats(written[i].path))
+        compare_file_with_run(opened, scene, moments[i], written[i].splat, read_splats(written[i].path))
         for i in _shown(len(written))
     ]
     print_redrawn(written[0].notes, found)
@@ -340,24 +340,24 @@ def _export_moving(
     arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...]
 ) -> list[Path]:
     """Write all times as one file of moving Gaussians."""
-    from dyngs.export.images import compare_run
+    from dyngs.export.images import compare_file_with_run
     from dyngs.export.splat_files import (
         SUFFIX,
         UP,
-        read_moment,
+        read_4dgs_frame,
         scene_part,
-        write_moving,
-        writing_of,
+        write_4dgs,
+        choose_write_options,
     )
 
-    how, line = writing_of(opened, UP, arguments.up, arguments.from_up)
+    how, line = choose_write_options(opened, UP, arguments.up, arguments.from_up)
     print_notes((line,))
     part = _part(arguments)
     scene = scene_part(opened.scene, part)
     path = _target(arguments, f"splats{SUFFIX}")
-    splats, notes = write_moving(opened, path, times, part, how)
+    splats, notes = write_4dgs(opened, path, times, part, how)
     found = [
-        compare_run(opened, scene, times[i], splats[i], read_moment(path, i))
+        compare_file_with_run(opened, scene, times[i], splats[i], read_4dgs_frame(path, i))
         for i in _shown(len(times))
     ]
     print_redrawn(notes, found)
@@ -435,24 +435,24 @@ def _export_network(arguments: argparse.Namespace) -> None:
 
 def _export_bodies(arguments: argparse.Namespace) -> None:
     """Write a moving scene with its bodies as animated nodes."""
-    from dyngs.export.images import compare_run
-    from dyngs.export.splat_files import write_bodies, writing_of
+    from dyngs.export.images import compare_file_with_run
+    from dyngs.export.splat_files import write_rigid_bodies, choose_write_options
     from dyngs.io.formats.formats import format_named, read_splats
 
     out = _target(arguments, "bodies.glb")
     opened = _open(arguments)
     time = (_times(arguments) or (0.0,))[0]
-    how, line = writing_of(opened, format_named("glb").up, arguments.up, arguments.from_up)
-    written = write_bodies(opened, out, time, how)
+    how, line = choose_write_options(opened, format_named("glb").up, arguments.up, arguments.from_up)
+    written = write_rigid_bodies(opened, out, time, how)
     print_notes((line,))
-    found = compare_run(opened, opened.scene, time, written.splat, read_splats(written.path))
+    found = compare_file_with_run(opened, opened.scene, time, written.splat, read_splats(written.path))
     print_redrawn(written.notes, [found])
     print_written(written.path)
 
 
 def _export_rigged(arguments: argparse.Namespace) -> None:
     """Write a person as a skinned mesh, or as Gaussians with joints."""
-    from dyngs.export.rigged.people import Played, write_mesh, write_rigged_splats
+    from dyngs.export.rigged.people import AnimationInfo, write_mesh, write_rigged_splats
     from dyngs.runs.opened import FRAME_RATE
 
     is_ply = arguments.joints and _kind(arguments) == "ply"
@@ -464,7 +464,7 @@ def _export_rigged(arguments: argparse.Namespace) -> None:
             "--motion does not go with --joints in a .ply, which has the rest pose; give --out FILE.glb"
         )
     opened = _moved(arguments, _open(arguments)).in_own_frame()
-    played = None if motion is None else Played(motion.stem, opened.fps or FRAME_RATE)
+    played = None if motion is None else AnimationInfo(motion.stem, opened.fps or FRAME_RATE)
     print_notes((write_rigged_splats if arguments.joints else write_mesh)(opened, out, played))
     print_written(out)
 
@@ -486,8 +486,8 @@ def _has_surface(arguments: argparse.Namespace) -> bool:
 
 def _export_surface(arguments: argparse.Namespace) -> None:
     """Write the surface of a scene, at several times one file each."""
-    from dyngs.export.surface_file import upright_surface, write_surface
-    from dyngs.gaussians.surface import num_holes
+    from dyngs.export.surface_file import surface_write_options, write_surface
+    from dyngs.gaussians.surface import count_holes
     from dyngs.models.renderable import SurfaceOptions
 
     out: Path = arguments.out or arguments.run_dir / ("mesh" if arguments.times else "mesh.ply")
@@ -497,14 +497,14 @@ def _export_surface(arguments: argparse.Namespace) -> None:
         )
     opened = _open(arguments)
     options = SurfaceOptions(arguments.level, arguments.cells, arguments.segments)
-    how, line = upright_surface(
+    how, line = surface_write_options(
         opened, ".ply" if arguments.times else out.suffix, arguments.up, arguments.from_up
     )
     print_notes((line,))
     for i, time in enumerate(_times(arguments) or (0.0,)):
         path = out / f"mesh_{i:04d}.ply" if arguments.times else out
         surface = write_surface(opened, path, time=time, options=options, how=how)
-        holes = num_holes(surface)
+        holes = count_holes(surface)
         closed = "closed" if holes == 0 else f"open at {counted(holes, 'place')}"
         faces = counted(len(surface.faces), "triangle")
         print_notes((f"{faces} with colours of {len(surface.vertices):,} vertices, {closed}",))
@@ -541,7 +541,7 @@ def _export_page(arguments: argparse.Namespace) -> None:
 def _export_cameras(arguments: argparse.Namespace) -> None:
     """Write the cameras of a run as a transforms.json, refined where training refined them."""
     from dyngs.data.capture import all_views
-    from dyngs.evaluate.report import found_corrections
+    from dyngs.evaluate.report import load_camera_corrections
     from dyngs.export.cameras import NAME, write_cameras
     from dyngs.runs.opened import open_run
 
@@ -554,7 +554,7 @@ def _export_cameras(arguments: argparse.Namespace) -> None:
         raise DyngsError(
             f"{path}: would stand in for the cameras of the capture; give another folder"
         )
-    found = found_corrections(source, run, capture.splits["train"])
+    found = load_camera_corrections(source, run, capture.splits["train"])
     if found is None and run.config.camera.refine == "always":
         raise DyngsError(
             f"{source}: refined cameras lie in checkpoints, and there is none; restore one or train again"
@@ -566,7 +566,7 @@ def _export_cameras(arguments: argparse.Namespace) -> None:
     if found is not None:
         line = "training cameras as training found them; others have the capture's poses, and known lenses"
         for name, views in splits.items():
-            splits[name] = [found.corrected_view(view) for view in views]
+            splits[name] = [found.correct_view(view) for view in views]
     print_notes((line,))
     written = write_cameras(path, capture, splits, run.world)
     count = counted(len(all_views(capture.splits)), "camera")

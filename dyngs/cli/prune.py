@@ -14,7 +14,7 @@ from dyngs.core.errors import DyngsError, as_word
 
 if TYPE_CHECKING:
     from dyngs.compress.search import Promise
-    from dyngs.evaluate.report import Cost
+    from dyngs.evaluate.report import RunMetrics
 
 MAX_LOSS = 0.2
 _EPILOG = """\
@@ -133,7 +133,7 @@ def _decibels(text: str) -> float:
     return value
 
 
-def cost_cells(before: Cost, after: Cost, promise: Promise | None = None) -> list[list[str]]:
+def cost_cells(before: RunMetrics, after: RunMetrics, promise: Promise | None = None) -> list[list[str]]:
     """Return the rows of a table that compares a run with the file of a pruned one."""
     ratio = before.num_gaussians / after.num_gaussians
     cells = [

@@ -127,7 +127,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
     from dyngs.io.outputs import writing
     from dyngs.runs.folder import inputs_of
     from dyngs.study.compare import ModelComparison
-    from dyngs.study.report import Report, can_plot, plot_curves, shown_views, table_of
+    from dyngs.study.report import Report, can_plot, plot_curves, page_views, table_of
     from dyngs.study.tradeoff import table_rows
 
     capture = Path(os.path.abspath(arguments.capture))  # so that it has a name, also as . or ..
@@ -165,7 +165,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
         rows,
         [table_of(about, rows)],
         left_out=unfit | left_out,
-        views=shown_views(out, results),
+        views=page_views(out, results),
         figure=plot_curves(curves) if can_plot() and any(curves.values()) else None,
     )
     _print_report(report, out / "comparison", is_json=arguments.json)

@@ -115,10 +115,10 @@ def _view(arguments: argparse.Namespace, config: Config) -> TrainingView:
     from dyngs.view.server import require_viser
 
     require_viser()
-    from dyngs.view.server import Serving
+    from dyngs.view.server import ServerOptions
     from dyngs.view.training import TrainingView
 
-    return TrainingView(config, Serving(arguments.host, arguments.port), print_lines)
+    return TrainingView(config, ServerOptions(arguments.host, arguments.port), print_lines)
 
 
 def _about_motion(folder: Path, config: Config) -> list[str]:

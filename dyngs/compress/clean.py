@@ -20,12 +20,12 @@ from dyngs.gaussians.rendering import depths_and_contributions
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.checkpoint import read_capture_of
 from dyngs.models.kind import HasGaussians, capability, kind_of
-from dyngs.ops.device import deterministic, device_for
+from dyngs.ops.device import deterministic, select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.checkpoint import has_only_scene_file, latest_checkpoint, load_run
 from dyngs.training.loop import Loop
-from dyngs.training.new_trainer import GaussianTrainer, assemble
-from dyngs.training.trainer import Edit, Trainer
+from dyngs.training.new_trainer import GaussianTrainer, build_trainer
+from dyngs.training.trainer import TrainingEdit, Trainer
 
 MAIN_FRACTION = 0.5  # Fraction of the weight of a Gaussian that must lie in one view
 # Depth of a Gaussian in that view, over the median depth of the view, below which it is near
@@ -39,7 +39,7 @@ FEWEST_VIEWS, MOST = 20, 0.01
 view only."""
 
 
-def remove_floaters(loop: Loop) -> Edit | None:
+def remove_floaters(loop: Loop) -> TrainingEdit | None:
     """Editor that removes floaters when training ends, if that is requested; static scenes only."""
     trainer = loop.trainer
     assert isinstance(trainer, Trainer)
@@ -56,8 +56,8 @@ def remove_floaters(loop: Loop) -> Edit | None:
     before = counted(len(found), "Gaussian")
     message = f"{count:,} of {before} hang close before single cameras"
     if count > MOST * len(found):
-        return Edit(f"{message}: too many to be floaters, none is removed")
-    return Edit(f"{message}: removed (train.remove_floaters)", ~found)
+        return TrainingEdit(f"{message}: too many to be floaters, none is removed")
+    return TrainingEdit(f"{message}: removed (train.remove_floaters)", ~found)
 
 
 @torch.no_grad()
@@ -158,7 +158,7 @@ def cleaned_run(
         raise DyngsError(f"{run_dir}: model.kind={config.model.kind} has no Gaussians to clean")
     with (
         kernel_threads(threads or num_cores()),
-        deterministic(device_for(config.run.device), True),
+        deterministic(select_device(config.run.device), True),
         torch.no_grad(),
     ):
         trainer = at_end(config, run_dir)
@@ -169,7 +169,7 @@ def cleaned_run(
                 f"{run_dir}: --clean needs two views or more, of which one judges what it costs"
             )
         images = unseen or [trainer.images[i] for i in held]
-        scene: GaussianScene = trainer.model.scene.unmasked()
+        scene: GaussianScene = trainer.model.scene.without_masks()
         before = quality_of(trainer, scene, images)
         trained_before = quality_of(trainer, scene)
 
@@ -220,13 +220,13 @@ def at_end(config: Config, run_dir: Path) -> GaussianTrainer:
     """Return the trainer of a run where it ended; without checkpoints with nothing but its
     scene."""
     run = load_run(run_dir, config.data.root)
-    trainer: GaussianTrainer = assemble(
+    trainer: GaussianTrainer = build_trainer(
         config, read_capture_of(config.data, run.info), restored=True
     )
     if has_only_scene_file(run_dir):
         scene = run.scene.to(trainer.device)
-        trainer.model.begin_with(scene, trainer.model.training)
-        trainer.model.exchange(scene)
+        trainer.model.start_from(scene, trainer.model.training)
+        trainer.model.replace_scene(scene)
     else:
         trainer.restore(latest_checkpoint(run_dir))
     return trainer
@@ -235,7 +235,7 @@ def at_end(config: Config, run_dir: Path) -> GaussianTrainer:
 def suspects_of(trainer: GaussianTrainer, held: Sequence[int]) -> dict[str, Tensor]:
     """Return the rows (K,) that may go, by kind, the most harmless first; of each first those that
     contribute least to all training views not ``held``."""
-    scene: GaussianScene = trainer.model.scene.unmasked()
+    scene: GaussianScene = trainer.model.scene.without_masks()
     views = scoring_views(trainer, scene)
     if scene.is_static:
         cameras = trainer.images.cameras()

@@ -19,7 +19,7 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.loader import ImageLoader
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import contributions
-from dyngs.gaussians.scene import GaussianScene, render_options, restored_scene
+from dyngs.gaussians.scene import GaussianScene, render_options, restore_scene
 from dyngs.models.checkpoint import Checkpoint, read_capture_of, restored_model
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
@@ -303,7 +303,7 @@ def coarsest_file(
     All steps are those that ``storage_plan`` measures, times one factor. The bytes are read again
     before they count. ``quality``: of a scene, the higher the better.
     """
-    scene = restored_scene(checkpoint, config.model)
+    scene = restore_scene(checkpoint, config.model)
     precision, coarseness = storage_plan(config, checkpoint, scene, None)
     best = None
 
@@ -311,7 +311,7 @@ def coarsest_file(
         nonlocal best
         steps = {name: step and step_below(factor * step) for name, step in precision.steps.items()}
         data = encoded(checkpoint.info, scene, steps, coarseness)
-        found = quality(restored_scene(decoded(data), config.model))
+        found = quality(restore_scene(decoded(data), config.model))
         if found >= least:
             best = data, found
         return found < least
@@ -341,7 +341,7 @@ def _chosen(capture: Capture, count: int) -> list[View]:
 
 
 def _visibility(scene: GaussianScene, shots: Sequence[Shot]) -> Tensor:
-    scene = scene.unmasked()
+    scene = scene.without_masks()
     total = torch.zeros(len(scene), device=scene.gaussians.means.device)
     for camera, time in shots:
         total += contributions(scene.at(time), camera, scene.options)[0]

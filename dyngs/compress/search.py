@@ -36,7 +36,7 @@ from dyngs.models.renderable import Posable
 from dyngs.models.views import background_colour
 from dyngs.ops.device import sent
 from dyngs.training.new_trainer import GaussianTrainer
-from dyngs.training.trainer import Edit
+from dyngs.training.trainer import TrainingEdit
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def apply_choice(trainer: GaussianTrainer, choice: PruneChoice, scores: Tensor) 
         model = model.model_copy(update={"alpha_min": choice.alpha_min})
     prune = config.prune.model_copy(update={"fraction": choice.fraction})
     changed = {"model": model, "colour": colour, "prune": prune}
-    trainer.apply(Edit(config=config.model_copy(update=changed)))
+    trainer.apply(TrainingEdit(config=config.model_copy(update=changed)))
     trainer.apply(removal(trainer, scores if choice.fraction else None))
     if choice.harmonics:
         _drop_harmonics(trainer, choice.harmonics)
@@ -84,7 +84,7 @@ def _drop_harmonics(trainer: GaussianTrainer, tolerance: float) -> None:
         _looks(trainer, seen, background), looks, trainer.model.options, background, tolerance
     )
     trainer.model.drop_harmonics(~found.keeps, found.offsets)
-    trainer.model.keep_plain(
+    trainer.model.freeze_plain_harmonics(
         ~found.keeps, AutoColour(opacity_entropy=trainer.config.colour.opacity_entropy)
     )
 
@@ -322,5 +322,5 @@ class Search:
 
     def _restart(self) -> None:
         trainer = self.trainer
-        trainer.begin_again(self._config, self.start)
-        trainer.model.exchange(trainer.model.scene.unmasked())
+        trainer.restart(self._config, self.start)
+        trainer.model.replace_scene(trainer.model.scene.without_masks())

@@ -37,7 +37,7 @@ from dyngs.models.views import background_colour
 from dyngs.ops.device import sent
 from dyngs.training.loop import Loop
 from dyngs.training.new_trainer import GaussianTrainer
-from dyngs.training.trainer import Edit, Trainer
+from dyngs.training.trainer import TrainingEdit, Trainer
 
 # Slope of the hyperbolic tangent: second differences of a profile are small numbers
 STEEPNESS = 4.0
@@ -147,7 +147,7 @@ MASKED_BELOW = 0.5
 (docs/prune.md)."""
 
 
-def prune_stage(loop: Loop) -> Edit | None:
+def prune_stage(loop: Loop) -> TrainingEdit | None:
     """Editor that prunes and masks when training ends and fine-tuning begins."""
     trainer = loop.trainer
     assert isinstance(trainer, Trainer)
@@ -158,9 +158,9 @@ def prune_stage(loop: Loop) -> Edit | None:
 
 
 @torch.no_grad()
-def pruning(trainer: GaussianTrainer) -> Edit:
+def pruning(trainer: GaussianTrainer) -> TrainingEdit:
     """Return the edit that prunes and masks the Gaussians of ``trainer`` by its config."""
-    scene = trainer.model.scene.unmasked()
+    scene = trainer.model.scene.without_masks()
     options = trainer.config.prune
     edit = removal(trainer, scores_of(trainer, options) if options.fraction > 0 else None)
     message = f"pruned: {len(scene):,} -> "
@@ -174,7 +174,7 @@ def pruning(trainer: GaussianTrainer) -> Edit:
     return replace(edit, message=f"{message}{left}, {cost}{_let_through(edit)}")
 
 
-def _let_through(edit: Edit) -> str:
+def _let_through(edit: TrainingEdit) -> str:
     masks = edit.masks
     if masks is None:
         return ""
@@ -184,17 +184,17 @@ def _let_through(edit: Edit) -> str:
 
 
 @torch.no_grad()
-def removal(trainer: GaussianTrainer, scores: Tensor | None) -> Edit:
+def removal(trainer: GaussianTrainer, scores: Tensor | None) -> TrainingEdit:
     """Return the edit that leaves all but the fraction ``prune.fraction`` with the lowest ``scores``
     (N,), and masks them if requested; from then on their number stays."""
     options = trainer.config.prune
-    whole = trainer.model.scene.unmasked()
+    whole = trainer.model.scene.without_masks()
     kept = None if scores is None else highest(scores, options.fraction)
     masks = None
     moves = capability(trainer.config.model, Moves) is not None and not whole.is_static
     if options.mask_times > 1 and moves:
         masks = _masks(trainer, whole, kept)
-    return Edit(kept=kept, masks=masks, stops_growing=True)
+    return TrainingEdit(kept=kept, masks=masks, stops_densification=True)
 
 
 @torch.no_grad()
@@ -202,7 +202,7 @@ def scores_of(trainer: GaussianTrainer, options: PruneConfig | None = None) -> T
     """Return (N,) how much each Gaussian matters now, by the score of ``options``; None: the first
     of docs/prune.md."""
     score = (options or PruneConfig()).score
-    scene = trainer.model.scene.unmasked()
+    scene = trainer.model.scene.without_masks()
     found = importance(scoring_views(trainer, scene), slopes=score == "sensitivity")
     match score:
         case "variation":
@@ -276,7 +276,7 @@ def _masks(trainer: GaussianTrainer, scene: GaussianScene, kept: Tensor | None) 
     fractions = importance(scoring_views(trainer, scene, times), slopes=False).fractions
     seen = fractions > MASKED_BELOW
     moved = field_scene_of(scene)
-    if moved is not None and moved.field is not None and moved.field.fades:
+    if moved is not None and moved.field is not None and moved.field.can_fade:
         seen |= there_after(scene, times, trainer.model.options.alpha_min).to(seen.device)
     return VisibilityMasks.pack(tuple(times), seen if kept is None else seen[:, kept])
 

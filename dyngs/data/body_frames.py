@@ -182,7 +182,7 @@ def read_body_file(path: Path) -> BodyFrames:
     return replace(body, fitted_to=str(found.get("fitted_to", "")))
 
 
-def with_fitted_body(capture: Capture, folder: Path) -> Capture:
+def ensure_fitted_body(capture: Capture, folder: Path) -> Capture:
     """Return the capture with the body parameters of ``folder``: ``body_train.npz``, and
     ``body_pose.npz`` if there."""
     if not (folder / "body_train.npz").is_file():

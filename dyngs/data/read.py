@@ -11,7 +11,7 @@ import numpy as np
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError, NoCaptureError, reading
 from dyngs.data import times
-from dyngs.data.body_frames import with_fitted_body
+from dyngs.data.body_frames import ensure_fitted_body
 from dyngs.data.capture import (
     Capture,
     CaptureFormat,
@@ -289,7 +289,7 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         warnings=(*warnings, *lacking, *layers, *notes, *copies, *more, *absent),
     )
     return normalise_capture(
-        capture if options.body is None else with_fitted_body(capture, options.body)
+        capture if options.body is None else ensure_fitted_body(capture, options.body)
     )
 
 

@@ -79,7 +79,7 @@ def nodes_at(positions: Tensor, means: Tensor) -> Nodes:
     return Nodes(positions, radii.clamp_min(floor).to(positions), followed)
 
 
-def spread_out(points: Tensor, count: int, taken: Tensor) -> Tensor:
+def farthest_points(points: Tensor, count: int, taken: Tensor) -> Tensor:
     """Return indices of at most ``count`` ``points`` (M, 3), each the farthest from those before it
     and from ``taken``.
 
@@ -207,7 +207,7 @@ class ControlNodes(DeformationField):
         }
         return field
 
-    def regroup(self) -> None:
+    def invalidate(self) -> None:
         self.buffers.pop("followed", None)
 
     def to(self, device: torch.device | str) -> ControlNodes:
@@ -316,12 +316,12 @@ class ControlNodes(DeformationField):
         kept = torch.zeros(0, dtype=torch.long, device=means.device)
         if len(old):
             kept = nodes_at(old, means).followed[:, 0].unique()
-        added = spread_out(means, self.options.nodes - len(kept), old[kept])
+        added = farthest_points(means, self.options.nodes - len(kept), old[kept])
         source = torch.cat([kept, torch.zeros(len(added), dtype=torch.long, device=kept.device)])
         is_new = torch.arange(len(source), device=source.device) >= len(kept)
         started = self._motion_at(means[added])
         values = {name: torch.cat([x[kept], started[name]]) for name, x in self._splines().items()}
-        self.parameters = self.parameters.rearranged(values, source, is_new)
+        self.parameters = self.parameters.reorder(values, source, is_new)
         self._assign(torch.cat([old[kept], means[added]]), means)
 
     def _assign(self, positions: Tensor, means: Tensor) -> None:

@@ -69,10 +69,10 @@ class DeformationField:
     setup: FieldSetup
     parameters: Parameters
     """All that is optimised."""
-    momentary = False
+    has_lifetime = False
     """Moving Gaussians are there for a while each, and stay as they are in steps that do not show
     them."""
-    fades = False
+    can_fade = False
     """Moving Gaussians may be there for a part of the clip only."""
 
     @property
@@ -120,7 +120,7 @@ class DeformationField:
         """
         return gaussians
 
-    def rest_outside_(self, window: tuple[float, float]) -> None:
+    def zero_gradients_outside_(self, window: tuple[float, float]) -> None:
         """Drop the gradients of what times in ``window`` hardly show: Adam would take them for as
         much as any."""
 
@@ -128,7 +128,7 @@ class DeformationField:
         """Return the field after an edit of the moving Gaussians."""
         return self
 
-    def regroup(self) -> None:
+    def invalidate(self) -> None:
         """Drop what was derived from the set of Gaussians; it is computed again when next
         needed."""
 
@@ -197,11 +197,11 @@ class OuterField(DeformationField):
     ) -> Gaussians:
         return self.others.shaded(gaussians, rows, which, time)
 
-    def rest_outside_(self, window: tuple[float, float]) -> None:
-        self.others.rest_outside_(window)
+    def zero_gradients_outside_(self, window: tuple[float, float]) -> None:
+        self.others.zero_gradients_outside_(window)
 
-    def regroup(self) -> None:
-        self.others.regroup()
+    def invalidate(self) -> None:
+        self.others.invalidate()
 
     def edited(self: Outer, edit: TopologyEdit) -> Outer:
         return self.around(self.others.edited(edit))
@@ -223,7 +223,7 @@ def innermost(field: DeformationField) -> DeformationField:
     return innermost(field.others) if isinstance(field, OuterField) else field
 
 
-def deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None = None) -> Gaussians:
+def apply_offsets(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None = None) -> Gaussians:
     """Return ``gaussians`` with ``offsets`` applied to ``rows`` ((M,) long; None = all, in order);
     differentiable.
 

@@ -36,7 +36,7 @@ class WindowedField(OuterField):
     logistic function, a and b, the ``edges`` (M, 2), are where the window begins and ends.
     """
 
-    fades = True
+    can_fade = True
 
     def __init__(self, others: DeformationField, num_moving: int) -> None:
         super().__init__(others)
@@ -78,7 +78,7 @@ def _window(edges: Tensor, time: float) -> Tensor:
     return torch.nn.functional.logsigmoid(inside).sum(1)
 
 
-def new_field(
+def create_field(
     options: DeformField, setup: FieldSetup, generator: torch.Generator
 ) -> DeformationField:
     """Return an untrained field of the kind asked for: every Gaussian stays where it is."""
@@ -96,7 +96,7 @@ def num_values(options: DeformField, num_times: int, num_moving: int = 0) -> int
     setup = FieldSetup(
         torch.zeros(3, device="cpu"), torch.ones(3, device="cpu"), num_times, num_moving, 1.0
     )
-    return new_field(options, setup, torch.Generator()).parameters.num_values
+    return create_field(options, setup, torch.Generator()).parameters.num_values
 
 
 def field_state(field: DeformationField) -> State:
@@ -108,7 +108,7 @@ def field_state(field: DeformationField) -> State:
     return field.state() | with_role({"box": box, "numbers": numbers}, Role.SHARED)
 
 
-def restored_field(
+def restore_field(
     options: DeformField, tensors: Mapping[str, Tensor], num_moving: int
 ) -> DeformationField:
     """Return the field of a checkpoint for M moving Gaussians."""
@@ -119,7 +119,7 @@ def restored_field(
     setup = FieldSetup(
         center, require_positive("box", half_size), int(num_times), num_moving, extent
     )
-    field = new_field(options, setup, torch.Generator()).restored(tensors)
+    field = create_field(options, setup, torch.Generator()).restored(tensors)
     bodies = part_of(tensors, "bodies")
     field = BodyField.stored(field, bodies) if bodies else field
     windows = part_of(tensors, "windows")

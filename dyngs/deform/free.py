@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dyngs.core.state import Role
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
-from dyngs.deform.fixed_cameras.start import TimedGaussians
+from dyngs.deform.fixed_cameras.initial_motion import TimedGaussians
 from dyngs.deform.keys import COPIES_OF_MOVING, FreeField
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import Parameters
@@ -43,7 +43,7 @@ class FreePrimitives(DeformationField):
     canonical place, is not learned: a window may shift without its path.
     """
 
-    momentary = fades = True
+    has_lifetime = can_fade = True
 
     def __init__(self, options: FreeField, setup: FieldSetup, generator: torch.Generator) -> None:
         self.options, self.setup = options, setup
@@ -52,7 +52,7 @@ class FreePrimitives(DeformationField):
         velocities = torch.zeros(len(centers), 3, device="cpu")
         self.parameters = self._untrained(centers, torch.ones_like(centers), velocities)
 
-    def started(self, start: FreeStart) -> FreePrimitives:
+    def started(self, start: FreeInitialization) -> FreePrimitives:
         """Return an untrained field with the windows and velocities of ``start``."""
         return self.with_parameters(
             self._untrained(start.centers[:, None], start.spans[:, None], start.velocities)
@@ -100,7 +100,7 @@ class FreePrimitives(DeformationField):
 
 
 @dataclass(frozen=True)
-class FreeStart:
+class FreeInitialization:
     """Gaussians to add when motion begins, and windows of all M that move: those of the static
     model come first."""
 
@@ -111,9 +111,9 @@ class FreeStart:
     velocities: Tensor  # (M, 3) world units per clip
 
 
-def free_start(
+def initialize_free(
     still: Gaussians, moments: Sequence[TimedGaussians], others: Gaussians, num_times: int
-) -> FreeStart:
+) -> FreeInitialization:
     """Return copies of the M ``still`` Gaussians that move, the Gaussians of ``moments``, and
     ``others``.
 
@@ -133,7 +133,7 @@ def free_start(
     spans[:copies] = 1 / copies
     velocities = torch.stack([one.velocity for one in groups]).repeat_interleave(sizes, dim=0)
     rest = torch.linspace(0, 1, len(others), device="cpu")
-    return FreeStart(
+    return FreeInitialization(
         faint.logit_opacities,
         (*(one.gaussians for one in groups[1:]), others),
         torch.cat([centers.repeat_interleave(sizes), rest]),

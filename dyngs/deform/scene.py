@@ -10,12 +10,12 @@ from torch import Tensor
 
 from dyngs.core.state import Role, State, StateTensor, part_of, prefixed
 from dyngs.core.tensor_checks import require_ascending, require_indices
-from dyngs.deform.field import DeformationField, Offsets, deformed
-from dyngs.deform.fields import field_state, restored_field
+from dyngs.deform.field import DeformationField, Offsets, apply_offsets
+from dyngs.deform.fields import field_state, restore_field
 from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.filters import filter_state, filtered, stored_filter
-from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, stored_times, times_state
+from dyngs.gaussians.filters import filter_state, apply_filter, restore_filter
+from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, restore_times, times_state
 from dyngs.gaussians.visibility import VisibilityMasks, matched
 from dyngs.models.renderable import Renderable, clamped_time
 
@@ -37,14 +37,14 @@ class DynamicScene(GaussianScene):
     ) -> DynamicScene:
         count = len(gaussians)
         own = part_of(tensors, "field")
-        std = stored_filter(tensors, count)
-        times = stored_times(tensors)
+        std = restore_filter(tensors, count)
+        times = restore_times(tensors)
         if not own:
             return DynamicScene(gaussians=gaussians, seen_at=times, filter_std=std)
         masks = VisibilityMasks.restored(part_of(tensors, "masks"), count)
         rows = tensors.get("rows", torch.arange(count, device=gaussians.means.device))
         require_ascending("rows", require_indices("rows", rows, (None,), count))
-        field = restored_field(options.deform, own, len(rows))
+        field = restore_field(options.deform, own, len(rows))
         return DynamicScene(
             gaussians=gaussians,
             seen_at=times,
@@ -82,7 +82,7 @@ class DynamicScene(GaussianScene):
         """
         now = clamped_time(time)
         if self.field is None or self.is_static:
-            return GaussianTimeStep(filtered(self.gaussians, self.filter_std), now)
+            return GaussianTimeStep(apply_filter(self.gaussians, self.filter_std), now)
         part = self._drawn_around(now)
         offsets = self.field.offsets(part.moving_means, now, part.asked)
         return GaussianTimeStep(part.moved(offsets, self.field, now), now)
@@ -168,5 +168,5 @@ class _DrawnPart:
     rows: Tensor | None  # their places among the A; None: all of them, in order
 
     def moved(self, offsets: Offsets, field: DeformationField, time: float) -> Gaussians:
-        now = filtered(deformed(self.gaussians, offsets, self.rows), self.filter_std)
+        now = apply_filter(apply_offsets(self.gaussians, offsets, self.rows), self.filter_std)
         return field.shaded(now, self.rows, self.asked, time)

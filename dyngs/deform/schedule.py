@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from dyngs.core.errors import DyngsError
 from dyngs.deform.keys import DynamicModel
-from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.schedule import RateSchedule
 from dyngs.models.schedule import Length
 
 SPLITS = (0.1, 0.3, 0.5)
@@ -31,10 +31,10 @@ class DeformSchedule:
     full: int
     decays: int  # step from which the field's rates fall
     splits: tuple[int, ...]  # steps after which Gaussians that do not move are frozen
-    rates: Rates
+    rates: RateSchedule
 
 
-def deform_schedule(model: DynamicModel, rates: Rates) -> DeformSchedule:
+def deform_schedule(model: DynamicModel, rates: RateSchedule) -> DeformSchedule:
     """Return the phases of a dynamic model in a run with ``rates``; ``freeze_below_px`` 0 freezes
     nothing.
 
@@ -60,7 +60,7 @@ def extended(model: DynamicModel, length: Length) -> DynamicModel:
 
     Raises DyngsError: its motion began too early for that length.
     """
-    old = deform_schedule(model, Rates(length.was))
+    old = deform_schedule(model, RateSchedule(length.was))
     fractions = {"motion_from": _motion_from(old, model, length)}
     if length.done >= old.opens:
         fractions |= {
@@ -82,7 +82,7 @@ def _motion_from(old: DeformSchedule, model: DynamicModel, length: Length) -> fl
     still to come."""
     if length.done >= old.fine:
         return length.kept(old.fine)
-    new = deform_schedule(model, Rates(length.steps))
+    new = deform_schedule(model, RateSchedule(length.steps))
     return length.kept(length.done + 1) if new.fine <= length.done else model.motion_from
 
 

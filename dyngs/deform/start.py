@@ -6,26 +6,26 @@ from collections.abc import Callable
 
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
-from dyngs.deform.bodies.paths import FrameStack, frame_stack_of, one_camera
-from dyngs.deform.fixed_cameras.hulls import FixedCameraClip, fixed_camera_clip
+from dyngs.deform.bodies.paths import FrameStack, render_frame_stack, one_camera
+from dyngs.deform.fixed_cameras.hulls import FixedCameraClip, build_fixed_camera_clip
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.kind import DYNAMIC
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.schedule import deform_schedule
-from dyngs.deform.still_error import (
-    StillErrors,
-    cameras_in_place,
-    still_errors,
-    views_to_compare,
+from dyngs.deform.static_errors import (
+    StaticErrors,
+    group_fixed_cameras,
+    static_errors,
+    select_comparison_views,
 )
 from dyngs.deform.training import SURELY_MOVING, DynamicTraining, TrainingViews
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.training import ColourTraining
 from dyngs.gaussians.model import GaussianModel, training_options
 from dyngs.gaussians.rendering import Shader
-from dyngs.gaussians.scene import drawn_as_trained
-from dyngs.gaussians.schedule import rates_of
-from dyngs.gaussians.start import colours_of, densifier_of, filter_update, first_gaussians
+from dyngs.gaussians.scene import restore_appearance
+from dyngs.gaussians.schedule import rate_schedule
+from dyngs.gaussians.initialization import colours_of, build_densifier, build_filter_update, load_or_create_gaussians
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.schedule import image_divisor
@@ -46,12 +46,12 @@ def start(run: RunStart) -> GaussianModel:
     problem = DYNAMIC.refusal(run.capture)
     if problem is not None:
         raise DyngsError(f"{run.config.data.root}: {problem}")
-    gaussians = first_gaussians(run)
-    colours = colours_of(run, gaussians, sees_time=True)
-    schedule = deform_schedule(model, rates_of(run.config))
+    gaussians = load_or_create_gaussians(run)
+    colours = colours_of(run, gaussians, uses_time=True)
+    schedule = deform_schedule(model, rate_schedule(run.config))
     views = _training_views(run, model, colours)
-    training = DynamicTraining(model, schedule, views, filter_update(run), run.generator)
-    return GaussianModel(run, training.first_scene(gaussians), training, densifier_of(run), colours)
+    training = DynamicTraining(model, schedule, views, build_filter_update(run), run.generator)
+    return GaussianModel(run, training.first_scene(gaussians), training, build_densifier(run), colours)
 
 
 def restore(model: DynamicModel, checkpoint: Checkpoint) -> DynamicScene:
@@ -59,7 +59,7 @@ def restore(model: DynamicModel, checkpoint: Checkpoint) -> DynamicScene:
     scene = DynamicScene.restored(
         model, Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
     )
-    return drawn_as_trained(scene, model, checkpoint)
+    return restore_appearance(scene, model, checkpoint)
 
 
 def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining) -> TrainingViews:
@@ -68,41 +68,41 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
     images = run.images
     views = capture.splits["train"]
     _, background = evaluation_background(config.data.background, capture.has_alpha)
-    divisor = image_divisor(config.train, deform_schedule(model, rates_of(config)).fine)
-    looked_at = views_to_compare(views)
+    divisor = image_divisor(config.train, deform_schedule(model, rate_schedule(config)).fine)
+    looked_at = select_comparison_views(views)
     options = training_options(run)
 
     def shader(time: float) -> Shader | None:
         return None if colours.network is None else colours.network.shader(time)
 
-    def errors_of(gaussians_at: Callable[[float], Gaussians]) -> StillErrors:
+    def errors_of(gaussians_at: Callable[[float], Gaussians]) -> StaticErrors:
         shown = [images.shrunk(i, divisor) for i in looked_at]
         sure = SURELY_MOVING * model.motion_threshold
-        return still_errors(gaussians_at, shown, options, background, shader, sure)
+        return static_errors(gaussians_at, shown, options, background, shader, sure)
 
-    in_place = cameras_in_place(views)
+    in_place = group_fixed_cameras(views)
 
     def standing() -> list[FixedCameraClip]:
         used = [in_place[i] for i in evenly_spaced(len(in_place), MAX_STANDING)]
         total = sum(map(len, used))
-        return [fixed_camera_clip((images[i] for i in seen), background, total) for seen in used]
+        return [build_fixed_camera_clip((images[i] for i in seen), background, total) for seen in used]
 
     def shots(still: Gaussians) -> FrameStack | None:
         order = one_camera(views)
-        limit = min(MAX_SHOTS, rates_of(config).steps // STEPS_PER_SHOT)
+        limit = min(MAX_SHOTS, rate_schedule(config).steps // STEPS_PER_SHOT)
         if config.train.minutes is not None:
             limit = min(limit, int(60 * config.train.minutes / SECONDS_PER_SHOT))
         if order is None or limit == 0 or len(set(images.sizes)) > 1:
             return None
         used = (images[order[i]] for i in evenly_spaced(len(order), limit))
-        return frame_stack_of(used, still, options, background, shader)
+        return render_frame_stack(used, still, options, background, shader)
 
     return TrainingViews(
         training_times(capture),
         training_cameras(views, config.data),
         run.extent,
         errors_of,
-        cameras_stay=bool(in_place),
+        has_fixed_cameras=bool(in_place),
         standing=standing,
         shots=shots,
         options=options,

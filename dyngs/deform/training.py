@@ -18,18 +18,18 @@ from dyngs.core.camera import Cameras
 from dyngs.core.state import Role, State, with_role
 from dyngs.data.loader import Image
 from dyngs.deform.bodies.paths import FrameStack
-from dyngs.deform.bodies.start import Bodies, found_bodies
+from dyngs.deform.bodies.rigid_bodies import Bodies, find_bodies
 from dyngs.deform.control_nodes import ControlNodes
-from dyngs.deform.field import DeformationField, FieldSetup, Offsets, deformed, innermost
-from dyngs.deform.fields import WindowedField, new_field
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, apply_offsets, innermost
+from dyngs.deform.fields import WindowedField, create_field
 from dyngs.deform.fixed_cameras.hulls import FixedCameraClip
-from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
-from dyngs.deform.free import FreePrimitives, FreeStart, free_start
+from dyngs.deform.fixed_cameras.initial_motion import InitialMotion, find_initial_motion
+from dyngs.deform.free import FreePrimitives, FreeInitialization, initialize_free
 from dyngs.deform.keys import DynamicModel, FreeField
 from dyngs.deform.random_gaussians import box_of, random_gaussians, with_gaussians
 from dyngs.deform.scene import DynamicScene
 from dyngs.deform.schedule import DeformSchedule, TimeWindow
-from dyngs.deform.still_error import StillErrors, two_group_threshold
+from dyngs.deform.static_errors import StaticErrors, otsu_threshold
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FILTER_VARIANCE, FilterUpdate, filter_std
 from dyngs.gaussians.model import SceneTraining
@@ -84,7 +84,7 @@ def measure_motion(
 @torch.no_grad()
 def bake_(gaussians: Gaussians, rows: Tensor, offsets: Offsets) -> None:
     """Apply ``offsets`` to ``rows`` (R,) of ``gaussians`` for good, in place."""
-    moved = deformed(gaussians.detach(), offsets, rows).tensors()
+    moved = apply_offsets(gaussians.detach(), offsets, rows).tensors()
     for name, x in gaussians.tensors().items():
         x.data.copy_(moved[name])
 
@@ -105,8 +105,8 @@ class TrainingViews:
     cameras: Sequence[Cameras]
     extent: float
     # how far its images disagree with what is still, where N Gaussians are seen
-    still_errors: Callable[[Callable[[float], Gaussians]], StillErrors]
-    cameras_stay: bool = False  # in place, so that images show what is still exactly alike
+    static_errors: Callable[[Callable[[float], Gaussians]], StaticErrors]
+    has_fixed_cameras: bool = False  # in place, so that images show what is still exactly alike
     standing: Callable[[], Sequence[FixedCameraClip]] = tuple  # returns what those cameras show
     # what one moving camera shows, against N Gaussians that stand still; None where there is no
     # such camera
@@ -158,12 +158,12 @@ class DynamicTraining(SceneTraining[DynamicScene]):
     def optimize(self, scene: DynamicScene, step: int) -> Count:
         if scene.field is None:
             return 0
-        scene.field.rest_outside_(self._window.bounds(step))
+        scene.field.zero_gradients_outside_(self._window.bounds(step))
         progress = self.schedule.rates.progress(step, since=self.schedule.decays)
         return scene.field.step(step - self.schedule.fine, progress)
 
     def resting(self, scene: DynamicScene) -> Tensor | None:
-        return scene.moving if scene.field is not None and scene.field.momentary else None
+        return scene.moving if scene.field is not None and scene.field.has_lifetime else None
 
     def leaves(self, scene: DynamicScene) -> list[Tensor]:
         return [] if scene.field is None else scene.field.leaves
@@ -174,21 +174,21 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         if scene.field is None:
             return scene
         if edited:
-            scene.field.regroup()
+            scene.field.invalidate()
         scene.field.extend(self._window.bounds(step), self._window.bounds(step + 1))
         scene = self._windowed(scene, step)
         return self._frozen(scene) if step in self.schedule.splits else scene
 
-    def revised(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
+    def edit_scene(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
         """Return the scene with Gaussians to begin motion with; None where a static model explains
         all."""
         if step != self.schedule.fine:
             return None
         now = scene.gaussians
-        found = self.capture.still_errors(lambda _: now)
+        found = self.capture.static_errors(lambda _: now)
         floor = self.options.motion_threshold
         errs = bool((found.most > SURELY_MOVING * floor).float().mean() > MIN_MOVING_FRACTION)
-        threshold = min(max(two_group_threshold(found.usual), floor), SURELY_MOVING * floor)
+        threshold = min(max(otsu_threshold(found.usual), floor), SURELY_MOVING * floor)
         rows = torch.nonzero(found.usual > threshold)[:, 0]
         first = self._first_motion(now.detach())
         if not errs and not first.moments:
@@ -203,12 +203,12 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         moving = torch.cat([rows, torch.arange(len(now), len(gaussians), device=rows.device)])
         center, half_size = box_of(now, self.capture.extent)
         setup = FieldSetup(center, half_size, len(self.times), len(moving), self.capture.extent)
-        field = new_field(self.options.deform, setup, self._generator)
+        field = create_field(self.options.deform, setup, self._generator)
         if isinstance(field, FreePrimitives) and start is not None:
             field = field.started(start)
         if bodies is not None:
             field = bodies.within(field)
-            self._see_all(bodies.explain_all)
+            self._see_all(bodies.explains_all_motion)
         std = self._update.of(gaussians)
         field = field.to(now.means.device)
         return replace(
@@ -238,34 +238,34 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         shots = None if self._is_free else self.capture.shots(still)
         if shots is None:
             return None
-        return found_bodies(shots, self.options.num_random_moving, still.sh.shape[1])
+        return find_bodies(shots, self.options.num_random_moving, still.sh.shape[1])
 
     def _begun(
         self,
         now: Gaussians,
         rows: Tensor,
-        first: FirstMotion,
+        first: InitialMotion,
         bodies: Bodies | None,
-    ) -> tuple[Sequence[Gaussians], FreeStart | None]:
+    ) -> tuple[Sequence[Gaussians], FreeInitialization | None]:
         """Return the Gaussians to add when motion begins, and the windows of all that move where
         these have some."""
-        is_explained = first.moments or (bodies and bodies.explain_all)
+        is_explained = first.moments or (bodies and bodies.explains_all_motion)
         count = 0 if is_explained else self.options.num_random_moving
         added = random_gaussians(now, count, self.capture.extent, self._generator)
         if not self._is_free:
             return [added, *(bodies.seeds if bodies else ())], None
         still, others = (x.to(device="cpu") for x in (now.select(rows), added))
-        start = free_start(still, first.moments, others, len(self.times))
+        start = initialize_free(still, first.moments, others, len(self.times))
         return start.added, start
 
-    def _first_motion(self, still: Gaussians) -> FirstMotion:
+    def _first_motion(self, still: Gaussians) -> InitialMotion:
         """Return what changes before fixed cameras, for a field that can begin there."""
         if not self._is_free:
-            return FirstMotion()
+            return InitialMotion()
         capture = self.capture
         limit = self.options.num_random_moving
         still = still.to(device="cpu")
-        return first_motion(capture.standing(), still, capture.extent, limit, capture.options)
+        return find_initial_motion(capture.standing(), still, capture.extent, limit, capture.options)
 
     def _windowed(self, scene: DynamicScene, step: int) -> DynamicScene:
         """Return the scene in which what follows nodes may be there for a part of the clip, once
@@ -290,10 +290,10 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         )
         pixels, mean = measure_motion(field, now.select(scene.moving), self.times, px_size)
         moves = pixels >= self.options.freeze_below_px
-        if self.capture.cameras_stay:
+        if self.capture.has_fixed_cameras:
             means = now.means[scene.moving]
-            seen = self.capture.still_errors(
-                lambda time: deformed(now, field.offsets(means, time), scene.moving)
+            seen = self.capture.static_errors(
+                lambda time: apply_offsets(now, field.offsets(means, time), scene.moving)
             )
             moves &= seen.usual[scene.moving] > SURELY_STILL * self.options.motion_threshold
         return _with_frozen(scene, mean, ~moves)
@@ -317,5 +317,5 @@ def _with_frozen(scene: DynamicScene, mean: Offsets, stays: Tensor) -> DynamicSc
     if scene.field is None or not len(kept):
         return replace(scene, field=None, moving=scene.moving[kept])
     left = scene.field.edited(TopologyEdit.select(kept))
-    left.regroup()
+    left.invalidate()
     return replace(scene, field=left, moving=scene.moving[kept])

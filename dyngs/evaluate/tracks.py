@@ -58,7 +58,7 @@ def track_scores(
     """
     if tracks is None:
         return TrackScores(reason=NO_TRACKS)
-    scene = scene.unmasked()
+    scene = scene.without_masks()
     num_opaque = int((torch.sigmoid(scene.gaussians.logit_opacities) > MIN_OPACITY).sum())
     if not num_opaque:
         return TrackScores(reason=NONE_OPAQUE)
@@ -138,7 +138,7 @@ def _carried_to(
     where it was bound; or, where Gaussians come and go, from one time to the next."""
     starts = np.unique(bound_at[np.isfinite(bound_at)]).tolist()
     moved = field_scene_of(scene)
-    if moved is None or moved.field is None or not moved.field.momentary:
+    if moved is None or moved.field is None or not moved.field.has_lifetime:
         found = {time: np.full_like(points, np.nan) for time in times}
         bound = []
         for start in starts:

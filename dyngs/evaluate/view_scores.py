@@ -30,11 +30,11 @@ from dyngs.data.capture import View
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced, static_cameras
-from dyngs.gaussians.colour.network import fitted_affine, recoloured
-from dyngs.human.avatar.scene import avatar_of
+from dyngs.gaussians.colour.network import fit_affine_colour, apply_affine_colour
+from dyngs.human.avatar.scene import as_human_scene
 from dyngs.models.renderable import DrawOptions, Renderable, Rendering
 from dyngs.models.views import background_colour
-from dyngs.ops.device import finish
+from dyngs.ops.device import synchronize
 
 REGION_METRICS = ("psnr_foreground", "psnr_moving", "psnr_static")
 
@@ -88,7 +88,7 @@ class Regions:
         found = [_psnr_inside(part, image, rendered, truth) for part in parts]
         return dict(zip(REGION_METRICS, found, strict=True))
 
-    def scores_of_things(self, image: Image, rendered: Tensor, truth: Tensor) -> dict[int, float]:
+    def object_scores(self, image: Image, rendered: Tensor, truth: Tensor) -> dict[int, float]:
         """Return the PSNR of a view, dB, on each thing that its motion mask tells apart and that it
         shows, by label."""
         if image.labels is None:
@@ -153,7 +153,7 @@ def _opened(shown: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Drawing:
+class SceneRenderer:
     """A scene and how it is drawn."""
 
     scene: Renderable
@@ -169,8 +169,8 @@ class Drawing:
         return rendering.rgb[0]
 
 
-def seconds_in_turn(
-    drawings: Sequence[Drawing], images: Sequence[Image], rounds: int
+def time_renders(
+    drawings: Sequence[SceneRenderer], images: Sequence[Image], rounds: int
 ) -> np.ndarray:
     """Return the seconds (D, ``rounds`` * I) that each of D drawings takes for each image.
 
@@ -185,7 +185,7 @@ def seconds_in_turn(
         for turn in range(len(drawings)):
             row = (column + turn) % len(drawings)
             start = time.perf_counter()
-            finish(drawings[row].image(image.cameras, image.time).device)
+            synchronize(drawings[row].image(image.cameras, image.time).device)
             seconds[row, column] = time.perf_counter() - start
     return seconds
 
@@ -278,13 +278,13 @@ def score_views(
                 empty = mask is not None and not bool((mask > 0).any())
                 why = "its mask ignores every pixel" if empty else "the image holds NaN or Inf"
                 raise DyngsError(f"view {image.name!r}: {name} is not finite, {why}")
-        if avatar_of(scene) is not None:
+        if as_human_scene(scene) is not None:
             values |= person_scores(image, rendering, background, lpips)
         values |= right_half_scores(image, rendering, background)
         values |= background_scores(image, rendering, background)
         if regions is not None:
             values |= regions.scores(image, rendered, truth)
-            values["psnr_things"] = regions.scores_of_things(image, rendered, truth)
+            values["psnr_things"] = regions.object_scores(image, rendered, truth)
         score = ViewScore(
             name=image.name,
             width=image.cameras.width,
@@ -344,8 +344,8 @@ def right_half_scores(image: Image, rendering: Rendering, background: Tensor) ->
     counts = left + 1 if image.mask is None else image.mask
     if not all(bool((half > 0).any()) for half in (counts[:, :middle], counts[:, middle:])):
         return {}
-    affine = fitted_affine([(image, rendering)], background, left)
-    fitted = recoloured(affine, image, rendering, background)
+    affine = fit_affine_colour([(image, rendering)], background, left)
+    fitted = apply_affine_colour(affine, image, rendering, background)
     return {
         "psnr_right": psnr(rendering.rgb[0][:, middle:], truth[:, middle:], mask),
         "psnr_right_fitted": psnr(fitted[:, middle:], truth[:, middle:], mask),
@@ -355,7 +355,7 @@ def right_half_scores(image: Image, rendering: Rendering, background: Tensor) ->
 POSE_METRICS = tuple(x.name for x in fields(PoseScores) if x.name not in ("updates", "per_view"))
 
 
-def means_of(scores: Sequence[ViewScore], names: Sequence[str] = POSE_METRICS) -> dict[str, Any]:
+def mean_scores(scores: Sequence[ViewScore], names: Sequence[str] = POSE_METRICS) -> dict[str, Any]:
     """Return the means of metrics over at least one view; None where a view has none, but for
     regions: these are over the views that have one."""
     means = {}
@@ -373,15 +373,15 @@ def _timed_render(
     """Return the rendering, the seconds it took, and the seconds of these for deformation."""
     with torch.no_grad():
         device = scene.device
-        finish(device)
+        synchronize(device)
         start = time.perf_counter()
         moment = scene.time_step(image.time)
-        finish(device)
-        deformed = time.perf_counter()
+        synchronize(device)
+        apply_offsets = time.perf_counter()
         rendering = scene.render(image.cameras, moment, options=options, background=background)
-        finish(device)
+        synchronize(device)
         end = time.perf_counter()
-    return rendering, end - start, deformed - start
+    return rendering, end - start, apply_offsets - start
 
 
 @dataclass(frozen=True)
@@ -405,7 +405,7 @@ def psnr_per_time(scores: Iterable[tuple[float | None, float]]) -> tuple[TimeSco
     )
 
 
-def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> MetricValue:
+def flicker(drawing: SceneRenderer, cameras: Cameras, times: Sequence[float]) -> MetricValue:
     """Return the mean of |R_{k+1} - 2 R_k + R_{k-1}| x 255: the second difference in time at one
     camera, without truth.
 
@@ -433,7 +433,7 @@ def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> Metri
     return MetricValue(fmean(values))
 
 
-def flicker_error(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) -> MetricValue:
+def flicker_error(drawing: SceneRenderer, loader: ImageLoader, views: Sequence[View]) -> MetricValue:
     """Return the mean of |(R_{k+1} - R_k) - (G_{k+1} - G_k)| x 255: the error of changes in time,
     at fixed cameras.
 
@@ -460,7 +460,7 @@ def flicker_error(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) 
 
 
 def temporal_scores(
-    drawing: Drawing, loader: ImageLoader, views: Sequence[View]
+    drawing: SceneRenderer, loader: ImageLoader, views: Sequence[View]
 ) -> dict[str, MetricValue]:
     """Return ``flicker`` before the first camera of a split, at the training times, and
     ``flicker_error``."""

@@ -19,7 +19,7 @@ from dyngs.io.fields import entry, float_array, is_number, numbers_of, read_json
 
 _MAX_FRAMES = 100_000
 """A longer path is taken for a typing mistake."""
-PLACED_PATHS = ("orbit", "spiral", "along")
+AUTOMATIC_PATHS = ("orbit", "spiral", "along")
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class CameraPath:
         return len(self.cameras)
 
 
-def clamped_times(times: Sequence[float]) -> tuple[tuple[float, ...], tuple[str, ...]]:
+def clamp_times(times: Sequence[float]) -> tuple[tuple[float, ...], tuple[str, ...]]:
     """Return ``times`` within [0, 1], and a line where one was not."""
     inside = tuple(min(max(float(time), 0.0), 1.0) for time in times)
     count = sum(a != b for a, b in zip(times, inside, strict=True))
@@ -53,7 +53,7 @@ def with_times(path: CameraPath, times: Sequence[float]) -> CameraPath:
         raise DyngsError(
             f"the camera path has {len(path)} cameras, but there are {len(times)} times; give as many"
         )
-    inside, notes = clamped_times(times)
+    inside, notes = clamp_times(times)
     return replace(path, times=inside, notes=(*path.notes, *notes))
 
 
@@ -76,13 +76,13 @@ def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
     return replace(cameras, intrinsics=intrinsics, width=width, height=height)
 
 
-def path_file(path: str) -> Path | None:
+def camera_path_file(path: str) -> Path | None:
     """Return the JSON file that ``path`` names; None for a path that is placed: orbit, spiral,
     along."""
-    if path in PLACED_PATHS:
+    if path in AUTOMATIC_PATHS:
         return None
     if not path.endswith(".json"):
-        names = ", ".join(PLACED_PATHS)
+        names = ", ".join(AUTOMATIC_PATHS)
         raise DyngsError(
             f"no camera path {path!r}; use {names}, or a .json file (docs/camera_paths.md)"
         )

@@ -14,7 +14,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
 from dyngs.export.camera_paths import (
     CameraPath,
-    path_file,
+    camera_path_file,
     pick_cameras,
     read_path,
     resize_cameras,
@@ -23,7 +23,7 @@ from dyngs.export.camera_paths import (
 from dyngs.export.images import file_stems
 from dyngs.export.orbits import frame_orbit_for_points, orbit_path, path_along, spiral_path
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.human.avatar.scene import avatar_of
+from dyngs.human.avatar.scene import as_human_scene
 from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.io.formats.similarity import AXES
 from dyngs.models.renderable import Renderable
@@ -75,7 +75,7 @@ def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
     if options.path is None:
         path = _fixed_camera(opened, options)
     else:
-        file = path_file(options.path)
+        file = camera_path_file(options.path)
         if file is None:
             path = _placed(opened, options.path, options)
         else:
@@ -97,7 +97,7 @@ def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
     return replace(path, notes=notes, fps=path.fps if opened.fps is None else opened.fps)
 
 
-def view_to_show(capture: Capture, name: str | None = None, split: str | None = None) -> View:
+def select_view(capture: Capture, name: str | None = None, split: str | None = None) -> View:
     """Return the view called ``name``, by default the first one.
 
     ``name``: of a view, of its image as written by ``dyngs render RUN``, or its number in the
@@ -121,7 +121,7 @@ def view_to_show(capture: Capture, name: str | None = None, split: str | None = 
     )
 
 
-def orbit_around(opened: Opened, count: int, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
+def orbit_cameras_around(opened: Opened, count: int, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
     """Return ``count`` cameras with images of ``size`` on a circle around a scene, a person in all
     of their motion.
 
@@ -144,12 +144,12 @@ def points_at(scene: Renderable, time: float | None = None) -> Tensor:
     return scene.at(time).means if isinstance(scene, GaussianScene) else scene.bounds
 
 
-def in_front_of(opened: Opened, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
+def frontal_cameras(opened: Opened, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
     """Return three neighbours on a circle around a scene, of which the second sees a person's
     front."""
-    ring = orbit_around(opened, _RING, size)
+    ring = orbit_cameras_around(opened, _RING, size)
     front = 0
-    person = avatar_of(opened.renderable)
+    person = as_human_scene(opened.renderable)
     if person is not None:
         facing = axis_angle_to_matrix(person.clip.poses[0, 0])[:, 2]
         front = int((ring.centers @ facing).argmax())
@@ -159,9 +159,9 @@ def in_front_of(opened: Opened, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras
 def _fixed_camera(opened: Opened, options: PathOptions) -> CameraPath:
     times = opened.renderable.times
     if opened.captured is None:
-        camera = in_front_of(opened, options.size or DEFAULT_SIZE).select(1)
+        camera = frontal_cameras(opened, options.size or DEFAULT_SIZE).select(1)
     else:
-        view = view_to_show(opened.capture, options.view, options.split)
+        view = select_view(opened.capture, options.view, options.split)
         (camera,) = training_cameras([view], opened.config.data)
         times = (view.time or 0.0,) if opened.fps is None else times
     times = times if options.times is None else options.times
@@ -177,8 +177,8 @@ def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
     if opened.captured is None:
         size = options.size or DEFAULT_SIZE
         if name == "orbit":
-            return CameraPath(orbit_around(opened, frames, size))
-        return CameraPath(spiral_path(in_front_of(opened, size), frames))
+            return CameraPath(orbit_cameras_around(opened, frames, size))
+        return CameraPath(spiral_path(frontal_cameras(opened, size), frames))
     views = opened.capture.splits["train"]
     cameras = cameras_for_paths(views, opened.config.data)
     if name == "spiral":
@@ -190,7 +190,7 @@ def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
     path, is_all_around = orbit_path(cameras, frames, up)
     if opened.person is None or is_all_around:
         return path
-    around = orbit_around(opened, frames, (cameras.width, cameras.height))
+    around = orbit_cameras_around(opened, frames, (cameras.width, cameras.height))
     return CameraPath(
         around, notes=("the person was filmed from one side: the orbit goes all around them",)
     )

@@ -20,7 +20,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.export.camera_paths import CameraPath, pick_cameras
 from dyngs.export.orbits import frame_orbit_for_points
 from dyngs.export.video import video_writer
-from dyngs.gaussians.rendering import drawing_options, render, splat_options
+from dyngs.gaussians.rendering import file_render_options, render, splat_options
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import Written, read_splats
 from dyngs.io.formats.similarity import AXES
@@ -73,7 +73,7 @@ def render_frame(
     )
 
 
-def path_frames(
+def render_path(
     scene: Renderable, path: CameraPath, options: DrawOptions | None = None
 ) -> Iterator[DrawnImage]:
     """Yield the frames along a path one by one, so that memory does not grow with their number.
@@ -114,7 +114,7 @@ def write_path_images(
     digits = max(4, len(str(len(path) - 1)))
 
     def frames() -> Iterator[tuple[str, DrawnImage]]:
-        for i, frame in enumerate(path_frames(scene, path, options)):
+        for i, frame in enumerate(render_path(scene, path, options)):
             yield f"frame_{i:0{digits}d}", frame
             report("frames", i + 1, len(path))
 
@@ -319,7 +319,7 @@ def color_map(values: np.ndarray, name: str) -> np.ndarray:
     return to_uint8(srgb_encoded(np.clip(linear, 0.0, 1.0)))
 
 
-def compare_run(
+def compare_file_with_run(
     opened: Opened, scene: GaussianScene, time: float, meant: SplatFile, read: SplatFile
 ) -> float:
     """Return the PSNR, dB, of a file and a scene at one time, seen by four cameras of its capture,
@@ -342,14 +342,14 @@ def compare_run(
     return _compare(wanted, frame.cameras(cameras), read, scene.options.near * frame.scale)
 
 
-def compare_splats(splat: SplatFile, written: Written) -> float:
+def compare_file_with_source(splat: SplatFile, written: Written) -> float:
     """Return the PSNR, dB, of a file and what it was converted from, seen from an orbit.
 
     Raises DyngsError: the file cannot be read.
     """
     cameras = _around(splat)
     moved = written.splat.frame.after(splat.frame.inverse())
-    options = drawing_options(splat)
+    options = file_render_options(splat)
     black = torch.zeros_like(splat.gaussians.means[0])
     with torch.no_grad():
         wanted = render(splat.gaussians, cameras, options, background=black).rgb

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from dyngs.core.conventions import SH_C0
 from dyngs.core.errors import DyngsError, counted
 from dyngs.core.gaussians import Gaussians
-from dyngs.deform.bodies.field import BodyField, bodies_of
+from dyngs.deform.bodies.field import BodyField, find_body_field
 from dyngs.deform.scene import field_scene_of
-from dyngs.gaussians.colour.network import with_harmonics
+from dyngs.gaussians.colour.network import bake_harmonics
 from dyngs.gaussians.levels import MERGED, levels_of
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
@@ -53,7 +53,7 @@ from dyngs.io.formats.splat_file import (
 from dyngs.io.gltf import GlbDocument
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import atomic_file
-from dyngs.ops.quaternions import rotation_matrices, shorter_ways, unit_quats
+from dyngs.ops.quaternions import rotation_matrices, align_quat_signs, unit_quats
 from dyngs.runs.folder import inputs_of
 from dyngs.runs.opened import Opened
 
@@ -132,7 +132,7 @@ Part = Literal["all", "moving", "still"]
 
 
 @dataclass(frozen=True)
-class Writing:
+class WriteOptions:
     """How Gaussians are written."""
 
     # unit quaternion wxyz, from the axes of the capture, or of the frame of an edited run, to those
@@ -144,16 +144,16 @@ class Writing:
     edit: Similarity = UNMOVED  # made after ``turn``, and stored so that it can be undone
 
 
-AS_THEY_ARE = Writing()
+DEFAULT_WRITE_OPTIONS = WriteOptions()
 
 
-def writing_of(
+def choose_write_options(
     opened: Opened,
     target: str,
     up: str | None = None,
     from_up: str | None = None,
     sh_degree: int | None = None,
-) -> tuple[Writing, str]:
+) -> tuple[WriteOptions, str]:
     """Return how a scene is written, and a line about which way is up in the file.
 
     ``target``: axis that viewers of the format take for up. ``up``: axis requested instead; "keep":
@@ -165,19 +165,19 @@ def writing_of(
     if up == "keep" or (edited is not None and edited.fixed and up is None):
         own = None if edited is None else edited.up
         known = "" if own is None else f", {own} up"
-        return Writing(
+        return WriteOptions(
             up=own, sh_degree=sh_degree
         ), f"axes are those of the {frame.removesuffix('ed run')}{known}"
     found = up_of(opened) if from_up is None else (axis_of(from_up), "--from-up")
     if found is None:
         line = "nothing says which way is up in this run, so axes are those of the capture; --from-up=AXIS tells it"
-        return Writing(sh_degree=sh_degree), line
+        return WriteOptions(sh_degree=sh_degree), line
     direction, who = found
     wanted = target if up is None else up
     here = next((name for name, axis in AXES.items() if axis == direction), "a slanted direction")
     turned = f"turned, it was {here} in the {frame}"
     turned = f"the axes of the {frame} are kept" if here == wanted else turned
-    how = Writing(turn_between(direction, axis_of(wanted)), wanted, sh_degree)
+    how = WriteOptions(turn_between(direction, axis_of(wanted)), wanted, sh_degree)
     return how, f"up is {wanted} in the file ({turned}, says {who})"
 
 
@@ -198,7 +198,7 @@ def up_of(opened: Opened) -> tuple[tuple[float, ...], str] | None:
 
 
 def write_run_splats(
-    opened: Opened, path: Path, time: float = 0.0, part: Part = "all", how: Writing = AS_THEY_ARE
+    opened: Opened, path: Path, time: float = 0.0, part: Part = "all", how: WriteOptions = DEFAULT_WRITE_OPTIONS
 ) -> Written:
     """Write a run at a time in [0, 1] as a file of Gaussians; its suffix names the format.
 
@@ -216,7 +216,7 @@ def write_run_sequence(
     folder: Path,
     times: Sequence[float],
     part: Part = "all",
-    how: Writing = AS_THEY_ARE,
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
     suffix: str = ".ply",
 ) -> list[Written]:
     """Write a sequence ``frame_0000.ply`` and so on, one file per time in [0, 1], for players.
@@ -242,7 +242,7 @@ def write_run_sequence(
 
 
 def write_run_levels(
-    opened: Opened, folder: Path, time: float = 0.0, part: Part = "all", how: Writing = AS_THEY_ARE
+    opened: Opened, folder: Path, time: float = 0.0, part: Part = "all", how: WriteOptions = DEFAULT_WRITE_OPTIONS
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Write a run at a time as a new folder of .sog in levels of detail; return Gaussians by level,
     and notes.
@@ -267,7 +267,7 @@ def scene_part(scene: GaussianScene, part: Part) -> GaussianScene:
 
 
 def splats_at(
-    opened: Opened, scene: GaussianScene, time: float, how: Writing = AS_THEY_ARE
+    opened: Opened, scene: GaussianScene, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
 ) -> SplatFile:
     """Return what a file of Gaussians is to hold of a scene at one time, in the axes that are asked
     for.
@@ -283,7 +283,7 @@ def splats_at(
     if not scene.is_static:
         comments.append(f"dyngs time {time!r}")
     if shader is not None:
-        baked = with_harmonics(gaussians, shader)
+        baked = bake_harmonics(gaussians, shader)
         gaussians = baked.gaussians
         comments.append(f"colours: harmonics fitted to a network, rms error {baked.error:.4f}")
     x, y, z = opened.info.world_offset
@@ -325,7 +325,7 @@ def tracks_of(
     ids = torch.arange(len(scene), device="cpu")
     ids = ids[moves] if part == "moving" else ids
     kind = np.float32 if frame == UNMOVED else np.float64
-    whole = scene.unmasked()
+    whole = scene.without_masks()
     positions = np.empty((len(ids), len(times), 3), kind)
     for k, time in enumerate(times):
         positions[:, k] = whole.at(time).means[ids].numpy()
@@ -352,12 +352,12 @@ UP = "-y"
 FPS = 30.0
 
 
-def write_moving(
+def write_4dgs(
     opened: Opened,
     path: Path,
     times: Sequence[float],
     part: Part = "all",
-    how: Writing = AS_THEY_ARE,
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> tuple[tuple[SplatFile, ...], tuple[str, ...]]:
     """Write a run at T >= 1 times in [0, 1] as one .4dgs, each shown for 1/30 s; return what it is
     meant to hold at each time, and notes about what the format could not hold.
@@ -400,7 +400,7 @@ def write_moving(
     return splats, notes
 
 
-def read_moment(path: Path, index: int) -> SplatFile:
+def read_4dgs_frame(path: Path, index: int) -> SplatFile:
     """Return what a .4dgs that dyngs wrote shows at its time number ``index``, read by the package
     fourdgs.
 
@@ -426,7 +426,7 @@ def _fourdgs(path: Path) -> tuple[Any, Any, Any]:
 
 
 @torch.no_grad()
-def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY_ARE) -> Written:
+def write_rigid_bodies(opened: Opened, path: Path, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS) -> Written:
     """Write a run at a time in [0, 1] as .glb: a node for each body, with its motion as an
     animation, one for the rest.
 
@@ -435,12 +435,12 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
     """
     inputs_of(opened).require_output(path)
     scene = field_scene_of(opened.scene)
-    field = None if scene is None else bodies_of(scene.field)
+    field = None if scene is None else find_body_field(scene.field)
     if scene is None or field is None:
         raise DyngsError(
             "--bodies: no body that turns was found in this run; leave it out, or give --times A:B:N"
         )
-    scene = scene.unmasked()  # the rows of the labels
+    scene = scene.without_masks()  # the rows of the labels
     splat = splats_at(opened, scene, time, how)
     require_writable(path, splat.gaussians)
     gaussians = splat.gaussians.replace(quats=unit_rotations(splat.gaussians.quats))
@@ -466,7 +466,7 @@ def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY
             node["translation"] = place.tolist()
             turned = Rotation.from_quat(turns[1:, body]) * Rotation.from_quat(turns[0, body]).inv()
             channels.append((len(nodes), "translation", places[1:, body]))
-            channels.append((len(nodes), "rotation", shorter_ways(turned.as_quat())))
+            channels.append((len(nodes), "rotation", align_quat_signs(turned.as_quat())))
         meshes.append({"name": name, "primitives": [add_gaussians(document, own)]})
         nodes.append(node)
     document.add_animation("motion", moments * opened.seconds, channels)

@@ -14,8 +14,8 @@ from dyngs.baselines.fields.kind import NgpModel
 from dyngs.baselines.fields.scene import space_of
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
-from dyngs.export.splat_files import AS_THEY_ARE, Writing, writing_of
-from dyngs.gaussians.surface import opaque_box, surface_of
+from dyngs.export.splat_files import DEFAULT_WRITE_OPTIONS, WriteOptions, choose_write_options
+from dyngs.gaussians.surface import opaque_box, extract_surface
 from dyngs.io.formats.ply import double_ply
 from dyngs.io.formats.similarity import Similarity, far_offset
 from dyngs.io.write import atomic_file
@@ -27,16 +27,16 @@ from dyngs.runs.opened import Opened
 SUFFIXES = ".ply", ".glb", ".obj"
 
 
-def upright_surface(
+def surface_write_options(
     opened: Opened, suffix: str, up: str | None, from_up: str | None
-) -> tuple[Writing, str]:
+) -> tuple[WriteOptions, str]:
     """Return how the mesh of a scene is turned, and a line about it, as of ``writing_of``.
 
     Viewers take y for up in .glb and .obj; those of .ply have no convention, so it stays in the
     axes of the capture.
     """
     usual = "keep" if suffix.lower() == ".ply" else None
-    return writing_of(opened, "y", up or usual, from_up)
+    return choose_write_options(opened, "y", up or usual, from_up)
 
 
 def write_surface(
@@ -45,7 +45,7 @@ def write_surface(
     *,
     time: float = 0.0,
     options: SurfaceOptions | None = None,
-    how: Writing = AS_THEY_ARE,
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> Surface:
     """Write the surface of a scene at ``time`` and return it.
 
@@ -111,4 +111,4 @@ def _fused_surface(opened: Opened, time: float, cells: int | None) -> Surface:
         common = torch.maximum(box[0], cube[0]), torch.minimum(box[1], cube[1])
         shares_much = bool((common[1] - common[0] > 0.1 * space.half).all())
         box = common if shares_much else cube
-    return surface_of(scene, cameras, box, time, cells=cells)
+    return extract_surface(scene, cameras, box, time, cells=cells)

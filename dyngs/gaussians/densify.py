@@ -46,7 +46,7 @@ class DensifySchedule:
 class Densifier:
     """A strategy that changes the set of Gaussians during training; this one leaves it as it is."""
 
-    def wants_signal(self, step: int) -> bool:
+    def needs_gradient(self, step: int) -> bool:
         """Return whether ``after_backward`` needs the gradient of the 2D means at ``step``."""
         return False
 
@@ -110,13 +110,13 @@ class DefaultDensifier(Densifier):
         self.sums = torch.zeros(2, 0, device="cpu")
         self._step_sums = self.sums
 
-    def wants_signal(self, step: int) -> bool:
+    def needs_gradient(self, step: int) -> bool:
         return step < self.schedule.stop
 
     def after_backward(
         self, step: int, probe_grad: Tensor, radii: Tensor, size: tuple[int, int]
     ) -> None:
-        if not self.wants_signal(step):
+        if not self.needs_gradient(step):
             return
         self._begin_step(probe_grad.shape[1], probe_grad.device)
         grad = probe_grad[..., 2:] if self.options.absgrad else probe_grad[..., :2]
@@ -128,7 +128,7 @@ class DefaultDensifier(Densifier):
         self._step_sums += torch.stack([torch.where(counts, length, 0.0).sum(0), counts.sum(0)])
 
     def tallies(self, step: int, count: int) -> list[Tensor]:
-        if not self.wants_signal(step):
+        if not self.needs_gradient(step):
             return []
         self._begin_step(count, self._step_sums.device)
         return [self._step_sums]
@@ -368,7 +368,7 @@ class McmcDensifier(Densifier):
         shared = copies > 1
         opacities = opacities.clone()
         log_scales = log_scales.clone()
-        thinner, factor = relocated(opacities[shared], copies[shared], self.options.prune_opacity)
+        thinner, factor = compute_relocation(opacities[shared], copies[shared], self.options.prune_opacity)
         opacities[shared] = thinner
         log_scales[shared] += factor.log().float()[:, None]
         return opacities, log_scales, shared
@@ -382,7 +382,7 @@ def _drawn(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
     )
 
 
-def relocated(
+def compute_relocation(
     opacities: Tensor, copies: Tensor, min_opacity: float = 0.005
 ) -> tuple[Tensor, Tensor]:
     """Return the opacities and scale factors of N coincident copies that composite to one Gaussian

@@ -79,7 +79,7 @@ def fuse_filter(gaussians: Gaussians, std: Tensor) -> Gaussians:
     return gaussians.replace(log_scales=log_scales, logit_opacities=fused)
 
 
-def filtered(gaussians: Gaussians, std: Tensor | None) -> Gaussians:
+def apply_filter(gaussians: Gaussians, std: Tensor | None) -> Gaussians:
     """Return the Gaussians fused with their 3D filter (N,); unchanged where that is None."""
     return gaussians if std is None else fuse_filter(gaussians, std)
 
@@ -89,7 +89,7 @@ def filter_state(std: Tensor | None) -> State:
     return {} if std is None else {"filter_std": StateTensor(std, Role.PER_GAUSSIAN)}
 
 
-def stored_filter(tensors: Mapping[str, Tensor], count: int) -> Tensor | None:
+def restore_filter(tensors: Mapping[str, Tensor], count: int) -> Tensor | None:
     """Return the 3D filter (N,) of a state, None without one. Raises ValueError for one that does
     not fit N."""
     std = tensors.get("filter_std")

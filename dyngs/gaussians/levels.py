@@ -26,7 +26,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import require_gaussians
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.models.renderable import Renderable, Rendering, TimeStep, joined_renderings, single_views
-from dyngs.ops.quaternions import quats_of, rotation_matrices
+from dyngs.ops.quaternions import quats_from_matrices, rotation_matrices
 
 MERGED = 4  # Gaussians in one of the next level, and blocks below one
 BLOCK = 4096  # Gaussians of a block; a power of ``MERGED``
@@ -173,7 +173,7 @@ def merged(gaussians: Gaussians, count: int) -> tuple[Gaussians, Tensor]:
     axes = axes * torch.linalg.det(axes).sign()[:, None, None]
     log_scales = 0.5 * variances.clamp_min(1e-60).log()
     opacities = (mass.sum(1) / _areas(log_scales)).clamp(1e-12, LARGEST_OPACITY)
-    return Gaussians(means, quats_of(axes), log_scales, opacities.logit(), sh), shares
+    return Gaussians(means, quats_from_matrices(axes), log_scales, opacities.logit(), sh), shares
 
 
 def _next_level(

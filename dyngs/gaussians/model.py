@@ -16,18 +16,18 @@ from dyngs.core.gaussians import morton_order
 from dyngs.core.state import Role, State, prefixed, with_role
 from dyngs.data.loader import Image
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.gaussians.colour.network import network_of
+from dyngs.gaussians.colour.network import restore_colour_network
 from dyngs.gaussians.colour.training import (
     AutoTraining,
     ColourTraining,
     MeasuredView,
-    TrainingLooks,
+    MeasurementViews,
 )
 from dyngs.gaussians.densify import Densifier
 from dyngs.gaussians.optimizer import FrozenMask, GaussianOptimizer
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, render_options
-from dyngs.gaussians.schedule import active_sh_degree, learning_rates, means_rate, rates_of
+from dyngs.gaussians.schedule import active_sh_degree, learning_rates, means_rate, rate_schedule
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Loss, Model, Updated
@@ -88,7 +88,7 @@ class SceneTraining(Generic[S]):
         Gaussians frozen."""
         return scene
 
-    def revised(self, scene: S, step: int) -> tuple[S, EditResult] | None:
+    def edit_scene(self, scene: S, step: int) -> tuple[S, EditResult] | None:
         """Return the scene as its kind changes it after ``step``, and the edit of its Gaussians;
         None: it does not."""
         return None
@@ -129,11 +129,11 @@ class GaussianModel(Model[GaussianScene]):
         self._config, self.densifier, self.colours = config, densifier, colours
         self._run = run
         self._generator = run.generator
-        self._rates, self._course = learning_rates(config), rates_of(config)
+        self._rates, self._course = learning_rates(config), rate_schedule(config)
         self.options = training_options(run)
-        self.begin_with(scene, training)
+        self.start_from(scene, training)
 
-    def begin_with(self, scene: GaussianScene, training: SceneTraining[Any]) -> None:
+    def start_from(self, scene: GaussianScene, training: SceneTraining[Any]) -> None:
         """Begin with this scene, a predicted one for instance, and learn it so; nothing is learned
         yet."""
         config = self._config
@@ -178,7 +178,7 @@ class GaussianModel(Model[GaussianScene]):
         now = self.training.time_step(scene, image, step)
         probe = (
             torch.zeros(1, len(scene), 4, requires_grad=True, device=scene.device)
-            if densifier.wants_signal(step)
+            if densifier.needs_gradient(step)
             else None
         )
         options = self._options(step)
@@ -224,10 +224,10 @@ class GaussianModel(Model[GaussianScene]):
         before = self._optimizer.parameters
         generator = self._generator
         lr_means = means_rate(self._rates, self._course.progress(step), self._run.extent)
-        frozen = self.colours.frozen_rest()
+        frozen = self.colours.frozen_harmonics()
         resting = self.training.resting(self._scene)
         still = self.training.still()
-        bad = self._optimizer.step(step, lr_means, frozen_rest=frozen, resting=resting, still=still)
+        bad = self._optimizer.step(step, lr_means, frozen_harmonics=frozen, resting=resting, still=still)
         bad = bad + self.colours.optimize(step) + self.training.optimize(self._scene, step)
         result = self.densifier.edit(step, self._optimizer.parameters, generator)
         if result is not None:
@@ -236,11 +236,11 @@ class GaussianModel(Model[GaussianScene]):
             self._apply(self._in_memory_order(result))
         self._perturb(lr_means)
         self._scene = self.training.after_step(self._scene, step, result is not None)
-        revised = self.training.revised(self._scene, step)
-        if revised is not None:
-            scene, result = revised
+        edit_scene = self.training.edit_scene(self._scene, step)
+        if edit_scene is not None:
+            scene, result = edit_scene
             self._apply(result, scene)
-        findings = (self._measured_harmonics(step), None if revised is None else revised[1].finding)
+        findings = (self._measured_harmonics(step), None if edit_scene is None else edit_scene[1].finding)
         self._scene.changed()
         text = "; ".join(text for text in findings if text) or None
         return Updated(bad, text, self._optimizer.parameters is not before)
@@ -254,7 +254,7 @@ class GaussianModel(Model[GaussianScene]):
         if still is not None and kept is not None:
             means.detach()[still.rows] = kept
 
-    def exchange(self, scene: GaussianScene) -> None:
+    def replace_scene(self, scene: GaussianScene) -> None:
         """Go on with ``scene``: the same Gaussians, moved, masked or drawn in another way."""
         self._scene = scene.with_gaussians(self._optimizer.parameters)
         self._scene.changed()
@@ -273,16 +273,16 @@ class GaussianModel(Model[GaussianScene]):
         """Replace the harmonics of the Gaussians ``dropped`` (N,) for good by their base, with
         ``offsets`` (N, 3)."""
         base = self._scene.gaussians.sh.detach()[:, 0] + offsets / SH_C0
-        self._optimizer.drop_rest(base, dropped)
-        self.exchange(self._scene)
+        self._optimizer.drop_harmonics(base, dropped)
+        self.replace_scene(self._scene)
 
-    def keep_plain(self, plain: Tensor, colour: AutoColour) -> None:
+    def freeze_plain_harmonics(self, plain: Tensor, colour: AutoColour) -> None:
         """Leave the harmonics of the Gaussians ``plain`` (N,) zero from now on."""
         colours = AutoTraining(colour, self._config.train.steps, len(self._run.images))
         colours.freeze(plain)
         self.colours = colours
 
-    def draw_as(self, model: SceneModel) -> None:
+    def set_render_options(self, model: SceneModel) -> None:
         """Draw with the settings of another section of the same kind from now on."""
         options = self._render_options(model)
         self.options = replace(self.options, alpha_min=options.alpha_min)
@@ -297,7 +297,7 @@ class GaussianModel(Model[GaussianScene]):
         gaussians = Gaussians.stored(checkpoint.part("gaussians"))
         optimizer = self._optimizer.restored(gaussians, checkpoint.tensors)
         colour = checkpoint.part("model.colour")
-        network_of(colour)  # raises where its tensors do not fit together
+        restore_colour_network(colour)  # raises where its tensors do not fit together
         self.colours.restore(colour, len(gaussians))
         scene = self.training.restored(optimizer.parameters, checkpoint.part("model"))
         if checkpoint.info.step >= self._config.train.steps:
@@ -358,7 +358,7 @@ class GaussianModel(Model[GaussianScene]):
         self.drop_harmonics(~found.keeps, found.offsets)
         return str(found)
 
-    def _looks(self, step: int) -> TrainingLooks:
+    def _looks(self, step: int) -> MeasurementViews:
         images = self._run.images
         colour = background_colour(self._run.background).to(self._scene.device)
 
@@ -370,7 +370,7 @@ class GaussianModel(Model[GaussianScene]):
         may_train = [
             i for i, time in enumerate(images.times) if self.training.trains_on(time, step)
         ]
-        return TrainingLooks(may_train, views, self._options(step), colour)
+        return MeasurementViews(may_train, views, self._options(step), colour)
 
     def _render_options(self, model: SceneModel) -> RenderOptions:
         return render_options(model, self._run.extent, self._run.capture.world_scale)

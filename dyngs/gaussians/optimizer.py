@@ -197,7 +197,7 @@ class Parameters:
         moved = {name: edit.apply(self._tensors[name].detach()) for name in names}
         return self._with(moved, edit.apply_moments) if names else self
 
-    def rearranged(
+    def reorder(
         self, values: Mapping[str, Tensor], source: Tensor, is_new: Tensor
     ) -> Parameters:
         """Return the parameters with other values for some tensors, and the moments of the old rows
@@ -306,7 +306,7 @@ class GaussianOptimizer:
         step: int,
         lr_means: float,
         *,
-        frozen_rest: Tensor | None = None,
+        frozen_harmonics: Tensor | None = None,
         resting: Tensor | None = None,
         still: FrozenMask | None = None,
     ) -> Count:
@@ -332,8 +332,8 @@ class GaussianOptimizer:
             "logit_opacities": self.options.lr_opacities,
             "sh": self._harmonics_rates(),
         }
-        if frozen_rest is not None and self.parameters.sh.grad is not None:
-            self.parameters.sh.grad[frozen_rest, 1:] = 0
+        if frozen_harmonics is not None and self.parameters.sh.grad is not None:
+            self.parameters.sh.grad[frozen_harmonics, 1:] = 0
         updates = [
             self._adam.update(name, x, rates[name], rows)
             for name, x in self.parameters.tensors().items()
@@ -357,13 +357,13 @@ class GaussianOptimizer:
         self._adam = self._adam.mapped(torch.zeros_like, result.zero_moments)
         self.parameters = _as_leaves(moved | result.changes)
 
-    def drop_rest(self, base: Tensor, frozen_rest: Tensor) -> None:
+    def drop_harmonics(self, base: Tensor, frozen_harmonics: Tensor) -> None:
         """Replace harmonics by a base colour, for good: rest and moments become zero; if they do
         for all, they go."""
         sh = self.parameters.sh.detach().clone()
-        count = 1 if bool(frozen_rest.all()) else sh.shape[1]
-        sh[frozen_rest, 0] = base[frozen_rest]
-        rest = frozen_rest[:, None, None].repeat(1, sh.shape[1], 1)
+        count = 1 if bool(frozen_harmonics.all()) else sh.shape[1]
+        sh[frozen_harmonics, 0] = base[frozen_harmonics]
+        rest = frozen_harmonics[:, None, None].repeat(1, sh.shape[1], 1)
         rest[:, 0] = False
 
         def dropped(x: Tensor) -> Tensor:

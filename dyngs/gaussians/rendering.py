@@ -24,7 +24,7 @@ from dyngs.models.renderable import (
 )
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project
-from dyngs.ops.rasterization import Blended, BlendOptions, Tally, blend_and_tally, rasterize, tally
+from dyngs.ops.rasterization import BlendedImages, BlendOptions, Tally, blend_and_tally, rasterize, tally
 from dyngs.ops.registration import check_choice, check_count, check_finite, finite_rows
 
 Shader = Callable[[Gaussians, Cameras, Tensor], Tensor]
@@ -202,7 +202,7 @@ def contributions(
 
 def depths_and_contributions(
     gaussians: Gaussians, cameras: Cameras, options: RenderOptions = RenderOptions()
-) -> tuple[Blended, Tensor]:
+) -> tuple[BlendedImages, Tensor]:
     """Return images (V, H, W, 1) of the depth, summed times the weight, and the (V, N)
     ``contributions``."""
     gaussians, cameras = _checked(gaussians.detach(), cameras, None, options)
@@ -311,7 +311,7 @@ def splat_options(splat: SplatFile) -> RenderOptions:
     return options if splat.eps2d is None else replace(options, eps2d=splat.eps2d)
 
 
-def drawing_options(splat: SplatFile) -> RenderOptions:
+def file_render_options(splat: SplatFile) -> RenderOptions:
     """Return ``splat_options`` with a near plane that suits the size of the scene."""
     means = splat.gaussians.means.double().numpy()
     distances = np.linalg.norm(means - np.median(means, axis=0), axis=1)

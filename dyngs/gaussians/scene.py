@@ -23,7 +23,7 @@ from dyngs.core.state import Role, State, prefixed, with_role
 from dyngs.core.tensor_checks import require_moments
 from dyngs.data.scene_space import TYPICAL_EXTENT
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.colour.network import ColourNetwork, RestFrame, network_of
+from dyngs.gaussians.colour.network import ColourNetwork, RestPose, restore_colour_network
 from dyngs.gaussians.rendering import GaussianRendering, RenderOptions, Shader, render
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.models.checkpoint import Checkpoint, restored_model
@@ -39,7 +39,7 @@ class GaussianTimeStep(TimeStep):
 
     gaussians: Gaussians
     time: float | None = None
-    frame: RestFrame | None = None  # where the Gaussians are at rest, if colours follow a body
+    frame: RestPose | None = None  # where the Gaussians are at rest, if colours follow a body
     # differentiable regularizers, weighted, by name; empty outside training
     penalties: dict[str, Tensor] = field(default_factory=dict)
 
@@ -180,9 +180,9 @@ class GaussianScene(Renderable):
         moves = torch.zeros(len(self), dtype=torch.bool, device=self.gaussians.means.device)
         if not self.is_static:
             moves[self.rows] = True
-        return self.unmasked().select(moves if which == "moving" else ~moves)
+        return self.without_masks().select(moves if which == "moving" else ~moves)
 
-    def unmasked(self: S) -> S:
+    def without_masks(self: S) -> S:
         """Return the scene with all Gaussians drawn at all times."""
         return replace(self, masks=None)
 
@@ -220,7 +220,7 @@ def require_gaussians(scene: Renderable, what: str) -> GaussianScene:
     return scene
 
 
-def restored_scene(checkpoint: Checkpoint, model: ModelSection) -> GaussianScene:
+def restore_scene(checkpoint: Checkpoint, model: ModelSection) -> GaussianScene:
     """Return the scene of a checkpoint of ``model``; see ``restored_model``."""
     return require_gaussians(restored_model(checkpoint, model), checkpoint.name)
 
@@ -229,10 +229,10 @@ def _number(time: float | TimeStep | None) -> float | None:
     return time.time if isinstance(time, TimeStep) else time
 
 
-def drawn_as_trained(scene: S, model: SceneModel, checkpoint: Checkpoint) -> S:
+def restore_appearance(scene: S, model: SceneModel, checkpoint: Checkpoint) -> S:
     """Return a restored scene with the colours of the checkpoint, drawn as the model is."""
     info = checkpoint.info
-    colour = network_of(checkpoint.part("model.colour"))
+    colour = restore_colour_network(checkpoint.part("model.colour"))
     options = render_options(model, info.extent, info.world_scale)
     return replace(
         scene, colour=colour, options=options, background=background_colour(info.background)
@@ -265,7 +265,7 @@ def times_state(times: tuple[float, ...]) -> State:
     )
 
 
-def stored_times(tensors: Mapping[str, Tensor]) -> tuple[float, ...]:
+def restore_times(tensors: Mapping[str, Tensor]) -> tuple[float, ...]:
     """Return the training times of a state. Raises ValueError for times that do not ascend within
     [0, 1]."""
     return tuple(require_moments("times", tensors["times"]).tolist()) if "times" in tensors else ()

@@ -33,7 +33,7 @@ REWIND = 0.3
 
 
 @dataclass(frozen=True)
-class Rates:
+class RateSchedule:
     """The course of all learning rates that fall over a run."""
 
     steps: int
@@ -50,9 +50,9 @@ class Rates:
         return min(max((at - since) / max(self.steps - since, 1), 0.0), 1.0)
 
 
-def rates_of(config: Config) -> Rates:
+def rate_schedule(config: Config) -> RateSchedule:
     """Return the course of the learning rates of a run."""
-    return Rates(config.train.steps, config.prune.steps)
+    return RateSchedule(config.train.steps, config.prune.steps)
 
 
 def rate_factors(config: Config) -> tuple[float, float]:

@@ -14,9 +14,9 @@ from dyngs.core.camera import Cameras
 from dyngs.core.state import Role, State, StateTensor
 from dyngs.core.tensor_checks import require_indices, require_tensor
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.filters import filter_state, filtered, stored_filter
+from dyngs.gaussians.filters import filter_state, apply_filter, restore_filter
 from dyngs.gaussians.rendering import GaussianRendering, RenderOptions
-from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, stored_times, times_state
+from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, restore_times, times_state
 from dyngs.models.renderable import TimeStep, clamped_time, joined_renderings, single_views
 
 _UNSEEN = -30.0  # Logit of an opacity that is never drawn
@@ -84,9 +84,9 @@ class StaticScene(GaussianScene):
     def restored(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
         return StaticScene(
             gaussians=gaussians,
-            filter_std=stored_filter(tensors, len(gaussians)),
+            filter_std=restore_filter(tensors, len(gaussians)),
             sides=Sides.stored(tensors, len(gaussians)),
-            seen_at=stored_times(tensors),
+            seen_at=restore_times(tensors),
         )
 
     @property
@@ -107,7 +107,7 @@ class StaticScene(GaussianScene):
 
     def time_step(self, time: float | None) -> GaussianTimeStep:
         """Return the Gaussians, fused with their 3D filter if there is one."""
-        return GaussianTimeStep(filtered(self.gaussians, self.filter_std), clamped_time(time))
+        return GaussianTimeStep(apply_filter(self.gaussians, self.filter_std), clamped_time(time))
 
     def render(
         self,

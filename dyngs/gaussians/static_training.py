@@ -19,8 +19,8 @@ from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.model import GaussianModel, SceneTraining
 from dyngs.gaussians.optimizer import FrozenMask
 from dyngs.gaussians.rendering import contributions
-from dyngs.gaussians.scene import drawn_as_trained
-from dyngs.gaussians.start import colours_of, densifier_of, filter_update, first_gaussians
+from dyngs.gaussians.scene import restore_appearance
+from dyngs.gaussians.initialization import colours_of, build_densifier, build_filter_update, load_or_create_gaussians
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
@@ -32,7 +32,7 @@ SURVEYED = 200
 
 
 @dataclass(frozen=True)
-class SmallRemoval:
+class SmallGaussianPruning:
     """Removal, once, of Gaussians that amount to less than ``pixels`` in every one of some views.
 
     What a Gaussian amounts to is its blending weight, summed over an image: 1 for a pixel that
@@ -61,15 +61,15 @@ class SmallRemoval:
         return EditResult(TopologyEdit.select(kept), finding=text)
 
 
-def small_removal(run: RunStart) -> SmallRemoval:
+def build_small_pruning(run: RunStart) -> SmallGaussianPruning:
     """Return when and by which views Gaussians of a run are removed: when no more are added."""
     config = run.config
     strategy = run.config.strategy
     if not (isinstance(strategy, DefaultStrategy) and strategy.prune_pixels > 0):
-        return SmallRemoval()
+        return SmallGaussianPruning()
     views = run.capture.splits["train"]
     cameras = training_cameras([views[i] for i in evenly_spaced(len(views), SURVEYED)], config.data)
-    return SmallRemoval(scaled(strategy.stop, config.train.steps), strategy.prune_pixels, cameras)
+    return SmallGaussianPruning(scaled(strategy.stop, config.train.steps), strategy.prune_pixels, cameras)
 
 
 class StaticTraining(SceneTraining[StaticScene]):
@@ -81,7 +81,7 @@ class StaticTraining(SceneTraining[StaticScene]):
     def __init__(
         self,
         update: FilterUpdate,
-        removal: SmallRemoval = SmallRemoval(),
+        removal: SmallGaussianPruning = SmallGaussianPruning(),
         still: FrozenMask | None = None,
     ) -> None:
         self._update, self._removal, self._still = update, removal, still
@@ -105,7 +105,7 @@ class StaticTraining(SceneTraining[StaticScene]):
             return replace(scene, filter_std=self._update.of(scene.gaussians))
         return scene
 
-    def revised(self, scene: StaticScene, step: int) -> tuple[StaticScene, EditResult] | None:
+    def edit_scene(self, scene: StaticScene, step: int) -> tuple[StaticScene, EditResult] | None:
         rows = None if self._still is None else self._still.rows
         result = self._removal.edit(scene, rows) if step == self._removal.step else None
         if result is None or result.edit is None:
@@ -127,10 +127,10 @@ def _still(run: RunStart) -> FrozenMask | None:
 
 def start(run: RunStart) -> GaussianModel:
     """Return the model of a static scene before its first step."""
-    gaussians = first_gaussians(run)
-    colours = colours_of(run, gaussians, sees_time=False)
-    training = StaticTraining(filter_update(run), small_removal(run), _still(run))
-    return GaussianModel(run, training.first_scene(gaussians), training, densifier_of(run), colours)
+    gaussians = load_or_create_gaussians(run)
+    colours = colours_of(run, gaussians, uses_time=False)
+    training = StaticTraining(build_filter_update(run), build_small_pruning(run), _still(run))
+    return GaussianModel(run, training.first_scene(gaussians), training, build_densifier(run), colours)
 
 
 def restore(model: SceneModel, checkpoint: Checkpoint) -> StaticScene:
@@ -138,4 +138,4 @@ def restore(model: SceneModel, checkpoint: Checkpoint) -> StaticScene:
     scene = StaticScene.restored(
         Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
     )
-    return drawn_as_trained(scene, model, checkpoint)
+    return restore_appearance(scene, model, checkpoint)

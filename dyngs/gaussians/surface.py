@@ -124,7 +124,7 @@ def colours_of(seen: Sequence[DepthView], points: Tensor, tolerance: float) -> T
     return total / weight
 
 
-def simplified(mesh: Mesh, most: int) -> Mesh:
+def simplify_mesh(mesh: Mesh, most: int) -> Mesh:
     """Return a mesh of about ``most`` faces, no more, whose vertices are joined within cells."""
     if len(mesh.faces) <= most:
         return mesh
@@ -179,7 +179,7 @@ def _meeting_points(mesh: Mesh, labels: np.ndarray, size: float) -> np.ndarray:
 
 
 @torch.no_grad()
-def surface_of(
+def extract_surface(
     scene: GaussianScene,
     cameras: Sequence[Cameras],
     box: tuple[Tensor, Tensor],
@@ -206,7 +206,7 @@ def surface_of(
         raise DyngsError(
             "no surface: none of the views shows anything solid where the Gaussians are"
         )
-    mesh = largest_pieces(mesh)
+    mesh = keep_largest_components(mesh)
     size = float((box[1] - box[0]).max()) / cells
     colours = colours_of(seen, torch.from_numpy(mesh.vertices).float(), 2 * size)
     return Surface(mesh.vertices, mesh.faces, colours.numpy())
@@ -240,7 +240,7 @@ def opaque_box(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
     return low - margin, high + margin
 
 
-def largest_pieces(mesh: Mesh) -> Mesh:
+def keep_largest_components(mesh: Mesh) -> Mesh:
     """Return the mesh without pieces of less than a fiftieth of the faces of the largest, and
     without vertices that no face has."""
     from trimesh.graph import connected_component_labels
@@ -254,7 +254,7 @@ def largest_pieces(mesh: Mesh) -> Mesh:
     return Mesh(mesh.vertices[used], joined.reshape(-1, 3))
 
 
-def num_holes(surface: Surface) -> int:
+def count_holes(surface: Surface) -> int:
     """Return how many closed lines of edges have a face on one side only."""
     from trimesh import Trimesh
     from trimesh.graph import connected_components

@@ -38,13 +38,13 @@ class HumanKind(HasGaussians, HasBody):
     ) -> DataConfig:
         """Return the options of a capture with a body: found, and fitted to the silhouettes."""
         from dyngs.capture.sfm.unposed import is_unposed
-        from dyngs.human.fit.fitted_capture import with_fitted_body
+        from dyngs.human.fit.fitted_capture import ensure_fitted_body
 
         if is_unposed(data):
-            from dyngs.human.detect.find_person import with_found_person
+            from dyngs.human.detect.detect_person import ensure_detected_person
 
-            data = with_found_person(data, say=say, report=report)
-        return with_fitted_body(
+            data = ensure_detected_person(data, say=say, report=report)
+        return ensure_fitted_body(
             data, section, only_if_needed=not section.fit, say=say, report=report
         )
 
@@ -57,7 +57,7 @@ class HumanKind(HasGaussians, HasBody):
         *,
         keep_feet: bool,
     ) -> InMotion:
-        from dyngs.human.avatar.in_motion import in_motion
+        from dyngs.human.avatar.play_motion import in_motion
 
         return in_motion(section, scene, info, path, keep_feet=keep_feet)
 

@@ -26,13 +26,13 @@ _TORCH = "install a torch for CUDA, see pytorch.org"
 _BUILD = "install dyngs with `pip install . -C cmake.define.DYNGS_CUDA=ON`, which needs nvcc (docs/gpu.md)"
 
 
-def device_for(choice: str) -> torch.device:
+def select_device(choice: str) -> torch.device:
     """Return the device for ``auto``, ``cpu`` or ``cuda``; auto is a GPU where one can be used,
     else the CPU."""
     check_choice("device", choice, CHOICES)
     if choice == "cpu":
         return CPU
-    reason = why_no_gpu()
+    reason = gpu_unavailable_reason()
     if reason is None:
         return torch.device("cuda", torch.cuda.current_device())
     if choice == "cuda":
@@ -40,12 +40,12 @@ def device_for(choice: str) -> torch.device:
     return CPU
 
 
-def why_on_cpu(choice: str) -> str | None:
+def cpu_fallback_reason(choice: str) -> str | None:
     """Return a line on why ``choice`` means the CPU although the machine seems to have a GPU; None
     otherwise."""
-    if choice != "auto" or not has_driver():
+    if choice != "auto" or not has_nvidia_driver():
         return None
-    reason = why_no_gpu()
+    reason = gpu_unavailable_reason()
     return None if reason is None else f"computing on the CPU: {reason}; device=cpu ends this line"
 
 
@@ -94,19 +94,19 @@ def keep_freed_memory() -> bool:
     return core.keep_freed_memory()
 
 
-def finish(device: torch.device) -> None:
+def synchronize(device: torch.device) -> None:
     """Wait until ``device`` has done what was asked of it, so that it can be timed."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
-def has_driver() -> bool:
+def has_nvidia_driver() -> bool:
     """Return whether a driver of NVIDIA seems to be installed."""
     return Path("/proc/driver/nvidia/version").exists() or shutil.which("nvidia-smi") is not None
 
 
 @cache
-def why_no_gpu() -> str | None:
+def gpu_unavailable_reason() -> str | None:
     """Return why no GPU can be used and what to do, beginning with a small letter; None where one
     can be."""
     if torch.version.cuda is None:
@@ -141,7 +141,7 @@ def findings() -> Mapping[str, str]:
     return {
         "torch for": "the CPU alone" if version is None else f"CUDA {version}",
         "kernels for GPUs": "built" if has_cuda_core() else "not built",
-        "driver": "there" if has_driver() else "none",
+        "driver": "there" if has_nvidia_driver() else "none",
         "GPU": gpu,
     }
 
@@ -160,7 +160,7 @@ def sent(x: Tensor, device: torch.device | str) -> Tensor:
     return x.to(device, non_blocking=x.device.type == "cpu")
 
 
-class ReadBack:
+class AsyncReadback:
     """Numbers of a tensor, which a GPU copies to the CPU as soon as it has them, while more work is
     queued."""
 

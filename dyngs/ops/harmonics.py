@@ -60,7 +60,7 @@ class _Dimmed(torch.autograd.Function):
         return grad * left[:, None, None], None, by_few, None
 
 
-def dimmed(sh: Tensor, left: Tensor, few: Tensor, every: int) -> Tensor:
+def dim_harmonics(sh: Tensor, left: Tensor, few: Tensor, every: int) -> Tensor:
     """Return harmonics (N, K, 3) whose colours are the parts ``left`` (N,) of those of ``sh``.
 
     Differentiable once, in ``sh`` and in ``few``, which is every so many-th of ``left``: enough to

@@ -101,7 +101,7 @@ def _known_backward(x: Backward) -> Sequence[Tensor]:
 known_features_op = register("known_features", _known, _known_backward, "table")
 
 
-def known_features(
+def select_features(
     features: Tensor, which: Tensor, coords: Tensor, table: Tensor, levels: HashLevels
 ) -> Tensor:
     """Return the rows ``which`` (K,) of ``features``, as ``hash_features`` of the points ``coords``

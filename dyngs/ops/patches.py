@@ -152,7 +152,7 @@ blend_patches_op = register("blend_patches", _blend, _blend_backward, "means col
 
 
 @dataclass(frozen=True)
-class Places:
+class PatchSamples:
     """The N places on patches that the pixels of V views show."""
 
     rows: Tensor  # (V, H, W) int32, which of them a pixel shows; -1: nothing
@@ -160,22 +160,22 @@ class Places:
     uv: Tensor  # (N, 2)
 
     @staticmethod
-    def of(ids: Tensor, uv: Tensor) -> Places:
+    def of(ids: Tensor, uv: Tensor) -> PatchSamples:
         """Return the places of what ``visible_patches`` returned, view by view, row by row."""
         shown = ids >= 0
         rows = torch.where(shown, shown.flatten().cumsum(0).view(ids.shape) - 1, -1).to(torch.int32)
-        return Places(rows, ids[shown], uv[shown])
+        return PatchSamples(rows, ids[shown], uv[shown])
 
 
 @dataclass(frozen=True)
-class Projected:
+class ProjectedPoints:
     """Points of patches in an image, differentiable."""
 
     means: Tensor  # (N, 2) px
     depths: Tensor  # (N,)
 
 
-def project_points(points: Tensor, cameras: Cameras, views: Tensor) -> Projected:
+def project_points(points: Tensor, cameras: Cameras, views: Tensor) -> ProjectedPoints:
     """Return where ``points`` (N, 3) of the world are in the images of ``views`` (N,)."""
     which = slice(0, 1) if len(cameras) == 1 else views
     pose = cameras.cam_from_world[which]
@@ -188,10 +188,10 @@ def project_points(points: Tensor, cameras: Cameras, views: Tensor) -> Projected
     x, y, z = (local + pose[:, :3, 3]).unbind(1)
     across = inner[:, 0, 0] * x / z + inner[:, 0, 2]
     down = inner[:, 1, 1] * y / z + inner[:, 1, 2]
-    return Projected(torch.stack([across, down], 1), z)
+    return ProjectedPoints(torch.stack([across, down], 1), z)
 
 
-def outline_crossings(points: Tensor, cameras: Cameras, places: Places) -> Tensor:
+def outline_crossings(points: Tensor, cameras: Cameras, places: PatchSamples) -> Tensor:
     """Return (V, 2, H, W): how far from a pixel's centre to the next in its row, in its column,
     their outline is.
 
@@ -215,7 +215,7 @@ def outline_crossings(points: Tensor, cameras: Cameras, places: Places) -> Tenso
     return out.view(-1).index_put((to,), crossing).view_as(out)
 
 
-def _differing(places: Places, axis: int) -> tuple[Tensor, Tensor, Tensor]:
+def _differing(places: PatchSamples, axis: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return indices of pixels that show another patch than the next along x (axis 0) or y, of
     those, of crossings."""
     rows = places.rows
@@ -235,7 +235,7 @@ def _differing(places: Places, axis: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _ends_between(
-    points: Tensor, cameras: Cameras, places: Places, pixels: Tensor, directions: Tensor
+    points: Tensor, cameras: Cameras, places: PatchSamples, pixels: Tensor, directions: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return (N,) steps in ``directions`` from ``pixels`` to where what they show ends, and (N,)
     whether it does."""
@@ -258,7 +258,7 @@ def _ends_between(
 
 
 def blend_patches(
-    means: Tensor, colours: Tensor, crossings: Tensor, places: Places
+    means: Tensor, colours: Tensor, crossings: Tensor, places: PatchSamples
 ) -> tuple[Tensor, Tensor]:
     """Return (V, H, W, C) images before black and (V, H, W) transmittance, differentiable once.
 

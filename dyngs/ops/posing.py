@@ -61,7 +61,7 @@ posing_op = register(
 
 
 @dataclass(frozen=True)
-class Posed:
+class PosedGaussians:
     """Gaussians in a pose."""
 
     means: Tensor  # (N, 3)
@@ -72,7 +72,7 @@ class Posed:
 
 def pose_by_joints(
     means: Tensor, quats: Tensor, log_scales: Tensor, weights: Tensor, transforms: Tensor
-) -> Posed:
+) -> PosedGaussians:
     """Return Gaussians moved by their joints, T_i = sum_j w_ij A_j: means T x, covariances T S T^T,
     both exactly.
 
@@ -86,4 +86,4 @@ def pose_by_joints(
     """
     inputs = means, quats, log_scales, weights, transforms
     dtype = reduce(torch.promote_types, (x.dtype for x in inputs), torch.float32)
-    return Posed(*posing_op(*(x.to(dtype) for x in inputs))[:4])
+    return PosedGaussians(*posing_op(*(x.to(dtype) for x in inputs))[:4])

@@ -95,7 +95,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
 
 
-def quats_of(matrices: Tensor) -> Tensor:
+def quats_from_matrices(matrices: Tensor) -> Tensor:
     """Return the unit quaternions wxyz (..., 4) of rotations (..., 3, 3), with their largest
     component positive.
 
@@ -122,7 +122,7 @@ def quats_of(matrices: Tensor) -> Tensor:
     )
 
 
-def shorter_ways(quats: np.ndarray) -> np.ndarray:
+def align_quat_signs(quats: np.ndarray) -> np.ndarray:
     """Return quaternions (F, ..., 4), their signs so that interpolated numbers go the shorter
     way."""
     turned = (quats[1:] * quats[:-1]).sum(-1, keepdims=True) < 0

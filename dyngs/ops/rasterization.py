@@ -79,7 +79,7 @@ class TileEntries:
 
 
 @dataclass(frozen=True)
-class Blended:
+class BlendedImages:
     """V blended images of D channels."""
 
     color: Tensor  # (V, H, W, D), background composited
@@ -247,7 +247,7 @@ def rasterize(
     probe: Tensor | None = None,
     options: BlendOptions = BlendOptions(),
     entries: TileEntries | None = None,
-) -> Blended:
+) -> BlendedImages:
     """Return the splats blended front to back into V images of D channels.
 
     Differentiable in means2d, factors, opacities, colors and background. ``opacities`` (V, N),
@@ -280,7 +280,7 @@ def rasterize(
         options.thresholds,
         options.absgrad,
     )
-    return Blended(color, transmittance)
+    return BlendedImages(color, transmittance)
 
 
 class Tally(IntEnum):
@@ -327,7 +327,7 @@ def blend_and_tally(
     options: BlendOptions = BlendOptions(),
     *,
     background: Tensor | None = None,
-) -> tuple[Blended, Tensor]:
+) -> tuple[BlendedImages, Tensor]:
     """Return what ``rasterize`` and ``tally`` do, of one pass; not differentiable."""
     entries = bin_tiles(projection, opacities, size, options)
     splats = [projection.means2d, projection.factors, opacities, projection.radii]
@@ -335,4 +335,4 @@ def blend_and_tally(
         sums, color, transmittance = tally_op(
             splats, colors, background, entries.tensors(), list(size), options.thresholds, int(kind)
         )
-    return Blended(color, transmittance), sums
+    return BlendedImages(color, transmittance), sums

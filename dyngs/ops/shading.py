@@ -17,10 +17,10 @@ from torch import Tensor
 from dyngs.ops.registration import Backward, launch, register
 
 
-def num_inputs(*, sees_time: bool, sees_normals: bool) -> int:
+def num_inputs(*, uses_time: bool, uses_normals: bool) -> int:
     """Return K, the width of the network's input: place, direction, base colour, and what else it
     sees."""
-    return 9 + 4 * sees_normals + sees_time
+    return 9 + 4 * uses_normals + uses_time
 
 
 def _shading(
@@ -37,7 +37,7 @@ def _shading(
     normals: bool,
 ) -> Tensor:
     out = base.new_empty(
-        base.shape[0], num_inputs(sees_time=time is not None, sees_normals=normals)
+        base.shape[0], num_inputs(uses_time=time is not None, uses_normals=normals)
     )
     at_rest = None if rest is None or turn is None else (rest, turn)
     seen = (

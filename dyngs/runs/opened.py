@@ -18,7 +18,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.capture import Capture, Split, View
 from dyngs.data.geometry import up_direction
-from dyngs.gaussians.rendering import drawing_options
+from dyngs.gaussians.rendering import file_render_options
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import all_suffixes, format_to_read, read_splats
@@ -331,7 +331,7 @@ def _open_avatar(path: Path) -> Opened:
 
 def opened_file(splat: SplatFile, path: Path) -> Opened:
     """Return the scene that a file holds, in its own frame."""
-    scene = StaticScene(gaussians=splat.gaussians, options=drawing_options(splat))
+    scene = StaticScene(gaussians=splat.gaussians, options=file_render_options(splat))
     scaled = splat.edited.scale != 1
     opened = opened_scene(scene, path)
     return replace(opened, stated_up=splat.up, notes=splat.notes, path=path, scaled=scaled)

@@ -91,7 +91,7 @@ def table_of(
     return Table(title, ["", *(columns[key][0] for key in shown)], cells)
 
 
-def shown_views(out: Path, results: Sequence[Measurement]) -> list[dict[str, Any]]:
+def page_views(out: Path, results: Sequence[Measurement]) -> list[dict[str, Any]]:
     """Return the views that a page shows, each with its images: the truth first, then those of the
     models."""
 
@@ -117,7 +117,7 @@ def write_report(stem: Path, report: Report) -> list[Path]:
         f"\nLeft out: {markdown_text(f'{name}: {why}')}\n" for name, why in report.left_out.items()
     )
     tables = "\n".join(markdown_table(table.head, table.cells) for table in report.tables)
-    svg = "" if report.figure is None else svg_of(report.figure)
+    svg = "" if report.figure is None else figure_to_svg(report.figure)
     values = {"rows": list(report.rows), **report.values, "left_out": dict(report.left_out)}
     texts = {
         "csv": csv_text(report.rows),
@@ -205,7 +205,7 @@ def markdown_text(text: str) -> str:
 # Plots
 
 
-def svg_of(figure: Figure) -> str:
+def figure_to_svg(figure: Figure) -> str:
     """Return a figure as an SVG element; equal figures give equal text."""
     import matplotlib
 

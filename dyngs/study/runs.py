@@ -24,7 +24,7 @@ from dyngs.training.events import Listener
 
 T = TypeVar("T")
 R = TypeVar("R")
-AS_STORED = ConfigDict(extra="forbid", allow_inf_nan=False)
+STORED_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
 """How the dataclasses of results are read: nothing else, and only numbers."""
 STUDY_FILE = "study.json"
 """What a study is about, in its folder."""
@@ -43,7 +43,7 @@ def finished(config: Config, out: Path, listeners: Sequence[Listener] = ()) -> P
     return train(begun.model_copy(update={"run": run}), resume_from=out, listeners=listeners)
 
 
-def done_in_turn(
+def run_tasks(
     do: Callable[[T], R], tasks: Sequence[T], ray_cores: int | None = None
 ) -> Iterator[tuple[T, R | DyngsError]]:
     """Yield each task and what ``do`` makes of it, or why it cannot, as they end.

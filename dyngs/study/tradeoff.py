@@ -30,7 +30,7 @@ from dyngs.core.section import CutOff
 from dyngs.core.state import tensors_of
 from dyngs.models.checkpoint import read_capture_of, restored_model, settings_of
 from dyngs.models.kind import HasGaussians, Moves, capability
-from dyngs.ops.device import device_for
+from dyngs.ops.device import select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
@@ -43,9 +43,9 @@ from dyngs.runs.checkpoint import (
 )
 from dyngs.runs.folder import inputs_of, write_config
 from dyngs.runs.opened import split_views
-from dyngs.study.measure import SCORES, Bench, Measurement, Subject
-from dyngs.study.runs import AS_STORED, done_in_turn, finished, require_same_study
-from dyngs.training.new_trainer import assemble
+from dyngs.study.measure import SCORES, SceneMeasurer, Measurement, Subject
+from dyngs.study.runs import STORED_CONFIG, run_tasks, finished, require_same_study
+from dyngs.training.new_trainer import build_trainer
 
 MIN_DOUBLINGS = 0.05
 """Smaller gains (3.5 %) count as none."""
@@ -60,7 +60,7 @@ Row = dict[str, Any]
 Value = float | int | str
 
 
-@dataclass(frozen=True, config=AS_STORED)
+@dataclass(frozen=True, config=STORED_CONFIG)
 class Variant:
     """Changes of a run; the defaults change nothing.
 
@@ -146,7 +146,7 @@ def parse_variations(words: Sequence[str]) -> dict[str, tuple[Value, ...]]:
     return found or SETTINGS
 
 
-def own_settings(run_dir: Path) -> dict[str, Value | None]:
+def current_settings(run_dir: Path) -> dict[str, Value | None]:
     """Return the settings that can be varied in a run, with its own values. Raises DyngsError: none
     can."""
     if has_only_scene_file(run_dir):
@@ -168,7 +168,7 @@ def own_settings(run_dir: Path) -> dict[str, Value | None]:
     return own
 
 
-def single_changes(
+def single_setting_variants(
     settings: Mapping[str, Sequence[Value]], own: Mapping[str, Value | None], finetune: int
 ) -> list[Variant]:
     """Return one variant per setting and value that applies to a run with the settings ``own`` and
@@ -220,7 +220,7 @@ class Tradeoff:
         """
         load_resolved(self.run_dir)  # what is no run is refused before anything else
         inputs_of(self.run_dir).require_output(self.out)
-        own = own_settings(self.run_dir)  # refuses what cannot be varied before anything is written
+        own = current_settings(self.run_dir)  # refuses what cannot be varied before anything is written
         run = load_run(self.run_dir)
         split_views(read_capture_of(run.config.data, run.info), self.split)
         newest = checkpoint_paths(self.run_dir)[-1]
@@ -229,10 +229,10 @@ class Tradeoff:
             "checkpoint": newest.name,
             "sha256": hashlib.sha256(newest.read_bytes()).hexdigest(),
             "split": self.split,
-            "device": device_for(self.device).type,
+            "device": select_device(self.device).type,
         }
         require_same_study(self.out, source, ("sha256", "split", "device"))
-        singles = [Variant(), *single_changes(self.settings, own, self.finetune)]
+        singles = [Variant(), *single_setting_variants(self.settings, own, self.finetune)]
         idle = self.settings.keys() - {name for variant in singles for name in variant.settings}
         if idle:
             show(f"nothing to vary in this run: {', '.join(sorted(idle))}")
@@ -243,12 +243,12 @@ class Tradeoff:
     def _measured(
         self, variants: Sequence[Variant], ray_cores: int | None
     ) -> dict[Variant, Measurement]:
-        bench = Bench(self.out, self.split, self.threads, self.device, rounds=self.rounds)
+        bench = SceneMeasurer(self.out, self.split, self.threads, self.device, rounds=self.rounds)
         subjects = [
             Subject(v.name, v.slug, self.run_dir, partial(self.folder, v)) for v in variants
         ]
         missing = [subject for subject in subjects if not bench.point(subject.slug).is_file()]
-        for subject, found in done_in_turn(bench.measure, missing, ray_cores):
+        for subject, found in run_tasks(bench.measure, missing, ray_cores):
             if isinstance(found, DyngsError):
                 raise found
             show(f"{subject.name}: {found.psnr:.2f} dB, {found.mb:.2f} MB")
@@ -295,7 +295,7 @@ class Tradeoff:
             config = load_resolved(source, [steps, *self._pruning(wanted)])
             with kernel_threads(self.threads or num_cores()):
                 capture = read_capture_of(config.data, start.info)
-                trainer = assemble(config, capture, restored=True)
+                trainer = build_trainer(config, capture, restored=True)
                 trainer.restore(start)
                 trainer.apply(pruning(trainer))
                 checkpoint = trainer.checkpoint()

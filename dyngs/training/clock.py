@@ -99,7 +99,7 @@ class _Mark:
     num_gaussians: int
 
 
-class Forecast:
+class TimeForecast:
     """Prediction of the seconds that a run still takes, by its pace so far.
 
     Args:

@@ -19,7 +19,7 @@ docs/storage.md."""
 FEWEST = 500  # Fewest Gaussians that a limit on the size must have room for
 
 
-def require_possible(config: Config) -> None:
+def validate_limits(config: Config) -> None:
     """Raise DyngsError where limits or choices of ``config`` contradict it or each other."""
     uses = kind_of(config.model).uses
     for key, value in _given(config).items():
@@ -66,7 +66,7 @@ def _of_single_images(config: Config) -> dict[str, str]:
     }
 
 
-def within_cap(config: Config, cap: int | None) -> Config:
+def apply_gaussian_cap(config: Config, cap: int | None) -> Config:
     """Return ``config`` with all numbers of Gaussians lowered to ``cap``; None: as it is."""
     changes = {}
     if cap is None:
@@ -80,7 +80,7 @@ def within_cap(config: Config, cap: int | None) -> Config:
     return config.model_copy(update=changes | {"strategy": config.strategy.limited(cap)})
 
 
-def most_gaussians(config: Config, num_times: int) -> int | None:
+def gaussian_limit(config: Config, num_times: int) -> int | None:
     """Return the largest number of Gaussians at the end by the limits of the run; None without
     one."""
     limits = [config.budget.max_gaussians] if config.budget.max_gaussians is not None else []

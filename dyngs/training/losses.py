@@ -12,7 +12,7 @@ from torch import Tensor
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image
 from dyngs.models.model import Look, Loss
-from dyngs.ops.device import ReadBack, sent
+from dyngs.ops.device import AsyncReadback, sent
 from dyngs.ops.loss import l1_ssim_loss
 
 
@@ -75,7 +75,7 @@ class StepCheck:
         numbers = [sent(x.detach(), device).double().reshape(1) for x in terms.values()]
         # sums, in which NaN and infinity show: a thirtieth of the time of isfinite
         numbers += [x.sum().double().reshape(1) for x in self._moved.values()]
-        self._read = ReadBack(torch.cat(numbers))
+        self._read = AsyncReadback(torch.cat(numbers))
 
     def loss(self, step: int, image: Image, moves_by: tuple[str, str]) -> float:
         """Return the sum of the terms; waits for them."""

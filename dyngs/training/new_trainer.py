@@ -16,7 +16,7 @@ from dyngs.data.read import read_capture, require_images
 from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.model import GaussianModel
-from dyngs.gaussians.start import FirstGaussians, surroundings
+from dyngs.gaussians.initialization import InitialGaussians, surroundings
 from dyngs.models.kind import Moves, RunStart, kind_of
 from dyngs.models.views import (
     background_colour,
@@ -25,13 +25,13 @@ from dyngs.models.views import (
     training_cameras,
     training_times,
 )
-from dyngs.ops.device import device_for
+from dyngs.ops.device import select_device
 from dyngs.training.corrections.camera_refinement import CameraRefinement
 from dyngs.training.corrections.exposure import ViewExposures
 from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
-from dyngs.training.priors import UsedPriors, used_priors
-from dyngs.training.trainer import Parts, Trainer
+from dyngs.training.priors import PriorLosses, load_priors
+from dyngs.training.trainer import TrainerParts, Trainer
 
 GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
 
@@ -45,14 +45,14 @@ FULL_OPACITY_FROM = 0.6
 ALIKE_IMAGES = 12  # number of images in which colours are compared with the background
 
 
-def assemble(
+def build_trainer(
     config: Config,
     capture: Capture | None = None,
     *,
     restored: bool = False,
     images: ImageLoader | None = None,
     held_out: frozenset[int] = frozenset(),
-    first: FirstGaussians | None = None,
+    first: InitialGaussians | None = None,
     uncapped: Config | None = None,
 ) -> Trainer[Any]:
     """Return the trainer of a scene: its model begun, nothing trained.
@@ -74,11 +74,11 @@ def assemble(
         images = ImageLoader(
             capture.splits["train"], config.data, with_maps=True, decoding_threads=usual_threads()
         )
-    priors = UsedPriors()
+    priors = PriorLosses()
     kind = kind_of(config.model)
     if "train.priors" in kind.uses:
         moves = isinstance(kind, Moves) and len(set(training_times(capture))) > 1
-        priors = used_priors(config, capture, images.views, moves=moves)
+        priors = load_priors(config, capture, images.views, moves=moves)
     if not priors.masks:
         images = images.without_motion_masks()
     background = resolved_background(config, capture)
@@ -92,7 +92,7 @@ def assemble(
         )
     early = _early_opacity(config, capture, images, background)
 
-    def parts(config: Config) -> Parts:
+    def parts(config: Config) -> TrainerParts:
         start = RunStart(
             config, uncapped or config, capture, images, background, extent, generator, first
         )
@@ -102,8 +102,8 @@ def assemble(
         refinement = None
         if config.camera.refine == "always":
             refinement = CameraRefinement(views, extent, steps)
-            applied_to = refinement.corrections.applied_to
-            images.corrected = lambda index, cameras: applied_to(views[index], cameras)
+            correct_cameras = refinement.corrections.correct_cameras
+            images.corrected = lambda index, cameras: correct_cameras(views[index], cameras)
         robust = None
         may_mask = "train.robust" in kind.uses and not isinstance(kind, Moves)
         if config.train.robust == "always" and may_mask:
@@ -121,11 +121,11 @@ def assemble(
             RegularizerLoss(),
         ]
         found = (robust, exposures, refinement)
-        return Parts(model, losses, [x for x in found if x is not None])
+        return TrainerParts(model, losses, [x for x in found if x is not None])
 
     return Trainer(
         config=config,
-        parts_of=parts,
+        build_parts=parts,
         capture=capture,
         images=images,
         background=background,
@@ -133,7 +133,7 @@ def assemble(
         generator=generator,
         findings=findings,
         held_out=held_out,
-        device=device_for(config.run.device),
+        device=select_device(config.run.device),
     )
 
 

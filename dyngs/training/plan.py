@@ -9,7 +9,7 @@ from typing import Any
 from dyngs.config import Config, TrainConfig
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.capture import Capture
-from dyngs.gaussians.start import FirstGaussians
+from dyngs.gaussians.initialization import InitialGaussians
 from dyngs.models.kind import ExtendsTo, capability
 from dyngs.models.schedule import PUBLISHED_STEPS, Length, scaled
 from dyngs.training.corrections.exposure import WARM_UP
@@ -47,7 +47,7 @@ class RunPlan:
     resolved: Config
     uncapped: Config | None = None
     capture: Capture | None = None
-    first: FirstGaussians | None = None
+    first: InitialGaussians | None = None
     limits: Limits = Limits()
     choices: tuple[Any, ...] = ()
 
@@ -60,7 +60,7 @@ def with_steps(config: Config, steps: int) -> Config:
     return config.model_copy(update={"train": config.train.model_copy(update={"steps": steps})})
 
 
-def with_length(config: Config, done: int, steps: int) -> Config:
+def extend_config(config: Config, done: int, steps: int) -> Config:
     """Return the configuration with which a run goes on, after ``done`` steps, to ``steps``; no
     limit of time holds.
 

@@ -17,7 +17,7 @@ from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, se
 from dyngs.models.kind import Predicts, capability
 from dyngs.models.prediction import Learner, load_optimizer, optimizer_state, updated
 from dyngs.training.events import StepReport
-from dyngs.training.trainer import Edit, ViewSampler
+from dyngs.training.trainer import TrainingEdit, ViewSampler
 
 WARM_UP = 0.05  # Fraction of the run in which the highest learning rate is reached
 WEIGHT_DECAY = 1e-5  # Weight decay of AdamW
@@ -60,10 +60,10 @@ class NetworkTrainer:
 
     def update(self, loss: Tensor, step: int) -> None:
         """Do a step of AdamW; none for gradients that are not finite."""
-        rate = rate_at(self.learner.lr, step, self.config.train.steps)
+        rate = one_cycle_rate(self.learner.lr, step, self.config.train.steps)
         self.bad_gradients += not updated(self.optimizer, self.learner.network, loss, rate)
 
-    def apply(self, edit: Edit) -> None:
+    def apply(self, edit: TrainingEdit) -> None:
         """Do nothing: no limit is for networks."""
 
     def checkpoint(self) -> Checkpoint:
@@ -107,7 +107,7 @@ def network_trainer(config: Config) -> NetworkTrainer:
     )
 
 
-def rate_at(highest: float, step: int, steps: int) -> float:
+def one_cycle_rate(highest: float, step: int, steps: int) -> float:
     """Return the learning rate of AdamW: a linear rise, then a linear fall (one cycle; Smith and
     Topin 2017)."""
     top = max(1, round(WARM_UP * steps))

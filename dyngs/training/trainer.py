@@ -56,7 +56,7 @@ class ViewSampler:
             if wanted(index):
                 return index
 
-    def coming(self, count: int, wanted: Callable[[int], bool]) -> list[int]:
+    def peek(self, count: int, wanted: Callable[[int], bool]) -> list[int]:
         """Return up to ``count`` views of this epoch that come next, by what is ``wanted`` now;
         nothing is drawn."""
         rest = self._order[self._position :].tolist()
@@ -73,7 +73,7 @@ class ViewSampler:
 
 
 @dataclass(frozen=True)
-class Edit:
+class TrainingEdit:
     """A change of a training between two steps, as a limit or the pruning stage requests it.
 
     Attributes:
@@ -88,7 +88,7 @@ class Edit:
     message: str = ""
     kept: Tensor | None = None
     masks: Any = None
-    stops_growing: bool = False
+    stops_densification: bool = False
     steps: int | None = None
     config: Config | None = None
 
@@ -96,7 +96,7 @@ class Edit:
 M = TypeVar("M", bound=Model[Any])
 
 
-class Parts(NamedTuple):
+class TrainerParts(NamedTuple):
     """Parts of a trainer that depend on the schedules of a run.
 
     The order of the losses decides the last bits of gradients.
@@ -124,7 +124,7 @@ class Trainer(Generic[M]):
     """
 
     config: Config
-    parts_of: Callable[[Config], Parts]
+    build_parts: Callable[[Config], TrainerParts]
     capture: Capture
     images: ImageLoader
     background: str
@@ -147,7 +147,7 @@ class Trainer(Generic[M]):
 
     def _begin(self, config: Config) -> None:
         self.config = config
-        self.model, self.losses, self.corrections = self.parts_of(config)
+        self.model, self.losses, self.corrections = self.build_parts(config)
         self.place(self.device)
 
     @property
@@ -234,21 +234,21 @@ class Trainer(Generic[M]):
             self.bad_gradients = self.bad_gradients + bad
         return StepReport(step, value, image, rendered.detach(), truth)
 
-    def apply(self, edit: Edit) -> None:
+    def apply(self, edit: TrainingEdit) -> None:
         """Change the training between two steps."""
         model: Any = self.model
         if edit.steps is not None:
             self._rescale(edit.steps)
         if edit.config is not None:
             self.config = edit.config
-            model.draw_as(edit.config.model)
-        if edit.stops_growing:
-            model.exchange(model.scene.unmasked())
+            model.set_render_options(edit.config.model)
+        if edit.stops_densification:
+            model.replace_scene(model.scene.without_masks())
             model.stop_growing()
         if edit.kept is not None:
             model.keep(edit.kept, self.done)
         if edit.masks is not None:
-            model.exchange(replace(model.scene, masks=edit.masks))
+            model.replace_scene(replace(model.scene, masks=edit.masks))
 
     def _rescale(self, steps: int) -> None:
         config = with_steps(self.config, steps)
@@ -257,10 +257,10 @@ class Trainer(Generic[M]):
             return
         step = self.done + 1
         seen = self.model.window(step)
-        self.begin_again(config, self.checkpoint())
+        self.restart(config, self.checkpoint())
         self.model.extend(seen, step)
 
-    def begin_again(self, config: Config, checkpoint: Checkpoint) -> None:
+    def restart(self, config: Config, checkpoint: Checkpoint) -> None:
         """Go back to ``checkpoint``, on the schedules of ``config``."""
         self._begin(config)
         self.restore(checkpoint)
@@ -343,8 +343,8 @@ class Trainer(Generic[M]):
             batch = self.config.train.batch_size
             count = self.images.decoded_ahead * self.processes.size
             fraction = self.processes.share(batch)
-            coming = self.sampler.coming(count, self._wanted(step))
-            self.images.expect([view for i, view in enumerate(coming) if i % batch in fraction])
+            peek = self.sampler.peek(count, self._wanted(step))
+            self.images.expect([view for i, view in enumerate(peek) if i % batch in fraction])
         return image
 
     def _wanted(self, step: int) -> Callable[[int], bool]:

@@ -15,7 +15,7 @@ import torch
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.human.avatar.scene import avatar_of
+from dyngs.human.avatar.scene import as_human_scene
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.motion import compose_rotations
 from dyngs.io.write import to_uint8
@@ -23,8 +23,8 @@ from dyngs.runs.opened import Opened
 from dyngs.view.edit import EditControls, can_be_edited
 from dyngs.view.layers import LAYERS, PARTS, draw
 from dyngs.view.session import Keyframe, Recording
-from dyngs.view.source import Source
-from dyngs.view.views import centers_of, has_timeline, pose_of, viewpoint_of, views_of
+from dyngs.view.source import SceneSource
+from dyngs.view.views import centers_of, has_timeline, pose_of, initial_viewpoint, views_of
 
 if TYPE_CHECKING:
     import viser
@@ -48,9 +48,9 @@ HELP = """\
 class Controls:
     """Controls of one browser; ``show`` makes them anew for another scene."""
 
-    def __init__(self, browsing: Browsing, source: Source, motions: Mapping[str, Path]) -> None:
+    def __init__(self, browsing: Browsing, source: SceneSource, motions: Mapping[str, Path]) -> None:
         self._browsing, self._source, self._motions = browsing, source, motions
-        self._frusta = Frusta(browsing)
+        self._frusta = CameraFrusta(browsing)
         self._folders: list[Any] = []
         self._edits: EditControls | None = None
         gui = browsing.client.gui
@@ -112,7 +112,7 @@ class Controls:
     def _change(self, **changes: Any) -> None:
         """Show something else, which frusta may cover."""
         self._browsing.session.change(**changes)
-        self._frusta.hide_what_covers()
+        self._frusta.hide_covering_frusta()
 
     def _add_edits(self, opened: Opened) -> None:
         self._edits = EditControls(self._browsing, opened)
@@ -268,11 +268,11 @@ class Controls:
 
 
 def _add_help(gui: viser.GuiApi, opened: Opened) -> None:
-    from dyngs.view.server import as_text
+    from dyngs.view.server import escape_markdown
 
     gui.add_markdown(HELP)
     for note in opened.notes:
-        gui.add_markdown(f"*{as_text(note)}*")
+        gui.add_markdown(f"*{escape_markdown(note)}*")
 
 
 def posed(opened: Opened, angles: Mapping[str, Sequence[float]]) -> Opened:
@@ -281,7 +281,7 @@ def posed(opened: Opened, angles: Mapping[str, Sequence[float]]) -> Opened:
     from scipy.spatial.transform import Rotation
 
     rest = opened.at_rest()
-    person = avatar_of(rest.renderable)
+    person = as_human_scene(rest.renderable)
     clip = None if person is None else person.played
     if person is None or clip is None:
         return rest
@@ -312,13 +312,13 @@ MOST_FRUSTA = 120
 """Frusta that are shown at most, spread evenly over the cameras."""
 
 
-class Frusta:
+class CameraFrusta:
     """Frusta of one browser."""
 
     def __init__(self, browsing: Browsing) -> None:
         self._browsing = browsing
         self._handles: list[tuple[Any, np.ndarray, float]] = []
-        browsing.on_move = self.hide_what_covers
+        browsing.on_move = self.hide_covering_frusta
 
     def show(self, opened: Opened) -> None:
         """Add the frusta, image by image, as the thread that draws finds time; of a camera that
@@ -328,7 +328,7 @@ class Frusta:
         views = views_of(opened).views
         poses = np.stack([view.cam_from_world for view in views])
         centers = centers_of(poses)
-        size = 0.05 * viewpoint_of(opened).extent
+        size = 0.05 * initial_viewpoint(opened).extent
         # Cameras of a video stand close together.
         spread = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
         size = min(size, 0.15 * spread) if spread > 1e-3 * size else size
@@ -342,7 +342,7 @@ class Frusta:
         for handle, _, _ in handles:
             handle.remove()
 
-    def hide_what_covers(self) -> None:
+    def hide_covering_frusta(self) -> None:
         """Hide the frusta that the browser's camera stands in, and all where the image is of
         another camera."""
         session = self._browsing.session
@@ -380,7 +380,7 @@ class Frusta:
         )
         handle.on_click(lambda _: self._go(index))
         handles.append((handle, position, size))
-        self.hide_what_covers()
+        self.hide_covering_frusta()
 
     def _go(self, index: int) -> None:
         browsing = self._browsing

@@ -18,12 +18,12 @@ from torch import Tensor
 from dyngs.api.edit import write_part
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.geometry import look_at, perpendicular, with_poses
-from dyngs.export.edit.crop import Box, held_by
+from dyngs.export.edit.crop import Box, gaussians_in_region
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.similarity import UNMOVED, Similarity
 from dyngs.runs.opened import Opened
 from dyngs.view.layers import Shot, depth_of
-from dyngs.view.views import camera_at, viewpoint_of
+from dyngs.view.views import camera_at, initial_viewpoint
 
 if TYPE_CHECKING:
     from dyngs.view.server import Browsing
@@ -64,7 +64,7 @@ def picked(
 
 
 @dataclass
-class Editing:
+class EditState:
     """Picked points, a box, and what is left of the scene ``whole`` after what was deleted.
 
     Attributes:
@@ -103,7 +103,7 @@ class Editing:
     def delete(self, *, inside: bool) -> int:
         """Delete what the box holds, or all else; return how many Gaussians go. Raises DyngsError:
         all would."""
-        kept = held_by(self.box, self.left.scene, world_of(self.whole)) ^ inside
+        kept = gaussians_in_region(self.box, self.left.scene, world_of(self.whole)) ^ inside
         if not bool(kept.any()):
             held = "all of the scene" if inside else "nothing"
             raise DyngsError(f"nothing would be left: the box holds {held}")
@@ -157,11 +157,11 @@ class EditControls:
     """Controls and marks of one browser for one scene; ``remove`` takes the marks away."""
 
     def __init__(self, browsing: Browsing, opened: Opened) -> None:
-        begin = viewpoint_of(opened)
+        begin = initial_viewpoint(opened)
         world = world_of(opened)
         extent = begin.extent * world.scale
         size = np.full(3, float(f"{0.5 * extent:.2g}"))
-        self.editing = Editing(opened, world.points(begin.center), size)
+        self.editing = EditState(opened, world.points(begin.center), size)
         self._browsing, self._extent = browsing, begin.extent
         self._back = world.inverse()
         self._marks = dict[str, Any]()

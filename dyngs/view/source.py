@@ -19,7 +19,7 @@ from dyngs.view.layers import coarser
 
 
 @dataclass(frozen=True)
-class Source:
+class SceneSource:
     """Names of scenes, at least one, and what loads the scene of a name."""
 
     names: tuple[str, ...]
@@ -32,7 +32,7 @@ def open_source(
     device: torch.device = CPU,
     data_root: Path | None = None,
     most: int | None = None,
-) -> Source:
+) -> SceneSource:
     """Return what is to be seen of a run, a file or a folder of runs; the first scene is not loaded
     yet.
 
@@ -58,7 +58,7 @@ def open_source(
         opened = open_to_view(runs[name], name, up, data_root).to(device)
         return opened if most is None else coarser(opened, most)
 
-    return Source(tuple(runs), load)
+    return SceneSource(tuple(runs), load)
 
 
 def open_to_view(
@@ -84,7 +84,7 @@ def open_to_view(
     return opened
 
 
-def first_of(source: Source) -> Opened:
+def first_of(source: SceneSource) -> Opened:
     """Return the first scene that can be loaded; a note says which could not. Raises DyngsError."""
     failed: list[DyngsError] = []
     for name in source.names:

@@ -21,16 +21,16 @@ from dyngs.models.views import background_colour
 from dyngs.runs.opened import Captured, Opened
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
-from dyngs.view.server import Serving, Viewer, free_port, require_viser
-from dyngs.view.session import Drawer
-from dyngs.view.source import Source
+from dyngs.view.server import ServerOptions, Viewer, free_port, require_viser
+from dyngs.view.session import RenderScheduler
+from dyngs.view.source import SceneSource
 from dyngs.view.views import captured_views
 
 REFRESH_SECONDS = 1.0
 """Seconds between two images of a browser in which nothing moves but the scene."""
 
 
-class DrawnBetweenSteps:
+class BetweenStepRenderer:
     """Draws for browsers in the thread that trains, between two steps, since steps change the scene
     in place.
 
@@ -41,7 +41,7 @@ class DrawnBetweenSteps:
 
     def __init__(
         self,
-        drawer: Drawer,
+        drawer: RenderScheduler,
         fraction: float = 0.2,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
@@ -80,7 +80,7 @@ class TrainingView:
     cannot be had.
     """
 
-    def __init__(self, config: Config, serving: Serving, say: Callable[[str], None]) -> None:
+    def __init__(self, config: Config, serving: ServerOptions, say: Callable[[str], None]) -> None:
         if capability(config.model, Predicts) is not None:
             raise DyngsError(
                 "--view shows scenes, and a network has none; `dyngs predict` makes one"
@@ -89,7 +89,7 @@ class TrainingView:
         free_port(serving.host, serving.port)  # now, not after reading the capture
         self._say = say
         self._serving = replace(serving, in_thread=False, target=0.05)
-        self._drawn: DrawnBetweenSteps | None = None
+        self._drawn: BetweenStepRenderer | None = None
         self._stack = ExitStack()
 
     def __enter__(self) -> TrainingView:
@@ -107,12 +107,12 @@ class TrainingView:
         begins = self._drawn is None
         if self._drawn is None:
             first = opened_training(trainer)
-            source = Source((first.name,), lambda _: first)
+            source = SceneSource((first.name,), lambda _: first)
             viewer = self._stack.enter_context(Viewer(source, first, self._serving))
             self._say(f"viewing: {viewer.link} (until the training ends)")
-            self._drawn = DrawnBetweenSteps(viewer.drawer)
+            self._drawn = BetweenStepRenderer(viewer.drawer)
         if self._drawn.after_step(trainer.model.scene) or begins:
-            event.loop.watch.pause(time.perf_counter() - start)
+            event.loop.stopwatch.pause(time.perf_counter() - start)
 
 
 def opened_training(trainer: Trainer[Any]) -> Opened:

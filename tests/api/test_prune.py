@@ -20,7 +20,7 @@ from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import compared
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths, latest_checkpoint, load_run
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 ASKED = ("prune.fraction=0.5", "prune.steps=6", "prune.mask_times=3", "run.threads=1")
@@ -82,7 +82,7 @@ def test_on_a_gpu_it_is_the_same(
     briefly = ("prune.steps=1", "run.threads=1")
     expected = prune_within(run_dir, tmp_path / "here", 3.0, briefly, silent)
     here = compared([run_dir, file_of(tmp_path / "here")], 1)
-    monkeypatch.setattr("dyngs.training.new_trainer.device_for", lambda _: GPU)
+    monkeypatch.setattr("dyngs.training.new_trainer.select_device", lambda _: GPU)
     with pretend_gpu():
         found = prune_within(run_dir, tmp_path / "there", 3.0, briefly, silent)
         there = compared([run_dir, file_of(tmp_path / "there")], 1, GPU)
@@ -105,7 +105,7 @@ def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
         assert path.read_bytes() == (tmp_path / "b" / path.relative_to(folder)).read_bytes()
     assert first.before - first.after <= 1.0
     config = load_resolved(folder)
-    trainer = assemble(config, restored=True)
+    trainer = build_trainer(config, restored=True)
     trainer.restore(latest_checkpoint(folder))
     shown = [trainer.images[i] for i in evenly_held_out(len(trainer.images))]
     assert quality_of(trainer, load_run(file_of(folder)).scene, shown) == pytest.approx(

@@ -11,9 +11,9 @@ from tiny_fields import busy_config
 
 from dyngs.compress.search import PruneChoice, apply_choice
 from dyngs.config import Config
-from dyngs.gaussians.scene import restored_scene
+from dyngs.gaussians.scene import restore_scene
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -26,7 +26,7 @@ def config(moving: Path) -> Config:
 
 @pytest.fixture(scope="module")
 def end(config: Config) -> Checkpoint:
-    trainer = assemble(config)
+    trainer = build_trainer(config)
     while trainer.done < config.train.steps:
         trainer.step()
     return trainer.checkpoint()
@@ -34,7 +34,7 @@ def end(config: Config) -> Checkpoint:
 
 @pytest.fixture
 def trainer(config: Config, end: Checkpoint) -> Trainer:
-    trainer = assemble(config, restored=True)
+    trainer = build_trainer(config, restored=True)
     trainer.restore(end)
     return trainer
 
@@ -49,7 +49,7 @@ def test_everything_that_a_choice_says(trainer: Trainer) -> None:
     assert len(scene) == count - count // 2
     assert (scene.options.alpha_min, trainer.model.options.alpha_min) == (0.02, 0.02)
     assert not bool(scene.gaussians.sh[:, 1:].any())
-    again = restored_scene(trainer.checkpoint(), trainer.config.model)
+    again = restore_scene(trainer.checkpoint(), trainer.config.model)
     assert torch.equal(again.at(0.4).means, scene.at(0.4).means)
     assert str(choice) == "50.0% of the Gaussians, alphas below 0.02, harmonics worth 100 dB"
     assert (trainer.config.colour.kind, trainer.config.prune.fraction) == ("auto", 0.5)

@@ -15,7 +15,7 @@ from dyngs.compress.measure import (
 )
 from dyngs.config import SceneModel
 from dyngs.config.io import load_resolved
-from dyngs.gaussians.scene import GaussianScene, restored_scene
+from dyngs.gaussians.scene import GaussianScene, restore_scene
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
 from dyngs.runs.stored_file import decoded
 
@@ -59,7 +59,7 @@ def test_the_coarsest_that_is_good_enough(tmp_path: Path) -> None:
     run = write_moving_run(tmp_path)
     config = load_resolved(run)
     checkpoint = latest_checkpoint(run)
-    exact = restored_scene(checkpoint, config.model).at(0.5).means
+    exact = restore_scene(checkpoint, config.model).at(0.5).means
 
     def quality(scene: GaussianScene) -> float:
         """Minus the sum of squares of how far the Gaussians are from where they were: their order
@@ -72,7 +72,7 @@ def test_the_coarsest_that_is_good_enough(tmp_path: Path) -> None:
     assert some is not None
     data, reached = some
     assert reached >= -1e-3
-    stored = restored_scene(type(checkpoint)(checkpoint.info, decoded(data).tensors), config.model)
+    stored = restore_scene(type(checkpoint)(checkpoint.info, decoded(data).tensors), config.model)
     assert quality(stored) == reached
     assert len(every[0]) <= len(data)
     assert coarsest_file(config, checkpoint, lambda scene: -1.0, 0.0) is None

@@ -14,7 +14,7 @@ from dyngs.compress.search import (
     evenly_held_out,
 )
 from dyngs.config import PruneConfig
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def trainer(moving: Path) -> Trainer:
     """At the end of its run, untrained: what is searched does not matter here."""
     config = busy_config(moving, moving, "control_nodes")
-    trainer = assemble(config.model_copy(update={"prune": PruneConfig(steps=3)}))
+    trainer = build_trainer(config.model_copy(update={"prune": PruneConfig(steps=3)}))
     trainer.done = config.train.steps
     return trainer
 

@@ -27,14 +27,14 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
-from dyngs.deform.free import FreePrimitives, FreeStart
+from dyngs.deform.free import FreePrimitives, FreeInitialization
 from dyngs.deform.keys import FreeField
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.densify import Densifier
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint, load_run
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -66,7 +66,7 @@ def final_bytes(run_dir: Path) -> bytes:
 
 def trained(config: Config) -> Trainer:
     """A trainer at the end of ``train.steps``."""
-    trainer = assemble(config)
+    trainer = build_trainer(config)
     while trainer.done < config.train.steps:
         trainer.step()
     return trainer
@@ -180,7 +180,7 @@ def test_what_is_there_for_a_while_is_masked_only_while_it_is_not() -> None:
     is there at them."""
     centers = torch.tensor([2, 3, 6, 7]) / 9
     spans = torch.full((4,), 0.03)
-    start = FreeStart(torch.zeros(0), (), centers, spans, torch.zeros(4, 3))
+    start = FreeInitialization(torch.zeros(0), (), centers, spans, torch.zeros(4, 3))
     field = FreePrimitives(FreeField(), tiny_setup(4), torch.Generator()).started(start)
     times = tuple(k / 9 for k in range(10))
     scene = DynamicScene(gaussians=cloud(5), seen_at=times, field=field, moving=torch.arange(4))

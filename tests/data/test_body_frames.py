@@ -17,7 +17,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import (
     about_pelvis,
     body_frames,
-    with_fitted_body,
+    ensure_fitted_body,
 )
 from dyngs.data.capture import BodyFrames, Capture
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
@@ -151,7 +151,7 @@ def test_bad_parameters(change: dict[str, Any], line: str) -> None:
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    options = HumanOptions(size=16, num_frames=3, num_new=2, num_cameras=2, num_test=1, samples=1)
+    options = HumanOptions(size=16, num_frames=3, num_pose_frames=2, num_cameras=2, num_test=1, samples=1)
     return read_capture(
         DataConfig(root=write_human_capture(tmp_path_factory.mktemp("body") / "person", options))
     )
@@ -167,13 +167,13 @@ def write(path: Path, count: int = 3, **more: np.ndarray) -> Path:
 
 def test_a_fit_replaces_the_bodies_of_a_capture(capture: Capture, tmp_path: Path) -> None:
     write(tmp_path / "body_train.npz", surface_model_type=np.array("anny"))
-    found = with_fitted_body(capture, tmp_path)
+    found = ensure_fitted_body(capture, tmp_path)
     assert found.body is not None
     assert found.body["train"].shape_space == "anny"
     assert found.body["test"] is found.body["train"]
     assert "pose" not in found.splits, "no parameters for the other clip"
     write(tmp_path / "body_pose.npz", count=2)
-    assert "pose" in with_fitted_body(capture, tmp_path).splits
+    assert "pose" in ensure_fitted_body(capture, tmp_path).splits
 
 
 def test_a_capture_is_read_with_the_fit_that_the_options_name(

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import KINDS, TIMES, cloud, stirred_field, tiny_field
 from torch import Tensor
 
-from dyngs.deform.field import Offsets, deformed
+from dyngs.deform.field import Offsets, apply_offsets
 from dyngs.gaussians import Gaussians
 from dyngs.ops.quaternions import identity_quat, quat_product
 
@@ -40,7 +40,7 @@ def test_every_field_starts_as_the_identity(kind: str, everything: bool) -> None
     gaussians = cloud()
     field = tiny_field(kind, everything=everything)
     for time in TIMES:
-        moved = deformed(gaussians, field.offsets(gaussians.means, time))
+        moved = apply_offsets(gaussians, field.offsets(gaussians.means, time))
         for name, x in gaussians.tensors().items():
             assert torch.equal(getattr(moved, name), x), (name, time)
 
@@ -71,8 +71,8 @@ def test_rows_alone_are_changed_and_as_without_rows(chosen: set[int], absent: se
     offsets = Offsets(
         **{k: None if k in absent else x for k, x in vars(some_offsets(len(rows))).items()}
     )
-    moved = deformed(gaussians, offsets, rows)
-    alone = deformed(gaussians.select(rows), offsets)
+    moved = apply_offsets(gaussians, offsets, rows)
+    alone = apply_offsets(gaussians.select(rows), offsets)
     others = torch.tensor([i for i in range(9) if i not in chosen], dtype=torch.long)
     for name, x in gaussians.tensors().items():
         assert torch.equal(getattr(moved, name)[rows], getattr(alone, name)), name
@@ -91,7 +91,7 @@ def test_values_and_gradients_are_those_of_plain_torch(
     rows = None if chosen is None else torch.tensor(sorted(chosen), dtype=torch.long)
     given = vars(some_offsets(9 if rows is None else len(rows), dtype)).items()
     found: list[list[Tensor]] = []
-    for move in (deformed, slowly_deformed):
+    for move in (apply_offsets, slowly_deformed):
         leaves = {
             name: x.to(dtype).clone().requires_grad_() for name, x in cloud().tensors().items()
         }
@@ -147,7 +147,7 @@ def test_gradcheck_of_deformed(rows: tuple[int, ...] | None) -> None:
 
     def moved(*tensors: Tensor) -> tuple[Tensor, ...]:
         return tuple(
-            deformed(Gaussians(*tensors[:5]), Offsets(*tensors[5:]), index).tensors().values()
+            apply_offsets(Gaussians(*tensors[:5]), Offsets(*tensors[5:]), index).tensors().values()
         )
 
     assert torch.autograd.gradcheck(moved, leaves)

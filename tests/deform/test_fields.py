@@ -15,7 +15,7 @@ from tiny_fields import (
 )
 
 from dyngs.core.state import tensors_of
-from dyngs.deform.fields import field_state, restored_field
+from dyngs.deform.fields import field_state, restore_field
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
@@ -28,7 +28,7 @@ def test_a_restored_field_moves_everything_alike(kind: str) -> None:
         field.offsets(means, time).means.square().sum().backward()
     field.parameters.step(1, 0.0)
     state = {name: x.clone() for name, x in tensors_of(field_state(field)).items()}
-    again = restored_field(tiny_options(kind), state, 9)
+    again = restore_field(tiny_options(kind), state, 9)
     same = again.setup
     assert torch.equal(same.center, setup.center)
     assert torch.equal(same.half_size, setup.half_size)
@@ -50,4 +50,4 @@ def test_what_is_missing_is_named(kind: str) -> None:
     state = tensors_of(field_state(tiny_field(kind)))
     for name in ("box", "numbers", next(name for name in state if name.startswith("learned."))):
         with pytest.raises(KeyError, match=name.removeprefix("learned.")):
-            restored_field(tiny_options(kind), {k: x for k, x in state.items() if k != name}, 9)
+            restore_field(tiny_options(kind), {k: x for k, x in state.items() if k != name}, 9)

@@ -11,8 +11,8 @@ from tiny_fields import cloud, stir, tiny_setup
 from dyngs.api.train import train
 from dyngs.config.io import load_config
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
-from dyngs.deform.fixed_cameras.start import TimedGaussians
-from dyngs.deform.free import SHORTEST, FreePrimitives, FreeStart, free_start
+from dyngs.deform.fixed_cameras.initial_motion import TimedGaussians
+from dyngs.deform.free import SHORTEST, FreePrimitives, FreeInitialization, initialize_free
 from dyngs.deform.keys import FreeField
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians import TopologyEdit
@@ -23,7 +23,7 @@ GAP = 1 / 9  # ``tiny_setup`` has ten times
 def field_of(
     centers: list[float], spans: list[float], velocities: list[list[float]]
 ) -> FreePrimitives:
-    start = FreeStart(
+    start = FreeInitialization(
         torch.zeros(0), (), torch.tensor(centers), torch.tensor(spans), torch.tensor(velocities)
     )
     return FreePrimitives(FreeField(), tiny_setup(len(centers)), torch.Generator()).started(start)
@@ -91,7 +91,7 @@ def test_static_gaussians_are_copied_over_the_clip_and_moments_have_their_times(
     thing = cloud(5)
     others = cloud(4)
     velocity = torch.tensor([1.0, 0.0, 2.0])
-    start = free_start(still, [TimedGaussians(0.25, thing, velocity)], others, num_times=10)
+    start = initialize_free(still, [TimedGaussians(0.25, thing, velocity)], others, num_times=10)
     assert [len(x) for x in start.added] == [3] * 9 + [5, 4]
     assert len(start.centers) == len(start.spans) == len(start.velocities) == 30 + 5 + 4
     assert start.centers[:30:3].tolist() == pytest.approx([0.05 + 0.1 * i for i in range(10)])

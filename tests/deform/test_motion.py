@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import cloud, stirred_field, tiny_setup
 from torch import Tensor
 
-from dyngs.deform.field import DeformationField, Offsets, deformed
+from dyngs.deform.field import DeformationField, Offsets, apply_offsets
 from dyngs.deform.training import PX_PER_OPACITY, bake_, measure_motion
 from dyngs.gaussians.optimizer import Parameters
 
@@ -96,7 +96,7 @@ def test_baking_freezes_at_the_mean(everything: bool) -> None:
     samples = [field.offsets(gaussians.means, t).means.detach() for t in TIMES]
     torch.testing.assert_close(mean.means, torch.stack(samples).mean(0))
     rows = torch.tensor([1, 4, 8])
-    expected = deformed(gaussians, mean.select(rows), rows)
+    expected = apply_offsets(gaussians, mean.select(rows), rows)
     baked = gaussians.replace(
         **{k: x.clone().requires_grad_() for k, x in gaussians.tensors().items()}
     )

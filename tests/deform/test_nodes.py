@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import followed
 from torch import Tensor
 
-from dyngs.deform.control_nodes import Nodes, nodes_at, spread_out
+from dyngs.deform.control_nodes import Nodes, nodes_at, farthest_points
 from dyngs.deform.field import Offsets
 
 
@@ -33,7 +33,7 @@ def matrix(rotation: Rotation) -> Tensor:
 
 def place_nodes(means: Tensor, count: int) -> Nodes:
     """Nodes spread over ``means``, which follow them."""
-    return nodes_at(means[spread_out(means, count, NONE)], means)
+    return nodes_at(means[farthest_points(means, count, NONE)], means)
 
 
 NONE = torch.zeros(0, 3)
@@ -65,6 +65,6 @@ def test_points_spread_out_are_distinct_and_the_same_each_time(
 ) -> None:
     """Also where many points coincide: there are as many as asked for, or as there are places."""
     x = torch.tensor(places, dtype=torch.float64)
-    chosen = spread_out(x, count, NONE)
-    assert torch.equal(chosen, spread_out(x, count, NONE))
+    chosen = farthest_points(x, count, NONE)
+    assert torch.equal(chosen, farthest_points(x, count, NONE))
     assert len({places[i] for i in chosen.tolist()}) == len(chosen) == min(count, len(set(places)))

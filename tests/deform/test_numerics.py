@@ -24,13 +24,13 @@ from dyngs.config import TrainConfig
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import tensors_of
 from dyngs.deform.control_nodes import ControlNodes
-from dyngs.deform.field import DeformationField, Offsets, deformed
+from dyngs.deform.field import DeformationField, Offsets, apply_offsets
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.networks import Hexplane
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import TopologyEdit
-from dyngs.gaussians.scene import restored_scene
-from dyngs.training.new_trainer import assemble
+from dyngs.gaussians.scene import restore_scene
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -54,7 +54,7 @@ def scene_of(rows: Tensor, field: DeformationField) -> DynamicScene:
 
 def fine_trainer(capture: Path, kind: str, **model: object) -> Trainer:
     """After ten steps, eight of them without motion."""
-    trainer = assemble(busy_config(capture, capture, kind, **model))
+    trainer = build_trainer(busy_config(capture, capture, kind, **model))
     for _ in range(10):
         trainer.step()
     return trainer
@@ -86,7 +86,7 @@ def test_two_training_times(tmp_path: Path, kind: str) -> None:
     model = config.model.model_copy(
         update={"deform": config.model.deform.model_copy(update=automatic)}
     )
-    trainer = assemble(config.model_copy(update={"model": model}))
+    trainer = build_trainer(config.model_copy(update={"model": model}))
     seen = {trainer.step().image.time for _ in range(12)}
     assert seen == {0.0, 1.0}
     assert isinstance(trainer.model.scene, DynamicScene)
@@ -110,7 +110,7 @@ def test_no_moving_gaussians(kind: str) -> None:
     assert {name: tuple(x.shape) for name, x in vars(offsets).items()} == {
         "means": (0, 3), "quats": (0, 4), "log_scales": (0, 3), "logit_opacities": (0,), "colors": (0, 3)
     }  # fmt: skip
-    moved = deformed(gaussians, offsets, torch.zeros(0, dtype=torch.long))
+    moved = apply_offsets(gaussians, offsets, torch.zeros(0, dtype=torch.long))
     assert all(torch.equal(x, gaussians.tensors()[name]) for name, x in moved.tensors().items())
     if moved.means.requires_grad:
         moved.means.sum().backward()
@@ -128,18 +128,18 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
     assert isinstance(scene, DynamicScene)
     assert scene.field is not None
     field = scene.field.edited(two)
-    field.regroup()
-    trainer.model.exchange(replace(scene, moving=two.source, field=field))
+    field.invalidate()
+    trainer.model.replace_scene(replace(scene, moving=two.source, field=field))
     trainer.step()
     keep = torch.ones(len(trainer.model.scene), dtype=torch.bool)
     keep[trainer.model.scene.rows] = False
     assert not keep.all()
-    trainer.model.densifier = assemble(trainer.config).model.densifier
+    trainer.model.densifier = build_trainer(trainer.config).model.densifier
     trainer.model.keep(keep, trainer.done)
     for _ in range(2):
         assert trainer.step().loss > 0
         assert trainer.num_moving == 0
-    other = assemble(trainer.config)
+    other = build_trainer(trainer.config)
     other.restore(trainer.checkpoint())
     assert other.step().loss == trainer.step().loss
 
@@ -190,14 +190,14 @@ def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> 
 
 
 @pytest.mark.parametrize("filtered", [False, True])
-def test_a_run_of_one_step(capture: Path, filtered: bool) -> None:
+def test_a_run_of_one_step(capture: Path, apply_filter: bool) -> None:
     """It ends as motion begins: with a field that is the identity, for the random Gaussians too,
     and filtered."""
-    config = busy_config(capture, capture, "hexplane", filter_3d=filtered)
+    config = busy_config(capture, capture, "hexplane", filter_3d=apply_filter)
     config = config.model_copy(update={"train": TrainConfig(steps=1)})
-    trainer = assemble(config)
+    trainer = build_trainer(config)
     trainer.step()
-    scene = restored_scene(trainer.checkpoint(), config.model)
+    scene = restore_scene(trainer.checkpoint(), config.model)
     assert not scene.is_static
     assert len(scene) == 60 + 12
     assert torch.equal(scene.at(0.3).means, scene.gaussians.means)

@@ -10,7 +10,7 @@ from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
 from torch import Tensor
 
 from dyngs.core.state import tensors_of
-from dyngs.deform.field import DeformationField, deformed
+from dyngs.deform.field import DeformationField, apply_offsets
 from dyngs.deform.fields import field_state
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
@@ -61,9 +61,9 @@ def test_times_after_the_clip_are_its_end(time: float) -> None:
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
 @pytest.mark.parametrize("filtered", [False, True])
-def test_what_moves_and_what_is_still_make_the_scene(kind: str, filtered: bool) -> None:
+def test_what_moves_and_what_is_still_make_the_scene(kind: str, apply_filter: bool) -> None:
     """Together, in their order, at each time."""
-    scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if filtered else None)
+    scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if apply_filter else None)
     moving = scene.part("moving")
     still = scene.part("still")
     others = torch.tensor([0, 2, 3, 6, 7])
@@ -97,16 +97,16 @@ def test_from_a_checkpoint(kind: str, rows: Tensor | None) -> None:
     assert scene.is_static == (num_moving == 0)
     means = gaussians.means if rows is None else gaussians.means[rows]
     with torch.no_grad():
-        moved = deformed(gaussians, field.offsets(means, 0.3), rows) if num_moving else gaussians
+        moved = apply_offsets(gaussians, field.offsets(means, 0.3), rows) if num_moving else gaussians
     assert same(scene.at(0.3), fuse_filter(moved, torch.ones(9)))
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
 @pytest.mark.parametrize("filtered", [False, True])
-def test_masks_show_the_same_of_fewer(kind: str, filtered: bool) -> None:
+def test_masks_show_the_same_of_fewer(kind: str, apply_filter: bool) -> None:
     """Before, between and after key times, in any order of times; parts and sizes are those of all
     Gaussians."""
-    scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if filtered else None)
+    scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if apply_filter else None)
     seen = torch.rand(3, 9, generator=torch.Generator().manual_seed(1)) < 0.4
     masked = replace(scene, masks=VisibilityMasks.pack((0.0, 0.5, 1.0), seen))
     for time, active in (
@@ -122,4 +122,4 @@ def test_masks_show_the_same_of_fewer(kind: str, filtered: bool) -> None:
             torch.testing.assert_close(x, whole.tensors()[name], rtol=0, atol=1e-6)
     assert len(masked) == 9
     assert same(masked.part("moving").at(0.4), scene.part("moving").at(0.4))
-    assert same(masked.unmasked().at(0.4), scene.at(0.4))
+    assert same(masked.without_masks().at(0.4), scene.at(0.4))

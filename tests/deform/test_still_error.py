@@ -17,13 +17,13 @@ from two_balls import cameras_around, two_balls
 from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
-from dyngs.deform.still_error import (
+from dyngs.deform.static_errors import (
     MIN_SAME,
-    cameras_in_place,
-    differing_fraction,
-    still_errors,
-    two_group_threshold,
-    views_to_compare,
+    group_fixed_cameras,
+    changed_fraction,
+    static_errors,
+    otsu_threshold,
+    select_comparison_views,
 )
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
@@ -81,7 +81,7 @@ def left_half() -> Tensor:
 
 def scores_of(gaussians: Gaussians, images: list[Image], background: Tensor) -> Tensor:
     """(N,) of cameras that do not stay in place."""
-    found = still_errors(lambda _: gaussians, images, OPTIONS, background)
+    found = static_errors(lambda _: gaussians, images, OPTIONS, background)
     assert torch.equal(found.most, found.usual)
     return found.most
 
@@ -139,22 +139,22 @@ def in_place(*errors: float, view: int = 0) -> list[Image]:
 def test_what_a_still_model_has_not_learned_is_no_motion() -> None:
     """Wrong by far, but in all images alike; with too few images to know, it may be motion."""
     ball = balls(sideways(0.0))
-    found = still_errors(lambda _: ball, in_place(*[0.4] * MIN_SAME), OPTIONS, BLACK)
+    found = static_errors(lambda _: ball, in_place(*[0.4] * MIN_SAME), OPTIONS, BLACK)
     assert (float(found.most), float(found.usual)) == pytest.approx((0.0, 0.0), abs=1e-6)
-    few = still_errors(lambda _: ball, in_place(*[0.4] * (MIN_SAME - 1)), OPTIONS, BLACK)
+    few = static_errors(lambda _: ball, in_place(*[0.4] * (MIN_SAME - 1)), OPTIONS, BLACK)
     assert float(few.most) == pytest.approx(0.4, rel=1e-3)
 
 
 def test_what_is_hidden_at_times_does_not_move() -> None:
     """Something passes in front in two of ten images: seen by ``most``, not by ``usual``."""
-    found = still_errors(
+    found = static_errors(
         lambda _: balls(sideways(0.0)), in_place(*[0.0] * 8, 0.3, 0.3), OPTIONS, BLACK
     )
     assert (float(found.most), float(found.usual)) == pytest.approx((0.3, 0.0), rel=1e-3, abs=1e-6)
 
 
 def test_what_changes_again_and_again_moves() -> None:
-    found = still_errors(
+    found = static_errors(
         lambda _: balls(sideways(0.0)), in_place(*[0.0] * 6, 0.1, 0.2, 0.3, 0.4), OPTIONS, BLACK
     )
     assert float(found.most) == pytest.approx(0.4, rel=1e-3)
@@ -170,11 +170,11 @@ def views(*cameras: int) -> list[View]:
 
 
 def test_of_cameras_in_place_few_are_chosen_with_many_moments() -> None:
-    chosen = views_to_compare(views(*[0, 1, 2] * 40), 20)
+    chosen = select_comparison_views(views(*[0, 1, 2] * 40), 20)
     assert chosen == [*range(0, 120, 12), *range(1, 120, 12)]
-    assert views_to_compare(views(0, 0, 0, 1), 50) == [0, 1, 2]
-    assert cameras_in_place(views(0, 1, 1, 0, 1, 2)) == [[1, 2, 4]]
-    assert cameras_in_place(views(0, 1, 2, 0, 1, 2)) == []
+    assert select_comparison_views(views(0, 0, 0, 1), 50) == [0, 1, 2]
+    assert group_fixed_cameras(views(0, 1, 1, 0, 1, 2)) == [[1, 2, 4]]
+    assert group_fixed_cameras(views(0, 1, 2, 0, 1, 2)) == []
 
 
 # --- two groups
@@ -192,17 +192,17 @@ def test_two_clear_groups_are_parted(low: list[float], high: list[float], scale:
     so many bins."""
     scores = scale * torch.tensor(low + high)
     order = torch.randperm(len(scores), generator=torch.Generator().manual_seed(len(scores)))
-    threshold = two_group_threshold(scores[order])
+    threshold = otsu_threshold(scores[order])
     bin_width = float(scores.max() - scores.min()) / 256
     assert scale * max(low) - bin_width <= threshold < scale * min(high) - bin_width
 
 
 def test_changing_brightness_is_no_motion_and_a_thing_that_comes_is() -> None:
     room = 0.5 * torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(0))
-    assert differing_fraction([[room, room + 0.2, room + 0.4]]) == 0
+    assert changed_fraction([[room, room + 0.2, room + 0.4]]) == 0
     come = room.clone()
     come[:4, :4] += 0.3
-    assert differing_fraction([[room, room, come]]) == 4 / 48, (
+    assert changed_fraction([[room, room, come]]) == 4 / 48, (
         "of 16 blocks of 2x2 pixels in each image"
     )
 
@@ -224,7 +224,7 @@ def left() -> torch.Tensor:
 def test_the_fraction_of_each_gaussian_in_the_mask() -> None:
     """The left ball lies in the mask, the right one does not; a fraction of one half counts as
     ``sure``."""
-    found = still_errors(
+    found = static_errors(
         lambda _: two_balls(), [masked_image(left())], RenderOptions(), BLACK, sure=0.06
     )
     torch.testing.assert_close(found.most, torch.tensor([0.12, 0.0]), rtol=0, atol=2e-3)
@@ -237,6 +237,6 @@ def test_what_is_covered_at_times_only_is_not_usual() -> None:
         + [masked_image(torch.zeros(18, 24)) for _ in range(4)]
         + [masked_image(None)]
     )
-    found = still_errors(lambda _: two_balls(), images, RenderOptions(), BLACK, sure=0.06)
+    found = static_errors(lambda _: two_balls(), images, RenderOptions(), BLACK, sure=0.06)
     assert float(found.most[0]) > 0.1
     assert float(found.usual.max()) == 0

@@ -35,7 +35,7 @@ from dyngs.deform.schedule import DeformSchedule
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import GaussianOptimizer
 from dyngs.gaussians.rendering import render
-from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.schedule import RateSchedule
 
 # --- phases
 # -----------------------------------------------------------------------------------------------------------
@@ -61,7 +61,7 @@ ERRORS = (0.01, 0.3, 0.02, 0.35, 0.03, 0.0, 0.31, 0.02, 0.01)
 
 def test_what_a_still_model_cannot_explain_moves() -> None:
     """And only after the last step of the coarse phase."""
-    run = new_run(flat_cloud(), still_errors=lambda _: alike(torch.tensor(ERRORS)))
+    run = new_run(flat_cloud(), static_errors=lambda _: alike(torch.tensor(ERRORS)))
     result = run.grow(FINE)
     assert run.scene.rows.tolist() == [1, 3, 6]
     assert run.scene.num_moving == 3
@@ -97,7 +97,7 @@ def test_small_errors_are_no_motion(
     gaussians = flat_cloud()
     run = new_run(
         gaussians,
-        still_errors=lambda _: alike(torch.tensor(errors)),
+        static_errors=lambda _: alike(torch.tensor(errors)),
         motion_threshold=motion_threshold,
         num_random_moving=5,
     )
@@ -120,7 +120,7 @@ def test_random_gaussians_move_too(kind: str) -> None:
     gaussians = flat_cloud()
     run = new_run(
         gaussians,
-        still_errors=lambda _: alike(torch.tensor(ERRORS)),
+        static_errors=lambda _: alike(torch.tensor(ERRORS)),
         num_random_moving=4,
         deform=tiny_options(kind),
     )
@@ -160,7 +160,7 @@ def test_motion_is_learned_from_images(kind: str) -> None:
     )
     steps = 150
     run = begun(gaussians, times=TIMES[::3], deform=options, motion_sparsity=0.0)
-    run.training.schedule = DeformSchedule(0, 0, 0, 0, (), Rates(steps))
+    run.training.schedule = DeformSchedule(0, 0, 0, 0, (), RateSchedule(steps))
     shift = torch.tensor([0.3, 0.0, 0.0])
     times = [(7 * i % 11) / 10 for i in range(steps)]
     for step, time in enumerate(times, start=1):
@@ -197,7 +197,7 @@ def test_where_cameras_stay_nothing_moves_that_images_show_still(
     moving = 0.3 * DynamicModel().motion_threshold
     errors = alike(torch.tensor([still, moving, moving, moving]))
     gaussians = flat_cloud(4)
-    run = begun(gaussians, still_errors=lambda _: errors, cameras_stay=in_place)
+    run = begun(gaussians, static_errors=lambda _: errors, has_fixed_cameras=in_place)
     move(run, torch.tensor([0.1, 0.0, 0.1, 0.1]))
     run.after_step(SPLIT)
     assert run.scene.rows.tolist() == kept
@@ -341,7 +341,7 @@ def test_motion_begins_where_fixed_cameras_see_changes() -> None:
     begin = partial(
         new_run, flat_cloud(), times, deform=FreeField(), num_random_moving=800, full=FINE + 20
     )
-    run = begin(still_errors=lambda _: errors, motion_threshold=0.1, time_window=0.2)
+    run = begin(static_errors=lambda _: errors, motion_threshold=0.1, time_window=0.2)
     run.training.capture = replace(run.training.capture, standing=lambda: footage)
     result = run.grow(FINE)
     assert result is not None

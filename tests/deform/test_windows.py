@@ -12,8 +12,8 @@ from tiny_fields import TIMES, cloud, stirred_field, tiny_options
 from torch import Tensor
 
 from dyngs.core.state import tensors_of
-from dyngs.deform.field import deformed
-from dyngs.deform.fields import EDGE, OPEN, WindowedField, field_state, restored_field
+from dyngs.deform.field import apply_offsets
+from dyngs.deform.fields import EDGE, OPEN, WindowedField, field_state, restore_field
 
 COUNT = 9
 
@@ -32,8 +32,8 @@ def test_an_open_window_changes_nothing(everything: bool) -> None:
     field = WindowedField(others, COUNT)
     gaussians = cloud()
     for time in TIMES:
-        before = deformed(gaussians, others.offsets(gaussians.means, time))
-        after = deformed(gaussians, field.offsets(gaussians.means, time))
+        before = apply_offsets(gaussians, others.offsets(gaussians.means, time))
+        after = apply_offsets(gaussians, field.offsets(gaussians.means, time))
         for name, x in after.tensors().items():
             assert torch.equal(x, before.tensors()[name]), name
 
@@ -76,7 +76,7 @@ def stored(field: WindowedField) -> dict[str, Tensor]:
 def test_a_stored_field_is_the_same_field() -> None:
     field = windowed()
     means = cloud().means
-    again = restored_field(tiny_options("control_nodes"), stored(field), COUNT)
+    again = restore_field(tiny_options("control_nodes"), stored(field), COUNT)
     assert isinstance(again, WindowedField)
     assert stored(again).keys() == stored(field).keys()
     for name, x in stored(again).items():
@@ -102,4 +102,4 @@ def test_a_forged_state_is_refused(change: Callable[[Tensor], Tensor | None]) ->
     if forged is not None:
         tensors["windows.edges"] = forged
     with pytest.raises((KeyError, ValueError)):
-        restored_field(tiny_options("control_nodes"), tensors, COUNT)
+        restore_field(tiny_options("control_nodes"), tensors, COUNT)

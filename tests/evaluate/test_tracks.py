@@ -21,9 +21,9 @@ from dyngs.core.camera import Cameras
 from dyngs.data.capture import View, all_views
 from dyngs.data.synthetic.captures import DynamicOptions, SceneName, write_dynamic_capture
 from dyngs.data.tracks import TrueTracks, read_true_tracks
-from dyngs.deform.bodies.field import BodyField, BodyRest
+from dyngs.deform.bodies.field import BodyField, BodyRestPose
 from dyngs.deform.field import FieldSetup
-from dyngs.deform.free import FreePrimitives, FreeStart
+from dyngs.deform.free import FreePrimitives, FreeInitialization
 from dyngs.deform.keys import FreeField
 from dyngs.deform.scene import DynamicScene
 from dyngs.evaluate.tracks import NO_TRACKS, NONE_OPAQUE, NONE_SEEN, track_scores
@@ -97,7 +97,7 @@ def test_what_lies_beside_a_gaussian_turns_with_it() -> None:
     splines = {"places": torch.zeros(1, 9, 3), "quats": quats[None]}
     body = BodyField(
         Sliding(speed=0.0),
-        BodyRest(center, torch.ones(1), torch.zeros(2, dtype=torch.long)),
+        BodyRestPose(center, torch.ones(1), torch.zeros(2, dtype=torch.long)),
         splines,
     )
     scene = moving_scene(body)
@@ -123,7 +123,7 @@ def turning_back(scale: float) -> tuple[GaussianScene, TrueTracks]:
     ways = [min(time, 1 - time) for time in TIMES]
     means = torch.tensor([[way - 1.0, 0.0, 0.0] for way in ways])
     velocities = scale * torch.tensor([[1.0, 0.0, 0.0]] * 2 + [[0.0] * 3] + [[-1.0, 0.0, 0.0]] * 2)
-    start = FreeStart(torch.zeros(0), (), torch.tensor(TIMES), torch.full((5,), 0.06), velocities)
+    start = FreeInitialization(torch.zeros(0), (), torch.tensor(TIMES), torch.full((5,), 0.06), velocities)
     setup = FieldSetup(torch.zeros(3), torch.ones(3), len(TIMES), len(TIMES), 1.0)
     field = FreePrimitives(FreeField(), setup, torch.Generator()).started(start)
     field.parameters["velocities"].data[:] = velocities

@@ -31,7 +31,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.avatar import pose_fit
-from dyngs.human.avatar.scene import avatar_of
+from dyngs.human.avatar.scene import as_human_scene
 from dyngs.models.renderable import Rendering
 from dyngs.runs.checkpoint import load_run
 
@@ -241,11 +241,11 @@ def test_held_out_frames_are_scored_in_the_poses_of_the_file(run: Path) -> None:
     loaded = load_run(run)
     capture = read_capture(loaded.config.data)
     trained, held = (
-        avatar_of(scene_of_split(loaded, capture, split)) for split in ("test", "pose")
+        as_human_scene(scene_of_split(loaded, capture, split)) for split in ("test", "pose")
     )
     assert trained is not None
     assert held is not None
-    assert (len(trained.moves_as), len(held.moves_as)) == (2, 1)
+    assert (len(trained.played_clip), len(held.played_clip)) == (2, 1)
     assert capture.body is not None
     given = torch.from_numpy(capture.body["pose"].poses[2]).float()
     assert held.played is not None

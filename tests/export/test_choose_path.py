@@ -19,7 +19,7 @@ from dyngs.config import Config, DataConfig, RunConfig, TrainConfig
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import ImageLoader
-from dyngs.export.choose_path import PathOptions, choose_path, orbit_around, view_to_show
+from dyngs.export.choose_path import PathOptions, choose_path, orbit_cameras_around, select_view
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.keys import HumanModel
@@ -100,22 +100,22 @@ def test_views_are_found_by_name_image_and_number(moving_run: Opened) -> None:
     capture = moving_run.capture
     test = capture.splits["test"]
     train = capture.splits["train"]
-    assert view_to_show(capture) is test[0]
-    assert view_to_show(capture, test[2].name) is test[2]
-    assert view_to_show(capture, "r_002") is test[2]
-    assert view_to_show(capture, "2") is test[2]
+    assert select_view(capture) is test[0]
+    assert select_view(capture, test[2].name) is test[2]
+    assert select_view(capture, "r_002") is test[2]
+    assert select_view(capture, "2") is test[2]
     # no split given: names are looked for in all
-    assert view_to_show(capture, train[3].name) is train[3]
-    assert view_to_show(capture, "r_004") is train[4]
-    assert view_to_show(capture, "4", "train") is train[4]
-    assert view_to_show(capture.replace(splits={"train": train, "test": ()})) is train[0]
+    assert select_view(capture, train[3].name) is train[3]
+    assert select_view(capture, "r_004") is train[4]
+    assert select_view(capture, "4", "train") is train[4]
+    assert select_view(capture.replace(splits={"train": train, "test": ()})) is train[0]
     for name, split in (("9", None), ("r_9", None), ("-1", None), (train[0].name, "test")):
         with pytest.raises(
             DyngsError, match=rf"no view '{name}'; the split test has 3 views: .*\(0\) to .*\(2\)"
         ):
-            view_to_show(capture, name, split)
+            select_view(capture, name, split)
     with pytest.raises(DyngsError, match="'val' has no views"):
-        view_to_show(capture, None, "val")
+        select_view(capture, None, "val")
 
 
 def some_gaussians(count: int = 50) -> Gaussians:
@@ -158,7 +158,7 @@ def test_an_orbit_shows_the_same_frames_in_any_unit(factor: float, tmp_path: Pat
 def test_a_single_gaussian_is_in_view_whole() -> None:
     one = opened_scene(StaticScene(gaussians=some_gaussians(1)))
     size = math.exp(-3)
-    distance = float((orbit_around(one, 1).centers[0] - one.scene.gaussians.means[0]).norm())
+    distance = float((orbit_cameras_around(one, 1).centers[0] - one.scene.gaussians.means[0]).norm())
     assert size < distance < 10 * size
 
 
@@ -178,7 +178,7 @@ def directions(centers: torch.Tensor) -> np.ndarray:
 
 
 def test_who_was_filmed_from_one_side_is_seen_from_all(tmp_path: Path) -> None:
-    options = HumanOptions(size=32, num_frames=2, num_new=0, num_cameras=1, num_test=1, samples=1)
+    options = HumanOptions(size=32, num_frames=2, num_pose_frames=0, num_cameras=1, num_test=1, samples=1)
     root = write_human_capture(tmp_path / "person", options)
     run = RunConfig(threads=1, dir=tmp_path / "run")
     folder = train(

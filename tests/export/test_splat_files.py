@@ -30,25 +30,25 @@ from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, Lens, PointCloud
 from dyngs.data.read import read_capture
-from dyngs.deform.bodies.field import BodyField, BodyRest
+from dyngs.deform.bodies.field import BodyField, BodyRestPose
 from dyngs.deform.fields import WindowedField
 from dyngs.deform.scene import DynamicScene
 from dyngs.export.cameras import NAME, write_cameras
-from dyngs.export.images import compare_run, compare_splats
+from dyngs.export.images import compare_file_with_run, compare_file_with_source
 from dyngs.export.splat_files import (
     Part,
-    Writing,
-    read_moment,
+    WriteOptions,
+    read_4dgs_frame,
     scene_part,
     splats_at,
     tracks_of,
     up_of,
-    write_bodies,
-    write_moving,
+    write_rigid_bodies,
+    write_4dgs,
     write_run_sequence,
     write_run_splats,
     write_tracks,
-    writing_of,
+    choose_write_options,
 )
 from dyngs.gaussians.rendering import render
 from dyngs.io.formats.formats import read_splats, upright, write_splats
@@ -129,17 +129,17 @@ def test_up_is_what_the_cameras_or_the_user_say(near: Opened) -> None:
     found = up_of(near)
     assert found is not None
     name = next(name for name, axis in AXES.items() if axis == found[0])
-    how, line = writing_of(near, "y")
+    how, line = choose_write_options(near, "y")
     assert how.turn == turn_between(found[0], AXES["y"])
     assert f"it was {name} in the capture" in line or name == "y"
-    assert "the axes of the capture are kept" in writing_of(near, name)[1]
+    assert "the axes of the capture are kept" in choose_write_options(near, name)[1]
     lost = replace(near, captured=Captured(near.config.data, DyngsError("gone")))
     assert up_of(lost) is None
-    how, line = writing_of(lost, "y", sh_degree=2)
+    how, line = choose_write_options(lost, "y", sh_degree=2)
     assert (how.turn, how.up, how.sh_degree) == ((1.0, 0.0, 0.0, 0.0), None, 2)
     assert "--from-up=AXIS tells it" in line
-    assert writing_of(lost, "y", from_up="z")[0].turn == turn_between(AXES["z"], AXES["y"])
-    assert writing_of(lost, "y", "keep", "z")[0].turn == (1.0, 0.0, 0.0, 0.0)
+    assert choose_write_options(lost, "y", from_up="z")[0].turn == turn_between(AXES["z"], AXES["y"])
+    assert choose_write_options(lost, "y", "keep", "z")[0].turn == (1.0, 0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -148,7 +148,7 @@ def test_edits_of_every_kind_of_scene_are_exact(kind: str) -> None:
     between."""
     scene = replace(scene_of_kind(kind), colour=None)
     edit = Similarity((0.6, 0.0, 0.8, 0.0), 2.5, (3.0, -1.0, 0.5))
-    splat = splats_at(opened_scene(scene), scene, 0.3, Writing(edit=edit, up="y"))
+    splat = splats_at(opened_scene(scene), scene, 0.3, WriteOptions(edit=edit, up="y"))
     seen = onlooker()
     before = scene.render(seen, 0.3, background=torch.zeros(3)).rgb
     options = replace(scene.options, near=scene.options.near * edit.scale)
@@ -159,16 +159,16 @@ def test_edits_of_every_kind_of_scene_are_exact(kind: str) -> None:
 
 
 def test_a_file_drawn_again_is_compared_with_its_run(near: Opened, tmp_path: Path) -> None:
-    for how in (Writing(), Writing(turn_between(AXES["z"], AXES["-y"]), "-y")):
+    for how in (WriteOptions(), WriteOptions(turn_between(AXES["z"], AXES["-y"]), "-y")):
         written = write_run_splats(near, tmp_path / "a.ply", 0.7, how=how)
         read = read_splats(written.path)
-        assert compare_run(near, near.scene, 0.7, written.splat, read) > 80
+        assert compare_file_with_run(near, near.scene, 0.7, written.splat, read) > 80
         # another time is seen as such
-        assert compare_run(near, near.scene, 0.0, written.splat, read) < 40
+        assert compare_file_with_run(near, near.scene, 0.0, written.splat, read) < 40
     splat = SplatFile(cloud(300), up="z")
     exact = write_splats(tmp_path / "a.ply", upright(splat, None, tmp_path / "a.ply"))
-    assert compare_splats(splat, exact) > 80
-    assert compare_splats(splat, write_splats(tmp_path / "a.splat", splat)) < 30
+    assert compare_file_with_source(splat, exact) > 80
+    assert compare_file_with_source(splat, write_splats(tmp_path / "a.splat", splat)) < 30
 
 
 def expected(times: tuple[float, ...], speed: float = 1.0) -> np.ndarray:
@@ -218,9 +218,9 @@ def test_a_file_of_tracks_holds_arrays_without_pickle(tmp_path: Path) -> None:
 def test_moving_files(tmp_path: Path, near: Opened, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("fourdgs")
     times = [i / 9 for i in range(10)]  # more than one group of key frame and deltas
-    splats, _ = write_moving(near, tmp_path / "a.4dgs", times)
+    splats, _ = write_4dgs(near, tmp_path / "a.4dgs", times)
     for i in (0, 3, 8, 9):
-        read = read_moment(tmp_path / "a.4dgs", i).gaussians
+        read = read_4dgs_frame(tmp_path / "a.4dgs", i).gaussians
         meant = splats[i].gaussians
         torch.testing.assert_close(read.means[:, 0], moved_x(ALL, times[i]), rtol=0, atol=0.01)
         torch.testing.assert_close(read.base_rgb, meant.base_rgb.clamp(0, 1), rtol=0, atol=0.01)
@@ -243,17 +243,17 @@ def rolling(tmp_path_factory: pytest.TempPathFactory) -> Opened:
     way = torch.linspace(0, 1, 9)
     places = torch.stack([2 * way - 1, 0.25 * way**2, 0 * way], dim=1)
     labels = torch.zeros(len(MOVING_ROWS), dtype=torch.long)
-    rest = BodyRest(torch.tensor([[0.1, 0.2, 0.0]]), torch.ones(1), labels)
+    rest = BodyRestPose(torch.tensor([[0.1, 0.2, 0.0]]), torch.ones(1), labels)
     field = BodyField(sliding_nodes(), rest, {"places": places[None], "quats": quats[None]})
     assert isinstance(opened.scene, DynamicScene)
     return opened.showing(replace(opened.scene, field=WindowedField(field, len(MOVING_ROWS))))
 
 
-@pytest.mark.parametrize("how", [Writing(), Writing((0.5, 0.5, 0.5, 0.5), "y")])
+@pytest.mark.parametrize("how", [WriteOptions(), WriteOptions((0.5, 0.5, 0.5, 0.5), "y")])
 def test_the_animation_of_bodies_shows_the_scene_at_all_times(
-    tmp_path: Path, rolling: Opened, how: Writing
+    tmp_path: Path, rolling: Opened, how: WriteOptions
 ) -> None:
-    written = write_bodies(rolling, tmp_path / "a.glb", 0.25, how)
+    written = write_rigid_bodies(rolling, tmp_path / "a.glb", 0.25, how)
     found = read_splats(written.path).gaussians
     order = [*MOVING_ROWS, *STILL_ROWS]  # the reader begins with the last node
     for name, x in found.tensors().items():  # without the animation

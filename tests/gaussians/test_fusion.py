@@ -9,7 +9,7 @@ import pytest
 import torch
 from seen_ball import HIGH, LOW, RADIUS, views
 
-from dyngs.gaussians.surface import Mesh, colours_of, fused, simplified
+from dyngs.gaussians.surface import Mesh, colours_of, fused, simplify_mesh
 
 
 @cache
@@ -31,7 +31,7 @@ def test_the_surface_is_where_all_views_see_it() -> None:
 
 @pytest.mark.parametrize("most", [40, 300, 10**6])
 def test_it_has_as_few_triangles_as_asked_for(most: int) -> None:
-    mesh = simplified(ball(), most)
+    mesh = simplify_mesh(ball(), most)
     assert min(most, len(ball().faces)) / 3 < len(mesh.faces) <= most
     assert np.abs(radii(mesh) - RADIUS).max() < 0.3
     assert (np.diff(np.sort(mesh.faces, axis=1), axis=1) > 0).all()
@@ -53,7 +53,7 @@ def test_joined_vertices_lie_where_planes_meet() -> None:
         for s in (-1, 1)
     ]
     faces = np.concatenate([flat + k * 441 for k in range(6)])
-    mesh = simplified(Mesh(np.concatenate(sides) + 1e-3, faces), 100)
+    mesh = simplify_mesh(Mesh(np.concatenate(sides) + 1e-3, faces), 100)
     for x in (-1, 1):
         for y in (-1, 1):
             distance = np.linalg.norm(mesh.vertices - np.array([x, y, 1]), axis=1).min()

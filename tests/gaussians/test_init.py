@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from dyngs.config import DefaultStrategy, McmcStrategy, PointsInit, RandomInit
 from dyngs.data.capture import View
 from dyngs.data.geometry import pinhole_matrix, times_seen
-from dyngs.gaussians.start import (
-    StartValues,
-    Surroundings,
+from dyngs.gaussians.initialization import (
+    InitialValues,
+    SceneGeometry,
     initial_gaussians,
     mean_squared_neighbour_distance,
 )
@@ -46,18 +46,18 @@ def _generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def _with_points(xyz: np.ndarray) -> Surroundings:
-    return Surroundings(_views(), xyz, np.full((len(xyz), 3), 255, np.uint8))
+def _with_points(xyz: np.ndarray) -> SceneGeometry:
+    return SceneGeometry(_views(), xyz, np.full((len(xyz), 3), 255, np.uint8))
 
 
 def test_extent_is_the_published_one() -> None:
-    assert Surroundings(_views()).extent == pytest.approx(1.1 * 4.0)
-    assert Surroundings(_views()[:1]).extent == 1.0
+    assert SceneGeometry(_views()).extent == pytest.approx(1.1 * 4.0)
+    assert SceneGeometry(_views()[:1]).extent == 1.0
 
 
 def test_points_give_their_published_start() -> None:
     grid = np.stack(np.meshgrid(*[np.arange(3.0)] * 3, indexing="ij"), -1).reshape(-1, 3) * 0.5
-    gaussians = initial_gaussians(_with_points(grid), PointsInit(), StartValues(), 3, _generator())
+    gaussians = initial_gaussians(_with_points(grid), PointsInit(), InitialValues(), 3, _generator())
     # Every point of a grid of pitch 0.5 has three neighbours at 0.5.
     torch.testing.assert_close(gaussians.scales, torch.full((27, 3), 0.5))
     torch.testing.assert_close(gaussians.opacities, torch.full((27,), 0.1))
@@ -90,13 +90,13 @@ def test_neighbour_distance_equals_brute_force(count: int, seed: int) -> None:
     ("scene", "options", "half"),
     [
         (_with_points(np.ones((9, 3))), RandomInit(num_random=4000, half_extent=2.0), 2.0),
-        (Surroundings(_views(), around_origin=True), PointsInit(num_random=4000), 1.1),
+        (SceneGeometry(_views(), around_origin=True), PointsInit(num_random=4000), 1.1),
     ],
 )
 def test_random_points_fill_their_cube(
-    scene: Surroundings, options: PointsInit | RandomInit, half: float
+    scene: SceneGeometry, options: PointsInit | RandomInit, half: float
 ) -> None:
-    gaussians = initial_gaussians(scene, options, StartValues(), 1, _generator())
+    gaussians = initial_gaussians(scene, options, InitialValues(), 1, _generator())
     assert len(gaussians) == 4000
     assert half * 0.99 < float(gaussians.means.abs().max()) <= half * 1.000001
     assert float(gaussians.means.mean(0).abs().max()) < 0.05 * half
@@ -111,9 +111,9 @@ def test_other_random_points_lie_where_cameras_look(
 ) -> None:
     """Wherever the scene lies: all in three images or more, most of them near what all cameras look
     at."""
-    scene = Surroundings(_views(offset), around_origin=by_convention)
+    scene = SceneGeometry(_views(offset), around_origin=by_convention)
     gaussians = initial_gaussians(
-        scene, PointsInit(num_random=2000), StartValues(), 1, _generator()
+        scene, PointsInit(num_random=2000), InitialValues(), 1, _generator()
     )
     xyz = gaussians.means.double().numpy()
     assert len(xyz) == 2000
@@ -125,12 +125,12 @@ def test_other_random_points_lie_where_cameras_look(
 
 def test_mcmc_starts_smaller_and_more_opaque_and_keeps_its_cap() -> None:
     xyz = np.random.default_rng(0).random((50, 3))
-    plain = initial_gaussians(_with_points(xyz), PointsInit(), StartValues(), 0, _generator())
-    start = StartValues.for_strategy(McmcStrategy(max_gaussians=50))
+    plain = initial_gaussians(_with_points(xyz), PointsInit(), InitialValues(), 0, _generator())
+    start = InitialValues.for_strategy(McmcStrategy(max_gaussians=50))
     mcmc = initial_gaussians(_with_points(xyz), PointsInit(), start, 0, _generator())
     torch.testing.assert_close(mcmc.scales, plain.scales * 0.1)
     torch.testing.assert_close(mcmc.opacities, torch.full((50,), 0.5))
-    capped = StartValues.for_strategy(DefaultStrategy(max_gaussians=20))
+    capped = InitialValues.for_strategy(DefaultStrategy(max_gaussians=20))
     few = initial_gaussians(_with_points(xyz), PointsInit(), capped, 0, _generator())
     assert len(few) == 20
     assert {tuple(row) for row in few.means.tolist()} <= {

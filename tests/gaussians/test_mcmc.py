@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dyngs.config import McmcStrategy
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.densify import DensifySchedule, McmcDensifier, relocated, rotate
+from dyngs.gaussians.densify import DensifySchedule, McmcDensifier, compute_relocation, rotate
 
 SCHEDULE = DensifySchedule(start=100, stop=1000, every=100)
 
@@ -38,7 +38,7 @@ def _profile_integral(opacity: Tensor, scale: Tensor, copies: int) -> Tensor:
 )
 def test_relocation_keeps_the_integral_of_the_profile(opacity: float, copies: int) -> None:
     o = torch.tensor([opacity], dtype=torch.float64)
-    thinner, factor = relocated(o, torch.tensor([copies]), min_opacity=0.0)
+    thinner, factor = compute_relocation(o, torch.tensor([copies]), min_opacity=0.0)
     before = _profile_integral(o, torch.tensor(1.0), 1)
     after = _profile_integral(thinner, factor, copies)
     # quadrature of an analytic function

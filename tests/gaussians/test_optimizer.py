@@ -63,7 +63,7 @@ def test_of_frozen_gaussians_only_the_base_colour_learns() -> None:
     frozen = torch.tensor([False, True, True, False])
     before = optimizer.parameters.sh.detach().clone()
     _set_gradients(optimizer, 1)
-    optimizer.step(1, 0.1, frozen_rest=frozen)
+    optimizer.step(1, 0.1, frozen_harmonics=frozen)
     changed = optimizer.parameters.sh.detach() != before
     assert changed[:, 0].all()
     assert changed[:, 1:].flatten(1).any(1).tolist() == [True, False, False, True]
@@ -79,7 +79,7 @@ def test_dropped_harmonics_stay_zero(frozen: tuple[bool, ...]) -> None:
     before = _stored(optimizer)
     rows = torch.tensor(frozen)
     base = torch.full((3, 3), 0.7)
-    optimizer.drop_rest(base, rows)
+    optimizer.drop_harmonics(base, rows)
     after = _stored(optimizer)
     assert torch.equal(after["gaussians.sh"][rows, 0], base[rows])
     assert not after["gaussians.sh"][rows, 1:].any()
@@ -94,7 +94,7 @@ def test_dropped_harmonics_stay_zero(frozen: tuple[bool, ...]) -> None:
     for each in (optimizer, other):
         for x in each.parameters.tensors().values():
             x.grad = torch.ones_like(x)
-        each.step(2, 0.1, frozen_rest=rows)
+        each.step(2, 0.1, frozen_harmonics=rows)
         assert not each.parameters.sh[rows, 1:].any()
     assert torch.equal(optimizer.parameters.sh, other.parameters.sh)
 

@@ -87,7 +87,7 @@ def test_rows_rearranged_take_their_moments_along() -> None:
     values = torch.randn(3, 5, generator=torch.Generator().manual_seed(2))
     source = torch.tensor([2, 99, 0])
     is_new = torch.tensor([False, True, False])
-    found = tensors_of(learned.rearranged({"weight": values}, source, is_new).state())
+    found = tensors_of(learned.reorder({"weight": values}, source, is_new).state())
     assert torch.equal(found["weight"], values)
     for name in ("exp_avg.weight", "exp_avg_sq.weight"):
         assert torch.equal(

@@ -17,11 +17,11 @@ from torch import Tensor
 from dyngs.config import FixedStrategy
 from dyngs.core.state import Role, part_of, tensors_of
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.colour.network import network_of
-from dyngs.gaussians.scene import GaussianScene, restored_scene
+from dyngs.gaussians.colour.network import restore_colour_network
+from dyngs.gaussians.scene import GaussianScene, restore_scene
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.models.static_section import StaticModel
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 
 TIMES = (None, 0.0, 0.37, 0.5, 1.0)
 
@@ -66,7 +66,7 @@ def test_what_is_stored_gives_the_same_images(kind: str, drawing: bool) -> None:
     scene = scene_of_kind(kind)
     state = scene.drawing_state() if drawing else scene.state()
     found = replace(
-        restored(kind, state), colour=network_of(part_of(tensors_of(state), "model.colour"))
+        restored(kind, state), colour=restore_colour_network(part_of(tensors_of(state), "model.colour"))
     )
     assert type(found) is type(scene)
     assert found.times == scene.times
@@ -128,10 +128,10 @@ def test_an_edited_scene_draws_the_copies_of_what_was_drawn(
     )
     assert len(edited) == len(rows)
     assert edited.times == scene.times
-    assert_alike(edited.unmasked().at(time), scene.unmasked().at(time).select(source))
+    assert_alike(edited.without_masks().at(time), scene.without_masks().at(time).select(source))
     if scene.masks is not None:
         seen = torch.isin(source, scene.masks.active(scene.masks.interval(time or 0.0)))
-        assert_alike(edited.at(time), scene.unmasked().at(time).select(source[seen]))
+        assert_alike(edited.at(time), scene.without_masks().at(time).select(source[seen]))
     assert_alike(scene.at(time), before, atol=0.0)
 
 
@@ -145,7 +145,7 @@ def test_what_moves_and_what_is_still_make_the_scene(kind: str) -> None:
     assert moving.moving_fraction == (1.0 if len(moving) else 0.0)
     assert still.moving_fraction == 0.0
     for time in TIMES:
-        whole = scene.unmasked().at(time)
+        whole = scene.without_masks().at(time)
         assert_alike(moving.at(time), whole.select(moves))
         assert_alike(still.at(time), whole.select(~moves))
 
@@ -205,10 +205,10 @@ def test_what_is_trained_is_what_is_loaded(model: str, tmp_path: Path) -> None:
     config = config.model_copy(update={"strategy": FixedStrategy()})
     if model == "static":
         config = config.model_copy(update={"model": StaticModel(sh_degree=1)})
-    trainer = assemble(config)
+    trainer = build_trainer(config)
     for _ in range(11):
         trainer.step()
-    loaded = restored_scene(trainer.checkpoint(), config.model)
+    loaded = restore_scene(trainer.checkpoint(), config.model)
     assert type(loaded) is type(trainer.model.scene)
     assert loaded.moving_fraction == trainer.model.scene.moving_fraction
     assert (loaded.moving_fraction > 0) == (model != "static")

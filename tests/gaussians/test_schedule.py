@@ -25,7 +25,7 @@ from dyngs.gaussians.schedule import (
     GROWTH,
     MAX_GROWTH,
     MIN_RESET_GAP,
-    Rates,
+    RateSchedule,
     active_sh_degree,
     densify_schedule,
     filter_steps,
@@ -142,13 +142,13 @@ def test_phases_of_a_dynamic_model_come_in_order(
     """Coarse, fine, all times, splits; each within the run, and never is there none before motion
     begins."""
     model = DynamicModel(motion_from=coarse, time_window_full_at=time_window_full_at)
-    schedule = deform_schedule(model, Rates(steps))
+    schedule = deform_schedule(model, RateSchedule(steps))
     assert schedule.rates.steps == steps
     assert 1 <= schedule.fine <= schedule.full <= steps
     assert all(schedule.full < split <= steps for split in schedule.splits)
     assert list(schedule.splits) == sorted(set(schedule.splits))
     assert (
-        deform_schedule(model.model_copy(update={"freeze_below_px": 0.0}), Rates(steps)).splits
+        deform_schedule(model.model_copy(update={"freeze_below_px": 0.0}), RateSchedule(steps)).splits
         == ()
     )
 
@@ -178,7 +178,7 @@ def test_images_sharpen_in_even_steps(coarsest: int, expected: set[int]) -> None
 
 @given(st.integers(1, 1000), st.floats(0, 1))
 def test_rates_fall_once_over_training(steps: int, fraction: float) -> None:
-    rates = Rates(steps)
+    rates = RateSchedule(steps)
     since = int(fraction * (steps - 1))
     progress = [rates.progress(step, since) for step in range(steps + 20)]
     assert progress == sorted(progress)
@@ -188,7 +188,7 @@ def test_rates_fall_once_over_training(steps: int, fraction: float) -> None:
 
 
 def test_a_stage_goes_back_and_falls_again() -> None:
-    rates = Rates(1000, 200)
+    rates = RateSchedule(1000, 200)
     assert rates.progress(1000) == 1
     assert rates.progress(1001) == pytest.approx(0.3 + 0.7 / 200)
     assert rates.progress(1100) == pytest.approx(0.65)

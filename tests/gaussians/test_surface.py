@@ -17,7 +17,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.gaussians.surface import Mesh, fused, largest_pieces, num_holes, opaque_box, surface_of
+from dyngs.gaussians.surface import Mesh, fused, keep_largest_components, count_holes, opaque_box, extract_surface
 from dyngs.io.formats.similarity import Similarity
 from dyngs.models.renderable import Surface
 
@@ -54,7 +54,7 @@ def cameras() -> list[Cameras]:
 
 @cache
 def surface() -> Surface:
-    return surface_of(ball(), cameras(), BOX, cells=30)
+    return extract_surface(ball(), cameras(), BOX, cells=30)
 
 
 def volume(found: Surface | Mesh) -> float:
@@ -68,7 +68,7 @@ def test_a_ball_of_gaussians_has_the_surface_of_a_ball() -> None:
     assert abs(np.median(radii) - RADIUS) < 0.01
     assert np.quantile(np.abs(radii - RADIUS), 0.95) < 0.05
     assert volume(surface()) == pytest.approx(4 / 3 * math.pi * RADIUS**3, rel=0.05)
-    assert num_holes(surface()) == 0
+    assert count_holes(surface()) == 0
     sides = surface().vertices[:, 0]
     assert surface().colours[sides > 0.1, 0].min() > 0.7
     assert surface().colours[sides < -0.1, 2].min() > 0.7
@@ -81,7 +81,7 @@ def test_the_surface_is_the_same_in_any_unit(factor: float) -> None:
     options = replace(whole.options, near=factor * whole.options.near)
     scene = replace(whole, gaussians=scaled(whole.gaussians, factor), options=options)
     moved = [Similarity(scale=factor).cameras(one) for one in cameras()]
-    found = surface_of(scene, moved, (factor * LOW, factor * HIGH), cells=30)
+    found = extract_surface(scene, moved, (factor * LOW, factor * HIGH), cells=30)
     np.testing.assert_array_equal(found.faces, surface().faces)
     np.testing.assert_allclose(found.vertices / factor, surface().vertices, rtol=0, atol=1e-3)
     box = opaque_box(scene.gaussians)
@@ -93,7 +93,7 @@ def test_without_what_no_view_sees_the_surface_ends() -> None:
     """From one side half a ball is seen, and nothing closes it."""
     half = fused(views()[:1], *BOX, 40, unseen_is_solid=False)
     assert half is not None
-    assert num_holes(Surface(half.vertices, half.faces, half.vertices)) > 0
+    assert count_holes(Surface(half.vertices, half.faces, half.vertices)) > 0
     assert half.vertices[:, 2].max() < 0.3
     np.testing.assert_allclose(np.linalg.norm(half.vertices, axis=1).mean(), RADIUS, atol=0.03)
 
@@ -110,7 +110,7 @@ def piece(center: tuple[float, float, float], count: int) -> tuple[Tensor, Tenso
 def test_small_pieces_go_and_faces_keep_their_corners() -> None:
     (large, first), (small, second) = piece((0, 0, 0), 200), piece((9, 0, 0), 2)
     mesh = Mesh(torch.cat([small, large]).numpy(), torch.cat([second, first + len(small)]).numpy())
-    kept = largest_pieces(mesh)
+    kept = keep_largest_components(mesh)
     assert kept.faces.shape == (200, 3)
     np.testing.assert_array_equal(kept.vertices[kept.faces], large.numpy()[first.numpy()])
-    assert num_holes(Surface(kept.vertices, kept.faces, kept.vertices)) == 1
+    assert count_holes(Surface(kept.vertices, kept.faces, kept.vertices)) == 1

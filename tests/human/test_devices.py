@@ -18,7 +18,7 @@ from dyngs.human.avatar.posing import (
     frame_pose,
     pose_blend_shapes,
     pose_gaussians,
-    rest_offsets,
+    pose_blend_offsets,
     skinning_weights,
     texel_gaussians,
 )
@@ -42,7 +42,7 @@ def test_no_tensor_is_made_on_the_default_device(tmp_path: Path) -> None:
         )
         pose = frame_pose(clip.at(0.3), 0)
         weights = skinning_weights(anchors, len(body.joints))
-        offsets = rest_offsets(anchors, pose, pose_blend_shapes(body))
+        offsets = pose_blend_offsets(anchors, pose, pose_blend_shapes(body))
         found = pose_gaussians(
             gaussians, weights, Skeleton(body.joints, body.parents), pose, offsets
         )

@@ -22,7 +22,7 @@ from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, restored_model
 from dyngs.models.kind import HasGaussians, Predicts, capability, kind_of
 from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 TRAINED = {
@@ -76,7 +76,7 @@ def config(request: pytest.FixtureRequest) -> Config:
 
 def trained(config: Config) -> Trainer:
     """After four steps."""
-    trainer = assemble(config)
+    trainer = build_trainer(config)
     assert isinstance(trainer, Trainer)
     for _ in range(4):
         trainer.step()
@@ -106,7 +106,7 @@ def test_it_is_trained_stored_and_restored(config: Config) -> None:
     """What a checkpoint holds is taken over as it is, and training goes on with the same bytes."""
     trainer = trained(config)
     first = trainer.checkpoint()
-    again = assemble(config, restored=True)
+    again = build_trainer(config, restored=True)
     assert isinstance(again, Trainer)
     again.restore(first)
     assert same(first, again.checkpoint())

@@ -19,19 +19,19 @@ import dyngs
 from dyngs.core.errors import DyngsError
 from dyngs.ops import device
 from dyngs.ops.device import (
-    ReadBack,
+    AsyncReadback,
     deterministic,
-    device_for,
+    select_device,
     findings,
-    why_no_gpu,
-    why_on_cpu,
+    gpu_unavailable_reason,
+    cpu_fallback_reason,
 )
 
 
 @pytest.fixture
 def machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
     """One with a usable GPU, of which a test takes away something."""
-    why_no_gpu.cache_clear()
+    gpu_unavailable_reason.cache_clear()
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
@@ -39,26 +39,26 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (9, 0))
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (10**9, 8 * 10**9))
     monkeypatch.setattr(device, "has_cuda_core", lambda: True)
-    monkeypatch.setattr(device, "has_driver", lambda: True)
+    monkeypatch.setattr(device, "has_nvidia_driver", lambda: True)
     core = SimpleNamespace(runtime_version=lambda: 13000, driver_version=lambda: 13020)
     monkeypatch.setattr(device, "cuda_core", lambda: core)
     yield monkeypatch
-    why_no_gpu.cache_clear()
+    gpu_unavailable_reason.cache_clear()
 
 
 def refused() -> str:
     with pytest.raises(DyngsError) as caught:
-        device_for("cuda")
+        select_device("cuda")
     line = str(caught.value)
     assert "\n" not in line
-    assert device_for("auto") == device_for("cpu") == torch.device("cpu")
+    assert select_device("auto") == select_device("cpu") == torch.device("cpu")
     return line
 
 
 def test_a_gpu_that_can_be_used_is(machine: pytest.MonkeyPatch) -> None:
-    assert device_for("auto") == device_for("cuda") == torch.device("cuda:0")
-    assert device_for("cpu") == torch.device("cpu")
-    assert why_on_cpu("auto") is None
+    assert select_device("auto") == select_device("cuda") == torch.device("cuda:0")
+    assert select_device("cpu") == torch.device("cpu")
+    assert cpu_fallback_reason("auto") is None
     assert findings() == {
         "torch for": "CUDA 13.0",
         "kernels for GPUs": "built",
@@ -108,17 +108,17 @@ def test_a_gpu_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
 
 def test_auto_says_why_only_where_a_gpu_seems_to_be(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(device, "has_cuda_core", lambda: False)
-    line = why_on_cpu("auto")
+    line = cpu_fallback_reason("auto")
     assert line is not None
     assert line.startswith("computing on the CPU: dyngs was built without")
-    assert why_on_cpu("cpu") is None
-    machine.setattr(device, "has_driver", lambda: False)
-    assert why_on_cpu("auto") is None
+    assert cpu_fallback_reason("cpu") is None
+    machine.setattr(device, "has_nvidia_driver", lambda: False)
+    assert cpu_fallback_reason("auto") is None
 
 
 def test_other_choices_are_refused() -> None:
     with pytest.raises(DyngsError, match="device must be one of auto, cpu, cuda"):
-        device_for("tpu")
+        select_device("tpu")
 
 
 def test_on_a_gpu_torch_is_told_to_repeat_itself(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -176,7 +176,7 @@ def test_blocks_are_reused_without_page_faults() -> None:
 
 def test_numbers_are_as_they_were_when_they_were_asked_for() -> None:
     x = torch.tensor([1.0, 2.5], requires_grad=True)
-    read = ReadBack(x)
+    read = AsyncReadback(x)
     with torch.no_grad():
         x.zero_()
     assert read.numbers().tolist() == [1.0, 2.5]

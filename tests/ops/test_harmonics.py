@@ -13,7 +13,7 @@ from torch import Tensor
 from dyngs.core.conventions import SH_C0
 from dyngs.core.errors import DyngsError
 from dyngs.ops.harmonics import (
-    dimmed,
+    dim_harmonics,
     evaluate_harmonics,
     light_harmonics,
     lit,
@@ -120,9 +120,9 @@ def test_what_has_no_normal_stays_finite() -> None:
 def test_gradients_of_dimmed_colours() -> None:
     sh = torch.randn(5, 4, 3, dtype=torch.float64, requires_grad=True)
     left = torch.linspace(0, 1, 5, dtype=torch.float64, requires_grad=True)
-    found = dimmed(sh, left, left[::2], 2)
+    found = dim_harmonics(sh, left, left[::2], 2)
     torch.testing.assert_close(found[:, 0] * SH_C0 + 0.5, (sh[:, 0] * SH_C0 + 0.5) * left[:, None])
-    assert torch.autograd.gradcheck(lambda x, y: dimmed(x, y.detach(), y, 1), (sh, left))
+    assert torch.autograd.gradcheck(lambda x, y: dim_harmonics(x, y.detach(), y, 1), (sh, left))
 
 
 def test_harmonics_of_light_have_no_mean() -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from dyngs.ops.hash_grid import (
     HashLevels,
     hash_features,
-    known_features,
+    select_features,
 )
 
 LEVELS = HashLevels.geometric(4, 3, 24, 64)
@@ -70,7 +70,7 @@ def test_known_features_have_the_gradient_of_a_look_up() -> None:
     coords = some(40)
     table = table_of(LEVELS, 2)
     which = torch.tensor([3, 17, 39])
-    known = known_features(
+    known = select_features(
         hash_features(coords, table, LEVELS).detach(), which, coords[which], table, LEVELS
     )
     again = hash_features(coords[which], table, LEVELS)

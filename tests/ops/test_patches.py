@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.ops.patches import (
-    Places,
+    PatchSamples,
     blend_patches,
     lattice,
     lattice_size,
@@ -104,7 +104,7 @@ def test_what_is_shown_projects_to_its_pixel() -> None:
     cameras = camera()
     points = flat((-1, -0.8, -1), (1, -0.5, 2), (0, 0.9, 0))
     ids, uv = visible_patches(points, cameras, 0.2)
-    places = Places.of(ids, uv)
+    places = PatchSamples.of(ids, uv)
     assert len(places.ids) > 30
     x, y, z = patch_values(points, places.ids, places.uv).unbind(1)
     rows = (ids[0] >= 0).nonzero()
@@ -153,11 +153,11 @@ def test_a_patch_through_the_near_plane_is_cut_there() -> None:
 
 def some_image(
     seed: int, views: int = 1, width: int = 14, height: int = 11
-) -> tuple[Tensor, Tensor, Tensor, Places]:
+) -> tuple[Tensor, Tensor, Tensor, PatchSamples]:
     """Means, colours of two channels, crossings anywhere, and the places of pixels that show one of
     three patches."""
     ids, uv = visible_patches(random_patches(3, seed, 0.5), camera(width, height, views=views), 0.2)
-    places = Places.of(ids, uv)
+    places = PatchSamples.of(ids, uv)
     generator = torch.Generator().manual_seed(seed)
     means = (ids >= 0).nonzero()[:, [2, 1]] + 0.5
     colours = torch.rand(len(means), 2, generator=generator, dtype=torch.float64)
@@ -189,7 +189,7 @@ def test_blending_is_what_it_is_defined_as(seed: int, views: int) -> None:
 
 def drawn(points: Tensor, cameras: Cameras, colours: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Images of patches, whose control points have ``colours`` (P, 6, C), and transmittance."""
-    places = Places.of(*visible_patches(points.detach(), cameras, 0.2))
+    places = PatchSamples.of(*visible_patches(points.detach(), cameras, 0.2))
     views = (places.rows >= 0).nonzero()[:, 0]
     means = project_points(patch_values(points, places.ids, places.uv), cameras, views).means
     shown = torch.ones(len(places.ids), 1, dtype=points.dtype)

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dyngs.ops.posing import Posed, pose_by_joints
+from dyngs.ops.posing import PosedGaussians, pose_by_joints
 from dyngs.ops.quaternions import rotation_matrices
 
 NAN = float("nan")
@@ -41,7 +41,7 @@ def random_case(count: int, joints: int, seed: int = 0) -> list[Tensor]:
     return [x.requires_grad_() for x in case]
 
 
-def moved_alone(linear: Tensor, quats: Tensor, log_scales: Tensor) -> Posed:
+def moved_alone(linear: Tensor, quats: Tensor, log_scales: Tensor) -> PosedGaussians:
     """Gaussians at the origin of which each follows a joint of its own, with the linear map (N, 3,
     3)."""
     transforms = torch.cat([linear, torch.zeros_like(linear[..., :1])], dim=-1)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dyngs.ops.quaternions import quat_product, quats_of, rotate, rotation_matrices, unit_quats
+from dyngs.ops.quaternions import quat_product, quats_from_matrices, rotate, rotation_matrices, unit_quats
 
 ROUNDING = 8 * torch.finfo(torch.float32).eps
 """Of a unit quaternion: two divisions, four squares, their sum, the root; and again for what it is
@@ -78,6 +78,6 @@ def matrix_of(quat: Tensor) -> Tensor:
 def test_quaternions_give_the_rotation_back(numbers: list[float]) -> None:
     """Of any rotation: half turns, and those with two or more components equally large."""
     quat = torch.nn.functional.normalize(torch.tensor(numbers, dtype=torch.float64), dim=0)
-    found = quats_of(matrix_of(quat))
+    found = quats_from_matrices(matrix_of(quat))
     torch.testing.assert_close(found * (found @ quat).sign(), quat, rtol=0, atol=1e-14)
     assert float(found.max()) > float(found.abs().max()) - 1e-12

@@ -29,7 +29,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.ops.projection import Projection
 from dyngs.ops.rasterization import (
     MAX_CHANNELS,
-    Blended,
+    BlendedImages,
     BlendOptions,
     Tally,
     rasterize,
@@ -50,7 +50,7 @@ def with_channels(scene: Scene, channels: int) -> tuple[Projection, Tensor, Tens
 
 
 def slopes(
-    function: Callable[..., Blended], scene: Scene, channels: int, **options: object
+    function: Callable[..., BlendedImages], scene: Scene, channels: int, **options: object
 ) -> dict[str, Tensor]:
     """Gradients with respect to every float input of the blending."""
     projection, opacities, colors, background = with_channels(scene, channels)

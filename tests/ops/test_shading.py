@@ -53,7 +53,7 @@ def test_it_is_what_torch_says(
         dtype
     )
     found = shading_inputs(base, *seen)
-    assert found.shape == (7, num_inputs(sees_time=timed, sees_normals=normals))
+    assert found.shape == (7, num_inputs(uses_time=timed, uses_normals=normals))
     # Numbers of at most 3 that come of some 30 roundings; 1e-5 is 84 units of float32, 1e-7 many of
     # float64.
     torch.testing.assert_close(found, reference.shading_inputs(base, *seen))

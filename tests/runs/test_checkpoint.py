@@ -20,7 +20,7 @@ from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import fuse_filter
-from dyngs.gaussians.scene import restored_scene
+from dyngs.gaussians.scene import restore_scene
 from dyngs.io import tensor_file
 from dyngs.io.tensor_file import write_tensors
 from dyngs.models.static_section import StaticModel
@@ -269,7 +269,7 @@ def test_contents_that_do_not_fit_end_in_one_line_or_a_finite_image(
     )
     path.parent.mkdir(exist_ok=True)
     if has_only_scene_file:
-        tensors = drawable(restored_scene(Checkpoint(CheckpointInfo(**_header()), tensors), model))  # type: ignore[arg-type]
+        tensors = drawable(restore_scene(Checkpoint(CheckpointInfo(**_header()), tensors), model))  # type: ignore[arg-type]
     refused = 0
     told = []
     for trial in range(11):

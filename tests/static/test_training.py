@@ -13,7 +13,7 @@ from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate, filter_std, fuse_filter
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.gaussians.static_training import SmallRemoval, StaticTraining
+from dyngs.gaussians.static_training import SmallGaussianPruning, StaticTraining
 
 INTRINSICS = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
 
@@ -60,7 +60,7 @@ def test_nothing_depends_on_time() -> None:
 def test_the_set_is_left_to_the_strategy() -> None:
     training = StaticTraining(FilterUpdate())
     assert all(
-        training.revised(training.first_scene(_gaussians(2.0)), step) is None
+        training.edit_scene(training.first_scene(_gaussians(2.0)), step) is None
         for step in (1, 2, 100)
     )
 
@@ -82,11 +82,11 @@ def test_what_no_view_shows_half_a_pixel_of_is_removed_once() -> None:
     elsewhere = replace(
         _camera(), cam_from_world=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))[None]
     )
-    training = StaticTraining(FilterUpdate(), SmallRemoval(7, 2.0, [elsewhere, _camera()]))
+    training = StaticTraining(FilterUpdate(), SmallGaussianPruning(7, 2.0, [elsewhere, _camera()]))
     scene = training.first_scene(_sized([1.5, 4.0, 1.0, 3.0]))
-    assert training.revised(scene, 6) is None
-    assert training.revised(scene, 8) is None
-    found = training.revised(scene, 7)
+    assert training.edit_scene(scene, 6) is None
+    assert training.edit_scene(scene, 8) is None
+    found = training.edit_scene(scene, 7)
     assert found is not None
     edited, result = found
     assert torch.equal(edited.gaussians.means, scene.gaussians.means[[1, 3]])
@@ -96,8 +96,8 @@ def test_what_no_view_shows_half_a_pixel_of_is_removed_once() -> None:
     assert result.finding.startswith(
         "2 of 4 Gaussians are removed: each makes up less than 2 px of every"
     )
-    assert training.revised(edited, 7) is None, "all that is left is large enough"
-    assert training.revised(training.first_scene(_sized([1.0, 1.5])), 7) is None, (
+    assert training.edit_scene(edited, 7) is None, "all that is left is large enough"
+    assert training.edit_scene(training.first_scene(_sized([1.0, 1.5])), 7) is None, (
         "something is left of every scene"
     )
 

@@ -22,7 +22,7 @@ from dyngs.study.report import (
     markdown_table,
     page_text,
     plot_variants,
-    svg_of,
+    figure_to_svg,
 )
 from dyngs.study.tradeoff import Row
 
@@ -81,7 +81,7 @@ def test_lines_of_a_plot_join_the_run_with_a_setting() -> None:
         assert len(front.get_xdata()) == 3
         found = {line.get_label(): len(line.get_xdata()) for line in lines}
         assert found == {"the run itself": 1, "prune": 3, "sh_degree": 2}
-    text = svg_of(figure)
+    text = figure_to_svg(figure)
     assert "<image" not in text
     assert 'href="http' not in text
 

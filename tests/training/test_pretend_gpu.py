@@ -19,7 +19,7 @@ from dyngs.export.images import write_split_images
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.folder import EXPORT_FOLDER
 from dyngs.runs.opened import open_run
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -31,8 +31,8 @@ def config_of(kind: str, root: Path, *more: str) -> Config:
 
 def trained(config: Config, monkeypatch: pytest.MonkeyPatch, device: torch.device) -> Trainer:
     """The trainer after all steps."""
-    monkeypatch.setattr("dyngs.training.new_trainer.device_for", lambda _: device)
-    trainer = assemble(config)
+    monkeypatch.setattr("dyngs.training.new_trainer.select_device", lambda _: device)
+    trainer = build_trainer(config)
     while trainer.done < config.train.steps:
         trainer.step()
     return trainer
@@ -111,16 +111,16 @@ def test_a_run_goes_on_there_from_a_checkpoint(
     still: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = config_of("static", still, *STATIC, "camera.refine=always", "train.exposure=always")
-    monkeypatch.setattr("dyngs.training.new_trainer.device_for", lambda _: torch.device("cpu"))
-    begun = assemble(config)
-    expected = assemble(config)
+    monkeypatch.setattr("dyngs.training.new_trainer.select_device", lambda _: torch.device("cpu"))
+    begun = build_trainer(config)
+    expected = build_trainer(config)
     for _ in range(10):
         begun.step()
     stored = begun.checkpoint()
     expected.restore(stored)
     with pretend_gpu():
-        monkeypatch.setattr("dyngs.training.new_trainer.device_for", lambda _: GPU)
-        resumed = assemble(config, restored=True)
+        monkeypatch.setattr("dyngs.training.new_trainer.select_device", lambda _: GPU)
+        resumed = build_trainer(config, restored=True)
         resumed.restore(stored)
         for _ in range(10):
             expected.step()
@@ -156,7 +156,7 @@ def test_views_are_drawn_and_scored_there_alike(
     train(config_of(kind, request.getfixturevalue(capture), *more, *others, f"run.dir={folder}"))
     expected = evaluate_run(folder, split, refine_poses=refined)
     images = write_split_images(open_run(folder), split, tmp_path / "cpu")
-    monkeypatch.setattr("dyngs.evaluate.report.device_for", lambda _: GPU)
+    monkeypatch.setattr("dyngs.evaluate.report.select_device", lambda _: GPU)
     with pretend_gpu():
         found = evaluate_run(folder, split, refine_poses=refined)
         there = write_split_images(open_run(folder), split, tmp_path / "GPU", device=GPU)
@@ -199,6 +199,6 @@ def test_with_limits_and_pruning_it_ends_with_the_same_bytes(
         ]
 
     expected = run("cpu")
-    monkeypatch.setattr("dyngs.training.new_trainer.device_for", lambda _: GPU)
+    monkeypatch.setattr("dyngs.training.new_trainer.select_device", lambda _: GPU)
     with pretend_gpu():
         assert run("GPU") == expected

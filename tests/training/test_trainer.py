@@ -32,7 +32,7 @@ from dyngs.io.tensor_file import write_tensors
 from dyngs.io.write import write_image
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import _KIND, load_checkpoint
-from dyngs.training.new_trainer import GaussianTrainer, assemble
+from dyngs.training.new_trainer import GaussianTrainer, build_trainer
 from dyngs.training.trainer import ViewSampler
 
 
@@ -44,7 +44,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _trainer(capture: Path, **data: object) -> GaussianTrainer:
-    return assemble(
+    return build_trainer(
         Config(
             data=DataConfig(root=capture, **data),  # type: ignore[arg-type]
             model=StaticModel(sh_degree=1),
@@ -110,7 +110,7 @@ class _Lifted(SceneTraining[_LiftedScene]):
     def after_step(self, scene: _LiftedScene, step: int, edited: bool) -> _LiftedScene:
         return scene
 
-    def revised(self, scene: _LiftedScene, step: int) -> tuple[_LiftedScene, EditResult] | None:
+    def edit_scene(self, scene: _LiftedScene, step: int) -> tuple[_LiftedScene, EditResult] | None:
         return None
 
     def window(self, step: int) -> tuple[float, float]:
@@ -132,7 +132,7 @@ class _Lifted(SceneTraining[_LiftedScene]):
 def _trained_by(trainer: GaussianTrainer, training: SceneTraining[Any]) -> GaussianTrainer:
     """``trainer`` with its Gaussians in a scene of another kind."""
     trainer.model.training = training
-    trainer.model.exchange(_LiftedScene(gaussians=trainer.model.scene.gaussians))
+    trainer.model.replace_scene(_LiftedScene(gaussians=trainer.model.scene.gaussians))
     return trainer
 
 

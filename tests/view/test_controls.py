@@ -18,7 +18,7 @@ from dyngs.human.body.joints import SMPLX_ROWS
 from dyngs.runs.opened import Opened, open_run
 from dyngs.view.controls import BODY_JOINTS, BY_SLIDERS, Controls, posed
 from dyngs.view.layers import draw
-from dyngs.view.source import Source
+from dyngs.view.source import SceneSource
 from dyngs.view.views import views_of
 
 
@@ -26,7 +26,7 @@ def page_of(opened: Opened | None = None, motions: dict[str, Path] | None = None
     session, _ = looking_at_balls()
     session.opened = opened or session.opened
     page: Any = Page(session)
-    Controls(page, Source(("it",), lambda _: session.opened), motions or {})
+    Controls(page, SceneSource(("it",), lambda _: session.opened), motions or {})
     return page
 
 

@@ -18,7 +18,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import read_splats
 from dyngs.runs.opened import Opened, open_run, open_scene, opened_scene
-from dyngs.view.edit import Editing, can_be_edited, picked
+from dyngs.view.edit import EditState, can_be_edited, picked
 from dyngs.view.layers import Shot
 
 SHOT = Shot(camera())
@@ -26,8 +26,8 @@ SHOT = Shot(camera())
 
 def editing(
     opened: Opened, centre: tuple[float, float, float] = (0.5, 0.0, 0.0), size: float = 1.2
-) -> Editing:
-    return Editing(opened, np.array(centre), np.full(3, size))
+) -> EditState:
+    return EditState(opened, np.array(centre), np.full(3, size))
 
 
 @pytest.fixture

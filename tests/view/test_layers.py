@@ -28,7 +28,7 @@ from dyngs.gaussians import levels
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.runs.opened import Opened, open_run, open_scene
-from dyngs.view.controls import Frusta
+from dyngs.view.controls import CameraFrusta
 from dyngs.view.layers import (
     LAYERS,
     PARTS,
@@ -41,10 +41,10 @@ from dyngs.view.views import (
     camera_at,
     fitting_fov,
     has_timeline,
-    look_point,
+    orbit_center,
     nearest_view,
     pose_of,
-    viewpoint_of,
+    initial_viewpoint,
     views_of,
 )
 
@@ -140,9 +140,9 @@ def test_a_window_shows_the_whole_image(aspect: float) -> None:
 def test_the_point_to_orbit_lies_on_the_axis_as_deep_as_the_scene(unit: float) -> None:
     one = looking((0, -4 * unit, 0))
     begin = Viewpoint(one, np.array([unit, 0, unit]), 2 * unit, np.array([0, 0, 1.0]))
-    assert look_point(one, begin) / unit == pytest.approx([0, 0, 0], abs=1e-6)
+    assert orbit_center(one, begin) / unit == pytest.approx([0, 0, 0], abs=1e-6)
     behind = replace(begin, center=np.array([0.0, -9 * unit, 0]))
-    assert look_point(one, behind) / unit == pytest.approx([0, -3.8, 0], abs=1e-6)
+    assert orbit_center(one, behind) / unit == pytest.approx([0, -3.8, 0], abs=1e-6)
 
 
 def test_the_nearest_view_is_near_in_place_direction_and_time(tmp_path: Path) -> None:
@@ -153,17 +153,17 @@ def test_the_nearest_view_is_near_in_place_direction_and_time(tmp_path: Path) ->
         assert nearest_view(opened, shown.cameras[index], time) == index
     assert {view.time for view in shown.views} == {*TRAIN_TIMES, *TEST_TIMES}
     assert has_timeline(opened)
-    begin = viewpoint_of(opened)
+    begin = initial_viewpoint(opened)
     assert torch.equal(begin.start.cam_from_world, shown.cameras[0].cam_from_world)
     assert views_of(replace(opened, as_captured=False)).images is None
 
 
 def test_a_frustum_that_the_camera_stands_in_is_hidden() -> None:
     session, _ = looking_at_balls()
-    frusta = Frusta(SimpleNamespace(session=session))  # type: ignore[arg-type]
+    frusta = CameraFrusta(SimpleNamespace(session=session))  # type: ignore[arg-type]
     assert session.eye is not None
     here, there = (SimpleNamespace(visible=True) for _ in range(2))
     eye = np.array(session.eye.position)
     frusta._handles = [(here, eye + 0.01, 0.2), (there, eye + 1.0, 0.2)]
-    frusta.hide_what_covers()
+    frusta.hide_covering_frusta()
     assert (here.visible, there.visible) == (False, True)

@@ -65,7 +65,7 @@ class NgpKind(ModelKind):
     def functions(self) -> tuple[Start, Restore]:
         from dyngs.baselines.fields import ngp, scene
 
-        return ngp.NgpTraining, partial(scene.restored_scene, ngp.NgpField)
+        return ngp.NgpTraining, partial(scene.restore_scene, ngp.NgpField)
 
 
 class NerfKind(ModelKind):
@@ -74,7 +74,7 @@ class NerfKind(ModelKind):
     def functions(self) -> tuple[Start, Restore]:
         from dyngs.baselines.fields import nerf, scene
 
-        return nerf.NerfTraining, partial(scene.restored_scene, nerf.NerfField)
+        return nerf.NerfTraining, partial(scene.restore_scene, nerf.NerfField)
 
 
 NERF = NerfKind(NerfModel)

@@ -106,7 +106,7 @@ class NerfField(Field):
         if shifts is None:
             shifts = rays.origins.new_full((len(rays), self.num_shifts), 0.5)
         num_coarse = SIZES[self.model.sizes].coarse
-        distances = evenly(rays, self.space, near, shifts[:, :num_coarse])
+        distances = sample_evenly(rays, self.space, near, shifts[:, :num_coarse])
         coarse, weights = self._through("coarse", rays, distances, time)
         distances = by_weights(distances, weights, shifts[:, num_coarse:])
         fine, _ = self._through("fine", rays, distances, time)
@@ -165,7 +165,7 @@ def crossed(rays: Rays, space: Space, near: float) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def evenly(rays: Rays, space: Space, near: float, shifts: Tensor) -> Tensor:
+def sample_evenly(rays: Rays, space: Space, near: float, shifts: Tensor) -> Tensor:
     """Return distances (R, K) of samples, one in each of K equal parts of the way through the
     space, ascending.
 

@@ -40,7 +40,7 @@ from dyngs.models.model import Updated
 from dyngs.models.volume import reached_samples, thinned_samples
 from dyngs.ops.device import sent
 from dyngs.ops.harmonics import harmonics_basis
-from dyngs.ops.hash_grid import HashLevels, hash_features, known_features
+from dyngs.ops.hash_grid import HashLevels, hash_features, select_features
 from dyngs.ops.rays import Rays, Space, Steps, composite, march
 
 # Features of hidden layers, and of the density network's output, whose first is the density
@@ -175,7 +175,7 @@ class NgpField(Field):
                 samples, which = reached_samples(densities, marched)
             else:
                 samples, which = thinned_samples(densities, marched, shifts[:, 1])
-        features = known_features(features, which, samples.coords, table, self.levels)
+        features = select_features(features, which, samples.coords, table, self.levels)
         geometry = self._geometry(features, time)
         basis = harmonics_basis(rays.directions, DIRECTION_DEGREE)
         colours = self._colours(geometry, basis[samples.rays])
@@ -186,7 +186,7 @@ class NgpField(Field):
         coords = self.space.unit(points)
         return self._density(self._geometry(self._features(coords), time), coords)
 
-    def may_hold(self, points: Tensor) -> Tensor:
+    def may_be_occupied(self, points: Tensor) -> Tensor:
         """See ``Field``: what lies in occupied cells, or beyond the innermost cube."""
         n = self.space.cells
         middle = points.new_tensor(self.space.centre)
@@ -245,7 +245,7 @@ def shapes(model: NgpModel, space: Space, pixels: int) -> dict[str, tuple[int, i
     return found
 
 
-def seen_cells(space: Space, views: Sequence[View]) -> Tensor:
+def cells_in_view(space: Space, views: Sequence[View]) -> Tensor:
     """Return bool of ``space.shape``: cells of which a view sees a part, outside of the next
     smaller cube."""
     seen = np.zeros(space.shape, dtype=bool)
@@ -320,7 +320,7 @@ class NgpTraining(FieldTraining):
     def _find_seen_cells(self) -> None:
         """Find the cells that may be occupied at all; nothing was found in any yet."""
         space = self._field.space
-        seen = seen_cells(space, self._run.capture.splits["train"])
+        seen = cells_in_view(space, self._run.capture.splits["train"])
         if not bool(seen.any()):
             raise DyngsError(
                 f"{self._run.config.data.root}: no training camera sees anything of the cube that the field lies in: "

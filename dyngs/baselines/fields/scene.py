@@ -129,7 +129,7 @@ class Field(ABC):
         """Return (M, 3) colours of points (M, 3) of the world, seen along unit directions (M,
         3)."""
 
-    def may_hold(self, points: Tensor) -> Tensor:
+    def may_be_occupied(self, points: Tensor) -> Tensor:
         """Return (M,) bool: whether there may be anything at points (M, 3) of the world, before
         looking."""
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
@@ -201,7 +201,7 @@ class FieldScene(Renderable):
     surface_options: ClassVar[frozenset[str]] = frozenset({"level", "cells"})
 
     def own_surface(self, time: float, options: SurfaceOptions) -> Surface:
-        return surface_of(self, time, options.level, options.cells)
+        return extract_surface(self, time, options.level, options.cells)
 
     @property
     def times(self) -> tuple[float, ...]:
@@ -263,7 +263,7 @@ class FieldScene(Renderable):
         return colour.view(*shape, 3), through.view(shape), depth.view(shape)
 
 
-def restored_scene(
+def restore_scene(
     field_class: type[Field], model: FieldModel, checkpoint: Checkpoint
 ) -> FieldScene:
     """Return the scene of a checkpoint. Raises KeyError or ValueError where its tensors do not
@@ -344,7 +344,7 @@ def _cascades(capture: Capture, middle: np.ndarray, half: float) -> int:
 
 
 @torch.no_grad()
-def surface_of(
+def extract_surface(
     scene: FieldScene, time: float = 0.0, level: float | None = None, cells: int | None = None
 ) -> Surface:
     """Return the surface in the innermost cube at ``time``.
@@ -395,7 +395,7 @@ def _densities(scene: FieldScene, time: float, cells: int) -> Tensor:
     x, y, z = torch.meshgrid(*(axis + middle for middle in space.centre), indexing="ij")
     points = torch.stack([x, y, z], -1).view(-1, 3)
     found = torch.zeros(len(points), device="cpu")
-    for which in scene.field.may_hold(points).nonzero()[:, 0].split(POINTS):
+    for which in scene.field.may_be_occupied(points).nonzero()[:, 0].split(POINTS):
         found[which] = scene.field.densities(points[which], time)
     found = found.view(x.shape)
     inner = torch.zeros_like(found)

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.baselines.fields.scene import NEAR, Field, FieldScene, restored_scene, space_of
+from dyngs.baselines.fields.scene import NEAR, Field, FieldScene, restore_scene, space_of
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import State, prefixed
 from dyngs.data.loader import Image
@@ -150,7 +150,7 @@ class FieldTraining(Model[FieldScene]):
         return self._scene.state() | prefixed("adam", self._adam.state())
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        self._learn(restored_scene(type(self._scene.field), self._model, checkpoint))
+        self._learn(restore_scene(type(self._scene.field), self._model, checkpoint))
         parameters = self._scene.field.parameters
         self._adam = AdamState.restored(checkpoint.part("adam"), parameters)
 

@@ -60,7 +60,7 @@ class BgTriangleKind(ModelKind):
     def functions(self) -> tuple[Start, Restore]:
         from dyngs.baselines.triangles import scene, training
 
-        return training.TriangleTraining, scene.restored_scene
+        return training.TriangleTraining, scene.restore_scene
 
 
 BG_TRIANGLE = BgTriangleKind(BgTriangleModel)

@@ -40,7 +40,7 @@ from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.patches import (
     NUM_POINTS,
     SEGMENTS,
-    Places,
+    PatchSamples,
     blend_patches,
     lattice,
     lattice_size,
@@ -248,13 +248,13 @@ class TriangleScene(Renderable):
 
     def drawn(
         self, camera: Cameras, options: TriangleOptions, background: Tensor | None = None
-    ) -> tuple[Rendering, Places]:
+    ) -> tuple[Rendering, PatchSamples]:
         """Return the image of one camera, differentiable, and what each drawn pixel shows."""
         times = options.supersampling
         patches = self.patches
         camera = camera.to(device=self.device)
         fine = camera.scaled(times)
-        places = Places.of(
+        places = PatchSamples.of(
             *visible_patches(patches.points.detach(), fine, options.near, options.segments)
         )
         at = project_points(
@@ -292,7 +292,7 @@ def scene_options(model: BgTriangleModel, unit: float) -> TriangleOptions:
     return TriangleOptions(near=NEAR * unit, supersampling=model.supersampling)
 
 
-def restored_scene(model: BgTriangleModel, checkpoint: Checkpoint) -> TriangleScene:
+def restore_scene(model: BgTriangleModel, checkpoint: Checkpoint) -> TriangleScene:
     """Return the scene of a checkpoint. Raises KeyError or ValueError where its tensors do not
     fit."""
     stored = checkpoint.part("triangles")

@@ -20,7 +20,7 @@ from dyngs.baselines.triangles.scene import (
     evaluated,
     flat_triangles,
     quarters,
-    restored_scene,
+    restore_scene,
     scene_options,
 )
 from dyngs.config import DefaultStrategy, ShColour
@@ -35,22 +35,22 @@ from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.training import ColourTraining
 from dyngs.gaussians.model import GaussianModel, SceneTraining
 from dyngs.gaussians.optimizer import AdamState
-from dyngs.gaussians.start import (
-    StartValues,
-    densifier_of,
-    first_gaussians,
+from dyngs.gaussians.initialization import (
+    InitialValues,
+    build_densifier,
+    load_or_create_gaussians,
     initial_gaussians,
     surroundings,
 )
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.gaussians.surface import colours_of, fused, opaque_box, seen_by, simplified
+from dyngs.gaussians.surface import colours_of, fused, opaque_box, seen_by, simplify_mesh
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Model, Updated
 from dyngs.models.schedule import scaled
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.loss import l1_ssim_loss
-from dyngs.ops.patches import NUM_POINTS, Places, lattice, lattice_size
+from dyngs.ops.patches import NUM_POINTS, PatchSamples, lattice, lattice_size
 
 NUM_FIRST = 2000  # Triangles that a run begins with, at most
 RADIUS = 1.5  # Of the first triangles, in mean distances of their points' three nearest neighbours
@@ -64,7 +64,7 @@ SURFACE_CELLS = 128  # Along the scene, at most; no more than pixels along an im
 
 def _at_points(run: RunStart, model: BgTriangleModel) -> tuple[Patches, float]:
     """Return triangles turned at random, and half the side of the scene."""
-    values = StartValues(max_gaussians=min(NUM_FIRST, model.max_triangles))
+    values = InitialValues(max_gaussians=min(NUM_FIRST, model.max_triangles))
     first = initial_gaussians(surroundings(run.capture), run.config.init, values, 0, run.generator)
     ends = first.means.quantile(torch.tensor([INNER, 1 - INNER], device="cpu"), dim=0)
     unit = float((ends[1] - ends[0]).max()) / 2
@@ -104,7 +104,7 @@ def _on_surface(run: RunStart, model: BgTriangleModel) -> tuple[Patches, float]:
     low, high = opaque_box(scene.gaussians)
     cells = min(SURFACE_CELLS, max(max(one.depth.shape) for one in seen))
     mesh = fused(seen, low, high, cells)
-    mesh = None if mesh is None else simplified(mesh, min(NUM_FIRST, model.max_triangles))
+    mesh = None if mesh is None else simplify_mesh(mesh, min(NUM_FIRST, model.max_triangles))
     if mesh is None or len(mesh.faces) == 0:
         raise DyngsError(
             f"{run.config.data.root}: {steps} steps of Gaussians show no surface for triangles to begin on: give more "
@@ -129,9 +129,9 @@ def _trained_gaussians(run: RunStart, steps: int) -> GaussianModel:
     }
     own = config.model_copy(update=changed)
     start = replace(run, config=own, asked=own)
-    scene = StaticScene(gaussians=first_gaussians(start))
+    scene = StaticScene(gaussians=load_or_create_gaussians(start))
     colour = ColourTraining(ShColour())
-    model = GaussianModel(start, scene, SceneTraining(), densifier_of(start), colour)
+    model = GaussianModel(start, scene, SceneTraining(), build_densifier(start), colour)
     order = torch.randint(len(run.images), (steps,), generator=run.generator, device="cpu")
     for step, index in enumerate(order.tolist(), 1):
         image = _shrunk(run.images[index])
@@ -158,7 +158,7 @@ CELLS = 6  # Cells along u and v of a triangle that were seen or not
 FAINTEST_EDGE = 0.2  # Slopes of an image below this are no edges
 
 
-class Tallies:
+class TriangleStatistics:
     """Sums over the views that were trained on since ``views`` was 0.
 
     Attributes:
@@ -179,11 +179,11 @@ class Tallies:
     def tensors(self) -> dict[str, Tensor]:
         return dict(vars(self))
 
-    def add(self, other: Tallies) -> None:
+    def add(self, other: TriangleStatistics) -> None:
         for name, x in self.tensors().items():
             x += other.tensors()[name]
 
-    def count(self, places: Places, slopes: Tensor) -> None:
+    def count(self, places: PatchSamples, slopes: Tensor) -> None:
         """Take in what a view shows, whose image has ``slopes`` (H, W)."""
         ids = places.ids.long()
         size = len(self.seen)
@@ -204,16 +204,16 @@ class Tallies:
         return with_role(self.tensors(), Role.TRAINING)
 
     @staticmethod
-    def restored(stored: Mapping[str, Tensor], count: int) -> Tallies:
+    def restored(stored: Mapping[str, Tensor], count: int) -> TriangleStatistics:
         """Return the tallies of ``count`` triangles in a state. Raises KeyError or ValueError."""
-        found = Tallies(count)
+        found = TriangleStatistics(count)
         for name, x in found.tensors().items():
             x.copy_(require_tensor(name, stored[name], tuple(x.shape)))
         return found
 
 
 @torch.no_grad()
-def most_pixels(scene: TriangleScene, cameras: Iterable[Cameras]) -> Tensor:
+def max_pixels(scene: TriangleScene, cameras: Iterable[Cameras]) -> Tensor:
     """Return (P,) the pixels that each triangle has in the view of ``cameras``, one each, that
     shows most of it."""
     most = torch.zeros(len(scene), device="cpu")
@@ -224,7 +224,7 @@ def most_pixels(scene: TriangleScene, cameras: Iterable[Cameras]) -> Tensor:
     return most
 
 
-def outlines(places: Places) -> Tensor:
+def outlines(places: PatchSamples) -> Tensor:
     """Return (N,) bool: which places lie within two drawn pixels of an outline, see
     ``blend_patches``."""
     rows = places.rows[0]
@@ -237,7 +237,7 @@ def outlines(places: Places) -> Tensor:
     return max_pool2d(differs[None, None], 3, 1, 1)[0, 0][drawn] > 0
 
 
-def slopes_of(image: Tensor) -> Tensor:
+def image_gradients(image: Tensor) -> Tensor:
     """Return (H, W): mean size of the slopes of ``image`` (H, W, 3) by Prewitt's operator; faint
     ones are 0."""
     across = torch.tensor([[-1.0, 0, 1]] * 3, device="cpu") / 3
@@ -259,7 +259,7 @@ ENLARGED = 1.1  # children, about their middles
 CELLS_OF_TRIANGLE = CELLS * (CELLS + 1) // 2  # of the square's cells those that a triangle has
 
 
-def areas_of(points: Tensor) -> Tensor:
+def patch_areas(points: Tensor) -> Tensor:
     """Return (P,) areas of the four flat triangles between corners and middles of the edges, world
     units squared."""
     places, faces = lattice(2)
@@ -267,14 +267,14 @@ def areas_of(points: Tensor) -> Tensor:
     return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=-1).sum(1)
 
 
-def useless(points: Tensor, tallies: Tallies, unit: float) -> Tensor:
+def useless(points: Tensor, tallies: TriangleStatistics, unit: float) -> Tensor:
     """Return (P,) bool: rarely seen, tiny, needles, mostly hidden, or seen only as slivers between
     others."""
     corners = points[:, CORNERS]
     sides = (corners.amax(1) - corners.amin(1)).sort(1).values
     return (
         (tallies.seen / tallies.views.clamp_min(1) < RARELY)
-        | (areas_of(points) < SMALLEST * unit**2)
+        | (patch_areas(points) < SMALLEST * unit**2)
         | (sides[:, 2] / sides[:, 1].clamp_min(1e-12) > LONGEST)
         | ((tallies.cells > 0).sum(1) < HIDDEN * CELLS_OF_TRIANGLE)
         | (tallies.cells.sum(1) < SLIVER * tallies.seen)
@@ -283,7 +283,7 @@ def useless(points: Tensor, tallies: Tallies, unit: float) -> Tensor:
 
 
 def change(
-    patches: Patches, tallies: Tallies, unit: float, most: int, rounds: int
+    patches: Patches, tallies: TriangleStatistics, unit: float, most: int, rounds: int
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return (K,) the rows that stay, and the rows of each learned tensor that come after them.
 
@@ -302,7 +302,7 @@ def change(
         gone = torch.zeros_like(gone)
     left = int((~gone).sum())
     wanted = -(-max(0, most - left) // (3 * max(1, rounds)))
-    may = ~gone & (areas_of(points) > SMALLEST_SPLIT * unit**2)
+    may = ~gone & (patch_areas(points) > SMALLEST_SPLIT * unit**2)
     count = min(wanted, max(0, most - left) // 3, int(may.sum()))
     gradient = tallies.gradients / tallies.views.clamp_min(1)
     edges = tallies.edges / (tallies.seen + 1)
@@ -364,8 +364,8 @@ class TriangleTraining(Model[TriangleScene]):
     def _learn(self, patches: Patches) -> None:
         leaves = {name: x.detach().requires_grad_() for name, x in patches.tensors.items()}
         self._scene = replace(self._scene, patches=replace(patches, **leaves))
-        self._tallies = Tallies(len(patches))
-        self._now = Tallies(len(patches))
+        self._tallies = TriangleStatistics(len(patches))
+        self._now = TriangleStatistics(len(patches))
 
     @property
     def scene(self) -> TriangleScene:
@@ -395,7 +395,7 @@ class TriangleTraining(Model[TriangleScene]):
         options = replace(self._scene.options, depth="expected" if depth else "none")
         rendering, places = self._scene.drawn(image.cameras, options, background)
         if not self.is_textured:
-            self._now.count(places, slopes_of(image.composite(background)))
+            self._now.count(places, image_gradients(image.composite(background)))
         return Drawn(rendering)
 
     def tallies(self, step: int) -> Sequence[Tensor]:
@@ -407,7 +407,7 @@ class TriangleTraining(Model[TriangleScene]):
         if not self.is_textured and grad is not None:
             self._now.gradients += grad.norm(dim=-1).sum(1) * self._now.views
             self._tallies.add(self._now)
-            self._now = Tallies(len(patches))
+            self._now = TriangleStatistics(len(patches))
         rates = self._rates(step)
         updates = [self._adam.update(name, x, rates[name]) for name, x in patches.tensors.items()]
         bad = self._adam.steps_(updates, step=step)
@@ -452,7 +452,7 @@ class TriangleTraining(Model[TriangleScene]):
     def _finished(self, bad: Tensor | int) -> Updated:
         """Remove what no training view shows."""
         images = self._run.images
-        shown = most_pixels(self._scene, (images[i].cameras for i in range(len(images))))
+        shown = max_pixels(self._scene, (images[i].cameras for i in range(len(images))))
         count = len(shown)
         stays = shown >= LEAST_SHOWN
         if bool(stays.all()) or not bool(stays.any()):
@@ -488,11 +488,11 @@ class TriangleTraining(Model[TriangleScene]):
 
     def restore(self, checkpoint: Checkpoint) -> None:
         self._awaits_surface = False
-        self._scene = restored_scene(self._model, checkpoint)
+        self._scene = restore_scene(self._model, checkpoint)
         patches = self._scene.patches
         self._learn(patches)
         self._adam = AdamState.restored(checkpoint.part("adam"), patches.tensors)
-        self._tallies = Tallies.restored(checkpoint.part("tallies"), len(patches))
+        self._tallies = TriangleStatistics.restored(checkpoint.part("tallies"), len(patches))
 
     def place(self, device: torch.device) -> None:
         if device.type != "cpu":

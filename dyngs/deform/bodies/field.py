@@ -18,7 +18,7 @@ from dyngs.core.tensor_checks import require_indices, require_positive, require_
 from dyngs.deform.field import DeformationField, Offsets, OuterField, chosen
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import Parameters
-from dyngs.ops.harmonics import dimmed, light_harmonics
+from dyngs.ops.harmonics import dim_harmonics, light_harmonics
 from dyngs.ops.nodes import SPAN, spline_motion
 from dyngs.ops.quaternions import identity_quat, rotate
 
@@ -29,7 +29,7 @@ size and softness."""
 PENUMBRA, GRAZING = 0.2, 0.3
 
 
-def light_left(
+def light_fraction(
     points: Tensor, labels: Tensor, places: Tensor, radii: Tensor, sun: Tensor, shade: Tensor
 ) -> Tensor:
     """Return the (N,) parts of the light that reach ``points`` (N, 3) around balls; differentiable
@@ -63,7 +63,7 @@ TEACHES = 8  # Every so many-th Gaussian says what the few numbers of shadows sh
 
 
 @dataclass(frozen=True)
-class BodyRest:
+class BodyRestPose:
     """Where bodies lie when they are at rest, and which Gaussians are theirs."""
 
     centers: Tensor  # (B, 3)
@@ -82,7 +82,7 @@ class BodyField(OuterField):
     """
 
     def __init__(
-        self, others: DeformationField, rest: BodyRest, learned: Mapping[str, Tensor]
+        self, others: DeformationField, rest: BodyRestPose, learned: Mapping[str, Tensor]
     ) -> None:
         """Take the control points ``places`` (B, P, 3) and ``quats`` (B, P, 4) of the bodies'
         splines, and others.
@@ -145,14 +145,14 @@ class BodyField(OuterField):
         places = self.poses(time)[0].detach()
         balls = places, self.rest.radii, self.parameters["sun"], self.parameters["shade"]
         with torch.no_grad():
-            left = light_left(means, labels, *balls)
-        few = light_left(means[::TEACHES], labels[::TEACHES], *balls)
+            left = light_fraction(means, labels, *balls)
+        few = light_fraction(means[::TEACHES], labels[::TEACHES], *balls)
         return super().shaded(
-            gaussians.replace(sh=dimmed(gaussians.sh, left, few, TEACHES)), rows, which, time
+            gaussians.replace(sh=dim_harmonics(gaussians.sh, left, few, TEACHES)), rows, which, time
         )
 
-    def rest_outside_(self, window: tuple[float, float]) -> None:
-        super().rest_outside_(window)
+    def zero_gradients_outside_(self, window: tuple[float, float]) -> None:
+        super().zero_gradients_outside_(window)
         for points in (self.parameters["places"], self.parameters["quats"]):
             pieces = points.shape[1] - SPAN + 1
             first = math.ceil(window[0] * pieces) + 1
@@ -187,7 +187,7 @@ class BodyField(OuterField):
             name: centers.new_zeros(len(centers), points, size)
             for name, size in (("places", 3), ("quats", 4))
         }
-        field = BodyField(others, BodyRest(centers, radii, labels), like)
+        field = BodyField(others, BodyRestPose(centers, radii, labels), like)
         field.parameters = field.parameters.restored(learned)
         return field
 
@@ -197,7 +197,7 @@ class BodyField(OuterField):
         return field
 
 
-def bodies_of(field: DeformationField | None) -> BodyField | None:
+def find_body_field(field: DeformationField | None) -> BodyField | None:
     """Return the field of bodies among ``field`` and those within it; None where there is none."""
     while isinstance(field, OuterField) and not isinstance(field, BodyField):
         field = field.others

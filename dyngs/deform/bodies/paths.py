@@ -21,7 +21,7 @@ from torch import Tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.data.times import static_cameras
-from dyngs.deform.fixed_cameras.hulls import shadows
+from dyngs.deform.fixed_cameras.hulls import detect_shadows
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, Shader, render
 
@@ -43,7 +43,7 @@ class FrameStack:
     images: np.ndarray  # (T, H, W, 3) float32
     still: np.ndarray  # (T, H, W, 3) float32, as the static model has them
     alphas: np.ndarray  # (T, H, W) of the images; of the static model where they have none
-    still_alphas: np.ndarray  # (T, H, W) of the static model
+    static_alphas: np.ndarray  # (T, H, W) of the static model
     depths: np.ndarray  # (T, H, W) of the static model, ``NEVER`` where it is not solid
     poses: np.ndarray  # (T, 4, 4) world to camera
     intrinsics: np.ndarray  # (T, 3, 3)
@@ -91,12 +91,12 @@ class FrameStack:
 
         In colour or in alpha. What is darker alike in all channels may be a shadow and counts less.
         """
-        weight = np.where(shadows(self.images, self.still), np.float32(SHADE), np.float32(1))
+        weight = np.where(detect_shadows(self.images, self.still), np.float32(SHADE), np.float32(1))
         colors = np.clip(_apart(self.images, self.still) / TOLERANCE, 0, 1) * weight
-        outlines = _apart(self.alphas[..., None], self.still_alphas[..., None]) / ALPHA_TOLERANCE
+        outlines = _apart(self.alphas[..., None], self.static_alphas[..., None]) / ALPHA_TOLERANCE
         return np.maximum(colors, np.clip(outlines, 0, 1))
 
-    def on_ball(
+    def ball_pixels(
         self, index: int, center: np.ndarray, radius: float, reach: float = 0.92
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return rows, columns and (n, 3) outward normals of the pixels of one image that see a
@@ -146,7 +146,7 @@ def one_camera(views: Sequence[View]) -> list[int] | None:
 
 
 @torch.no_grad()
-def frame_stack_of(
+def render_frame_stack(
     images: Iterable[Image],
     still: Gaussians,
     options: RenderOptions,
@@ -286,7 +286,7 @@ class Discs:
         return np.stack([x[best] + 0.5, y[best] + 0.5, self.radii[k[best]]], axis=1)
 
 
-def found_paths(shots: FrameStack, maps: np.ndarray) -> list[Path]:
+def find_paths(shots: FrameStack, maps: np.ndarray) -> list[Path]:
     """Return paths that things may move along where ``maps`` (T, H, W) are marked, the most likely
     first.
 
@@ -308,10 +308,10 @@ def found_paths(shots: FrameStack, maps: np.ndarray) -> list[Path]:
     return found
 
 
-def clear_(maps: np.ndarray, shots: FrameStack, path: Path) -> None:
+def clear_path_(maps: np.ndarray, shots: FrameStack, path: Path) -> None:
     """Set ``maps`` (T, H, W) to 0 where the thing on ``path`` is seen, and a little around it."""
     for i, center in enumerate(path.centers):
-        rows, columns, _ = shots.on_ball(i, center, 1.2 * path.radius, 1.0)
+        rows, columns, _ = shots.ball_pixels(i, center, 1.2 * path.radius, 1.0)
         maps[i, rows, columns] = 0
 
 

@@ -51,7 +51,7 @@ class FixedCameraClip:
     median: np.ndarray  # (H, W, 3) uint8, what is still
 
 
-def fixed_camera_clip(
+def build_fixed_camera_clip(
     images: Iterable[Image], background: Tensor, total: int = 1
 ) -> FixedCameraClip:
     """Return the frames of one camera that stands still, on the CPU."""
@@ -102,7 +102,7 @@ def changes(images: np.ndarray) -> np.ndarray:
     )
     found = np.zeros(apart.shape, bool)
     for i, (difference, image) in enumerate(zip(apart, values, strict=True)):
-        differs = (difference > threshold) & ~shadows(image, median)
+        differs = (difference > threshold) & ~detect_shadows(image, median)
         differs = ndimage.binary_closing(np.pad(differs, 2), iterations=1)[2:-2, 2:-2]
         found[i] = _without_specks(
             np.asarray(ndimage.binary_fill_holes(differs)), difference / threshold
@@ -124,7 +124,7 @@ def _without_specks(differs: np.ndarray, certainty: np.ndarray) -> np.ndarray:
     return kept[labels]
 
 
-def shadows(image: np.ndarray, still: np.ndarray) -> np.ndarray:
+def detect_shadows(image: np.ndarray, still: np.ndarray) -> np.ndarray:
     """Return (..., H, W) bool: as ``still`` but darker, all channels alike (after Horprasert et al.
     1999)."""
     left = (image + _DARK) / (still + _DARK)
@@ -249,7 +249,7 @@ def silhouettes_at(clips: Sequence[FixedCameraClip], time: float) -> list[Change
     return found
 
 
-def blobs_in(views: Sequence[ChangedRegion], low: np.ndarray, high: np.ndarray) -> list[Blob]:
+def extract_blobs(views: Sequence[ChangedRegion], low: np.ndarray, high: np.ndarray) -> list[Blob]:
     """Return the connected parts of the visual hull of what ``views`` see to change, in the box
     ``low`` to ``high``."""
     if len(views) < 2:

@@ -43,7 +43,7 @@ class Sphere:
 Region = Box | Sphere
 
 
-def region_of(words: Sequence[str]) -> Region:
+def parse_region(words: Sequence[str]) -> Region:
     """Return what ``--crop`` names: "x,y,z x,y,z" (box), or "x,y,z RADIUS" (sphere).
 
     Raises DyngsError: none of these.
@@ -69,7 +69,7 @@ def region_of(words: Sequence[str]) -> Region:
     return Sphere(first, radius)
 
 
-def held_by(region: Region, scene: GaussianScene, world: Similarity) -> Tensor:
+def gaussians_in_region(region: Region, scene: GaussianScene, world: Similarity) -> Tensor:
     """Return (N,) bool which Gaussians have their centre in ``region``, at one training time or
     more.
 

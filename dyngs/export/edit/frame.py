@@ -88,7 +88,7 @@ def direction(text: str) -> Point | str:
     return found
 
 
-def scale_of(text: str) -> float:
+def parse_scale(text: str) -> float:
     """Return the factor that ``--scale`` names: itself, or "x,y,z x,y,z LENGTH", two points of the
     scene and what their distance is to be. Raises DyngsError."""
     words = text.split()
@@ -156,7 +156,7 @@ def _residuals(
     return residuals, f"{found}; residuals {each}; root mean square {mean:.3g}"
 
 
-def geo_frame(path: Path) -> GeoFrame:
+def control_point_frame(path: Path) -> GeoFrame:
     """Return the frame of control points. Raises DyngsError: no such file, or they do not determine
     it."""
     points, world = np.split(_control_points(path), 2, axis=1)
@@ -217,7 +217,7 @@ def gps_frame(opened: Opened) -> GeoFrame:
     found = []
     views = [v for v in all_views(opened.capture.splits) if v.image_path is not None]
     for view in views:
-        position = position_of(view.image_path)
+        position = read_gps_position(view.image_path)
         if position is not None:
             found.append((position, -view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3]))
     if len(found) < FEWEST:
@@ -253,7 +253,7 @@ def gps_frame(opened: Opened) -> GeoFrame:
     return GeoFrame(similarity, notes)
 
 
-def position_of(path: Path) -> Point | None:
+def read_gps_position(path: Path) -> Point | None:
     """Return latitude, longitude (degrees) and altitude (m) that EXIF of a photo states; None: not
     all of them."""
     from PIL import Image

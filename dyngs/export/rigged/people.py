@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dyngs.core.conventions import SH_C0
 from dyngs.core.errors import DyngsError
-from dyngs.export.rigged.surface import fitted_surface
+from dyngs.export.rigged.surface import fit_surface
 from dyngs.export.rigged.texture import (
     SEEN,
     bake_texels,
@@ -28,7 +28,7 @@ from dyngs.export.rigged.texture import (
     texture_image,
 )
 from dyngs.human.avatar.posing import Anchors, Skeleton, heaviest_joints
-from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.human.avatar.scene import HumanScene, as_human_scene
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body import BodyTemplate, apply_shape
 from dyngs.human.body.body_reader import load_template
@@ -48,7 +48,7 @@ from dyngs.io.formats.splat_file import SplatFile, require_writable
 from dyngs.io.gltf import INDICES, VERTICES, GlbDocument
 from dyngs.io.write import atomic_file
 from dyngs.models.kind import HasBody, capability
-from dyngs.ops.quaternions import shorter_ways
+from dyngs.ops.quaternions import align_quat_signs
 from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.folder import inputs_of
 
@@ -142,14 +142,14 @@ class Rig:
         return moved
 
 
-def rig_of(scene: HumanScene, vertices: Tensor) -> Rig:
+def build_rig(scene: HumanScene, vertices: Tensor) -> Rig:
     """Return the rig of a person whose surface at rest has ``vertices`` (V, 3), m."""
     scale = float(scene.clip.scale.mean()) * float(np.exp(scene.fit.log_scale))
     return Rig(scene.learned_skeleton, scale, -scale * float(vertices[:, 1].amin()))
 
 
 @dataclass(frozen=True)
-class Played:
+class AnimationInfo:
     """The motion that a file shows: its name and frame rate; the run plays it."""
 
     name: str
@@ -162,7 +162,7 @@ def add_animation(
     rig: Rig,
     vertices: Tensor,
     weights: Tensor,
-    played: Played,
+    played: AnimationInfo,
 ) -> None:
     """Add the motion that a person plays, y up, on the floor y = 0, around the origin, as an
     animation of the joints, which are the first nodes; joints that never turn have no channel.
@@ -172,7 +172,7 @@ def add_animation(
     """
     joints = rig.skeleton.joints
     parents = rig.skeleton.parents
-    clip = upright(scene.moves_as, scene.clip, joints)
+    clip = upright(scene.played_clip, scene.clip, joints)
     frames = torch.linspace(0, len(clip) - 1, min(len(clip), _FLOOR_FRAMES), device="cpu").long()
     lowest = []
     for row in frames.tolist():
@@ -184,7 +184,7 @@ def add_animation(
     root = root - np.array([middle[0], min(lowest), middle[2]])
     poses = clip.poses.double().numpy()
     quats = Rotation.from_rotvec(poses.reshape(-1, 3)).as_quat().reshape(*poses.shape[:2], 4)
-    quats = shorter_ways(quats)
+    quats = align_quat_signs(quats)
     scale = clip.scale.double().numpy() / rig.scale
     channels = [(0, "translation", root)]
     if np.abs(scale - 1).max() > _STILL:  # not of a person who keeps the size
@@ -248,7 +248,7 @@ _LARGEST = 2048  # texels along a side of the largest texture
 _MOST_SAMPLES = 512  # texels along a side of the atlas from which the surface is moved
 
 
-def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> tuple[str, ...]:
+def write_mesh(run: LoadedRun, path: Path, played: AnimationInfo | None = None) -> tuple[str, ...]:
     """Write the person of a run or avatar file as a skinned mesh with a texture, in T-pose, y up,
     facing +z; return a line about each thing that was chosen, or that glTF cannot hold.
 
@@ -266,10 +266,10 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> tupl
         baked = bake_texels(scene, texels, normals)
         image = texture_image(fill_unseen(baked, texels), texels)
         samples = atlas_texels(body, min(size // 2, _MOST_SAMPLES), vertices)
-        surface = fitted_surface(
+        surface = fit_surface(
             scene.gaussians, body, vertices, samples, bake_texels(scene, samples, normals)
         )
-        rig = rig_of(scene, surface.vertices)
+        rig = build_rig(scene, surface.vertices)
         document = mesh_document(body, rig, surface.vertices, image)
         if played is not None:
             add_animation(document, scene, rig, surface.vertices, body.weights, played)
@@ -293,7 +293,7 @@ def person_and_template(run: LoadedRun, wanted: str) -> tuple[HumanScene, BodyTe
 
     Raises DyngsError: the run is not that of a person, or the template cannot be read.
     """
-    scene = avatar_of(run.scene)
+    scene = as_human_scene(run.scene)
     model = run.config.model
     if scene is None or capability(model, HasBody) is None:
         raise DyngsError(
@@ -350,7 +350,7 @@ def mesh_document(body: BodyTemplate, rig: Rig, vertices: Tensor, image: np.ndar
 
 @torch.no_grad()
 def write_rigged_splats(
-    run: LoadedRun, path: Path, played: Played | None = None
+    run: LoadedRun, path: Path, played: AnimationInfo | None = None
 ) -> tuple[str, ...]:
     """Write the person of a run or avatar file at rest, with skinning weights: T-pose, y up, facing
     +z, soles at y = 0; return a line about each thing that the file cannot hold.
@@ -363,7 +363,7 @@ def write_rigged_splats(
     scene, body = person_and_template(run, "--joints")
     inputs_of(run).require_output(path)
     vertices = rest_vertices(scene, body)
-    rig = rig_of(scene, vertices)
+    rig = build_rig(scene, vertices)
     gaussians = scene.gaussians
     notes = ()
     if scene.colour is not None:

@@ -14,7 +14,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from dyngs.gaussians.colour.network import with_harmonics
+from dyngs.gaussians.colour.network import bake_harmonics
 from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.atlas import Texels
@@ -92,8 +92,8 @@ def frontal_colours(scene: HumanScene, normals: Tensor) -> Tensor:
         moment = upright.time_step(None)
         shader = upright.shader(moment)
         if shader is not None:
-            gaussians = with_harmonics(moment.gaussians, shader).gaussians
-        posing = frame_pose(upright.moves_as, 0)
+            gaussians = bake_harmonics(moment.gaussians, shader).gaussians
+        posing = frame_pose(upright.played_clip, 0)
         skeleton = scene.learned_skeleton
         joints = joint_transforms(skeleton.joints, skeleton.parents, posing.rotations)
         linear = blend_transforms(scene.weights, joints)[..., :3]

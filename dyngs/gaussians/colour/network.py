@@ -37,7 +37,7 @@ ROUNDS = 3
 Shown = tuple[Image, Rendering]  # An image, and the rendering of its one view
 
 
-def recoloured(affine: Tensor, image: Image, rendering: Rendering, background: Tensor) -> Tensor:
+def apply_affine_colour(affine: Tensor, image: Image, rendering: Rendering, background: Tensor) -> Tensor:
     """Return (H, W, 3) a rendering as the camera of ``image`` would have made it.
 
     Where the image has alpha, the background was not in front of the camera and keeps its colour.
@@ -61,7 +61,7 @@ def recoloured(affine: Tensor, image: Image, rendering: Rendering, background: T
 
 
 @torch.no_grad()
-def fitted_affine(
+def fit_affine_colour(
     shown: Sequence[Shown], background: Tensor, counts: Tensor | None = None
 ) -> Tensor:
     """Return (3, 4) M, one for all, that brings renderings closest to their images: least squares
@@ -139,7 +139,7 @@ def _sums(image: Image, rendering: Rendering, background: Tensor, counts: Tensor
 
 
 @dataclass(frozen=True)
-class RestFrame:
+class RestPose:
     """Rest pose of a moving body, which its colours follow."""
 
     places: Tensor  # (N, 3) centres of the drawn Gaussians at rest
@@ -152,10 +152,10 @@ class ColourNetwork:
 
     layers: tuple[Layer, ...]
     box: Tensor  # (2, 3) centre and half sides of the scene, world units
-    sees_time: bool
+    uses_time: bool
     # the cosine between the shortest axis of the Gaussian and the direction, and the direction
     # mirrored at that axis, are inputs
-    sees_normals: bool
+    uses_normals: bool
 
     @property
     def num_values(self) -> int:
@@ -166,13 +166,13 @@ class ColourNetwork:
     def state(self) -> State:
         tensors = {
             "box": self.box,
-            "sees": torch.tensor([self.sees_time, self.sees_normals], device="cpu"),
+            "sees": torch.tensor([self.uses_time, self.uses_normals], device="cpu"),
         }
         for i, layer in enumerate(self.layers):
             tensors |= {f"weight{i}": layer.weight.detach(), f"bias{i}": layer.bias.detach()}
         return with_role(tensors, Role.SHARED)
 
-    def shader(self, time: float | None, frame: RestFrame | None = None) -> Shader:
+    def shader(self, time: float | None, frame: RestPose | None = None) -> Shader:
         """Return the shader at ``time`` (clamped to [0, 1], None is 0); ``frame`` for Gaussians on
         a body."""
 
@@ -191,7 +191,7 @@ class ColourNetwork:
         center: Tensor,
         drawn: Tensor,
         time: float | None,
-        frame: RestFrame | None,
+        frame: RestPose | None,
     ) -> Tensor:
         """Return (N, 3) colours seen from ``center``; zero, and not computed, for those that are
         not ``drawn`` (N,)."""
@@ -209,14 +209,14 @@ class ColourNetwork:
             self.box.to(dtype),
             None if frame is None else frame.places.to(dtype),
             None if frame is None else frame.turn.to(dtype),
-            moment if self.sees_time else None,
-            self.sees_normals,
+            moment if self.uses_time else None,
+            self.uses_normals,
         )
         shown = (base + perceptron(inputs, self.layers).to(dtype)).clamp_min(0)
         return shown.new_zeros(len(gaussians), 3).index_copy(0, rows, shown)
 
 
-def box_around(means: Tensor) -> Tensor:
+def robust_bounding_box(means: Tensor) -> Tensor:
     """Return (2, 3) centre and half sides of the box of ``means`` (N, 3) but their outer percent;
     no side is zero."""
     if not len(means):
@@ -233,25 +233,25 @@ def box_around(means: Tensor) -> Tensor:
     )
 
 
-def network_of(state: Mapping[str, Tensor]) -> ColourNetwork | None:
+def restore_colour_network(state: Mapping[str, Tensor]) -> ColourNetwork | None:
     """Return the network of a checkpoint, from the state of its colours; None where there is
     none."""
     count = sum(name.startswith("weight") for name in state)
     if not count:
         return None
-    sees_time, sees_normals = (
+    uses_time, uses_normals = (
         bool(x) for x in require_tensor("sees", state["sees"], (2,), torch.bool)
     )
     require_positive("box", require_tensor("box", state["box"], (2, 3), None)[1])
     layers = []
-    width = num_inputs(sees_time=sees_time, sees_normals=sees_normals)
+    width = num_inputs(uses_time=uses_time, uses_normals=uses_normals)
     for i in range(count):
         weight = require_tensor(
             f"weight{i}", state[f"weight{i}"], (3 if i == count - 1 else None, width), None
         )
         width = len(weight)
         layers.append(Layer(weight, require_tensor(f"bias{i}", state[f"bias{i}"], (width,), None)))
-    return ColourNetwork(tuple(layers), state["box"], sees_time, sees_normals)
+    return ColourNetwork(tuple(layers), state["box"], uses_time, uses_normals)
 
 
 DIRECTIONS = 96  # Number of directions from which colours are sampled; degree 3 has 16 terms
@@ -260,7 +260,7 @@ _FAR = 1e4  # Distance of the camera, in largest distances of a Gaussian from th
 
 
 @dataclass(frozen=True)
-class Baked:
+class BakedHarmonics:
     """Gaussians with harmonics, and the root mean squared error of their colours over all
     directions."""
 
@@ -269,7 +269,7 @@ class Baked:
 
 
 @torch.no_grad()
-def with_harmonics(gaussians: Gaussians, shader: Shader, degree: int = 3) -> Baked:
+def bake_harmonics(gaussians: Gaussians, shader: Shader, degree: int = 3) -> BakedHarmonics:
     """Return the Gaussians with the harmonics of ``degree`` that come nearest to the colours of
     ``shader``.
 
@@ -292,7 +292,7 @@ def with_harmonics(gaussians: Gaussians, shader: Shader, degree: int = 3) -> Bak
     error = math.sqrt(
         max(squares - float(explained), 0.0) / max(3 * DIRECTIONS * len(gaussians), 1)
     )
-    return Baked(gaussians.replace(sh=sh), error)
+    return BakedHarmonics(gaussians.replace(sh=sh), error)
 
 
 def sphere(count: int) -> Tensor:

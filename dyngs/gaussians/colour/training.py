@@ -47,16 +47,16 @@ class ViewDependence:
     offsets: Tensor  # (N, 3) colour to add to the base of the others
     # worth_all, worth_kept: dB on the held-out views that the harmonics of all, of the kept ones
     # bring
-    worth_all: float
-    worth_kept: float
+    gain_all: float
+    gain_kept: float
 
     def __str__(self) -> str:
         fraction = float(self.keeps.float().mean()) if len(self.keeps) else 0.0
         if fraction == 0:
-            return f"view dependence does not pay ({self.worth_all:+.2f} dB on held-out training views): none is stored"
+            return f"view dependence does not pay ({self.gain_all:+.2f} dB on held-out training views): none is stored"
         return (
-            f"view dependence pays for {fraction:.0%} of the Gaussians: {self.worth_kept:+.2f} dB on held-out training "
-            f"views (for all of them: {self.worth_all:+.2f} dB)"
+            f"view dependence pays for {fraction:.0%} of the Gaussians: {self.gain_kept:+.2f} dB on held-out training "
+            f"views (for all of them: {self.gain_all:+.2f} dB)"
         )
 
 
@@ -84,14 +84,14 @@ def find_view_dependent(
         (slope,) = torch.autograd.grad(_squared_error(view, means, half, options, background), half)
         worths -= slope
     without, with_all = (math.fsum(column) for column in zip(*errors, strict=True))
-    keeps = first_worthwhile(changes, worths, without, tolerance)
+    keeps = select_worthwhile(changes, worths, without, tolerance)
     kept = math.fsum(
         _squared_error(x, means, keeps.float(), options, background).item() for x in held_out
     )
     return ViewDependence(keeps, means, _decibels(without, with_all), _decibels(without, kept))
 
 
-def first_worthwhile(changes: Tensor, worths: Tensor, without: float, tolerance: float) -> Tensor:
+def select_worthwhile(changes: Tensor, worths: Tensor, without: float, tolerance: float) -> Tensor:
     """Return (N,) bool, the fewest rows, by descending ``changes``, that bring all but
     ``tolerance`` of the gain.
 
@@ -168,7 +168,7 @@ _HELD_OUT = 5  # Index, in each eight views, of the one that is held out
 
 
 @dataclass(frozen=True)
-class TrainingLooks:
+class MeasurementViews:
     """The training views as the scene is drawn for them now."""
 
     indices: Sequence[int]  # of the views that may be trained on
@@ -201,11 +201,11 @@ class ColourTraining:
         """Return whether training view ``index`` must not be trained on in ``step``."""
         return False
 
-    def measured(self, step: int, looks: Callable[[], TrainingLooks]) -> ViewDependence | None:
+    def measured(self, step: int, looks: Callable[[], MeasurementViews]) -> ViewDependence | None:
         """Measure, if due after ``step``, whose harmonics improve images; the others are dropped."""
         return None
 
-    def frozen_rest(self) -> Tensor | None:
+    def frozen_harmonics(self) -> Tensor | None:
         """Return (N,) bool, Gaussians whose harmonics stay zero but for the base colour; None: of
         none."""
         return None
@@ -238,11 +238,11 @@ class NetworkTraining(ColourTraining):
         box: Tensor,
         generator: torch.Generator,
         *,
-        sees_time: bool,
+        uses_time: bool,
     ) -> None:
         super().__init__(options)
-        self.options, self.steps, self.box, self.sees_time = options, steps, box, sees_time
-        inputs = num_inputs(sees_time=sees_time, sees_normals=True)
+        self.options, self.steps, self.box, self.uses_time = options, steps, box, uses_time
+        inputs = num_inputs(uses_time=uses_time, uses_normals=True)
         values = _start_values([inputs, *[options.width] * options.depth, 3], generator)
         self.parameters = Parameters(values, dict.fromkeys(values, options.lr))
 
@@ -252,7 +252,7 @@ class NetworkTraining(ColourTraining):
         layers = (
             Layer(self.parameters[f"weight{i}"], self.parameters[f"bias{i}"]) for i in range(count)
         )
-        return ColourNetwork(tuple(layers), self.box, self.sees_time, sees_normals=True)
+        return ColourNetwork(tuple(layers), self.box, self.uses_time, uses_normals=True)
 
     @property
     def learned(self) -> Parameters:
@@ -287,7 +287,7 @@ class AutoTraining(ColourTraining):
         """Return true for every eighth view, until the harmonics are measured on them."""
         return step <= self.measured_after and index in self.held_out
 
-    def measured(self, step: int, looks: Callable[[], TrainingLooks]) -> ViewDependence | None:
+    def measured(self, step: int, looks: Callable[[], MeasurementViews]) -> ViewDependence | None:
         if step != self.measured_after or not self.held_out:
             return None
         views = looks()
@@ -306,7 +306,7 @@ class AutoTraining(ColourTraining):
         """Keep the harmonics of the Gaussians ``frozen`` (N,) zero from now on."""
         self._frozen = None if bool(frozen.all()) else frozen
 
-    def frozen_rest(self) -> Tensor | None:
+    def frozen_harmonics(self) -> Tensor | None:
         return self._frozen
 
     def follow(self, edit: TopologyEdit) -> None:

@@ -21,7 +21,7 @@ from dyngs.core.state import part_of
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import render_options
-from dyngs.human.avatar.scene import HumanScene, avatar_of
+from dyngs.human.avatar.scene import HumanScene, as_human_scene
 from dyngs.human.body.body_reader import template_path
 from dyngs.human.keys import HumanModel
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
@@ -47,7 +47,7 @@ def write_avatar(person: Renderable, model: ModelSection, info: CheckpointInfo, 
     # late: scipy, which reading an avatar does without
     from dyngs.human.motion.placement import rest_clip
 
-    scene = avatar_of(person)
+    scene = as_human_scene(person)
     if scene is None or not isinstance(model, HumanModel):
         raise DyngsError(
             f"--format avatar needs the run of a person (model.kind=human), this one is {model.kind}"

@@ -20,7 +20,7 @@ from dyngs.human.avatar.posing import (
     BodyPose,
     Skeleton,
     frame_pose,
-    rest_offsets,
+    pose_blend_offsets,
 )
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.skinning import apply_transforms, blend_transforms, joint_transforms
@@ -288,7 +288,7 @@ def in_colours_of(
     def shown() -> Iterator[tuple[Image, BodyPose, Tensor]]:
         for image in images:
             pose = frame_pose(scene.clip, rows[image.frame or 0])
-            offsets = rest_offsets(anchors, pose, scene.shapes)
+            offsets = pose_blend_offsets(anchors, pose, scene.shapes)
             yield image, pose, anchors.points if offsets is None else anchors.points + offsets
 
     sh = scene.gaussians.sh.clone()

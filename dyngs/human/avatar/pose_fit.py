@@ -110,7 +110,7 @@ WINDOW, LEAST_GAIN, MOST_WINDOWS = 8, 0.02, 12
 by that share; a round ends below the last rate, or after so many windows."""
 
 
-def fitted_to_images(
+def fit_poses_to_images(
     scene: HumanScene,
     images: ImageLoader,
     background: Tensor,
@@ -127,7 +127,7 @@ def fitted_to_images(
     """
     groups = by_time(images, which)
     times = sorted(groups)
-    parts = [scene.moves_as.at(time) for time in times]
+    parts = [scene.played_clip.at(time) for time in times]
     poses, trans, scale = (
         torch.cat([getattr(x, name) for x in parts]) for name in ("poses", "trans", "scale")
     )
@@ -340,7 +340,7 @@ class PoseRefit:
 
     def _fitted(self, scene: HumanScene, which: list[int]) -> HumanScene:
         still = replace(scene, gaussians=scene.gaussians.detach())
-        return fitted_to_images(still, self._images, self._background, self._comparison, which)[0]
+        return fit_poses_to_images(still, self._images, self._background, self._comparison, which)[0]
 
     @torch.no_grad()
     def _psnr(self, scene: HumanScene, index: int) -> float:
@@ -359,5 +359,5 @@ class PoseRefit:
 def _joints(scene: HumanScene, time: float) -> Tensor:
     """Return the joints of the body (22, 3) at ``time``, in the world over the person's scale: m of
     the body."""
-    pose = frame_pose(scene.moves_as.at(time), 0)
+    pose = frame_pose(scene.played_clip.at(time), 0)
     return posed_joints(scene.learned_skeleton, pose)[: JOINT_NAMES.index("jaw")] / pose.scale

@@ -27,7 +27,7 @@ from dyngs.human.motion.motion import MotionClip
 from dyngs.ops.device import sent
 from dyngs.ops.harmonics import lit
 from dyngs.ops.posing import pose_by_joints
-from dyngs.ops.quaternions import quats_of, rotation_matrices
+from dyngs.ops.quaternions import quats_from_matrices, rotation_matrices
 
 # message of files that cannot hold it
 LEFT_OUT = "the learned light is left out: colours are those in even light"
@@ -154,12 +154,12 @@ def blended_rotations(weights: Tensor, transforms: Tensor) -> Tensor:
 
     Each has the sign in which it is nearer to that of the heaviest joint: their sum never vanishes.
     """
-    quats = quats_of(transforms[..., :3])
+    quats = quats_from_matrices(transforms[..., :3])
     signs = torch.where(quats @ quats.T < 0, -1.0, 1.0).to(weights)
     return rotation_matrices((weights * signs[weights.argmax(1)]) @ quats)
 
 
-def rest_offsets(
+def pose_blend_offsets(
     anchors: Anchors, posing: BodyPose, shapes: PoseBlendShapes | None
 ) -> Tensor | None:
     """Return the pose-dependent offsets (N, 3) at rest, m; None where the template has none."""
@@ -256,7 +256,7 @@ def texel_gaussians(
     opacity = torch.where(height == min(heights), _LOWEST_OPACITY, _UPPER_OPACITY)
     gaussians = Gaussians(
         means=anchors.points.clone(),
-        quats=quats_of(texels.frames)[rows],
+        quats=quats_from_matrices(texels.frames)[rows],
         log_scales=size.log()[:, None] + ratios,
         logit_opacities=(opacity / (1 - opacity)).log().to(size),
         sh=size.new_zeros(len(rows), num_sh_terms(sh_degree), 3),

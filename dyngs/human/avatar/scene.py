@@ -19,7 +19,7 @@ from dyngs.core.tensor_checks import (
 )
 from dyngs.data.capture import Capture, Split
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.colour.network import RestFrame
+from dyngs.gaussians.colour.network import RestPose
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.human.avatar.posing import (
@@ -37,7 +37,7 @@ from dyngs.human.avatar.posing import (
     learned_light,
     new_corrections,
     pose_gaussians,
-    rest_offsets,
+    pose_blend_offsets,
     skinning_weights,
 )
 from dyngs.human.body.joints import SMPLX_ROWS
@@ -94,7 +94,7 @@ class HumanScene(GaussianScene, Posable):
 
     @property
     def times(self) -> tuple[float, ...]:
-        return tuple(self.moves_as.times.tolist())
+        return tuple(self.played_clip.times.tolist())
 
     @property
     def is_static(self) -> bool:
@@ -149,7 +149,7 @@ class HumanScene(GaussianScene, Posable):
         return () if self.light is None else (LEFT_OUT,)
 
     @property
-    def moves_as(self) -> MotionClip:
+    def played_clip(self) -> MotionClip:
         """The clip that is played, with what was learned about the person applied."""
         if "clip" not in self._derived:
             poses = self.learned["poses"].detach()
@@ -170,7 +170,7 @@ class HumanScene(GaussianScene, Posable):
         kept = self._derived.get("posed")
         if kept is not None and not torch.is_grad_enabled():
             return replace(kept, time=now)
-        posed = self.in_pose(frame_pose(self.moves_as.at(now), 0), now)
+        posed = self.in_pose(frame_pose(self.played_clip.at(now), 0), now)
         if self.is_static and not torch.is_grad_enabled():
             self._derived["posed"] = posed
         return posed
@@ -179,13 +179,13 @@ class HumanScene(GaussianScene, Posable):
         """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable
         in the pose."""
         gaussians = self._posed(posing, self.weights, self.learned_skeleton, self.light)
-        frame = RestFrame(self.gaussians.means, posing.rotations[0])
+        frame = RestPose(self.gaussians.means, posing.rotations[0])
         return GaussianTimeStep(gaussians, time, frame)
 
     def _posed(
         self, posing: BodyPose, weights: Tensor, skeleton: Skeleton, light: Light | None
     ) -> Gaussians:
-        offsets = rest_offsets(self.anchors, posing, self.shapes)
+        offsets = pose_blend_offsets(self.anchors, posing, self.shapes)
         return pose_gaussians(self.gaussians, weights, skeleton, posing, offsets, light)
 
     def in_frame(self, row: int, given_weights: Tensor | None = None) -> tuple[Gaussians, BodyPose]:
@@ -320,7 +320,7 @@ def first_scene(
     )
 
 
-def avatar_of(scene: Renderable) -> HumanScene | None:
+def as_human_scene(scene: Renderable) -> HumanScene | None:
     """Return ``scene`` if it is a person, who can be posed; None for any other scene."""
     return scene if isinstance(scene, HumanScene) else None
 

@@ -11,9 +11,9 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.model import GaussianModel
-from dyngs.gaussians.scene import drawn_as_trained
-from dyngs.gaussians.schedule import rates_of
-from dyngs.gaussians.start import colours_of, densifier_of
+from dyngs.gaussians.scene import restore_appearance
+from dyngs.gaussians.schedule import rate_schedule
+from dyngs.gaussians.initialization import colours_of, build_densifier
 from dyngs.human.avatar.observations import in_colours_of
 from dyngs.human.avatar.pose_fit import PoseRefit
 from dyngs.human.avatar.posing import (
@@ -46,7 +46,7 @@ def start(run: RunStart) -> GaussianModel:
     model = config.model
     assert isinstance(model, HumanModel)
     scene, motion = human_start(config, model, run.capture, run.images)
-    colours = colours_of(run, scene.gaussians, sees_time=False)
+    colours = colours_of(run, scene.gaussians, uses_time=False)
     filmed = run.capture.splits["train"]
     cameras = training_cameras(filmed, config.data)
     views = [(camera, view.frame or 0) for camera, view in zip(cameras, filmed, strict=True)]
@@ -57,12 +57,12 @@ def start(run: RunStart) -> GaussianModel:
         if model.refine and config.train.minutes is None
         else None
     )
-    training = HumanTraining(model, motion.frames, rates_of(config), views, outlines, refit)
+    training = HumanTraining(model, motion.frames, rate_schedule(config), views, outlines, refit)
     if model.light and model.refine and colours.network is None:
         normals = rest_normals(scene.gaussians)
         learned = new_corrections(scene.clip, scene.skeleton, scene.anchors, normals)
         scene = replace(scene, learned=learned)
-    return GaussianModel(run, scene, training, densifier_of(run), colours)
+    return GaussianModel(run, scene, training, build_densifier(run), colours)
 
 
 def restore(model: HumanModel, checkpoint: Checkpoint) -> HumanScene:
@@ -70,7 +70,7 @@ def restore(model: HumanModel, checkpoint: Checkpoint) -> HumanScene:
     scene = HumanScene.restored(
         Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
     )
-    return drawn_as_trained(scene, model, checkpoint)
+    return restore_appearance(scene, model, checkpoint)
 
 
 def human_start(

@@ -18,10 +18,10 @@ from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
-from dyngs.gaussians.colour.network import RestFrame
+from dyngs.gaussians.colour.network import RestPose
 from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.scene import GaussianTimeStep
-from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.schedule import RateSchedule
 from dyngs.human.avatar.observations import (
     HARDLY,
     filled,
@@ -226,7 +226,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         self,
         options: HumanModel,
         frames: Sequence[int],
-        rates: Rates,
+        rates: RateSchedule,
         views: Sequence[tuple[Cameras, int]] = (),
         outlines: OutlineLoss | None = None,
         refit: PoseRefit | None = None,
@@ -279,7 +279,7 @@ class HumanTraining(SceneTraining[HumanScene]):
             strain, uneven = strains(rest.means, moved.means, anchors.points, near, scale)
             penalties["rigidity"] = PARAMS.rigidity * strain / CENTIMETRE**2
             penalties["smoothness"] = PARAMS.smoothness * uneven / CENTIMETRE**2
-        frame = RestFrame(rest.means, posing.rotations[0])
+        frame = RestPose(rest.means, posing.rotations[0])
         return GaussianTimeStep(moved, image.time, frame, penalties)
 
     def optimize(self, scene: HumanScene, step: int) -> Count:
@@ -298,7 +298,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         """Return the corrections."""
         return scene.learned.leaves
 
-    def revised(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
+    def edit_scene(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
         """Return the scene, and after the last step new values for what the images hardly show.
 
         After the first step with a line about outlines, if there is one. In between poses may be

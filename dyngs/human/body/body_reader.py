@@ -253,7 +253,7 @@ def _read_once(
     return read_body(body, uv)
 
 
-def has_same_shapes(body: BodyTemplate, given: BodyFrames) -> bool:
+def has_same_shape_space(body: BodyTemplate, given: BodyFrames) -> bool:
     """Return whether the shape parameters of ``given`` are of the shape space of ``body``, as far
     as the files say.
 
@@ -271,7 +271,7 @@ def rest_shape(body: BodyTemplate, given: BodyFrames) -> tuple[Tensor, Tensor]:
 
     A template with another shape space than that of ``given`` stays as it is.
     """
-    if not has_same_shapes(body, given):
+    if not has_same_shape_space(body, given):
         return body.vertices, body.joints
     with torch.no_grad():
         return apply_shape(body, torch.from_numpy(given.betas).to(body.vertices)[: body.num_shapes])

@@ -123,7 +123,7 @@ def body_discs(body: BodyTemplate, resolution: int) -> BodyDiscs:
     )
 
 
-def drawn_silhouettes(discs: Gaussians, cameras: Cameras) -> Tensor:
+def render_silhouettes(discs: Gaussians, cameras: Cameras) -> Tensor:
     """Return coverage (V, H, W) in [0, 1] of posed discs in the images of V cameras;
     differentiable."""
 
@@ -439,7 +439,7 @@ class Fitting:
 
     def silhouettes(self, learned: Parameters, row: int, cameras: Cameras) -> Tensor:
         """Return the silhouettes (V, H, W) of frame ``row`` for V cameras."""
-        return drawn_silhouettes(self.shaped(learned).in_pose(self.pose(learned, row)), cameras)
+        return render_silhouettes(self.shaped(learned).in_pose(self.pose(learned, row)), cameras)
 
     def error(self, learned: Parameters, seen: Mapping[int, ObservedFrame]) -> Tensor:
         """Return the mean error of the frames ``seen``, by row: of silhouettes, and of joints where
@@ -448,7 +448,7 @@ class Fitting:
         errors = []
         for row, frame in seen.items():
             pose = self.pose(learned, row)
-            error = silhouette_error(drawn_silhouettes(body.in_pose(pose), frame.cameras), frame)
+            error = silhouette_error(render_silhouettes(body.in_pose(pose), frame.cameras), frame)
             if frame.joints is not None:
                 joints = posed_joints(body.skeleton, pose)
                 error = error + 0.1 * keypoint_error(joints, frame.joints, frame.cameras)
@@ -595,7 +595,7 @@ def likely_headings(errors: Sequence[Sequence[float]], weight: float = 0.01) -> 
     return cheapest_path(costs, np.broadcast_to(change, (anchors - 1, count, count)))
 
 
-def first_poses(
+def estimate_initial_poses(
     times: Tensor,
     body: BodyDiscs,
     observed: Observations,
@@ -906,7 +906,7 @@ def fit_capture(
         tried = _from_given(fitting, seen, shape, report, effort)
         first_gain = GAIN if shape_known else GAIN_OF_SHAPE
     else:
-        clip = first_poses(motion.clip.times, discs, seen.used.get, report)
+        clip = estimate_initial_poses(motion.clip.times, discs, seen.used.get, report)
         motion = CapturedMotion(clip, motion.frames)
         fitting = Fitting(clip, discs, pose_prior(clip, is_given=False))
         tried = _from_silhouettes(fitting, seen, shape, report, effort)

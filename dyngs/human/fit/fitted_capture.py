@@ -33,15 +33,15 @@ from dyngs.data.images.images import straight_uint8
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import is_capture, read_capture
 from dyngs.data.times import evenly_spaced
-from dyngs.human.avatar.pose_fit import SILHOUETTES, fitted_to_images
+from dyngs.human.avatar.pose_fit import SILHOUETTES, fit_poses_to_images
 from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.body import NUM_FITTED, BodyTemplate
-from dyngs.human.body.body_reader import has_same_shapes, load_template, rest_shape
+from dyngs.human.body.body_reader import has_same_shape_space, load_template, rest_shape
 from dyngs.human.fit.capture_fit import (
     CaptureFit,
     body_discs,
-    drawn_silhouettes,
+    render_silhouettes,
     fit_capture,
     fitted_clips,
     placed_clip,
@@ -120,7 +120,7 @@ def write_fitted_capture(
         first = person
         if first is None and body.name != "anny" and capture.body is not None:
             given_body = capture.body["train"]
-            first = given_body if has_same_shapes(body, given_body) else None
+            first = given_body if has_same_shape_space(body, given_body) else None
         shaped = with_shape(body, first)
         found = fit_capture(
             capture,
@@ -229,7 +229,7 @@ def known_shape(path: Path, body: BodyTemplate) -> BodyFrames:
                 f"{path}: no fitted person there; give a capture that `dyngs data fit` wrote, or its run"
             )
         found = read_body_file(folder / _BODY)
-    if not has_same_shapes(body, found):
+    if not has_same_shape_space(body, found):
         raise DyngsError(
             f"{folder / _BODY}: is of another template than {body.name}; name that of the person with --template, or "
             "fit that person with `dyngs data fit` first"
@@ -373,7 +373,7 @@ def posed_by_avatar(
 
     def fitted(views: Sequence[View]) -> HumanScene:
         nothing = scene.gaussians.means.new_zeros(3)
-        return fitted_to_images(scene, ImageLoader(views, small), nothing, SILHOUETTES)[0]
+        return fit_poses_to_images(scene, ImageLoader(views, small), nothing, SILHOUETTES)[0]
 
     before = _overlap(scene, tested)
     after = _overlap(fitted(others), tested)
@@ -500,7 +500,7 @@ def _overlays(
             (mean, found.motion.clip, (0.9, 0.1, 0.1)),
             (shaped, fitted, (0.0, 0.7, 0.1)),
         ):
-            drawn = drawn_silhouettes(person.in_pose(frame_pose(clip, row)), image.cameras)
+            drawn = render_silhouettes(person.in_pose(frame_pose(clip, row)), image.cameras)
             inside = drawn[0] > 0.5
             outside = (~inside).float()[None]
             near_edge = torch.nn.functional.max_pool2d(outside, 3, 1, 1)[0] > 0
@@ -514,7 +514,7 @@ def _overlays(
     return whole
 
 
-def with_fitted_body(
+def ensure_fitted_body(
     data: DataConfig,
     model: HumanModel | None = None,
     *,
@@ -532,7 +532,7 @@ def with_fitted_body(
     model = model or HumanModel()
     if data.body is not None:
         path = data.body / _BODY
-        if path.is_file() and not has_same_shapes(load_template(model), read_body_file(path)):
+        if path.is_file() and not has_same_shape_space(load_template(model), read_body_file(path)):
             say(
                 f"body:    {data.body} is a fit of another template: its poses are taken, not its shape"
             )

@@ -18,7 +18,7 @@ from dyngs.human.body.skinning import apply_transforms, axis_angle_to_matrix, jo
 from dyngs.human.motion.motion import Motion, MotionClip
 
 
-def least_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def shortest_arc_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the smallest rotation (3, 3) from one unit vector to another; half a turn about any
     axis for opposites."""
     axis = np.cross(start, end)
@@ -106,7 +106,7 @@ def up_direction(clip: MotionClip) -> Tensor:
 
 def _turn_between(start: Tensor, end: Tensor) -> Tensor:
     one, other = (x.double().cpu().numpy() for x in (start, end))
-    return torch.from_numpy(least_rotation(one, other)).to(start)
+    return torch.from_numpy(shortest_arc_rotation(one, other)).to(start)
 
 
 def _joints_of(clip: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> Tensor:
@@ -171,7 +171,7 @@ def floor_contact(clip: MotionClip, soles: Tensor, up: Tensor, fps: float) -> Te
     return torch.from_numpy(binary_opening(is_still, np.ones((shortest, 1)))).to(soles.device)
 
 
-def feet_kept(clip: MotionClip, soles: Tensor, up: Tensor, fps: float) -> tuple[MotionClip, str]:
+def reduce_foot_sliding(clip: MotionClip, soles: Tensor, up: Tensor, fps: float) -> tuple[MotionClip, str]:
     """Return the clip with the root moved along the floor so that feet that touch it stay; and a
     line about how far they slide, before and after.
 

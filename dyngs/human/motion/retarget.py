@@ -28,7 +28,7 @@ from dyngs.human.motion.motion import (
     require_frame_count,
     require_frame_rate,
 )
-from dyngs.human.motion.placement import least_rotation, place_on_floor
+from dyngs.human.motion.placement import shortest_arc_rotation, place_on_floor
 
 _OURS = (
     "pelvis spine1 spine2 spine3 neck head *_collar *_shoulder *_elbow *_wrist *_hip *_knee *_ankle *_foot "
@@ -262,7 +262,7 @@ def _alignments(
         ]
         lengths = [float(np.linalg.norm(bone)) for bone in bones]
         if min(lengths) > 1e-9:
-            turns[name] = least_rotation(bones[0] / lengths[0], bones[1] / lengths[1])
+            turns[name] = shortest_arc_rotation(bones[0] / lengths[0], bones[1] / lengths[1])
         else:
             turns[name] = turns.get(f"{side}_{_FOLLOWS.get(joint, '')}", np.eye(3))
     return turns

@@ -109,7 +109,7 @@ class Person:
         return self._bodies[view.frame]
 
 
-def person_in(capture: Capture, template: BodyTemplate, images: ImageLoader) -> Person:
+def captured_person(capture: Capture, template: BodyTemplate, images: ImageLoader) -> Person:
     """Return the person of a capture with its ``images``.
 
     Raises DyngsError: no body parameters, no silhouettes, or a view without parameters.
@@ -132,10 +132,10 @@ def person_in(capture: Capture, template: BodyTemplate, images: ImageLoader) -> 
     return Person(capture.root.name, body, motion, images)
 
 
-def person_of(data: DataConfig, template: BodyTemplate) -> Person:
+def read_captured_person(data: DataConfig, template: BodyTemplate) -> Person:
     """Return the person of a capture with depth maps; see ``person_in``."""
     capture = read_capture(data)
-    return person_in(capture, template, ImageLoader(capture.splits["train"], data, with_maps=True))
+    return captured_person(capture, template, ImageLoader(capture.splits["train"], data, with_maps=True))
 
 
 def metric(cameras: Cameras, scale: float) -> Cameras:

@@ -422,7 +422,7 @@ _TARGET = np.array([0.0, 0.95, 0.0])  # the point that all cameras look at, m
 
 
 @dataclass(frozen=True)
-class Lamp:
+class DirectionalLight:
     """A distant lamp and light from all sides."""
 
     # (3,) direction to the lamp, of any length
@@ -438,7 +438,7 @@ class HumanOptions:
 
     size: int = 128  # width and height in pixels
     num_frames: int = 12  # frames of the walk, for the splits train and test
-    num_new: int = 6  # frames of another motion, the split ``pose``; 0: no such split
+    num_pose_frames: int = 6  # frames of another motion, the split ``pose``; 0: no such split
     num_cameras: int = 8  # training cameras, on a ring around the person
     # test cameras, each midway between two training cameras; 0: neither test nor ``pose``
     num_test: int = 2
@@ -490,8 +490,8 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     outfit, clothed, texture = _dressed(body, options.seed, options.usual_clothes)
     train, test = _cameras(options)
     clips = {"train": (options.num_frames, {"train": train, "test": test})}
-    if options.num_new and test:
-        clips["pose"] = options.num_new, {"pose": test}
+    if options.num_pose_frames and test:
+        clips["pose"] = options.num_pose_frames, {"pose": test}
     with new_folder(out) as started:
         for name, (num_frames, splits) in clips.items():
             clip = _clip(body, num_frames, options.scene_seed, name == "pose")
@@ -527,11 +527,11 @@ def _dressed(
     return outfit, dress_body(body, outfit), paint_texture(body, outfit)
 
 
-def random_light(seed: int | None) -> Lamp:
+def random_light(seed: int | None) -> DirectionalLight:
     """Return the light of ``seed``, from any side and above, of which three quarters to all reach a
     white surface that faces it; None: ``Lamp()``."""
     if seed is None:
-        return Lamp()
+        return DirectionalLight()
     make = np.random.default_rng([seed, 3])
     azimuth = make.uniform(-np.pi, np.pi)
     height = make.uniform(0.0, 1.2)
@@ -539,7 +539,7 @@ def random_light(seed: int | None) -> Lamp:
     ambient = make.uniform(0.75, 1.05) - diffuse
     tint = 1.0 + make.uniform(-0.06, 0.06) * np.array([1.0, 0.0, -1.0])
     red, green, blue = (float(diffuse * part) for part in tint)
-    return Lamp(
+    return DirectionalLight(
         (float(np.sin(azimuth)), float(height), float(np.cos(azimuth))),
         (float(ambient),),
         (red, green, blue),
@@ -547,7 +547,7 @@ def random_light(seed: int | None) -> Lamp:
 
 
 def render_mesh(
-    mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples: int, light: Lamp = Lamp()
+    mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples: int, light: DirectionalLight = DirectionalLight()
 ) -> np.ndarray:
     """Return sRGB values and straight alpha (size, size, 4) in [0, 1], of ``samples`` x ``samples``
     per pixel.
@@ -668,7 +668,7 @@ def _focal(size: int) -> float:
     return float(0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X))
 
 
-def _shaded(mesh: PosedMesh, fragments: Fragments, light: Lamp) -> np.ndarray:
+def _shaded(mesh: PosedMesh, fragments: Fragments, light: DirectionalLight) -> np.ndarray:
     uv = interpolate(fragments.barycentric, mesh.uv[mesh.uv_faces[fragments.faces]])
     normal = normalized(
         interpolate(fragments.barycentric, mesh.normals[mesh.faces[fragments.faces]])
@@ -744,7 +744,7 @@ def person_options(options: PeopleOptions, number: int) -> HumanOptions:
     return HumanOptions(
         size=options.size,
         num_frames=options.frames,
-        num_new=0,
+        num_pose_frames=0,
         num_cameras=options.cameras,
         num_test=0,
         seed=seed,

@@ -32,7 +32,7 @@ from dyngs.runs.checkpoint import (
     load_run,
 )
 from dyngs.runs.folder import EXPORT_FOLDER
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -59,7 +59,7 @@ def config_of(capture: Path, run_dir: Path, budget: BudgetConfig) -> Config:
 
 @pytest.fixture(scope="module")
 def trainer(still: Path, tmp_path_factory: pytest.TempPathFactory) -> Trainer:
-    trainer = assemble(config_of(still, tmp_path_factory.mktemp("run"), BudgetConfig()))
+    trainer = build_trainer(config_of(still, tmp_path_factory.mktemp("run"), BudgetConfig()))
     while trainer.done < 12:
         trainer.step()
     return trainer

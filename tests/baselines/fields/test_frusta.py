@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dyngs.baselines.fields.ngp import seen_cells
+from dyngs.baselines.fields.ngp import cells_in_view
 from dyngs.data.capture import View
 from dyngs.data.geometry import projected
 from dyngs.ops.rays import Space
@@ -29,7 +29,7 @@ VIEWS = [view_from((0.3, 0.1, -2.5), 0.0), view_from((0.5, -0.2, 0.4), 1.9)]
 @pytest.mark.parametrize("cells", [12, 9])
 def test_all_that_a_camera_sees_may_be_occupied(cells: int) -> None:
     space = Space((0.2, 0.0, -0.3), 1.0, 3, cells)
-    seen = seen_cells(space, VIEWS)
+    seen = cells_in_view(space, VIEWS)
     rng = np.random.default_rng(0)
     assert seen.shape == space.shape
     points = rng.uniform(-space.outermost, space.outermost, (20_000, 3)) + space.centre

@@ -10,7 +10,7 @@ import torch
 
 from dyngs.baselines.fields.kind import NgpModel
 from dyngs.baselines.fields.ngp import NgpField
-from dyngs.baselines.fields.scene import FieldScene, surface_of
+from dyngs.baselines.fields.scene import FieldScene, extract_surface
 from dyngs.ops.rays import Space
 
 MIDDLE = torch.tensor([0.3, -0.1, 0.2])
@@ -36,7 +36,7 @@ def scene() -> FieldScene:
 
 
 def test_a_ball_is_found_with_faces_outwards_and_colours(scene: FieldScene) -> None:
-    found = surface_of(scene, cells=40)
+    found = extract_surface(scene, cells=40)
     offsets = found.vertices - MIDDLE.numpy()
     assert np.linalg.norm(offsets, axis=1) == pytest.approx(np.full(len(offsets), 0.5), abs=2e-3)
     corners = found.vertices[found.faces] - MIDDLE.numpy()

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.baselines.fields.nerf import by_weights, crossed, evenly
+from dyngs.baselines.fields.nerf import by_weights, crossed, sample_evenly
 from dyngs.ops.rays import Rays, Space
 
 SPACE = Space((0.0, 0.0, 0.0), 1.0, 1, 1)
@@ -19,7 +19,7 @@ ACROSS = Rays(torch.tensor([[-3.0, 0.2, 0.1]]), torch.tensor([[1.0, 0.0, 0.0]]))
 def test_each_part_of_the_way_has_one_sample(count: int, seed: int, cascades: int) -> None:
     space = Space((0.0, 0.0, 0.0), 1.0, cascades, 1)
     shifts = torch.rand(1, count, generator=torch.Generator().manual_seed(seed))
-    found = evenly(ACROSS, space, 0.05, shifts)[0].double()
+    found = sample_evenly(ACROSS, space, 0.05, shifts)[0].double()
     begin, end = (float(x) for x in crossed(ACROSS, space, 0.05))
     parts = (
         (found - begin) / (end - begin)

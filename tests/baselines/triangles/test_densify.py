@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 from small_triangles import bent, triangle
 
-from dyngs.baselines.triangles.training import Tallies, change, useless
+from dyngs.baselines.triangles.training import TriangleStatistics, change, useless
 
 
-def seen(count: int) -> Tallies:
+def seen(count: int) -> TriangleStatistics:
     """All triangles, everywhere, in each of 10 views."""
-    tallies = Tallies(count)
+    tallies = TriangleStatistics(count)
     tallies.views += 10
     tallies.seen += 10
     tallies.cells += 1

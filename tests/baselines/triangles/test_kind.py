@@ -14,7 +14,7 @@ from small_triangles import config_of
 
 import dyngs
 from dyngs.baselines.triangles.scene import TriangleScene
-from dyngs.baselines.triangles.training import most_pixels
+from dyngs.baselines.triangles.training import max_pixels
 from dyngs.cli import main
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
@@ -40,7 +40,7 @@ def test_it_learns_and_keeps_to_its_number(run: Path) -> None:
     assert 100 < len(scene.patches) <= 300
     assert scene.patches.texture == 3
     views = open_run(run).capture.splits["train"]
-    assert most_pixels(scene, training_cameras(views, load_resolved(run).data)).min() >= 1
+    assert max_pixels(scene, training_cameras(views, load_resolved(run).data)).min() >= 1
 
 
 def test_a_run_that_is_cut_ends_with_the_same_bytes(capture: Path, tmp_path: Path) -> None:

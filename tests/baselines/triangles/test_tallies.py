@@ -5,20 +5,20 @@ from __future__ import annotations
 import torch
 from small_triangles import camera, triangle
 
-from dyngs.baselines.triangles.training import Tallies, outlines
-from dyngs.ops.patches import Places, visible_patches
+from dyngs.baselines.triangles.training import TriangleStatistics, outlines
+from dyngs.ops.patches import PatchSamples, visible_patches
 
 BEHIND = triangle((-1, -1, -9), (1, -1, -9), (0, 1, -9))
 LARGE = triangle((-3, -3, 0), (3, -3, 0), (-3, 3, 0))
 
 
-def places_of(*triangles: torch.Tensor) -> Places:
-    return Places.of(*visible_patches(torch.cat(triangles), camera(), 0.2))
+def places_of(*triangles: torch.Tensor) -> PatchSamples:
+    return PatchSamples.of(*visible_patches(torch.cat(triangles), camera(), 0.2))
 
 
 def test_what_is_seen_is_counted() -> None:
     places = places_of(LARGE, BEHIND)
-    tallies = Tallies(2)
+    tallies = TriangleStatistics(2)
     tallies.count(places, torch.ones(16, 16))
     tallies.count(places, torch.zeros(16, 16))
     assert tallies.views == 2

@@ -13,9 +13,9 @@ from tiny_fields import TIMES, cloud, stirred_field, tiny_options
 from torch import Tensor
 
 from dyngs.core.state import tensors_of
-from dyngs.deform.bodies.field import BodyField, BodyRest
-from dyngs.deform.field import deformed
-from dyngs.deform.fields import field_state, restored_field
+from dyngs.deform.bodies.field import BodyField, BodyRestPose
+from dyngs.deform.field import apply_offsets
+from dyngs.deform.fields import field_state, restore_field
 
 CENTERS = torch.tensor([[0.2, -0.1, 0.3], [-0.4, 0.0, 0.1]])
 RADII = torch.tensor([0.2, 0.3])
@@ -26,7 +26,7 @@ def field_of(kind: str = "control_nodes", points: int = 7) -> BodyField:
     generator = torch.Generator().manual_seed(0)
     places = CENTERS[:, None] + 0.3 * torch.randn(2, points, 3, generator=generator)
     quats = torch.tensor([1.0, 0, 0, 0]) + 0.5 * torch.randn(2, points, 4, generator=generator)
-    rest = BodyRest(CENTERS, RADII, LABELS)
+    rest = BodyRestPose(CENTERS, RADII, LABELS)
     return BodyField(
         stirred_field(kind),
         rest,
@@ -44,7 +44,7 @@ def test_bodies_move_rigidly_and_others_as_without_them(kind: str) -> None:
         turns = Rotation.from_quat(quats[:, [1, 2, 3, 0]])
         offsets = field.offsets(gaussians.means, time)
         alone = field.others.offsets(gaussians.means, time)
-        moved = deformed(gaussians, offsets).detach()
+        moved = apply_offsets(gaussians, offsets).detach()
         for body in range(2):
             own = torch.tensor([i for i, label in enumerate(LABELS.tolist()) if label == body])
             arms = (gaussians.means[own] - CENTERS[body]).double().numpy()
@@ -112,7 +112,7 @@ def stored(field: BodyField) -> dict[str, Tensor]:
 def test_a_stored_field_is_the_same_field() -> None:
     field = field_of()
     means = cloud().means
-    again = restored_field(tiny_options("control_nodes"), stored(field), 9)
+    again = restore_field(tiny_options("control_nodes"), stored(field), 9)
     assert isinstance(again, BodyField)
     assert stored(again).keys() == stored(field).keys()
     for name, x in stored(again).items():
@@ -139,4 +139,4 @@ def test_a_forged_state_is_refused(name: str, change: Callable[[Tensor], Tensor 
     if forged is not None:
         tensors[name] = forged
     with pytest.raises((KeyError, ValueError)):
-        restored_field(tiny_options("control_nodes"), tensors, 9)
+        restore_field(tiny_options("control_nodes"), tensors, 9)

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from rolling_ball import hopping, rolling
 
-from dyngs.deform.bodies.paths import found_paths
+from dyngs.deform.bodies.paths import find_paths
 
 
 def test_a_ball_is_found_at_all_times() -> None:
     shots, centers, _ = rolling()
-    (path, *_) = found_paths(shots, shots.differences())
+    (path, *_) = find_paths(shots, shots.differences())
     assert np.linalg.norm(path.centers - centers, axis=1).max() < 0.25 * 0.28
     assert path.radius == pytest.approx(0.28, rel=0.1)
 
@@ -20,7 +20,7 @@ def test_a_ball_is_found_at_all_times() -> None:
 def test_a_ball_that_hops_is_followed_through_its_bounces() -> None:
     """Smoothness alone would cut the corners where it leaves the plate again."""
     shots, centers, _ = hopping()
-    path = found_paths(shots, shots.differences())[0]
+    path = find_paths(shots, shots.differences())[0]
     errors = np.linalg.norm(path.centers - centers, axis=1)
     assert np.median(errors) < 0.1 * 0.28
     assert errors.max() < 0.6 * 0.28

@@ -15,7 +15,7 @@ from tiny_fields import cloud
 from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
-from dyngs.deform.bodies.paths import FrameStack, frame_stack_of, one_camera
+from dyngs.deform.bodies.paths import FrameStack, render_frame_stack, one_camera
 from dyngs.gaussians.rendering import RenderOptions
 
 
@@ -32,7 +32,7 @@ def test_rays_go_through_the_points_that_they_show() -> None:
 def test_pixels_on_a_ball_see_its_surface() -> None:
     """They differ from the static model, unless something hides the ball."""
     shots, centers, _ = rolling()
-    rows, columns, normals = shots.on_ball(3, centers[3], 0.28)
+    rows, columns, normals = shots.ball_pixels(3, centers[3], 0.28)
     assert len(rows) > 50
     assert np.linalg.norm(normals, axis=1) == pytest.approx(1)
     points = centers[3] + 0.28 * normals
@@ -42,8 +42,8 @@ def test_pixels_on_a_ball_see_its_surface() -> None:
     assert inside.mean() > 2 * shots.differences()[3].mean()
     values = {name: x for name, x in vars(shots).items() if name != "centers"}
     hidden = FrameStack(**values | {"depths": np.full_like(shots.depths, 0.1)})
-    assert not len(hidden.on_ball(3, centers[3], 0.28)[0])
-    assert not len(shots.on_ball(3, np.array([50.0, 0, 0]), 0.28)[0])
+    assert not len(hidden.ball_pixels(3, centers[3], 0.28)[0])
+    assert not len(shots.ball_pixels(3, np.array([50.0, 0, 0]), 0.28)[0])
 
 
 def test_one_camera_shows_each_time_once() -> None:
@@ -66,9 +66,9 @@ def test_masked_pixels_are_as_the_static_model_has_them() -> None:
     mask = torch.zeros(8, 8)
     mask[:4] = 1
     image = Image("a", camera, rgb, torch.ones(8, 8), mask, 0.5)
-    shots = frame_stack_of([image], gaussians, RenderOptions(), torch.ones(3))
+    shots = render_frame_stack([image], gaussians, RenderOptions(), torch.ones(3))
     assert np.array_equal(shots.alphas[0, :4], np.ones((4, 8)))
-    assert np.array_equal(shots.alphas[0, 4:], shots.still_alphas[0, 4:])
+    assert np.array_equal(shots.alphas[0, 4:], shots.static_alphas[0, 4:])
     assert np.array_equal(shots.images[0, :4], rgb[:4].numpy())
     assert np.array_equal(shots.images[0, 4:], shots.still[0, 4:])
     assert shots.times.tolist() == [0.5]

@@ -8,18 +8,18 @@ import torch
 from rolling_ball import rolling
 from tiny_fields import tiny_options
 
-from dyngs.deform.bodies.start import angles_deg, found_bodies
+from dyngs.deform.bodies.rigid_bodies import angles_deg, find_bodies
 from dyngs.deform.field import FieldSetup
-from dyngs.deform.fields import new_field
+from dyngs.deform.fields import create_field
 
 
 def test_a_rolling_ball_begins_on_its_way() -> None:
     """The seeds lie on the ball in the middle of the clip, and the field takes them along the true
     motion."""
     shots, centers, turns = rolling()
-    found = found_bodies(shots, 400, 4)
+    found = find_bodies(shots, 400, 4)
     assert found is not None
-    assert found.explain_all
+    assert found.explains_all_motion
     assert found.finding.startswith("1 body turns by ")
     (seeds,) = found.seeds
     assert 100 < len(seeds) <= 400
@@ -28,7 +28,7 @@ def test_a_rolling_ball_begins_on_its_way() -> None:
     assert np.linalg.norm(arms, axis=1).max() < 1.3 * 0.28
     others = 5
     setup = FieldSetup(torch.zeros(3), torch.ones(3), len(shots), others + len(seeds), 1.0)
-    field = found.within(new_field(tiny_options("control_nodes"), setup, torch.Generator()))
+    field = found.within(create_field(tiny_options("control_nodes"), setup, torch.Generator()))
     assert field.rest.labels.tolist() == [-1] * others + [0] * len(seeds)
     means = torch.cat([torch.zeros(others, 3), seeds.means])
     for t in (0, 5, middle, len(shots) - 1):
@@ -46,5 +46,5 @@ def test_what_slides_is_not_made_to_turn() -> None:
     """It is left to others, or a body with hardly any turn: its path, too, is found from the
     images."""
     shots, _, _ = rolling(turns=False)
-    found = found_bodies(shots, 400, 4)
+    found = find_bodies(shots, 400, 4)
     assert found is None or angles_deg(found.bodies[0].turning.rotations).max() < 12

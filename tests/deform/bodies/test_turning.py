@@ -6,7 +6,7 @@ import numpy as np
 from rolling_ball import hopping, rolling
 
 from dyngs.deform.bodies.paths import Path
-from dyngs.deform.bodies.start import (
+from dyngs.deform.bodies.rigid_bodies import (
     angles_deg,
     estimate_rotation,
 )

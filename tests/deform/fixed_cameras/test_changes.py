@@ -9,7 +9,7 @@ import torch
 from static_balls import BLACK, Ball, cameras, drawn, filmed
 
 from dyngs.data.loader import Image
-from dyngs.deform.fixed_cameras.hulls import LONGEST_SIDE, changes, fixed_camera_clip
+from dyngs.deform.fixed_cameras.hulls import LONGEST_SIDE, changes, build_fixed_camera_clip
 
 TIMES = tuple(i / 8 for i in range(9))
 
@@ -62,12 +62,12 @@ def test_large_images_are_shrunk_and_masks_kept() -> None:
         Image("view", large, torch.full((10, width, 3), 0.1 * i), None, mask, i / 2)
         for i in range(3)
     ]
-    one = fixed_camera_clip(images, BLACK)
+    one = build_fixed_camera_clip(images, BLACK)
     assert one.images.shape == (3, 5, LONGEST_SIDE, 3)
     assert not one.counted[:, :, :10].any()
     assert one.counted[:, :, 10:].all()
     assert not one.changed[:, :, :10].any()
     assert one.times == (0.0, 0.5, 1.0)
-    assert fixed_camera_clip(images, BLACK, total=8000).images.shape[2] == LONGEST_SIDE // 2
+    assert build_fixed_camera_clip(images, BLACK, total=8000).images.shape[2] == LONGEST_SIDE // 2
     with pytest.raises(ValueError, match="no images"):
-        fixed_camera_clip([], BLACK)
+        build_fixed_camera_clip([], BLACK)

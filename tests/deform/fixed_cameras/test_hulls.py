@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from static_balls import Ball, filmed
 
-from dyngs.deform.fixed_cameras.hulls import Blob, blobs_in, silhouettes_at
+from dyngs.deform.fixed_cameras.hulls import Blob, extract_blobs, silhouettes_at
 
 LOW = np.full(3, -3.0)
 HIGH = np.full(3, 3.0)
@@ -17,7 +17,7 @@ def hulls(*balls: Ball, count: int = 8) -> list[Blob]:
     """Of the last of some moments; before, the balls were not there."""
     times = [i / (MOMENTS - 1) for i in range(MOMENTS)]
     clips = filmed(lambda t: balls if t == 1.0 else [], times, count)
-    return sorted(blobs_in(silhouettes_at(clips, 1.0), LOW, HIGH), key=lambda blob: -blob.radius)
+    return sorted(extract_blobs(silhouettes_at(clips, 1.0), LOW, HIGH), key=lambda blob: -blob.radius)
 
 
 # of four, three suffice: their hull has corners
@@ -46,6 +46,6 @@ def test_what_one_of_eight_cameras_does_not_see_is_found() -> None:
     for count, number in ((8, 1), (3, 0)):
         clips = filmed(lambda t: [Ball((0.1, 0.0, 0.0))] if t == 1.0 else [], times, count)
         clips[0].changed[:] = False
-        found = blobs_in(silhouettes_at(clips, 1.0), LOW, HIGH)
+        found = extract_blobs(silhouettes_at(clips, 1.0), LOW, HIGH)
         assert len(found) == number
         assert all(np.linalg.norm(blob.center - [0.1, 0.0, 0.0]) < 0.05 for blob in found)

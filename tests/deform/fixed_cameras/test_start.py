@@ -7,14 +7,14 @@ import torch
 from static_balls import Ball, Balls, filmed
 from tiny_fields import cloud
 
-from dyngs.deform.fixed_cameras.start import FirstMotion, first_motion
+from dyngs.deform.fixed_cameras.initial_motion import InitialMotion, find_initial_motion
 from dyngs.gaussians.rendering import RenderOptions
 
 TIMES = tuple(i / 11 for i in range(12))
 
 
-def started(balls: Balls, count: int = 6, limit: int = 600) -> FirstMotion:
-    return first_motion(filmed(balls, TIMES, count), cloud(50), 1.0, limit, RenderOptions())
+def started(balls: Balls, count: int = 6, limit: int = 600) -> InitialMotion:
+    return find_initial_motion(filmed(balls, TIMES, count), cloud(50), 1.0, limit, RenderOptions())
 
 
 def crossing(time: float) -> tuple[float, float, float]:
@@ -36,5 +36,5 @@ def test_where_nothing_changes_nothing_begins(count: int, limit: int) -> None:
     """A ball that stands still; one camera, which sees no depth; no Gaussians allowed."""
     at = (lambda _: (0.0, 0.0, 0.0)) if count == 6 and limit else crossing
     found = started(lambda t: [Ball(at(t))], count, limit)
-    assert found == FirstMotion()
+    assert found == InitialMotion()
     assert found.finding is None

@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from static_balls import Ball, filmed
 
-from dyngs.deform.fixed_cameras.start import surface_changes
+from dyngs.deform.fixed_cameras.initial_motion import detect_surface_changes
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 
@@ -39,7 +39,7 @@ def test_a_ball_that_is_blue_at_a_time_gets_blue_gaussians_then_just_before_its_
         TIMES,
         noise=0.0,
     )
-    (found,) = surface_changes(clips, shell(), RenderOptions(), 1000)
+    (found,) = detect_surface_changes(clips, shell(), RenderOptions(), 1000)
     assert found.time == TIMES[2]
     assert len(found.gaussians) > 300
     close = (found.gaussians.base_rgb - torch.tensor([0.1, 0.2, 0.9])).abs().amax(1) < 0.15
@@ -47,5 +47,5 @@ def test_a_ball_that_is_blue_at_a_time_gets_blue_gaussians_then_just_before_its_
     apart = (found.gaussians.means - CENTER).norm(dim=1)
     assert ((apart - INSIDE).abs() < 0.03).all()
     assert not found.velocity.any()
-    fewer = surface_changes(clips, shell(), RenderOptions(), 50)
+    fewer = detect_surface_changes(clips, shell(), RenderOptions(), 50)
     assert sum(len(one.gaussians) for one in fewer) <= 50

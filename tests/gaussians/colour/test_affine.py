@@ -10,7 +10,7 @@ from flat_wall import BLACK, cameras_before_wall, seen_from
 from torch import Tensor
 
 from dyngs.data.loader import Image
-from dyngs.gaussians.colour.network import fitted_affine, recoloured
+from dyngs.gaussians.colour.network import fit_affine_colour, apply_affine_colour
 from dyngs.models.renderable import Rendering
 
 WARM = torch.tensor([[1.2, 0.05, 0.0, 0.02], [0.0, 1.0, -0.03, -0.01], [0.02, 0.0, 0.8, 0.03]])
@@ -31,10 +31,10 @@ def image_and_rendering() -> tuple[Image, Rendering]:
 
 def test_an_affine_is_found_again() -> None:
     image, rendering = image_and_rendering()
-    found = fitted_affine([(image, rendering)], BLACK)
+    found = fit_affine_colour([(image, rendering)], BLACK)
     # the ridge pulls a little to the identity
     torch.testing.assert_close(found, WARM, atol=0.02, rtol=0)
-    shown = recoloured(found, image, rendering, BLACK)
+    shown = apply_affine_colour(found, image, rendering, BLACK)
     assert float((shown - image.rgb_premultiplied).abs().mean()) < 3e-3
 
 
@@ -45,7 +45,7 @@ def test_masked_pixels_and_those_of_weight_0_do_not_count() -> None:
     mask = torch.ones(60, 80)
     counts = torch.ones(60, 80)
     mask[:10], counts[50:] = 0, 0
-    found = fitted_affine(
+    found = fit_affine_colour(
         [(replace(image, rgb_premultiplied=spoilt, mask=mask), rendering)], BLACK, counts
     )
     torch.testing.assert_close(found, WARM, atol=0.02, rtol=0)
@@ -59,7 +59,7 @@ def test_a_background_behind_a_cut_out_object_keeps_its_colour() -> None:
     object_only = 0.5 * rendering.rgb[0] * alpha[..., None]
     cut_out = replace(image, rgb_premultiplied=2 * object_only, alpha=alpha)
     drawn = shown_as(object_only + (1 - alpha[..., None]) * WHITE, 1 - alpha)
-    found = fitted_affine([(cut_out, drawn)], WHITE)
-    again = recoloured(found, cut_out, drawn, WHITE)
+    found = fit_affine_colour([(cut_out, drawn)], WHITE)
+    again = apply_affine_colour(found, cut_out, drawn, WHITE)
     torch.testing.assert_close(again, cut_out.composite(WHITE), atol=0.01, rtol=0)
     assert bool((again[:, :20] == 1).all())

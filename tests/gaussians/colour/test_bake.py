@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.colour.network import with_harmonics
+from dyngs.gaussians.colour.network import bake_harmonics
 from dyngs.gaussians.rendering import Shader
 from dyngs.ops.harmonics import evaluate_harmonics
 
@@ -25,7 +25,7 @@ def harmonics_shader(sh: Tensor, degree: int) -> Shader:
 def test_harmonics_are_found_again(degree: int) -> None:
     gaussians = random_scene(n=8, degree=degree).gaussians
     sh = 0.1 * gaussians.sh  # no colour is clamped
-    baked = with_harmonics(gaussians, harmonics_shader(sh, degree), 3)
+    baked = bake_harmonics(gaussians, harmonics_shader(sh, degree), 3)
     assert baked.gaussians.sh.shape == (8, 16, 3)
     # the eye is 1e4 times farther than the Gaussians, not infinitely far
     torch.testing.assert_close(baked.gaussians.sh[:, : sh.shape[1]], sh, rtol=0, atol=1e-4)
@@ -47,9 +47,9 @@ def test_the_error_is_what_cannot_be_fitted() -> None:
         white = (cameras.centers[:, 2] > 0).double()
         return white[:, None, None].expand(len(cameras), len(gaussians), 3)
 
-    baked = with_harmonics(gaussians, half, 0)
+    baked = bake_harmonics(gaussians, half, 0)
     torch.testing.assert_close(
         baked.gaussians.base_rgb, torch.full((3, 3), 0.5, dtype=torch.float64)
     )
     assert baked.error == pytest.approx(0.5)
-    assert with_harmonics(gaussians, half, 3).error < 0.25
+    assert bake_harmonics(gaussians, half, 3).error < 0.25

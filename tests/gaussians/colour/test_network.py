@@ -14,7 +14,7 @@ from torch import Tensor
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import (
     ColourNetwork,
-    RestFrame,
+    RestPose,
 )
 from dyngs.gaussians.rendering import render
 from dyngs.ops.perceptron import Layer, reference_perceptron
@@ -23,18 +23,18 @@ from dyngs.ops.shading import num_inputs
 
 
 def network(
-    *, sees_time: bool = True, sees_normals: bool = True, last: float = 0.3, seed: int = 0
+    *, uses_time: bool = True, uses_normals: bool = True, last: float = 0.3, seed: int = 0
 ) -> ColourNetwork:
     """8 hidden units, float64; with ``last=0`` an untrained one."""
     g = torch.Generator().manual_seed(seed)
-    inputs = num_inputs(sees_time=sees_time, sees_normals=sees_normals)
+    inputs = num_inputs(uses_time=uses_time, uses_normals=uses_normals)
 
     def random(*shape: int) -> Tensor:
         return torch.randn(shape, generator=g, dtype=torch.float64)
 
     layers = (Layer(random(8, inputs), random(8)), Layer(last * random(3, 8), last * random(3)))
     box = torch.tensor([[0.1, 0.2, 0.3], [1.0, 2.0, 3.0]], dtype=torch.float64)
-    return ColourNetwork(layers, box, sees_time, sees_normals)
+    return ColourNetwork(layers, box, uses_time, uses_normals)
 
 
 def plain(gaussians: Gaussians) -> Gaussians:
@@ -42,10 +42,10 @@ def plain(gaussians: Gaussians) -> Gaussians:
 
 
 @pytest.mark.parametrize("sees_normals", [False, True])
-def test_a_zero_last_layer_changes_nothing(sees_normals: bool) -> None:
+def test_a_zero_last_layer_changes_nothing(uses_normals: bool) -> None:
     scene = random_scene()
     gaussians = plain(scene.gaussians)
-    shader = network(last=0.0, sees_normals=sees_normals).shader(0.3)
+    shader = network(last=0.0, uses_normals=uses_normals).shader(0.3)
     drawn = render(gaussians, scene.cameras, shader=shader).rgb
     torch.testing.assert_close(drawn, render(gaussians, scene.cameras).rgb, rtol=0, atol=1e-14)
 
@@ -91,11 +91,11 @@ def test_colours_turn_with_a_body() -> None:
     """A body and a camera turned together look the same, if the network is told how the body was at
     rest."""
     scene = random_scene(n=5)
-    net = network(sees_time=False)
+    net = network(uses_time=False)
     gaussians = plain(scene.gaussians)
     turn = rotation_matrices(torch.tensor([[0.3, 0.5, -0.2, 0.7]], dtype=torch.float64))[0]
     shown = torch.ones(2, 5, 2, dtype=torch.int32)
-    at_rest = net.shader(None, RestFrame(gaussians.means, torch.eye(3, dtype=torch.float64)))
+    at_rest = net.shader(None, RestPose(gaussians.means, torch.eye(3, dtype=torch.float64)))
     w, x, y, z = torch.nn.functional.normalize(
         torch.tensor([0.3, 0.5, -0.2, 0.7], dtype=torch.float64), dim=0
     )
@@ -112,5 +112,5 @@ def test_colours_turn_with_a_body() -> None:
     cameras = replace(
         scene.cameras, cam_from_world=scene.cam_from_world @ torch.linalg.inv(world_from_world)
     )
-    now = net.shader(None, RestFrame(gaussians.means, turn))(moved, cameras, shown)
+    now = net.shader(None, RestPose(gaussians.means, turn))(moved, cameras, shown)
     torch.testing.assert_close(now, at_rest(gaussians, scene.cameras, shown))

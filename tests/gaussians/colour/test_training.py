@@ -25,7 +25,7 @@ from dyngs.config import (
 from dyngs.core.state import tensors_of
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.colour.network import network_of
+from dyngs.gaussians.colour.network import restore_colour_network
 from dyngs.gaussians.colour.training import (
     AutoTraining,
     NetworkTraining,
@@ -33,7 +33,7 @@ from dyngs.gaussians.colour.training import (
     rate_factor,
 )
 from dyngs.models.static_section import StaticModel
-from dyngs.training.new_trainer import GaussianTrainer, assemble
+from dyngs.training.new_trainer import GaussianTrainer, build_trainer
 
 
 def gaussians() -> Gaussians:
@@ -45,7 +45,7 @@ def colours(seed: int = 0, **options: object) -> NetworkTraining:
     box = torch.tensor([[0.0] * 3, [2.0] * 3])
     generator = torch.Generator().manual_seed(seed)
     return NetworkTraining(
-        NetworkColour.model_validate(options), 60, box, generator, sees_time=True
+        NetworkColour.model_validate(options), 60, box, generator, uses_time=True
     )
 
 
@@ -84,26 +84,26 @@ def test_state_goes_round_and_training_goes_on_alike() -> None:
     train(resumed, 6, 10)
     for name, x in stored(whole).items():
         assert torch.equal(x, stored(resumed)[name]), name
-    found = network_of(stored(whole))
+    found = restore_colour_network(stored(whole))
     assert found is not None
     assert torch.equal(found.layers[1].weight, whole.network.layers[1].weight)
 
 
 def test_the_frozen_follow_the_set_and_go_round() -> None:
     colours = AutoTraining(AutoColour(), 100, 20)
-    assert colours.frozen_rest() is None
+    assert colours.frozen_harmonics() is None
     colours.freeze(torch.tensor([True, False, True]))
     colours.follow(TopologyEdit(torch.tensor([1, 2, 2]), torch.tensor([False, False, True])))
-    assert colours.frozen_rest() is not None
+    assert colours.frozen_harmonics() is not None
     other = AutoTraining(AutoColour(), 100, 20)
     other.restore(tensors_of(colours.state()), 3)
-    frozen = other.frozen_rest()
+    frozen = other.frozen_harmonics()
     assert frozen is not None
     assert frozen.tolist() == [False, True, True]
     with pytest.raises(ValueError, match="frozen"):
         other.restore(tensors_of(colours.state()), 4)
     colours.freeze(torch.ones(3, dtype=torch.bool))
-    assert colours.frozen_rest() is None, (
+    assert colours.frozen_harmonics() is None, (
         "where no harmonics are stored none need to be kept at zero"
     )
 
@@ -140,7 +140,7 @@ def seven_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _coloured(
     capture: Path, colour: NetworkColour | AutoColour, strategy: DefaultStrategy | None = None
 ) -> GaussianTrainer:
-    return assemble(
+    return build_trainer(
         Config(
             data=DataConfig(root=capture),
             model=StaticModel(sh_degree=1),
@@ -188,14 +188,14 @@ def test_harmonics_that_do_not_pay_are_dropped(seven_views: Path, name: str) -> 
         counts.add(len(trainer.model.scene.gaussians))
         if report.finding is not None:
             findings[step] = report.finding
-            dropped = trainer.model.colours.frozen_rest()
+            dropped = trainer.model.colours.frozen_harmonics()
         if step <= MEASURED_AFTER:
             seen.add(report.image.name)
     assert len(seen) == 6
     assert list(findings) == [MEASURED_AFTER]
     assert len(counts) > 4
     sh = trainer.model.scene.gaussians.sh
-    frozen = trainer.model.colours.frozen_rest()
+    frozen = trainer.model.colours.frozen_harmonics()
     if name == "none pays":
         assert "does not pay" in findings[MEASURED_AFTER]
         assert sh.shape[1] == 1

@@ -16,7 +16,7 @@ from dyngs.gaussians.colour.training import (
     MeasuredView,
     ViewDependence,
     find_view_dependent,
-    first_worthwhile,
+    select_worthwhile,
 )
 from dyngs.gaussians.rendering import RenderOptions, render
 
@@ -69,8 +69,8 @@ def test_a_matte_scene_keeps_none() -> None:
     """What was learned of the view is noise: it is worth less than nothing."""
     found = find(balls(0.05 * noise(0)), balls(torch.zeros(24, 3, 3)))
     assert not found.keeps.any()
-    assert found.worth_all < 0
-    assert found.worth_kept == 0
+    assert found.gain_all < 0
+    assert found.gain_kept == 0
     assert "does not pay" in str(found)
 
 
@@ -81,7 +81,7 @@ def test_only_the_glossy_part_keeps_them() -> None:
         "all but those that are hardly seen or hardly glossy"
     )
     assert not found.keeps[~GLOSSY].any()
-    assert found.worth_kept > 3
+    assert found.gain_kept > 3
     assert "pays for 2" in str(found)
 
 
@@ -111,7 +111,7 @@ def test_the_fewest_that_are_worth_nearly_everything(
     changes = torch.rand(count, generator=g)
     worths = torch.randn(count, generator=g)
     without = float(worths.clamp_min(0).sum()) + 1
-    keeps = first_worthwhile(changes, worths, without, tolerance)
+    keeps = select_worthwhile(changes, worths, without, tolerance)
     order = changes.argsort(descending=True, stable=True)
     errors = [without - float(worths[order[:k]].double().sum()) for k in range(count + 1)]
     limit = min(errors) * 10 ** (tolerance / 10) * (1 + 1e-9)

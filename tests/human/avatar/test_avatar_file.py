@@ -34,7 +34,7 @@ from dyngs.runs.opened import open_run, open_scene
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture") / "person"
     return write_human_capture(
-        folder, HumanOptions(size=24, num_frames=2, num_new=0, num_cameras=2, num_test=0)
+        folder, HumanOptions(size=24, num_frames=2, num_pose_frames=0, num_cameras=2, num_test=0)
     )
 
 

@@ -26,7 +26,7 @@ from dyngs.human.avatar.pose_fit import (
     IMAGES,
     SILHOUETTES,
     PoseComparison,
-    fitted_to_images,
+    fit_poses_to_images,
 )
 from dyngs.human.avatar.scene import HumanScene
 
@@ -39,7 +39,7 @@ def truth(person: Path) -> tuple[HumanScene, list[Cameras]]:
 def fitted(
     scene: HumanScene, images: list[Image], comparison: PoseComparison = IMAGES
 ) -> tuple[HumanScene, list[int]]:
-    return fitted_to_images(scene, cast(ImageLoader, Shown(images)), WHITE, comparison)
+    return fit_poses_to_images(scene, cast(ImageLoader, Shown(images)), WHITE, comparison)
 
 
 def test_disturbed_poses_are_found_again(
@@ -53,8 +53,8 @@ def test_disturbed_poses_are_found_again(
     assert mean_psnr(fit, images) > mean_psnr(start, images) + 5
     assert len(updates) == 2
     for row in range(2):
-        true = joints_of(scene, scene.moves_as, row)
-        before, after = (joints_of(scene, x.moves_as, row) for x in (start, fit))
+        true = joints_of(scene, scene.played_clip, row)
+        before, after = (joints_of(scene, x.played_clip, row) for x in (start, fit))
         errors = [float((x - true).norm(dim=1).mean()) for x in (before, after)]
         assert errors[1] < 0.5 * errors[0]
         assert errors[0] > 0.03
@@ -69,8 +69,8 @@ def test_what_fits_already_stays(
     scene, cameras = truth
     images = images_of(scene, cameras[:1], [0.0])
     fit, _ = fitted(scene, images)
-    torch.testing.assert_close(fit.moves_as.poses, scene.moves_as.poses[:1], rtol=0, atol=1e-5)
-    torch.testing.assert_close(fit.moves_as.trans, scene.moves_as.trans[:1], rtol=0, atol=1e-6)
+    torch.testing.assert_close(fit.played_clip.poses, scene.played_clip.poses[:1], rtol=0, atol=1e-5)
+    torch.testing.assert_close(fit.played_clip.trans, scene.played_clip.trans[:1], rtol=0, atol=1e-6)
 
 
 def test_silhouettes_alone_find_poses_again(
@@ -84,8 +84,8 @@ def test_silhouettes_alone_find_poses_again(
         replace(x, rgb_premultiplied=torch.rand_like(x.rgb_premultiplied)) for x in images
     ]
     fit, _ = fitted(start, without_colours, SILHOUETTES)
-    true = joints_of(scene, scene.moves_as, 0)
-    before, after = (joints_of(x, x.moves_as, 0) for x in (start, fit))
+    true = joints_of(scene, scene.played_clip, 0)
+    before, after = (joints_of(x, x.played_clip, 0) for x in (start, fit))
     errors = [float((x - true).norm(dim=1).mean()) for x in (before, after)]
     assert errors[1] < 0.5 * errors[0]
     assert mean_psnr(fit, images) > mean_psnr(start, images) + 3
@@ -101,8 +101,8 @@ def test_one_silhouette_moves_the_person_and_turns_no_joint(
     sideways = camera[0, :3] * 0.03  # in the image, where one view shows it
     start = scene.playing(replace(scene.clip, trans=scene.clip.trans + sideways))
     fit, _ = fitted(start, images, SILHOUETTES)
-    torch.testing.assert_close(fit.moves_as.poses, start.moves_as.poses[:1], rtol=0, atol=1e-6)
-    off = [(x.moves_as.trans[0] - scene.moves_as.trans[0]).norm() for x in (start, fit)]
+    torch.testing.assert_close(fit.played_clip.poses, start.played_clip.poses[:1], rtol=0, atol=1e-6)
+    off = [(x.played_clip.trans[0] - scene.played_clip.trans[0]).norm() for x in (start, fit)]
     assert off[1] < 0.4 * off[0]
 
 
@@ -114,4 +114,4 @@ def test_masked_pixels_say_nothing_about_the_pose(
     start = disturbed(scene)
     images = images_of(scene, cameras[:1], [0.0], mask=torch.zeros(SIZE, SIZE))
     fit, _ = fitted(start, images)
-    torch.testing.assert_close(fit.moves_as.poses, start.moves_as.poses[:1], rtol=0, atol=1e-5)
+    torch.testing.assert_close(fit.played_clip.poses, start.played_clip.poses[:1], rtol=0, atol=1e-5)

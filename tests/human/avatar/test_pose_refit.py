@@ -57,10 +57,10 @@ def test_one_row_comes_nearer_to_the_truth_and_all_else_stays(
     with torch.no_grad():
         start.learned["poses"].fill_(0.01)
         start.learned["trans"].fill_(0.002)
-    true = joints_of(scene, scene.moves_as, 1)
-    before = float((joints_of(start, start.moves_as, 1) - true).norm(dim=1).mean())
+    true = joints_of(scene, scene.played_clip, 1)
+    before = float((joints_of(start, start.played_clip, 1) - true).norm(dim=1).mean())
     found = refit_to(scene, cameras).refitted(start, 1)
-    after = float((joints_of(found, found.moves_as, 1) - true).norm(dim=1).mean())
+    after = float((joints_of(found, found.played_clip, 1) - true).norm(dim=1).mean())
     assert after < 0.6 * before
     for name in ("poses", "trans"):
         assert torch.equal(getattr(found.clip, name)[::2], getattr(start.clip, name)[::2])

@@ -26,7 +26,7 @@ from dyngs.human.avatar.posing import (
     blended_rotations,
     pose_blend_shapes,
     pose_gaussians,
-    rest_offsets,
+    pose_blend_offsets,
     rotate_sh,
     skinning_weights,
     texel_gaussians,
@@ -210,7 +210,7 @@ def test_blend_shapes_of_the_template_move_texels_as_its_surface() -> None:
     weights = skinning_weights(anchors, 24)
     shapes = pose_blend_shapes(body)
     assert shapes is not None
-    offsets = rest_offsets(anchors, posing, shapes)
+    offsets = pose_blend_offsets(anchors, posing, shapes)
     found = pose_gaussians(
         gaussians, weights, Skeleton(body.joints, body.parents), posing, offsets
     ).means

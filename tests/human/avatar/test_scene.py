@@ -81,7 +81,7 @@ def test_two_clips_of_the_same_pose_give_the_same_image() -> None:
 
 def test_baked_corrections_are_those_of_training() -> None:
     trained = stirred()
-    played = reloaded(trained).moves_as
+    played = reloaded(trained).played_clip
     for row in range(len(trained.clip)):
         posing = corrected_pose(trained.learned, trained.clip, row)
         torch.testing.assert_close(

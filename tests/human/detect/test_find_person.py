@@ -18,9 +18,9 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, all_views
 from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
-from dyngs.human.detect import find_person as module
+from dyngs.human.detect import detect_person as module
 from dyngs.human.detect.detector import Detection
-from dyngs.human.detect.find_person import find_person, with_found_person, write_found_person
+from dyngs.human.detect.detect_person import detect_person, ensure_detected_person, write_detected_person
 from dyngs.human.fit.keypoints import JOINTS, read_keypoints
 from dyngs.io.write import write_image
 from tests.detections import person
@@ -90,7 +90,7 @@ def test_masks_and_key_points_of_all_views(
 ) -> None:
     monkeypatch.setattr(module, "SIDE", side)
     said: list[str] = []
-    found = find_person(capture_of(clip), Rough(), tmp_path / "found", report_nothing, said.append)
+    found = detect_person(capture_of(clip), Rough(), tmp_path / "found", report_nothing, said.append)
     assert found.masks is not None
     assert found.keypoints is not None
     seen = [number for number in range(COUNT) if number != 4]
@@ -109,7 +109,7 @@ def test_masks_and_key_points_of_all_views(
 
 def test_nobody_is_an_error(clip: Path, tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="Rough finds nobody in 10 images"):
-        find_person(
+        detect_person(
             capture_of(clip), Rough(nobody=True), tmp_path / "found", report_nothing, [].append
         )
 
@@ -124,7 +124,7 @@ def test_a_camera_in_which_nobody_is_found_is_left_out(clip: Path, tmp_path: Pat
     detector.detect = lambda images: next(answers)(images)  # type: ignore[method-assign]
     said: list[str] = []
     both = capture.replace(splits={"train": (*first, *others)})
-    found = find_person(both, detector, tmp_path / "found", report_nothing, said.append)
+    found = detect_person(both, detector, tmp_path / "found", report_nothing, said.append)
     assert "warning: camera 1: Rough finds nobody, its images are left out" in said
     assert found.masks is not None
     assert not any(read_image(found.masks / f"{view.name}.png").any() for view in others)
@@ -136,7 +136,7 @@ def test_a_capture_of_the_person_comes_out(
 ) -> None:
     monkeypatch.setattr("dyngs.human.fit.capture_fit.STEPS", 2)
     out = tmp_path / "ann"
-    result = write_found_person(DataConfig(root=clip, frames="0:10:4"), out, Rough(), say=[].append)
+    result = write_detected_person(DataConfig(root=clip, frames="0:10:4"), out, Rough(), say=[].append)
     assert result.root == out
     capture = read_capture(DataConfig(root=out))
     assert capture.body is not None
@@ -146,7 +146,7 @@ def test_a_capture_of_the_person_comes_out(
         "nothing else is left behind"
     )
     with pytest.raises(DyngsError, match=r"exists|not empty"):
-        write_found_person(DataConfig(root=clip), out, Rough(), say=[].append)
+        write_detected_person(DataConfig(root=clip), out, Rough(), say=[].append)
 
 
 def test_a_clip_is_looked_at_once(
@@ -162,10 +162,10 @@ def test_a_clip_is_looked_at_once(
         made.append(out)
         return SimpleNamespace(summary="fitted")
 
-    monkeypatch.setattr(module, "write_found_person", write)
+    monkeypatch.setattr(module, "write_detected_person", write)
     said: list[str] = []
     for frames in ("0:8", "0:8", "0:4"):
-        data = with_found_person(DataConfig(root=clip, frames=frames), say=said.append)
+        data = ensure_detected_person(DataConfig(root=clip, frames=frames), say=said.append)
         assert (data.root, data.frames) == (made[-1], None)
     assert len(made) == 2
     assert [line for line in said if "found before" in line] == [said[2]]

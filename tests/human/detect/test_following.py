@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.human.detect.detector import Detection
-from dyngs.human.detect.find_person import with_sides
+from dyngs.human.detect.detect_person import with_sides
 from tests.detections import person
 
 LEFT = [1, 3, 5, 7, 9, 11, 13, 15]

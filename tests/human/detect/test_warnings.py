@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from dyngs.human.detect.detector import Detection
-from dyngs.human.detect.find_person import warnings_of
+from dyngs.human.detect.detect_person import warnings_of
 from tests.detections import person
 
 SIZE = 400

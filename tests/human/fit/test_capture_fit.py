@@ -42,7 +42,7 @@ from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.io.write import write_image
 
 OPTIONS = HumanOptions(
-    size=96, num_frames=4, num_new=0, num_cameras=5, num_test=1, seed=1, samples=1, body_seed=5
+    size=96, num_frames=4, num_pose_frames=0, num_cameras=5, num_test=1, seed=1, samples=1, body_seed=5
 )
 
 
@@ -100,7 +100,7 @@ def test_a_body_file_finds_its_own_shape(
     betas = torch.zeros(10)
     betas[:2] = torch.tensor([2.0, -1.5])
     options = HumanOptions(
-        size=96, num_frames=2, num_new=0, num_cameras=5, num_test=1, seed=1, samples=1
+        size=96, num_frames=2, num_pose_frames=0, num_cameras=5, num_test=1, seed=1, samples=1
     )
     root = write_capture_of(
         *write_smpl_like(tmp_path, "smplx"), tmp_path / "person", options, betas, monkeypatch
@@ -198,7 +198,7 @@ def test_images_without_silhouettes_are_refused(wrong: tuple[Capture, Capture]) 
 
 
 TWO_CLIPS = HumanOptions(
-    size=96, num_frames=2, num_new=2, num_cameras=4, num_test=4, seed=0, samples=1
+    size=96, num_frames=2, num_pose_frames=2, num_cameras=4, num_test=4, seed=0, samples=1
 )
 EFFORT = FitEffort(side=64, steps=40)
 AWAY = np.array([0.03, -0.02, 0.02])

@@ -21,7 +21,7 @@ from dyngs.human.body.body_reader import load_template, rest_shape
 from dyngs.human.fit.fitted_capture import (
     FitInputs,
     read_person,
-    with_fitted_body,
+    ensure_fitted_body,
     write_body,
     write_fitted_capture,
     write_split,
@@ -36,7 +36,7 @@ from dyngs.io.write import write_image
 def person_of_zeros(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small capture whose poses are said to be for the mean shape of another template."""
     options = HumanOptions(
-        size=32, num_frames=2, num_new=2, num_cameras=3, num_test=1, samples=1, body_seed=3
+        size=32, num_frames=2, num_pose_frames=2, num_cameras=3, num_test=1, samples=1, body_seed=3
     )
     root = write_human_capture(tmp_path_factory.mktemp("fit") / "person", options)
     for name in ("train", "pose"):
@@ -54,7 +54,7 @@ def data(person_of_zeros: Path, tmp_path: Path, short_fits: None) -> DataConfig:
 
 def test_a_capture_is_fitted_once(data: DataConfig) -> None:
     said: list[str] = []
-    fitted = with_fitted_body(data, say=said.append)
+    fitted = ensure_fitted_body(data, say=said.append)
     assert fitted.body is not None
     assert {path.name for path in fitted.body.iterdir()} == {
         *("body_train.npz", "body_pose.npz", "fit_report.json", "fit_overlays.png")
@@ -65,7 +65,7 @@ def test_a_capture_is_fitted_once(data: DataConfig) -> None:
         ("train", "val", "test", "pose"), "anny"
     )
     assert "fitted to the silhouettes first" in said[0]
-    again = with_fitted_body(data, say=said.append)
+    again = ensure_fitted_body(data, say=said.append)
     assert again == fitted
     assert "the fit of before" in said[-1]
 
@@ -84,13 +84,13 @@ def test_a_fit_is_fitted_again_only_for_another_template(
     ).root
     given = DataConfig(root=out)
     said = list[str]()
-    assert with_fitted_body(given, smpl, say=pytest.fail) == given
-    assert with_fitted_body(given, say=said.append) != given
+    assert ensure_fitted_body(given, smpl, say=pytest.fail) == given
+    assert ensure_fitted_body(given, say=said.append) != given
     assert "fitted to the silhouettes first" in said[0]
     named = data.model_copy(update={"body": out})
     said = []
-    assert with_fitted_body(named, smpl, say=pytest.fail) == named
-    assert with_fitted_body(named, say=said.append) == named
+    assert ensure_fitted_body(named, smpl, say=pytest.fail) == named
+    assert ensure_fitted_body(named, say=said.append) == named
     assert "is a fit of another template: its poses are taken, not its shape" in said[0]
 
 
@@ -184,7 +184,7 @@ def test_photos_and_found_masks_are_written_apart(tmp_path: Path) -> None:
 
 def test_masks_of_a_folder_replace_those_of_a_capture(tmp_path: Path) -> None:
     options = HumanOptions(
-        size=32, num_frames=2, num_new=0, num_cameras=2, num_test=0, seed=1, samples=1
+        size=32, num_frames=2, num_pose_frames=0, num_cameras=2, num_test=0, seed=1, samples=1
     )
     root = write_human_capture(tmp_path / "person", options)
     given = read_capture(DataConfig(root=root, test_every=0))

@@ -23,7 +23,7 @@ from dyngs.human.fit.capture_fit import (
     Fitting,
     ObservedFrame,
     body_discs,
-    first_poses,
+    estimate_initial_poses,
     likely_headings,
     place_and_height,
     pose_prior,
@@ -111,7 +111,7 @@ def test_the_heading_is_found(body: BodyDiscs, monkeypatch: pytest.MonkeyPatch) 
     place = torch.tensor([0.0, 1.0, 0.0])
     heading = 2.0
     seen = seen_by(body, standing(place, heading), ring(3, place))
-    clip = first_poses(torch.zeros(1, dtype=torch.float64), body, lambda _: seen)
+    clip = estimate_initial_poses(torch.zeros(1, dtype=torch.float64), body, lambda _: seen)
     facing = Rotation.from_rotvec(clip.poses[0, 0].double().numpy()).apply([0.0, 0.0, 1.0])
     # few steps, from 45 degrees apart
     assert facing @ np.array([math.sin(heading), 0.0, math.cos(heading)]) > 0.8
@@ -129,7 +129,7 @@ def test_who_turns_before_one_camera_is_followed(
     turns = [0.4 * math.pi + x for x in (0.1, 1.6, 3.1)]
     seen = [with_joints(body, standing(place, turn), camera) for turn in turns]
     times = torch.linspace(0, 1, 3, dtype=torch.float64)
-    clip = first_poses(times, body, seen.__getitem__)
+    clip = estimate_initial_poses(times, body, seen.__getitem__)
     for root, turn in zip(clip.poses[:, 0], turns, strict=True):
         facing = Rotation.from_rotvec(root.double().numpy()).apply([0.0, 0.0, 1.0])
         assert facing @ np.array([math.sin(turn), 0.0, math.cos(turn)]) > 0.8

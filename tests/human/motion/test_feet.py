@@ -12,7 +12,7 @@ from torch import Tensor
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.motion.placement import feet_kept, floor_contact, sole_points
+from dyngs.human.motion.placement import reduce_foot_sliding, floor_contact, sole_points
 
 FPS = 30.0
 BODY = default_template()
@@ -49,7 +49,7 @@ def test_soles_are_on_the_floor_under_the_feet_and_follow_them() -> None:
 
 def test_a_person_who_stands_and_is_pushed_stays_where_it_is() -> None:
     clip = clip_of(steps(20, (0.004, 0.0, 0.003)))
-    kept, note = feet_kept(clip, soles_of(clip), Y, FPS)
+    kept, note = reduce_foot_sliding(clip, soles_of(clip), Y, FPS)
     assert note == (
         "feet: on the floor in 20 of 20 frames, where they slide 5.0 mm per frame; with the root moved 0.0 mm"
     )
@@ -82,7 +82,7 @@ def walk(stride: float, root: float) -> MotionClip:
 def test_a_walk_with_a_root_that_is_too_fast_is_slowed_down_to_the_feet() -> None:
     true = walk(0.3, 1.0)
     fast = walk(0.3, 1.3)
-    kept, note = feet_kept(fast, soles_of(fast), Y, FPS)
+    kept, note = reduce_foot_sliding(fast, soles_of(fast), Y, FPS)
     frames, _, before, after = (float(x) for x in re.findall(r"[\d.]+", note))
     assert frames > 60
     assert after < 0.4 * before

@@ -23,7 +23,7 @@ from dyngs.human.synthetic.capture import (
     write_human_capture,
 )
 
-TINY = HumanOptions(size=24, num_frames=2, num_new=2, num_cameras=3, num_test=1, samples=1)
+TINY = HumanOptions(size=24, num_frames=2, num_pose_frames=2, num_cameras=3, num_test=1, samples=1)
 
 
 @cache

@@ -13,7 +13,7 @@ from splat_scenes import AROUND, cloud, seen
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.export.edit.frame import fitted
-from dyngs.gaussians.filters import filtered
+from dyngs.gaussians.filters import apply_filter
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.io.formats.similarity import (
     AXES,
@@ -47,7 +47,7 @@ def drawn(
     """Images (V, H, W, 3) of Gaussians with a 3D filter, and of both moved."""
     gaussians = cloud(150, degree).to(dtype=dtype)
     cameras = exact(AROUND).to(dtype=dtype)
-    gaussians = filtered(gaussians, torch.linspace(0.01, 0.1, 150, dtype=dtype))
+    gaussians = apply_filter(gaussians, torch.linspace(0.01, 0.1, 150, dtype=dtype))
 
     def seen(cameras: Cameras, scale: float, moved: bool) -> torch.Tensor:
         options = RenderOptions(near=0.01 * scale, mode=mode)  # type: ignore[arg-type]

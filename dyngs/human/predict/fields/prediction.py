@@ -23,7 +23,7 @@ from dyngs.data.read import captures_in
 from dyngs.data.times import distinct_times
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template, read_body
-from dyngs.human.fit.fitted_capture import with_fitted_body
+from dyngs.human.fit.fitted_capture import ensure_fitted_body
 from dyngs.human.predict.fields.eg_human_nerf import EgHumanNerf
 from dyngs.human.predict.fields.keypoint_nerf import AROUND, KeypointNerf
 from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
@@ -35,7 +35,7 @@ from dyngs.human.predict.people import (
     PosedBody,
     Sources,
     metric,
-    person_of,
+    read_captured_person,
     sources_of,
     window,
 )
@@ -60,7 +60,7 @@ from dyngs.models.renderable import (
     fixed_cameras,
 )
 from dyngs.models.views import evaluation_background
-from dyngs.ops.device import CPU, device_for
+from dyngs.ops.device import CPU, select_device
 
 NETWORKS: dict[str, Callable[[torch.Generator], FieldNetwork]] = {
     "keypoint_nerf": KeypointNerf,
@@ -164,7 +164,7 @@ class PredictedModel(Model[PredictedField]):
         self._section = run.config.model
         self._scene: PredictedField | None = None
 
-    def begin_with(self, scene: PredictedField) -> None:
+    def start_from(self, scene: PredictedField) -> None:
         self._scene = scene
 
     @property
@@ -237,7 +237,7 @@ class FieldPredictor(Predictor[FieldNetwork]):
         return self.config.model_copy(update={"data": data, "model": model})
 
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
-        model.begin_with(scene)
+        model.start_from(scene)
 
 
 class FieldLearner(Learner[FieldNetwork]):
@@ -287,7 +287,7 @@ class FieldLearner(Learner[FieldNetwork]):
 
     def _open(self, data: DataConfig) -> Person:
         """Return a person. Raises DyngsError: nobody to learn from."""
-        found = person_of(data, self._template)
+        found = read_captured_person(data, self._template)
         if all(len(ring) <= FEWEST_VIEWS for ring in moments(found.views).values()):
             raise DyngsError(f"{data.root}: shows no moment in three views or more to learn from")
         if self.network.needs_depth and any(view.depth_path is None for view in found.views):
@@ -310,7 +310,7 @@ def _part(image: Image, generator: torch.Generator) -> Image:
 
 def learner(config: Config, generator: torch.Generator) -> FieldLearner:
     """Return a network before the first step."""
-    device = device_for(config.run.device)
+    device = select_device(config.run.device)
     network = NETWORKS[config.model.kind](generator).to(device)
     return FieldLearner(config, network, captures_in(config.data), device)
 
@@ -331,8 +331,8 @@ def predictor(
     network = NETWORKS[model.kind](torch.Generator())
     load_weights(network, checkpoint)
     if model.body is None:
-        data = with_fitted_body(data, only_if_needed=True, say=say, report=report)
-    return FieldPredictor(config, network, person_of(data, template_of(model)), data)
+        data = ensure_fitted_body(data, only_if_needed=True, say=say, report=report)
+    return FieldPredictor(config, network, read_captured_person(data, template_of(model)), data)
 
 
 def template_of(model: FieldPredictorModel) -> BodyTemplate:

@@ -29,9 +29,9 @@ from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import captures_in, read_capture
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.colour.network import RestFrame
+from dyngs.gaussians.colour.network import RestPose
 from dyngs.gaussians.scene import GaussianTimeStep, render_options
-from dyngs.gaussians.schedule import Rates
+from dyngs.gaussians.schedule import RateSchedule
 from dyngs.human.avatar.observations import FACING_EXPONENT, project_points
 from dyngs.human.avatar.posing import BodyPose, Skeleton, pose_blend_shapes, texel_gaussians
 from dyngs.human.avatar.scene import HumanScene, first_scene
@@ -40,10 +40,10 @@ from dyngs.human.body.atlas import Texels, atlas_texels
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import load_template
 from dyngs.human.body.mesh import vertex_normals
-from dyngs.human.fit.fitted_capture import with_fitted_body
+from dyngs.human.fit.fitted_capture import ensure_fitted_body
 from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.human.predict.gps.rectification import spread
-from dyngs.human.predict.people import Person, depths, person_in
+from dyngs.human.predict.people import Person, depths, captured_person
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
 from dyngs.models.prediction import (
     Encoder,
@@ -59,7 +59,7 @@ from dyngs.models.prediction import (
     upsampled,
 )
 from dyngs.models.renderable import Renderable
-from dyngs.ops.device import CPU, device_for
+from dyngs.ops.device import CPU, select_device
 from dyngs.ops.quaternions import quat_product, unit_quats
 
 
@@ -526,7 +526,7 @@ class PersonPredictor(Predictor[AtlasNetwork]):
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
         assert isinstance(config.model, HumanModel)
         frames = self._person.person.motion.frames
-        model.begin_with(scene, HumanTraining(config.model, frames, Rates(config.train.steps)))
+        model.start_from(scene, HumanTraining(config.model, frames, RateSchedule(config.train.steps)))
 
     def _scene(self, maps: TexelMaps) -> HumanScene:
         return predict_avatar(self._person, maps, self.mean, self.network)
@@ -565,7 +565,7 @@ class AtlasLearner(Learner[AtlasNetwork]):
         scene = predict_avatar(self._moved[person], maps, self.mean, self.network)
         row = filmed.motion.rows[-1 if targets[0].frame is None else targets[0].frame]
         gaussians, posing = scene.in_frame(row, scene.given_weights())
-        frame = RestFrame(scene.gaussians.means, posing.rotations[0])
+        frame = RestPose(scene.gaussians.means, posing.rotations[0])
         moment = GaussianTimeStep(gaussians, targets[0].time, frame)
         loss, rendered, truth = _images_error(
             scene, [moment] * len(targets), targets, background, self.config
@@ -594,7 +594,7 @@ class AtlasLearner(Learner[AtlasNetwork]):
 def learner(config: Config, generator: torch.Generator) -> AtlasLearner:
     """Return the network of ``model.kind: human_predictor`` before the first step: captures read,
     nothing trained."""
-    device = device_for(config.run.device)
+    device = select_device(config.run.device)
     model: Any = config.model
     body = load_template(human_options(model))
     network = new_network(model, generator).to(device)
@@ -619,7 +619,7 @@ def predictor(
     model: Any = config.model
     network = new_network(model, torch.Generator())
     mean = load_network(network, checkpoint, model.resolution)
-    data = with_fitted_body(data, human_options(model), only_if_needed=True, say=say, report=report)
+    data = ensure_fitted_body(data, human_options(model), only_if_needed=True, say=say, report=report)
     person = read_person(data, model, load_template(human_options(model)))
     return PersonPredictor(config, network, mean, person, data)
 
@@ -656,7 +656,7 @@ def read_person(data: DataConfig, model: HumanPredictorModel, body: BodyTemplate
     """Return the person of one capture."""
     capture = read_capture(data)
     images = ImageLoader(capture.splits["train"], data)
-    return atlas_person(person_in(capture, body, images), model)
+    return atlas_person(captured_person(capture, body, images), model)
 
 
 def mean_colours(people: list[AtlasPerson], resolution: int) -> Tensor:

@@ -68,8 +68,8 @@ from dyngs.models.prediction import (
     upsampled,
 )
 from dyngs.models.renderable import Renderable
-from dyngs.ops.device import CPU, device_for
-from dyngs.ops.quaternions import quat_product, quats_of, unit_quats
+from dyngs.ops.device import CPU, select_device
+from dyngs.ops.quaternions import quat_product, quats_from_matrices, unit_quats
 
 QUARTER = 4
 """Pixels of the windows per pixel of the sweep."""
@@ -274,7 +274,7 @@ def gaussians_of(pair: RectifiedPair, offsets: Tensor, raw: Tensor) -> Gaussians
     opacities = (part["opacity"][:, 0] + _OPACITY_LOGIT).sigmoid() * within
     opacities = opacities.clamp(1e-4, 1 - 1e-4)
     one = part["rotation"].new_tensor([1.0, 0.0, 0.0, 0.0])
-    world_from_rect = quats_of(pair.rect_from_world.T[None])
+    world_from_rect = quats_from_matrices(pair.rect_from_world.T[None])
     rgb = pair.rgb.permute(0, 2, 3, 1)[solid]
     return Gaussians(
         means=pair.points(depth)[solid],
@@ -361,7 +361,7 @@ class GpsPredictor(Predictor[GpsNetwork]):
         return preset.model_copy(update={"data": data, "model": model})
 
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
-        model.begin_with(scene, StaticTraining(FilterUpdate()))
+        model.start_from(scene, StaticTraining(FilterUpdate()))
 
 
 class GpsLearner(Learner[GpsNetwork]):
@@ -437,7 +437,7 @@ def _picture(pair: RectifiedPair, offsets: Tensor) -> Tensor:
 
 def learner(config: Config, generator: torch.Generator) -> GpsLearner:
     """Return the network of ``model.kind: gps`` before the first step."""
-    device = device_for(config.run.device)
+    device = select_device(config.run.device)
     return GpsLearner(config, GpsNetwork(generator).to(device), captures_in(config.data), device)
 
 

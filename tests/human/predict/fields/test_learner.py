@@ -34,7 +34,7 @@ def run(
     )
 
 
-def person_of(folder: Path) -> Path:
+def read_captured_person(folder: Path) -> Path:
     return folder / "s0000" / "p000001"
 
 
@@ -64,16 +64,16 @@ def test_a_prediction_is_a_run(
     run: Path, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Drawn and measured like any other; not trained, and no Gaussians."""
-    made = predict(run, person_of(folder), tmp_path / "three", 3)
+    made = predict(run, read_captured_person(folder), tmp_path / "three", 3)
     found = load_run(made.run_dir)
     assert isinstance(found.renderable, PredictedField)
     assert (found.config.model.kind, found.step, found.config.data.root) == (
         "predicted_field",
         0,
-        person_of(folder),
+        read_captured_person(folder),
     )
     assert (made.steps, made.num_gaussians, len(made.views)) == (0, 0, 3)
-    again = predict(run, person_of(folder), tmp_path / "again", made.views)
+    again = predict(run, read_captured_person(folder), tmp_path / "again", made.views)
     state = load_run(again.run_dir).renderable.state()
     assert all(
         torch.equal(x.tensor, state[name].tensor) for name, x in found.renderable.state().items()
@@ -88,12 +88,12 @@ def test_a_prediction_is_a_run(
         capsys, "train", "--resume", str(made.run_dir)
     )
     assert "is not trained" in error_line(
-        capsys, "train", f"data.root={person_of(folder)}", "model.kind=predicted_field"
+        capsys, "train", f"data.root={read_captured_person(folder)}", "model.kind=predicted_field"
     )
 
 
 def test_what_cannot_be_predicted_from_is_refused(run: Path, folder: Path, tmp_path: Path) -> None:
-    person = person_of(folder)
+    person = read_captured_person(folder)
     out = tmp_path / "out"
     with pytest.raises(
         DyngsError, match="p000001: a field is predicted from two views of one moment"
@@ -139,7 +139,7 @@ def test_a_body_is_fitted_where_none_is_given(
         "dyngs.human.predict.fields.prediction.with_fitted_body",
         lambda data, **_: (asked.append(data.root), data)[1],
     )
-    person = Path(shutil.copytree(person_of(folder), tmp_path / "bare"))
+    person = Path(shutil.copytree(read_captured_person(folder), tmp_path / "bare"))
     (person / "body_train.npz").unlink()
     with pytest.raises(DyngsError, match="bare: has no body parameters"):
         predict(run, person, tmp_path / "out", 2)
@@ -148,7 +148,7 @@ def test_a_body_is_fitted_where_none_is_given(
 
 
 def test_somebody_must_be_seen_from_three_sides(folder: Path, tmp_path: Path) -> None:
-    person = Path(shutil.copytree(person_of(folder), tmp_path / "set" / "ann"))
+    person = Path(shutil.copytree(read_captured_person(folder), tmp_path / "set" / "ann"))
     file = person / "transforms_train.json"
     document = json.loads(file.read_text())
     file.write_text(json.dumps(document | {"frames": document["frames"][:2]}))

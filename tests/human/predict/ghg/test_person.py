@@ -12,7 +12,7 @@ from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.read import read_capture
 from dyngs.human.predict.ghg.network import AtlasPerson, spread_views
-from dyngs.human.predict.people import person_in
+from dyngs.human.predict.people import captured_person
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +54,6 @@ def test_captures_without_a_body_or_silhouettes_are_refused(
 ) -> None:
     capture = read_capture(DataConfig.model_validate({"root": people(tmp_path, (2,)) / "p2"}))
     with pytest.raises(DyngsError, match="no body parameters"):
-        person_in(capture.replace(body=None), body(), sitter.person.images)
+        captured_person(capture.replace(body=None), body(), sitter.person.images)
     with pytest.raises(DyngsError, match="no silhouettes"):
-        person_in(capture.replace(has_alpha=False), body(), sitter.person.images)
+        captured_person(capture.replace(has_alpha=False), body(), sitter.person.images)

@@ -31,7 +31,7 @@ from dyngs.human.predict.ghg.network import (
     colours_nearby,
     observe_texels,
 )
-from dyngs.human.predict.people import person_in
+from dyngs.human.predict.people import captured_person
 from dyngs.human.synthetic.capture import (
     PosedMesh,
     render_mesh,
@@ -83,7 +83,7 @@ def sitter(poses: Tensor) -> AtlasPerson:
         Path("person"), "body_json", {"train": (view,)}, has_alpha=True, body={"train": frames}
     )
     images = cast(ImageLoader, SimpleNamespace(views=(view,)))
-    person = person_in(capture, body(), images)
+    person = captured_person(capture, body(), images)
     return atlas_person(person, HumanPredictorModel(resolution=64, scaffold_heights=(0.0, 0.04)))
 
 

@@ -44,7 +44,7 @@ def run(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(stereo_config(folder, tmp_path_factory.mktemp("run") / "net"))
 
 
-def person_of(folder: Path) -> Path:
+def read_captured_person(folder: Path) -> Path:
     return captures_in(DataConfig(root=folder))[0].root
 
 
@@ -87,7 +87,7 @@ def test_training_lowers_the_errors(folder: Path, tmp_path: Path) -> None:
 def test_a_prediction_is_a_run_of_a_static_scene(run: Path, folder: Path, tmp_path: Path) -> None:
     """Which is drawn, measured and trained on like any other; the same views give the same
     bytes."""
-    person = person_of(folder)
+    person = read_captured_person(folder)
     made = predict(run, person, tmp_path / "two", ("f000_c03.png", "f000_c05.png"))
     found = load_run(made.run_dir)
     assert isinstance(found.scene, StaticScene)
@@ -107,7 +107,7 @@ def test_a_prediction_is_a_run_of_a_static_scene(run: Path, folder: Path, tmp_pa
 def test_a_ring_is_seen_from_all_round(run: Path, folder: Path, tmp_path: Path) -> None:
     """Between two views the surface of these two is drawn, as if there were no others; so it is
     after storing."""
-    person = person_of(folder)
+    person = read_captured_person(folder)
     all_round = predict(run, person, tmp_path / "12", 12)
     assert len(all_round.views) == 12
     found = load_run(all_round.run_dir).scene
@@ -149,7 +149,7 @@ def test_one_moment_of_several_is_what_its_run_is_trained_on(
     run: Path, folder: Path, tmp_path: Path
 ) -> None:
     person = changed(
-        person_of(folder),
+        read_captured_person(folder),
         tmp_path / "moving",
         lambda frames: [
             frame | {"frame": i % 2, "time": float(i % 2)} for i, frame in enumerate(frames)
@@ -190,7 +190,7 @@ def without_depth(frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def test_what_cannot_be_trained_on_is_refused(
     folder: Path, tmp_path: Path, change: Any, message: str
 ) -> None:
-    changed(person_of(folder), tmp_path / "set" / "p", change)
+    changed(read_captured_person(folder), tmp_path / "set" / "p", change)
     with pytest.raises(DyngsError, match=message):
         learner(stereo_config(tmp_path / "set", tmp_path), torch.Generator())
 

@@ -22,13 +22,13 @@ import numpy as np
 import torch
 
 from dyngs.core.conventions import SH_C0
-from dyngs.deform.bodies.field import BodyField, BodyRest
-from dyngs.deform.bodies.paths import FrameStack, Path, clear_, found_paths
+from dyngs.deform.bodies.field import BodyField, BodyRestPose
+from dyngs.deform.bodies.paths import FrameStack, Path, clear_path_, find_paths
 from dyngs.deform.control_nodes import spline_basis
 from dyngs.deform.field import MAX_KEY_TIMES, DeformationField
 from dyngs.gaussians import Gaussians
 from dyngs.ops.harmonics import light_harmonics
-from dyngs.ops.quaternions import shorter_ways
+from dyngs.ops.quaternions import align_quat_signs
 
 COARSE, FINE = 6, 8  # Cells along an edge of the cube that the sphere is divided by
 GRID = 256  # Cubes along an edge of the table of the cells that directions point at
@@ -87,7 +87,7 @@ def estimate_rotation(shots: FrameStack, path: Path) -> BodyRotation:
 
 
 def _frame(shots: FrameStack, path: Path, index: int) -> Frame:
-    rows, columns, normals = shots.on_ball(index, path.centers[index], path.radius)
+    rows, columns, normals = shots.ball_pixels(index, path.centers[index], path.radius)
     step = max(len(rows) // MOST_PIXELS, 1)
     return normals[::step], shots.images[index, rows[::step], columns[::step]]
 
@@ -426,11 +426,11 @@ class Bodies:
         turns = [Rotation.from_matrix(body.turning.rotations) for body in self.bodies]
         turns = [np.degrees((turn[1:] * turn[:-1].inv()).magnitude()).sum() for turn in turns]
         things = "1 body turns" if len(turns) == 1 else f"{len(turns)} bodies turn"
-        clip = "followed at all times at once" if self.explain_all else "other things move, too"
+        clip = "followed at all times at once" if self.explains_all_motion else "other things move, too"
         return f"{things} by {', '.join(f'{turn:.0f}' for turn in turns)} degrees; {clip}"
 
     @cached_property
-    def explain_all(self) -> bool:
+    def explains_all_motion(self) -> bool:
         """Whether hardly anything else moves."""
         from scipy.ndimage import uniform_filter
 
@@ -438,7 +438,7 @@ class Bodies:
         marked = maps * (uniform_filter(maps, 5, axes=(1, 2)) > MARKED)
         whole = float(marked.sum())
         for body in self.bodies:
-            clear_(marked, self.shots, body.path)
+            clear_path_(marked, self.shots, body.path)
         return float(marked.sum()) < LEFT * whole
 
     def within(self, others: DeformationField) -> BodyField:
@@ -460,7 +460,7 @@ class Bodies:
             name: torch.from_numpy(np.stack(x)).float().to(device) for name, x in splines.items()
         }
         radii = torch.tensor([body.path.radius for body in self.bodies], device=device)
-        rest = BodyRest(
+        rest = BodyRestPose(
             torch.from_numpy(centers).float().to(device), radii, (labels - 1).to(device)
         )
         albedo = torch.cat([seeds.sh[:, 0] + 0.5 / SH_C0 for seeds in self.seeds]).to(device)
@@ -470,7 +470,7 @@ class Bodies:
         return BodyField(others, rest, points | {"albedo": albedo, "sun": up})
 
 
-def found_bodies(shots: FrameStack, limit: int, num_terms: int) -> Bodies | None:
+def find_bodies(shots: FrameStack, limit: int, num_terms: int) -> Bodies | None:
     """Return what moves rigidly, with at most ``limit`` Gaussians of ``num_terms`` harmonics; None
     where nothing does.
 
@@ -495,7 +495,7 @@ def _rigid_bodies(shots: FrameStack) -> tuple[RigidBody, ...]:
     bodies = []
     refused = []
     while len(bodies) < MOST_BODIES and len(refused) < MOST_REFUSED:
-        paths = found_paths(shots, maps)
+        paths = find_paths(shots, maps)
         if not paths:
             break
         fresh = [path for path in paths if not any(path.is_like(other) for other in refused)]
@@ -503,11 +503,11 @@ def _rigid_bodies(shots: FrameStack) -> tuple[RigidBody, ...]:
             body = RigidBody(path, estimate_rotation(shots, path))
             if _is_rigid(body.turning):
                 bodies.append(body)
-                clear_(maps, shots, path)
+                clear_path_(maps, shots, path)
                 break
             refused.append(path)
         else:
-            clear_(maps, shots, paths[0])
+            clear_path_(maps, shots, paths[0])
     return tuple(bodies)
 
 
@@ -540,7 +540,7 @@ def _quats(rotations: np.ndarray) -> np.ndarray:
     before."""
     from scipy.spatial.transform import Rotation
 
-    return shorter_ways(Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]])
+    return align_quat_signs(Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]])
 
 
 def _fitted(basis: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -151,7 +151,7 @@ def _turns(people: Sequence[Detection]) -> bool:
 SIDE = 960  # longest side of the images that a detector sees, px
 
 
-def find_person(
+def detect_person(
     capture: Capture,
     detector: Detector,
     folder: Path,
@@ -229,7 +229,7 @@ def _write_keypoints(path: Path, points: dict[str, np.ndarray]) -> None:
     write_text(path, json.dumps({"images": images, "annotations": people}) + "\n")
 
 
-def write_found_person(
+def write_detected_person(
     options: DataConfig,
     out: Path,
     detector: Detector,
@@ -247,13 +247,13 @@ def write_found_person(
     folder = temporary_folder_beside(out.with_name(f"{out.name}.found"))
     try:
         capture = read_fixed_camera(options) if clip else read_capture(options)
-        found = find_person(capture, detector, folder, report, say)
+        found = detect_person(capture, detector, folder, report, say)
         return write_fitted_capture(options, out, report, found)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def with_found_person(
+def ensure_detected_person(
     data: DataConfig, *, say: Callable[[str], None] = show, report: ReportProgress = report_nothing
 ) -> DataConfig:
     """Return the options with the capture of the person that is found in a clip; the same clip is
@@ -268,7 +268,7 @@ def with_found_person(
     def find() -> None:
         detector = MediaPipe()
         say(f"person:  found first, as by `dyngs data people`, into {folder}")
-        say(write_found_person(data, folder, detector, report, say).summary)
+        say(write_detected_person(data, folder, detector, report, say).summary)
 
     make_once(folder, find, say, f"person:  found before, in {folder}")
     note_source(folder, data.root)

@@ -29,21 +29,21 @@ SHOWS = 1e-3  # Sum of weights, in pixels, from which a Gaussian counts as visib
 
 
 @dataclass(frozen=True)
-class StillErrors:
+class StaticErrors:
     """Errors of a static scene in the images, per Gaussian."""
 
     most: Tensor  # (N,) large where anything moves, be it this Gaussian or what hides it at times
     usual: Tensor  # (N,) large where this moves
 
 
-def still_errors(
+def static_errors(
     gaussians_at: Callable[[float], Gaussians],
     images: Sequence[Image],
     options: RenderOptions,
     background: Tensor,
     shader_at: Callable[[float], Shader | None] = lambda _: None,
     sure: float = 1.0,
-) -> StillErrors:
+) -> StaticErrors:
     """Return the errors of a static scene in the images, where each Gaussian is seen.
 
     e_vi = |sum_p w_vip (expected - truth)| / sum_p w_vip with w = alpha T for each image v, a mean
@@ -89,11 +89,11 @@ def still_errors(
     errors, weights = (torch.stack(x) for x in zip(*found, strict=True))
     if not masked and not expected:
         mean = errors.sum(0) / weights.sum(0).clamp_min(1e-6)
-        return StillErrors(mean, mean)
+        return StaticErrors(mean, mean)
     shows = weights > SHOWS
     ordered = torch.where(shows, errors / weights.clamp_min(SHOWS), 0.0).sort(0, True).values
     rank = ((1 - USUAL) * shows.sum(0)).long().clamp_max(len(ordered) - 1)
-    return StillErrors(ordered[0], ordered.gather(0, rank[None])[0])
+    return StaticErrors(ordered[0], ordered.gather(0, rank[None])[0])
 
 
 def weighted_sums(
@@ -111,15 +111,15 @@ def weighted_sums(
     ]
 
 
-def cameras_in_place(views: Sequence[View]) -> list[list[int]]:
+def group_fixed_cameras(views: Sequence[View]) -> list[list[int]]:
     """Return the indices of the views of each fixed camera that took ``MIN_SAME`` views or more."""
     return [seen for seen in static_cameras(views) if len(seen) >= MIN_SAME]
 
 
-def views_to_compare(views: Sequence[View], limit: int = 50) -> list[int]:
+def select_comparison_views(views: Sequence[View], limit: int = 50) -> list[int]:
     """Return indices of at most ``limit`` views, evenly chosen; of fixed cameras, ``MOMENTS`` of
     each or more."""
-    cameras = cameras_in_place(views)
+    cameras = group_fixed_cameras(views)
     if not cameras:
         return evenly_spaced(len(views), limit)
     chosen = [cameras[i] for i in evenly_spaced(len(cameras), max(limit // MOMENTS, 1))]
@@ -143,7 +143,7 @@ def _camera_key(image: Image) -> bytes:
     )
 
 
-def two_group_threshold(scores: Tensor) -> float:
+def otsu_threshold(scores: Tensor) -> float:
     """Return the threshold between two groups of ``scores`` (N,) (Otsu 1979); infinite where all
     are equal."""
     from skimage.filters import threshold_otsu
@@ -154,7 +154,7 @@ def two_group_threshold(scores: Tensor) -> float:
 
 
 @torch.no_grad()
-def differing_fraction(cameras: Sequence[Sequence[Tensor]]) -> float:
+def changed_fraction(cameras: Sequence[Sequence[Tensor]]) -> float:
     """Return the fraction of pixels that differ from the median image of their camera.
 
     Each image is first brought to the brightness of the median (changing exposure is no motion) and

@@ -10,7 +10,7 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.body_reader import load_template
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import motion_clip
-from dyngs.human.motion.placement import feet_kept, place_like, sole_points, up_direction
+from dyngs.human.motion.placement import reduce_foot_sliding, place_like, sole_points, up_direction
 from dyngs.human.motion.retarget import read_motion
 from dyngs.models.checkpoint import CheckpointInfo
 from dyngs.models.kind import InMotion
@@ -40,8 +40,8 @@ def in_motion(
     if keep_feet:
         skeleton = playing.learned_skeleton
         floor = float(scene.anchors.points[:, 1].min())
-        soles = sole_points(playing.moves_as, skeleton.joints, skeleton.parents, floor)
-        clip, note = feet_kept(clip, soles, up_direction(scene.clip), motion.fps)
+        soles = sole_points(playing.played_clip, skeleton.joints, skeleton.parents, floor)
+        clip, note = reduce_foot_sliding(clip, soles, up_direction(scene.clip), motion.fps)
         playing = scene.playing(clip)
         notes = (*notes, note)
     return InMotion(playing.to(person.gaussians.means.device), motion.fps, notes)

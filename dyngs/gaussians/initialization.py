@@ -34,7 +34,7 @@ from dyngs.data.scene_space import (
     points_in_frusta,
 )
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.colour.network import box_around
+from dyngs.gaussians.colour.network import robust_bounding_box
 from dyngs.gaussians.colour.training import AutoTraining, ColourTraining, NetworkTraining
 from dyngs.gaussians.densify import DefaultDensifier, Densifier, McmcDensifier
 from dyngs.gaussians.filters import FilterUpdate
@@ -56,7 +56,7 @@ CANDIDATES = 4
 
 
 @dataclass(frozen=True)
-class StartValues:
+class InitialValues:
     """Scales and opacities of the first Gaussians, by strategy."""
 
     opacity: float = START_OPACITY  # in (0, 1)
@@ -64,19 +64,19 @@ class StartValues:
     max_gaussians: int = 3_000_000  # more points than this are thinned at random
 
     @staticmethod
-    def for_strategy(strategy: Strategy) -> StartValues:
+    def for_strategy(strategy: Strategy) -> InitialValues:
         """Return the published start of ``strategy`` (3DGS-MCMC: more opaque and smaller)."""
         match strategy:
             case McmcStrategy():
-                return StartValues(MCMC_OPACITY, MCMC_SCALE, strategy.max_gaussians)
+                return InitialValues(MCMC_OPACITY, MCMC_SCALE, strategy.max_gaussians)
             case DefaultStrategy():
-                return StartValues(max_gaussians=strategy.max_gaussians)
+                return InitialValues(max_gaussians=strategy.max_gaussians)
             case FixedStrategy():
-                return StartValues()
+                return InitialValues()
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class SceneGeometry:
     """Cameras and extent of a scene before training, in scene units."""
 
     views: Sequence[View]
@@ -101,10 +101,10 @@ class Surroundings:
         return extent_of(self.camera_centers) or 1.0
 
 
-def surroundings(capture: Capture) -> Surroundings:
+def surroundings(capture: Capture) -> SceneGeometry:
     """Return the properties of a capture that initialisation needs."""
     points = capture.points
-    return Surroundings(
+    return SceneGeometry(
         views=capture.splits["train"],
         points=None if points is None else points.xyz,
         points_rgb=None if points is None else points.rgb,
@@ -114,9 +114,9 @@ def surroundings(capture: Capture) -> Surroundings:
 
 
 def initial_gaussians(
-    scene: Surroundings,
+    scene: SceneGeometry,
     options: PointsInit | RandomInit | SceneInit,
-    start: StartValues,
+    start: InitialValues,
     sh_degree: int,
     generator: torch.Generator,
 ) -> Gaussians:
@@ -146,7 +146,7 @@ def initial_gaussians(
 
 
 def _random_points(
-    scene: Surroundings,
+    scene: SceneGeometry,
     options: PointsInit | RandomInit | SceneInit,
     max_points: int,
     generator: torch.Generator,
@@ -184,7 +184,7 @@ def _seen_together(views: Sequence[View], count: int, generator: torch.Generator
     return torch.from_numpy(xyz[np.sort(np.argsort(-order, kind="stable")[:count])])
 
 
-def _isotropic(xyz: Tensor, base: Tensor, start: StartValues, sh_degree: int) -> Gaussians:
+def _isotropic(xyz: Tensor, base: Tensor, start: InitialValues, sh_degree: int) -> Gaussians:
     log_scale = 0.5 * mean_squared_neighbour_distance(xyz).log() + math.log(start.scale_factor)
     logit = math.log(start.opacity / (1 - start.opacity))
     sizes = log_scale.float()[:, None]
@@ -209,7 +209,7 @@ def mean_squared_neighbour_distance(xyz: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class FirstGaussians:
+class InitialGaussians:
     """Gaussians of a scene that a run goes on from, and which of them (N,) bool stay as they are;
     None: none."""
 
@@ -217,18 +217,18 @@ class FirstGaussians:
     frozen: Tensor | None = None
 
 
-def first_gaussians(run: RunStart) -> Gaussians:
+def load_or_create_gaussians(run: RunStart) -> Gaussians:
     """Return the Gaussians of the scene to go on from, at the points of the capture, or at
     random."""
     if run.first is not None:
         return run.first.gaussians
     config = run.config
-    start = StartValues.for_strategy(run.asked.strategy)
+    start = InitialValues.for_strategy(run.asked.strategy)
     where = surroundings(run.capture)
     return initial_gaussians(where, config.init, start, config.stored_sh_degree, run.generator)
 
 
-def colours_of(run: RunStart, gaussians: Gaussians, *, sees_time: bool) -> ColourTraining:
+def colours_of(run: RunStart, gaussians: Gaussians, *, uses_time: bool) -> ColourTraining:
     """Return how colours are trained."""
     colour = run.config.colour
     steps = run.config.train.steps
@@ -238,13 +238,13 @@ def colours_of(run: RunStart, gaussians: Gaussians, *, sees_time: bool) -> Colou
         case AutoColour():
             return AutoTraining(colour, steps, len(run.capture.splits["train"]))
         case NetworkColour():
-            box = box_around(gaussians.means)
-            return NetworkTraining(colour, steps, box, run.generator, sees_time=sees_time)
+            box = robust_bounding_box(gaussians.means)
+            return NetworkTraining(colour, steps, box, run.generator, uses_time=uses_time)
         case _:
             assert_never(colour)
 
 
-def densifier_of(run: RunStart) -> Densifier:
+def build_densifier(run: RunStart) -> Densifier:
     """Return the strategy of the run."""
     strategy = run.config.strategy
     steps = run.config.train.steps
@@ -267,7 +267,7 @@ def densifier_of(run: RunStart) -> Densifier:
             assert_never(strategy)
 
 
-def filter_update(run: RunStart) -> FilterUpdate:
+def build_filter_update(run: RunStart) -> FilterUpdate:
     """Return when the 3D filter of the model is computed anew."""
     config = run.config
     cameras = (

@@ -15,7 +15,7 @@ from dyngs.core.conventions import SH_C0
 from dyngs.deform.fixed_cameras.hulls import (
     FixedCameraClip,
     Track,
-    blobs_in,
+    extract_blobs,
     linked,
     silhouettes_at,
 )
@@ -46,7 +46,7 @@ class TimedGaussians:
     velocity: Tensor  # (3,) world units per clip
 
 
-def moments_of(
+def track_gaussians(
     track: Track, clips: Sequence[FixedCameraClip], thinned: float, num_terms: int
 ) -> list[TimedGaussians]:
     """Return Gaussians on the surface of what ``track`` follows, one for ``thinned`` of its cubes,
@@ -64,7 +64,7 @@ def moments_of(
         here = Track((time,), (blob,))
         points, side = usual if track.travels else surface(here)
         dense = _on_surface(points, side, here, clips, num_terms)
-        if pays(dense, time, clips):
+        if improves_images(dense, time, clips):
             gaussians = _thinned(dense, max(round(len(points) / thinned), 1))
             found.append(
                 TimedGaussians(time, gaussians, torch.from_numpy(velocity * track.travels).float())
@@ -79,7 +79,7 @@ def _thinned(gaussians: Gaussians, count: int) -> Gaussians:
     return kept.replace(log_scales=kept.log_scales + 0.5 * math.log(len(gaussians) / count))
 
 
-def pays(gaussians: Gaussians, time: float, clips: Sequence[FixedCameraClip]) -> bool:
+def improves_images(gaussians: Gaussians, time: float, clips: Sequence[FixedCameraClip]) -> bool:
     """Return whether ``gaussians``, drawn over the cameras' medians, are nearer to the images of
     ``time`` than these.
 
@@ -157,7 +157,7 @@ CHANGE = 0.05  # Least change of a channel, of 1
 LIFT = 0.5  # Distance of a copy before its original, in longest standard deviations
 
 
-def surface_changes(
+def detect_surface_changes(
     clips: Sequence[FixedCameraClip], still: Gaussians, options: RenderOptions, limit: int
 ) -> list[TimedGaussians]:
     """Return copies of ``still`` Gaussians at the times at which most cameras see another colour
@@ -231,20 +231,20 @@ ROOM = 0.25  # Room around the things that stand still and the cameras, in sides
 
 
 @dataclass(frozen=True)
-class FirstMotion:
+class InitialMotion:
     """What changes, as Gaussians at single times."""
 
     moments: tuple[TimedGaussians, ...] = ()
     finding: str | None = None
 
 
-def first_motion(
+def find_initial_motion(
     clips: Sequence[FixedCameraClip],
     still: Gaussians,
     extent: float,
     limit: int,
     options: RenderOptions,
-) -> FirstMotion:
+) -> InitialMotion:
     """Return what changes before the cameras of ``clips``, where ``still`` Gaussians are or the
     cameras look.
 
@@ -252,32 +252,32 @@ def first_motion(
     at times.
     """
     if len(clips) < 2 or limit < 1:
-        return FirstMotion()
-    tracks = found_tracks(clips, *_box(clips, still, extent))
+        return InitialMotion()
+    tracks = find_tracks(clips, *_box(clips, still, extent))
     cubes = sum(len(surface(track)[0]) * len(track.times) for track in tracks)
     thinned = max(cubes / limit, 1.0)
     num_terms = still.sh.shape[1]
     things = [
-        moments for moments in (moments_of(x, clips, thinned, num_terms) for x in tracks) if moments
+        moments for moments in (track_gaussians(x, clips, thinned, num_terms) for x in tracks) if moments
     ]
-    shades = surface_changes(clips, still, options, limit)
+    shades = detect_surface_changes(clips, still, options, limit)
     moments = tuple(moment for group in (*things, shades) for moment in group)
     if not moments:
-        return FirstMotion()
+        return InitialMotion()
     total = len(_times(clips))
     count = sum(len(one.gaussians) for one in moments)
     lengths = ", ".join(str(len(one)) for one in things)
     what = f"things that move found at {lengths} of {total} times" if things else "surfaces change"
-    return FirstMotion(moments, f"{what} before the fixed cameras: {count:,} Gaussians begin there")
+    return InitialMotion(moments, f"{what} before the fixed cameras: {count:,} Gaussians begin there")
 
 
-def found_tracks(
+def find_tracks(
     clips: Sequence[FixedCameraClip], low: np.ndarray, high: np.ndarray
 ) -> list[Track]:
     """Return the tracks of all that moves in the box from ``low`` to ``high`` (3,), longest
     first."""
     times = _times(clips)
-    return linked(times, [blobs_in(silhouettes_at(clips, time), low, high) for time in times])
+    return linked(times, [extract_blobs(silhouettes_at(clips, time), low, high) for time in times])
 
 
 def _box(
