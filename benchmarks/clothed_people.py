@@ -306,7 +306,11 @@ class Lens:
 
 
 def draw(
-    avatar: Avatar, posed: tuple[np.ndarray, np.ndarray], pose: np.ndarray, lens: Lens, light: DirectionalLight
+    avatar: Avatar,
+    posed: tuple[np.ndarray, np.ndarray],
+    pose: np.ndarray,
+    lens: Lens,
+    light: DirectionalLight,
 ) -> np.ndarray:
     """Return sRGB values and straight alpha (size, size, 4) in [0, 1]: the texture's value times
     the light received."""
@@ -318,7 +322,7 @@ def draw(
     normal = normalized(interpolate(fragments.barycentric, normals[corners]))
     # hair is seen from both sides
     normal *= np.where(((pose[:3, 3] - place) * normal).sum(1) < 0, -1.0, 1.0)[:, None]
-    facing = np.maximum(normal @ normalized(np.array(light.towards)), 0.0)
+    facing = np.maximum(normal @ normalized(np.array(light.direction)), 0.0)
     received = np.array(light.ambient) + np.array(light.diffuse) * facing[:, None]
     uv = interpolate(
         fragments.barycentric, np.concatenate([avatar.uv, avatar.uv[:, :1]], axis=1)[corners]

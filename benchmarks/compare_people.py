@@ -34,7 +34,7 @@ from dyngs.core.metrics import psnr, ssim
 from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import captures_in, read_capture
-from dyngs.human.predict.gps.rectification import angle, around
+from dyngs.human.predict.gps.rectification import angle_between_views, order_around_person
 from dyngs.io.outputs import new_folder
 from dyngs.io.write import write_image, write_text
 from dyngs.models.prediction import Predictor
@@ -158,7 +158,9 @@ def task_of(
     `test` with those of its views, in an arc those between neighbours.
     """
     moment = views[0].frame, views[0].time
-    ring = around(views, [i for i, view in enumerate(views) if (view.frame, view.time) == moment])
+    ring = order_around_person(
+        views, [i for i, view in enumerate(views) if (view.frame, view.time) == moment]
+    )
     step = len(ring) / count if spread else max(1, round(len(ring) * APART / 360))
 
     def at(place: float) -> int:
@@ -171,7 +173,13 @@ def task_of(
     if not spread:
         gaps = [(views[a], views[b]) for a, b in pairwise(sources)]
         found = [
-            x for x in found if any(angle(x, a) + angle(x, b) < 1.3 * angle(a, b) for a, b in gaps)
+            x
+            for x in found
+            if any(
+                angle_between_views(x, a) + angle_between_views(x, b)
+                < 1.3 * angle_between_views(a, b)
+                for a, b in gaps
+            )
         ]
     return sources, found
 

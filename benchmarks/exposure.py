@@ -76,7 +76,8 @@ def scores(run: Path) -> list[str]:
     one = fit_affine_colour(shown, background)
     plain = [psnr(r.rgb[0], p.composite(background), p.mask) for p, r in shown]
     fitted = [
-        psnr(apply_affine_colour(one, p, r, background), p.composite(background), p.mask) for p, r in shown
+        psnr(apply_affine_colour(one, p, r, background), p.composite(background), p.mask)
+        for p, r in shown
     ]
     halves = [right_half_scores(p, r, background) for p, r in shown]
     means = [

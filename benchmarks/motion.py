@@ -49,7 +49,7 @@ from dyngs.data.synthetic.captures import (
 from dyngs.data.synthetic.captures import Scene as TrueScene
 from dyngs.data.times import evenly_spaced
 from dyngs.data.tracks import read_true_tracks
-from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, select_rows
 from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.evaluate.report import evaluate_run, split_views
@@ -57,6 +57,7 @@ from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import Regions, score_views
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate
+from dyngs.gaussians.initialization import InitialValues, initial_gaussians, scene_geometry
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import RateSchedule
@@ -141,10 +142,10 @@ class TrueMotion(DeformationField):
             f(angle) for angle in turns for f in (np.sin, np.cos)
         ]
         colors = torch.einsum(
-            "b,mbd->md", means.new_tensor(terms), chosen(self.parameters["colors"], rows)
+            "b,mbd->md", means.new_tensor(terms), select_rows(self.parameters["colors"], rows)
         )
-        labels = chosen(self.labels, rows)
-        means = chosen(means, rows)
+        labels = select_rows(self.labels, rows)
+        means = select_rows(means, rows)
         moved = means.clone()
         quats = means.new_tensor([1.0, 0, 0, 0]).repeat(len(means), 1)
         scales = means.new_zeros(len(means), 3)
@@ -163,8 +164,8 @@ class TrueMotion(DeformationField):
             moved - means, quats - quats.new_tensor([1.0, 0, 0, 0]), scales, opacities, colors
         )
 
-    def edited(self, edit: TopologyEdit) -> TrueMotion:
-        field = self.with_parameters(self.parameters.edited(Role.PER_MOVING, edit))
+    def apply_edit(self, edit: TopologyEdit) -> TrueMotion:
+        field = self.with_parameters(self.parameters.apply_edit(Role.PER_MOVING, edit))
         field.labels = self.labels[edit.source]
         return field
 
@@ -193,7 +194,7 @@ def oracle(name: SceneName, config: Config, seed: int = 0) -> GaussianTrainer:
     capture = read_capture(config.data)  # in the unit of the files, in which the true motion is
     trainer = build_trainer(config, capture)
     points, colours, labels = surface_points(name, capture.splits["train"], seed)
-    start = replace(surroundings(capture), points=points, points_rgb=colours)
+    start = replace(scene_geometry(capture), points=points, points_rgb=colours)
     generator = torch.Generator().manual_seed(seed)
     values = InitialValues.for_strategy(config.strategy)
     gaussians = initial_gaussians(start, PointsInit(), values, model.sh_degree, generator)
@@ -202,7 +203,7 @@ def oracle(name: SceneName, config: Config, seed: int = 0) -> GaussianTrainer:
     setup = FieldSetup(*box_of(gaussians, trainer.extent), len(times), len(moving), trainer.extent)
     scene = DynamicScene(
         gaussians=gaussians,
-        seen_at=times,
+        training_times=times,
         field=TrueMotion(name, labels[moving], setup),
         moving=moving,
     )

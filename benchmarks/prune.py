@@ -72,7 +72,7 @@ def promises(given: argparse.Namespace) -> None:
             began = time.perf_counter()
             promise = prune_within(given.run_dir, out, most, overrides)
             print(f"\n{promise}\n{time.perf_counter() - began:.0f} s\n", flush=True)
-        before, after = compared([given.run_dir, file_of(out)], given.threads)
+        before, after = compare_runs([given.run_dir, file_of(out)], given.threads)
         print(line(f"{most:g} dB allowed", file_of(out), after, before, given.threads), end="")
         print(stored(file_of(out), given.threads), flush=True)
     print(line("trained", given.run_dir, before, before, given.threads))
@@ -143,7 +143,7 @@ def main() -> None:
         if not checkpoint_paths(out):
             common = ("prune.fraction=0.8", f"run.threads={given.threads}")
             prune_run(given.run_dir, out, (*common, *given.overrides, *asked))
-        before, after = compared([given.run_dir, out], given.threads)
+        before, after = compare_runs([given.run_dir, out], given.threads)
         print(line(name, out, after, before, given.threads), end="", flush=True)
         print(stored(file_of(out), given.threads), flush=True)
     print(line("trained", given.run_dir, before, before, given.threads))

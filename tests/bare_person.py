@@ -84,7 +84,7 @@ def bare_scene(
         anchors=anchors,
         skeleton=skeleton,
         clip=clip,
-        learned=learned.restored(values),
+        learned=learned.with_state(values),
     )
 
 
@@ -95,8 +95,8 @@ def bare_run(scene: HumanScene | None = None) -> LoadedRun:
     return LoadedRun(config, bare_scene() if scene is None else scene, 0, 0.0, info)
 
 
-def playing(run: LoadedRun, clip: MotionClip) -> LoadedRun:
+def with_motion(run: LoadedRun, clip: MotionClip) -> LoadedRun:
     """The run with its person in another clip."""
     scene = run.scene
     assert isinstance(scene, HumanScene)
-    return replace(run, renderable=scene.playing(clip))
+    return replace(run, renderable=scene.with_motion(clip))

@@ -248,8 +248,8 @@ def colmap_root(tmp_path: Path) -> Path:
 @pytest.fixture
 def short_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bodies are fitted to captures in two steps, on squares of 32 px."""
-    effort = FitEffort(side=32, steps=2, visits=0)
-    for name in ("fit_capture", "placed_clip"):
+    effort = FitEffort(side=32, steps=2, draws_per_frame=0)
+    for name in ("fit_capture", "place_new_poses"):
         monkeypatch.setattr(
             fitted_capture, name, partial(getattr(fitted_capture, name), effort=effort)
         )

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dyngs.ops.hash_grid import HashLevels
-from dyngs.ops.rays import Samples, Space, Steps
+from dyngs.ops.rays import MarchSteps, Samples, Space
 
 PRIMES = 1, 2654435761, 805459861
 
@@ -72,7 +72,12 @@ def cell_of(space: Space, point: Tensor) -> tuple[int, int, int, int] | None:
 
 
 def reference_march(
-    origin: Tensor, direction: Tensor, shift: float, space: Space, occupied: Tensor, steps: Steps
+    origin: Tensor,
+    direction: Tensor,
+    shift: float,
+    space: Space,
+    occupied: Tensor,
+    steps: MarchSteps,
 ) -> list[float]:
     """Starts of the samples of a ray with samples of one length: every step is tried."""
     assert steps.cone == 0

@@ -16,7 +16,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.state import Role, tensors_of
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.control_nodes import ControlNodes
-from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, select_rows
 from dyngs.deform.fields import field_state
 from dyngs.deform.keys import ControlNodesField, DynamicModel
 from dyngs.deform.scene import DynamicScene
@@ -46,7 +46,7 @@ class Sliding(DeformationField):
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         self.calls += 1
         return Offsets(
-            torch.tensor([self.speed * time, 0.0, 0.0]).expand(len(chosen(means, rows)), 3)
+            torch.tensor([self.speed * time, 0.0, 0.0]).expand(len(select_rows(means, rows)), 3)
         )
 
 
@@ -58,7 +58,7 @@ class Blinking(Sliding):
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         odd = round(time * (self.num_times - 1)) % 2
-        means = chosen(means, rows)
+        means = select_rows(means, rows)
         return Offsets(
             torch.zeros(len(means), 3), colors=torch.full((len(means), 3), self.speed * odd)
         )
@@ -74,10 +74,10 @@ class Lines(DeformationField):
         self.parameters = Parameters(start, {"means": 1.6e-4 * setup.extent}, 0.01, Role.PER_MOVING)
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        return Offsets((2 * time - 1) * chosen(self.parameters["means"], rows)[:, 0])
+        return Offsets((2 * time - 1) * select_rows(self.parameters["means"], rows)[:, 0])
 
-    def edited(self, edit: TopologyEdit) -> Lines:
-        return self.with_parameters(self.parameters.edited(Role.PER_MOVING, edit))
+    def apply_edit(self, edit: TopologyEdit) -> Lines:
+        return self.with_parameters(self.parameters.apply_edit(Role.PER_MOVING, edit))
 
 
 def row_of_balls(count: int = 5) -> Gaussians:
@@ -110,7 +110,7 @@ def sliding_nodes() -> ControlNodes:
 
 def still_scene(count: int = 5, times: tuple[float, ...] = ()) -> StaticScene:
     """A scene in which nothing moves."""
-    return StaticScene(gaussians=row_of_balls(count), seen_at=times)
+    return StaticScene(gaussians=row_of_balls(count), training_times=times)
 
 
 def moving_scene(
@@ -120,7 +120,7 @@ def moving_scene(
 ) -> DynamicScene:
     """Five balls of which ``rows`` follow ``motion``."""
     return DynamicScene(
-        gaussians=row_of_balls(), seen_at=times, field=motion, moving=torch.tensor(rows)
+        gaussians=row_of_balls(), training_times=times, field=motion, moving=torch.tensor(rows)
     )
 
 

@@ -85,7 +85,7 @@ class Run:
         gradients."""
         left_out = self.training.optimize(self.scene, step)
         if result is not None and result.edit is not None:
-            edited = self.scene.edited(result.edit)
+            edited = self.scene.apply_edit(result.edit)
             self.scene = edited.with_gaussians(leaves(edited.gaussians))
         self.scene = self.training.after_step(self.scene, step, result is not None)
         return int(left_out)

@@ -28,7 +28,7 @@ from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.projection import project
 from dyngs.ops.rasterization import Tally, tally
-from dyngs.ops.rays import Rays, Space, Steps, composite, march, reached
+from dyngs.ops.rays import MarchSteps, Rays, Space, composite, march, reached
 from dyngs.ops.registration import count_nonfinite_op
 from dyngs.ops.shading import shading_inputs
 from dyngs.ops.skinning import add_offsets_, blend_skinning, offset_gradients
@@ -253,7 +253,7 @@ def field_case(count: int, dtype: torch.dtype) -> Case:
     shifts = numbers.uniform(count)
 
     def run(table: Tensor) -> list[Tensor]:
-        samples = march(rays, shifts, space, occupied, Steps(0.05, 0.05, 0.01))
+        samples = march(rays, shifts, space, occupied, MarchSteps(0.05, 0.05, 0.01))
         features = hash_features(samples.coords, table, levels)
         some = torch.arange(0, len(samples), 3)
         again = select_features(features.detach(), some, samples.coords[some], table, levels)

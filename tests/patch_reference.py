@@ -62,7 +62,9 @@ def reference_visible(
     return ids, uv, depth
 
 
-def reference_blend(colours: Tensor, crossings: Tensor, places: PatchSamples) -> tuple[Tensor, Tensor]:
+def reference_blend(
+    colours: Tensor, crossings: Tensor, places: PatchSamples
+) -> tuple[Tensor, Tensor]:
     """As ``blend_patches``, by its definition; what a pixel shows is a row of colours and of how
     much is nothing."""
     views, height, width = places.rows.shape

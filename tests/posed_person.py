@@ -87,7 +87,7 @@ def disturbed(scene: HumanScene) -> HumanScene:
     poses = clip.poses.clone()
     away = torch.randn(len(clip), len(rows), 3, generator=random)
     poses[:, rows] += 0.15 * away / away.norm(dim=2, keepdim=True)
-    return scene.playing(
+    return scene.with_motion(
         replace(clip, poses=poses, trans=clip.trans + torch.tensor([0.03, 0.0, 0.0]))
     )
 

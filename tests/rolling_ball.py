@@ -65,20 +65,24 @@ def seen(balls: Sequence[PaintedBall], size: int) -> tuple[FrameStack, np.ndarra
     images = [
         _shown(Scene((plate, ball)), pose, size) for ball, pose in zip(balls, poses, strict=True)
     ]
-    still = [_shown(Scene((plate,)), pose, size) for pose in poses]
+    static = [_shown(Scene((plate,)), pose, size) for pose in poses]
     focal = 0.5 * size / np.tan(0.5 * CAMERA_ANGLE_X)
     lens = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
-    shots = FrameStack(
+    frame_stack = FrameStack(
         times=times,
         images=np.stack(images),
-        still=np.stack(still),
+        static=np.stack(static),
         alphas=np.zeros((count, size, size)),
         static_alphas=np.zeros((count, size, size)),
         depths=np.full((count, size, size), NEVER),
         poses=np.stack([FLIP @ np.linalg.inv(pose) for pose in poses]),
         intrinsics=np.repeat(lens[None], count, axis=0),
     )
-    return shots, np.array([ball.center for ball in balls]), np.array([ball.turn for ball in balls])
+    return (
+        frame_stack,
+        np.array([ball.center for ball in balls]),
+        np.array([ball.turn for ball in balls]),
+    )
 
 
 def _shown(scene: Scene, pose: np.ndarray, size: int) -> np.ndarray:

@@ -38,7 +38,7 @@ def scene_of_kind(kind: str) -> GaussianScene:
     clip."""
     std = 0.01 + torch.arange(9.0) / 100
     if kind == "static":
-        return StaticScene(gaussians=cloud(), filter_std=std, seen_at=SEEN_AT)
+        return StaticScene(gaussians=cloud(), filter_std=std, training_times=SEEN_AT)
     if kind == "human":
         return _person()
     masks = None
@@ -51,7 +51,7 @@ def scene_of_kind(kind: str) -> GaussianScene:
         field.edges.data[:] = torch.tensor([[0.1, 0.4], [0.3, 1.2], [-0.1, 0.8], OPEN])
     return DynamicScene(
         gaussians=cloud(),
-        seen_at=SEEN_AT,
+        training_times=SEEN_AT,
         field=field,
         moving=MOVING,
         filter_std=std,
@@ -66,10 +66,10 @@ def restored(kind: str, state: State) -> GaussianScene:
     gaussians = Gaussians.stored(part_of(tensors, "gaussians"))
     own = part_of(tensors, "model")
     if kind == "static":
-        return StaticScene.restored(gaussians, own)
+        return StaticScene.from_state(gaussians, own)
     if kind == "human":
-        return HumanScene.restored(gaussians, own)
-    return DynamicScene.restored(DynamicModel(deform=tiny_options(_field(kind))), gaussians, own)
+        return HumanScene.from_state(gaussians, own)
+    return DynamicScene.from_state(DynamicModel(deform=tiny_options(_field(kind))), gaussians, own)
 
 
 def onlooker() -> Cameras:

@@ -60,7 +60,7 @@ def test_it_is_adam(along_last_axis: bool) -> None:
 def test_mapped_changes_both_moments_of_what_is_named() -> None:
     adam, _ = stepped(2)
     some, everything, nothing = (
-        adam.mapped(torch.zeros_like, names) for names in (["bias"], None, [])
+        adam.map(torch.zeros_like, names) for names in (["bias"], None, [])
     )
     for part in ("exp_avg", "exp_avg_sq"):
         before, found, all_zero, same = (
@@ -76,7 +76,7 @@ def test_mapped_changes_both_moments_of_what_is_named() -> None:
 def test_a_restored_one_goes_on_as_if_never_stopped() -> None:
     adam, tensors = stepped(2)
     copies = {name: x.detach().clone().requires_grad_() for name, x in tensors.items()}
-    other = AdamState.restored(tensors_of(adam.state()), tensors)
+    other = AdamState.from_state(tensors_of(adam.state()), tensors)
     for one, own in ((adam, tensors), (other, copies)):
         for name, x in own.items():
             x.grad = random(x.shape, 99)
@@ -93,7 +93,7 @@ def test_moments_that_do_not_fit_are_refused(part: str) -> None:
     state = tensors_of(adam.state())
     name = f"{part}.weight"
     with pytest.raises(KeyError, match=name):
-        AdamState.restored({k: x for k, x in state.items() if k != name}, tensors)
+        AdamState.from_state({k: x for k, x in state.items() if k != name}, tensors)
     bad = (
         torch.full((4, 5), float("nan")),
         torch.zeros(5, 5),
@@ -101,4 +101,4 @@ def test_moments_that_do_not_fit_are_refused(part: str) -> None:
     )
     for x in bad:
         with pytest.raises(ValueError, match=name):
-            AdamState.restored(state | {name: x}, tensors)
+            AdamState.from_state(state | {name: x}, tensors)

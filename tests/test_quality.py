@@ -136,8 +136,8 @@ def test_a_person(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the box of the person: in poses that were seen, and in those of a clip that was not. The
     body is fitted in few steps, by which the given poses hardly change: its tests tell how good it
     is."""
-    effort = FitEffort(side=48, steps=10, visits=0)
-    for name in ("fit_capture", "placed_clip"):
+    effort = FitEffort(side=48, steps=10, draws_per_frame=0)
+    for name in ("fit_capture", "place_new_poses"):
         monkeypatch.setattr(
             fitted_capture, name, partial(getattr(fitted_capture, name), effort=effort)
         )

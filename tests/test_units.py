@@ -55,7 +55,9 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("captures")
     write_still_capture(root / "still", StillOptions(size=24, num_train=8, num_test=2, samples=1))
     write_tiny_capture(root / "moving")
-    person = HumanOptions(size=32, num_frames=3, num_pose_frames=1, num_cameras=4, num_test=1, samples=1)
+    person = HumanOptions(
+        size=32, num_frames=3, num_pose_frames=1, num_cameras=4, num_test=1, samples=1
+    )
     write_human_capture(root / "person", person)
     return root
 

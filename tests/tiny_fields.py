@@ -50,7 +50,9 @@ def tiny_setup(num_moving: int = 9, num_times: int = 10) -> FieldSetup:
 def tiny_field(kind: str, num_moving: int = 9, *, everything: bool = True) -> DeformationField:
     """An untrained field."""
     generator = torch.Generator().manual_seed(3)
-    return create_field(tiny_options(kind, everything=everything), tiny_setup(num_moving), generator)
+    return create_field(
+        tiny_options(kind, everything=everything), tiny_setup(num_moving), generator
+    )
 
 
 def stirred_field(

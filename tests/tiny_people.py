@@ -10,7 +10,7 @@ from dyngs.config import Config, DataConfig
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.keys import HumanPredictorModel
-from dyngs.human.predict.ghg.network import AtlasPerson, read_person
+from dyngs.human.predict.ghg.network import AtlasPerson, read_atlas_person
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 
 TINY = HumanOptions(size=32, num_frames=1, num_pose_frames=1, num_cameras=8, num_test=1, samples=1)
@@ -36,7 +36,7 @@ def people(folder: Path, seeds: tuple[int, ...], options: HumanOptions = TINY) -
 
 def person(capture: Path, model: HumanPredictorModel = NET) -> AtlasPerson:
     """The person of one capture."""
-    return read_person(DataConfig.model_validate({"root": capture}), model, body())
+    return read_atlas_person(DataConfig.model_validate({"root": capture}), model, body())
 
 
 def config(folder: Path, run: Path, **changes: object) -> Config:

@@ -32,8 +32,8 @@ from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import view_size
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.keys import FreeField
-from dyngs.deform.static_errors import group_fixed_cameras, changed_fraction
-from dyngs.gaussians.colour.network import fit_affine_colour, apply_affine_colour
+from dyngs.deform.static_errors import changed_fraction, group_fixed_cameras
+from dyngs.gaussians.colour.network import apply_affine_colour, fit_affine_colour
 from dyngs.io.write import write_text
 from dyngs.models.kind import HasGaussians, Moves, capability, kind_of
 from dyngs.models.renderable import Rendering
@@ -42,7 +42,7 @@ from dyngs.models.views import background_colour, evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
 from dyngs.training.corrections.camera_refinement import fit_camera_to_image
 from dyngs.training.loop import Interrupts
-from dyngs.training.new_trainer import GaussianTrainer, build_trainer, with_points
+from dyngs.training.new_trainer import GaussianTrainer, add_initial_points, build_trainer
 
 Pair = tuple[GaussianTrainer, GaussianTrainer]
 Score = Callable[[Pair, int], list[float]]
@@ -234,7 +234,7 @@ def _motion(config: Config, capture: Capture) -> Choice | None:
         return None
     given = 60 * (config.train.minutes or math.inf)
     begun = time.monotonic()
-    capture = with_points(capture, config, quiet=True)
+    capture = add_initial_points(capture, config, log_messages=False)
     show(f"pilot runs of {counted(MOTION.steps, 'step')}, compared on held-out training views:")
     choice = _compared(
         "model.kind=dynamic",
@@ -275,7 +275,7 @@ def _with_settings(
                 found.append((f"{section}.{key}=always", section, always, score))
     if moving and config.colour == ShColour() and not config.colour.model_fields_set:
         found.append(("colour.kind=network", "colour", lambda _: NetworkColour(), plain))
-    capture = with_points(capture, config)
+    capture = add_initial_points(capture, config)
     views = capture.splits["train"]
     folds = _held_out(views)
     steps, first_side = _affordable(config, views[0], len(found), len(folds))

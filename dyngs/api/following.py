@@ -20,7 +20,7 @@ from safetensors.torch import load, save
 
 from dyngs.config import Config
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
-from dyngs.ops.device import deterministic, select_device, keep_freed_memory
+from dyngs.ops.device import deterministic, keep_freed_memory, select_device
 from dyngs.ops.native import kernel_threads
 from dyngs.training.events import Event, TopologyChanged
 from dyngs.training.loop import Interrupts, Trainable

@@ -110,7 +110,7 @@ class ScaledScene(GaussianScene):
     def time_step(self, time: float | None) -> _ScaledTimeStep:
         inner = self.scene.time_step(time)
         return _ScaledTimeStep(
-            _scaled(inner.gaussians, self.scale), inner.time, inner.frame, inner=inner
+            _scaled(inner.gaussians, self.scale), inner.time, inner.rest_pose, inner=inner
         )
 
     def render(
@@ -134,8 +134,10 @@ class ScaledScene(GaussianScene):
         )
         return drawn if drawn.depth is None else replace(drawn, depth=self.scale * drawn.depth)
 
-    def edited(self, edit: TopologyEdit) -> ScaledScene:
-        return replace(self, scene=self.scene.edited(edit), gaussians=self.gaussians.edited(edit))
+    def apply_edit(self, edit: TopologyEdit) -> ScaledScene:
+        return replace(
+            self, scene=self.scene.apply_edit(edit), gaussians=self.gaussians.apply_edit(edit)
+        )
 
     def state(self) -> State:
         return self.scene.state()

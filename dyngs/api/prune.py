@@ -19,7 +19,7 @@ from dyngs.data.read import require_folder
 from dyngs.io.outputs import new_folder
 from dyngs.models.checkpoint import Checkpoint, read_capture_of, settings_of
 from dyngs.models.kind import HasGaussians, capability
-from dyngs.ops.device import deterministic, select_device, keep_freed_memory
+from dyngs.ops.device import deterministic, keep_freed_memory, select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import RECORD_NAME
 from dyngs.runs.checkpoint import (

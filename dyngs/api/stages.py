@@ -20,8 +20,15 @@ from dyngs.models.views import training_times
 from dyngs.runs.capture_record import require_same_capture
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.folder import ASKED_NAME, EXPORT_FOLDER
-from dyngs.training.limits import gaussian_limit, apply_gaussian_cap
-from dyngs.training.plan import Limits, RunPlan, Stage, describe_extension, extend_config, with_steps
+from dyngs.training.limits import apply_gaussian_cap, gaussian_limit
+from dyngs.training.plan import (
+    Limits,
+    RunPlan,
+    Stage,
+    describe_extension,
+    extend_config,
+    with_steps,
+)
 from dyngs.training.processes import Processes
 
 
@@ -49,7 +56,7 @@ def share_views(processes: Processes) -> Stage:
         if config.train.batch_size == 1:
             train = config.train.model_copy(update={"batch_size": processes.size})
             config = config.model_copy(update={"train": train})
-        processes.share(config.train.batch_size)
+        processes.views_of_process(config.train.batch_size)
         return replace(plan, resolved=config), None
 
     return stage

@@ -35,7 +35,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.outputs import writing
 from dyngs.models.kind import Predicts, capability
-from dyngs.ops.device import deterministic, select_device, keep_freed_memory
+from dyngs.ops.device import deterministic, keep_freed_memory, select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import write_record
 from dyngs.runs.checkpoint import (
@@ -165,7 +165,7 @@ def train(
         else:
             resumed.require_settings(plan.resolved)
             plan = planned(plan, [read_same_capture(folder, resumed), set_limits])
-            stopwatch.pause(-seconds_at(folder, resumed.info.step))
+            stopwatch.exclude(-seconds_at(folder, resumed.info.step))
         trainer = _built(plan, resumed, images)
         run = _Run(plan, trainer, folder, resumed, processes=processes, stopwatch=stopwatch)
         run.run(listeners)
@@ -324,14 +324,14 @@ class _Run:
             write_config(self.config, self.folder)
         path = save_checkpoint(self.folder, checkpoint, self.loop.stopwatch.seconds)
         self._saved = self.loop.trainer.done
-        self._save_timer.saved(begin, self.loop.stopwatch.seconds)
+        self._save_timer.record_save(begin, self.loop.stopwatch.seconds)
         self.loop.emit(Saved(self._saved, path))
 
     def _evaluate(self, step: int) -> None:
         start = time.perf_counter()
         report = evaluate_run(self.folder, "test", capture=self._plan.capture)
         seconds = time.perf_counter() - start
-        self.loop.stopwatch.pause(seconds)
+        self.loop.stopwatch.exclude(seconds)
         self.loop.emit(Evaluated(step, "test", report.psnr, report.ssim, seconds))
 
     def _reached(self) -> Iterator[str]:

@@ -269,7 +269,7 @@ def computing_device(choice: str) -> torch.device:
 
     Raises DyngsError: ``cuda`` where no GPU can be used.
     """
-    from dyngs.ops.device import select_device, cpu_fallback_reason
+    from dyngs.ops.device import cpu_fallback_reason, select_device
 
     device = select_device(choice)
     reason = cpu_fallback_reason(choice)

@@ -295,8 +295,8 @@ def run_fit(arguments: argparse.Namespace) -> int:
 
 def run_people(arguments: argparse.Namespace) -> int:
     """Find a person and fit a body; print what was found, and the next command."""
-    from dyngs.human.detect.detector import MediaPipe
     from dyngs.human.detect.detect_person import write_detected_person
+    from dyngs.human.detect.detector import MediaPipe
 
     options = args.data_section(arguments.overrides).model_copy(update={"root": arguments.clip})
     detector = MediaPipe(arguments.mediapipe)

@@ -99,11 +99,11 @@ def _examine_core() -> Iterator[Check]:
 def _examine_gpu() -> Iterator[Check]:
     """Yield what there is of a CUDA GPU; without one dyngs works, too."""
     try:
-        from dyngs.ops.device import findings, gpu_unavailable_reason
+        from dyngs.ops.device import gpu_status, gpu_unavailable_reason
     except (ImportError, DyngsError):
         return
     reason = gpu_unavailable_reason()
-    for name, value in findings().items():
+    for name, value in gpu_status().items():
         yield Check(name, value)
     if reason is None:
         yield Check("device", "cuda")

@@ -274,11 +274,11 @@ def _export_splats(
     paths."""
     from dyngs.export.images import compare_file_with_run
     from dyngs.export.splat_files import (
+        choose_write_options,
         scene_part,
         write_run_levels,
         write_run_sequence,
         write_run_splats,
-        choose_write_options,
     )
     from dyngs.io.formats.formats import format_named, known_format, read_splats
 
@@ -291,7 +291,9 @@ def _export_splats(
             "the colours of the run are a network; spherical harmonics of degree 3 are fitted to it"
         )
         print_notes((line,))
-    how, line = choose_write_options(opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
+    how, line = choose_write_options(
+        opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree
+    )
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
     out: Path | None = arguments.out
     is_sequence = _is_sequence(arguments)
@@ -324,7 +326,9 @@ def _export_splats(
             path = out / f"{stem}{suffix}" if out.is_dir() else out
         written = [write_run_splats(opened, path, moments[0], part, how)]
     found = [
-        compare_file_with_run(opened, scene, moments[i], written[i].splat, read_splats(written[i].path))
+        compare_file_with_run(
+            opened, scene, moments[i], written[i].splat, read_splats(written[i].path)
+        )
         for i in _shown(len(written))
     ]
     print_redrawn(written[0].notes, found)
@@ -342,19 +346,19 @@ def _export_moving(
     """Write all times as one file of moving Gaussians."""
     from dyngs.export.images import compare_file_with_run
     from dyngs.export.splat_files import (
-        SUFFIX,
-        UP,
+        FOURDGS_SUFFIX,
+        FOURDGS_UP,
+        choose_write_options,
         read_4dgs_frame,
         scene_part,
         write_4dgs,
-        choose_write_options,
     )
 
-    how, line = choose_write_options(opened, UP, arguments.up, arguments.from_up)
+    how, line = choose_write_options(opened, FOURDGS_UP, arguments.up, arguments.from_up)
     print_notes((line,))
     part = _part(arguments)
     scene = scene_part(opened.scene, part)
-    path = _target(arguments, f"splats{SUFFIX}")
+    path = _target(arguments, f"splats{FOURDGS_SUFFIX}")
     splats, notes = write_4dgs(opened, path, times, part, how)
     found = [
         compare_file_with_run(opened, scene, times[i], splats[i], read_4dgs_frame(path, i))
@@ -436,16 +440,20 @@ def _export_network(arguments: argparse.Namespace) -> None:
 def _export_bodies(arguments: argparse.Namespace) -> None:
     """Write a moving scene with its bodies as animated nodes."""
     from dyngs.export.images import compare_file_with_run
-    from dyngs.export.splat_files import write_rigid_bodies, choose_write_options
+    from dyngs.export.splat_files import choose_write_options, write_rigid_bodies
     from dyngs.io.formats.formats import format_named, read_splats
 
     out = _target(arguments, "bodies.glb")
     opened = _open(arguments)
     time = (_times(arguments) or (0.0,))[0]
-    how, line = choose_write_options(opened, format_named("glb").up, arguments.up, arguments.from_up)
+    how, line = choose_write_options(
+        opened, format_named("glb").up, arguments.up, arguments.from_up
+    )
     written = write_rigid_bodies(opened, out, time, how)
     print_notes((line,))
-    found = compare_file_with_run(opened, opened.scene, time, written.splat, read_splats(written.path))
+    found = compare_file_with_run(
+        opened, opened.scene, time, written.splat, read_splats(written.path)
+    )
     print_redrawn(written.notes, [found])
     print_written(written.path)
 
@@ -514,7 +522,7 @@ def _export_surface(arguments: argparse.Namespace) -> None:
 def _export_page(arguments: argparse.Namespace) -> None:
     """Write a page that plays in a browser by itself, or a folder whose page fetches a scene as it
     is seen."""
-    from dyngs.export.html.page import write_folder, write_page
+    from dyngs.export.html.page import write_page, write_page_folder
 
     most = arguments.max_gaussians_drawn
     if most is not None and not arguments.folder:
@@ -531,7 +539,7 @@ def _export_page(arguments: argparse.Namespace) -> None:
     opened = opened if arguments.from_up is None else replace(opened, stated_up=arguments.from_up)
     time = arguments.time or 0.0
     if arguments.folder:
-        written = write_folder(opened, out, most=most, time=time)
+        written = write_page_folder(opened, out, most=most, time=time)
     else:
         written = write_page(opened, out, time=time)
     print_notes(written.notes)

@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Prune, compare with the run before, and print a table."""
     from dyngs.api.prune import file_of
     from dyngs.api.train import num_cores
-    from dyngs.evaluate.report import compared
+    from dyngs.evaluate.report import compare_runs
     from dyngs.runs.checkpoint import load_run
 
     keys = {"prune": "fraction", "score": "score", "masks": "mask_times", "steps": "steps"}
@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
         folder, promise = _pruned(arguments, overrides)
     pruned = load_run(folder)
     device = args.computing_device(pruned.config.run.device)
-    before, after = compared(
+    before, after = compare_runs(
         [arguments.run_dir, file_of(folder)],
         arguments.threads or num_cores(),
         device,
@@ -133,7 +133,9 @@ def _decibels(text: str) -> float:
     return value
 
 
-def cost_cells(before: RunMetrics, after: RunMetrics, promise: Promise | None = None) -> list[list[str]]:
+def cost_cells(
+    before: RunMetrics, after: RunMetrics, promise: Promise | None = None
+) -> list[list[str]]:
     """Return the rows of a table that compares a run with the file of a pruned one."""
     ratio = before.num_gaussians / after.num_gaussians
     cells = [

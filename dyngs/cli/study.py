@@ -127,8 +127,8 @@ def run_compare(arguments: argparse.Namespace) -> int:
     from dyngs.io.outputs import writing
     from dyngs.runs.folder import inputs_of
     from dyngs.study.compare import ModelComparison
-    from dyngs.study.report import Report, can_plot, plot_curves, page_views, table_of
-    from dyngs.study.tradeoff import table_rows
+    from dyngs.study.report import Report, build_table, can_plot, page_views, plot_curves
+    from dyngs.study.tradeoff import build_rows
 
     capture = Path(os.path.abspath(arguments.capture))  # so that it has a name, also as . or ..
     out = (arguments.out or Path("compare", capture.name)).absolute()
@@ -156,14 +156,14 @@ def run_compare(arguments: argparse.Namespace) -> int:
             results, left_out, curves = comparison.run(configs, arguments.ray)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(_CONTINUES) from None
-    rows = sorted(table_rows(results), key=lambda row: -row["psnr"])
+    rows = sorted(build_rows(results), key=lambda row: -row["psnr"])
     views = f"{results[0].num_views} held-out views (split {comparison.split})"
     about = f"{capture.name}: {comparison.limit} each, {views}; PSNR in dB, seconds of training; {_FRONT}"
     report = Report(
         "Comparison",
         about,
         rows,
-        [table_of(about, rows)],
+        [build_table(about, rows)],
         left_out=unfit | left_out,
         views=page_views(out, results),
         figure=plot_curves(curves) if can_plot() and any(curves.values()) else None,
@@ -174,7 +174,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
 
 def _print_report(report: Report, stem: Path, *, is_json: bool) -> None:
     """Write the files of a study and print its tables, or its .json alone."""
-    from dyngs.study.report import MISSING, can_plot, write_report
+    from dyngs.study.report import MATPLOTLIB_MISSING, can_plot, write_report
 
     paths = write_report(stem, report)
     if is_json:
@@ -185,7 +185,7 @@ def _print_report(report: Report, stem: Path, *, is_json: bool) -> None:
         print_lines(f"left out: {name}: {problem}")
     print(f"written: {paths[0]} and {', '.join(path.suffix for path in paths[1:])}")
     if not can_plot():
-        print_notes((MISSING,))
+        print_notes((MATPLOTLIB_MISSING,))
 
 
 def run_tradeoff(arguments: argparse.Namespace) -> int:
@@ -204,7 +204,7 @@ def run_tradeoff(arguments: argparse.Namespace) -> int:
 
 def _tradeoff(arguments: argparse.Namespace, out: Path) -> int:
     from dyngs.study import tradeoff
-    from dyngs.study.report import RATES, Report, can_plot, plot_variants, table_of
+    from dyngs.study.report import RATES, Report, build_table, can_plot, plot_variants
 
     requirements = tradeoff.parse_requirements(arguments.require) if arguments.require else []
     metric = arguments.minimize or arguments.maximize
@@ -228,7 +228,7 @@ def _tradeoff(arguments: argparse.Namespace, out: Path) -> int:
         except KeyboardInterrupt:
             raise KeyboardInterrupt(_CONTINUES) from None
     variants = list(found)
-    rows = tradeoff.table_rows(list(found.values()))
+    rows = tradeoff.build_rows(list(found.values()))
     rates = tradeoff.exchange_rates(found)
     about = f"{counted(found[variants[0]].num_views, 'view')}; {_FRONT}"
     settings = [variant.setting for variant in variants]
@@ -236,13 +236,13 @@ def _tradeoff(arguments: argparse.Namespace, out: Path) -> int:
         "Quality, speed and size",
         about,
         rows,
-        [table_of(about, rows), table_of("each setting alone", rates, RATES)],
+        [build_table(about, rows), build_table("each setting alone", rates, RATES)],
         {"exchange_rates": rates, "changes": [variant.changes for variant in variants]},
         figure=plot_variants(rows, settings) if can_plot() else None,
     )
     _print_report(report, out / "tradeoff", is_json=arguments.json)
     if arguments.require or metric:
-        number = tradeoff.choose(rows, requirements, goal)
+        number = tradeoff.choose_variant(rows, requirements, goal)
         best = rows[number]
         folder = study.folder(variants[number])
         if not arguments.json:

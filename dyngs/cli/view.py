@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         from dyngs.view.controls import motion_files
         from dyngs.view.server import ServerOptions, Viewer
-        from dyngs.view.source import first_of, open_source
+        from dyngs.view.source import load_first, open_source
 
     if arguments.threads > 0:
         torch.set_num_threads(arguments.threads)
@@ -71,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
     root = args.data_root(arguments)
     most = arguments.max_gaussians_drawn
     source = open_source(arguments.source, arguments.up, device, root, most)
-    first = first_of(source)
+    first = load_first(source)
     if motions and first.person is None:
         raise DyngsError(
             f"--motion goes with a person (model.kind=human), {first.name} is none; leave it out"

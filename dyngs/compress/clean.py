@@ -25,7 +25,7 @@ from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.checkpoint import has_only_scene_file, latest_checkpoint, load_run
 from dyngs.training.loop import Loop
 from dyngs.training.new_trainer import GaussianTrainer, build_trainer
-from dyngs.training.trainer import TrainingEdit, Trainer
+from dyngs.training.trainer import Trainer, TrainingEdit
 
 MAIN_FRACTION = 0.5  # Fraction of the weight of a Gaussian that must lie in one view
 # Depth of a Gaussian in that view, over the median depth of the view, below which it is near

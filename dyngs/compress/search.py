@@ -34,7 +34,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.renderable import Posable
 from dyngs.models.views import background_colour
-from dyngs.ops.device import sent
+from dyngs.ops.device import copy_async
 from dyngs.training.new_trainer import GaussianTrainer
 from dyngs.training.trainer import TrainingEdit
 
@@ -78,14 +78,14 @@ def _drop_harmonics(trainer: GaussianTrainer, tolerance: float) -> None:
     usable = [i for i in range(len(trainer.images)) if i not in trainer.held_out]
     judged = usable[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY] or usable[:1]
     seen = [i for i in usable if i not in judged] or judged
-    background = sent(background_colour(trainer.background), trainer.device)
+    background = copy_async(background_colour(trainer.background), trainer.device)
     looks = list(_looks(trainer, judged, background))
     found = find_view_dependent(
         _looks(trainer, seen, background), looks, trainer.model.options, background, tolerance
     )
-    trainer.model.drop_harmonics(~found.keeps, found.offsets)
+    trainer.model.drop_harmonics(~found.kept_harmonics, found.offsets)
     trainer.model.freeze_plain_harmonics(
-        ~found.keeps, AutoColour(opacity_entropy=trainer.config.colour.opacity_entropy)
+        ~found.kept_harmonics, AutoColour(opacity_entropy=trainer.config.colour.opacity_entropy)
     )
 
 

@@ -34,10 +34,10 @@ from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.models.kind import Moves, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
-from dyngs.ops.device import sent
+from dyngs.ops.device import copy_async
 from dyngs.training.loop import Loop
 from dyngs.training.new_trainer import GaussianTrainer
-from dyngs.training.trainer import TrainingEdit, Trainer
+from dyngs.training.trainer import Trainer, TrainingEdit
 
 # Slope of the hyperbolic tangent: second differences of a profile are small numbers
 STEEPNESS = 4.0
@@ -253,7 +253,7 @@ def quality_of(
 ) -> float:
     """Return the mean PSNR of ``images`` drawn of ``scene``, dB; by default of ``probe_images``, as
     in training."""
-    background = sent(background_colour(trainer.background), trainer.device)
+    background = copy_async(background_colour(trainer.background), trainer.device)
     options = trainer.model.options
     options = options if alpha_min is None else replace(options, alpha_min=alpha_min)
     scene = scene.to(trainer.device)

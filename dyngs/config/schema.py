@@ -1,7 +1,7 @@
 """Descriptions of the configuration keys: allowed values, default, meaning; and look-up of sections
 by kind.
 
-Error messages and the table in docs/cli.md are generated from this, so that neither can disagree
+Error messages and docs/reference/config.md are generated from this, so that neither can disagree
 with ``dyngs.config``.
 """
 
@@ -94,18 +94,6 @@ def _kind_key(name: str, info: FieldInfo, variants: list[type[BaseModel]]) -> Co
         str(default_kind(info)),
         description,
     )
-
-
-def keys_table() -> str:
-    """Return all keys as a table in Markdown, for docs/cli.md."""
-    lines = ["| key | allowed | default | meaning |", "|---|---|---|---|"]
-    for key in config_keys():
-        variant = f" ({', '.join(key.kinds)})" if key.kinds else ""
-        default = f"`{key.default}`" if key.default else "required"
-        lines.append(
-            f"| `{key.name}`{variant} | {key.allowed} | {default} | {key.description.replace('|', chr(92) + '|')} |"
-        )
-    return "\n".join(lines) + "\n"
 
 
 def allowed_values(info: FieldInfo, plural: bool = False) -> str:

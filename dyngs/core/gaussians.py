@@ -133,7 +133,7 @@ class Gaussians:
         ``select``."""
         return Gaussians(**{name: x.index_select(0, rows) for name, x in self.tensors().items()})
 
-    def edited(self, edit: TopologyEdit) -> Gaussians:
+    def apply_edit(self, edit: TopologyEdit) -> Gaussians:
         """Return the Gaussians after ``edit``, without gradients."""
         return self.detach().select(edit.source)
 

@@ -31,7 +31,7 @@ from dyngs.data.images.images import (
 )
 from dyngs.data.images.lens import LensMap, is_pinhole, undistort, undistort_map
 from dyngs.data.read import view_size
-from dyngs.ops.device import CPU, gpu_memory, sent
+from dyngs.ops.device import CPU, copy_async, gpu_memory
 
 # mean of the mask over a shrunk pixel from which the whole pixel is kept; allows for rounding
 FULLY_KEPT = 1 - 1e-4
@@ -96,7 +96,7 @@ class Image:
 
     def to(self, device: torch.device | str) -> Image:
         """Return the same image, with its camera, on another device."""
-        tensors: Any = {name: sent(x, device) for name, x in self.tensors().items()}
+        tensors: Any = {name: copy_async(x, device) for name, x in self.tensors().items()}
         return replace(self, cameras=self.cameras.to(device=device), **tensors)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -350,7 +350,7 @@ class ImageLoader:
         if found is not None:
             return found
         image = self._on_demand(index) if pending is None else pending.result()
-        found = {name: sent(x, self._device) for name, x in image.items()}
+        found = {name: copy_async(x, self._device) for name, x in image.items()}
         size = _num_bytes(found)
         left = sum((i, 1) not in self._cache.images for i in range(len(self))) - 1
         waiting = min(2 * self._threads, left) * size

@@ -29,9 +29,9 @@ from dyngs.deform.field import (
     DeformationField,
     FieldSetup,
     Offsets,
-    chosen,
     head_sizes,
     offsets_of,
+    select_rows,
 )
 from dyngs.deform.keys import ControlNodesField
 from dyngs.gaussians import TopologyEdit
@@ -120,7 +120,7 @@ def follow(
     return offsets_of(moved, blended, heads)
 
 
-def turned(offsets: Tensor, vectors: Tensor) -> Tensor:
+def rotate_by_offsets(offsets: Tensor, vectors: Tensor) -> Tensor:
     """Return (..., 3) ``vectors`` turned by the rotations identity + ``offsets`` (..., 4), of any
     length."""
     return rotate(offsets + identity_quat(offsets), vectors)
@@ -174,7 +174,7 @@ class ControlNodes(DeformationField):
         self.buffers = {"positions": NOTHING}
         self.parameters = self._untrained(0)
 
-    def restored(self, tensors: Mapping[str, Tensor]) -> ControlNodes:
+    def with_state(self, tensors: Mapping[str, Tensor]) -> ControlNodes:
         buffers = part_of(tensors, "buffers")
         count = len(buffers["positions"])
         require_tensor("positions", buffers["positions"], (count, 3))
@@ -185,7 +185,7 @@ class ControlNodes(DeformationField):
                 require_indices(name, buffers[name], (length, None), count)
         field = copy.copy(self)
         lengths = dict.fromkeys(head_sizes(self.options), count)
-        field.parameters = self._untrained(0).restored(part_of(tensors, "learned"), lengths)
+        field.parameters = self._untrained(0).with_state(part_of(tensors, "learned"), lengths)
         field.buffers = buffers
         return field
 
@@ -200,7 +200,7 @@ class ControlNodes(DeformationField):
     def num_values(self) -> int:
         return self.parameters.num_values + sum(x.numel() for x in self.buffers.values())
 
-    def edited(self, edit: TopologyEdit) -> ControlNodes:
+    def apply_edit(self, edit: TopologyEdit) -> ControlNodes:
         field = copy.copy(self)
         field.buffers = {
             n: edit.apply(x) if n == "followed" else x for n, x in self.buffers.items()
@@ -245,8 +245,8 @@ class ControlNodes(DeformationField):
         self, means: Tensor, rows: Tensor | None, motion: Tensor, values: Tensor
     ) -> Offsets:
         nodes = self.nodes_for(means)
-        nodes = replace(nodes, followed=chosen(nodes.followed, rows))
-        return follow(nodes, chosen(means, rows), motion, values, head_sizes(self.options))
+        nodes = replace(nodes, followed=select_rows(nodes.followed, rows))
+        return follow(nodes, select_rows(means, rows), motion, values, head_sizes(self.options))
 
     def _penalties(self, motion: Tensor) -> dict[str, Tensor]:
         """Return the nodes' acceleration and their neighbours' deviation from rigid motion, in
@@ -346,6 +346,6 @@ class ControlNodes(DeformationField):
             arms = (points[:, None] - nodes.positions[nodes.followed])[:, :, None].expand(
                 -1, -1, self.num_points, -1
             )
-            swing = turned(splines["quats"][nodes.followed], arms) - arms
+            swing = rotate_by_offsets(splines["quats"][nodes.followed], arms) - arms
             started["means"] = started["means"] + torch.einsum("mb,mbpd->mpd", weights, swing)
         return started

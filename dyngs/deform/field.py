@@ -43,8 +43,8 @@ class Offsets:
     colors: Tensor | None = None
 
     def select(self, index: Tensor | slice) -> Offsets:
-        others = (self.quats, self.log_scales, self.logit_opacities, self.colors)
-        return Offsets(self.means[index], *(None if x is None else x[index] for x in others))
+        inner_field = (self.quats, self.log_scales, self.logit_opacities, self.colors)
+        return Offsets(self.means[index], *(None if x is None else x[index] for x in inner_field))
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class DeformationField:
         """Continue what was learned for the times in ``seen`` to those in ``soon``, which are
         trained on next."""
 
-    def shaded(
+    def apply_shading(
         self, gaussians: Gaussians, rows: Tensor | None, which: Tensor | None, time: float
     ) -> Gaussians:
         """Return the Gaussians drawn at ``time`` in the light that what moves leaves to them.
@@ -124,7 +124,7 @@ class DeformationField:
         """Drop the gradients of what times in ``window`` hardly show: Adam would take them for as
         much as any."""
 
-    def edited(self: F, edit: TopologyEdit) -> F:
+    def apply_edit(self: F, edit: TopologyEdit) -> F:
         """Return the field after an edit of the moving Gaussians."""
         return self
 
@@ -136,14 +136,14 @@ class DeformationField:
         """Return the state that ``restored`` needs, without the setup."""
         return prefixed("learned", self.parameters.state())
 
-    def restored(self: F, tensors: Mapping[str, Tensor]) -> F:
+    def with_state(self: F, tensors: Mapping[str, Tensor]) -> F:
         """Return the field of a state that ``state`` returned, with the options and the setup of
         this one.
 
         Raises KeyError or ValueError: a tensor is missing, or is not as a field of these options
         has it.
         """
-        return self.with_parameters(self.parameters.restored(part_of(tensors, "learned")))
+        return self.with_parameters(self.parameters.with_state(part_of(tensors, "learned")))
 
     def to(self: F, device: torch.device | str) -> F:
         field = self.with_parameters(self.parameters.to(device))
@@ -159,9 +159,9 @@ class DeformationField:
 class OuterField(DeformationField):
     """A field that changes the offsets of another one, ``others``, of the same Gaussians."""
 
-    def __init__(self, others: DeformationField) -> None:
-        self.setup = others.setup
-        self.others = others
+    def __init__(self, inner_field: DeformationField) -> None:
+        self.setup = inner_field.setup
+        self.inner_field = inner_field
 
     def changed(self, found: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
         """Return the offsets ``found`` by the other field with the changes; arguments as of
@@ -169,58 +169,58 @@ class OuterField(DeformationField):
         raise NotImplementedError
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        return self.changed(self.others.offsets(means, time, rows), means, time, rows)
+        return self.changed(self.inner_field.offsets(means, time, rows), means, time, rows)
 
     def in_training(self, means: Tensor, time: float) -> tuple[Offsets, dict[str, Tensor]]:
-        found, penalties = self.others.in_training(means, time)
+        found, penalties = self.inner_field.in_training(means, time)
         return self.changed(found, means, time, None), penalties
 
     @property
     def num_values(self) -> int:
-        return self.parameters.num_values + self.others.num_values
+        return self.parameters.num_values + self.inner_field.num_values
 
     @property
     def leaves(self) -> list[Tensor]:
-        return [*self.parameters.leaves, *self.others.leaves]
+        return [*self.parameters.leaves, *self.inner_field.leaves]
 
     def step(self, step: int, progress: float) -> Count:
-        return self.parameters.step(step, progress) + self.others.step(step, progress)
+        return self.parameters.step(step, progress) + self.inner_field.step(step, progress)
 
     def penalties(self, time: float) -> dict[str, Tensor]:
-        return self.others.penalties(time)
+        return self.inner_field.penalties(time)
 
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
-        self.others.extend(seen, soon)
+        self.inner_field.extend(seen, soon)
 
-    def shaded(
+    def apply_shading(
         self, gaussians: Gaussians, rows: Tensor | None, which: Tensor | None, time: float
     ) -> Gaussians:
-        return self.others.shaded(gaussians, rows, which, time)
+        return self.inner_field.apply_shading(gaussians, rows, which, time)
 
     def zero_gradients_outside_(self, window: tuple[float, float]) -> None:
-        self.others.zero_gradients_outside_(window)
+        self.inner_field.zero_gradients_outside_(window)
 
     def invalidate(self) -> None:
-        self.others.invalidate()
+        self.inner_field.invalidate()
 
-    def edited(self: Outer, edit: TopologyEdit) -> Outer:
-        return self.around(self.others.edited(edit))
+    def apply_edit(self: Outer, edit: TopologyEdit) -> Outer:
+        return self.around(self.inner_field.apply_edit(edit))
 
-    def around(self: Outer, others: DeformationField) -> Outer:
+    def around(self: Outer, inner_field: DeformationField) -> Outer:
         """Return the same changes of another field of the same Gaussians."""
         field = copy.copy(self)
-        field.others = others
+        field.inner_field = inner_field
         return field
 
     def to(self: Outer, device: torch.device | str) -> Outer:
         field = super().to(device)
-        field.others = self.others.to(device)
+        field.inner_field = self.inner_field.to(device)
         return field
 
 
 def innermost(field: DeformationField) -> DeformationField:
     """Return the field within all others that change its offsets."""
-    return innermost(field.others) if isinstance(field, OuterField) else field
+    return innermost(field.inner_field) if isinstance(field, OuterField) else field
 
 
 def apply_offsets(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None = None) -> Gaussians:
@@ -272,7 +272,7 @@ class _AddOffsets(torch.autograd.Function):
         return None, grads[0], by_quats, *grads[2:], *by_offsets
 
 
-def chosen(x: Tensor, rows: Tensor | None) -> Tensor:
+def select_rows(x: Tensor, rows: Tensor | None) -> Tensor:
     """Return the ``rows`` of ``x``; all for None."""
     return x if rows is None else x.index_select(0, rows)
 

@@ -13,7 +13,7 @@ from dyngs.core.state import Role, State, part_of, prefixed, with_role
 from dyngs.core.tensor_checks import require_positive, require_tensor
 from dyngs.deform.bodies.field import BodyField
 from dyngs.deform.control_nodes import ControlNodes
-from dyngs.deform.field import DeformationField, FieldSetup, Offsets, OuterField, chosen
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, OuterField, select_rows
 from dyngs.deform.free import FreePrimitives
 from dyngs.deform.keys import ControlNodesField, DeformField, FreeField, HexplaneField, MlpField
 from dyngs.deform.networks import Hexplane, Mlp
@@ -38,8 +38,8 @@ class WindowedField(OuterField):
 
     can_fade = True
 
-    def __init__(self, others: DeformationField, num_moving: int) -> None:
-        super().__init__(others)
+    def __init__(self, inner_field: DeformationField, num_moving: int) -> None:
+        super().__init__(inner_field)
         edges = torch.tensor(OPEN, device="cpu").expand(num_moving, 2)
         self.parameters = Parameters({"edges": edges}, {"edges": LR}, LR_DECAY, Role.PER_MOVING)
 
@@ -48,7 +48,7 @@ class WindowedField(OuterField):
         return self.parameters["edges"]
 
     def changed(self, found: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
-        edges = chosen(self.edges, rows)
+        edges = select_rows(self.edges, rows)
         window = _window(edges, time) - _window(edges.new_tensor([OPEN]), time)
         logits = window if found.logit_opacities is None else found.logit_opacities + window
         return replace(found, logit_opacities=logits)
@@ -59,17 +59,21 @@ class WindowedField(OuterField):
         self.edges.data[:, 1].clamp_max_(OPEN[1])
         return count
 
-    def edited(self, edit: TopologyEdit) -> WindowedField:
-        return super().edited(edit).with_parameters(self.parameters.edited(Role.PER_MOVING, edit))
+    def apply_edit(self, edit: TopologyEdit) -> WindowedField:
+        return (
+            super()
+            .apply_edit(edit)
+            .with_parameters(self.parameters.apply_edit(Role.PER_MOVING, edit))
+        )
 
     def state(self) -> State:
-        return self.others.state() | prefixed("windows", self.parameters.state())
+        return self.inner_field.state() | prefixed("windows", self.parameters.state())
 
     @staticmethod
-    def stored(others: DeformationField, tensors: Mapping[str, Tensor]) -> WindowedField:
+    def from_state(inner_field: DeformationField, tensors: Mapping[str, Tensor]) -> WindowedField:
         """Return the field of a state within the restored ``others``; raises as ``restored``."""
-        field = WindowedField(others, others.setup.num_moving)
-        field.parameters = field.parameters.restored(tensors)
+        field = WindowedField(inner_field, inner_field.setup.num_moving)
+        field.parameters = field.parameters.with_state(tensors)
         return field
 
 
@@ -119,8 +123,8 @@ def restore_field(
     setup = FieldSetup(
         center, require_positive("box", half_size), int(num_times), num_moving, extent
     )
-    field = create_field(options, setup, torch.Generator()).restored(tensors)
+    field = create_field(options, setup, torch.Generator()).with_state(tensors)
     bodies = part_of(tensors, "bodies")
-    field = BodyField.stored(field, bodies) if bodies else field
+    field = BodyField.from_state(field, bodies) if bodies else field
     windows = part_of(tensors, "windows")
-    return WindowedField.stored(field, windows) if windows else field
+    return WindowedField.from_state(field, windows) if windows else field

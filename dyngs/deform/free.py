@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from dyngs.core.state import Role
-from dyngs.deform.field import DeformationField, FieldSetup, Offsets, chosen
+from dyngs.deform.field import DeformationField, FieldSetup, Offsets, select_rows
 from dyngs.deform.fixed_cameras.initial_motion import TimedGaussians
 from dyngs.deform.keys import COPIES_OF_MOVING, FreeField
 from dyngs.gaussians import Gaussians, TopologyEdit
@@ -52,7 +52,7 @@ class FreePrimitives(DeformationField):
         velocities = torch.zeros(len(centers), 3, device="cpu")
         self.parameters = self._untrained(centers, torch.ones_like(centers), velocities)
 
-    def started(self, start: FreeInitialization) -> FreePrimitives:
+    def with_initialization(self, start: FreeInitialization) -> FreePrimitives:
         """Return an untrained field with the windows and velocities of ``start``."""
         return self.with_parameters(
             self._untrained(start.centers[:, None], start.spans[:, None], start.velocities)
@@ -60,17 +60,17 @@ class FreePrimitives(DeformationField):
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         centers, origins, log_spans, velocities = (
-            chosen(self.parameters[name], rows) for name in NAMES
+            select_rows(self.parameters[name], rows) for name in NAMES
         )
         shift = velocities * (time - origins.detach())
         spans = log_spans.exp() + SHORTEST * self.gap
         window = -0.5 * ((time - centers) / spans).square()
         return Offsets(shift, logit_opacities=window[:, 0])
 
-    def edited(self, edit: TopologyEdit) -> FreePrimitives:
+    def apply_edit(self, edit: TopologyEdit) -> FreePrimitives:
         """Return the field after an edit; new rows are earlier and later in turn than those they
         descend from."""
-        parameters = self.parameters.edited(Role.PER_MOVING, edit)
+        parameters = self.parameters.apply_edit(Role.PER_MOVING, edit)
         new = torch.nonzero(edit.is_new)[:, 0]
         if len(new):
             # two of one source get both signs
@@ -112,7 +112,7 @@ class FreeInitialization:
 
 
 def initialize_free(
-    still: Gaussians, moments: Sequence[TimedGaussians], others: Gaussians, num_times: int
+    static: Gaussians, timed_gaussians: Sequence[TimedGaussians], others: Gaussians, num_times: int
 ) -> FreeInitialization:
     """Return copies of the M ``still`` Gaussians that move, the Gaussians of ``moments``, and
     ``others``.
@@ -120,13 +120,13 @@ def initialize_free(
     Of the first there are so many that each is there for a part of the clip only; those of moments
     are there for about a gap between times, ``others`` for a quarter of the clip, somewhere.
     """
-    copies = min(num_times, max(COPIES_OF_MOVING // max(len(still), 1), 1))
-    faint = still.replace(
-        logit_opacities=still.logit_opacities.clamp_max(FAINT if moments else math.inf)
+    copies = min(num_times, max(COPIES_OF_MOVING // max(len(static), 1), 1))
+    faint = static.replace(
+        logit_opacities=static.logit_opacities.clamp_max(FAINT if timed_gaussians else math.inf)
     )
     resting = torch.zeros(3, device="cpu")
     parts = [TimedGaussians((i + 0.5) / copies, faint, resting) for i in range(copies)]
-    groups = [*parts, *moments]
+    groups = [*parts, *timed_gaussians]
     sizes = torch.tensor([len(one.gaussians) for one in groups], device="cpu")
     centers = torch.tensor([one.time for one in groups], device="cpu")
     spans = torch.full_like(centers, FIRST_SPAN / max(num_times - 1, 1))

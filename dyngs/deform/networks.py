@@ -13,8 +13,8 @@ from dyngs.deform.field import (
     DeformationField,
     FieldSetup,
     Offsets,
-    chosen,
     head_sizes,
+    select_rows,
     split_heads,
 )
 from dyngs.deform.keys import HexplaneField, MlpField
@@ -69,7 +69,7 @@ class Hexplane(DeformationField):
         ]
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        coords = self.setup.normalized(chosen(means.detach(), rows))
+        coords = self.setup.normalized(select_rows(means.detach(), rows))
         features = hexplane_features(coords, time, self.levels)
         return split_heads(self.decoder(features, self.parameters), self.options)
 
@@ -110,13 +110,15 @@ class Mlp(DeformationField):
         self.parameters = Parameters(weights, dict.fromkeys(weights, options.lr), MLP_LR_DECAY)
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        space = encoded(self.setup.normalized(chosen(means.detach(), rows)), SPACE_FREQUENCIES)
-        moment = encoded(space.new_full((1, 1), time), TIME_FREQUENCIES)
+        space = encode_frequencies(
+            self.setup.normalized(select_rows(means.detach(), rows)), SPACE_FREQUENCIES
+        )
+        moment = encode_frequencies(space.new_full((1, 1), time), TIME_FREQUENCIES)
         features = torch.cat([space, moment.expand(len(space), -1)], dim=1)
         return split_heads(self.decoder(features, self.parameters), self.options)
 
 
-def encoded(x: Tensor, num_frequencies: int) -> Tensor:
+def encode_frequencies(x: Tensor, num_frequencies: int) -> Tensor:
     """Return (M, D * (1 + 2 L)) ``x`` (M, D) and its sines and cosines at L octaves (NeRF:
     Mildenhall et al. 2020)."""
     octaves = 2.0 ** torch.arange(num_frequencies, dtype=x.dtype, device=x.device)

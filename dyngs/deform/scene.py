@@ -14,9 +14,9 @@ from dyngs.deform.field import DeformationField, Offsets, apply_offsets
 from dyngs.deform.fields import field_state, restore_field
 from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.filters import filter_state, apply_filter, restore_filter
+from dyngs.gaussians.filters import apply_filter, filter_state, restore_filter
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, restore_times, times_state
-from dyngs.gaussians.visibility import VisibilityMasks, matched
+from dyngs.gaussians.visibility import VisibilityMasks, intersect_sorted
 from dyngs.models.renderable import Renderable, clamped_time
 
 _NONE = torch.zeros(0, dtype=torch.long, device="cpu")
@@ -26,13 +26,13 @@ _NONE = torch.zeros(0, dtype=torch.long, device="cpu")
 class DynamicScene(GaussianScene):
     """N canonical Gaussians of which a field moves M."""
 
-    seen_at: tuple[float, ...]  # distinct training times in [0, 1], ascending
+    training_times: tuple[float, ...]  # distinct training times in [0, 1], ascending
     field: DeformationField | None = None
     moving: Tensor = _NONE  # (M,) ascending indices of the Gaussians that it moves
     filter_std: Tensor | None = None
 
     @staticmethod
-    def restored(
+    def from_state(
         options: DynamicModel, gaussians: Gaussians, tensors: Mapping[str, Tensor]
     ) -> DynamicScene:
         count = len(gaussians)
@@ -40,14 +40,14 @@ class DynamicScene(GaussianScene):
         std = restore_filter(tensors, count)
         times = restore_times(tensors)
         if not own:
-            return DynamicScene(gaussians=gaussians, seen_at=times, filter_std=std)
-        masks = VisibilityMasks.restored(part_of(tensors, "masks"), count)
+            return DynamicScene(gaussians=gaussians, training_times=times, filter_std=std)
+        masks = VisibilityMasks.from_state(part_of(tensors, "masks"), count)
         rows = tensors.get("rows", torch.arange(count, device=gaussians.means.device))
         require_ascending("rows", require_indices("rows", rows, (None,), count))
         field = restore_field(options.deform, own, len(rows))
         return DynamicScene(
             gaussians=gaussians,
-            seen_at=times,
+            training_times=times,
             field=field,
             moving=rows,
             masks=masks,
@@ -56,7 +56,7 @@ class DynamicScene(GaussianScene):
 
     @property
     def times(self) -> tuple[float, ...]:
-        return self.seen_at
+        return self.training_times
 
     @property
     def is_static(self) -> bool:
@@ -106,17 +106,17 @@ class DynamicScene(GaussianScene):
             penalties = self.field.penalties(time)
         return part.moved(offsets, self.field, time), offsets, penalties
 
-    def edited(self, edit: TopologyEdit) -> DynamicScene:
+    def apply_edit(self, edit: TopologyEdit) -> DynamicScene:
         position = torch.full((len(self),), -1, device=self.moving.device)
         position[self.moving] = torch.arange(len(self.moving), device=self.moving.device)
         descent = position[edit.source]
         rows = torch.nonzero(descent >= 0)[:, 0]
         field = self.field
         if field is not None:
-            field = field.edited(TopologyEdit(descent[rows], edit.is_new[rows]))
+            field = field.apply_edit(TopologyEdit(descent[rows], edit.is_new[rows]))
         return replace(
             self,
-            gaussians=self.gaussians.edited(edit),
+            gaussians=self.gaussians.apply_edit(edit),
             moving=rows,
             field=field,
             masks=None if self.masks is None else self.masks.select(edit.source),
@@ -124,7 +124,7 @@ class DynamicScene(GaussianScene):
         )
 
     def _model_state(self) -> State:
-        state = filter_state(self.filter_std) | times_state(self.seen_at)
+        state = filter_state(self.filter_std) | times_state(self.training_times)
         if self.field is not None:
             state |= prefixed("field", field_state(self.field))
             state["rows"] = StateTensor(self.moving, Role.SHARED)
@@ -148,7 +148,7 @@ class DynamicScene(GaussianScene):
             return _DrawnPart(gaussians, self.filter_std, means, None, rows)
         active = self.masks.active(interval)
         std = None if self.filter_std is None else self.filter_std[active]
-        asked, rows = matched(self.moving, active, len(self))
+        asked, rows = intersect_sorted(self.moving, active, len(self))
         return _DrawnPart(gaussians.picked(active), std, means, asked, rows)
 
 
@@ -169,4 +169,4 @@ class _DrawnPart:
 
     def moved(self, offsets: Offsets, field: DeformationField, time: float) -> Gaussians:
         now = apply_filter(apply_offsets(self.gaussians, offsets, self.rows), self.filter_std)
-        return field.shaded(now, self.rows, self.asked, time)
+        return field.apply_shading(now, self.rows, self.asked, time)

@@ -25,12 +25,12 @@ times."""
 class DeformSchedule:
     """The steps at which the phases of training begin."""
 
-    fine: int  # last step without motion
+    coarse_end: int  # last step without motion
     # opens, full: steps between which the window of times grows, to all of them
-    opens: int
-    full: int
-    decays: int  # step from which the field's rates fall
-    splits: tuple[int, ...]  # steps after which Gaussians that do not move are frozen
+    window_grows_from: int
+    window_full_at: int
+    decay_from: int  # step from which the field's rates fall
+    freeze_steps: tuple[int, ...]  # steps after which Gaussians that do not move are frozen
     rates: RateSchedule
 
 
@@ -42,17 +42,19 @@ def deform_schedule(model: DynamicModel, rates: RateSchedule) -> DeformSchedule:
     nothing.
     """
     steps = rates.steps
-    fine = model.moves_after(steps)
-    opens = max(fine, round(model.time_window_grows_from * steps))
-    full = max(opens, round(model.time_window_full_at * steps))
-    decays = full if model.time_window < 1 else fine
-    splits = (
-        sorted({full + round(fraction * (steps - full)) for fraction in SPLITS})
+    coarse_end = model.moves_after(steps)
+    window_grows_from = max(coarse_end, round(model.time_window_grows_from * steps))
+    window_full_at = max(window_grows_from, round(model.time_window_full_at * steps))
+    decay_from = window_full_at if model.time_window < 1 else coarse_end
+    freeze_steps = (
+        sorted({window_full_at + round(fraction * (steps - window_full_at)) for fraction in SPLITS})
         if model.freeze_below_px > 0
         else []
     )
-    splits = tuple(step for step in splits if step > full)
-    return DeformSchedule(fine, opens, full, decays, splits, rates)
+    freeze_steps = tuple(step for step in freeze_steps if step > window_full_at)
+    return DeformSchedule(
+        coarse_end, window_grows_from, window_full_at, decay_from, freeze_steps, rates
+    )
 
 
 def extended(model: DynamicModel, length: Length) -> DynamicModel:
@@ -62,17 +64,17 @@ def extended(model: DynamicModel, length: Length) -> DynamicModel:
     """
     old = deform_schedule(model, RateSchedule(length.was))
     fractions = {"motion_from": _motion_from(old, model, length)}
-    if length.done >= old.opens:
+    if length.done >= old.window_grows_from:
         fractions |= {
-            "time_window_grows_from": length.kept(old.opens),
-            "time_window_full_at": length.kept(old.full),
+            "time_window_grows_from": length.kept(old.window_grows_from),
+            "time_window_full_at": length.kept(old.window_full_at),
         }
     changed = model.model_copy(update=fractions)
-    begins = changed.moves_after(length.steps)
-    if old.fine <= length.done < begins:
+    motion_start = changed.moves_after(length.steps)
+    if old.coarse_end <= length.done < motion_start:
         raise DyngsError(
-            f"train.steps={length.steps}: motion began after {old.fine:,} steps, and a run of {length.steps:,} trains "
-            f"{begins:,} before anything moves; train anew with so many steps"
+            f"train.steps={length.steps}: motion began after step {old.coarse_end:,}, but a run of "
+            f"{length.steps:,} steps trains {motion_start:,} static steps; start a new run"
         )
     return changed
 
@@ -80,10 +82,10 @@ def extended(model: DynamicModel, length: Length) -> DynamicModel:
 def _motion_from(old: DeformSchedule, model: DynamicModel, length: Length) -> float:
     """Return the share after which motion is learned: the step where it began, else one that is
     still to come."""
-    if length.done >= old.fine:
-        return length.kept(old.fine)
+    if length.done >= old.coarse_end:
+        return length.kept(old.coarse_end)
     new = deform_schedule(model, RateSchedule(length.steps))
-    return length.kept(length.done + 1) if new.fine <= length.done else model.motion_from
+    return length.kept(length.done + 1) if new.coarse_end <= length.done else model.motion_from
 
 
 MIN_VIEWS = 6
@@ -97,48 +99,60 @@ grows."""
 class TimeWindow:
     """The times that are trained on at each step."""
 
-    strays: tuple[float, ...]
+    time_offsets: tuple[float, ...]
     first: float
-    begins: int
-    opens: int
-    full: int
+    motion_start: int
+    window_grows_from: int
+    window_full_at: int
     _limits: dict[int, tuple[float, float]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
     @staticmethod
     def around_middle(
-        times: Sequence[float], first: float, begins: int, opens: int, full: int
+        times: Sequence[float],
+        first: float,
+        motion_start: int,
+        window_grows_from: int,
+        window_full_at: int,
     ) -> TimeWindow:
         return TimeWindow(
-            tuple(sorted(abs(time - MIDDLE) for time in times)), first, begins, opens, full
+            tuple(sorted(abs(time - MIDDLE) for time in times)),
+            first,
+            motion_start,
+            window_grows_from,
+            window_full_at,
         )
 
     def num_views(self, step: int) -> int:
-        start = min(len(self.strays), max(MIN_VIEWS, math.ceil(self.first * len(self.strays))))
-        progress = (step - self.opens) / max(self.full - self.opens, 1)
-        return start + int(min(max(progress, 0.0), 1.0) * (len(self.strays) - start))
+        start = min(
+            len(self.time_offsets), max(MIN_VIEWS, math.ceil(self.first * len(self.time_offsets)))
+        )
+        progress = (step - self.window_grows_from) / max(
+            self.window_full_at - self.window_grows_from, 1
+        )
+        return start + int(min(max(progress, 0.0), 1.0) * (len(self.time_offsets) - start))
 
     def reach(self, step: int) -> float:
         """Return the largest |time - 0.5| in the window at ``step``; 0.5 once it is full."""
         count = self.num_views(step)
-        return MIDDLE if count == len(self.strays) else self.strays[count - 1]
+        return MIDDLE if count == len(self.time_offsets) else self.time_offsets[count - 1]
 
     def bounds(self, step: int) -> tuple[float, float]:
         """Return the first and last time in the window at ``step``; [0, 1] once it is full."""
         reach = self.reach(step)
         return MIDDLE - reach, MIDDLE + reach
 
-    def holds(self, time: float, step: int) -> bool:
+    def contains(self, time: float, step: int) -> bool:
         """Return whether ``time`` is trained on at ``step``; while it grows, every other step takes
         only new times."""
         # Not by ``bounds``: their rounding may shut out the very times that the window ends with.
-        if step <= self.begins:
+        if step <= self.motion_start:
             return True
         if step not in self._limits:  # once, though all views ask
             oldest = (
-                self.strays[max(self.num_views(step) - FRONTIER_VIEWS, 0)]
-                if self.tracks(step)
+                self.time_offsets[max(self.num_views(step) - FRONTIER_VIEWS, 0)]
+                if self.is_frontier_step(step)
                 else 0.0
             )
             self._limits.clear()
@@ -146,11 +160,11 @@ class TimeWindow:
         oldest, newest = self._limits[step]
         return oldest <= abs(time - MIDDLE) <= newest
 
-    def tracks(self, step: int) -> bool:
+    def is_frontier_step(self, step: int) -> bool:
         """Return whether ``step`` is for the newest views only: every other one while the window
         grows."""
         return (
-            self.opens < step < self.full
+            self.window_grows_from < step < self.window_full_at
             and step % 2 == 0
-            and self.num_views(step) < len(self.strays)
+            and self.num_views(step) < len(self.time_offsets)
         )

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
-from dyngs.deform.bodies.paths import FrameStack, render_frame_stack, one_camera
+from dyngs.deform.bodies.paths import FrameStack, one_camera, render_frame_stack
 from dyngs.deform.fixed_cameras.hulls import FixedCameraClip, build_fixed_camera_clip
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.kind import DYNAMIC
@@ -15,17 +15,22 @@ from dyngs.deform.schedule import deform_schedule
 from dyngs.deform.static_errors import (
     StaticErrors,
     group_fixed_cameras,
-    static_errors,
     select_comparison_views,
+    static_errors,
 )
 from dyngs.deform.training import SURELY_MOVING, DynamicTraining, TrainingViews
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.training import ColourTraining
+from dyngs.gaussians.initialization import (
+    build_colour_training,
+    build_densifier,
+    build_filter_update,
+    load_or_create_gaussians,
+)
 from dyngs.gaussians.model import GaussianModel, training_options
 from dyngs.gaussians.rendering import Shader
 from dyngs.gaussians.scene import restore_appearance
 from dyngs.gaussians.schedule import rate_schedule
-from dyngs.gaussians.initialization import colours_of, build_densifier, build_filter_update, load_or_create_gaussians
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.schedule import image_divisor
@@ -47,16 +52,18 @@ def start(run: RunStart) -> GaussianModel:
     if problem is not None:
         raise DyngsError(f"{run.config.data.root}: {problem}")
     gaussians = load_or_create_gaussians(run)
-    colours = colours_of(run, gaussians, uses_time=True)
+    colours = build_colour_training(run, gaussians, uses_time=True)
     schedule = deform_schedule(model, rate_schedule(run.config))
     views = _training_views(run, model, colours)
     training = DynamicTraining(model, schedule, views, build_filter_update(run), run.generator)
-    return GaussianModel(run, training.first_scene(gaussians), training, build_densifier(run), colours)
+    return GaussianModel(
+        run, training.first_scene(gaussians), training, build_densifier(run), colours
+    )
 
 
 def restore(model: DynamicModel, checkpoint: Checkpoint) -> DynamicScene:
     """Return the scene of a checkpoint."""
-    scene = DynamicScene.restored(
+    scene = DynamicScene.from_state(
         model, Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
     )
     return restore_appearance(scene, model, checkpoint)
@@ -68,7 +75,7 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
     images = run.images
     views = capture.splits["train"]
     _, background = evaluation_background(config.data.background, capture.has_alpha)
-    divisor = image_divisor(config.train, deform_schedule(model, rate_schedule(config)).fine)
+    divisor = image_divisor(config.train, deform_schedule(model, rate_schedule(config)).coarse_end)
     looked_at = select_comparison_views(views)
     options = training_options(run)
 
@@ -82,12 +89,14 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
 
     in_place = group_fixed_cameras(views)
 
-    def standing() -> list[FixedCameraClip]:
+    def fixed_clips() -> list[FixedCameraClip]:
         used = [in_place[i] for i in evenly_spaced(len(in_place), MAX_STANDING)]
         total = sum(map(len, used))
-        return [build_fixed_camera_clip((images[i] for i in seen), background, total) for seen in used]
+        return [
+            build_fixed_camera_clip((images[i] for i in seen), background, total) for seen in used
+        ]
 
-    def shots(still: Gaussians) -> FrameStack | None:
+    def frame_stack(static: Gaussians) -> FrameStack | None:
         order = one_camera(views)
         limit = min(MAX_SHOTS, rate_schedule(config).steps // STEPS_PER_SHOT)
         if config.train.minutes is not None:
@@ -95,7 +104,7 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
         if order is None or limit == 0 or len(set(images.sizes)) > 1:
             return None
         used = (images[order[i]] for i in evenly_spaced(len(order), limit))
-        return render_frame_stack(used, still, options, background, shader)
+        return render_frame_stack(used, static, options, background, shader)
 
     return TrainingViews(
         training_times(capture),
@@ -103,7 +112,7 @@ def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining)
         run.extent,
         errors_of,
         has_fixed_cameras=bool(in_place),
-        standing=standing,
-        shots=shots,
+        fixed_clips=fixed_clips,
+        frame_stack=frame_stack,
         options=options,
     )

@@ -32,8 +32,8 @@ SHOWS = 1e-3  # Sum of weights, in pixels, from which a Gaussian counts as visib
 class StaticErrors:
     """Errors of a static scene in the images, per Gaussian."""
 
-    most: Tensor  # (N,) large where anything moves, be it this Gaussian or what hides it at times
-    usual: Tensor  # (N,) large where this moves
+    peak: Tensor  # (N,) large where anything moves, be it this Gaussian or what hides it at times
+    typical: Tensor  # (N,) large where this moves
 
 
 def static_errors(
@@ -163,9 +163,9 @@ def changed_fraction(cameras: Sequence[Sequence[Tensor]]) -> float:
     differing = total = 0
     for images in cameras:
         smooth = [avg_pool2d(image.movedim(2, 0), 2, ceil_mode=True) for image in images]
-        usual = torch.stack(smooth).median(0).values
+        typical = torch.stack(smooth).median(0).values
         for image in smooth:
-            gap = image - usual
+            gap = image - typical
             gap = gap - gap.flatten(1).median(1).values[:, None, None]
             differing += int((gap.abs().mean(0) > DIFFERS).sum())
             total += gap[0].numel()

@@ -24,7 +24,7 @@ from dyngs.deform.field import DeformationField, FieldSetup, Offsets, apply_offs
 from dyngs.deform.fields import WindowedField, create_field
 from dyngs.deform.fixed_cameras.hulls import FixedCameraClip
 from dyngs.deform.fixed_cameras.initial_motion import InitialMotion, find_initial_motion
-from dyngs.deform.free import FreePrimitives, FreeInitialization, initialize_free
+from dyngs.deform.free import FreeInitialization, FreePrimitives, initialize_free
 from dyngs.deform.keys import DynamicModel, FreeField
 from dyngs.deform.random_gaussians import box_of, random_gaussians, with_gaussians
 from dyngs.deform.scene import DynamicScene
@@ -75,8 +75,8 @@ def measure_motion(
         pixels = stray / px_size + PX_PER_OPACITY * apart["colors"].abs().amax(1)
         if sample.logit_opacities is not None and mean.logit_opacities is not None:
             now = (gaussians.logit_opacities + sample.logit_opacities).sigmoid()
-            usual = (gaussians.logit_opacities + mean.logit_opacities).sigmoid()
-            pixels = pixels + PX_PER_OPACITY * (now - usual).abs()
+            typical = (gaussians.logit_opacities + mean.logit_opacities).sigmoid()
+            pixels = pixels + PX_PER_OPACITY * (now - typical).abs()
         score = torch.maximum(score, pixels)
     return score, mean
 
@@ -107,10 +107,10 @@ class TrainingViews:
     # how far its images disagree with what is still, where N Gaussians are seen
     static_errors: Callable[[Callable[[float], Gaussians]], StaticErrors]
     has_fixed_cameras: bool = False  # in place, so that images show what is still exactly alike
-    standing: Callable[[], Sequence[FixedCameraClip]] = tuple  # returns what those cameras show
+    fixed_clips: Callable[[], Sequence[FixedCameraClip]] = tuple  # returns what those cameras show
     # what one moving camera shows, against N Gaussians that stand still; None where there is no
     # such camera
-    shots: Callable[[Gaussians], FrameStack | None] = lambda _: None
+    frame_stack: Callable[[Gaussians], FrameStack | None] = lambda _: None
     options: RenderOptions = field(default_factory=RenderOptions)  # how training images are drawn
 
 
@@ -135,11 +135,11 @@ class DynamicTraining(SceneTraining[DynamicScene]):
 
     def first_scene(self, gaussians: Gaussians) -> DynamicScene:
         return DynamicScene(
-            gaussians=gaussians, seen_at=self.times, filter_std=self._update.of(gaussians)
+            gaussians=gaussians, training_times=self.times, filter_std=self._update.of(gaussians)
         )
 
     def trains_on(self, time: float | None, step: int) -> bool:
-        return self._window.holds(time or 0.0, step)
+        return self._window.contains(time or 0.0, step)
 
     def window(self, step: int) -> tuple[float, float]:
         return self._window.bounds(step)
@@ -152,17 +152,19 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         if scene.field is None:
             return scene.time_step(image.time)
         time = image.time or 0.0
-        gaussians, offsets, penalties = scene.in_training(time, detach=self._window.tracks(step))
+        gaussians, offsets, penalties = scene.in_training(
+            time, detach=self._window.is_frontier_step(step)
+        )
         return GaussianTimeStep(gaussians, image.time, None, penalties | self._sparsity(offsets))
 
     def optimize(self, scene: DynamicScene, step: int) -> Count:
         if scene.field is None:
             return 0
         scene.field.zero_gradients_outside_(self._window.bounds(step))
-        progress = self.schedule.rates.progress(step, since=self.schedule.decays)
-        return scene.field.step(step - self.schedule.fine, progress)
+        progress = self.schedule.rates.progress(step, since=self.schedule.decay_from)
+        return scene.field.step(step - self.schedule.coarse_end, progress)
 
-    def resting(self, scene: DynamicScene) -> Tensor | None:
+    def skip_unseen_rows(self, scene: DynamicScene) -> Tensor | None:
         return scene.moving if scene.field is not None and scene.field.has_lifetime else None
 
     def leaves(self, scene: DynamicScene) -> list[Tensor]:
@@ -177,26 +179,26 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             scene.field.invalidate()
         scene.field.extend(self._window.bounds(step), self._window.bounds(step + 1))
         scene = self._windowed(scene, step)
-        return self._frozen(scene) if step in self.schedule.splits else scene
+        return self._frozen(scene) if step in self.schedule.freeze_steps else scene
 
     def edit_scene(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
         """Return the scene with Gaussians to begin motion with; None where a static model explains
         all."""
-        if step != self.schedule.fine:
+        if step != self.schedule.coarse_end:
             return None
         now = scene.gaussians
         found = self.capture.static_errors(lambda _: now)
         floor = self.options.motion_threshold
-        errs = bool((found.most > SURELY_MOVING * floor).float().mean() > MIN_MOVING_FRACTION)
-        threshold = min(max(otsu_threshold(found.usual), floor), SURELY_MOVING * floor)
-        rows = torch.nonzero(found.usual > threshold)[:, 0]
+        errs = bool((found.peak > SURELY_MOVING * floor).float().mean() > MIN_MOVING_FRACTION)
+        threshold = min(max(otsu_threshold(found.typical), floor), SURELY_MOVING * floor)
+        rows = torch.nonzero(found.typical > threshold)[:, 0]
         first = self._first_motion(now.detach())
-        if not errs and not first.moments:
+        if not errs and not first.timed_gaussians:
             return None
         bodies = self._first_bodies(now.detach())
         added, start = self._begun(now.detach(), rows, first, bodies)
-        finding = first.finding if bodies is None else bodies.finding
-        result = replace(with_gaussians(now.detach(), added), finding=finding)
+        message = first.message if bodies is None else bodies.message
+        result = replace(with_gaussians(now.detach(), added), message=message)
         if start is not None:
             result.changes["logit_opacities"][rows] = start.logits.to(rows.device)
         gaussians = Gaussians(**result.changes)
@@ -205,7 +207,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         setup = FieldSetup(center, half_size, len(self.times), len(moving), self.capture.extent)
         field = create_field(self.options.deform, setup, self._generator)
         if isinstance(field, FreePrimitives) and start is not None:
-            field = field.started(start)
+            field = field.with_initialization(start)
         if bodies is not None:
             field = bodies.within(field)
             self._see_all(bodies.explains_all_motion)
@@ -215,9 +217,9 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             scene, gaussians=gaussians, field=field, moving=moving, filter_std=std
         ), result
 
-    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> DynamicScene:
+    def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> DynamicScene:
         self._see_all("all_times" in tensors)
-        return DynamicScene.restored(self.options, gaussians, tensors)
+        return DynamicScene.from_state(self.options, gaussians, tensors)
 
     def state(self) -> State:
         return (
@@ -229,16 +231,20 @@ class DynamicTraining(SceneTraining[DynamicScene]):
     def _see_all(self, at_once: bool) -> None:
         """Train on all times from the first if ``at_once``: nothing need be followed outwards."""
         first = 1.0 if at_once or self._is_free else self.options.time_window
-        phases = self.schedule.fine, self.schedule.opens, self.schedule.full
+        phases = (
+            self.schedule.coarse_end,
+            self.schedule.window_grows_from,
+            self.schedule.window_full_at,
+        )
         self._sees_all = at_once
         self._window = TimeWindow.around_middle(self.capture.times, first, *phases)
 
-    def _first_bodies(self, still: Gaussians) -> Bodies | None:
+    def _first_bodies(self, static: Gaussians) -> Bodies | None:
         """Return what moves rigidly before one moving camera."""
-        shots = None if self._is_free else self.capture.shots(still)
-        if shots is None:
+        frame_stack = None if self._is_free else self.capture.frame_stack(static)
+        if frame_stack is None:
             return None
-        return find_bodies(shots, self.options.num_random_moving, still.sh.shape[1])
+        return find_bodies(frame_stack, self.options.num_random_moving, static.sh.shape[1])
 
     def _begun(
         self,
@@ -249,29 +255,31 @@ class DynamicTraining(SceneTraining[DynamicScene]):
     ) -> tuple[Sequence[Gaussians], FreeInitialization | None]:
         """Return the Gaussians to add when motion begins, and the windows of all that move where
         these have some."""
-        is_explained = first.moments or (bodies and bodies.explains_all_motion)
+        is_explained = first.timed_gaussians or (bodies and bodies.explains_all_motion)
         count = 0 if is_explained else self.options.num_random_moving
         added = random_gaussians(now, count, self.capture.extent, self._generator)
         if not self._is_free:
             return [added, *(bodies.seeds if bodies else ())], None
-        still, others = (x.to(device="cpu") for x in (now.select(rows), added))
-        start = initialize_free(still, first.moments, others, len(self.times))
+        static, others = (x.to(device="cpu") for x in (now.select(rows), added))
+        start = initialize_free(static, first.timed_gaussians, others, len(self.times))
         return start.added, start
 
-    def _first_motion(self, still: Gaussians) -> InitialMotion:
+    def _first_motion(self, static: Gaussians) -> InitialMotion:
         """Return what changes before fixed cameras, for a field that can begin there."""
         if not self._is_free:
             return InitialMotion()
         capture = self.capture
         limit = self.options.num_random_moving
-        still = still.to(device="cpu")
-        return find_initial_motion(capture.standing(), still, capture.extent, limit, capture.options)
+        static = static.to(device="cpu")
+        return find_initial_motion(
+            capture.fixed_clips(), static, capture.extent, limit, capture.options
+        )
 
     def _windowed(self, scene: DynamicScene, step: int) -> DynamicScene:
         """Return the scene in which what follows nodes may be there for a part of the clip, once
         all times are seen."""
         field = scene.field
-        if step != max(self.schedule.full, self.schedule.fine + 1) or field is None:
+        if step != max(self.schedule.window_full_at, self.schedule.coarse_end + 1) or field is None:
             return scene
         if isinstance(field, WindowedField) or not isinstance(innermost(field), ControlNodes):
             return scene
@@ -295,7 +303,7 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             seen = self.capture.static_errors(
                 lambda time: apply_offsets(now, field.offsets(means, time), scene.moving)
             )
-            moves &= seen.usual[scene.moving] > SURELY_STILL * self.options.motion_threshold
+            moves &= seen.typical[scene.moving] > SURELY_STILL * self.options.motion_threshold
         return _with_frozen(scene, mean, ~moves)
 
     def _sparsity(self, offsets: Offsets) -> dict[str, Tensor]:
@@ -311,11 +319,11 @@ class DynamicTraining(SceneTraining[DynamicScene]):
 def _with_frozen(scene: DynamicScene, mean: Offsets, stays: Tensor) -> DynamicScene:
     """Return the scene in which those of the moving Gaussians that ``stays`` (M,) names stand still
     at ``mean``."""
-    still = torch.nonzero(stays)[:, 0]
+    static = torch.nonzero(stays)[:, 0]
     kept = torch.nonzero(~stays)[:, 0]
-    bake_(scene.gaussians, scene.moving[still], mean.select(still))
+    bake_(scene.gaussians, scene.moving[static], mean.select(static))
     if scene.field is None or not len(kept):
         return replace(scene, field=None, moving=scene.moving[kept])
-    left = scene.field.edited(TopologyEdit.select(kept))
+    left = scene.field.apply_edit(TopologyEdit.select(kept))
     left.invalidate()
     return replace(scene, field=left, moving=scene.moving[kept])

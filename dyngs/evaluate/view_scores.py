@@ -30,7 +30,7 @@ from dyngs.data.capture import View
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced, static_cameras
-from dyngs.gaussians.colour.network import fit_affine_colour, apply_affine_colour
+from dyngs.gaussians.colour.network import apply_affine_colour, fit_affine_colour
 from dyngs.human.avatar.scene import as_human_scene
 from dyngs.models.renderable import DrawOptions, Renderable, Rendering
 from dyngs.models.views import background_colour
@@ -433,7 +433,9 @@ def flicker(drawing: SceneRenderer, cameras: Cameras, times: Sequence[float]) ->
     return MetricValue(fmean(values))
 
 
-def flicker_error(drawing: SceneRenderer, loader: ImageLoader, views: Sequence[View]) -> MetricValue:
+def flicker_error(
+    drawing: SceneRenderer, loader: ImageLoader, views: Sequence[View]
+) -> MetricValue:
     """Return the mean of |(R_{k+1} - R_k) - (G_{k+1} - G_k)| x 255: the error of changes in time,
     at fixed cameras.
 

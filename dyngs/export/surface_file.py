@@ -15,7 +15,7 @@ from dyngs.baselines.fields.scene import space_of
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
 from dyngs.export.splat_files import DEFAULT_WRITE_OPTIONS, WriteOptions, choose_write_options
-from dyngs.gaussians.surface import opaque_box, extract_surface
+from dyngs.gaussians.surface import extract_surface, opaque_box
 from dyngs.io.formats.ply import double_ply
 from dyngs.io.formats.similarity import Similarity, far_offset
 from dyngs.io.write import atomic_file

@@ -20,4 +20,4 @@ class EditResult:
     changes: dict[str, Tensor] = field(default_factory=dict[str, Tensor])
     # fields whose optimizer moments start anew in every row
     zero_moments: frozenset[str] = frozenset()
-    finding: str | None = None  # a line for people about why, or None
+    message: str | None = None  # a line for people about why, or None

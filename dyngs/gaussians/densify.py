@@ -368,7 +368,9 @@ class McmcDensifier(Densifier):
         shared = copies > 1
         opacities = opacities.clone()
         log_scales = log_scales.clone()
-        thinner, factor = compute_relocation(opacities[shared], copies[shared], self.options.prune_opacity)
+        thinner, factor = compute_relocation(
+            opacities[shared], copies[shared], self.options.prune_opacity
+        )
         opacities[shared] = thinner
         log_scales[shared] += factor.log().float()[:, None]
         return opacities, log_scales, shared

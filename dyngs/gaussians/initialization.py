@@ -101,7 +101,7 @@ class SceneGeometry:
         return extent_of(self.camera_centers) or 1.0
 
 
-def surroundings(capture: Capture) -> SceneGeometry:
+def scene_geometry(capture: Capture) -> SceneGeometry:
     """Return the properties of a capture that initialisation needs."""
     points = capture.points
     return SceneGeometry(
@@ -224,11 +224,13 @@ def load_or_create_gaussians(run: RunStart) -> Gaussians:
         return run.first.gaussians
     config = run.config
     start = InitialValues.for_strategy(run.asked.strategy)
-    where = surroundings(run.capture)
+    where = scene_geometry(run.capture)
     return initial_gaussians(where, config.init, start, config.stored_sh_degree, run.generator)
 
 
-def colours_of(run: RunStart, gaussians: Gaussians, *, uses_time: bool) -> ColourTraining:
+def build_colour_training(
+    run: RunStart, gaussians: Gaussians, *, uses_time: bool
+) -> ColourTraining:
     """Return how colours are trained."""
     colour = run.config.colour
     steps = run.config.train.steps
@@ -257,7 +259,9 @@ def build_densifier(run: RunStart) -> Densifier:
             options = strategy.model_copy(
                 update={"grad_threshold": grad_threshold(strategy, steps)}
             )
-            center = torch.from_numpy(surroundings(run.capture).camera_centers.mean(axis=0)).float()
+            center = torch.from_numpy(
+                scene_geometry(run.capture).camera_centers.mean(axis=0)
+            ).float()
             return DefaultDensifier(
                 options, densify_schedule(strategy, steps, on_white), run.extent, center
             )

@@ -125,7 +125,7 @@ def sizes_on_image(balls: np.ndarray, camera: Cameras) -> np.ndarray:
     return np.where(seen, max(k[0, 0], k[1, 1]) * balls[:, 4] / nearest, -1.0)
 
 
-def levels_of(gaussians: Gaussians) -> Levels:
+def build_levels(gaussians: Gaussians) -> Levels:
     """Return the tree of N Gaussians, equal ones for equal Gaussians. Raises DyngsError where there
     are none."""
     if not len(gaussians):
@@ -147,7 +147,7 @@ def levels_of(gaussians: Gaussians) -> Levels:
     return Levels(tuple(levels), tuple(blocks))
 
 
-def merged(gaussians: Gaussians, count: int) -> tuple[Gaussians, Tensor]:
+def merge_gaussians(gaussians: Gaussians, count: int) -> tuple[Gaussians, Tensor]:
     """Return N Gaussians merged from ``count`` each, and the shares (N, count) in their masses,
     whose rows sum to 1.
 
@@ -189,7 +189,7 @@ def _next_level(
         own = rows.clamp_max(len(level) - 1)
         several = level.select(own).to(dtype=torch.float64)
         several.logit_opacities[rows >= len(level)] = -torch.inf
-        part, shares = merged(several, MERGED)
+        part, shares = merge_gaussians(several, MERGED)
         below = points[own].unflatten(0, shares.shape)
         means = (shares[..., None] * below).sum(1)
         variances = spreads[own].reshape(shares.shape) + (below - means[:, None]).square().sum(2)
@@ -273,7 +273,7 @@ class LevelScene(Renderable):
             )
         gaussians = still.at(None)
         return LevelScene(
-            replace(still, gaussians=gaussians, filter_std=None), levels_of(gaussians), most
+            replace(still, gaussians=gaussians, filter_std=None), build_levels(gaussians), most
         )
 
     @property

@@ -74,12 +74,12 @@ class SceneTraining(Generic[S]):
         """Return what the scene learns next to the Gaussians and their colours."""
         return ()
 
-    def resting(self, scene: S) -> Tensor | None:
+    def skip_unseen_rows(self, scene: S) -> Tensor | None:
         """Return the indices of the Gaussians that stay as they are in steps that do not show them;
         None: of none."""
         return None
 
-    def still(self) -> FrozenMask | None:
+    def frozen_mask(self) -> FrozenMask | None:
         """Return what stays as it is, whatever the images say."""
         return None
 
@@ -96,7 +96,7 @@ class SceneTraining(Generic[S]):
     def follow(self, edit: TopologyEdit) -> None:
         """Let what the training itself keeps per Gaussian follow a change of the set."""
 
-    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> S:
+    def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> S:
         """Return the scene of a checkpoint, and take over the training's state."""
         raise NotImplementedError
 
@@ -169,7 +169,11 @@ class GaussianModel(Model[GaussianScene]):
     @property
     def leaves(self) -> Sequence[Tensor]:
         found = [*self._optimizer.parameters.tensors().values()]
-        found += [] if self.colours.learned is None else self.colours.learned.leaves
+        found += (
+            []
+            if self.colours.network_parameters is None
+            else self.colours.network_parameters.leaves
+        )
         return [*found, *self.training.leaves(self._scene)]
 
     def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
@@ -225,34 +229,47 @@ class GaussianModel(Model[GaussianScene]):
         generator = self._generator
         lr_means = means_rate(self._rates, self._course.progress(step), self._run.extent)
         frozen = self.colours.frozen_harmonics()
-        resting = self.training.resting(self._scene)
-        still = self.training.still()
-        bad = self._optimizer.step(step, lr_means, frozen_harmonics=frozen, resting=resting, still=still)
+        skip_unseen_rows = self.training.skip_unseen_rows(self._scene)
+        frozen_mask = self.training.frozen_mask()
+        bad = self._optimizer.step(
+            step,
+            lr_means,
+            frozen_harmonics=frozen,
+            skip_unseen_rows=skip_unseen_rows,
+            frozen_mask=frozen_mask,
+        )
         bad = bad + self.colours.optimize(step) + self.training.optimize(self._scene, step)
         result = self.densifier.edit(step, self._optimizer.parameters, generator)
         if result is not None:
-            if still is not None:
-                result = still.grown(result, self._optimizer.parameters)
+            if frozen_mask is not None:
+                result = frozen_mask.exclude_from_edit(result, self._optimizer.parameters)
             self._apply(self._in_memory_order(result))
         self._perturb(lr_means)
         self._scene = self.training.after_step(self._scene, step, result is not None)
-        edit_scene = self.training.edit_scene(self._scene, step)
-        if edit_scene is not None:
-            scene, result = edit_scene
+        scene_edit = self.training.edit_scene(self._scene, step)
+        if scene_edit is not None:
+            scene, result = scene_edit
             self._apply(result, scene)
-        findings = (self._measured_harmonics(step), None if edit_scene is None else edit_scene[1].finding)
+        findings = (
+            self._measured_harmonics(step),
+            None if scene_edit is None else scene_edit[1].message,
+        )
         self._scene.changed()
         text = "; ".join(text for text in findings if text) or None
         return Updated(bad, text, self._optimizer.parameters is not before)
 
     def _perturb(self, lr_means: float) -> None:
         """Let the strategy shake the Gaussians, but for those that stay as they are."""
-        still = self.training.still()
+        frozen_mask = self.training.frozen_mask()
         means = self._optimizer.parameters.means
-        kept = None if still is None or still.rows is None else means.detach()[still.rows]
+        kept = (
+            None
+            if frozen_mask is None or frozen_mask.rows is None
+            else means.detach()[frozen_mask.rows]
+        )
         self.densifier.perturb(self._optimizer.parameters, lr_means, self._generator)
-        if still is not None and kept is not None:
-            means.detach()[still.rows] = kept
+        if frozen_mask is not None and kept is not None:
+            means.detach()[frozen_mask.rows] = kept
 
     def replace_scene(self, scene: GaussianScene) -> None:
         """Go on with ``scene``: the same Gaussians, moved, masked or drawn in another way."""
@@ -295,11 +312,11 @@ class GaussianModel(Model[GaussianScene]):
 
     def restore(self, checkpoint: Checkpoint) -> None:
         gaussians = Gaussians.stored(checkpoint.part("gaussians"))
-        optimizer = self._optimizer.restored(gaussians, checkpoint.tensors)
+        optimizer = self._optimizer.with_state(gaussians, checkpoint.tensors)
         colour = checkpoint.part("model.colour")
         restore_colour_network(colour)  # raises where its tensors do not fit together
         self.colours.restore(colour, len(gaussians))
-        scene = self.training.restored(optimizer.parameters, checkpoint.part("model"))
+        scene = self.training.restore(optimizer.parameters, checkpoint.part("model"))
         if checkpoint.info.step >= self._config.train.steps:
             self.stop_growing()
         self.densifier.load_state(checkpoint.part("strategy"))
@@ -330,7 +347,7 @@ class GaussianModel(Model[GaussianScene]):
         ``edited``: is already."""
         self._optimizer.apply(result)
         if edited is None:
-            edited = self._scene if result.edit is None else self._scene.edited(result.edit)
+            edited = self._scene if result.edit is None else self._scene.apply_edit(result.edit)
         self._scene = edited.with_gaussians(self._optimizer.parameters)
         if result.edit is not None:
             self.colours.follow(result.edit)
@@ -352,10 +369,10 @@ class GaussianModel(Model[GaussianScene]):
         was found."""
         if not self._scene.gaussians.sh_degree:
             return None
-        found = self.colours.measured(step, lambda: self._looks(step))
+        found = self.colours.measure_harmonics(step, lambda: self._looks(step))
         if found is None:
             return None
-        self.drop_harmonics(~found.keeps, found.offsets)
+        self.drop_harmonics(~found.kept_harmonics, found.offsets)
         return str(found)
 
     def _looks(self, step: int) -> MeasurementViews:

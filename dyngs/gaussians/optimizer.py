@@ -33,7 +33,7 @@ class AdamState:
         )
 
     @staticmethod
-    def restored(stored: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> AdamState:
+    def from_state(stored: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> AdamState:
         """Return the moments of ``tensors`` from what ``state`` returned."""
         return AdamState(
             *(
@@ -97,7 +97,7 @@ class AdamState:
             arrays = [one.reshape(-1, x.shape[-1]) for one in arrays]
         return AdamUpdate(*arrays, lr=lr, rows=rows)
 
-    def mapped(
+    def map(
         self, function: Callable[[Tensor], Tensor], names: Iterable[str] | None = None
     ) -> AdamState:
         """Return the moments with ``function`` applied to those of the named tensors; None: of
@@ -117,7 +117,7 @@ class AdamState:
         return first | second
 
     def to(self, device: torch.device | str) -> AdamState:
-        return self.mapped(lambda x: x.to(device))
+        return self.map(lambda x: x.to(device))
 
 
 def _stored(
@@ -191,15 +191,13 @@ class Parameters:
             return self._adam.update(name, x, lr, along_last_axis=True)
         return self._adam.update(name, x, lr, None if x.grad is None else seen_rows(x.grad))
 
-    def edited(self, role: Role, edit: TopologyEdit) -> Parameters:
+    def apply_edit(self, role: Role, edit: TopologyEdit) -> Parameters:
         """Return the parameters after an edit of the Gaussians that ``role`` speaks of."""
         names = [name for name, own in self._roles.items() if own is role]
         moved = {name: edit.apply(self._tensors[name].detach()) for name in names}
         return self._with(moved, edit.apply_moments) if names else self
 
-    def reorder(
-        self, values: Mapping[str, Tensor], source: Tensor, is_new: Tensor
-    ) -> Parameters:
+    def reorder(self, values: Mapping[str, Tensor], source: Tensor, is_new: Tensor) -> Parameters:
         """Return the parameters with other values for some tensors, and the moments of the old rows
         ``source``."""
         return self._with(values, lambda x: _moments_of(x, source, is_new))
@@ -212,7 +210,7 @@ class Parameters:
             name: StateTensor(x, self._roles[name]) for name, x in self.values().items()
         } | self._adam.state()
 
-    def restored(
+    def with_state(
         self, tensors: Mapping[str, Tensor], rows: Mapping[str, int] | None = None
     ) -> Parameters:
         """Return what ``state`` returned as parameters like these, on their device.
@@ -229,7 +227,7 @@ class Parameters:
         }
         found = Parameters(values, self.rates, self.decay, self._roles)
         if any(name.startswith(MOMENTS) for name in tensors):
-            found._adam = AdamState.restored(tensors, values)
+            found._adam = AdamState.from_state(tensors, values)
         return found
 
     def to(self, device: torch.device | str) -> Parameters:
@@ -243,7 +241,7 @@ class Parameters:
         """Return the parameters with other ``values``, and their moments changed by ``moments``."""
         found = Parameters({}, self.rates, self.decay, self._roles)
         found._tensors = self._tensors | {name: _leaf(x) for name, x in values.items()}
-        found._adam = self._adam.mapped(moments, values)
+        found._adam = self._adam.map(moments, values)
         return found
 
 
@@ -270,7 +268,7 @@ class FrozenMask:
     rows: Tensor | None = None
     shapes: bool = False
 
-    def grown(self, result: EditResult, parameters: Gaussians) -> EditResult:
+    def exclude_from_edit(self, result: EditResult, parameters: Gaussians) -> EditResult:
         """Return a change of the set without what it does to Gaussians that stay: they come last,
         as they were."""
         if self.rows is None:
@@ -307,8 +305,8 @@ class GaussianOptimizer:
         lr_means: float,
         *,
         frozen_harmonics: Tensor | None = None,
-        resting: Tensor | None = None,
-        still: FrozenMask | None = None,
+        skip_unseen_rows: Tensor | None = None,
+        frozen_mask: FrozenMask | None = None,
     ) -> Count:
         """Update the parameters, drop the gradients, and return the number of rows left out for bad
         gradients.
@@ -320,11 +318,11 @@ class GaussianOptimizer:
                 None: none.
             still: what keeps parameters and moments whatever it receives.
         """
-        rows = None if still is None or still.rows is None else ~still.rows
-        if resting is not None:
-            seen = self._rows_with_gradient()[resting]
+        rows = None if frozen_mask is None or frozen_mask.rows is None else ~frozen_mask.rows
+        if skip_unseen_rows is not None:
+            seen = self._rows_with_gradient()[skip_unseen_rows]
             rows = seen.new_ones(len(self.parameters)) if rows is None else rows
-            rows[resting] &= seen
+            rows[skip_unseen_rows] &= seen
         rates: dict[str, float | Tensor] = {
             "means": lr_means,
             "quats": self.options.lr_quats,
@@ -338,7 +336,7 @@ class GaussianOptimizer:
             self._adam.update(name, x, rates[name], rows)
             for name, x in self.parameters.tensors().items()
         ]
-        if still is not None and still.shapes:
+        if frozen_mask is not None and frozen_mask.shapes:
             updates = updates[-1:]  # of the harmonics
         return self._adam.steps_(updates, step=step, eps=ADAM_EPS)
 
@@ -351,10 +349,10 @@ class GaussianOptimizer:
         edit = result.edit
         moved = self.parameters.detach().tensors()
         if edit is not None:
-            self._adam = self._adam.mapped(edit.apply_moments)
+            self._adam = self._adam.map(edit.apply_moments)
             rest = moved.keys() - result.changes.keys()
             moved |= {name: edit.apply(moved[name]) for name in rest}
-        self._adam = self._adam.mapped(torch.zeros_like, result.zero_moments)
+        self._adam = self._adam.map(torch.zeros_like, result.zero_moments)
         self.parameters = _as_leaves(moved | result.changes)
 
     def drop_harmonics(self, base: Tensor, frozen_harmonics: Tensor) -> None:
@@ -370,7 +368,7 @@ class GaussianOptimizer:
             return x.masked_fill(rest, 0)[:, :count].contiguous()
 
         self.parameters = _as_leaves({**self.parameters.tensors(), "sh": dropped(sh)})
-        self._adam = self._adam.mapped(dropped, ["sh"])
+        self._adam = self._adam.map(dropped, ["sh"])
 
     def to(self, device: torch.device | str) -> GaussianOptimizer:
         moved = GaussianOptimizer(self.parameters.detach().to(device=device), self.options)
@@ -380,13 +378,13 @@ class GaussianOptimizer:
     def state(self) -> State:
         return self._adam.state()
 
-    def restored(self, parameters: Gaussians, tensors: Mapping[str, Tensor]) -> GaussianOptimizer:
+    def with_state(self, parameters: Gaussians, tensors: Mapping[str, Tensor]) -> GaussianOptimizer:
         """Return an optimizer of copies of ``parameters`` with the moments that ``state``
         returned."""
         # steps change them in place, and a checkpoint may share its memory with another trainer
         copies = Gaussians(**{name: x.detach().clone() for name, x in parameters.tensors().items()})
         optimizer = GaussianOptimizer(copies, self.options)
-        optimizer._adam = AdamState.restored(tensors, parameters.tensors())
+        optimizer._adam = AdamState.from_state(tensors, parameters.tensors())
         return optimizer
 
     def _harmonics_rates(self) -> Tensor:

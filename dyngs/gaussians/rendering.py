@@ -24,7 +24,14 @@ from dyngs.models.renderable import (
 )
 from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.projection import Projection, ProjectionOptions, project
-from dyngs.ops.rasterization import BlendedImages, BlendOptions, Tally, blend_and_tally, rasterize, tally
+from dyngs.ops.rasterization import (
+    BlendedImages,
+    BlendOptions,
+    Tally,
+    blend_and_tally,
+    rasterize,
+    tally,
+)
 from dyngs.ops.registration import check_choice, check_count, check_finite, finite_rows
 
 Shader = Callable[[Gaussians, Cameras, Tensor], Tensor]

@@ -39,7 +39,7 @@ class GaussianTimeStep(TimeStep):
 
     gaussians: Gaussians
     time: float | None = None
-    frame: RestPose | None = None  # where the Gaussians are at rest, if colours follow a body
+    rest_pose: RestPose | None = None  # where the Gaussians are at rest, if colours follow a body
     # differentiable regularizers, weighted, by name; empty outside training
     penalties: dict[str, Tensor] = field(default_factory=dict)
 
@@ -133,7 +133,7 @@ class GaussianScene(Renderable):
 
     def shader(self, now: GaussianTimeStep) -> Shader | None:
         """Return the shader of the Gaussians of a time; None where harmonics give the colours."""
-        return None if self.colour is None else self.colour.shader(now.time, now.frame)
+        return None if self.colour is None else self.colour.shader(now.time, now.rest_pose)
 
     def render(
         self,
@@ -167,13 +167,13 @@ class GaussianScene(Renderable):
         )
 
     @abstractmethod
-    def edited(self: S, edit: TopologyEdit) -> S:
+    def apply_edit(self: S, edit: TopologyEdit) -> S:
         """Return the scene after a change of the set of Gaussians; everything stored per Gaussian
         follows it."""
 
     def select(self: S, index: Tensor) -> S:
         """Return the scene with only the Gaussians at ``index`` (long or bool)."""
-        return self.edited(TopologyEdit.select(index))
+        return self.apply_edit(TopologyEdit.select(index))
 
     def part(self, which: Literal["moving", "still"]) -> GaussianScene:
         """Return only the Gaussians that move, or only those that do not."""

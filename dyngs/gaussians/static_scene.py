@@ -14,7 +14,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.state import Role, State, StateTensor
 from dyngs.core.tensor_checks import require_indices, require_tensor
 from dyngs.gaussians import Gaussians, TopologyEdit
-from dyngs.gaussians.filters import filter_state, apply_filter, restore_filter
+from dyngs.gaussians.filters import apply_filter, filter_state, restore_filter
 from dyngs.gaussians.rendering import GaussianRendering, RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, restore_times, times_state
 from dyngs.models.renderable import TimeStep, clamped_time, joined_renderings, single_views
@@ -23,7 +23,7 @@ _UNSEEN = -30.0  # Logit of an opacity that is never drawn
 
 
 @dataclass(frozen=True)
-class Sides:
+class ViewSides:
     """To which of S sides each of N Gaussians belongs."""
 
     of: Tensor  # (N,) int64
@@ -31,14 +31,14 @@ class Sides:
     middle: Tensor  # (3,) of what is seen, in the world
 
     @staticmethod
-    def joined(parts: Sequence[Gaussians], centers: Sequence[Tensor]) -> Sides:
+    def joined(parts: Sequence[Gaussians], centers: Sequence[Tensor]) -> ViewSides:
         """Return those of ``parts`` one after another; ``centers``: (3,) where each is seen from,
         on average."""
         device = centers[0].device
         middle = Gaussians.joined(parts).means.mean(0)
         sizes = torch.tensor([len(part) for part in parts], device=device)
         of = torch.arange(len(parts), dtype=torch.int64, device=device).repeat_interleave(sizes)
-        return Sides(of, normalize(torch.stack([*centers]) - middle, dim=1), middle)
+        return ViewSides(of, normalize(torch.stack([*centers]) - middle, dim=1), middle)
 
     def seen_by(self, camera: Cameras, gaussians: Gaussians) -> Gaussians:
         """Return the Gaussians as one camera is to see them: those of other sides are
@@ -48,8 +48,8 @@ class Sides:
             logit_opacities=gaussians.logit_opacities.where(self.of == side, _UNSEEN)
         )
 
-    def edited(self, edit: TopologyEdit) -> Sides:
-        return Sides(edit.apply(self.of), self.toward, self.middle)
+    def apply_edit(self, edit: TopologyEdit) -> ViewSides:
+        return ViewSides(edit.apply(self.of), self.toward, self.middle)
 
     def state(self) -> State:
         shared = {"toward": self.toward, "middle": self.middle}
@@ -58,14 +58,14 @@ class Sides:
         }
 
     @staticmethod
-    def stored(tensors: Mapping[str, Tensor], count: int) -> Sides | None:
+    def from_state(tensors: Mapping[str, Tensor], count: int) -> ViewSides | None:
         """Return those of a state for N = ``count``, None without. Raises KeyError, ValueError:
         they do not fit."""
         if "sides.of" not in tensors:
             return None
         toward = require_tensor("toward", tensors["sides.toward"], (None, 3))
         of = require_indices("of", tensors["sides.of"], (count,), len(toward), torch.int64)
-        return Sides(of, toward, require_tensor("middle", tensors["sides.middle"], (3,)))
+        return ViewSides(of, toward, require_tensor("middle", tensors["sides.middle"], (3,)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,23 +75,23 @@ class StaticScene(GaussianScene):
 
     has_levels: ClassVar[bool] = True
     filter_std: Tensor | None = None
-    sides: Sides | None = None
+    sides: ViewSides | None = None
     # distinct training times in [0, 1], ascending, where a dynamic model was asked for and nothing
     # moves
-    seen_at: tuple[float, ...] = ()
+    training_times: tuple[float, ...] = ()
 
     @staticmethod
-    def restored(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
+    def from_state(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
         return StaticScene(
             gaussians=gaussians,
             filter_std=restore_filter(tensors, len(gaussians)),
-            sides=Sides.stored(tensors, len(gaussians)),
-            seen_at=restore_times(tensors),
+            sides=ViewSides.from_state(tensors, len(gaussians)),
+            training_times=restore_times(tensors),
         )
 
     @property
     def times(self) -> tuple[float, ...]:
-        return self.seen_at
+        return self.training_times
 
     @property
     def is_static(self) -> bool:
@@ -135,11 +135,11 @@ class StaticScene(GaussianScene):
             )
         return joined_renderings(found)
 
-    def edited(self, edit: TopologyEdit) -> StaticScene:
+    def apply_edit(self, edit: TopologyEdit) -> StaticScene:
         std = None if self.filter_std is None else edit.apply(self.filter_std)
-        sides = None if self.sides is None else self.sides.edited(edit)
-        return replace(self, gaussians=self.gaussians.edited(edit), filter_std=std, sides=sides)
+        sides = None if self.sides is None else self.sides.apply_edit(edit)
+        return replace(self, gaussians=self.gaussians.apply_edit(edit), filter_std=std, sides=sides)
 
     def _model_state(self) -> State:
         sides = {} if self.sides is None else self.sides.state()
-        return filter_state(self.filter_std) | times_state(self.seen_at) | sides
+        return filter_state(self.filter_std) | times_state(self.training_times) | sides

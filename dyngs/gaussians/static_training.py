@@ -16,11 +16,16 @@ from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate
+from dyngs.gaussians.initialization import (
+    build_colour_training,
+    build_densifier,
+    build_filter_update,
+    load_or_create_gaussians,
+)
 from dyngs.gaussians.model import GaussianModel, SceneTraining
 from dyngs.gaussians.optimizer import FrozenMask
 from dyngs.gaussians.rendering import contributions
 from dyngs.gaussians.scene import restore_appearance
-from dyngs.gaussians.initialization import colours_of, build_densifier, build_filter_update, load_or_create_gaussians
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
@@ -58,7 +63,7 @@ class SmallGaussianPruning:
             f"{len(scene) - int(kept.sum()):,} of {len(scene):,} Gaussians are removed: each makes up less than "
             f"{self.pixels:g} px of every training view (strategy.prune_pixels)"
         )
-        return EditResult(TopologyEdit.select(kept), finding=text)
+        return EditResult(TopologyEdit.select(kept), message=text)
 
 
 def build_small_pruning(run: RunStart) -> SmallGaussianPruning:
@@ -69,7 +74,9 @@ def build_small_pruning(run: RunStart) -> SmallGaussianPruning:
         return SmallGaussianPruning()
     views = run.capture.splits["train"]
     cameras = training_cameras([views[i] for i in evenly_spaced(len(views), SURVEYED)], config.data)
-    return SmallGaussianPruning(scaled(strategy.stop, config.train.steps), strategy.prune_pixels, cameras)
+    return SmallGaussianPruning(
+        scaled(strategy.stop, config.train.steps), strategy.prune_pixels, cameras
+    )
 
 
 class StaticTraining(SceneTraining[StaticScene]):
@@ -82,11 +89,11 @@ class StaticTraining(SceneTraining[StaticScene]):
         self,
         update: FilterUpdate,
         removal: SmallGaussianPruning = SmallGaussianPruning(),
-        still: FrozenMask | None = None,
+        frozen_mask: FrozenMask | None = None,
     ) -> None:
-        self._update, self._removal, self._still = update, removal, still
+        self._update, self._removal, self._still = update, removal, frozen_mask
 
-    def still(self) -> FrozenMask | None:
+    def frozen_mask(self) -> FrozenMask | None:
         return self._still
 
     def follow(self, edit: TopologyEdit) -> None:
@@ -110,13 +117,13 @@ class StaticTraining(SceneTraining[StaticScene]):
         result = self._removal.edit(scene, rows) if step == self._removal.step else None
         if result is None or result.edit is None:
             return None
-        return scene.edited(result.edit), result
+        return scene.apply_edit(result.edit), result
 
-    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
+    def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
         if self._still is not None and "frozen" in tensors:
             frozen = require_tensor("frozen", tensors["frozen"], (len(gaussians),), torch.bool)
             self._still = replace(self._still, rows=frozen.to(gaussians.means.device))
-        return StaticScene.restored(gaussians, tensors)
+        return StaticScene.from_state(gaussians, tensors)
 
 
 def _still(run: RunStart) -> FrozenMask | None:
@@ -128,14 +135,16 @@ def _still(run: RunStart) -> FrozenMask | None:
 def start(run: RunStart) -> GaussianModel:
     """Return the model of a static scene before its first step."""
     gaussians = load_or_create_gaussians(run)
-    colours = colours_of(run, gaussians, uses_time=False)
+    colours = build_colour_training(run, gaussians, uses_time=False)
     training = StaticTraining(build_filter_update(run), build_small_pruning(run), _still(run))
-    return GaussianModel(run, training.first_scene(gaussians), training, build_densifier(run), colours)
+    return GaussianModel(
+        run, training.first_scene(gaussians), training, build_densifier(run), colours
+    )
 
 
 def restore(model: SceneModel, checkpoint: Checkpoint) -> StaticScene:
     """Return the scene of a checkpoint."""
-    scene = StaticScene.restored(
+    scene = StaticScene.from_state(
         Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
     )
     return restore_appearance(scene, model, checkpoint)

@@ -36,7 +36,7 @@ class Mesh:
     faces: np.ndarray  # (F, 3)
 
 
-def fused(
+def fuse_depths(
     seen: Sequence[DepthView],
     low: Tensor,
     high: Tensor,
@@ -105,7 +105,7 @@ def _pixels(camera: Cameras, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Te
     return torch.where(inside, column, 0).long(), torch.where(inside, row, 0).long(), z, inside
 
 
-def colours_of(seen: Sequence[DepthView], points: Tensor, tolerance: float) -> Tensor:
+def sample_colours(seen: Sequence[DepthView], points: Tensor, tolerance: float) -> Tensor:
     """Return (N, 3) mean colours of surface ``points`` (N, 3) in the views that show them; grey
     where none does.
 
@@ -200,19 +200,21 @@ def extract_surface(
         DyngsError: no view shows anything solid there.
     """
     cells = cells or 192
-    seen = [seen_by(scene, camera, time) for camera in cameras]
-    mesh = fused(seen, *box, cells, unseen_is_solid=False)
+    seen = [render_depth_view(scene, camera, time) for camera in cameras]
+    mesh = fuse_depths(seen, *box, cells, unseen_is_solid=False)
     if mesh is None:
         raise DyngsError(
             "no surface: none of the views shows anything solid where the Gaussians are"
         )
     mesh = keep_largest_components(mesh)
     size = float((box[1] - box[0]).max()) / cells
-    colours = colours_of(seen, torch.from_numpy(mesh.vertices).float(), 2 * size)
+    colours = sample_colours(seen, torch.from_numpy(mesh.vertices).float(), 2 * size)
     return Surface(mesh.vertices, mesh.faces, colours.numpy())
 
 
-def seen_by(scene: GaussianScene, camera: Cameras, time: float | None = None) -> DepthView:
+def render_depth_view(
+    scene: GaussianScene, camera: Cameras, time: float | None = None
+) -> DepthView:
     """Return what one camera sees of a scene; colours are those of what is there, without the
     background."""
     options = replace(scene.options, depth="expected")

@@ -56,7 +56,7 @@ class VisibilityMasks:
         return with_role({"times": times, "bits": self.bits, "count": count}, Role.SHARED)
 
     @staticmethod
-    def restored(state: Mapping[str, Tensor], count: int | None = None) -> VisibilityMasks | None:
+    def from_state(state: Mapping[str, Tensor], count: int | None = None) -> VisibilityMasks | None:
         """Return the masks of a state that ``state()`` returned; None of an empty one."""
         if not state:
             return None
@@ -70,7 +70,7 @@ class VisibilityMasks:
         return VisibilityMasks(tuple(times.tolist()), bits, count)
 
 
-def matched(rows: Tensor, active: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def intersect_sorted(rows: Tensor, active: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Return the positions of common indices in ``rows`` and in ``active``, both ascending indices
     below ``count``."""
     place = torch.full((count,), -1, device=rows.device)

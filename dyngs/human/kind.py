@@ -57,9 +57,9 @@ class HumanKind(HasGaussians, HasBody):
         *,
         keep_feet: bool,
     ) -> InMotion:
-        from dyngs.human.avatar.play_motion import in_motion
+        from dyngs.human.avatar.play_motion import play_motion
 
-        return in_motion(section, scene, info, path, keep_feet=keep_feet)
+        return play_motion(section, scene, info, path, keep_feet=keep_feet)
 
     def read_person(self, path: Path) -> tuple[HumanModel, Posable, CheckpointInfo]:
         from dyngs.human.avatar.avatar_file import read_avatar

@@ -21,7 +21,7 @@ from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
 from dyngs.models.model import Model
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour, evaluation_background
-from dyngs.ops.device import CPU, sent
+from dyngs.ops.device import CPU, copy_async
 from dyngs.ops.loss import l1_ssim_loss
 
 GROUPS = 8
@@ -191,7 +191,7 @@ class Learner(ABC, Generic[N]):
 
     def drawn_background(self, generator: torch.Generator) -> Tensor:
         """Return the colour (3,) behind an example."""
-        return sent(background_colour(self.background, generator), self.device)
+        return copy_async(background_colour(self.background, generator), self.device)
 
     @abstractmethod
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:

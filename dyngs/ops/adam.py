@@ -16,7 +16,7 @@ from typing import Any, TypeAlias, cast
 import torch
 from torch import Tensor
 
-from dyngs.ops.device import sent
+from dyngs.ops.device import copy_async
 from dyngs.ops.registration import InPlace, has_kernel, launch, register
 
 # a number, or a tensor () of one that may still be on a GPU, where int waits for it
@@ -174,5 +174,5 @@ def _column_rates(lr: float | Tensor, param: Tensor) -> Tensor:
 def _rates(
     values: tuple[float, ...], row_size: int, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    rates = sent(torch.tensor(values, dtype=dtype, device="cpu"), device)
+    rates = copy_async(torch.tensor(values, dtype=dtype, device="cpu"), device)
     return rates.expand(row_size).contiguous()

@@ -131,7 +131,7 @@ def gpu_unavailable_reason() -> str | None:
     return None
 
 
-def findings() -> Mapping[str, str]:
+def gpu_status() -> Mapping[str, str]:
     """Return what there is of torch's CUDA, driver, GPU and compiled core, by name; for ``dyngs
     doctor``."""
     version = torch.version.cuda
@@ -151,7 +151,7 @@ def _said(version: int) -> str:
     return f"{version // 1000}.{version % 1000 // 10}"
 
 
-def sent(x: Tensor, device: torch.device | str) -> Tensor:
+def copy_async(x: Tensor, device: torch.device | str) -> Tensor:
     """Return ``x`` on ``device``; the copy of a tensor of the CPU is queued.
 
     The driver has taken a copy of pageable memory before the call returns, so that ``x`` may change

@@ -91,7 +91,7 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class Steps:
+class MarchSteps:
     """How long samples are: at least ``length``, and at least ``cone`` times their distance; world
     units."""
 
@@ -151,7 +151,7 @@ march_samples_op = register("march_samples", _march_samples)
 
 
 @torch.no_grad()
-def march(rays: Rays, shifts: Tensor, space: Space, occupied: Tensor, steps: Steps) -> Samples:
+def march(rays: Rays, shifts: Tensor, space: Space, occupied: Tensor, steps: MarchSteps) -> Samples:
     """Return the samples of rays whose middle lies in an occupied cell.
 
     Empty cells are skipped by whole steps. ``shifts`` (R,) in [0, 1): by which fraction of a step

@@ -502,7 +502,7 @@ def encoded(
         means = kept["gaussians.means"]
         near = restored(means, coding_of("gaussians.means", means, steps))
         edit = stored_edit(scene, near.numpy())
-        kept = drawable(scene.edited(edit))
+        kept = drawable(scene.apply_edit(edit))
         if coarseness is not None:
             kept[COARSENESS] = edit.apply(coarseness)
             rows = kept[COARSENESS].numpy()

@@ -41,7 +41,7 @@ class Stopwatch:
     def seconds(self) -> float:
         return time.perf_counter() - self._since
 
-    def pause(self, seconds: float) -> None:
+    def exclude(self, seconds: float) -> None:
         """Leave ``seconds`` out (negative: count them in)."""
         self._since += seconds
 
@@ -64,7 +64,7 @@ class SaveTimer:
         interval = max(60 * self._minutes, self._duration / SAVE_FRACTION)
         return self._minutes > 0 and now - self._last >= interval
 
-    def saved(self, begin: float, end: float) -> None:
+    def record_save(self, begin: float, end: float) -> None:
         """Note that a checkpoint was written from ``begin`` to ``end``, seconds of training."""
         self._last = end
         self._duration = end - begin
@@ -110,7 +110,7 @@ class TimeForecast:
         self.pixels = pixels
         self._marks = [_Mark(step, seconds, 0.0, num_gaussians)]
 
-    def pause(self, seconds: float) -> None:
+    def exclude(self, seconds: float) -> None:
         """Leave ``seconds`` that were not spent training out."""
         self._marks = [replace(mark, seconds=mark.seconds + seconds) for mark in self._marks]
 

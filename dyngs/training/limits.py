@@ -86,11 +86,11 @@ def gaussian_limit(config: Config, num_times: int) -> int | None:
     limits = [config.budget.max_gaussians] if config.budget.max_gaussians is not None else []
     megabytes = config.budget.max_mb
     if megabytes is not None and capability(config.model, LimitsSize) is not None:
-        limits.append(room(config, num_times, megabytes))
+        limits.append(max_gaussians_in_file(config, num_times, megabytes))
     return min(limits, default=None)
 
 
-def room(config: Config, num_times: int, megabytes: float) -> int:
+def max_gaussians_in_file(config: Config, num_times: int, megabytes: float) -> int:
     """Return the number of Gaussians that fit in a file of so many 1e6 bytes at the usual
     precision.
 

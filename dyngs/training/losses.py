@@ -12,7 +12,7 @@ from torch import Tensor
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image
 from dyngs.models.model import Look, Loss
-from dyngs.ops.device import AsyncReadback, sent
+from dyngs.ops.device import AsyncReadback, copy_async
 from dyngs.ops.loss import l1_ssim_loss
 
 
@@ -72,7 +72,7 @@ class StepCheck:
     ) -> None:
         self._terms = tuple(terms)
         self._moved = {name: x.detach() for name, x in moved.items() if x.numel()}
-        numbers = [sent(x.detach(), device).double().reshape(1) for x in terms.values()]
+        numbers = [copy_async(x.detach(), device).double().reshape(1) for x in terms.values()]
         # sums, in which NaN and infinity show: a thirtieth of the time of isfinite
         numbers += [x.sum().double().reshape(1) for x in self._moved.values()]
         self._read = AsyncReadback(torch.cat(numbers))

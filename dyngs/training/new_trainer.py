@@ -15,8 +15,8 @@ from dyngs.data.loader import ImageLoader, usual_threads
 from dyngs.data.read import read_capture, require_images
 from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
+from dyngs.gaussians.initialization import InitialGaussians, scene_geometry
 from dyngs.gaussians.model import GaussianModel
-from dyngs.gaussians.initialization import InitialGaussians, surroundings
 from dyngs.models.kind import Moves, RunStart, kind_of
 from dyngs.models.views import (
     background_colour,
@@ -31,7 +31,7 @@ from dyngs.training.corrections.exposure import ViewExposures
 from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
 from dyngs.training.priors import PriorLosses, load_priors
-from dyngs.training.trainer import TrainerParts, Trainer
+from dyngs.training.trainer import Trainer, TrainerParts
 
 GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
 
@@ -68,7 +68,7 @@ def build_trainer(
             may end with; None: the same.
     """
     if capture is None:
-        capture = read_capture(config.data) if restored else prepared(config)
+        capture = read_capture(config.data) if restored else prepare_capture(config)
     generator = torch.Generator().manual_seed(config.run.seed)
     if images is None:
         images = ImageLoader(
@@ -82,11 +82,11 @@ def build_trainer(
     if not priors.masks:
         images = images.without_motion_masks()
     background = resolved_background(config, capture)
-    extent = surroundings(capture).extent
-    findings = [priors.message] if priors.message else []
+    extent = scene_geometry(capture).extent
+    messages = [priors.message] if priors.message else []
     published = capture.has_alpha and config.train.alpha_weight == 0 and background != "random"
     if published and not restored:
-        findings.append(
+        messages.append(
             f"images are compared on {background} alone, as published (train.alpha_weight=0): {background} surfaces "
             "may be transparent"
         )
@@ -131,22 +131,22 @@ def build_trainer(
         background=background,
         extent=extent,
         generator=generator,
-        findings=findings,
+        pending_messages=messages,
         held_out=held_out,
         device=select_device(config.run.device),
     )
 
 
-def prepared(config: Config) -> Capture:
+def prepare_capture(config: Config) -> Capture:
     """Return the capture of a run with the points that its scene begins with, see
     ``with_first_points``.
 
     Problems of the capture and the source of its points are logged.
     """
-    return with_points(require_images(read_capture(config.data)), config)
+    return add_initial_points(require_images(read_capture(config.data)), config)
 
 
-def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Capture:
+def add_initial_points(capture: Capture, config: Config, *, log_messages: bool = True) -> Capture:
     """Return ``capture`` as ``prepared`` does, for a kind whose Gaussians begin at points; others
     need none."""
     lines: list[str] = []
@@ -164,7 +164,7 @@ def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Cap
                 if why is None
                 else [f"init.kind=random draws points around the origin, but {why}: give auto"]
             )
-    for line in [] if quiet else [*lines, *before_training(capture)]:
+    for line in [*lines, *before_training(capture)] if log_messages else []:
         warn(line)
     return capture
 

@@ -26,7 +26,7 @@ from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour
 from dyngs.ops.adam import Count
-from dyngs.ops.device import CPU, sent
+from dyngs.ops.device import CPU, copy_async
 from dyngs.training.events import StepReport
 from dyngs.training.losses import StepCheck
 from dyngs.training.plan import with_steps
@@ -130,7 +130,7 @@ class Trainer(Generic[M]):
     background: str
     extent: float
     generator: torch.Generator
-    findings: list[str] = field(default_factory=list)
+    pending_messages: list[str] = field(default_factory=list)
     held_out: frozenset[int] = frozenset()
     device: torch.device = CPU
     processes: Processes = field(default_factory=Processes)
@@ -176,10 +176,10 @@ class Trainer(Generic[M]):
         self.done = step
         if updated.is_rearranged:
             self.processes.require_same(tensors_of(self.model.scene.state()), f"after step {step}")
-        findings = [*self.findings, updated.finding or ""]
-        self.findings.clear()
-        finding = "\n".join(line for line in findings if line)
-        return replace(reports[0], loss=loss, finding=finding or None)
+        messages = [*self.pending_messages, updated.finding or ""]
+        self.pending_messages.clear()
+        message = "\n".join(line for line in messages if line)
+        return replace(reports[0], loss=loss, message=message or None)
 
     def _averaged(self, step: int, losses: Sequence[float]) -> float:
         """Return the mean loss over the views of a step, and average their gradients, too."""
@@ -201,7 +201,7 @@ class Trainer(Generic[M]):
         image = self._image(index, step)
         for correction in self.corrections:
             image = correction.before_render(image)
-        background = sent(background_colour(self.background, self.generator), self.device)
+        background = copy_async(background_colour(self.background, self.generator), self.device)
         depth = any(loss.needs_depth(image) for loss in self.losses)
         drawn = self.model.draw(image, step, background, depth=depth)
         view = RenderedView(
@@ -330,7 +330,7 @@ class Trainer(Generic[M]):
         batch = self.config.train.batch_size
         wanted = self._wanted(step)
         drawn = [self.sampler.next(self.generator, wanted) for _ in range(batch)]
-        fraction = self.processes.share(batch)
+        fraction = self.processes.views_of_process(batch)
         if batch == 1:
             return [(drawn[0], None)]
         seeds = torch.randint(2**62, (batch,), generator=self.generator, device="cpu").tolist()
@@ -342,9 +342,9 @@ class Trainer(Generic[M]):
         if self.images.decoded_ahead:
             batch = self.config.train.batch_size
             count = self.images.decoded_ahead * self.processes.size
-            fraction = self.processes.share(batch)
-            peek = self.sampler.peek(count, self._wanted(step))
-            self.images.expect([view for i, view in enumerate(peek) if i % batch in fraction])
+            fraction = self.processes.views_of_process(batch)
+            upcoming = self.sampler.peek(count, self._wanted(step))
+            self.images.expect([view for i, view in enumerate(upcoming) if i % batch in fraction])
         return image
 
     def _wanted(self, step: int) -> Callable[[int], bool]:

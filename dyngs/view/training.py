@@ -63,7 +63,7 @@ class BetweenStepRenderer:
         with torch.no_grad():
             for session in sessions:
                 shell = _shell(scene, session.opened.background)
-                session.take(session.opened.showing(shell), refreshes=refreshes)
+                session.update_scene(session.opened.showing(shell), refreshes=refreshes)
             while self._drawer.draw_one():
                 if self._clock() - start > REFRESH_SECONDS * self._fraction:
                     break
@@ -112,7 +112,7 @@ class TrainingView:
             self._say(f"viewing: {viewer.link} (until the training ends)")
             self._drawn = BetweenStepRenderer(viewer.drawer)
         if self._drawn.after_step(trainer.model.scene) or begins:
-            event.loop.stopwatch.pause(time.perf_counter() - start)
+            event.loop.stopwatch.exclude(time.perf_counter() - start)
 
 
 def opened_training(trainer: Trainer[Any]) -> Opened:

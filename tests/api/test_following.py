@@ -63,7 +63,9 @@ def _require_same_bytes(one: Path, other: Path) -> None:
 
 @pytest.fixture(scope="module")
 def small_person(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    options = HumanOptions(size=32, num_frames=3, num_pose_frames=1, num_cameras=2, num_test=1, samples=1)
+    options = HumanOptions(
+        size=32, num_frames=3, num_pose_frames=1, num_cameras=2, num_test=1, samples=1
+    )
     return write_human_capture(tmp_path_factory.mktemp("person"), options)
 
 

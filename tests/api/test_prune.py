@@ -18,7 +18,7 @@ from dyngs.compress.stage import quality_of
 from dyngs.config import PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
-from dyngs.evaluate.report import compared
+from dyngs.evaluate.report import compare_runs
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths, latest_checkpoint, load_run
 from dyngs.training.new_trainer import build_trainer
 
@@ -81,11 +81,11 @@ def test_on_a_gpu_it_is_the_same(
     """The search, of few candidates, its file, and the comparison with the run before."""
     briefly = ("prune.steps=1", "run.threads=1")
     expected = prune_within(run_dir, tmp_path / "here", 3.0, briefly, silent)
-    here = compared([run_dir, file_of(tmp_path / "here")], 1)
+    here = compare_runs([run_dir, file_of(tmp_path / "here")], 1)
     monkeypatch.setattr("dyngs.training.new_trainer.select_device", lambda _: GPU)
     with pretend_gpu():
         found = prune_within(run_dir, tmp_path / "there", 3.0, briefly, silent)
-        there = compared([run_dir, file_of(tmp_path / "there")], 1, GPU)
+        there = compare_runs([run_dir, file_of(tmp_path / "there")], 1, GPU)
     assert found == expected
     files = [file_of(tmp_path / name) / SCENE_FILE for name in ("there", "here")]
     assert files[0].read_bytes() == files[1].read_bytes()
@@ -111,7 +111,7 @@ def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
     assert quality_of(trainer, load_run(file_of(folder)).scene, shown) == pytest.approx(
         first.after, abs=1e-4
     )
-    before, after = compared([run_dir, file_of(folder)], 1)
+    before, after = compare_runs([run_dir, file_of(folder)], 1)
     assert after.num_gaussians < before.num_gaussians
     assert after.stored is not None
     assert after.stored < before.megabytes

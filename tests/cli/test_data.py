@@ -187,7 +187,9 @@ def test_options_of_one_video_are_refused_for_several(
 
 @pytest.mark.usefixtures("short_fits")
 def test_a_fitted_capture_says_how_good_it_is(tmp_path: Path, capsys: PrintedOutput) -> None:
-    options = HumanOptions(size=48, num_frames=2, num_pose_frames=0, num_cameras=5, num_test=1, samples=1)
+    options = HumanOptions(
+        size=48, num_frames=2, num_pose_frames=0, num_cameras=5, num_test=1, samples=1
+    )
     root = write_human_capture(tmp_path / "person", options)
     assert main(["data", "fit", str(root), str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out
@@ -209,7 +211,9 @@ def test_the_run_of_a_known_person_finds_poses_by_its_avatar(
     tmp_path: Path, capsys: PrintedOutput, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
-    options = HumanOptions(size=32, num_frames=1, num_pose_frames=0, num_cameras=3, num_test=1, samples=1)
+    options = HumanOptions(
+        size=32, num_frames=1, num_pose_frames=0, num_cameras=3, num_test=1, samples=1
+    )
     root = write_human_capture(tmp_path / "person", options)
     fitted = tmp_path / "fitted"
     run = tmp_path / "run"
@@ -250,7 +254,9 @@ def test_a_body_file_of_ones_own_is_fitted_trained_and_known_again(
     smpl_files: tuple[Path, Path],
 ) -> None:
     monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
-    options = HumanOptions(size=32, num_frames=1, num_pose_frames=0, num_cameras=3, num_test=1, samples=1)
+    options = HumanOptions(
+        size=32, num_frames=1, num_pose_frames=0, num_cameras=3, num_test=1, samples=1
+    )
     root = write_human_capture(tmp_path / "person", options)
     fitted = tmp_path / "fitted"
     run = tmp_path / "run"

@@ -27,7 +27,7 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config.io import load_resolved
-from dyngs.deform.free import FreePrimitives, FreeInitialization
+from dyngs.deform.free import FreeInitialization, FreePrimitives
 from dyngs.deform.keys import FreeField
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.densify import Densifier
@@ -181,9 +181,11 @@ def test_what_is_there_for_a_while_is_masked_only_while_it_is_not() -> None:
     centers = torch.tensor([2, 3, 6, 7]) / 9
     spans = torch.full((4,), 0.03)
     start = FreeInitialization(torch.zeros(0), (), centers, spans, torch.zeros(4, 3))
-    field = FreePrimitives(FreeField(), tiny_setup(4), torch.Generator()).started(start)
+    field = FreePrimitives(FreeField(), tiny_setup(4), torch.Generator()).with_initialization(start)
     times = tuple(k / 9 for k in range(10))
-    scene = DynamicScene(gaussians=cloud(5), seen_at=times, field=field, moving=torch.arange(4))
+    scene = DynamicScene(
+        gaussians=cloud(5), training_times=times, field=field, moving=torch.arange(4)
+    )
     keys = (times[0], times[5], times[9])
     masks = VisibilityMasks.pack(keys, there_after(scene, keys, 1 / 255))
     assert masks.seen.sum(0).tolist() == [1, 1, 1, 1, 3]

@@ -151,7 +151,9 @@ def test_bad_parameters(change: dict[str, Any], line: str) -> None:
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    options = HumanOptions(size=16, num_frames=3, num_pose_frames=2, num_cameras=2, num_test=1, samples=1)
+    options = HumanOptions(
+        size=16, num_frames=3, num_pose_frames=2, num_cameras=2, num_test=1, samples=1
+    )
     return read_capture(
         DataConfig(root=write_human_capture(tmp_path_factory.mktemp("body") / "person", options))
     )

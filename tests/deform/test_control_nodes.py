@@ -40,7 +40,7 @@ def placed(means: Tensor, **options: object) -> ControlNodes:
 
 def changed(field: ControlNodes, source: Tensor, is_new: Tensor) -> ControlNodes:
     """The field after an edit in training."""
-    field = field.edited(TopologyEdit(source, is_new))
+    field = field.apply_edit(TopologyEdit(source, is_new))
     field.invalidate()
     return field
 

@@ -12,7 +12,7 @@ from dyngs.api.train import train
 from dyngs.config.io import load_config
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.deform.fixed_cameras.initial_motion import TimedGaussians
-from dyngs.deform.free import SHORTEST, FreePrimitives, FreeInitialization, initialize_free
+from dyngs.deform.free import SHORTEST, FreeInitialization, FreePrimitives, initialize_free
 from dyngs.deform.keys import FreeField
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians import TopologyEdit
@@ -26,7 +26,9 @@ def field_of(
     start = FreeInitialization(
         torch.zeros(0), (), torch.tensor(centers), torch.tensor(spans), torch.tensor(velocities)
     )
-    return FreePrimitives(FreeField(), tiny_setup(len(centers)), torch.Generator()).started(start)
+    return FreePrimitives(
+        FreeField(), tiny_setup(len(centers)), torch.Generator()
+    ).with_initialization(start)
 
 
 def test_paths_are_straight_and_windows_follow_their_definition() -> None:
@@ -59,7 +61,7 @@ def test_new_gaussians_are_earlier_and_later_on_the_same_path() -> None:
     edit = TopologyEdit(
         torch.tensor([1, 0, 0, 1, 1]), torch.tensor([False, True, True, True, True])
     )
-    children = field.edited(edit)
+    children = field.apply_edit(edit)
     centers = children.parameters["centers"].detach()[:, 0]
     assert sorted(centers[1:3].tolist()) == pytest.approx([0.45, 0.55])
     assert centers[0] == 0
@@ -87,11 +89,11 @@ def test_what_a_step_does_not_show_rests() -> None:
 
 
 def test_static_gaussians_are_copied_over_the_clip_and_moments_have_their_times() -> None:
-    still = cloud(3)
+    static = cloud(3)
     thing = cloud(5)
     others = cloud(4)
     velocity = torch.tensor([1.0, 0.0, 2.0])
-    start = initialize_free(still, [TimedGaussians(0.25, thing, velocity)], others, num_times=10)
+    start = initialize_free(static, [TimedGaussians(0.25, thing, velocity)], others, num_times=10)
     assert [len(x) for x in start.added] == [3] * 9 + [5, 4]
     assert len(start.centers) == len(start.spans) == len(start.velocities) == 30 + 5 + 4
     assert start.centers[:30:3].tolist() == pytest.approx([0.05 + 0.1 * i for i in range(10)])

@@ -73,12 +73,12 @@ def test_the_last_time_is_the_last_row() -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.integers(2, 40), st.lists(st.floats(0, 0.5), min_size=1, max_size=6))
 def test_rows_that_were_seen_never_change_and_at_the_end_none_is_left_over(
-    rows: int, strays: list[float]
+    rows: int, time_offsets: list[float]
 ) -> None:
     """For any sequence of growing windows around the middle, up to the whole clip."""
     field = field_with_rows(rows)
     last = rows - 1
-    windows = [(0.5 - x, 0.5 + x) for x in (*sorted(strays), 0.5)]
+    windows = [(0.5 - x, 0.5 + x) for x in (*sorted(time_offsets), 0.5)]
     for seen, soon in pairwise(windows):
         before = rows_of(field)
         field.extend(seen, soon)

@@ -30,5 +30,5 @@ def test_bodies_are_sought_in_as_many_images_as_the_run_is_long(
     model = build_trainer(dyngs.load_config("dynamic", keys)).model
     assert isinstance(model, GaussianModel)
     assert isinstance(model.training, DynamicTraining)
-    shots = model.training.capture.shots(model.scene.gaussians)
+    shots = model.training.capture.frame_stack(model.scene.gaussians)
     assert (None if shots is None else len(shots)) == count

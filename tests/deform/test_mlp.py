@@ -10,7 +10,7 @@ from tiny_fields import cloud, tiny_setup
 
 from dyngs.deform.field import Offsets
 from dyngs.deform.keys import MlpField
-from dyngs.deform.networks import SKIP_LAYER, Mlp, encoded
+from dyngs.deform.networks import SKIP_LAYER, Mlp, encode_frequencies
 
 
 def outputs(offsets: Offsets) -> list[torch.Tensor]:
@@ -19,12 +19,12 @@ def outputs(offsets: Offsets) -> list[torch.Tensor]:
 
 def test_the_encoding_has_known_values() -> None:
     x = torch.tensor([[0.0, 0.5], [math.pi / 2, -1.0]], dtype=torch.float64)
-    found = encoded(x, 2)
+    found = encode_frequencies(x, 2)
     assert found.shape == (2, 10)
     columns = [x[:, :1], x[:, 1:]]
     expected = [x, *(f(k * c) for f in (torch.sin, torch.cos) for k in (1, 2) for c in columns)]
     torch.testing.assert_close(found, torch.cat(expected, dim=1))
-    assert torch.equal(encoded(x, 0), x)
+    assert torch.equal(encode_frequencies(x, 0), x)
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def score(script: Callable[[Tensor, float], Offsets], px_size: Tensor | None = N
     return measure_motion(Scripted(script), gaussians, TIMES, size)[0]
 
 
-def still(means: Tensor) -> Tensor:
+def static(means: Tensor) -> Tensor:
     return torch.zeros_like(means)
 
 
@@ -60,10 +60,10 @@ def test_turning_and_growing_count_by_the_size_of_the_gaussian() -> None:
     longest = cloud(4).scales.amax(1)
 
     def turn(means: Tensor, t: float) -> Offsets:
-        return Offsets(still(means), filled(len(means), 0.0, 0.0, 0.0, 0.01 * (2 * t - 1)))
+        return Offsets(static(means), filled(len(means), 0.0, 0.0, 0.0, 0.01 * (2 * t - 1)))
 
     def growth(means: Tensor, t: float) -> Offsets:
-        return Offsets(still(means), None, filled(len(means), 0.0, 0.1 * (2 * t - 1), 0.0))
+        return Offsets(static(means), None, filled(len(means), 0.0, 0.1 * (2 * t - 1), 0.0))
 
     torch.testing.assert_close(score(turn), 0.02 * longest)
     torch.testing.assert_close(score(growth), 0.1 * longest)
@@ -73,10 +73,10 @@ def test_opacity_and_colour_count_whatever_the_size_of_a_pixel() -> None:
     gaussians = cloud(4)
 
     def fade(means: Tensor, t: float) -> Offsets:
-        return Offsets(still(means), logit_opacities=torch.full((len(means),), 2 * t - 1))
+        return Offsets(static(means), logit_opacities=torch.full((len(means),), 2 * t - 1))
 
     def blush(means: Tensor, t: float) -> Offsets:
-        return Offsets(still(means), colors=filled(len(means), 0.1 * (2 * t - 1), 0.0, 0.05 * t))
+        return Offsets(static(means), colors=filled(len(means), 0.1 * (2 * t - 1), 0.0, 0.05 * t))
 
     px_size = torch.tensor([0.01, 0.1, 1.0, 0.3])
     logits = gaussians.logit_opacities

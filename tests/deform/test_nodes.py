@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import followed
 from torch import Tensor
 
-from dyngs.deform.control_nodes import Nodes, nodes_at, farthest_points
+from dyngs.deform.control_nodes import Nodes, farthest_points, nodes_at
 from dyngs.deform.field import Offsets
 
 

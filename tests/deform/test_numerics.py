@@ -49,7 +49,7 @@ def values(offsets: Offsets) -> Tensor:
 
 def scene_of(rows: Tensor, field: DeformationField) -> DynamicScene:
     """The cloud, ``rows`` of which a field moves."""
-    return DynamicScene(gaussians=cloud(), seen_at=(0.0, 1.0), field=field, moving=rows)
+    return DynamicScene(gaussians=cloud(), training_times=(0.0, 1.0), field=field, moving=rows)
 
 
 def fine_trainer(capture: Path, kind: str, **model: object) -> Trainer:
@@ -127,7 +127,7 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
     two = TopologyEdit.select(torch.tensor([0, 3]))
     assert isinstance(scene, DynamicScene)
     assert scene.field is not None
-    field = scene.field.edited(two)
+    field = scene.field.apply_edit(two)
     field.invalidate()
     trainer.model.replace_scene(replace(scene, moving=two.source, field=field))
     trainer.step()
@@ -189,11 +189,11 @@ def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> 
 # ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("filtered", [False, True])
-def test_a_run_of_one_step(capture: Path, apply_filter: bool) -> None:
+@pytest.mark.parametrize("is_filtered", [False, True])
+def test_a_run_of_one_step(capture: Path, is_filtered: bool) -> None:
     """It ends as motion begins: with a field that is the identity, for the random Gaussians too,
     and filtered."""
-    config = busy_config(capture, capture, "hexplane", filter_3d=apply_filter)
+    config = busy_config(capture, capture, "hexplane", filter_3d=is_filtered)
     config = config.model_copy(update={"train": TrainConfig(steps=1)})
     trainer = build_trainer(config)
     trainer.step()

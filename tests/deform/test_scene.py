@@ -28,7 +28,7 @@ def scene_of(
     """The cloud, ``rows`` of which a field moves."""
     times = (0.0, 0.5, 1.0)
     return DynamicScene(
-        gaussians=cloud(), seen_at=times, field=field, moving=rows, filter_std=filter_std
+        gaussians=cloud(), training_times=times, field=field, moving=rows, filter_std=filter_std
     )
 
 
@@ -60,21 +60,21 @@ def test_times_after_the_clip_are_its_end(time: float) -> None:
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
-@pytest.mark.parametrize("filtered", [False, True])
-def test_what_moves_and_what_is_still_make_the_scene(kind: str, apply_filter: bool) -> None:
+@pytest.mark.parametrize("is_filtered", [False, True])
+def test_what_moves_and_what_is_still_make_the_scene(kind: str, is_filtered: bool) -> None:
     """Together, in their order, at each time."""
-    scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if apply_filter else None)
+    scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if is_filtered else None)
     moving = scene.part("moving")
-    still = scene.part("still")
+    static = scene.part("still")
     others = torch.tensor([0, 2, 3, 6, 7])
-    assert (len(moving), len(still)) == (4, 5)
-    assert (moving.is_static, still.is_static) == (False, True)
-    assert (moving.moving_fraction, still.moving_fraction) == (1.0, 0.0)
-    assert moving.times == still.times == scene.times
+    assert (len(moving), len(static)) == (4, 5)
+    assert (moving.is_static, static.is_static) == (False, True)
+    assert (moving.moving_fraction, static.moving_fraction) == (1.0, 0.0)
+    assert moving.times == static.times == scene.times
     for time in (0.0, 0.37, 1.0):
         whole = scene.at(time)
         assert same(moving.at(time), whole.select(ROWS))
-        assert same(still.at(time), whole.select(others))
+        assert same(static.at(time), whole.select(others))
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
@@ -91,22 +91,24 @@ def test_from_a_checkpoint(kind: str, rows: Tensor | None) -> None:
     }
     if rows is not None:
         state["rows"] = rows
-    scene = DynamicScene.restored(DynamicModel(deform=tiny_options(kind)), gaussians, state)
+    scene = DynamicScene.from_state(DynamicModel(deform=tiny_options(kind)), gaussians, state)
     assert scene.times == (0.0, 0.25, 1.0)
     assert torch.equal(scene.rows, torch.arange(9) if rows is None else rows)
     assert scene.is_static == (num_moving == 0)
     means = gaussians.means if rows is None else gaussians.means[rows]
     with torch.no_grad():
-        moved = apply_offsets(gaussians, field.offsets(means, 0.3), rows) if num_moving else gaussians
+        moved = (
+            apply_offsets(gaussians, field.offsets(means, 0.3), rows) if num_moving else gaussians
+        )
     assert same(scene.at(0.3), fuse_filter(moved, torch.ones(9)))
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
-@pytest.mark.parametrize("filtered", [False, True])
-def test_masks_show_the_same_of_fewer(kind: str, apply_filter: bool) -> None:
+@pytest.mark.parametrize("is_filtered", [False, True])
+def test_masks_show_the_same_of_fewer(kind: str, is_filtered: bool) -> None:
     """Before, between and after key times, in any order of times; parts and sizes are those of all
     Gaussians."""
-    scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if apply_filter else None)
+    scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if is_filtered else None)
     seen = torch.rand(3, 9, generator=torch.Generator().manual_seed(1)) < 0.4
     masked = replace(scene, masks=VisibilityMasks.pack((0.0, 0.5, 1.0), seen))
     for time, active in (

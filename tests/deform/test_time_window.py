@@ -16,7 +16,7 @@ clips = st.lists(st.floats(0, 1), min_size=1, max_size=60)
 
 
 def held(window: TimeWindow, times: list[float], step: int) -> list[float]:
-    return [time for time in times if window.holds(time, step)]
+    return [time for time in times if window.contains(time, step)]
 
 
 @settings(max_examples=150, deadline=None)
@@ -48,14 +48,14 @@ def test_every_other_step_is_for_the_newest(times: list[float], first: float, st
     inside = sorted(
         (t for t in times if abs(t - 0.5) <= window.reach(step)), key=lambda t: abs(t - 0.5)
     )
-    strays = [abs(time - 0.5) for time in inside]
-    assert window.tracks(step) == (window.num_views(step) < len(times))
-    assert not window.tracks(step + 1)
-    if not window.tracks(step):
+    time_offsets = [abs(time - 0.5) for time in inside]
+    assert window.is_frontier_step(step) == (window.num_views(step) < len(times))
+    assert not window.is_frontier_step(step + 1)
+    if not window.is_frontier_step(step):
         assert newest == times
         return
     assert len(newest) >= min(FRONTIER_VIEWS, window.num_views(step))
     assert set(newest) <= set(inside)
     nearest = min(abs(time - 0.5) for time in newest)
-    assert [x for x in strays if x >= nearest] == sorted(abs(time - 0.5) for time in newest)
-    assert sum(x > nearest for x in strays[: window.num_views(step)]) < FRONTIER_VIEWS
+    assert [x for x in time_offsets if x >= nearest] == sorted(abs(time - 0.5) for time in newest)
+    assert sum(x > nearest for x in time_offsets[: window.num_views(step)]) < FRONTIER_VIEWS

@@ -193,9 +193,9 @@ def test_where_cameras_stay_nothing_moves_that_images_show_still(
     in_place: bool, kept: list[int]
 ) -> None:
     """Four move by far, the fourth least; the images say of two that they are like the median."""
-    still = 0.2 * DynamicModel().motion_threshold
+    static = 0.2 * DynamicModel().motion_threshold
     moving = 0.3 * DynamicModel().motion_threshold
-    errors = alike(torch.tensor([still, moving, moving, moving]))
+    errors = alike(torch.tensor([static, moving, moving, moving]))
     gaussians = flat_cloud(4)
     run = begun(gaussians, static_errors=lambda _: errors, has_fixed_cameras=in_place)
     move(run, torch.tensor([0.1, 0.0, 0.1, 0.1]))
@@ -318,14 +318,14 @@ def test_state_goes_round(kind: str, phase: str) -> None:
         run.after_step(SPLIT)
     other = new_run(gaussians, deform=deform)
     stored = {name: x.clone() for name, x in run.model_state.items()}
-    other.scene = other.training.restored(gaussians, stored)
+    other.scene = other.training.restore(gaussians, stored)
     assert other.model_state.keys() == run.model_state.keys()
     assert all(torch.equal(x, other.model_state[name]) for name, x in run.model_state.items())
     assert other.scene.num_moving == run.scene.num_moving
     for time in (0.0, 0.4):
         for name, x in run.drawn_at(time).tensors().items():
             assert torch.equal(x, other.drawn_at(time).tensors()[name]), name
-    assert other.training.restored(gaussians, {}).field is None
+    assert other.training.restore(gaussians, {}).field is None
 
 
 # --- fixed cameras
@@ -342,11 +342,11 @@ def test_motion_begins_where_fixed_cameras_see_changes() -> None:
         new_run, flat_cloud(), times, deform=FreeField(), num_random_moving=800, full=FINE + 20
     )
     run = begin(static_errors=lambda _: errors, motion_threshold=0.1, time_window=0.2)
-    run.training.capture = replace(run.training.capture, standing=lambda: footage)
+    run.training.capture = replace(run.training.capture, fixed_clips=lambda: footage)
     result = run.grow(FINE)
     assert result is not None
-    assert result.finding is not None
-    assert "found at 8 of 8 times" in result.finding
+    assert result.message is not None
+    assert "found at 8 of 8 times" in result.message
     assert run.training.trains_on(0.0, FINE + 1)
     copies = 3 * len(times)  # of the static Gaussians that move: one for each time
     assert copies < run.scene.num_moving <= copies + 2 * 800
@@ -355,5 +355,5 @@ def test_motion_begins_where_fixed_cameras_see_changes() -> None:
         ball = now.means[now.opacities > 0.5]
         assert len(ball) > 50
         assert (ball.median(0).values - torch.tensor([0.0, 0.1, 1.6 * time - 0.8])).norm() < 0.1
-    scene = begin().training.restored(run.scene.gaussians, run.model_state)
+    scene = begin().training.restore(run.scene.gaussians, run.model_state)
     torch.testing.assert_close(scene.at(0.3).means, run.scene.at(0.3).means)

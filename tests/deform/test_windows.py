@@ -65,8 +65,8 @@ def test_windows_close_where_nothing_is_to_be_seen_and_open_no_further_than_they
         field.step(step, 0.0)
     assert bool((field.edges[:, 0] > began[:, 0]).all())
     assert torch.equal(field.edges[:, 1], began[:, 1])
-    assert len(field.leaves) == 1 + len(field.others.leaves)
-    assert field.penalties(0.3).keys() == field.others.penalties(0.3).keys()
+    assert len(field.leaves) == 1 + len(field.inner_field.leaves)
+    assert field.penalties(0.3).keys() == field.inner_field.penalties(0.3).keys()
 
 
 def stored(field: WindowedField) -> dict[str, Tensor]:
@@ -83,7 +83,7 @@ def test_a_stored_field_is_the_same_field() -> None:
         assert torch.equal(x, stored(field)[name]), name
     for name, x in vars(again.offsets(means, 0.37)).items():
         assert torch.equal(x, getattr(field.offsets(means, 0.37), name)), name
-    assert again.num_values == field.num_values == field.others.num_values + 2 * COUNT
+    assert again.num_values == field.num_values == field.inner_field.num_values + 2 * COUNT
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from dyngs.data.synthetic.captures import DynamicOptions, SceneName, write_dynam
 from dyngs.data.tracks import TrueTracks, read_true_tracks
 from dyngs.deform.bodies.field import BodyField, BodyRestPose
 from dyngs.deform.field import FieldSetup
-from dyngs.deform.free import FreePrimitives, FreeInitialization
+from dyngs.deform.free import FreeInitialization, FreePrimitives
 from dyngs.deform.keys import FreeField
 from dyngs.deform.scene import DynamicScene
 from dyngs.evaluate.tracks import NO_TRACKS, NONE_OPAQUE, NONE_SEEN, track_scores
@@ -123,13 +123,15 @@ def turning_back(scale: float) -> tuple[GaussianScene, TrueTracks]:
     ways = [min(time, 1 - time) for time in TIMES]
     means = torch.tensor([[way - 1.0, 0.0, 0.0] for way in ways])
     velocities = scale * torch.tensor([[1.0, 0.0, 0.0]] * 2 + [[0.0] * 3] + [[-1.0, 0.0, 0.0]] * 2)
-    start = FreeInitialization(torch.zeros(0), (), torch.tensor(TIMES), torch.full((5,), 0.06), velocities)
+    start = FreeInitialization(
+        torch.zeros(0), (), torch.tensor(TIMES), torch.full((5,), 0.06), velocities
+    )
     setup = FieldSetup(torch.zeros(3), torch.ones(3), len(TIMES), len(TIMES), 1.0)
-    field = FreePrimitives(FreeField(), setup, torch.Generator()).started(start)
+    field = FreePrimitives(FreeField(), setup, torch.Generator()).with_initialization(start)
     field.parameters["velocities"].data[:] = velocities
     scene = DynamicScene(
         gaussians=row_of_balls().replace(means=means),
-        seen_at=TIMES,
+        training_times=TIMES,
         field=field,
         moving=torch.arange(5),
     )

@@ -248,8 +248,8 @@ def test_held_out_frames_are_scored_in_the_poses_of_the_file(run: Path) -> None:
     assert (len(trained.played_clip), len(held.played_clip)) == (2, 1)
     assert capture.body is not None
     given = torch.from_numpy(capture.body["pose"].poses[2]).float()
-    assert held.played is not None
-    torch.testing.assert_close(held.played.poses[0], given, rtol=0, atol=1e-6)
+    assert held.replacement_clip is not None
+    torch.testing.assert_close(held.replacement_clip.poses[0], given, rtol=0, atol=1e-6)
 
 
 def test_refined_poses_stand_beside_those_as_given(

@@ -158,7 +158,9 @@ def test_an_orbit_shows_the_same_frames_in_any_unit(factor: float, tmp_path: Pat
 def test_a_single_gaussian_is_in_view_whole() -> None:
     one = opened_scene(StaticScene(gaussians=some_gaussians(1)))
     size = math.exp(-3)
-    distance = float((orbit_cameras_around(one, 1).centers[0] - one.scene.gaussians.means[0]).norm())
+    distance = float(
+        (orbit_cameras_around(one, 1).centers[0] - one.scene.gaussians.means[0]).norm()
+    )
     assert size < distance < 10 * size
 
 
@@ -178,7 +180,9 @@ def directions(centers: torch.Tensor) -> np.ndarray:
 
 
 def test_who_was_filmed_from_one_side_is_seen_from_all(tmp_path: Path) -> None:
-    options = HumanOptions(size=32, num_frames=2, num_pose_frames=0, num_cameras=1, num_test=1, samples=1)
+    options = HumanOptions(
+        size=32, num_frames=2, num_pose_frames=0, num_cameras=1, num_test=1, samples=1
+    )
     root = write_human_capture(tmp_path / "person", options)
     run = RunConfig(threads=1, dir=tmp_path / "run")
     folder = train(

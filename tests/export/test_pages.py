@@ -36,8 +36,14 @@ from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr, ssim
-from dyngs.export.html import numbers
-from dyngs.export.html.page import ELEMENT, MOST_VIEWS, element_script, write_folder, write_page
+from dyngs.export.html import scene_data
+from dyngs.export.html.page import (
+    ELEMENT,
+    MOST_VIEWS,
+    element_script,
+    write_page,
+    write_page_folder,
+)
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
@@ -85,7 +91,7 @@ def test_a_page_shows_what_dyngs_draws(kind: str, browser: Browser, tmp_path: Pa
 @pytest.mark.parametrize(("texture", "degree"), [(0, 0), (1, 1), (3, 4)])
 def test_triangles(texture: int, degree: int, browser: Browser, tmp_path: Path) -> None:
     patches = bent(12, seed=1, degree=degree)
-    patches = patches.textured(texture) if texture else patches
+    patches = patches.with_texture(texture) if texture else patches
     varied = patches.colours + 0.2 * torch.randn(
         patches.colours.shape, generator=torch.Generator().manual_seed(2)
     )
@@ -193,9 +199,9 @@ def test_only_a_new_folder_is_written_and_no_moving_scene(tmp_path: Path) -> Non
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine").touch()
     with pytest.raises(DyngsError, match="exists already"):
-        write_folder(still, tmp_path / "full")
+        write_page_folder(still, tmp_path / "full")
     with pytest.raises(DyngsError, match="for still scenes"):
-        write_folder(opened_scene(sliding_scene()), tmp_path / "new", most=9)
+        write_page_folder(opened_scene(sliding_scene()), tmp_path / "new", most=9)
     assert [path.name for path in tmp_path.rglob("*")] == ["full", "mine"]
 
 
@@ -264,9 +270,9 @@ def test_a_long_clip_is_fetched_as_it_is_played(
 ) -> None:
     scene = scene_of_kind("hexplane")
     view = large(onlooker())
-    monkeypatch.setattr(numbers, "CHUNK_BYTES", 60)
+    monkeypatch.setattr(scene_data, "CHUNK_BYTES", 60)
     scene = replace(scene, background=torch.ones(3))
-    written = write_folder(
+    written = write_page_folder(
         replace(opened_scene(scene), stated_up="-y"), tmp_path / "clip", views=(view,)
     )
     curves = written.header["curves"]

@@ -32,9 +32,9 @@ from dyngs.export.rigged.people import (
     add_animation,
     anchor_normals,
     body_mesh,
+    build_rig,
     mesh_document,
     rest_vertices,
-    build_rig,
     surface_normals,
     write_mesh,
     write_rigged_splats,
@@ -60,7 +60,7 @@ from dyngs.human.body.skinning import (
     joint_transforms,
 )
 from dyngs.human.motion.gltf import read_gltf
-from dyngs.human.motion.placement import upright
+from dyngs.human.motion.placement import rotate_clip_to_y_up
 from dyngs.io.formats.formats import read_splats
 from dyngs.runs.checkpoint import load_run
 
@@ -121,7 +121,9 @@ def written(path: Path, scene: HumanScene) -> SkinnedGlb:
     with torch.no_grad():
         rig = build_rig(scene, body.vertices)
         document = mesh_document(body, rig, body.vertices, GREY)
-        add_animation(document, scene, rig, body.vertices, body.weights, AnimationInfo("dance", 10.0))
+        add_animation(
+            document, scene, rig, body.vertices, body.weights, AnimationInfo("dance", 10.0)
+        )
         document.write(path)
     return SkinnedGlb(path)
 
@@ -134,7 +136,7 @@ def test_the_skin_moves_vertices_as_our_own_skinning_does(tmp_path: Path, scale:
     found = written(tmp_path / "x.glb", scene)
     _, _, source = body_mesh(body)
     skeleton = scene.learned_skeleton
-    clip = upright(scene.played_clip, scene.clip, skeleton.joints)
+    clip = rotate_clip_to_y_up(scene.played_clip, scene.clip, skeleton.joints)
     lowest = []
     shifts = []
     for frame in range(4):
@@ -158,7 +160,7 @@ def test_our_reader_of_motions_finds_the_same_motion(tmp_path: Path) -> None:
     written(tmp_path / "x.glb", scene)
     found = read_gltf(tmp_path / "x.glb", fps=10.0)
     assert found.names == JOINT_NAMES
-    clip = upright(scene.played_clip, scene.clip, scene.learned_skeleton.joints)
+    clip = rotate_clip_to_y_up(scene.played_clip, scene.clip, scene.learned_skeleton.joints)
     skeleton = scene.learned_skeleton
     for frame in range(4):
         world = joint_transforms(
@@ -268,7 +270,7 @@ def test_the_skin_moves_gaussians_as_the_avatar_does(tmp_path: Path) -> None:
     assert "viewers may show the rest pose" in notes[0]
     found = SkinnedGlb(tmp_path / "ann.glb")
     assert found.primitive["mode"] == 0
-    turned = upright(scene.played_clip, scene.clip, scene.learned_skeleton.joints)
+    turned = rotate_clip_to_y_up(scene.played_clip, scene.clip, scene.learned_skeleton.joints)
     torch.testing.assert_close(turned.poses, scene.played_clip.poses, atol=1e-5, rtol=0)
     for frame, time in enumerate((0.0, 0.5, 1.0)):
         difference = found.posed(frame) - scene.at(time).means.numpy()

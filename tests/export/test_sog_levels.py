@@ -14,7 +14,7 @@ import torch
 from dyngs.export import splat_files
 from dyngs.export.splat_files import write_sog_levels
 from dyngs.gaussians import Gaussians
-from dyngs.gaussians.levels import levels_of
+from dyngs.gaussians.levels import build_levels
 from dyngs.io.formats.formats import SOG_INDEX, read_splats
 from dyngs.io.formats.splat_file import SplatFile
 
@@ -64,7 +64,7 @@ def test_leaves_are_alternatives_of_one_place(
             for part in folder.iterdir():
                 archive.write(part, part.name)
         files.append(read_splats(path).gaussians)
-    wanted = levels_of(splat.gaussians).levels
+    wanted = build_levels(splat.gaussians).levels
     shown = [0] * 3
     for leaf in leaves(index["tree"]):
         low = torch.tensor(leaf["bound"]["min"])

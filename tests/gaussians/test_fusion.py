@@ -9,12 +9,12 @@ import pytest
 import torch
 from seen_ball import HIGH, LOW, RADIUS, views
 
-from dyngs.gaussians.surface import Mesh, colours_of, fused, simplify_mesh
+from dyngs.gaussians.surface import Mesh, fuse_depths, sample_colours, simplify_mesh
 
 
 @cache
 def ball() -> Mesh:
-    found = fused(views(), LOW, HIGH, 40)
+    found = fuse_depths(views(), LOW, HIGH, 40)
     assert found is not None
     return found
 
@@ -62,7 +62,7 @@ def test_joined_vertices_lie_where_planes_meet() -> None:
 
 def test_colours_are_those_of_the_views_that_show_a_point() -> None:
     points = torch.tensor([[RADIUS, 0.0, 0.0], [-RADIUS, 0.0, 0.0], [0.0, 0.0, 9.0]])
-    colours = colours_of(views(), points, 0.1)
+    colours = sample_colours(views(), points, 0.1)
     torch.testing.assert_close(colours[0], torch.tensor([1.0, 0, 0]), atol=0.02, rtol=0)
     torch.testing.assert_close(colours[1], torch.zeros(3), atol=0.02, rtol=0)
     torch.testing.assert_close(colours[2], torch.full((3,), 0.5))

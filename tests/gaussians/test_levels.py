@@ -12,7 +12,7 @@ from splat_scenes import cloud
 from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians import levels as module
-from dyngs.gaussians.levels import MERGED, Levels, levels_of, merged
+from dyngs.gaussians.levels import MERGED, Levels, build_levels, merge_gaussians
 from dyngs.gaussians.rendering import render
 from dyngs.ops.quaternions import rotation_matrices
 
@@ -35,7 +35,7 @@ def test_merged_moments_are_those_of_the_mixture() -> None:
         .to(dtype=torch.float64)
         .replace(logit_opacities=torch.full((40,), -5.0).double())
     )
-    one, shares = merged(several, 4)
+    one, shares = merge_gaussians(several, 4)
     second = covariances(several) + several.means[:, :, None] * several.means[:, None, :]
     for i in range(10):
         own = slice(4 * i, 4 * i + 4)
@@ -50,7 +50,7 @@ def test_merged_moments_are_those_of_the_mixture() -> None:
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 64, 1000])
 def test_every_level_holds_the_one_below(count: int, small_blocks: None) -> None:
     gaussians = cloud(count)
-    levels = levels_of(gaussians)
+    levels = build_levels(gaussians)
     assert len(levels.levels[-1]) <= 16
     for fine, coarse in zip(levels.levels, levels.levels[1:], strict=False):
         assert len(coarse) == -(-len(fine) // MERGED)
@@ -73,7 +73,7 @@ def whole(levels: Levels, cut: list[tuple[int, int]]) -> list[int]:
 
 
 def test_a_cut_shows_everything_once(small_blocks: None) -> None:
-    levels = levels_of(cloud(1000))
+    levels = build_levels(cloud(1000))
     counts = []
     for pixels in (0.0, 0.5, 2.0, 8.0, 1e9):
         cut = levels.cut(camera(), pixels=pixels)
@@ -90,14 +90,14 @@ def test_a_cut_shows_everything_once(small_blocks: None) -> None:
 def test_the_finest_cut_is_the_scene_to_the_bit(small_blocks: None) -> None:
     """Seen whole; equal depths, which no two here have, would be drawn in another order."""
     gaussians = cloud(300)
-    levels = levels_of(gaussians)
+    levels = build_levels(gaussians)
     seen = levels.seen_by(camera(), pixels=0.0)
     assert len(seen) == 300
     assert torch.equal(render(seen, camera()).rgb, render(gaussians, camera()).rgb)
 
 
 def test_what_is_behind_or_beside_the_camera_stays_coarse(small_blocks: None) -> None:
-    levels = levels_of(cloud(1000))
+    levels = build_levels(cloud(1000))
     pose = camera().cam_from_world.clone()
     for turn in (
         torch.diag(torch.tensor([-1.0, 1, -1, 1])),
@@ -123,7 +123,7 @@ def test_from_afar_fewer_look_the_same(small_blocks: None) -> None:
     truth = torch.nn.functional.avg_pool2d(
         render(gaussians, sharp).rgb.permute(0, 3, 1, 2), 8
     ).permute(0, 2, 3, 1)
-    seen = levels_of(gaussians).seen_by(far)
+    seen = build_levels(gaussians).seen_by(far)
     assert len(seen) < len(gaussians) / 5
     errors = [float((render(x, far).rgb - truth).square().mean()) for x in (seen, gaussians)]
     assert errors[0] < 1.02 * errors[1]

@@ -30,7 +30,7 @@ def _stored(optimizer: GaussianOptimizer) -> dict[str, torch.Tensor]:
 
 def _restored(tensors: dict[str, torch.Tensor]) -> GaussianOptimizer:
     parameters = Gaussians(**part_of(tensors, "gaussians"))
-    return GaussianOptimizer(_gaussians(2, seed=9), OptimConfig()).restored(parameters, tensors)
+    return GaussianOptimizer(_gaussians(2, seed=9), OptimConfig()).with_state(parameters, tensors)
 
 
 def _set_gradients(
@@ -47,11 +47,11 @@ def test_gaussians_that_rest_are_left_alone_where_they_are_not_seen() -> None:
     """Of two that are not seen only the one that rests; one that is seen moves, be it at rest else
     or not."""
     optimizer = GaussianOptimizer(_gaussians(5), OptimConfig())
-    resting = torch.tensor([0, 3])
+    skip_unseen_rows = torch.tensor([0, 3])
     for step in (1, 2):
         before = _stored(optimizer)
         _set_gradients(optimizer, step, unseen=[1, 3] if step == 2 else [])
-        optimizer.step(step, 0.1, resting=resting)
+        optimizer.step(step, 0.1, skip_unseen_rows=skip_unseen_rows)
     for name, x in _stored(optimizer).items():
         if "." in name and name.startswith(("gaussians", "exp_avg.")):
             changed = (x != before[name]).flatten(1).any(1) if x.ndim > 1 else x != before[name]

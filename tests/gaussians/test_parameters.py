@@ -61,7 +61,7 @@ def test_an_edit_moves_rows_and_starts_new_ones_without_moments() -> None:
     before = {name: x.clone() for name, x in tensors_of(learned.state()).items()}
     index = torch.tensor([3, 0, 0, 2, 3])
     is_new = torch.tensor([False, False, True, False, True])
-    edited = learned.edited(Role.PER_MOVING, TopologyEdit(index, is_new))
+    edited = learned.apply_edit(Role.PER_MOVING, TopologyEdit(index, is_new))
     after = tensors_of(edited.state())
     assert torch.equal(after["weight"], before["weight"][index])
     assert edited["weight"].requires_grad
@@ -70,7 +70,7 @@ def test_an_edit_moves_rows_and_starts_new_ones_without_moments() -> None:
         assert torch.equal(after[name][~is_new], before[name][index][~is_new])
         assert not after[name][is_new].any()
     assert all(torch.equal(after[name], x) for name, x in before.items() if "weight" not in name)
-    assert learned.edited(Role.PER_GAUSSIAN, TopologyEdit(index, is_new)) is learned, (
+    assert learned.apply_edit(Role.PER_GAUSSIAN, TopologyEdit(index, is_new)) is learned, (
         "no tensor has that role"
     )
     edited["weight"].grad = torch.ones(5, 5)
@@ -102,7 +102,7 @@ def test_a_restored_one_goes_on_as_if_never_stopped() -> None:
         give_gradients(first, step)
         first.step(step, step / 6)
     state = tensors_of(first.state())
-    second = second.restored(state)
+    second = second.with_state(state)
     for learned in (first, second):
         for step in (4, 5):
             give_gradients(learned, step)
@@ -111,4 +111,4 @@ def test_a_restored_one_goes_on_as_if_never_stopped() -> None:
         assert torch.equal(tensors_of(second.state())[name], x), name
     for name in ("bias", "exp_avg.bias"):
         with pytest.raises(KeyError, match=name):
-            second.restored({n: x for n, x in state.items() if n != name})
+            second.with_state({n: x for n, x in state.items() if n != name})

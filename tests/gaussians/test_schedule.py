@@ -144,11 +144,13 @@ def test_phases_of_a_dynamic_model_come_in_order(
     model = DynamicModel(motion_from=coarse, time_window_full_at=time_window_full_at)
     schedule = deform_schedule(model, RateSchedule(steps))
     assert schedule.rates.steps == steps
-    assert 1 <= schedule.fine <= schedule.full <= steps
-    assert all(schedule.full < split <= steps for split in schedule.splits)
-    assert list(schedule.splits) == sorted(set(schedule.splits))
+    assert 1 <= schedule.coarse_end <= schedule.window_full_at <= steps
+    assert all(schedule.window_full_at < split <= steps for split in schedule.freeze_steps)
+    assert list(schedule.freeze_steps) == sorted(set(schedule.freeze_steps))
     assert (
-        deform_schedule(model.model_copy(update={"freeze_below_px": 0.0}), RateSchedule(steps)).splits
+        deform_schedule(
+            model.model_copy(update={"freeze_below_px": 0.0}), RateSchedule(steps)
+        ).freeze_steps
         == ()
     )
 

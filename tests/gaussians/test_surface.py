@@ -17,7 +17,14 @@ from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.gaussians.surface import Mesh, fused, keep_largest_components, count_holes, opaque_box, extract_surface
+from dyngs.gaussians.surface import (
+    Mesh,
+    count_holes,
+    extract_surface,
+    fuse_depths,
+    keep_largest_components,
+    opaque_box,
+)
 from dyngs.io.formats.similarity import Similarity
 from dyngs.models.renderable import Surface
 
@@ -91,7 +98,7 @@ def test_the_surface_is_the_same_in_any_unit(factor: float) -> None:
 
 def test_without_what_no_view_sees_the_surface_ends() -> None:
     """From one side half a ball is seen, and nothing closes it."""
-    half = fused(views()[:1], *BOX, 40, unseen_is_solid=False)
+    half = fuse_depths(views()[:1], *BOX, 40, unseen_is_solid=False)
     assert half is not None
     assert count_holes(Surface(half.vertices, half.faces, half.vertices)) > 0
     assert half.vertices[:, 2].max() < 0.3

@@ -16,9 +16,9 @@ from dyngs.human.avatar.observations import nearest_neighbours
 from dyngs.human.avatar.posing import (
     Skeleton,
     frame_pose,
+    pose_blend_offsets,
     pose_blend_shapes,
     pose_gaussians,
-    pose_blend_offsets,
     skinning_weights,
     texel_gaussians,
 )

@@ -24,7 +24,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.levels import LevelScene
-from dyngs.gaussians.static_scene import Sides, StaticScene
+from dyngs.gaussians.static_scene import StaticScene, ViewSides
 from dyngs.human.predict.fields.prediction import NETWORKS, PredictedField
 from dyngs.human.predict.people import PosedBody, Sources
 from dyngs.models.renderable import Renderable
@@ -49,7 +49,7 @@ def scene_of(kind: str) -> Renderable:
     if kind == "sides":
         parts = [cloud(40), cloud(60)]
         eyes = [torch.tensor([4.0, 0.0, 1.5]), torch.tensor([-4.0, 0.0, 1.5])]
-        return StaticScene(gaussians=Gaussians.joined(parts), sides=Sides.joined(parts, eyes))
+        return StaticScene(gaussians=Gaussians.joined(parts), sides=ViewSides.joined(parts, eyes))
     if kind in NETWORKS:
         images = Sources(
             torch.ones(3, 4, 16, 16), torch.eye(4).expand(3, 4, 4), torch.eye(3).expand(3, 3, 3)

@@ -20,11 +20,11 @@ from dyngs.core.errors import DyngsError
 from dyngs.ops import device
 from dyngs.ops.device import (
     AsyncReadback,
-    deterministic,
-    select_device,
-    findings,
-    gpu_unavailable_reason,
     cpu_fallback_reason,
+    deterministic,
+    gpu_status,
+    gpu_unavailable_reason,
+    select_device,
 )
 
 
@@ -59,7 +59,7 @@ def test_a_gpu_that_can_be_used_is(machine: pytest.MonkeyPatch) -> None:
     assert select_device("auto") == select_device("cuda") == torch.device("cuda:0")
     assert select_device("cpu") == torch.device("cpu")
     assert cpu_fallback_reason("auto") is None
-    assert findings() == {
+    assert gpu_status() == {
         "torch for": "CUDA 13.0",
         "kernels for GPUs": "built",
         "driver": "there",
@@ -72,7 +72,7 @@ def test_a_torch_for_the_cpu_alone(machine: pytest.MonkeyPatch) -> None:
     assert re.search(
         r"device cuda: this torch \(.*\) is built without CUDA: install a torch for CUDA", refused()
     )
-    assert findings()["GPU"] == "none"
+    assert gpu_status()["GPU"] == "none"
 
 
 def test_kernels_that_were_not_built(machine: pytest.MonkeyPatch) -> None:
@@ -81,7 +81,7 @@ def test_kernels_that_were_not_built(machine: pytest.MonkeyPatch) -> None:
         "built without its kernels for GPUs: install dyngs with `pip install . -C cmake.define"
         in refused()
     )
-    assert findings()["kernels for GPUs"] == "not built"
+    assert gpu_status()["kernels for GPUs"] == "not built"
 
 
 def test_kernels_that_cannot_be_loaded(machine: pytest.MonkeyPatch) -> None:

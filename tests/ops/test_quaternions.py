@@ -8,7 +8,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dyngs.ops.quaternions import quat_product, quats_from_matrices, rotate, rotation_matrices, unit_quats
+from dyngs.ops.quaternions import (
+    quat_product,
+    quats_from_matrices,
+    rotate,
+    rotation_matrices,
+    unit_quats,
+)
 
 ROUNDING = 8 * torch.finfo(torch.float32).eps
 """Of a unit quaternion: two divisions, four squares, their sum, the root; and again for what it is

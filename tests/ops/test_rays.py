@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngs.ops.rays import (
+    MarchSteps,
     Rays,
     Samples,
     Space,
-    Steps,
     composite,
     march,
     offsets_of,
@@ -69,7 +69,7 @@ def test_samples_lie_in_occupied_cells_and_none_is_skipped(
     generator = torch.Generator().manual_seed(seed)
     occupied = torch.rand(NESTED.shape, generator=generator) < fraction
     rays = some_rays(1, seed)
-    steps = Steps(0.05, 0.07)
+    steps = MarchSteps(0.05, 0.07)
     found = march(rays, shifts_of(rays, shift), NESTED, occupied, steps)
     expected = reference_march(rays.origins[0], rays.directions[0], shift, NESTED, occupied, steps)
     assert found.starts.tolist() == pytest.approx(expected)
@@ -88,7 +88,7 @@ def test_an_empty_space_has_no_samples_and_a_full_one_all() -> None:
         shifts_of(rays, 0.25),
         space,
         torch.ones(space.shape, dtype=torch.bool),
-        Steps(0.0, 0.125),
+        MarchSteps(0.0, 0.125),
     )
     assert len(full) == 16
     assert (
@@ -98,7 +98,7 @@ def test_an_empty_space_has_no_samples_and_a_full_one_all() -> None:
                 shifts_of(rays),
                 space,
                 torch.zeros(space.shape, dtype=torch.bool),
-                Steps(0.0, 0.125),
+                MarchSteps(0.0, 0.125),
             )
         )
         == 0
@@ -111,7 +111,7 @@ def test_an_empty_space_has_no_samples_and_a_full_one_all() -> None:
                 shifts_of(away),
                 space,
                 torch.ones(space.shape, dtype=torch.bool),
-                Steps(0.0, 0.125),
+                MarchSteps(0.0, 0.125),
             )
         )
         == 0
@@ -121,7 +121,7 @@ def test_an_empty_space_has_no_samples_and_a_full_one_all() -> None:
 def test_samples_grow_with_the_distance() -> None:
     rays = towards(1.0, 0.1, 0.0)
     all_cells = torch.ones(NESTED.shape, dtype=torch.bool)
-    found = march(rays, shifts_of(rays), NESTED, all_cells, Steps(0.05, 0.01, cone=0.02))
+    found = march(rays, shifts_of(rays), NESTED, all_cells, MarchSteps(0.05, 0.01, cone=0.02))
     lengths = found.ends - found.starts
     assert torch.allclose(lengths, (0.02 * found.starts).clamp_min(0.01))
     assert torch.allclose(found.starts[1:], found.ends[:-1])

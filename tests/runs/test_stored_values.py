@@ -112,20 +112,20 @@ def moving(kind: str) -> tuple[DynamicScene, DynamicModel]:
     """A scene of which some Gaussians move, and its model."""
     field = stirred_field(kind, len(ROWS))
     scene = DynamicScene(
-        gaussians=cloud(9), seen_at=(0.0, 1.0), field=field, moving=torch.tensor(ROWS)
+        gaussians=cloud(9), training_times=(0.0, 1.0), field=field, moving=torch.tensor(ROWS)
     )
     return scene, DynamicModel(deform=tiny_options(kind))
 
 
 def stored(scene: GaussianScene) -> dict[str, torch.Tensor]:
     """What a file holds of a scene, in its order."""
-    return drawable(scene.edited(stored_edit(scene, scene.gaussians.means.numpy())))
+    return drawable(scene.apply_edit(stored_edit(scene, scene.gaussians.means.numpy())))
 
 
 def read(tensors: dict[str, torch.Tensor], model: DynamicModel) -> DynamicScene:
     """The scene of what a file holds."""
     full = completed(tensors)
-    return DynamicScene.restored(
+    return DynamicScene.from_state(
         model, Gaussians(**part_of(full, "gaussians")), part_of(full, "model")
     )
 

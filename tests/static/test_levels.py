@@ -17,7 +17,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.gaussians import levels
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.static_scene import Sides, StaticScene
+from dyngs.gaussians.static_scene import StaticScene, ViewSides
 
 
 def test_near_it_is_the_scene_itself() -> None:
@@ -59,7 +59,7 @@ def test_colours_of_a_network_are_drawn_too() -> None:
 def test_other_scenes_are_refused() -> None:
     with pytest.raises(DyngsError, match="for still scenes"):
         LevelScene.of(moving_scene(sliding_nodes()))
-    sides = Sides(torch.zeros(400, dtype=torch.int64), torch.eye(3)[:2], torch.zeros(3))
+    sides = ViewSides(torch.zeros(400, dtype=torch.int64), torch.eye(3)[:2], torch.zeros(3))
     with pytest.raises(DyngsError, match="look the same from all sides"):
         LevelScene.of(StaticScene(gaussians=cloud(), sides=sides))
     with pytest.raises(DyngsError, match="not made of Gaussians"):

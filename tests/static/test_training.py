@@ -92,8 +92,8 @@ def test_what_no_view_shows_half_a_pixel_of_is_removed_once() -> None:
     assert torch.equal(edited.gaussians.means, scene.gaussians.means[[1, 3]])
     assert result.edit is not None
     assert torch.equal(result.edit.apply(scene.gaussians.means), edited.gaussians.means)
-    assert result.finding is not None
-    assert result.finding.startswith(
+    assert result.message is not None
+    assert result.message.startswith(
         "2 of 4 Gaussians are removed: each makes up less than 2 px of every"
     )
     assert training.edit_scene(edited, 7) is None, "all that is left is large enough"
@@ -115,7 +115,9 @@ def test_the_filter_is_kept_until_it_is_due() -> None:
     assert torch.equal(drawn(scene).log_scales, with_near.log_scales)
     scene = training.after_step(scene, 100, False)
     assert torch.equal(drawn(scene).log_scales, with_far.log_scales)
-    edited = scene.with_gaussians(near).edited(TopologyEdit.select(torch.ones(3, dtype=torch.bool)))
+    edited = scene.with_gaussians(near).apply_edit(
+        TopologyEdit.select(torch.ones(3, dtype=torch.bool))
+    )
     scene = training.after_step(edited, 101, True)
     assert torch.equal(drawn(scene).log_scales, with_near.log_scales)
     scene = training.after_step(scene.with_gaussians(far), 102, True)
@@ -128,7 +130,7 @@ def test_state_goes_round() -> None:
     training = StaticTraining(FilterUpdate([_camera()]))
     first = training.first_scene(_gaussians(2.0))
     stored = part_of(tensors_of(first.state()), "model")
-    second = training.restored(_gaussians(4.0), stored)
+    second = training.restore(_gaussians(4.0), stored)
     drawn = (
         training.time_step(scene, _image(), 1).gaussians.log_scales for scene in (first, second)
     )

@@ -143,7 +143,7 @@ class Toy(Model[ToyScene]):
 
     def restore(self, checkpoint: Checkpoint) -> None:
         self._grid = stored_grid(checkpoint).clone().requires_grad_()
-        self._adam = AdamState.restored(checkpoint.part("adam"), {"grid": self._grid})
+        self._adam = AdamState.from_state(checkpoint.part("adam"), {"grid": self._grid})
 
     def place(self, device: torch.device) -> None:
         assert device.type == "cpu"

@@ -168,8 +168,11 @@ def test_what_has_begun_keeps_its_step() -> None:
             assert now.fine == (350 if steps < 9000 else 1000)
             assert image_divisor(new.train, done) <= image_divisor(options, done)
             assert active_sh_degree(new.train, done, 3) >= active_sh_degree(options, done, 3)
-            if done >= old.opens and steps < 9000:
-                assert (now.opens, now.full) == (old.opens, min(old.full, steps))
+            if done >= old.window_grows_from and steps < 9000:
+                assert (now.window_grows_from, now.window_full_at) == (
+                    old.window_grows_from,
+                    min(old.window_full_at, steps),
+                )
             assert describe_extension(config, new, done).count("\n") == 0
 
 

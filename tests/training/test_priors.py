@@ -16,12 +16,12 @@ from dyngs.gaussians.rendering import RenderOptions
 from dyngs.models.model import Drawn, Look, Model
 from dyngs.training.priors import (
     PointTracks,
-    TimedCamera,
     PriorLosses,
+    TimedCamera,
     depth_error,
+    load_priors,
     render_displacements,
     track_error,
-    load_priors,
 )
 
 HERE = camera(32, 24)
@@ -59,7 +59,10 @@ def scene(speed: float) -> DynamicScene:
     gaussians = gaussians.replace(means=gaussians.means.clone().requires_grad_())
     field = Sliding(speed=speed, setup=SETUP)
     return DynamicScene(
-        gaussians=gaussians, seen_at=(0.0, 1.0), field=field, moving=torch.tensor(MOVING_ROWS)
+        gaussians=gaussians,
+        training_times=(0.0, 1.0),
+        field=field,
+        moving=torch.tensor(MOVING_ROWS),
     )
 
 

@@ -76,8 +76,8 @@ class _LiftedScene(GaussianScene):
             self.gaussians.replace(means=self.gaussians.means + torch.tensor([0.0, 0.0, 0.1])), time
         )
 
-    def edited(self, edit: TopologyEdit) -> _LiftedScene:
-        return replace(self, gaussians=self.gaussians.edited(edit))
+    def apply_edit(self, edit: TopologyEdit) -> _LiftedScene:
+        return replace(self, gaussians=self.gaussians.apply_edit(edit))
 
     def _model_state(self) -> State:
         return {}
@@ -121,7 +121,7 @@ class _Lifted(SceneTraining[_LiftedScene]):
 
     def follow(self, edit: TopologyEdit) -> None: ...
 
-    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> _LiftedScene:
+    def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> _LiftedScene:
         self.steps = tensors["steps"].tolist()
         return _LiftedScene(gaussians=gaussians)
 

@@ -15,7 +15,7 @@ from dyngs.compress.stage import highest, quality_of, scores_of
 from dyngs.config import Config
 from dyngs.core.errors import counted
 from dyngs.training.loop import Loop
-from dyngs.training.trainer import TrainingEdit, Trainer
+from dyngs.training.trainer import Trainer, TrainingEdit
 
 REMOVED_FROM = 0.7  # Fraction of the run from which Gaussians beyond the limit are removed
 

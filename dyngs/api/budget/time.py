@@ -16,10 +16,10 @@ from typing import Any
 from dyngs.config import Config
 from dyngs.core.errors import counted
 from dyngs.data.loader import ImageLoader
-from dyngs.training.clock import TimeForecast, Stopwatch
+from dyngs.training.clock import Stopwatch, TimeForecast
 from dyngs.training.loop import Loop
 from dyngs.training.plan import RunPlan, with_steps
-from dyngs.training.trainer import TrainingEdit, Trainer
+from dyngs.training.trainer import Trainer, TrainingEdit
 
 FEWEST = 200  # Steps that must fit; otherwise the images are shrunk
 SMALLEST_SIDE = 64  # Longest side, px, below which images are not shrunk
@@ -84,7 +84,9 @@ def _forecast(trainer: Trainer[Any], now: float) -> TimeForecast:
     return TimeForecast(trainer.done, now, trainer.num_gaussians, pixels)
 
 
-def fitting_steps(forecast: TimeForecast, config: Config, done: int, seconds: float, most: int) -> int:
+def fitting_steps(
+    forecast: TimeForecast, config: Config, done: int, seconds: float, most: int
+) -> int:
     """Return the largest number of steps, ``done`` to ``most``, whose rest after ``done`` fits in
     ``seconds``."""
     low = done

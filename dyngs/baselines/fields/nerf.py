@@ -19,8 +19,8 @@ from dyngs.baselines.fields.scene import (
     PUBLISHED_PIXELS,
     TIME,
     Field,
-    Seen,
-    encoded,
+    RenderedRays,
+    encode_frequencies,
     restored_parameters,
 )
 from dyngs.baselines.fields.training import FieldTraining
@@ -94,21 +94,23 @@ class NerfField(Field):
         return cls(model, space, parameters)
 
     @classmethod
-    def restored(cls, model: NerfModel, space: Space, stored: Mapping[str, Tensor]) -> NerfField:
+    def from_state(cls, model: NerfModel, space: Space, stored: Mapping[str, Tensor]) -> NerfField:
         return cls(model, space, restored_parameters(stored, shapes(model)))
 
     @property
-    def num_shifts(self) -> int:
+    def num_random_values(self) -> int:
         sizes = SIZES[self.model.sizes]
         return sizes.coarse + sizes.fine
 
-    def seen(self, rays: Rays, time: float, *, near: float, shifts: Tensor | None = None) -> Seen:
+    def seen(
+        self, rays: Rays, time: float, *, near: float, shifts: Tensor | None = None
+    ) -> RenderedRays:
         if shifts is None:
-            shifts = rays.origins.new_full((len(rays), self.num_shifts), 0.5)
+            shifts = rays.origins.new_full((len(rays), self.num_random_values), 0.5)
         num_coarse = SIZES[self.model.sizes].coarse
         distances = sample_evenly(rays, self.space, near, shifts[:, :num_coarse])
         coarse, weights = self._through("coarse", rays, distances, time)
-        distances = by_weights(distances, weights, shifts[:, num_coarse:])
+        distances = sample_by_weights(distances, weights, shifts[:, num_coarse:])
         fine, _ = self._through("fine", rays, distances, time)
         return replace(fine, num_samples=fine.num_samples + coarse.num_samples, coarse=coarse)
 
@@ -117,21 +119,21 @@ class NerfField(Field):
 
     def colours(self, points: Tensor, directions: Tensor, time: float) -> Tensor:
         outputs = self._outputs("fine", self.space.unit(points), time)
-        return self._colours("fine", outputs, encoded(directions, DIRECTION_OCTAVES))
+        return self._colours("fine", outputs, encode_frequencies(directions, DIRECTION_OCTAVES))
 
     def _through(
         self, network: str, rays: Rays, distances: Tensor, time: float
-    ) -> tuple[Seen, Tensor]:
+    ) -> tuple[RenderedRays, Tensor]:
         """Return what rays see at distances (R, K), ascending, and the weights (R, K) of these."""
-        samples = along(rays, self.space, distances)
+        samples = build_samples(rays, self.space, distances)
         outputs = self._outputs(network, samples.coords, time)
-        directions = encoded(rays.directions, DIRECTION_OCTAVES)[samples.rays]
+        directions = encode_frequencies(rays.directions, DIRECTION_OCTAVES)[samples.rays]
         colours = self._colours(network, outputs, directions)
         seen = composite(self._densities(outputs), colours, samples, 0.0)
         weights = seen.weights.view(distances.shape)
         # at the sample, as published; the last one has no middle
         depth = (weights * distances).sum(1)
-        return Seen(seen.colour, seen.transmittance, depth, len(samples)), weights
+        return RenderedRays(seen.colour, seen.transmittance, depth, len(samples)), weights
 
     def _layers(self, name: str, count: int) -> list[Layer]:
         own = self.parameters
@@ -140,7 +142,7 @@ class NerfField(Field):
     def _outputs(self, network: str, coords: Tensor, time: float) -> Tensor:
         """Return (M, 1 + width) raw densities and bottlenecks at ``coords`` of the unit cube."""
         # in the unit of the published scenes
-        places = encoded((coords - 0.5) * (2 * PUBLISHED_HALF), POSITION_OCTAVES)
+        places = encode_frequencies((coords - 0.5) * (2 * PUBLISHED_HALF), POSITION_OCTAVES)
         trunk = self._layers(f"{network}.trunk", DEPTH + 1)
         return perceptron(self.with_time(places, time), trunk, skip=SKIP)
 
@@ -154,7 +156,7 @@ class NerfField(Field):
 
 
 @torch.no_grad()
-def crossed(rays: Rays, space: Space, near: float) -> tuple[Tensor, Tensor]:
+def intersect_space(rays: Rays, space: Space, near: float) -> tuple[Tensor, Tensor]:
     """Return distances (R,) at which rays enter and leave the outermost cube, from ``near`` on;
     equal if they miss."""
     offsets = rays.origins - rays.origins.new_tensor(space.centre)
@@ -172,7 +174,7 @@ def sample_evenly(rays: Rays, space: Space, near: float, shifts: Tensor) -> Tens
     ``shifts`` (R, K) in [0, 1): where in its part each lies. Parts are equal in the distance; with
     surroundings in its inverse, so that what is far away gets few.
     """
-    begin, end = (x[:, None] for x in crossed(rays, space, near))
+    begin, end = (x[:, None] for x in intersect_space(rays, space, near))
     at = (torch.arange(shifts.shape[1], device=shifts.device) + shifts) / shifts.shape[1]
     if space.cascades == 1:
         return begin + (end - begin) * at
@@ -180,7 +182,7 @@ def sample_evenly(rays: Rays, space: Space, near: float, shifts: Tensor) -> Tens
 
 
 @torch.no_grad()
-def by_weights(distances: Tensor, weights: Tensor, shifts: Tensor) -> Tensor:
+def sample_by_weights(distances: Tensor, weights: Tensor, shifts: Tensor) -> Tensor:
     """Return (R, K + N) distances, ascending: those given (R, K), and N more where their weights
     (R, K) are.
 
@@ -202,7 +204,7 @@ def by_weights(distances: Tensor, weights: Tensor, shifts: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def along(rays: Rays, space: Space, distances: Tensor) -> Samples:
+def build_samples(rays: Rays, space: Space, distances: Tensor) -> Samples:
     """Return samples from each of the distances (R, K) to the next; coordinates are of their
     starts."""
     count, each = distances.shape

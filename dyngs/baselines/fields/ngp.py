@@ -23,8 +23,8 @@ from dyngs.baselines.fields.scene import (
     PUBLISHED_PIXELS,
     TIME,
     Field,
-    Seen,
-    network,
+    RenderedRays,
+    mlp,
     restored_parameters,
     truncated_exp,
 )
@@ -38,10 +38,10 @@ from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Updated
 from dyngs.models.volume import reached_samples, thinned_samples
-from dyngs.ops.device import sent
+from dyngs.ops.device import copy_async
 from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.hash_grid import HashLevels, hash_features, select_features
-from dyngs.ops.rays import Rays, Space, Steps, composite, march
+from dyngs.ops.rays import MarchSteps, Rays, Space, composite, march
 
 # Features of hidden layers, and of the density network's output, whose first is the density
 WIDTH, GEOMETRY = 64, 16
@@ -127,7 +127,7 @@ class NgpField(Field):
         return cls(model, space, parameters, pixels, occupied)
 
     @classmethod
-    def restored(cls, model: NgpModel, space: Space, stored: Mapping[str, Tensor]) -> NgpField:
+    def from_state(cls, model: NgpModel, space: Space, stored: Mapping[str, Tensor]) -> NgpField:
         pixels = int(require_tensor("pixels", stored["pixels"], (1,), torch.int64))
         parameters = restored_parameters(stored, shapes(model, space, pixels))
         count = math.prod(space.shape)
@@ -137,7 +137,7 @@ class NgpField(Field):
         return cls(model, space, parameters, pixels, occupied)
 
     @property
-    def num_shifts(self) -> int:
+    def num_random_values(self) -> int:
         return 2  # where the samples of a ray lie, and which of those that hardly show are taken
 
     def state(self) -> State:
@@ -150,7 +150,7 @@ class NgpField(Field):
 
     @cached_property
     def levels(self) -> HashLevels:
-        return levels_of(self.model, self.space, self.pixels)
+        return hash_levels(self.model, self.space, self.pixels)
 
     @cached_property
     def across(self) -> int:
@@ -163,8 +163,10 @@ class NgpField(Field):
         """Length of a sample, world units."""
         return 2 * self.space.half * math.sqrt(3) / self.across
 
-    def seen(self, rays: Rays, time: float, *, near: float, shifts: Tensor | None = None) -> Seen:
-        steps = Steps(near, self.step, CONE / self.across if self.space.cascades > 1 else 0.0)
+    def seen(
+        self, rays: Rays, time: float, *, near: float, shifts: Tensor | None = None
+    ) -> RenderedRays:
+        steps = MarchSteps(near, self.step, CONE / self.across if self.space.cascades > 1 else 0.0)
         places = rays.origins.new_full((len(rays), 2), 0.5) if shifts is None else shifts
         marched = march(rays, places[:, 0].contiguous(), self.space, self.occupied, steps)
         table = self.parameters["table"]
@@ -180,7 +182,7 @@ class NgpField(Field):
         basis = harmonics_basis(rays.directions, DIRECTION_DEGREE)
         colours = self._colours(geometry, basis[samples.rays])
         drawn = composite(self._density(geometry, samples.coords), colours, samples)
-        return Seen(drawn.colour, drawn.transmittance, drawn.depth, len(samples))
+        return RenderedRays(drawn.colour, drawn.transmittance, drawn.depth, len(samples))
 
     def densities(self, points: Tensor, time: float) -> Tensor:
         coords = self.space.unit(points)
@@ -202,7 +204,7 @@ class NgpField(Field):
         return hash_features(coords, self.parameters["table"], self.levels)
 
     def _network(self, x: Tensor, name: str) -> Tensor:
-        return network(x, [w for key, w in self.parameters.items() if key.startswith(name)])
+        return mlp(x, [w for key, w in self.parameters.items() if key.startswith(name)])
 
     def _geometry(self, features: Tensor, time: float) -> Tensor:
         return self._network(self.with_time(features, time), "density")
@@ -223,7 +225,7 @@ class NgpField(Field):
         return self._network(torch.cat([geometry, basis], 1), "colour").sigmoid()
 
 
-def levels_of(model: NgpModel, space: Space, pixels: int) -> HashLevels:
+def hash_levels(model: NgpModel, space: Space, pixels: int) -> HashLevels:
     """Return the levels of the hash grid for images with a longest side of ``pixels`` px."""
     sizes = SIZES[model.sizes]
     finest = min(max(64, round(FINEST * pixels * min(space.cascades, 2))), 4096)
@@ -239,7 +241,7 @@ def shapes(model: NgpModel, space: Space, pixels: int) -> dict[str, tuple[int, i
         "density": (inputs, WIDTH, GEOMETRY),
         "colour": (GEOMETRY + DIRECTION_TERMS, WIDTH, WIDTH, 3),
     }
-    found = {"table": (levels_of(model, space, pixels).num_rows, sizes.features)}
+    found = {"table": (hash_levels(model, space, pixels).num_rows, sizes.features)}
     for name, layers in widths.items():
         found |= {f"{name}.{i}": (out, n) for i, (n, out) in enumerate(pairwise(layers))}
     return found
@@ -389,7 +391,7 @@ class NgpTraining(FieldTraining):
 
     def _drawn(self, below: int, count: int) -> Tensor:
         drawn = torch.randint(below, (count,), generator=self._run.generator, device="cpu")
-        return sent(drawn, self._cells.device)
+        return copy_async(drawn, self._cells.device)
 
     def _opacities_of(self, cells: Tensor) -> Tensor:
         generator = self._run.generator
@@ -399,12 +401,14 @@ class NgpTraining(FieldTraining):
         y = torch.div(cells, n, rounding_mode="floor") % n
         z = torch.div(cells, n * n, rounding_mode="floor")
         half = space.half * 2.0 ** torch.div(z, n, rounding_mode="floor")
-        within = sent(torch.rand((len(cells), 3), generator=generator, device="cpu"), cells.device)
+        within = copy_async(
+            torch.rand((len(cells), 3), generator=generator, device="cpu"), cells.device
+        )
         places = torch.stack([x, y, z % n], 1) + within
         points = (places * (2 / n) - 1) * half[:, None] + within.new_tensor(space.centre)
-        times = self._scene.seen_at or (0.0,)
+        times = self._scene.training_times or (0.0,)
         which = 0
-        if self._scene.seen_at:
+        if self._scene.training_times:
             which = int(torch.randint(len(times), (1,), generator=generator, device="cpu"))
         return self._field.densities(points, times[which]) * (half * (2 * math.sqrt(3) / 1024))
 

@@ -65,14 +65,14 @@ F = TypeVar("F", bound="Field")
 
 
 @dataclass(frozen=True)
-class Seen:
+class RenderedRays:
     """What R rays see, before black."""
 
     colour: Tensor  # (R, 3)
     transmittance: Tensor  # (R,)
     depth: Tensor  # (R,) sum of weight times the distance along the ray
     num_samples: int  # that were taken
-    coarse: Seen | None = None  # by the coarse network, where there is one
+    coarse: RenderedRays | None = None  # by the coarse network, where there is one
 
 
 @dataclass(frozen=True)
@@ -101,17 +101,19 @@ class Field(ABC):
 
     @classmethod
     @abstractmethod
-    def restored(cls: type[F], model: Any, space: Space, stored: Mapping[str, Tensor]) -> F:
+    def from_state(cls: type[F], model: Any, space: Space, stored: Mapping[str, Tensor]) -> F:
         """Return the field in a state. Raises KeyError or ValueError where its tensors do not
         fit."""
 
     @property
     @abstractmethod
-    def num_shifts(self) -> int:
+    def num_random_values(self) -> int:
         """K: random numbers that a ray needs in training."""
 
     @abstractmethod
-    def seen(self, rays: Rays, time: float, *, near: float, shifts: Tensor | None = None) -> Seen:
+    def seen(
+        self, rays: Rays, time: float, *, near: float, shifts: Tensor | None = None
+    ) -> RenderedRays:
         """Return what rays see at ``time``; differentiable in the parameters.
 
         Args:
@@ -143,7 +145,7 @@ class Field(ABC):
         moves (T-NeRF)."""
         if not self.model.time:
             return x
-        when = encoded(x.new_full((1, 1), time), TIME_OCTAVES)
+        when = encode_frequencies(x.new_full((1, 1), time), TIME_OCTAVES)
         return torch.cat([x, when.expand(len(x), -1)], 1)
 
 
@@ -176,7 +178,7 @@ def truncated_exp(x: Tensor) -> Tensor:
     return result
 
 
-def encoded(x: Tensor, octaves: int) -> Tensor:
+def encode_frequencies(x: Tensor, octaves: int) -> Tensor:
     """Return (M, D (1 + 2 octaves)): x, then the sines and cosines of 2^k x of each octave k,
     without pi (NeRF)."""
     parts = [x]
@@ -185,7 +187,7 @@ def encoded(x: Tensor, octaves: int) -> Tensor:
     return torch.cat(parts, 1)
 
 
-def network(x: Tensor, weights: Sequence[Tensor]) -> Tensor:
+def mlp(x: Tensor, weights: Sequence[Tensor]) -> Tensor:
     """Return (M, out) outputs of a perceptron without biases."""
     return perceptron(x, [Layer(weight, weight.new_zeros(len(weight))) for weight in weights])
 
@@ -195,7 +197,7 @@ class FieldScene(Renderable):
     """A field; ``seen_at``: distinct training times in [0, 1], ascending, where it moves."""
 
     field: Field
-    seen_at: tuple[float, ...] = ()
+    training_times: tuple[float, ...] = ()
     options: DrawOptions = dataclasses.field(default_factory=DrawOptions)
     background: Tensor | None = None
     surface_options: ClassVar[frozenset[str]] = frozenset({"level", "cells"})
@@ -205,7 +207,7 @@ class FieldScene(Renderable):
 
     @property
     def times(self) -> tuple[float, ...]:
-        return self.seen_at
+        return self.training_times
 
     @property
     def is_static(self) -> bool:
@@ -225,8 +227,8 @@ class FieldScene(Renderable):
         space = self.field.space
         numbers = [*space.centre, space.half, space.cascades, space.cells]
         own = {"space": torch.tensor(numbers, dtype=torch.float64, device="cpu")}
-        if self.seen_at:
-            own["times"] = torch.tensor(self.seen_at, dtype=torch.float64, device="cpu")
+        if self.training_times:
+            own["times"] = torch.tensor(self.training_times, dtype=torch.float64, device="cpu")
         return prefixed("field", with_role(own, Role.SHARED) | self.field.state())
 
     def render(
@@ -274,7 +276,7 @@ def restore_scene(
     if not (half > 0 and cascades in range(1, 17) and cells in range(1, 1025)):
         raise ValueError(f"'space' is no space: {numbers}")
     space = Space((x, y, z), half, int(cascades), int(cells))
-    field = field_class.restored(model, space, stored)
+    field = field_class.from_state(model, space, stored)
     times = require_moments("times", stored["times"]).tolist() if "times" in stored else ()
     behind = evaluation_background(checkpoint.info.background, False)[1]
     return FieldScene(field, tuple(times), DrawOptions(near=NEAR * half), behind)

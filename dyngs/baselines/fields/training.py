@@ -22,7 +22,7 @@ from dyngs.models.renderable import DrawOptions, Rendering
 from dyngs.models.views import evaluation_background, training_times
 from dyngs.models.volume import rays_of
 from dyngs.ops.adam import seen_rows
-from dyngs.ops.device import sent
+from dyngs.ops.device import copy_async
 
 
 class ColourLoss(Loss):
@@ -115,11 +115,13 @@ class FieldTraining(Model[FieldScene]):
         camera = image.cameras.to(device=device)
         count = camera.width * camera.height
         pixels = torch.randint(count, (self.num_rays,), generator=generator, device="cpu")
-        shifts = torch.rand((len(pixels), field.num_shifts), generator=generator, device="cpu")
-        pixels = sent(pixels, device)
+        shifts = torch.rand(
+            (len(pixels), field.num_random_values), generator=generator, device="cpu"
+        )
+        pixels = copy_async(pixels, device)
         rays, z = rays_of(camera, pixels)
         near = self._scene.options.near
-        seen = field.seen(rays, image.time or 0.0, near=near, shifts=sent(shifts, device))
+        seen = field.seen(rays, image.time or 0.0, near=near, shifts=copy_async(shifts, device))
         self.count(len(rays), seen.num_samples)
         part = part_of(image, pixels)
         rgb = seen.colour + seen.transmittance[:, None] * background
@@ -152,7 +154,7 @@ class FieldTraining(Model[FieldScene]):
     def restore(self, checkpoint: Checkpoint) -> None:
         self._learn(restore_scene(type(self._scene.field), self._model, checkpoint))
         parameters = self._scene.field.parameters
-        self._adam = AdamState.restored(checkpoint.part("adam"), parameters)
+        self._adam = AdamState.from_state(checkpoint.part("adam"), parameters)
 
     def place(self, device: torch.device) -> None:
         self._learn(self._scene.to(device))

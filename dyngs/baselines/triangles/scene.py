@@ -87,10 +87,12 @@ class Patches:
         """Return (N, 3) colours without harmonics of places (N, 2) on triangles (N,) int32."""
         return patch_values(self.colours, ids, uv, self.texture)
 
-    def textured(self, segments: int) -> Patches:
+    def with_texture(self, segments: int) -> Patches:
         """Return them with the colours at the points of a lattice."""
         places, _ = lattice(segments)
-        return replace(self, colours=evaluated(self.colours.detach(), places), texture=segments)
+        return replace(
+            self, colours=evaluate_patches(self.colours.detach(), places), texture=segments
+        )
 
     def state(self) -> State:
         own = {name: x.detach() for name, x in self.tensors.items()}
@@ -98,7 +100,7 @@ class Patches:
         return with_role(own, Role.SHARED)
 
     @staticmethod
-    def restored(stored: Mapping[str, Tensor]) -> Patches:
+    def from_state(stored: Mapping[str, Tensor]) -> Patches:
         """Return the triangles in a state. Raises KeyError or ValueError where its tensors do not
         fit."""
         texture = int(require_indices("texture", stored["texture"], (1,), MOST_TEXTURE + 1))
@@ -116,7 +118,7 @@ class Patches:
         return Patches(points.clone(), colours.clone(), harmonics.clone(), texture)
 
 
-def evaluated(values: Tensor, places: Tensor) -> Tensor:
+def evaluate_patches(values: Tensor, places: Tensor) -> Tensor:
     """Return (P, N, C): quadratic ``values`` (P, 6, C) of every triangle at the same ``places`` (N,
     2)."""
     count = len(values)
@@ -125,7 +127,7 @@ def evaluated(values: Tensor, places: Tensor) -> Tensor:
     return patch_values(values, ids, uv).view(count, len(places), values.shape[2])
 
 
-def quarters(values: Tensor) -> Tensor:
+def subdivide(values: Tensor) -> Tensor:
     """Return (4 P, 6, C): quadratic ``values`` (P, 6, C) on the parts that middles of edges cut a
     triangle into."""
     places, faces = lattice(2)
@@ -133,7 +135,7 @@ def quarters(values: Tensor) -> Tensor:
     middles = torch.stack(
         [(corners[:, i] + corners[:, j]) / 2 for i, j in ((0, 1), (0, 2), (1, 2))], 1
     )
-    at = evaluated(values, torch.cat([corners, middles], 1).flatten(0, 1)).view(
+    at = evaluate_patches(values, torch.cat([corners, middles], 1).flatten(0, 1)).view(
         -1, 6, values.shape[2]
     )
     parts = torch.empty_like(at)
@@ -185,7 +187,7 @@ class TriangleScene(Renderable):
         patches = self.patches
         count = options.segments or max(SEGMENTS, patches.texture)
         places, faces = lattice(count)
-        vertices = evaluated(patches.points, places)
+        vertices = evaluate_patches(patches.points, places)
         ids = torch.arange(len(patches), dtype=torch.int32, device="cpu").repeat_interleave(
             len(places)
         )
@@ -299,4 +301,4 @@ def restore_scene(model: BgTriangleModel, checkpoint: Checkpoint) -> TriangleSce
     unit = require_tensor("unit", stored["unit"], (1,), torch.float64)
     half = float(require_positive("unit", unit))
     behind = evaluation_background(checkpoint.info.background, False)[1]
-    return TriangleScene(Patches.restored(stored), half, scene_options(model, half), behind)
+    return TriangleScene(Patches.from_state(stored), half, scene_options(model, half), behind)

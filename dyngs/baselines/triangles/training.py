@@ -17,11 +17,11 @@ from dyngs.baselines.triangles.scene import (
     Patches,
     TriangleOptions,
     TriangleScene,
-    evaluated,
+    evaluate_patches,
     flat_triangles,
-    quarters,
     restore_scene,
     scene_options,
+    subdivide,
 )
 from dyngs.config import DefaultStrategy, ShColour
 from dyngs.config.kinds import section_of_kind
@@ -33,17 +33,23 @@ from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.training import ColourTraining
-from dyngs.gaussians.model import GaussianModel, SceneTraining
-from dyngs.gaussians.optimizer import AdamState
 from dyngs.gaussians.initialization import (
     InitialValues,
     build_densifier,
-    load_or_create_gaussians,
     initial_gaussians,
-    surroundings,
+    load_or_create_gaussians,
+    scene_geometry,
 )
+from dyngs.gaussians.model import GaussianModel, SceneTraining
+from dyngs.gaussians.optimizer import AdamState
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.gaussians.surface import colours_of, fused, opaque_box, seen_by, simplify_mesh
+from dyngs.gaussians.surface import (
+    fuse_depths,
+    opaque_box,
+    render_depth_view,
+    sample_colours,
+    simplify_mesh,
+)
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.model import Drawn, Model, Updated
@@ -65,7 +71,9 @@ SURFACE_CELLS = 128  # Along the scene, at most; no more than pixels along an im
 def _at_points(run: RunStart, model: BgTriangleModel) -> tuple[Patches, float]:
     """Return triangles turned at random, and half the side of the scene."""
     values = InitialValues(max_gaussians=min(NUM_FIRST, model.max_triangles))
-    first = initial_gaussians(surroundings(run.capture), run.config.init, values, 0, run.generator)
+    first = initial_gaussians(
+        scene_geometry(run.capture), run.config.init, values, 0, run.generator
+    )
     ends = first.means.quantile(torch.tensor([INNER, 1 - INNER], device="cpu"), dim=0)
     unit = float((ends[1] - ends[0]).max()) / 2
     if not unit > 0:
@@ -100,10 +108,10 @@ def _on_surface(run: RunStart, model: BgTriangleModel) -> tuple[Patches, float]:
         for index in evenly_spaced(len(run.images), VIEWS):
             image = _shrunk(run.images[index])
             own = image.composite(torch.zeros(3, device="cpu"))
-            seen.append(replace(seen_by(scene, image.cameras), colour=own))
+            seen.append(replace(render_depth_view(scene, image.cameras), colour=own))
     low, high = opaque_box(scene.gaussians)
     cells = min(SURFACE_CELLS, max(max(one.depth.shape) for one in seen))
-    mesh = fused(seen, low, high, cells)
+    mesh = fuse_depths(seen, low, high, cells)
     mesh = None if mesh is None else simplify_mesh(mesh, min(NUM_FIRST, model.max_triangles))
     if mesh is None or len(mesh.faces) == 0:
         raise DyngsError(
@@ -112,7 +120,7 @@ def _on_surface(run: RunStart, model: BgTriangleModel) -> tuple[Patches, float]:
         )
     vertices = torch.from_numpy(mesh.vertices).float()
     faces = torch.from_numpy(mesh.faces)
-    colours = colours_of(seen, vertices, 2 * float((high - low).max()) / cells)
+    colours = sample_colours(seen, vertices, 2 * float((high - low).max()) / cells)
     corners = vertices[faces]
     ends = corners.flatten(0, 1)
     unit = float((ends.amax(0) - ends.amin(0)).max()) / 2
@@ -192,7 +200,7 @@ class TriangleStatistics:
         self.seen += (shown > 0).to(self.seen)
         scale = places.rows.shape[1] // slopes.shape[0]
         fine = interpolate(slopes[None, None], scale_factor=scale)[0, 0] / scale**2
-        inside = fine[places.rows[0] >= 0] * ~outlines(places)
+        inside = fine[places.rows[0] >= 0] * ~near_outline(places)
         self.edges += torch.bincount(ids, weights=inside.double(), minlength=size).to(self.edges)
         u, v = (places.uv * (CELLS - 1)).long().clamp(0, CELLS - 1).unbind(1)
         cell = (ids * CELLS + u) * CELLS + v
@@ -204,7 +212,7 @@ class TriangleStatistics:
         return with_role(self.tensors(), Role.TRAINING)
 
     @staticmethod
-    def restored(stored: Mapping[str, Tensor], count: int) -> TriangleStatistics:
+    def from_state(stored: Mapping[str, Tensor], count: int) -> TriangleStatistics:
         """Return the tallies of ``count`` triangles in a state. Raises KeyError or ValueError."""
         found = TriangleStatistics(count)
         for name, x in found.tensors().items():
@@ -224,7 +232,7 @@ def max_pixels(scene: TriangleScene, cameras: Iterable[Cameras]) -> Tensor:
     return most
 
 
-def outlines(places: PatchSamples) -> Tensor:
+def near_outline(places: PatchSamples) -> Tensor:
     """Return (N,) bool: which places lie within two drawn pixels of an outline, see
     ``blend_patches``."""
     rows = places.rows[0]
@@ -263,11 +271,11 @@ def patch_areas(points: Tensor) -> Tensor:
     """Return (P,) areas of the four flat triangles between corners and middles of the edges, world
     units squared."""
     places, faces = lattice(2)
-    a, b, c = evaluated(points, places)[:, faces].unbind(2)
+    a, b, c = evaluate_patches(points, places)[:, faces].unbind(2)
     return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=-1).sum(1)
 
 
-def useless(points: Tensor, tallies: TriangleStatistics, unit: float) -> Tensor:
+def prunable(points: Tensor, tallies: TriangleStatistics, unit: float) -> Tensor:
     """Return (P,) bool: rarely seen, tiny, needles, mostly hidden, or seen only as slivers between
     others."""
     corners = points[:, CORNERS]
@@ -282,7 +290,7 @@ def useless(points: Tensor, tallies: TriangleStatistics, unit: float) -> Tensor:
     )
 
 
-def change(
+def densify(
     patches: Patches, tallies: TriangleStatistics, unit: float, most: int, rounds: int
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return (K,) the rows that stay, and the rows of each learned tensor that come after them.
@@ -297,7 +305,7 @@ def change(
         rounds: how often triangles are split from now on, this time included.
     """
     points = patches.points.detach()
-    gone = useless(points, tallies, unit)
+    gone = prunable(points, tallies, unit)
     if bool(gone.all()):
         gone = torch.zeros_like(gone)
     left = int((~gone).sum())
@@ -310,11 +318,11 @@ def change(
     score = torch.where(may, gain, -1.0)
     chosen = score.sort(descending=True, stable=True).indices[:count].sort().values
     gone[chosen] = True
-    parts = quarters(points[chosen])
+    parts = subdivide(points[chosen])
     middles = parts.mean(1, keepdim=True)
     added = {
         "points": middles + ENLARGED * (parts - middles),
-        "colours": quarters(patches.colours.detach()[chosen]),
+        "colours": subdivide(patches.colours.detach()[chosen]),
         "harmonics": patches.harmonics.detach()[chosen].repeat_interleave(4, 0),
     }
     return (~gone).nonzero()[:, 0], added
@@ -444,7 +452,7 @@ class TriangleTraining(Model[TriangleScene]):
     def _texture(self) -> None:
         """Learn textures from now on, with the moments of what stays as it is."""
         before = self._adam
-        self._begin(self._scene.patches.textured(self._model.texture))
+        self._begin(self._scene.patches.with_texture(self._model.texture))
         for name in ("points", "harmonics"):
             self._adam.exp_avg[name] = before.exp_avg[name]
             self._adam.exp_avg_sq[name] = before.exp_avg_sq[name]
@@ -467,7 +475,7 @@ class TriangleTraining(Model[TriangleScene]):
     def _change(self, most: int, rounds: int) -> None:
         """Remove and split; see ``change``."""
         scene = self._scene
-        self._exchange(*change(scene.patches, self._tallies, scene.unit, most, rounds))
+        self._exchange(*densify(scene.patches, self._tallies, scene.unit, most, rounds))
 
     def _exchange(self, kept: Tensor, added: Mapping[str, Tensor]) -> None:
         """Keep the rows ``kept`` (K,), and add others, whose moments are 0."""
@@ -491,8 +499,8 @@ class TriangleTraining(Model[TriangleScene]):
         self._scene = restore_scene(self._model, checkpoint)
         patches = self._scene.patches
         self._learn(patches)
-        self._adam = AdamState.restored(checkpoint.part("adam"), patches.tensors)
-        self._tallies = TriangleStatistics.restored(checkpoint.part("tallies"), len(patches))
+        self._adam = AdamState.from_state(checkpoint.part("adam"), patches.tensors)
+        self._tallies = TriangleStatistics.from_state(checkpoint.part("tallies"), len(patches))
 
     def place(self, device: torch.device) -> None:
         if device.type != "cpu":

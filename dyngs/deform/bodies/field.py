@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dyngs.core.state import Role, State, StateTensor, fields_moved_to, part_of, prefixed
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
-from dyngs.deform.field import DeformationField, Offsets, OuterField, chosen
+from dyngs.deform.field import DeformationField, Offsets, OuterField, select_rows
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.harmonics import dim_harmonics, light_harmonics
@@ -82,7 +82,7 @@ class BodyField(OuterField):
     """
 
     def __init__(
-        self, others: DeformationField, rest: BodyRestPose, learned: Mapping[str, Tensor]
+        self, inner_field: DeformationField, rest: BodyRestPose, learned: Mapping[str, Tensor]
     ) -> None:
         """Take the control points ``places`` (B, P, 3) and ``quats`` (B, P, 4) of the bodies'
         splines, and others.
@@ -90,7 +90,7 @@ class BodyField(OuterField):
         These may be missing: ``albedo`` (M, 3), in units of the harmonic of degree 0; ``light`` (8,
         3); ``sun`` (3,) and ``shade`` (4,), see ``light_left``.
         """
-        super().__init__(others)
+        super().__init__(inner_field)
         self.rest = rest
         like = rest.centers
         blank = {"albedo": like.new_zeros(len(rest.labels), 3), "light": like.new_zeros(8, 3)}
@@ -111,8 +111,8 @@ class BodyField(OuterField):
         return motion[:, :3], quats
 
     def changed(self, found: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
-        labels = chosen(self.rest.labels, rows)
-        means = chosen(means, rows)
+        labels = select_rows(self.rest.labels, rows)
+        means = select_rows(means, rows)
         own = torch.nonzero(labels >= 0)[:, 0]
         body = labels[own]
         places, quats = (x.index_select(0, body) for x in self.poses(time))
@@ -120,7 +120,7 @@ class BodyField(OuterField):
         arms = rotate(quats, means[own] - self.rest.centers[body])
         moved = arms + places - means[own]
         facing = torch.nn.functional.normalize(arms.detach(), dim=1)
-        lit = (light_harmonics(facing) @ self.parameters["light"]) * chosen(
+        lit = (light_harmonics(facing) @ self.parameters["light"]) * select_rows(
             self.parameters["albedo"], rows
         )[own]
         turned = found.quats if found.quats is not None else means.new_zeros(len(means), 4)
@@ -135,10 +135,10 @@ class BodyField(OuterField):
             ),
         )
 
-    def shaded(
+    def apply_shading(
         self, gaussians: Gaussians, rows: Tensor | None, which: Tensor | None, time: float
     ) -> Gaussians:
-        labels = chosen(self.rest.labels, which)
+        labels = select_rows(self.rest.labels, which)
         if rows is not None:
             labels = labels.new_full((len(gaussians),), -1).index_copy(0, rows, labels)
         means = gaussians.means.detach()
@@ -147,7 +147,7 @@ class BodyField(OuterField):
         with torch.no_grad():
             left = light_fraction(means, labels, *balls)
         few = light_fraction(means[::TEACHES], labels[::TEACHES], *balls)
-        return super().shaded(
+        return super().apply_shading(
             gaussians.replace(sh=dim_harmonics(gaussians.sh, left, few, TEACHES)), rows, which, time
         )
 
@@ -160,24 +160,26 @@ class BodyField(OuterField):
             if points.grad is not None and window != (0.0, 1.0):
                 points.grad[:, :first], points.grad[:, last + 1 :] = 0, 0
 
-    def edited(self, edit: TopologyEdit) -> BodyField:
-        field = super().edited(edit)
+    def apply_edit(self, edit: TopologyEdit) -> BodyField:
+        field = super().apply_edit(edit)
         field.rest = replace(self.rest, labels=self.rest.labels[edit.source])
-        return field.with_parameters(self.parameters.edited(Role.PER_MOVING, edit))
+        return field.with_parameters(self.parameters.apply_edit(Role.PER_MOVING, edit))
 
     def state(self) -> State:
         rest = {name: StateTensor(x, Role.SHARED) for name, x in vars(self.rest).items()}
         rest["labels"] = StateTensor(self.rest.labels, Role.PER_MOVING)
-        return self.others.state() | prefixed("bodies", rest | super().state())
+        return self.inner_field.state() | prefixed("bodies", rest | super().state())
 
     @staticmethod
-    def stored(others: DeformationField, tensors: Mapping[str, Tensor]) -> BodyField:
+    def from_state(inner_field: DeformationField, tensors: Mapping[str, Tensor]) -> BodyField:
         """Return the field of a state within the restored ``others``; raises as ``restored``."""
         centers = require_tensor("centers", tensors["centers"], (None, 3))
         radii = require_positive(
             "radii", require_tensor("radii", tensors["radii"], (len(centers),))
         )
-        labels = require_tensor("labels", tensors["labels"], (others.setup.num_moving,), torch.long)
+        labels = require_tensor(
+            "labels", tensors["labels"], (inner_field.setup.num_moving,), torch.long
+        )
         require_indices("labels", labels + 1, (len(labels),), len(centers) + 1)
         learned = part_of(tensors, "learned")
         points = learned["places"].shape[1] if learned["places"].ndim == 3 else 0
@@ -187,8 +189,8 @@ class BodyField(OuterField):
             name: centers.new_zeros(len(centers), points, size)
             for name, size in (("places", 3), ("quats", 4))
         }
-        field = BodyField(others, BodyRestPose(centers, radii, labels), like)
-        field.parameters = field.parameters.restored(learned)
+        field = BodyField(inner_field, BodyRestPose(centers, radii, labels), like)
+        field.parameters = field.parameters.with_state(learned)
         return field
 
     def to(self, device: torch.device | str) -> BodyField:
@@ -200,5 +202,5 @@ class BodyField(OuterField):
 def find_body_field(field: DeformationField | None) -> BodyField | None:
     """Return the field of bodies among ``field`` and those within it; None where there is none."""
     while isinstance(field, OuterField) and not isinstance(field, BodyField):
-        field = field.others
+        field = field.inner_field
     return field if isinstance(field, BodyField) else None

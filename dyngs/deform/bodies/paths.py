@@ -41,7 +41,7 @@ class FrameStack:
 
     times: np.ndarray  # (T,) ascending, in [0, 1]
     images: np.ndarray  # (T, H, W, 3) float32
-    still: np.ndarray  # (T, H, W, 3) float32, as the static model has them
+    static: np.ndarray  # (T, H, W, 3) float32, as the static model has them
     alphas: np.ndarray  # (T, H, W) of the images; of the static model where they have none
     static_alphas: np.ndarray  # (T, H, W) of the static model
     depths: np.ndarray  # (T, H, W) of the static model, ``NEVER`` where it is not solid
@@ -67,7 +67,7 @@ class FrameStack:
         """(T,) pixels."""
         return self.intrinsics[:, 0, 0]
 
-    def projected(self, which: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def project(self, which: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (n, 2) pixels and (n,) depths of ``points`` (n, 3) in the images ``which``
         (n,)."""
         seen = np.einsum("nij,nj->ni", self.poses[which, :3, :3], points) + self.poses[which, :3, 3]
@@ -91,8 +91,10 @@ class FrameStack:
 
         In colour or in alpha. What is darker alike in all channels may be a shadow and counts less.
         """
-        weight = np.where(detect_shadows(self.images, self.still), np.float32(SHADE), np.float32(1))
-        colors = np.clip(_apart(self.images, self.still) / TOLERANCE, 0, 1) * weight
+        weight = np.where(
+            detect_shadows(self.images, self.static), np.float32(SHADE), np.float32(1)
+        )
+        colors = np.clip(_apart(self.images, self.static) / TOLERANCE, 0, 1) * weight
         outlines = _apart(self.alphas[..., None], self.static_alphas[..., None]) / ALPHA_TOLERANCE
         return np.maximum(colors, np.clip(outlines, 0, 1))
 
@@ -104,7 +106,7 @@ class FrameStack:
 
         Not those that the static model hides. Args: ``reach``: of the disc looked at, in radii.
         """
-        (pixel,), (depth,) = self.projected(np.array([index]), center[None])
+        (pixel,), (depth,) = self.project(np.array([index]), center[None])
         around = radius * self.focal[index] / depth + 1
         low = np.clip(np.floor(pixel - around), 0, self.size[::-1]).astype(int)
         high = np.clip(np.ceil(pixel + around) + 1, 0, self.size[::-1]).astype(int)
@@ -148,7 +150,7 @@ def one_camera(views: Sequence[View]) -> list[int] | None:
 @torch.no_grad()
 def render_frame_stack(
     images: Iterable[Image],
-    still: Gaussians,
+    static: Gaussians,
     options: RenderOptions,
     background: Tensor,
     shader_at: Callable[[float], Shader | None] = lambda _: None,
@@ -164,7 +166,7 @@ def render_frame_stack(
         size = max(image.cameras.width, image.cameras.height)
         small = image.shrunk(math.ceil(size / LONGEST_SIDE))
         shader = shader_at(image.time or 0.0)
-        drawn = render(still, small.cameras, options, background=background, shader=shader)
+        drawn = render(static, small.cameras, options, background=background, shader=shader)
         assert drawn.depth is not None
         alpha = drawn.alpha.reshape(small.cameras.height, small.cameras.width)
         depth = torch.where(alpha > SOLID, drawn.depth.reshape(alpha.shape), NEVER)
@@ -175,10 +177,10 @@ def render_frame_stack(
             own_alpha = torch.where(small.mask > 0, own_alpha, alpha)
         shown = {
             "images": rgb,
-            "still": drawn.rgb[0],
+            "static": drawn.rgb[0],
             "depths": depth,
             "alphas": own_alpha,
-            "still_alphas": alpha,
+            "static_alphas": alpha,
         }
         camera = {
             "poses": small.cameras.cam_from_world[0].double(),
@@ -286,63 +288,69 @@ class Discs:
         return np.stack([x[best] + 0.5, y[best] + 0.5, self.radii[k[best]]], axis=1)
 
 
-def find_paths(shots: FrameStack, maps: np.ndarray) -> list[Path]:
+def find_paths(frame_stack: FrameStack, maps: np.ndarray) -> list[Path]:
     """Return paths that things may move along where ``maps`` (T, H, W) are marked, the most likely
     first.
 
     No two are of the same thing at the same size; which are things is for their turning to tell.
     """
-    if len(shots) <= 2 * HALF:
+    if len(frame_stack) <= 2 * HALF:
         return []
     discs = Discs(maps)
-    chains = _chains(_straight_pieces(shots, discs, np.random.default_rng(0)), len(shots))
+    chains = _chains(
+        _straight_pieces(frame_stack, discs, np.random.default_rng(0)), len(frame_stack)
+    )
     followed = [
         path
-        for path in (_followed(shots, discs, chain) for chain in chains)
+        for path in (_followed(frame_stack, discs, chain) for chain in chains)
         if path.support > LEAST_SUPPORT
     ]
     found: list[Path] = []
-    for path in sorted(followed, key=lambda path: _unsteadiness(shots, discs, path) - path.support):
+    for path in sorted(
+        followed, key=lambda path: _unsteadiness(frame_stack, discs, path) - path.support
+    ):
         if not any(path.is_like(other) for other in found):
             found.append(path)
     return found
 
 
-def clear_path_(maps: np.ndarray, shots: FrameStack, path: Path) -> None:
+def clear_path_(maps: np.ndarray, frame_stack: FrameStack, path: Path) -> None:
     """Set ``maps`` (T, H, W) to 0 where the thing on ``path`` is seen, and a little around it."""
     for i, center in enumerate(path.centers):
-        rows, columns, _ = shots.ball_pixels(i, center, 1.2 * path.radius, 1.0)
+        rows, columns, _ = frame_stack.ball_pixels(i, center, 1.2 * path.radius, 1.0)
         maps[i, rows, columns] = 0
 
 
 def _colors(
-    shots: FrameStack, which: np.ndarray, centers: np.ndarray, radius: np.ndarray
+    frame_stack: FrameStack, which: np.ndarray, centers: np.ndarray, radius: np.ndarray
 ) -> np.ndarray:
     """Return the (n, 3) mean colours in the middle of balls with ``centers`` (n, 3) in the images
     ``which`` (n,)."""
-    height, width = shots.size
-    pixels, depths = shots.projected(which, centers)
+    height, width = frame_stack.size
+    pixels, depths = frame_stack.project(which, centers)
     grid = np.array([-0.5, 0.0, 0.5])
     around = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
-    found = pixels[:, None] + around * (radius * shots.focal[which] / depths)[:, None, None]
+    found = pixels[:, None] + around * (radius * frame_stack.focal[which] / depths)[:, None, None]
     x, y = np.moveaxis(np.clip(found, 0, np.array([width, height]) - 1).astype(int), -1, 0)
-    return shots.images[which[:, None], y, x].mean(1)
+    return frame_stack.images[which[:, None], y, x].mean(1)
 
 
-def _unsteadiness(shots: FrameStack, discs: Discs, path: Path) -> float:
+def _unsteadiness(frame_stack: FrameStack, discs: Discs, path: Path) -> float:
     """Return the standard deviation of a path's colours over time: that of what goes on as another
     thing is large."""
-    which = np.nonzero(_contrast(shots, discs, path.centers, path.radius) > LEAST_PEAK)[0]
+    which = np.nonzero(_contrast(frame_stack, discs, path.centers, path.radius) > LEAST_PEAK)[0]
     if len(which) < 2:
         return 0.0
-    colors = _colors(shots, which, path.centers[which], np.full(len(which), path.radius))
+    colors = _colors(frame_stack, which, path.centers[which], np.full(len(which), path.radius))
     return float(np.linalg.norm(colors.std(axis=0)))
 
 
-def _contrast(shots: FrameStack, discs: Discs, centers: np.ndarray, radius: float) -> np.ndarray:
-    which = np.arange(len(shots))
-    pixels, depths = shots.projected(which, centers)
-    return discs.at(which, pixels, radius * shots.focal / depths)
+def _contrast(
+    frame_stack: FrameStack, discs: Discs, centers: np.ndarray, radius: float
+) -> np.ndarray:
+    which = np.arange(len(frame_stack))
+    pixels, depths = frame_stack.project(which, centers)
+    return discs.at(which, pixels, radius * frame_stack.focal / depths)
 
 
 @dataclass(frozen=True)
@@ -367,26 +375,28 @@ class Start:
     last: int
 
 
-def _straight_pieces(shots: FrameStack, discs: Discs, random: np.random.Generator) -> list[Pieces]:
+def _straight_pieces(
+    frame_stack: FrameStack, discs: Discs, random: np.random.Generator
+) -> list[Pieces]:
     """Return straight paths through the most marked discs, around every other image."""
-    peaks = [discs.peaks(i) for i in range(len(shots))]
+    peaks = [discs.peaks(i) for i in range(len(frame_stack))]
     found = []
     counts = np.array([len(one) for one in peaks])
     table = np.stack([np.resize(one, (PEAKS, 3)) for one in peaks])
-    for middle in range(HALF, len(shots) - HALF, 2):
+    for middle in range(HALF, len(frame_stack) - HALF, 2):
         near = [t for t in range(middle - HALF, middle + HALF + 1) if counts[t]]
         if len(near) < 3:
             continue
         which = random.permuted(np.tile(near, (TRIPLES, 1)), axis=1)[:, :3]
         picked = table[which, random.integers(0, counts[which])]
-        centers, steps, radii = _through(shots, which, middle, picked)
+        centers, steps, radii = _through(frame_stack, which, middle, picked)
         values = []
         for t in range(middle - HALF, middle + HALF + 1):
-            pixels, depths = shots.projected(
+            pixels, depths = frame_stack.project(
                 np.full(len(centers), t), centers + (t - middle) * steps
             )
             values.append(
-                discs.at(np.full(len(centers), t), pixels, radii * shots.focal[t] / depths)
+                discs.at(np.full(len(centers), t), pixels, radii * frame_stack.focal[t] / depths)
             )
         scores = np.sort(np.array(values), axis=0)[1:].mean(0)
         kept = []
@@ -399,7 +409,7 @@ def _straight_pieces(shots: FrameStack, discs: Discs, random: np.random.Generato
             scores, centers, steps, radii = (x[kept] for x in (scores, centers, steps, radii))
             times = np.arange(middle - HALF, middle + HALF + 1)
             shown = [
-                _colors(shots, np.full(len(kept), t), centers + (t - middle) * steps, radii)
+                _colors(frame_stack, np.full(len(kept), t), centers + (t - middle) * steps, radii)
                 for t in times
             ]
             found.append(Pieces(middle, scores, centers, steps, radii, np.mean(shown, axis=0)))
@@ -484,17 +494,17 @@ def _parting(first: Pieces, later: Pieces) -> np.ndarray:
 
 
 def _through(
-    shots: FrameStack, which: np.ndarray, middle: int, picked: np.ndarray
+    frame_stack: FrameStack, which: np.ndarray, middle: int, picked: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return centres (n, 3), steps (n, 3) and radii (n,) of paths through three discs each, where
     these agree."""
     count = len(which)
     flat = which.ravel()
-    ways = shots.rays(flat, picked[..., :2].reshape(-1, 2))
+    ways = frame_stack.rays(flat, picked[..., :2].reshape(-1, 2))
     across = np.eye(3) - ways[:, :, None] * ways[:, None]
     later = (which - middle).astype(float)
     across = across.reshape(count, 3, 3, 3)
-    seen = np.einsum("ntij,ntj->nti", across, shots.centers[flat].reshape(count, 3, 3))
+    seen = np.einsum("ntij,ntj->nti", across, frame_stack.centers[flat].reshape(count, 3, 3))
     blocks = [
         [np.einsum("nt,ntij->nij", later ** (a + b), across) for b in range(2)] for a in range(2)
     ]
@@ -505,9 +515,9 @@ def _through(
     centers = solved[:, :3]
     steps = solved[:, 3:]
     places = (centers[:, None] + later[..., None] * steps[:, None]).reshape(-1, 3)
-    pixels, depths = shots.projected(flat, places)
+    pixels, depths = frame_stack.project(flat, places)
     misses = np.linalg.norm(pixels.reshape(count, 3, 2) - picked[..., :2], axis=-1).max(1)
-    sizes = np.log(picked[..., 2] * (depths / shots.focal[flat]).reshape(count, 3))
+    sizes = np.log(picked[..., 2] * (depths / frame_stack.focal[flat]).reshape(count, 3))
     radii = np.exp(sizes.mean(1))
     agree = (misses < 0.35 * picked[..., 2].min(1)) & (np.ptp(sizes, axis=1) < 1)
     agree &= (depths.reshape(count, 3) > 1e-3).all(1) & (
@@ -516,20 +526,22 @@ def _through(
     return centers[agree], steps[agree], radii[agree]
 
 
-def _followed(shots: FrameStack, discs: Discs, start: Start) -> Path:
+def _followed(frame_stack: FrameStack, discs: Discs, start: Start) -> Path:
     """Return the smooth path through all images of the ball that begins as ``start`` says.
 
     Followed outwards from there image by image, then looked for in all images at once.
     """
-    count = len(shots)
+    count = len(frame_stack)
     radius = start.radius
     centers = start.centers
     ways = np.zeros((count, 3))
     weights = np.zeros(count)
 
     def looked(which: np.ndarray, reach: float) -> np.ndarray:
-        ways[which], weights[which] = _sighted(shots, discs, which, centers[which], radius, reach)
-        return _smooth(shots, ways, weights, radius)
+        ways[which], weights[which] = _sighted(
+            frame_stack, discs, which, centers[which], radius, reach
+        )
+        return _smooth(frame_stack, ways, weights, radius)
 
     low = start.first
     high = start.last
@@ -544,13 +556,17 @@ def _followed(shots: FrameStack, discs: Discs, start: Start) -> Path:
         if turn % 2:
             sizes = radius * np.geomspace(0.8, 1.25, 9)
             radius = float(
-                sizes[np.argmax([_contrast(shots, discs, centers, size).mean() for size in sizes])]
+                sizes[
+                    np.argmax(
+                        [_contrast(frame_stack, discs, centers, size).mean() for size in sizes]
+                    )
+                ]
             )
-    return Path(centers, radius, float(_contrast(shots, discs, centers, radius).mean()))
+    return Path(centers, radius, float(_contrast(frame_stack, discs, centers, radius).mean()))
 
 
 def _sighted(
-    shots: FrameStack,
+    frame_stack: FrameStack,
     discs: Discs,
     which: np.ndarray,
     centers: np.ndarray,
@@ -559,19 +575,21 @@ def _sighted(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return in ``which`` (n,) images (n, 3) directions and (n,) weights of discs up to ``reach``
     radii from balls."""
-    pixels, depths = shots.projected(which, centers)
-    sizes = radius * shots.focal[which] / depths
+    pixels, depths = frame_stack.project(which, centers)
+    sizes = radius * frame_stack.focal[which] / depths
     side = np.linspace(-1, 1, 2 * LOOKS + 1)
     grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     looked = pixels[:, None] + grid * np.maximum(1.0, reach * sizes)[:, None, None]
     images, radii = (np.repeat(x, len(grid)) for x in (which, sizes))
     values = discs.at(images, looked.reshape(-1, 2), radii).reshape(len(which), -1)
     best = (values - 0.15 * (grid**2).sum(1)).argmax(1)[:, None]
-    ways = shots.rays(which, np.take_along_axis(looked, best[..., None], 1)[:, 0])
+    ways = frame_stack.rays(which, np.take_along_axis(looked, best[..., None], 1)[:, 0])
     return ways, np.maximum(np.take_along_axis(values, best, 1)[:, 0], 0.0) ** 2
 
 
-def _smooth(shots: FrameStack, ways: np.ndarray, weights: np.ndarray, radius: float) -> np.ndarray:
+def _smooth(
+    frame_stack: FrameStack, ways: np.ndarray, weights: np.ndarray, radius: float
+) -> np.ndarray:
     """Return the (T, 3) places nearest to the rays along ``ways``, with small second differences
     but at kinks.
 
@@ -580,10 +598,10 @@ def _smooth(shots: FrameStack, ways: np.ndarray, weights: np.ndarray, radius: fl
     """
     from scipy.linalg import solveh_banded
 
-    count = len(shots)
+    count = len(frame_stack)
     stiffness = STIFFNESS * float(np.median(weights[weights > 0])) if (weights > 0).any() else 1.0
     across = weights[:, None, None] * (np.eye(3) - ways[:, :, None] * ways[:, None])
-    right = np.einsum("tij,tj->ti", across, shots.centers).ravel()
+    right = np.einsum("tij,tj->ti", across, frame_stack.centers).ravel()
     rays = np.zeros((7, 3 * count))  # upper bands: entry (i, j) lies in row 6 + i - j, column j
     for i in range(3):
         for j in range(i, 3):

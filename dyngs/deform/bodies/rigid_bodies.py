@@ -69,27 +69,27 @@ class BodyRotation:
     counts: np.ndarray  # (C,) pixels that fell on it
 
 
-def estimate_rotation(shots: FrameStack, path: Path) -> BodyRotation:
+def estimate_rotation(frame_stack: FrameStack, path: Path) -> BodyRotation:
     """Return how the body on ``path`` turns."""
-    frames = without_light([_frame(shots, path, t) for t in range(len(shots))])
-    starts = _windows(frames, _basis(shots.times, path))
-    still = np.broadcast_to(np.eye(3), (len(frames), 3, 3))
-    rotations = still
+    frames = without_light([_frame(frame_stack, path, t) for t in range(len(frame_stack))])
+    starts = _windows(frames, _basis(frame_stack.times, path))
+    static = np.broadcast_to(np.eye(3), (len(frames), 3, 3))
+    rotations = static
     if starts:
         tried = np.stack([_polished(frames, _followed(frames, *start)) for start in starts])
         rotations = tried[disagreements(frames, tried).argmin()]
         rotations = rotations @ rotations[len(frames) // 2].T
     seen = np.sum([_sums(*both) for both in zip(frames, rotations, strict=True)], axis=0)
-    moved, stood = disagreements(frames, np.stack([rotations, still]))
+    moved, stood = disagreements(frames, np.stack([rotations, static]))
     every = np.concatenate([colors for _, colors in frames])
     by_chance = 2 * float(every.var(axis=0).sum()) if len(every) else 0.0
     return BodyRotation(rotations, float(moved), float(stood), by_chance, _means(seen).T, seen[3])
 
 
-def _frame(shots: FrameStack, path: Path, index: int) -> Frame:
-    rows, columns, normals = shots.ball_pixels(index, path.centers[index], path.radius)
+def _frame(frame_stack: FrameStack, path: Path, index: int) -> Frame:
+    rows, columns, normals = frame_stack.ball_pixels(index, path.centers[index], path.radius)
     step = max(len(rows) // MOST_PIXELS, 1)
-    return normals[::step], shots.images[index, rows[::step], columns[::step]]
+    return normals[::step], frame_stack.images[index, rows[::step], columns[::step]]
 
 
 def without_light(frames: Frames) -> Frames:
@@ -407,26 +407,30 @@ class RigidBody:
     """A thing that moves rigidly over the times of T images."""
 
     path: Path
-    turning: BodyRotation
+    rotation: BodyRotation
 
 
 @dataclass(frozen=True)
 class Bodies:
     """Bodies that were found, and how they were seen."""
 
-    shots: FrameStack
+    frame_stack: FrameStack
     bodies: tuple[RigidBody, ...]
     seeds: tuple[Gaussians, ...]  # of each, where it is in the middle of the clip
 
     @property
-    def finding(self) -> str:
+    def message(self) -> str:
         """A line about them."""
         from scipy.spatial.transform import Rotation
 
-        turns = [Rotation.from_matrix(body.turning.rotations) for body in self.bodies]
+        turns = [Rotation.from_matrix(body.rotation.rotations) for body in self.bodies]
         turns = [np.degrees((turn[1:] * turn[:-1].inv()).magnitude()).sum() for turn in turns]
         things = "1 body turns" if len(turns) == 1 else f"{len(turns)} bodies turn"
-        clip = "followed at all times at once" if self.explains_all_motion else "other things move, too"
+        clip = (
+            "followed at all times at once"
+            if self.explains_all_motion
+            else "other things move, too"
+        )
         return f"{things} by {', '.join(f'{turn:.0f}' for turn in turns)} degrees; {clip}"
 
     @cached_property
@@ -434,28 +438,28 @@ class Bodies:
         """Whether hardly anything else moves."""
         from scipy.ndimage import uniform_filter
 
-        maps = self.shots.differences()
+        maps = self.frame_stack.differences()
         marked = maps * (uniform_filter(maps, 5, axes=(1, 2)) > MARKED)
         whole = float(marked.sum())
         for body in self.bodies:
-            clear_path_(marked, self.shots, body.path)
+            clear_path_(marked, self.frame_stack, body.path)
         return float(marked.sum()) < LEFT * whole
 
-    def within(self, others: DeformationField) -> BodyField:
+    def within(self, inner_field: DeformationField) -> BodyField:
         """Return the field of ``others`` in which the last of the moving Gaussians, the seeds, are
         the bodies'."""
-        num_pieces = min(max(round(PIECES_PER_TIME * len(self.shots)), 1), MAX_KEY_TIMES)
-        basis = spline_basis(torch.from_numpy(self.shots.times), num_pieces).numpy()
+        num_pieces = min(max(round(PIECES_PER_TIME * len(self.frame_stack)), 1), MAX_KEY_TIMES)
+        basis = spline_basis(torch.from_numpy(self.frame_stack.times), num_pieces).numpy()
         splines = {
             "places": [_fitted(basis, body.path.centers) for body in self.bodies],
-            "quats": [_fitted(basis, _quats(body.turning.rotations)) for body in self.bodies],
+            "quats": [_fitted(basis, _quats(body.rotation.rotations)) for body in self.bodies],
         }
-        centers = np.stack([body.path.centers[len(self.shots) // 2] for body in self.bodies])
+        centers = np.stack([body.path.centers[len(self.frame_stack) // 2] for body in self.bodies])
         counts = [len(seeds) for seeds in self.seeds]
         labels = torch.repeat_interleave(
-            torch.tensor([others.setup.num_moving - sum(counts), *counts], device="cpu")
+            torch.tensor([inner_field.setup.num_moving - sum(counts), *counts], device="cpu")
         )
-        device = others.setup.center.device
+        device = inner_field.setup.center.device
         points = {
             name: torch.from_numpy(np.stack(x)).float().to(device) for name, x in splines.items()
         }
@@ -466,11 +470,11 @@ class Bodies:
         albedo = torch.cat([seeds.sh[:, 0] + 0.5 / SH_C0 for seeds in self.seeds]).to(device)
         albedo = torch.cat([albedo.new_zeros(len(labels) - len(albedo), 3), albedo])
         # of the cameras
-        up = torch.from_numpy(-self.shots.poses[:, 1, :3].mean(0)).float().to(device)
-        return BodyField(others, rest, points | {"albedo": albedo, "sun": up})
+        up = torch.from_numpy(-self.frame_stack.poses[:, 1, :3].mean(0)).float().to(device)
+        return BodyField(inner_field, rest, points | {"albedo": albedo, "sun": up})
 
 
-def find_bodies(shots: FrameStack, limit: int, num_terms: int) -> Bodies | None:
+def find_bodies(frame_stack: FrameStack, limit: int, num_terms: int) -> Bodies | None:
     """Return what moves rigidly, with at most ``limit`` Gaussians of ``num_terms`` harmonics; None
     where nothing does.
 
@@ -478,57 +482,57 @@ def find_bodies(shots: FrameStack, limit: int, num_terms: int) -> Bodies | None:
     better than if it did not turn, and than by chance: what bends shows other colours in the same
     direction.
     """
-    bodies = _rigid_bodies(shots) if limit and min(shots.size) >= SMALLEST else ()
+    bodies = _rigid_bodies(frame_stack) if limit and min(frame_stack.size) >= SMALLEST else ()
     if not bodies or limit < len(bodies):
         return None
     return Bodies(
-        shots,
+        frame_stack,
         bodies,
-        tuple(_seeds(body, shots, limit // len(bodies), num_terms) for body in bodies),
+        tuple(_seeds(body, frame_stack, limit // len(bodies), num_terms) for body in bodies),
     )
 
 
-def _rigid_bodies(shots: FrameStack) -> tuple[RigidBody, ...]:
+def _rigid_bodies(frame_stack: FrameStack) -> tuple[RigidBody, ...]:
     """Return what moves rigidly; each is taken out before the next is sought, and what hides others
     where none is."""
-    maps = shots.differences()
+    maps = frame_stack.differences()
     bodies = []
     refused = []
     while len(bodies) < MOST_BODIES and len(refused) < MOST_REFUSED:
-        paths = find_paths(shots, maps)
+        paths = find_paths(frame_stack, maps)
         if not paths:
             break
         fresh = [path for path in paths if not any(path.is_like(other) for other in refused)]
         for path in fresh[: MOST_REFUSED - len(refused)]:
-            body = RigidBody(path, estimate_rotation(shots, path))
-            if _is_rigid(body.turning):
+            body = RigidBody(path, estimate_rotation(frame_stack, path))
+            if _is_rigid(body.rotation):
                 bodies.append(body)
-                clear_path_(maps, shots, path)
+                clear_path_(maps, frame_stack, path)
                 break
             refused.append(path)
         else:
-            clear_path_(maps, shots, paths[0])
+            clear_path_(maps, frame_stack, paths[0])
     return tuple(bodies)
 
 
-def _is_rigid(turning: BodyRotation) -> bool:
-    least = min(AGREES * turning.standing, BY_CHANCE * turning.by_chance)
-    return turning.by_chance >= LEAST_MARKS and turning.disagreement < least
+def _is_rigid(rotation: BodyRotation) -> bool:
+    least = min(AGREES * rotation.standing, BY_CHANCE * rotation.by_chance)
+    return rotation.by_chance >= LEAST_MARKS and rotation.disagreement < least
 
 
-def _seeds(body: RigidBody, shots: FrameStack, limit: int, num_terms: int) -> Gaussians:
-    middle = len(shots) // 2
+def _seeds(body: RigidBody, frame_stack: FrameStack, limit: int, num_terms: int) -> Gaussians:
+    middle = len(frame_stack) // 2
     random = np.random.default_rng(0)
     radius = body.path.radius
-    _, depths = shots.projected(np.arange(len(shots)), body.path.centers)
-    pixels = 4 * np.pi * float(np.median(radius * shots.focal / depths)) ** 2
+    _, depths = frame_stack.project(np.arange(len(frame_stack)), body.path.centers)
+    pixels = 4 * np.pi * float(np.median(radius * frame_stack.focal / depths)) ** 2
     count = min(limit, max(int(pixels / PX_PER_SEED), 1))
     ways = random.normal(size=(count, 3))
     ways = ways / np.linalg.norm(ways, axis=1, keepdims=True)
     away = radius * random.uniform(INNER, 1.0, size=(count, 1))
-    usual = body.turning.colors[body.turning.counts > 0].mean(0)
+    usual = body.rotation.colors[body.rotation.counts > 0].mean(0)
     place = cells(ways, FINE)
-    colors = np.where(body.turning.counts[place, None] > 0, body.turning.colors[place], usual)
+    colors = np.where(body.rotation.counts[place, None] > 0, body.rotation.colors[place], usual)
     base = torch.from_numpy((colors - 0.5) / SH_C0).float()
     spacing = radius * math.sqrt(4 * math.pi / count)
     means = torch.from_numpy(body.path.centers[middle] + away * ways).float()

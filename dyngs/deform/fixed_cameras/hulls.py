@@ -124,10 +124,10 @@ def _without_specks(differs: np.ndarray, certainty: np.ndarray) -> np.ndarray:
     return kept[labels]
 
 
-def detect_shadows(image: np.ndarray, still: np.ndarray) -> np.ndarray:
+def detect_shadows(image: np.ndarray, static: np.ndarray) -> np.ndarray:
     """Return (..., H, W) bool: as ``still`` but darker, all channels alike (after Horprasert et al.
     1999)."""
-    left = (image + _DARK) / (still + _DARK)
+    left = (image + _DARK) / (static + _DARK)
     tint = left.max(-1) - left.min(-1)
     return (left.max(-1) < 1) & (left.min(-1) > DARKEST_SHADOW) & (tint < SHADOW_TINT)
 
@@ -399,7 +399,7 @@ class Track:
         return float(np.median([blob.radius for blob in self.blobs]))
 
     @property
-    def travels(self) -> bool:
+    def is_travelling(self) -> bool:
         """Whether it goes on and on: what turns or bends in place is no track to start from.
 
         Of places a radius apart or more, in the order of time, successive steps must not mostly
@@ -415,18 +415,18 @@ class Track:
             return False
         return float((steps[1:] * steps[:-1]).sum()) > SAME_WAY * float((steps**2).sum())
 
-    def predicted(self, time: float) -> np.ndarray:
+    def predict(self, time: float) -> np.ndarray:
         last = self.blobs[-1].center
         if len(self.blobs) < 2:
             return last
         pace = (last - self.blobs[-2].center) / (self.times[-1] - self.times[-2])
         return last + (time - self.times[-1]) * pace
 
-    def extended(self, time: float, blob: Blob) -> Track:
+    def append(self, time: float, blob: Blob) -> Track:
         return Track((*self.times, time), (*self.blobs, blob))
 
 
-def linked(times: Sequence[float], blobs: Sequence[Sequence[Blob]]) -> list[Track]:
+def link_tracks(times: Sequence[float], blobs: Sequence[Sequence[Blob]]) -> list[Track]:
     """Return the tracks among the ``blobs`` of each of ``times`` (ascending), longest first.
 
     Blobs are assigned to the tracks so far by the least total cost (Kuhn 1955), each within a gate
@@ -448,7 +448,7 @@ def linked(times: Sequence[float], blobs: Sequence[Sequence[Blob]]) -> list[Trac
         taken = {int(c): int(r) for r, c in zip(rows, columns, strict=True) if cost[r, c] < np.inf}
         fresh = [Track((time,), (blob,)) for j, blob in enumerate(found) if j not in taken]
         for column, row in taken.items():
-            open_[row] = open_[row].extended(time, found[column])
+            open_[row] = open_[row].append(time, found[column])
         open_ += fresh
     kept = [track for track in done + open_ if len(track.times) >= FEWEST_TIMES]
     return sorted(kept, key=lambda track: -len(track.times))
@@ -459,10 +459,10 @@ def _cost(track: Track, time: float, blob: Blob) -> float:
     last = track.blobs[-1]
     reach = FIRST_REACH * last.radius
     if len(track.blobs) > 1:
-        step = np.linalg.norm(track.predicted(time) - last.center)
+        step = np.linalg.norm(track.predict(time) - last.center)
         reach = REACH * max(last.radius, track.radius) + SPEED_REACH * float(step)
     terms = (
-        float(np.linalg.norm(blob.center - track.predicted(time))) / reach,
+        float(np.linalg.norm(blob.center - track.predict(time))) / reach,
         float(np.abs(blob.color - last.color).max()) / COLOR_REACH,
         abs(float(np.log(blob.radius / track.radius))) / SIZE_REACH,
     )

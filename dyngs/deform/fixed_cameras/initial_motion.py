@@ -16,7 +16,7 @@ from dyngs.deform.fixed_cameras.hulls import (
     FixedCameraClip,
     Track,
     extract_blobs,
-    linked,
+    link_tracks,
     silhouettes_at,
 )
 from dyngs.deform.random_gaussians import box_of
@@ -62,12 +62,14 @@ def track_gaussians(
     found: list[TimedGaussians] = []
     for time, blob, velocity in zip(track.times, track.blobs, pace, strict=True):
         here = Track((time,), (blob,))
-        points, side = usual if track.travels else surface(here)
+        points, side = usual if track.is_travelling else surface(here)
         dense = _on_surface(points, side, here, clips, num_terms)
         if improves_images(dense, time, clips):
             gaussians = _thinned(dense, max(round(len(points) / thinned), 1))
             found.append(
-                TimedGaussians(time, gaussians, torch.from_numpy(velocity * track.travels).float())
+                TimedGaussians(
+                    time, gaussians, torch.from_numpy(velocity * track.is_travelling).float()
+                )
             )
     return found
 
@@ -100,9 +102,11 @@ def improves_images(gaussians: Gaussians, time: float, clips: Sequence[FixedCame
         if float(torch.from_numpy(one.changed[i])[covered].float().mean()) < SHOWN:
             continue
         shown += 1
-        truth, still = (torch.from_numpy(x).float() / 255 for x in (one.images[i], one.median))
-        before += float((still - truth).square().sum(-1)[covered].sum())
-        after += float((drawn.rgb[0] + (1 - alpha) * still - truth).square().sum(-1)[covered].sum())
+        truth, static = (torch.from_numpy(x).float() / 255 for x in (one.images[i], one.median))
+        before += float((static - truth).square().sum(-1)[covered].sum())
+        after += float(
+            (drawn.rgb[0] + (1 - alpha) * static - truth).square().sum(-1)[covered].sum()
+        )
     return shown >= SHOWN * looked_at and after < PAYS * before
 
 
@@ -158,7 +162,7 @@ LIFT = 0.5  # Distance of a copy before its original, in longest standard deviat
 
 
 def detect_surface_changes(
-    clips: Sequence[FixedCameraClip], still: Gaussians, options: RenderOptions, limit: int
+    clips: Sequence[FixedCameraClip], static: Gaussians, options: RenderOptions, limit: int
 ) -> list[TimedGaussians]:
     """Return copies of ``still`` Gaussians at the times at which most cameras see another colour
     there, in this colour.
@@ -167,8 +171,8 @@ def detect_surface_changes(
     with w = alpha T; that of what is only covered by something else differs from camera to camera.
     At most ``limit``, those that change most.
     """
-    graphs = [_blended(still, one, options) for one in clips]
-    towards = torch.cat([one.camera.centers for one in clips]).to(still.means).mean(0)
+    graphs = [_blended(static, one, options) for one in clips]
+    towards = torch.cat([one.camera.centers for one in clips]).to(static.means).mean(0)
     found: list[tuple[float, Tensor, Tensor]] = []
     for time in sorted({time for one in clips for time in one.times}):
         seen: list[Tensor] = []
@@ -190,24 +194,24 @@ def detect_surface_changes(
         found.append((time, rows, usual[rows]))
     sizes = torch.cat([usual.abs().amax(1) for _, _, usual in found]).sort(descending=True).values
     least = float(sizes[limit]) if len(sizes) > limit else 0.0
-    moments: list[TimedGaussians] = []
+    timed_gaussians: list[TimedGaussians] = []
     for time, rows, usual in found:
         kept = usual.abs().amax(1) > least
         if bool(kept.any()):
-            copies = _recoloured(still.select(rows[kept]), usual[kept], towards)
-            moments.append(TimedGaussians(time, copies, still.means.new_zeros(3)))
-    return moments
+            copies = _recoloured(static.select(rows[kept]), usual[kept], towards)
+            timed_gaussians.append(TimedGaussians(time, copies, static.means.new_zeros(3)))
+    return timed_gaussians
 
 
 def _blended(
-    still: Gaussians, one: FixedCameraClip, options: RenderOptions
+    static: Gaussians, one: FixedCameraClip, options: RenderOptions
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return a constant colour, its blending, and the (N, 1) sums of weights, of every Gaussian in
     one camera."""
-    flat = torch.zeros(len(still), 1, 3, requires_grad=True, device=still.means.device)
-    blended = render(still.replace(sh=flat), one.camera.to(device=still.means.device), options).rgb[
-        0
-    ]
+    flat = torch.zeros(len(static), 1, 3, requires_grad=True, device=static.means.device)
+    blended = render(
+        static.replace(sh=flat), one.camera.to(device=static.means.device), options
+    ).rgb[0]
     (weights,) = torch.autograd.grad(blended, flat, torch.ones_like(blended), retain_graph=True)
     return flat, blended, weights[:, 0, :1]
 
@@ -234,13 +238,13 @@ ROOM = 0.25  # Room around the things that stand still and the cameras, in sides
 class InitialMotion:
     """What changes, as Gaussians at single times."""
 
-    moments: tuple[TimedGaussians, ...] = ()
-    finding: str | None = None
+    timed_gaussians: tuple[TimedGaussians, ...] = ()
+    message: str | None = None
 
 
 def find_initial_motion(
     clips: Sequence[FixedCameraClip],
-    still: Gaussians,
+    static: Gaussians,
     extent: float,
     limit: int,
     options: RenderOptions,
@@ -253,39 +257,43 @@ def find_initial_motion(
     """
     if len(clips) < 2 or limit < 1:
         return InitialMotion()
-    tracks = find_tracks(clips, *_box(clips, still, extent))
+    tracks = find_tracks(clips, *_box(clips, static, extent))
     cubes = sum(len(surface(track)[0]) * len(track.times) for track in tracks)
     thinned = max(cubes / limit, 1.0)
-    num_terms = still.sh.shape[1]
+    num_terms = static.sh.shape[1]
     things = [
-        moments for moments in (track_gaussians(x, clips, thinned, num_terms) for x in tracks) if moments
+        timed_gaussians
+        for timed_gaussians in (track_gaussians(x, clips, thinned, num_terms) for x in tracks)
+        if timed_gaussians
     ]
-    shades = detect_surface_changes(clips, still, options, limit)
-    moments = tuple(moment for group in (*things, shades) for moment in group)
-    if not moments:
+    shades = detect_surface_changes(clips, static, options, limit)
+    timed_gaussians = tuple(moment for group in (*things, shades) for moment in group)
+    if not timed_gaussians:
         return InitialMotion()
     total = len(_times(clips))
-    count = sum(len(one.gaussians) for one in moments)
+    count = sum(len(one.gaussians) for one in timed_gaussians)
     lengths = ", ".join(str(len(one)) for one in things)
     what = f"things that move found at {lengths} of {total} times" if things else "surfaces change"
-    return InitialMotion(moments, f"{what} before the fixed cameras: {count:,} Gaussians begin there")
+    return InitialMotion(
+        timed_gaussians, f"{what} before the fixed cameras: {count:,} Gaussians begin there"
+    )
 
 
-def find_tracks(
-    clips: Sequence[FixedCameraClip], low: np.ndarray, high: np.ndarray
-) -> list[Track]:
+def find_tracks(clips: Sequence[FixedCameraClip], low: np.ndarray, high: np.ndarray) -> list[Track]:
     """Return the tracks of all that moves in the box from ``low`` to ``high`` (3,), longest
     first."""
     times = _times(clips)
-    return linked(times, [extract_blobs(silhouettes_at(clips, time), low, high) for time in times])
+    return link_tracks(
+        times, [extract_blobs(silhouettes_at(clips, time), low, high) for time in times]
+    )
 
 
 def _box(
-    clips: Sequence[FixedCameraClip], still: Gaussians, extent: float
+    clips: Sequence[FixedCameraClip], static: Gaussians, extent: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return two corners (3,) of a box with the still things and the cameras, and some room
     around."""
-    center, half_size = (x.double().cpu().numpy() for x in box_of(still, extent))
+    center, half_size = (x.double().cpu().numpy() for x in box_of(static, extent))
     centers = np.concatenate([one.camera.centers.double().cpu().numpy() for one in clips])
     low = np.minimum(center - half_size, centers.min(0))
     high = np.maximum(center + half_size, centers.max(0))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.core.errors import DyngsError, counted
-from dyngs.export.splat_files import splats_at, up_of
+from dyngs.export.splat_files import find_up_direction, splats_at
 from dyngs.gaussians.rendering import splat_options
 from dyngs.io.formats.formats import format_to_read, read_splats
 from dyngs.io.formats.similarity import Similarity, axis_of, joined, turn_between
@@ -17,7 +17,7 @@ from dyngs.io.formats.splat_file import SplatFile, with_degree
 from dyngs.runs.opened import open_scene
 
 
-def merged(
+def merge_scenes(
     splat: SplatFile, up: Sequence[float] | None, files: Sequence[Path], tell: Callable[[str], None]
 ) -> SplatFile:
     """Return the contents with those of more files or runs, whose up is brought to ``up`` (3,)
@@ -58,5 +58,5 @@ def _still(file: Path) -> tuple[SplatFile, Sequence[float] | None]:
         raise DyngsError(
             f"{file}: moves, and --merge adds still scenes; `dyngs export --time T` makes one of it"
         )
-    found = up_of(opened)
+    found = find_up_direction(opened)
     return splats_at(opened, opened.scene, 0.0), None if found is None else found[0]

@@ -241,7 +241,9 @@ def _add_splines(
             lists.quantised(name, own, 16 if bits == 16 else 8)
 
 
-def _add_person(scene: HumanScene, order: Tensor, lists: PackedArrays, tolerance: float) -> dict[str, Any]:
+def _add_person(
+    scene: HumanScene, order: Tensor, lists: PackedArrays, tolerance: float
+) -> dict[str, Any]:
     from scipy.spatial.transform import Rotation
 
     clip = scene.played_clip
@@ -339,7 +341,9 @@ class MotionSplines:
 
 
 @torch.no_grad()
-def motion_splines(field: DeformationField, means: Tensor, num_times: int, tolerance: float) -> MotionSplines:
+def motion_splines(
+    field: DeformationField, means: Tensor, num_times: int, tolerance: float
+) -> MotionSplines:
     """Return the motion of ``means`` (M, 3) as splines."""
     match field:
         case WindowedField(others=others):

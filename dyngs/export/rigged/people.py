@@ -41,7 +41,7 @@ from dyngs.human.body.skinning import (
     joint_transforms,
 )
 from dyngs.human.keys import HumanModel
-from dyngs.human.motion.placement import upright
+from dyngs.human.motion.placement import rotate_clip_to_y_up
 from dyngs.io.formats.gltf import EXTENSION, add_gaussians
 from dyngs.io.formats.ply import write_ply
 from dyngs.io.formats.splat_file import SplatFile, require_writable
@@ -172,7 +172,7 @@ def add_animation(
     """
     joints = rig.skeleton.joints
     parents = rig.skeleton.parents
-    clip = upright(scene.played_clip, scene.clip, joints)
+    clip = rotate_clip_to_y_up(scene.played_clip, scene.clip, joints)
     frames = torch.linspace(0, len(clip) - 1, min(len(clip), _FLOOR_FRAMES), device="cpu").long()
     lowest = []
     for row in frames.tolist():

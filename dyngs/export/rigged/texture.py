@@ -86,7 +86,7 @@ def frontal_colours(scene: HumanScene, normals: Tensor) -> Tensor:
     gaussians = scene.gaussians
     seen_along = -normals
     if scene.colour is not None:
-        upright = scene.playing(
+        upright = scene.with_motion(
             rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
         )
         moment = upright.time_step(None)

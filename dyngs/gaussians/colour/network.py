@@ -37,7 +37,9 @@ ROUNDS = 3
 Shown = tuple[Image, Rendering]  # An image, and the rendering of its one view
 
 
-def apply_affine_colour(affine: Tensor, image: Image, rendering: Rendering, background: Tensor) -> Tensor:
+def apply_affine_colour(
+    affine: Tensor, image: Image, rendering: Rendering, background: Tensor
+) -> Tensor:
     """Return (H, W, 3) a rendering as the camera of ``image`` would have made it.
 
     Where the image has alpha, the background was not in front of the camera and keeps its colour.
@@ -142,8 +144,8 @@ def _sums(image: Image, rendering: Rendering, background: Tensor, counts: Tensor
 class RestPose:
     """Rest pose of a moving body, which its colours follow."""
 
-    places: Tensor  # (N, 3) centres of the drawn Gaussians at rest
-    turn: Tensor  # (3, 3) rotation of the body from rest to the world
+    means: Tensor  # (N, 3) centres of the drawn Gaussians at rest
+    rotation: Tensor  # (3, 3) rotation of the body from rest to the world
 
 
 @dataclass(frozen=True)
@@ -172,13 +174,13 @@ class ColourNetwork:
             tensors |= {f"weight{i}": layer.weight.detach(), f"bias{i}": layer.bias.detach()}
         return with_role(tensors, Role.SHARED)
 
-    def shader(self, time: float | None, frame: RestPose | None = None) -> Shader:
+    def shader(self, time: float | None, rest_pose: RestPose | None = None) -> Shader:
         """Return the shader at ``time`` (clamped to [0, 1], None is 0); ``frame`` for Gaussians on
         a body."""
 
         def colors(gaussians: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
             views = [
-                self._seen_from(gaussians, center, shown[:, 0] > 0, time, frame)
+                self._seen_from(gaussians, center, shown[:, 0] > 0, time, rest_pose)
                 for center, shown in zip(cameras.centers, radii, strict=True)
             ]
             return torch.stack(views) if views else gaussians.means.new_empty(0, len(gaussians), 3)
@@ -191,7 +193,7 @@ class ColourNetwork:
         center: Tensor,
         drawn: Tensor,
         time: float | None,
-        frame: RestPose | None,
+        rest_pose: RestPose | None,
     ) -> Tensor:
         """Return (N, 3) colours seen from ``center``; zero, and not computed, for those that are
         not ``drawn`` (N,)."""
@@ -207,8 +209,8 @@ class ColourNetwork:
             rows,
             center,
             self.box.to(dtype),
-            None if frame is None else frame.places.to(dtype),
-            None if frame is None else frame.turn.to(dtype),
+            None if rest_pose is None else rest_pose.means.to(dtype),
+            None if rest_pose is None else rest_pose.rotation.to(dtype),
             moment if self.uses_time else None,
             self.uses_normals,
         )

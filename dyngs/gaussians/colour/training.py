@@ -43,7 +43,7 @@ class MeasuredView:
 class ViewDependence:
     """The Gaussians whose view dependence is worth its cost."""
 
-    keeps: Tensor  # (N,) bool, Gaussians whose harmonics stay
+    kept_harmonics: Tensor  # (N,) bool, Gaussians whose harmonics stay
     offsets: Tensor  # (N, 3) colour to add to the base of the others
     # worth_all, worth_kept: dB on the held-out views that the harmonics of all, of the kept ones
     # bring
@@ -51,7 +51,7 @@ class ViewDependence:
     gain_kept: float
 
     def __str__(self) -> str:
-        fraction = float(self.keeps.float().mean()) if len(self.keeps) else 0.0
+        fraction = float(self.kept_harmonics.float().mean()) if len(self.kept_harmonics) else 0.0
         if fraction == 0:
             return f"view dependence does not pay ({self.gain_all:+.2f} dB on held-out training views): none is stored"
         return (
@@ -84,11 +84,14 @@ def find_view_dependent(
         (slope,) = torch.autograd.grad(_squared_error(view, means, half, options, background), half)
         worths -= slope
     without, with_all = (math.fsum(column) for column in zip(*errors, strict=True))
-    keeps = select_worthwhile(changes, worths, without, tolerance)
+    kept_harmonics = select_worthwhile(changes, worths, without, tolerance)
     kept = math.fsum(
-        _squared_error(x, means, keeps.float(), options, background).item() for x in held_out
+        _squared_error(x, means, kept_harmonics.float(), options, background).item()
+        for x in held_out
     )
-    return ViewDependence(keeps, means, _decibels(without, with_all), _decibels(without, kept))
+    return ViewDependence(
+        kept_harmonics, means, _decibels(without, with_all), _decibels(without, kept)
+    )
 
 
 def select_worthwhile(changes: Tensor, worths: Tensor, without: float, tolerance: float) -> Tensor:
@@ -104,9 +107,9 @@ def select_worthwhile(changes: Tensor, worths: Tensor, without: float, tolerance
         [torch.zeros(1, device=worths.device), worths[order].double().cumsum(0)]
     )
     enough = errors <= errors.clamp_min(1e-12).min() * 10 ** (tolerance / 10)
-    keeps = torch.zeros(len(changes), dtype=torch.bool, device=changes.device)
-    keeps[order[: int(enough.int().argmax())]] = True
-    return keeps
+    kept_harmonics = torch.zeros(len(changes), dtype=torch.bool, device=changes.device)
+    kept_harmonics[order[: int(enough.int().argmax())]] = True
+    return kept_harmonics
 
 
 def _mean_and_change(seen: Iterable[MeasuredView], options: RenderOptions) -> tuple[Tensor, Tensor]:
@@ -189,7 +192,7 @@ class ColourTraining:
         return None
 
     @property
-    def learned(self) -> Parameters | None:
+    def network_parameters(self) -> Parameters | None:
         return None
 
     def penalties(self, gaussians: Gaussians) -> dict[str, Tensor]:
@@ -201,7 +204,9 @@ class ColourTraining:
         """Return whether training view ``index`` must not be trained on in ``step``."""
         return False
 
-    def measured(self, step: int, looks: Callable[[], MeasurementViews]) -> ViewDependence | None:
+    def measure_harmonics(
+        self, step: int, looks: Callable[[], MeasurementViews]
+    ) -> ViewDependence | None:
         """Measure, if due after ``step``, whose harmonics improve images; the others are dropped."""
         return None
 
@@ -255,7 +260,7 @@ class NetworkTraining(ColourTraining):
         return ColourNetwork(tuple(layers), self.box, self.uses_time, uses_normals=True)
 
     @property
-    def learned(self) -> Parameters:
+    def network_parameters(self) -> Parameters:
         return self.parameters
 
     def optimize(self, step: int) -> Count:
@@ -269,7 +274,7 @@ class NetworkTraining(ColourTraining):
 
     def restore(self, tensors: Mapping[str, Tensor], count: int) -> None:
         self.box = require_tensor("box", tensors["box"], (2, 3), None)
-        self.parameters = self.parameters.restored(tensors)
+        self.parameters = self.parameters.with_state(tensors)
 
 
 class AutoTraining(ColourTraining):
@@ -287,7 +292,9 @@ class AutoTraining(ColourTraining):
         """Return true for every eighth view, until the harmonics are measured on them."""
         return step <= self.measured_after and index in self.held_out
 
-    def measured(self, step: int, looks: Callable[[], MeasurementViews]) -> ViewDependence | None:
+    def measure_harmonics(
+        self, step: int, looks: Callable[[], MeasurementViews]
+    ) -> ViewDependence | None:
         if step != self.measured_after or not self.held_out:
             return None
         views = looks()
@@ -299,7 +306,7 @@ class AutoTraining(ColourTraining):
         found = find_view_dependent(
             views.views(seen), judged, views.options, views.background, self.tolerance
         )
-        self.freeze(~found.keeps)
+        self.freeze(~found.kept_harmonics)
         return found
 
     def freeze(self, frozen: Tensor) -> None:

@@ -171,4 +171,4 @@ def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
     stored |= {f"learned.{name}": tensors[name] for name in ("light", "normals") if name in tensors}
     for name, dtype in (("anchors.face", torch.int32), ("anchors.joints", torch.uint8)):
         stored[name] = require_tensor(name, stored[name], stored[name].shape, dtype).long()
-    return HumanScene.restored(Gaussians.stored(part_of(tensors, "gaussians")), stored)
+    return HumanScene.from_state(Gaussians.stored(part_of(tensors, "gaussians")), stored)

@@ -49,7 +49,7 @@ def nearest_neighbours(points: Tensor, count: int = 5) -> Tensor:
     return torch.from_numpy(found[~own].reshape(num_points, count)).long().to(points.device)
 
 
-def linked_neighbours(points: Tensor, weights: Tensor, count: int = 5) -> Tensor:
+def same_part_neighbours(points: Tensor, weights: Tensor, count: int = 5) -> Tensor:
     """Return the rows (Q, count) int64 of the nearest other points that follow the same joints,
     nearest first.
 
@@ -71,7 +71,7 @@ def linked_neighbours(points: Tensor, weights: Tensor, count: int = 5) -> Tensor
 _SHORTEST = 1e-6  # added to all distances, squared: points that coincide pull each other nowhere
 
 
-def strains(
+def rigidity_errors(
     means: Tensor, moved: Tensor, points: Tensor, near: Tensor, scale: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return mean squares () of changes of the distance to a neighbour, and of unlike offsets;
@@ -90,10 +90,10 @@ def strains(
 
 
 # sightings (see sightings) at which a Gaussian's own values count as much as what is around it
-ENOUGH = 1.0
-MIRRORED = 0.9  # trust in the other side of the body, where that was seen
+HALF_CONFIDENCE_VIEWS = 1.0
+MIRROR_CONFIDENCE = 0.9  # trust in the other side of the body, where that was seen
 # trust in a Gaussian's own values below which it is counted as unseen in the line for people
-HARDLY = 0.5
+LOW_CONFIDENCE = 0.5
 _NEIGHBOURS = 8
 _SAME_PLACE = 1.5
 """Distance from the mirrored anchor, in sides of its texel, within which a Gaussian is its mirror
@@ -106,7 +106,7 @@ rounds it takes."""
 
 
 @torch.no_grad()
-def sightings(
+def effective_view_counts(
     drawn: Iterable[tuple[Gaussians, Cameras]], sizes: Tensor, scale: float, options: RenderOptions
 ) -> Tensor:
     """Return (N,) sums over views of the squared fraction of each Gaussian's texel that is seen
@@ -130,7 +130,7 @@ def sightings(
 
 def visibility_confidence(seen: Tensor) -> Tensor:
     """Return the trust (N,) in [0, 1] in values learned from so many sightings (N,)."""
-    return 1 - ENOUGH / (seen + ENOUGH)
+    return 1 - HALF_CONFIDENCE_VIEWS / (seen + HALF_CONFIDENCE_VIEWS)
 
 
 def filled(
@@ -143,14 +143,14 @@ def filled(
     like those of linked neighbours. ``weights`` (N, J) are the template's; ``middle`` is x of the
     plane of symmetry, m; ``trust`` (N,) in [0, 1].
     """
-    other, mixed, known = mirrored_trust(anchors, middle, trust)
+    other, mixed, known = mirror_blend_weights(anchors, middle, trust)
     fraction = mixed[:, None]
     away = gaussians.means - anchors.points
     flipped = away[other] * away.new_tensor([-1.0, 1.0, 1.0])
     opacity = gaussians.logit_opacities[:, None]
     sh = gaussians.sh.clone()
     colour = torch.lerp(sh[:, 0], sh[other, 0], fraction)
-    sh[:, 0] = smoothed(colour, known, anchors, weights)
+    sh[:, 0] = smooth_over_neighbours(colour, known, anchors, weights)
     sh[:, 1:] *= trust[:, None, None]
     return {
         "sh": sh,
@@ -159,19 +159,21 @@ def filled(
     }
 
 
-def mirrored_trust(anchors: Anchors, middle: float, trust: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def mirror_blend_weights(
+    anchors: Anchors, middle: float, trust: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return rows (N,) of the mirror images, the fractions (N,) to mix of their values, and trust
     (N,) in the mixture.
 
     ``middle`` is x of the plane of symmetry, m; ``trust`` (N,) is that in own values.
     """
-    other, is_image = mirror_images(anchors, middle)
-    borrowed = (1 - trust) * trust[other] * is_image * MIRRORED
+    other, is_image = find_mirror_gaussians(anchors, middle)
+    borrowed = (1 - trust) * trust[other] * is_image * MIRROR_CONFIDENCE
     known = trust + borrowed
     return other, borrowed / known.clamp_min(_OWN), known
 
 
-def mirror_images(anchors: Anchors, middle: float) -> tuple[Tensor, Tensor]:
+def find_mirror_gaussians(anchors: Anchors, middle: float) -> tuple[Tensor, Tensor]:
     """Return (N,) rows of the Gaussians nearest to positions mirrored at x = ``middle``, and if
     they are near (N,)."""
     from scipy.spatial import KDTree
@@ -183,7 +185,9 @@ def mirror_images(anchors: Anchors, middle: float) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(np.asarray(rows)).long().to(anchors.points.device), is_near
 
 
-def smoothed(values: Tensor, trust: Tensor, anchors: Anchors, weights: Tensor) -> Tensor:
+def smooth_over_neighbours(
+    values: Tensor, trust: Tensor, anchors: Anchors, weights: Tensor
+) -> Tensor:
     """Return values (N, C) that are like those of linked neighbours, and like ``values`` where
     there is trust.
 
@@ -197,7 +201,7 @@ def smoothed(values: Tensor, trust: Tensor, anchors: Anchors, weights: Tensor) -
     count = len(values)
     given = values.detach().double().cpu().numpy()
     # a link to itself changes nothing
-    near = linked_neighbours(anchors.points, weights, _NEIGHBOURS)
+    near = same_part_neighbours(anchors.points, weights, _NEIGHBOURS)
     if not near.shape[1]:
         return values
     steps = (anchors.points[near] - anchors.points[:, None]).norm(dim=-1) / anchors.size[:, None]
@@ -275,7 +279,7 @@ def project_points(world: Tensor, camera: Cameras) -> tuple[Tensor, Tensor, Tens
     return pixels, depth, (depth > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
 
 
-def in_colours_of(
+def colour_from_images(
     scene: HumanScene, rows: Mapping[int, int], normals: Tensor, images: Iterable[Image]
 ) -> HumanScene:
     """Return a person whose Gaussians are in the colours of some images.
@@ -292,10 +296,10 @@ def in_colours_of(
             yield image, pose, anchors.points if offsets is None else anchors.points + offsets
 
     sh = scene.gaussians.sh.clone()
-    weights = scene.given_weights()
+    weights = scene.template_weights()
     colours, seen = observed_colours(normals, weights, scene.skeleton, shown())
     middle = float(scene.skeleton.joints[0, 0])
-    other, fraction, known = mirrored_trust(anchors, middle, visibility_confidence(seen))
+    other, fraction, known = mirror_blend_weights(anchors, middle, visibility_confidence(seen))
     colours = torch.lerp(colours, colours[other], fraction[:, None])
-    sh[:, 0] = (smoothed(colours, known, anchors, weights) - 0.5) / SH_C0
+    sh[:, 0] = (smooth_over_neighbours(colours, known, anchors, weights) - 0.5) / SH_C0
     return replace(scene, gaussians=scene.gaussians.replace(sh=sh))

@@ -10,14 +10,14 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.body_reader import load_template
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import motion_clip
-from dyngs.human.motion.placement import reduce_foot_sliding, place_like, sole_points, up_direction
+from dyngs.human.motion.placement import place_like, reduce_foot_sliding, sole_points, up_direction
 from dyngs.human.motion.retarget import read_motion
 from dyngs.models.checkpoint import CheckpointInfo
 from dyngs.models.kind import InMotion
 from dyngs.models.renderable import Renderable
 
 
-def in_motion(
+def play_motion(
     section: HumanModel, person: Renderable, info: CheckpointInfo, path: Path, *, keep_feet: bool
 ) -> InMotion:
     """See ``dyngs.models.kind.HasBody``."""
@@ -35,13 +35,13 @@ def in_motion(
     clip = motion_clip(motion)
     if not is_fit:
         clip = place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
-    playing = scene.playing(clip)
+    playing = scene.with_motion(clip)
     notes = tuple(motion.notes)
     if keep_feet:
         skeleton = playing.learned_skeleton
         floor = float(scene.anchors.points[:, 1].min())
         soles = sole_points(playing.played_clip, skeleton.joints, skeleton.parents, floor)
         clip, note = reduce_foot_sliding(clip, soles, up_direction(scene.clip), motion.fps)
-        playing = scene.playing(clip)
+        playing = scene.with_motion(clip)
         notes = (*notes, note)
     return InMotion(playing.to(person.gaussians.means.device), motion.fps, notes)

@@ -47,14 +47,14 @@ class PoseComparison:
     # the loss () between a rendering and an image on a background (3,), with sides divided by a
     # factor
     difference: Callable[[Rendering, Image, Tensor, int], Tensor]
-    turn_weight: float  # of the mean squared rotation that is added to the joints, 1 / rad^2
-    shift_weight: float = 0.0  # of the mean squared translation that is added, 1 / m^2
+    rotation_weight: float  # of the mean squared rotation that is added to the joints, 1 / rad^2
+    translation_weight: float = 0.0  # of the mean squared translation that is added, 1 / m^2
     # images of a time step from which on rotations are fitted; with fewer the shift is
-    views_to_turn: int = 1
-    most_windows: int | None = None  # after which a round ends; None: ``MOST_WINDOWS``
+    min_views_for_rotations: int = 1
+    max_windows: int | None = None  # after which a round ends; None: ``MOST_WINDOWS``
 
 
-def difference_of_images(drawn: Rendering, image: Image, background: Tensor, shrink: int) -> Tensor:
+def image_difference(drawn: Rendering, image: Image, background: Tensor, shrink: int) -> Tensor:
     """Return 0.8 L1 + 0.2 (1 - SSIM) + 0.1 of the mean error of alpha ()."""
     rendered = drawn.rgb[0]
     truth = image.composite(background)
@@ -65,12 +65,14 @@ def difference_of_images(drawn: Rendering, image: Image, background: Tensor, shr
         rendered = rendered * mask[..., None]
         truth = truth * mask[..., None]
         error = error * mask
-        mask = shrunk(mask[..., None], shrink)[..., 0]
-    loss = l1_ssim_loss(shrunk(rendered, shrink), shrunk(truth, shrink), SSIM_WEIGHT, mask)
-    return loss + ALPHA_WEIGHT * shrunk(error[..., None], shrink).abs().mean()
+        mask = downscale_image(mask[..., None], shrink)[..., 0]
+    loss = l1_ssim_loss(
+        downscale_image(rendered, shrink), downscale_image(truth, shrink), SSIM_WEIGHT, mask
+    )
+    return loss + ALPHA_WEIGHT * downscale_image(error[..., None], shrink).abs().mean()
 
 
-def difference_of_silhouettes(
+def silhouette_difference(
     drawn: Rendering, image: Image, background: Tensor, shrink: int
 ) -> Tensor:
     """Return the squared error of alpha, over the area of the silhouette (); nothing else of the
@@ -78,19 +80,19 @@ def difference_of_silhouettes(
     assert image.alpha is not None
     mask = 1.0 if image.mask is None else image.mask
     error = (drawn.alpha[0] - image.alpha) * mask
-    area = shrunk((image.alpha * mask)[..., None], shrink).sum().clamp_min(1)
-    return shrunk(error[..., None], shrink).square().sum() / area
+    area = downscale_image((image.alpha * mask)[..., None], shrink).sum().clamp_min(1)
+    return downscale_image(error[..., None], shrink).square().sum() / area
 
 
-IMAGES = PoseComparison(difference_of_images, turn_weight=POSE_WEIGHT / POSE_CM**2)
-SILHOUETTES = PoseComparison(
-    difference_of_silhouettes, turn_weight=1.0, shift_weight=10.0, views_to_turn=2
+IMAGE_COMPARISON = PoseComparison(image_difference, rotation_weight=POSE_WEIGHT / POSE_CM**2)
+SILHOUETTE_COMPARISON = PoseComparison(
+    silhouette_difference, rotation_weight=1.0, translation_weight=10.0, min_views_for_rotations=2
 )
 """One view hides how far limbs reach towards the camera: rotations fitted to it look wrong from
 elsewhere."""
 
 
-def shrunk(image: Tensor, factor: int) -> Tensor:
+def downscale_image(image: Tensor, factor: int) -> Tensor:
     """Return the (H, W, C) image with its sides divided by ``factor``, averaged over pixel
     areas."""
     if factor == 1:
@@ -99,13 +101,13 @@ def shrunk(image: Tensor, factor: int) -> Tensor:
     return area_downscale(image, width, height)
 
 
-COARSE_PX = 40  # height of the person, px, in the coarsest of the three rounds
+COARSE_HEIGHT_PX = 40  # height of the person, px, in the coarsest of the three rounds
 FIRST_RATES = (5e-3, 5e-3, 3e-3)
 LAST_RATES = (2.5e-3, 1.2e-3, 5e-4)
 """Learning rates of rotations, rad, in the three rounds."""
-SHIFT_RATE = 0.5  # learning rate of the translation, m, over that of rotations, rad
+TRANSLATION_RATE = 0.5  # learning rate of the translation, m, over that of rotations, rad
 BETAS = (0.9, 0.99)
-WINDOW, LEAST_GAIN, MOST_WINDOWS = 8, 0.02, 12
+UPDATES_PER_WINDOW, MIN_LOSS_DECREASE, MAX_WINDOWS = 8, 0.02, 12
 """After so many updates (at least one for each image) the rate is halved unless the mean loss fell
 by that share; a round ends below the last rate, or after so many windows."""
 
@@ -114,7 +116,7 @@ def fit_poses_to_images(
     scene: HumanScene,
     images: ImageLoader,
     background: Tensor,
-    comparison: PoseComparison = IMAGES,
+    comparison: PoseComparison = IMAGE_COMPARISON,
     which: Collection[int] | None = None,
 ) -> tuple[HumanScene, list[int]]:
     """Return the person in the poses in which it looks most like ``images``, rotations of joints
@@ -125,7 +127,7 @@ def fit_poses_to_images(
     correct; ``background`` (3,) is behind both. ``which`` are the indices of the images that count,
     None: all.
     """
-    groups = by_time(images, which)
+    groups = group_by_time(images, which)
     times = sorted(groups)
     parts = [scene.played_clip.at(time) for time in times]
     poses, trans, scale = (
@@ -148,10 +150,12 @@ def fit_poses_to_images(
     clip = corrected_clip(none, starts, corrections[:, :-1], shifts)
     # ``playing`` applies both again
     exactly = corrected_clip(SharedCorrection(-fit.turns, -fit.log_scale), clip)
-    return scene.playing(exactly), counts
+    return scene.with_motion(exactly), counts
 
 
-def by_time(images: ImageLoader, which: Collection[int] | None = None) -> dict[float, list[int]]:
+def group_by_time(
+    images: ImageLoader, which: Collection[int] | None = None
+) -> dict[float, list[int]]:
     """Return indices of images by their time; those without one are of time 0. ``which`` count,
     None: all."""
     groups: dict[float, list[int]] = {}
@@ -185,15 +189,15 @@ def _fit_pose(
             start.trans + shift * start.scale,
             start.scale,
         )
-        moment = scene.in_pose(posing, time)
+        moment = scene.time_step_in_pose(posing, time)
         losses = []
         for image in shown:
             drawn = scene.render(
                 image.cameras, moment, options=scene.options, background=background
             )
             losses.append(comparison.difference(drawn, image, background, shrink))
-        size = comparison.turn_weight * turns.square().mean()
-        size = size + comparison.shift_weight * shift.square().mean()
+        size = comparison.rotation_weight * turns.square().mean()
+        size = size + comparison.translation_weight * shift.square().mean()
         return torch.stack(losses).mean() + size
 
     @torch.no_grad()
@@ -204,12 +208,12 @@ def _fit_pose(
     heights = [
         x.cameras.height if x.alpha is None else int((x.alpha > 0).any(1).sum()) for x in images
     ]
-    coarse = max(1, round(max(heights) / COARSE_PX))
+    coarse = max(1, round(max(heights) / COARSE_HEIGHT_PX))
     found = none if guess is None else better(none, guess, coarse)
-    factors = [(slice(-1, None), SHIFT_RATE)]
-    if len(images) >= comparison.views_to_turn:
+    factors = [(slice(-1, None), TRANSLATION_RATE)]
+    if len(images) >= comparison.min_views_for_rotations:
         factors.append((slice(-1), 1.0))
-    window = len(images) * math.ceil(WINDOW / len(images))
+    window = len(images) * math.ceil(UPDATES_PER_WINDOW / len(images))
     count = 0
     shrinks = coarse, round(math.sqrt(coarse)), 1
     for shrink, rate, last in zip(shrinks, FIRST_RATES, LAST_RATES, strict=True):
@@ -217,7 +221,7 @@ def _fit_pose(
         moments = torch.zeros_like(found), torch.zeros_like(found)
         before = math.inf
         update = 0
-        for _ in range(comparison.most_windows or MOST_WINDOWS):
+        for _ in range(comparison.max_windows or MAX_WINDOWS):
             total = 0.0
             for _ in range(window):
                 update += 1
@@ -235,7 +239,7 @@ def _fit_pose(
                         step=update,
                         betas=BETAS,
                     )
-            if total > (1 - LEAST_GAIN) * before:
+            if total > (1 - MIN_LOSS_DECREASE) * before:
                 rate /= 2
                 if rate < last:
                     break
@@ -244,9 +248,9 @@ def _fit_pose(
     return better(none, found, 1), count
 
 
-TRIED = 3  # time steps at which a view is left out
-REFIT_GAIN = 0.5  # mean of its PSNR in the person's box, dB, from which all poses are fitted
-LEAST_MOVE = 0.005
+NUM_TRIAL_TIMES = 3  # time steps at which a view is left out
+MIN_REFIT_GAIN_DB = 0.5  # mean of its PSNR in the person's box, dB, from which all poses are fitted
+MIN_JOINT_SHIFT = 0.005
 """Mean of all joints, m of the body, from which they are fitted the first time: training learns
 less without.
 
@@ -254,8 +258,8 @@ Poses that are given, or found in good silhouettes, are moved by 2 to 6 mm, thos
 masks by 6 to 16.
 """
 # fractions of the run after which poses are fitted, one after each step
-STARTS = (0.25, 0.45, 0.65)
-REFIT_WINDOWS = 6  # of each round of a fit: training goes on with what is found
+REFIT_STARTS = (0.25, 0.45, 0.65)
+MAX_REFIT_WINDOWS = 6  # of each round of a fit: training goes on with what is found
 
 
 class PoseRefit:
@@ -268,17 +272,19 @@ class PoseRefit:
         goes_on: whether views gained when poses were fitted last.
     """
 
-    goes_on = True
+    is_active = True
 
     def __init__(self, images: ImageLoader, background: Tensor, steps: int) -> None:
         self._images, self._background = images, background
-        self._groups = [sorted(group) for _, group in sorted(by_time(images).items())]
-        self._starts = [round(start * steps) for start in STARTS]
+        self._groups = [sorted(group) for _, group in sorted(group_by_time(images).items())]
+        self._starts = [round(start * steps) for start in REFIT_STARTS]
         # as many updates as the run has, at most
-        few = steps // (len(FIRST_RATES) * WINDOW * len(self._groups))
-        self._comparison = replace(IMAGES, most_windows=min(max(few, 1), REFIT_WINDOWS))
+        few = steps // (len(FIRST_RATES) * UPDATES_PER_WINDOW * len(self._groups))
+        self._comparison = replace(
+            IMAGE_COMPARISON, max_windows=min(max(few, 1), MAX_REFIT_WINDOWS)
+        )
 
-    def suits(self, scene: HumanScene) -> bool:
+    def applies_to(self, scene: HumanScene) -> bool:
         """Return whether each row of the clip of training has images of its own, and some have two
         or more."""
         return len(self._groups) == len(scene.clip) and any(
@@ -289,27 +295,36 @@ class PoseRefit:
         """Return the scene as it is after ``step``, and a line if that was decided; None: nothing
         is to do."""
         since = [step - start for start in self._starts if start <= step]
-        if not self.goes_on or not since or since[-1] > len(self._groups) or not self.suits(scene):
+        if (
+            not self.is_active
+            or not since
+            or since[-1] > len(self._groups)
+            or not self.applies_to(scene)
+        ):
             return None
         scene.changed()
         if since[-1] > 0:
-            return self.refitted(scene, since[-1] - 1), ""
-        gain, move = self.tried(scene)
-        self.goes_on = gain >= REFIT_GAIN and (move >= LEAST_MOVE or step > self._starts[0])
+            return self.refit_frame(scene, since[-1] - 1), ""
+        gain, move = self.measure_gain(scene)
+        self.is_active = gain >= MIN_REFIT_GAIN_DB and (
+            move >= MIN_JOINT_SHIFT or step > self._starts[0]
+        )
         decided = (
-            "are fitted to the images again" if self.goes_on else "stay, but for what is learned"
+            "are fitted to the images again" if self.is_active else "stay, but for what is learned"
         )
         why = f"such a fit moves joints by {1000 * move:.0f} mm, and views left out of it gain {gain:.1f} dB"
         return scene, f"poses {decided}: {why}"
 
-    def tried(self, scene: HumanScene) -> tuple[float, float]:
+    def measure_gain(self, scene: HumanScene) -> tuple[float, float]:
         """Return what poses fitted to all views but one of their time do, as means over some times.
 
         By how many dB the view that was left out gains, in the person's box; how far joints move, m
         of the body.
         """
         rows = [row for row in range(len(self._groups)) if self._is_fitted(row)]
-        rows = [rows[(2 * i + 1) * len(rows) // (2 * TRIED)] for i in range(TRIED)]
+        rows = [
+            rows[(2 * i + 1) * len(rows) // (2 * NUM_TRIAL_TIMES)] for i in range(NUM_TRIAL_TIMES)
+        ]
         gains = []
         moves = []
         for number, row in enumerate(dict.fromkeys(rows)):
@@ -322,10 +337,14 @@ class PoseRefit:
             moves.append(float((after - before).norm(dim=1).mean()))
         return fmean(gains), fmean(moves)
 
-    def refitted(self, scene: HumanScene, row: int) -> HumanScene:
+    def refit_frame(self, scene: HumanScene, row: int) -> HumanScene:
         """Return the scene with row ``row`` of the clip of training as it was fitted, and its
         corrections zero."""
-        found = self._fitted(scene, self._groups[row]).played if self._is_fitted(row) else None
+        found = (
+            self._fitted(scene, self._groups[row]).replacement_clip
+            if self._is_fitted(row)
+            else None
+        )
         if found is None:
             return scene
         clip = {"poses": scene.clip.poses.clone(), "trans": scene.clip.trans.clone()}
@@ -340,7 +359,9 @@ class PoseRefit:
 
     def _fitted(self, scene: HumanScene, which: list[int]) -> HumanScene:
         still = replace(scene, gaussians=scene.gaussians.detach())
-        return fit_poses_to_images(still, self._images, self._background, self._comparison, which)[0]
+        return fit_poses_to_images(still, self._images, self._background, self._comparison, which)[
+            0
+        ]
 
     @torch.no_grad()
     def _psnr(self, scene: HumanScene, index: int) -> float:

@@ -24,14 +24,14 @@ from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.joints import JOINT_NAMES, mirrored_joints
 from dyngs.human.body.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.motion.motion import MotionClip
-from dyngs.ops.device import sent
+from dyngs.ops.device import copy_async
 from dyngs.ops.harmonics import lit
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.quaternions import quats_from_matrices, rotation_matrices
 
 # message of files that cannot hold it
-LEFT_OUT = "the learned light is left out: colours are those in even light"
-TERMS = 8  # number of harmonics of degree 1 and 2; degree 0 is the colour itself
+LIGHT_NOT_EXPORTED = "the learned light is left out: colours are those in even light"
+NUM_LIGHT_TERMS = 8  # number of harmonics of degree 1 and 2; degree 0 is the colour itself
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def rest_normals(gaussians: Gaussians) -> Tensor:
     return rotation_matrices(gaussians.quats)[..., 2]
 
 
-def difference_of_sides(gaussians: Gaussians, images: Tensor, is_image: Tensor) -> Tensor:
+def colour_asymmetry(gaussians: Gaussians, images: Tensor, is_image: Tensor) -> Tensor:
     """Return the mean squared difference () between base colours and those of the mirror images.
 
     Clothes are mostly the same on both sides and light is not: this tells one from the other where
@@ -290,8 +290,8 @@ def skinning_weights(
     return dense.scatter_add(1, anchors.joints, parts)
 
 
-FINER = 2  # texels of the finer atlas along a side of one
-PIXELS = 2.0  # pixels along the side of a texel from which it is replaced by smaller ones
+FINE_FACTOR = 2  # texels of the finer atlas along a side of one
+MAX_TEXEL_PIXELS = 2.0  # pixels along the side of a texel from which it is replaced by smaller ones
 _LIMBS = ("wrist", "ankle", "foot", "index", "middle", "pinky", "ring", "thumb")
 
 
@@ -321,9 +321,9 @@ def surface_texels(
     named = [any(part in name for part in _LIMBS) for name in JOINT_NAMES[: len(body.parents)]]
     limbs = torch.tensor(named, device=texels.points.device)
     on_limbs = limbs[texels.weights.argmax(1)]
-    if not bool(on_limbs.any()) or float(texels.size[on_limbs].median()) < PIXELS * pixel:
+    if not bool(on_limbs.any()) or float(texels.size[on_limbs].median()) < MAX_TEXEL_PIXELS * pixel:
         return [texels]
-    fine = atlas_texels(body, FINER * resolution, vertices)
+    fine = atlas_texels(body, FINE_FACTOR * resolution, vertices)
     return [texels.select(~on_limbs), fine.select(limbs[fine.weights.argmax(1)])]
 
 
@@ -349,7 +349,7 @@ LR = {
     "normals": 1e-3,
 }
 """Learning rates."""
-OF_FRAMES = ("poses", "trans")  # what is learned of single frames
+PER_FRAME = ("poses", "trans")  # what is learned of single frames
 LR_DECAY = 0.1  # last over first learning rate
 POSE_WEIGHT, WEIGHTS_WEIGHT, LIGHT_WEIGHT = 1e-4, 1e-3, 1e-3
 """Of the squared corrections of poses and joints, of skinning weights, and of the light, in the
@@ -388,7 +388,7 @@ def new_corrections(
         "weights": torch.zeros_like(anchors.weights),
     }
     if normals is not None:
-        zeros |= {"light": normals.new_zeros(TERMS, 3), "normals": normals}
+        zeros |= {"light": normals.new_zeros(NUM_LIGHT_TERMS, 3), "normals": normals}
     own = ("weights", "normals")
     roles = {name: Role.PER_GAUSSIAN if name in own else Role.SHARED for name in zeros}
     return Parameters(zeros, LR | {"trans": LR["trans"] * unit}, LR_DECAY, roles)
@@ -447,7 +447,7 @@ def corrected_skeleton(learned: Parameters, skeleton: Skeleton) -> Skeleton:
     return Skeleton(skeleton.joints + learned["joints"], skeleton.parents)
 
 
-def share_sides(learned: Parameters) -> None:
+def symmetrize_joint_gradients(learned: Parameters) -> None:
     """Give the joints at rest the mean gradient of both sides of the body, so that they stay mirror
     images.
 
@@ -456,7 +456,9 @@ def share_sides(learned: Parameters) -> None:
     """
     gradient = learned["joints"].grad
     if gradient is not None:
-        mirrored = sent(torch.tensor(mirrored_joints(len(gradient)), device="cpu"), gradient.device)
+        mirrored = copy_async(
+            torch.tensor(mirrored_joints(len(gradient)), device="cpu"), gradient.device
+        )
         other = gradient.index_select(0, mirrored)
         other[:, 0].neg_()
         gradient.add_(other).div_(2)

@@ -23,7 +23,7 @@ from dyngs.gaussians.colour.network import RestPose
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.human.avatar.posing import (
-    LEFT_OUT,
+    LIGHT_NOT_EXPORTED,
     Anchors,
     BodyPose,
     Light,
@@ -36,13 +36,13 @@ from dyngs.human.avatar.posing import (
     frame_pose,
     learned_light,
     new_corrections,
-    pose_gaussians,
     pose_blend_offsets,
+    pose_gaussians,
     skinning_weights,
 )
 from dyngs.human.body.joints import SMPLX_ROWS
 from dyngs.human.body.skinning import check_tree
-from dyngs.human.motion.motion import MotionClip, captured_motion, same_bodies
+from dyngs.human.motion.motion import MotionClip, captured_motion, has_same_parameters
 from dyngs.models.renderable import Posable, Renderable, clamped_time
 
 
@@ -57,13 +57,13 @@ class HumanScene(GaussianScene, Posable):
     shapes: PoseBlendShapes | None = None  # the template's pose blend shapes, or None
     # another clip to play, given as that of training was; None: that of training, corrected frame
     # by frame
-    played: MotionClip | None = None
+    replacement_clip: MotionClip | None = None
     # (N,) in [0, 1] how far colours are what the training views showed, not filled; None: that was
     # not found out
     seen: Tensor | None = None
 
     @staticmethod
-    def restored(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
+    def from_state(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
         """Return the scene of what ``state`` returned, playing the clip of training. Raises
         KeyError or ValueError."""
         tensors = dict(tensors)
@@ -85,7 +85,7 @@ class HumanScene(GaussianScene, Posable):
             anchors=anchors,
             skeleton=skeleton,
             clip=clip,
-            learned=new_corrections(clip, skeleton, anchors, learned.get("normals")).restored(
+            learned=new_corrections(clip, skeleton, anchors, learned.get("normals")).with_state(
                 learned
             ),
             shapes=shapes,
@@ -99,7 +99,7 @@ class HumanScene(GaussianScene, Posable):
     @property
     def is_static(self) -> bool:
         """Whether the clip that is played has one pose."""
-        return len(self.clip if self.played is None else self.played) == 1
+        return len(self.clip if self.replacement_clip is None else self.replacement_clip) == 1
 
     @property
     def rows(self) -> Tensor:
@@ -146,7 +146,7 @@ class HumanScene(GaussianScene, Posable):
     @property
     def left_out(self) -> tuple[str, ...]:
         """Notes about what files without learned light leave out."""
-        return () if self.light is None else (LEFT_OUT,)
+        return () if self.light is None else (LIGHT_NOT_EXPORTED,)
 
     @property
     def played_clip(self) -> MotionClip:
@@ -156,8 +156,8 @@ class HumanScene(GaussianScene, Posable):
             trans = self.learned["trans"].detach()
             self._derived["clip"] = (
                 corrected_clip(self.fit, self.clip, poses, trans)
-                if self.played is None
-                else corrected_clip(self.fit, self.played)
+                if self.replacement_clip is None
+                else corrected_clip(self.fit, self.replacement_clip)
             )
         return self._derived["clip"]
 
@@ -170,12 +170,12 @@ class HumanScene(GaussianScene, Posable):
         kept = self._derived.get("posed")
         if kept is not None and not torch.is_grad_enabled():
             return replace(kept, time=now)
-        posed = self.in_pose(frame_pose(self.played_clip.at(now), 0), now)
+        posed = self.time_step_in_pose(frame_pose(self.played_clip.at(now), 0), now)
         if self.is_static and not torch.is_grad_enabled():
             self._derived["posed"] = posed
         return posed
 
-    def in_pose(self, posing: BodyPose, time: float) -> GaussianTimeStep:
+    def time_step_in_pose(self, posing: BodyPose, time: float) -> GaussianTimeStep:
         """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable
         in the pose."""
         gaussians = self._posed(posing, self.weights, self.learned_skeleton, self.light)
@@ -188,30 +188,32 @@ class HumanScene(GaussianScene, Posable):
         offsets = pose_blend_offsets(self.anchors, posing, self.shapes)
         return pose_gaussians(self.gaussians, weights, skeleton, posing, offsets, light)
 
-    def in_frame(self, row: int, given_weights: Tensor | None = None) -> tuple[Gaussians, BodyPose]:
+    def gaussians_in_frame(
+        self, row: int, template_weights: Tensor | None = None
+    ) -> tuple[Gaussians, BodyPose]:
         """Return the Gaussians in frame ``row`` of the clip of training; differentiable in all that
         is learned.
 
         With ``given_weights`` (N, J) nothing that was learned about the body is applied.
         """
-        if given_weights is not None:
+        if template_weights is not None:
             posing = frame_pose(self.clip, row)
-            return self._posed(posing, given_weights, self.skeleton, None), posing
+            return self._posed(posing, template_weights, self.skeleton, None), posing
         posing = corrected_pose(self.learned, self.clip, row)
         skeleton = corrected_skeleton(self.learned, self.skeleton)
         weights = skinning_weights(self.anchors, len(skeleton.joints), self.learned["weights"])
         return self._posed(posing, weights, skeleton, learned_light(self.learned)), posing
 
-    def given_weights(self) -> Tensor:
+    def template_weights(self) -> Tensor:
         """Return (N, J) skinning weights of the template."""
         return skinning_weights(self.anchors, len(self.skeleton.joints))
 
-    def edited(self, edit: TopologyEdit) -> HumanScene:
+    def apply_edit(self, edit: TopologyEdit) -> HumanScene:
         return replace(
             self,
-            gaussians=self.gaussians.edited(edit),
+            gaussians=self.gaussians.apply_edit(edit),
             anchors=self.anchors.select(edit.source),
-            learned=self.learned.edited(Role.PER_GAUSSIAN, edit),
+            learned=self.learned.apply_edit(Role.PER_GAUSSIAN, edit),
             seen=None if self.seen is None else self.seen[edit.source],
         )
 
@@ -220,13 +222,13 @@ class HumanScene(GaussianScene, Posable):
         count = len(self) if (which == "still") == self.is_static else 0
         return self.select(torch.arange(count, device=self.gaussians.means.device))
 
-    def playing(self, clip: MotionClip) -> HumanScene:
+    def with_motion(self, clip: MotionClip) -> HumanScene:
         """Return the same person in another clip, whose poses are given as those of training were.
 
         What was learned about all poses is applied: the person's size, and how the joints are
         turned.
         """
-        return replace(self, played=clip)
+        return replace(self, replacement_clip=clip)
 
     def up_of_body(self) -> Tensor:
         from dyngs.human.motion.placement import up_direction  # late: scipy
@@ -236,7 +238,7 @@ class HumanScene(GaussianScene, Posable):
     def at_rest(self) -> HumanScene:
         from dyngs.human.motion.placement import rest_clip  # late: scipy
 
-        return self.playing(rest_clip(self.clip, self.skeleton.joints, self.skeleton.parents))
+        return self.with_motion(rest_clip(self.clip, self.skeleton.joints, self.skeleton.parents))
 
     def placed(self, rotation: Tensor, scale: float, shift: Tensor) -> HumanScene:
         from dyngs.human.motion.placement import moved  # late: scipy
@@ -248,8 +250,8 @@ class HumanScene(GaussianScene, Posable):
         def there(clip: MotionClip) -> MotionClip:
             return moved(clip, rotation, scale, shift, pelvis)
 
-        played = None if self.played is None else there(self.played)
-        return replace(self, clip=there(self.clip), played=played)
+        replacement_clip = None if self.replacement_clip is None else there(self.replacement_clip)
+        return replace(self, clip=there(self.clip), replacement_clip=replacement_clip)
 
     def as_filmed(self, capture: Capture, split: Split) -> HumanScene:
         """Return the person as the views of a split show them.
@@ -260,10 +262,12 @@ class HumanScene(GaussianScene, Posable):
         if capture.body is None:
             return self
         own = capture.body[split]
-        if split != "pose" and same_bodies(own, capture.body["train"]):
+        if split != "pose" and has_same_parameters(own, capture.body["train"]):
             return self
         views = capture.splits[split]
-        return self.playing(captured_motion(capture.root, own, views, self.skeleton.joints).clip)
+        return self.with_motion(
+            captured_motion(capture.root, own, views, self.skeleton.joints).clip
+        )
 
     def drawing_state(self) -> State:
         """Return what drawing needs; learned corrections of skinning weights are applied to

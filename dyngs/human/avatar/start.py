@@ -10,11 +10,11 @@ from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians import Gaussians
+from dyngs.gaussians.initialization import build_colour_training, build_densifier
 from dyngs.gaussians.model import GaussianModel
 from dyngs.gaussians.scene import restore_appearance
 from dyngs.gaussians.schedule import rate_schedule
-from dyngs.gaussians.initialization import colours_of, build_densifier
-from dyngs.human.avatar.observations import in_colours_of
+from dyngs.human.avatar.observations import colour_from_images
 from dyngs.human.avatar.pose_fit import PoseRefit
 from dyngs.human.avatar.posing import (
     Skeleton,
@@ -26,7 +26,7 @@ from dyngs.human.avatar.posing import (
     surface_texels,
 )
 from dyngs.human.avatar.scene import HumanScene, first_scene
-from dyngs.human.avatar.training import HumanTraining, outline_loss
+from dyngs.human.avatar.training import HumanTraining, make_outline_loss
 from dyngs.human.body.body_reader import load_template, rest_shape
 from dyngs.human.keys import NO_BODY, HumanModel
 from dyngs.human.motion.motion import CapturedMotion, captured_motion
@@ -34,7 +34,7 @@ from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import RunStart
 from dyngs.models.views import evaluation_background, training_cameras
 
-FIRST_VIEWS = 50  # number of images from which a person's first colours are taken
+MAX_COLOUR_VIEWS = 50  # number of images from which a person's first colours are taken
 
 
 def start(run: RunStart) -> GaussianModel:
@@ -45,12 +45,12 @@ def start(run: RunStart) -> GaussianModel:
     config = run.config
     model = config.model
     assert isinstance(model, HumanModel)
-    scene, motion = human_start(config, model, run.capture, run.images)
-    colours = colours_of(run, scene.gaussians, uses_time=False)
+    scene, motion = initialize_human_scene(config, model, run.capture, run.images)
+    colours = build_colour_training(run, scene.gaussians, uses_time=False)
     filmed = run.capture.splits["train"]
     cameras = training_cameras(filmed, config.data)
     views = [(camera, view.frame or 0) for camera, view in zip(cameras, filmed, strict=True)]
-    outlines = None if colours.network is not None else outline_loss(run)
+    outlines = None if colours.network is not None else make_outline_loss(run)
     behind = evaluation_background(config.data.background, run.capture.has_alpha)[1]
     refit = (
         PoseRefit(run.images, behind, config.train.steps)
@@ -67,13 +67,13 @@ def start(run: RunStart) -> GaussianModel:
 
 def restore(model: HumanModel, checkpoint: Checkpoint) -> HumanScene:
     """Return the scene of a checkpoint."""
-    scene = HumanScene.restored(
+    scene = HumanScene.from_state(
         Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
     )
     return restore_appearance(scene, model, checkpoint)
 
 
-def human_start(
+def initialize_human_scene(
     config: Config, model: HumanModel, capture: Capture, images: ImageLoader
 ) -> tuple[HumanScene, CapturedMotion]:
     """Return a person before the first step, and the clip of training.
@@ -98,5 +98,5 @@ def human_start(
     gaussians, anchors, normals = surface_gaussians(parts, sh_degree)
     skeleton = Skeleton(joints, body.parents)
     scene = first_scene(gaussians, anchors, skeleton, filmed.clip, pose_blend_shapes(body))
-    shown = (images[i] for i in evenly_spaced(len(images), FIRST_VIEWS))
-    return in_colours_of(scene, filmed.rows, normals, shown), filmed
+    shown = (images[i] for i in evenly_spaced(len(images), MAX_COLOUR_VIEWS))
+    return colour_from_images(scene, filmed.rows, normals, shown), filmed

@@ -23,21 +23,21 @@ from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.gaussians.schedule import RateSchedule
 from dyngs.human.avatar.observations import (
-    HARDLY,
+    LOW_CONFIDENCE,
+    effective_view_counts,
     filled,
-    linked_neighbours,
-    mirror_images,
-    sightings,
-    strains,
+    find_mirror_gaussians,
+    rigidity_errors,
+    same_part_neighbours,
     visibility_confidence,
 )
 from dyngs.human.avatar.pose_fit import PoseRefit
 from dyngs.human.avatar.posing import (
-    OF_FRAMES,
+    PER_FRAME,
     BodyPose,
+    colour_asymmetry,
     correction_penalties,
-    difference_of_sides,
-    share_sides,
+    symmetrize_joint_gradients,
 )
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.keys import HumanModel
@@ -45,16 +45,18 @@ from dyngs.models.kind import RunStart
 from dyngs.models.model import Look, Loss
 from dyngs.models.views import background_colour
 from dyngs.ops.adam import Count
-from dyngs.ops.device import sent
+from dyngs.ops.device import copy_async
 from dyngs.ops.loss import l1_ssim_loss
 
-REACH = 2  # distance from the mask up to which images are compared as they were taken, px
-OUTSIDE = 0.02  # alpha up to which a pixel is outside of the mask
-FRAMES = 21  # of a camera, whose median is what is behind
+OUTLINE_REACH_PX = (
+    2  # distance from the mask up to which images are compared as they were taken, px
+)
+MAX_OUTSIDE_ALPHA = 0.02  # alpha up to which a pixel is outside of the mask
+PLATE_FRAMES = 21  # of a camera, whose median is what is behind
 # median difference, over pixels outside of the masks, from which the camera or the light has moved
-STANDS = 12 / 255
+MAX_BACKGROUND_CHANGE = 12 / 255
 # least fraction of the pixels near outlines, behind which something is known, to use any
-WORTH_TELLING = 0.01
+MIN_OUTLINE_FRACTION = 0.01
 _STRIP = 32  # rows whose median is taken at once
 
 
@@ -99,16 +101,16 @@ class OutlineLoss(Loss):
         if plate is not None and alpha is not None and truth.shape == plate[0].shape:
             photo = self._photos[look.index].rgb_premultiplied
             colours, known, photo, behind = (
-                sent(x, rendered.device) for x in (*plate, photo, self._behind)
+                copy_async(x, rendered.device) for x in (*plate, photo, self._behind)
             )
-            use = (known & _near(alpha))[..., None]
+            use = (known & _near_silhouette(alpha))[..., None]
             seen = look.drawn.rendering.transmittance[0][..., None]
             rendered = rendered + use * seen * (colours - behind)
             truth = torch.where(use, photo, truth)
         return {"image": l1_ssim_loss(rendered, truth, self._ssim_weight, look.image.mask)}
 
 
-def outline_loss(run: RunStart) -> OutlineLoss | None:
+def make_outline_loss(run: RunStart) -> OutlineLoss | None:
     """Return how colours are compared near outlines; None where masks come with the images, or no
     camera stands."""
     views = run.images.views
@@ -127,18 +129,18 @@ def outline_loss(run: RunStart) -> OutlineLoss | None:
     plates: dict[int, tuple[Tensor, Tensor]] = {}
     known = total = 0.0
     for camera, rows in _standing(views).items():
-        shown = [rows[i] for i in evenly_spaced(len(rows), FRAMES)]
+        shown = [rows[i] for i in evenly_spaced(len(rows), PLATE_FRAMES)]
         alphas = torch.stack([x for i in shown if (x := run.images[i].alpha) is not None])
-        near = _near(alphas)
+        near = _near_silhouette(alphas)
         bare = [(255 * photos[i].rgb_premultiplied).round().byte() for i in shown]
         plate = _plate(torch.stack(bare), near)
         if plate is None:
             continue
         plates[camera] = plate
-        rims = near & (alphas <= 1 - OUTSIDE)
+        rims = near & (alphas <= 1 - MAX_OUTSIDE_ALPHA)
         known += float((rims & plate[1]).sum())
         total += float(rims.sum())
-    if not plates or known < WORTH_TELLING * total:
+    if not plates or known < MIN_OUTLINE_FRACTION * total:
         return None
     return OutlineLoss(
         photos, plates, background_colour(run.background), config.train.ssim_weight, known / total
@@ -160,11 +162,11 @@ def _standing(views: Sequence[View]) -> dict[int, list[int]]:
     return {camera: own for camera, own in rows.items() if len(own) > SEEN_BARE and stands(own)}
 
 
-def _near(alpha: Tensor) -> Tensor:
+def _near_silhouette(alpha: Tensor) -> Tensor:
     """Return where (..., H, W) the mask is, and up to ``REACH`` px around it."""
-    size = 2 * REACH + 1
-    grown = torch.nn.functional.max_pool2d(alpha[..., None, :, :], size, 1, REACH)
-    return grown[..., 0, :, :] > OUTSIDE
+    size = 2 * OUTLINE_REACH_PX + 1
+    grown = torch.nn.functional.max_pool2d(alpha[..., None, :, :], size, 1, OUTLINE_REACH_PX)
+    return grown[..., 0, :, :] > MAX_OUTSIDE_ALPHA
 
 
 def _plate(photos: Tensor, near: Tensor) -> tuple[Tensor, Tensor] | None:
@@ -183,7 +185,7 @@ def _plate(photos: Tensor, near: Tensor) -> tuple[Tensor, Tensor] | None:
         away.append((bare - colours[rows]).abs().amax(-1)[:, known[rows]].flatten())
     differences = torch.cat(away)
     differences = differences[~differences.isnan()]
-    if not len(differences) or float(differences.median()) > STANDS:
+    if not len(differences) or float(differences.median()) > MAX_BACKGROUND_CHANGE:
         return None
     return colours, known
 
@@ -194,7 +196,7 @@ class AvatarParams:
 
     refine_from: float = 0.1  # fraction of the run after which corrections are learned
     # fraction after which those of single frames are: what all frames share comes first
-    frames_from: float = 0.25
+    refine_frames_from: float = 0.25
     offset_weight: float = 2e-4  # of squared distances from the scaffold
     scale_weight: float = 1e-2  # of the squared excess of log-scales over the size of the texel
     rigidity: float = 1e-2  # of squared changes, by posing, of distances between neighbours
@@ -204,7 +206,7 @@ class AvatarParams:
     sides_weight: float = 0.1
     views: int = 100  # training views, at most, in which it is counted how much they show
     # fraction of Gaussians that are hardly seen from which on a message says so
-    worth_telling: float = 0.01
+    min_reported_fraction: float = 0.01
 
 
 PARAMS = AvatarParams()
@@ -237,11 +239,11 @@ class HumanTraining(SceneTraining[HumanScene]):
         self.colour_loss = outlines
         self._finding = None if outlines is None else outlines.finding
         self.refines_from = round(PARAMS.refine_from * rates.steps)
-        self.frames_from = round(PARAMS.frames_from * rates.steps)
+        self.refine_frames_from = round(PARAMS.refine_frames_from * rates.steps)
         self._rows = {frame: row for row, frame in enumerate(frames)}
         self._has_refined = False
-        self._near: Tensor | None = None
-        self._images: tuple[Tensor, Tensor] | None = None
+        self._neighbours: Tensor | None = None
+        self._mirror_images: tuple[Tensor, Tensor] | None = None
         self._refit = refit
 
     def time_step(self, scene: HumanScene, image: Image, step: int) -> GaussianTimeStep:
@@ -264,19 +266,21 @@ class HumanTraining(SceneTraining[HumanScene]):
         if self._refines(step):
             penalties |= correction_penalties(scene.learned)
             if scene.light is not None:
-                if self._images is None:
-                    self._images = mirror_images(anchors, float(scene.skeleton.joints[0, 0]))
-                unlike = difference_of_sides(rest, *self._images)
+                if self._mirror_images is None:
+                    self._mirror_images = find_mirror_gaussians(
+                        anchors, float(scene.skeleton.joints[0, 0])
+                    )
+                unlike = colour_asymmetry(rest, *self._mirror_images)
                 penalties["sides"] = PARAMS.sides_weight * unlike
-        if self._near is None:
-            weights = scene.given_weights()
-            self._near = linked_neighbours(anchors.points, weights, PARAMS.neighbours)
-        if self._near.shape[1]:
+        if self._neighbours is None:
+            weights = scene.template_weights()
+            self._neighbours = same_part_neighbours(anchors.points, weights, PARAMS.neighbours)
+        if self._neighbours.shape[1]:
             # in each step between neighbours of one of the five columns, in cm^2: distances do not
             # change, and offsets from the scaffold are alike
-            near = self._near[:, step % self._near.shape[1]]
+            near = self._neighbours[:, step % self._neighbours.shape[1]]
             scale = scene.clip.scale[row]
-            strain, uneven = strains(rest.means, moved.means, anchors.points, near, scale)
+            strain, uneven = rigidity_errors(rest.means, moved.means, anchors.points, near, scale)
             penalties["rigidity"] = PARAMS.rigidity * strain / CENTIMETRE**2
             penalties["smoothness"] = PARAMS.smoothness * uneven / CENTIMETRE**2
         frame = RestPose(rest.means, posing.rotations[0])
@@ -288,9 +292,9 @@ class HumanTraining(SceneTraining[HumanScene]):
             return 0
         self._has_refined = True
         progress = self.rates.progress(step, since=self.refines_from)
-        share_sides(scene.learned)
-        if step <= self.frames_from:
-            for name in OF_FRAMES:
+        symmetrize_joint_gradients(scene.learned)
+        if step <= self.refine_frames_from:
+            for name in PER_FRAME:
                 scene.learned[name].grad = None
         return scene.learned.step(step - self.refines_from, progress)
 
@@ -305,12 +309,12 @@ class HumanTraining(SceneTraining[HumanScene]):
         fitted again.
         """
         if step == 1 and self._finding is not None:
-            return scene, EditResult(None, finding=self._finding)
+            return scene, EditResult(None, message=self._finding)
         if step == self.rates.steps:
             has_views = self.options.fill_unseen and self.views and len(scene)
             return self._filled(scene, step) if has_views else None
         found = None if self._refit is None else self._refit.edit_scene(scene, step)
-        return None if found is None else (found[0], EditResult(None, finding=found[1] or None))
+        return None if found is None else (found[0], EditResult(None, message=found[1] or None))
 
     def _filled(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult]:
         shown = [self.views[i] for i in evenly_spaced(len(self.views), PARAMS.views)]
@@ -321,32 +325,32 @@ class HumanTraining(SceneTraining[HumanScene]):
                 for camera, frame in shown
             )
             size = scene.anchors.size
-            seen = sightings(drawn, size, float(scene.clip.scale.mean()), scene.options)
+            seen = effective_view_counts(drawn, size, float(scene.clip.scale.mean()), scene.options)
             trust = visibility_confidence(seen * (len(self.views) / len(shown)))
             middle = float(scene.skeleton.joints[0, 0])
             gaussians = scene.gaussians.detach()
-            changes = filled(gaussians, scene.anchors, scene.given_weights(), middle, trust)
-        hardly = float((trust < HARDLY).float().mean())
+            changes = filled(gaussians, scene.anchors, scene.template_weights(), middle, trust)
+        hardly = float((trust < LOW_CONFIDENCE).float().mean())
         line = f"{hardly:.0%} of the surface is hardly seen: filled from the other side of the body and from around it"
-        finding = line if hardly >= PARAMS.worth_telling else None
-        return replace(scene, seen=trust), EditResult(None, changes, finding=finding)
+        message = line if hardly >= PARAMS.min_reported_fraction else None
+        return replace(scene, seen=trust), EditResult(None, changes, message=message)
 
     def follow(self, edit: TopologyEdit | None = None) -> None:
         """Find out anew who the neighbours are."""
-        self._near = self._images = None
+        self._neighbours = self._mirror_images = None
 
-    def restored(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
+    def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
         self.follow()
         if "refines_from" in tensors:  # the run may have become longer since
             self._has_refined = True
             self.refines_from = min(self.refines_from, int(tensors["refines_from"]))
         if self._refit is not None:
-            self._refit.goes_on = "poses_stay" not in tensors
-        return HumanScene.restored(gaussians, tensors)
+            self._refit.is_active = "poses_stay" not in tensors
+        return HumanScene.from_state(gaussians, tensors)
 
     def state(self) -> State:
         kept = {}
-        if self._refit is not None and not self._refit.goes_on:
+        if self._refit is not None and not self._refit.is_active:
             kept["poses_stay"] = torch.ones(1, device="cpu")
         if self._has_refined:
             kept["refines_from"] = torch.tensor(self.refines_from, device="cpu")
@@ -358,7 +362,9 @@ class HumanTraining(SceneTraining[HumanScene]):
 
     def _in_frame(self, scene: HumanScene, row: int, step: int) -> tuple[Gaussians, BodyPose]:
         """Return the Gaussians in row ``row`` of the clip as ``step`` draws them, and the pose."""
-        return scene.in_frame(row, None if self._refines(step) else scene.given_weights())
+        return scene.gaussians_in_frame(
+            row, None if self._refines(step) else scene.template_weights()
+        )
 
     def _refines(self, step: int) -> bool:
         return self.options.refine and step > self.refines_from

@@ -24,7 +24,7 @@ from dyngs.human.body.skinning import (
 )
 
 # shape parameters of a file of SMPL's family that are fitted: as many as every such file has
-NUM_FITTED = 10
+NUM_FITTED_SHAPES = 10
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class BodyTemplate:
             digest.update(
                 b""
                 if values is None
-                else values[..., :NUM_FITTED].contiguous().cpu().numpy().tobytes()
+                else values[..., :NUM_FITTED_SHAPES].contiguous().cpu().numpy().tobytes()
             )
         return digest.hexdigest()[:16]
 
@@ -125,14 +125,14 @@ BONE_UNIT = 0.015
 """Change of a bone vector by one unit of a direction, m: about the spread among adults of the same
 height."""
 # joints that exist on both sides
-SIDED = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")
-MIDDLE = ("spine1", "spine2", "spine3", "neck", "head")  # joints in the plane of symmetry
-NUM_BONE_SHAPES = 3 * len(SIDED) + 2 * len(MIDDLE)
+PAIRED_JOINTS = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")
+MIDLINE_JOINTS = ("spine1", "spine2", "spine3", "neck", "head")  # joints in the plane of symmetry
+NUM_BONE_SHAPES = 3 * len(PAIRED_JOINTS) + 2 * len(MIDLINE_JOINTS)
 """B: a bone vector has three coordinates, in the plane of symmetry two."""
 _NEAREST = 0.02  # distance added to all distances when a vertex lies between several joints, m
 
 
-def bone_shapes(
+def bone_shape_directions(
     vertices: np.ndarray, joints: np.ndarray, parents: tuple[int, ...], weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return directions of the vertices (M, 3, B) and of the joints (J, 3, B), m per unit of a
@@ -154,11 +154,11 @@ def _joint_directions(parents: tuple[int, ...]) -> np.ndarray:
         if parent >= 0:
             below[joint] = np.maximum(below[joint], below[parent])
     moves = []
-    for name in SIDED:
+    for name in PAIRED_JOINTS:
         left, right = (below[:, JOINT_NAMES.index(f"{side}_{name}")] for side in ("left", "right"))
         for axis, mirrored in enumerate((-1.0, 1.0, 1.0)):
             moves.append(np.outer(left + mirrored * right, np.eye(3)[axis]))
-    for name in MIDDLE:
+    for name in MIDLINE_JOINTS:
         moves += [np.outer(below[:, JOINT_NAMES.index(name)], np.eye(3)[axis]) for axis in (1, 2)]
     return BONE_UNIT * np.stack(moves, axis=-1)
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dyngs.core.errors import DyngsError, reading
 from dyngs.data.capture import BodyFrames
-from dyngs.human.body.body import BodyTemplate, apply_shape, bone_shapes
+from dyngs.human.body.body import BodyTemplate, apply_shape, bone_shape_directions
 from dyngs.human.keys import HumanModel
 from dyngs.io.fields import read_limited, require_at_most
 from dyngs.io.numpy_files import read_arrays
@@ -76,7 +76,7 @@ def read_body(path: Path, uv: Path | None = None) -> BodyTemplate:
             joints = file.numbers("J", count, 3)
             rest = (x.astype(np.float32).astype(np.float64) for x in (vertices, joints, weights))
             bare, bones, skin = rest
-            dirs, joint_dirs = bone_shapes(bare, bones, parents, skin)
+            dirs, joint_dirs = bone_shape_directions(bare, bones, parents, skin)
             if "J_shapedirs" in arrays:  # before the directions of bones
                 own = file.numbers("shapedirs", size, 3, None)
                 own_joints = file.numbers("J_shapedirs", count, 3, own.shape[2])

@@ -25,13 +25,13 @@ from dyngs.core.errors import DyngsError, counted, show
 from dyngs.data.capture import Capture, View, by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.read import is_capture, read_capture
-from dyngs.human.detect.detector import SURE, Detection, Detector, MediaPipe
-from dyngs.human.fit.capture_fit import cheapest_path
+from dyngs.human.detect.detector import MIN_CONFIDENCE, Detection, Detector, MediaPipe
+from dyngs.human.fit.capture_fit import viterbi_path
 from dyngs.human.fit.fitted_capture import FitInputs, FittedCapture, write_fitted_capture
 from dyngs.io.outputs import make_once, note_source, require_new_folder
 from dyngs.io.write import cache_folder, temporary_folder_beside, write_image, write_text
 
-SWAP = 0.04
+SWAP_COST = 0.04
 """What a swapped image costs, in heights of the person by which each key point moves: a limb taken
 for the other one in a few images moves them more, and who has turned around stays so for long."""
 _PAIRS = {
@@ -42,7 +42,7 @@ _PAIRS = {
 """Key points of COCO on the left and on the right."""
 
 
-def with_sides(person: Sequence[Detection | None]) -> tuple[list[Detection | None], int]:
+def fix_left_right_swaps(person: Sequence[Detection | None]) -> tuple[list[Detection | None], int]:
     """Return the detections of a person (F) with left and right as over time, and in how many
     images that changed.
 
@@ -77,17 +77,17 @@ def _swapped(points: np.ndarray, pairs: np.ndarray, heights: np.ndarray) -> np.n
         return np.zeros(len(points), bool)
     # (2, F, P, 2, 3): as they are, swapped
     both = np.stack([points[:, pairs], points[:, pairs[:, ::-1]]])
-    sure: np.ndarray = np.all(points[:, pairs, 2] > SURE, axis=-1)  # (F, P)
+    sure: np.ndarray = np.all(points[:, pairs, 2] > MIN_CONFIDENCE, axis=-1)  # (F, P)
     weights = (sure[1:] & sure[:-1])[..., None]
     # (2, 2, F - 1, P, 2): from the row's state to the column's
     moved = np.linalg.norm(both[None, :, 1:, ..., :2] - both[:, None, :-1, ..., :2], axis=-1)
     units = heights[1:].clip(1e-6) * (2 * weights.sum((1, 2))).clip(1)
     changes = (moved * weights).sum((3, 4)) / units
-    costs = np.tile([0.0, SWAP], (len(points), 1))
-    return np.array(cheapest_path(costs, changes.transpose(2, 0, 1)), bool)
+    costs = np.tile([0.0, SWAP_COST], (len(points), 1))
+    return np.array(viterbi_path(costs, changes.transpose(2, 0, 1)), bool)
 
 
-def warnings_of(
+def capture_warnings(
     images: np.ndarray, person: Sequence[Detection | None], *, alone: bool = True
 ) -> list[str]:
     """Return lines on what will be bad.
@@ -126,7 +126,7 @@ def warnings_of(
 def _is_cut_off(person: Detection, height: int) -> bool:
     ankles = person.keypoints[[15, 16]]
     return bool(
-        (ankles[:, 2] < SURE).all()
+        (ankles[:, 2] < MIN_CONFIDENCE).all()
         or (ankles[:, 1] > height - 2).any()
         or person.box[3] > height - 1.5
     )
@@ -143,12 +143,12 @@ def _turns(people: Sequence[Detection]) -> bool:
     """Whether the person is seen from the front and from behind: the left shoulder right of the
     right one, and left, by a tenth of their height."""
     left, right = (np.array([x.keypoints[row] for x in people]) for row in (5, 6))
-    sure = (left[:, 2] > SURE) & (right[:, 2] > SURE)
+    sure = (left[:, 2] > MIN_CONFIDENCE) & (right[:, 2] > MIN_CONFIDENCE)
     across = (left[sure, 0] - right[sure, 0]) / np.array([max(x.height, 1.0) for x in people])[sure]
     return bool((across > 0.1).any() and (across < -0.1).any())
 
 
-SIDE = 960  # longest side of the images that a detector sees, px
+DETECTOR_SIDE_PX = 960  # longest side of the images that a detector sees, px
 
 
 def detect_person(
@@ -170,12 +170,12 @@ def detect_person(
     cameras = [*by_camera(capture.splits).values()]
     for index, views in enumerate(cameras, 1):
         # A detector reads files, which only live here.
-        size = target_size(views[0].width, views[0].height, 1.0, SIDE)
+        size = target_size(views[0].width, views[0].height, 1.0, DETECTOR_SIDE_PX)
         files = [folder / "frames" / f"{row:06d}.png" for row in range(len(views))]
         images = np.stack([_shrunk_image(view, size) for view in views])
         for file, image in zip(files, images, strict=True):
             write_image(file, image)
-        person, swapped = with_sides(detector.detect(files))
+        person, swapped = fix_left_right_swaps(detector.detect(files))
         for file in files:
             file.unlink()
         report("cameras in which the person is found", index, len(cameras))
@@ -188,7 +188,7 @@ def detect_person(
                 f"{where}{detector.name} finds the person, {np.median(heights):.0f} px high, in {len(heights)} of "
                 f"{counted(len(person), 'image')}; left and right swapped in {counted(swapped, 'image')}"
             )
-            for warning in warnings_of(images, person, alone=len(cameras) == 1):
+            for warning in capture_warnings(images, person, alone=len(cameras) == 1):
                 say(f"warning: {where}{warning}")
         masks = np.zeros(images.shape[:3], bool)
         for row, own in enumerate(person):
@@ -240,7 +240,7 @@ def write_detected_person(
     new folder ``out``.
 
     ``options.root`` is a video or a folder of the frames of one standing camera, or a capture with
-    cameras. Raises DyngsError: see ``find_person`` and ``write_fitted_capture``.
+    cameras. Raises DyngsError: see ``detect_person`` and ``write_fitted_capture``.
     """
     require_new_folder(out)
     clip = options.format == "auto" and not is_capture(options.root) and is_plain_clip(options.root)

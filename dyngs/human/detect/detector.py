@@ -20,7 +20,7 @@ from dyngs.core.errors import DyngsError, as_word
 from dyngs.human.detect import mediapipe_worker
 from dyngs.io.numpy_files import read_arrays
 
-SURE = 0.3
+MIN_CONFIDENCE = 0.3
 """Least confidence of a key point that counts."""
 
 
@@ -45,7 +45,7 @@ class Detection:
         if person.any():
             rows, columns = (person.any(side).nonzero()[0] for side in (1, 0))
             return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.float64)
-        sure = self.keypoints[self.keypoints[:, 2] > SURE, :2]
+        sure = self.keypoints[self.keypoints[:, 2] > MIN_CONFIDENCE, :2]
         return (
             np.concatenate([sure.min(0), sure.max(0)]).astype(np.float64)
             if len(sure)
@@ -75,15 +75,15 @@ class Detector(Protocol):
         ...
 
 
-VARIABLE = "DYNGS_MEDIAPIPE"
+MEDIAPIPE_VARIABLE = "DYNGS_MEDIAPIPE"
 """Environment variable: the Python interpreter of an environment with MediaPipe."""
-PACKAGE = "mediapipe==0.10.21"
+MEDIAPIPE_PACKAGE = "mediapipe==0.10.21"
 """The last version that has its models in its wheel and needs no download when it runs."""
-INSTALL = (
-    f"`python -m venv ENV && ENV/bin/pip install {PACKAGE}` (Python 3.9 to 3.12), then give --mediapipe ENV/bin/python "
-    f"or set {VARIABLE} to it"
+INSTALL_HINT = (
+    f"`python -m venv ENV && ENV/bin/pip install {MEDIAPIPE_PACKAGE}` (Python 3.9 to 3.12), "
+    f"then give --mediapipe ENV/bin/python or set {MEDIAPIPE_VARIABLE} to it"
 )
-OTHERS = "or give masks of another program to `dyngs data fit` (docs/person.md)"
+MASKS_HINT = "or give masks of another program to `dyngs data fit` (docs/person.md)"
 LANDMARKS = (0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)
 """Rows of MediaPipe's landmarks that are the key points of COCO, in their order."""
 _SECONDS_PER_IMAGE, _SECONDS_TO_START = 10.0, 120.0
@@ -97,15 +97,15 @@ class MediaPipe:
     def __init__(self, python: Path | None = None) -> None:
         """``python``: the interpreter of that environment; None: ``$DYNGS_MEDIAPIPE``. Raises
         DyngsError: not there."""
-        named = os.environ.get(VARIABLE, "")
+        named = os.environ.get(MEDIAPIPE_VARIABLE, "")
         chosen = python or (Path(named).expanduser() if named else None)
         if chosen is None:
             raise DyngsError(
-                f"no detector finds the person: install MediaPipe with {INSTALL}; {OTHERS}"
+                f"no detector finds the person: install MediaPipe with {INSTALL_HINT}; {MASKS_HINT}"
             )
         if not chosen.is_file():
             raise DyngsError(
-                f"{chosen}: no such Python interpreter; install MediaPipe with {INSTALL}"
+                f"{chosen}: no such Python interpreter; install MediaPipe with {INSTALL_HINT}"
             )
         self._python = chosen
 
@@ -143,7 +143,7 @@ class MediaPipe:
         if done.returncode == mediapipe_worker.NO_MEDIAPIPE:
             raise DyngsError(
                 f"{self._python}: {_last_line(done.stderr)}; give the interpreter of an environment made by "
-                f"`{as_word(self._python)} -m pip install {PACKAGE}`"
+                f"`{as_word(self._python)} -m pip install {MEDIAPIPE_PACKAGE}`"
             )
         if done.returncode:
             raise DyngsError(

@@ -69,7 +69,7 @@ class BodyDiscs:
     # (9 (J - 1), 3 P) pose blend shapes, m per unit of the rotations minus the identity
     pose_dirs: Tensor | None
 
-    def in_shape(self, betas: Tensor, padding: Tensor) -> BodyDiscs:
+    def with_shape(self, betas: Tensor, padding: Tensor) -> BodyDiscs:
         """Return the body of one person, of the mean shape; differentiable.
 
         ``betas`` (B,) are shape parameters; ``padding`` (P,) m, by how much clothes and hair lie
@@ -193,7 +193,7 @@ def longest_box_side(images: Iterable[Image]) -> int:
     return longest
 
 
-def observed_frame(
+def crop_frame(
     images: Sequence[Image],
     box_side: int,
     size: int,
@@ -240,7 +240,7 @@ Observations = Callable[[int], ObservedFrame | None]
 """Returns what is observed in a row of the clip, None where nobody is seen."""
 
 
-def in_turn(frames: Mapping[int, ObservedFrame]) -> Observations:
+def rotate_views(frames: Mapping[int, ObservedFrame]) -> Observations:
     """Return a function that observes a frame by three of its views, the next three at each call."""
     turns = Counter[int]()
 
@@ -251,7 +251,7 @@ def in_turn(frames: Mapping[int, ObservedFrame]) -> Observations:
     return look
 
 
-NUM_TURNED = 22
+NUM_FITTED_JOINTS = 22
 """Joints that are turned: those of the body. Fingers, jaw and eyes do not show in silhouettes."""
 _USUAL = """
 hip       -11   1  -6   23 14  7
@@ -271,7 +271,7 @@ wrist      -4  -2  10    3 11  6
 and their standard deviations, degrees; the right side is the mirror image."""
 
 
-def usual_pose(joints: int) -> tuple[Tensor, Tensor]:
+def usual_pose_statistics(joints: int) -> tuple[Tensor, Tensor]:
     """Return mean and standard deviation (joints, 3) of usual poses, axis-angle, rad.
 
     The mean is zero for joints that are not known. Deviations are at least 8 degrees: a few clips
@@ -305,10 +305,10 @@ class PosePrior:
 def pose_prior(clip: MotionClip, *, is_given: bool) -> PosePrior:
     """Return the prior that poses are about those given, with an expected error of 0.05 rad, or that
     corrected poses are usual ones; rotations add as vectors, which holds for small ones."""
-    poses = clip.poses[:, :NUM_TURNED]
+    poses = clip.poses[:, :NUM_FITTED_JOINTS]
     if is_given:
         return PosePrior(torch.zeros_like(poses), torch.full_like(poses[0], 0.05), math.inf)
-    mean, spread = (x.to(poses) for x in usual_pose(NUM_TURNED))
+    mean, spread = (x.to(poses) for x in usual_pose_statistics(NUM_FITTED_JOINTS))
     return PosePrior(mean - poses, spread, 3.0)
 
 
@@ -325,12 +325,12 @@ _RATES = {
 """Learning rates at the first step; a tenth at the last."""
 LIMIT_WEIGHT = 2e-2
 """Weight of the mean square of what lies beyond the limit of a joint, in standard deviations."""
-KEYPOINT = 0.02  # expected error of a key point, as a fraction of the square's side
-MISTAKEN = 1.0
+KEYPOINT_STD = 0.02  # expected error of a key point, as a fraction of the square's side
+OUTLIER_ERROR = 1.0
 """Squared difference of coverages, over the person's area, from which on a silhouette is rather a
 mistake. Good masks have 0.05 to 0.2; at 0.3 bodies found in masks of a detector were no better, at
 infinity twice as far off."""
-FRAMES = 3  # frames drawn in each step
+FRAMES_PER_STEP = 3  # frames drawn in each step
 
 
 def silhouette_error(drawn: Tensor, seen: ObservedFrame) -> Tensor:
@@ -342,7 +342,7 @@ def silhouette_error(drawn: Tensor, seen: ObservedFrame) -> Tensor:
     """
     wrong = ((drawn - seen.alpha) * seen.known).square().sum((1, 2))
     error = wrong / (seen.alpha * seen.known).sum((1, 2)).clamp_min(1.0)
-    return (error / (1 + error / MISTAKEN)).mean()
+    return (error / (1 + error / OUTLIER_ERROR)).mean()
 
 
 def keypoint_error(joints: Tensor, marked: Tensor, cameras: Cameras) -> Tensor:
@@ -360,11 +360,11 @@ def keypoint_error(joints: Tensor, marked: Tensor, cameras: Cameras) -> Tensor:
     pixels = local @ cameras.intrinsics.mT
     positions = pixels[..., :2] / pixels[..., 2:].clamp_min(1e-3) / cameras.width
     return _robust_mean(
-        (positions - marked[..., :2]).square().sum(-1) / KEYPOINT**2, marked[..., 2]
+        (positions - marked[..., :2]).square().sum(-1) / KEYPOINT_STD**2, marked[..., 2]
     )
 
 
-def place_error(joints: Tensor, given: Tensor, unit: Tensor) -> Tensor:
+def joint_position_error(joints: Tensor, given: Tensor, unit: Tensor) -> Tensor:
     """Return the mean robust distance of joints (J, 3) from positions (55, 4), as for key points.
 
     ``unit`` is the length of a metre of the person in the world; errors of 3 cm are expected.
@@ -381,7 +381,7 @@ def _robust_mean(squares: Tensor, weights: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class TriedFit:
+class CandidateFit:
     """One way to fit."""
 
     name: str  # for people
@@ -391,7 +391,7 @@ class TriedFit:
 
 
 @dataclass(frozen=True)
-class Fitting:
+class BodyFit:
     """Given poses of F frames, the template's discs, and the poses that are expected."""
 
     clip: MotionClip
@@ -410,8 +410,8 @@ class Fitting:
         shapes = {
             "log_scale": (1,),
             "betas": self.body.shape_dirs.shape[-1:],
-            "turns": (NUM_TURNED, 3),
-            "poses": (frames, NUM_TURNED, 3),
+            "turns": (NUM_FITTED_JOINTS, 3),
+            "poses": (frames, NUM_FITTED_JOINTS, 3),
             "trans": (frames, 3),
             "padding": self.body.weights.shape[:1],
             "offset": (3,),
@@ -427,15 +427,15 @@ class Fitting:
         """Return the fitted pose of frame ``row``."""
         own = learned["turns"] + learned["poses"][row]
         given = self.clip.rotations[row]
-        turned = given[:NUM_TURNED] @ axis_angle_to_matrix(own)
+        turned = given[:NUM_FITTED_JOINTS] @ axis_angle_to_matrix(own)
         scale = self.clip.scale[row] * learned["log_scale"][0].exp()
         away = learned["shift"] + learned["trans"][row] + scale * (turned[0] @ learned["offset"])
-        rotations = torch.cat([turned, given[NUM_TURNED:]])
+        rotations = torch.cat([turned, given[NUM_FITTED_JOINTS:]])
         return BodyPose(rotations, self.clip.trans[row] + away, scale)
 
     def shaped(self, learned: Parameters) -> BodyDiscs:
         """Return the body in the fitted shape."""
-        return self.body.in_shape(learned["betas"], learned["padding"])
+        return self.body.with_shape(learned["betas"], learned["padding"])
 
     def silhouettes(self, learned: Parameters, row: int, cameras: Cameras) -> Tensor:
         """Return the silhouettes (V, H, W) of frame ``row`` for V cameras."""
@@ -454,7 +454,9 @@ class Fitting:
                 error = error + 0.1 * keypoint_error(joints, frame.joints, frame.cameras)
             if frame.positions is not None:
                 joints = posed_joints(body.skeleton, pose)
-                error = error + 0.1 * place_error(joints, frame.positions, pose.scale.detach())
+                error = error + 0.1 * joint_position_error(
+                    joints, frame.positions, pose.scale.detach()
+                )
             errors.append(error)
         return torch.stack(errors).mean()
 
@@ -486,7 +488,7 @@ class Fitting:
         steps: int,
         observed: Observations,
         report: ReportProgress = report_nothing,
-        fallen: float = 0.0,
+        schedule_start: float = 0.0,
     ) -> Parameters:
         """Return the fit ``start`` after ``steps`` of Adam on what is named.
 
@@ -501,21 +503,24 @@ class Fitting:
             found[name].requires_grad_(name in learned)
         order = spread_order(len(self.clip))
         for step in range(1, steps + 1):
-            rows = {order[((step - 1) * FRAMES + i) % len(order)] for i in range(FRAMES)}
+            rows = {
+                order[((step - 1) * FRAMES_PER_STEP + i) % len(order)]
+                for i in range(FRAMES_PER_STEP)
+            }
             seen = {row: frame for row in sorted(rows) if (frame := observed(row)) is not None}
             loss = self.penalty(found)
             if seen:
                 loss = loss + self.error(found, seen) * (len(seen) / len(rows))
             if loss.requires_grad:  # else nothing is to be learned
                 loss.backward()
-            found.step(step, fallen + (1 - fallen) * step / steps)
+            found.step(step, schedule_start + (1 - schedule_start) * step / steps)
             report("fit of the body", step, steps)
         return found
 
     @torch.no_grad()
     def measured(
         self, name: str, learned: Parameters, judged: Mapping[int, ObservedFrame]
-    ) -> TriedFit:
+    ) -> CandidateFit:
         """Return a candidate with its IoU in the frames ``judged``, by row."""
         found = [torch.zeros(0, device="cpu")] * len(self.clip)
         for row, frame in judged.items():
@@ -526,7 +531,7 @@ class Fitting:
             either = (ours | theirs) & known
             found[row] = both.sum((1, 2)) / either.sum((1, 2)).clamp_min(1)
         per_frame = tuple(float(x.mean()) for x in found)
-        return TriedFit(name, learned, float(torch.cat(found).mean()), per_frame)
+        return CandidateFit(name, learned, float(torch.cat(found).mean()), per_frame)
 
 
 def spread_order(count: int) -> list[int]:
@@ -537,11 +542,11 @@ def spread_order(count: int) -> list[int]:
     return [(i * stride) % count for i in range(count)]
 
 
-def fitted_motion(learned: Parameters, clip: MotionClip, *, own_frames: bool) -> MotionClip:
+def apply_fit(learned: Parameters, clip: MotionClip, *, own_frames: bool) -> MotionClip:
     """Return a clip with what was learned: of the clip that was fitted with the corrections of its
     frames, of another one, whose poses were given by the same means, with what holds for all."""
     values = learned.values()
-    missing = (0, 0, 0, clip.poses.shape[1] - NUM_TURNED)
+    missing = (0, 0, 0, clip.poses.shape[1] - NUM_FITTED_JOINTS)
     turns, poses = (torch.nn.functional.pad(values[name], missing) for name in ("turns", "poses"))
     shared = SharedCorrection(turns, float(values["log_scale"][0]))
     frames = (poses, values["trans"]) if own_frames else ()
@@ -555,7 +560,7 @@ NUM_HEADINGS = 8  # directions that a person may face
 STEPS = 40
 """Steps of Adam for each heading of an anchor, and, at each size, for each frame from the pose of
 the one before."""
-OFF_COURSE = math.radians(30)
+MAX_HEADING_ERROR = math.radians(30)
 """Rotation of the root away from the path of headings from which a frame is begun on that path
 instead."""
 STATURE = 1.70  # height of a person in a usual pose, m, where a single camera leaves it open
@@ -563,7 +568,7 @@ FramePose = tuple[Tensor, Tensor, float]
 """Pose (J, 3), translation (3,) and error of one frame."""
 
 
-def cheapest_path(costs: np.ndarray, changes: np.ndarray) -> list[int]:
+def viterbi_path(costs: np.ndarray, changes: np.ndarray) -> list[int]:
     """Return the states (T,) whose costs (T, S) and changes (T - 1, S, S) cost least in all.
 
     ``changes`` are from the state of the row to that of the column. Source: the algorithm of
@@ -592,7 +597,7 @@ def likely_headings(errors: Sequence[Sequence[float]], weight: float = 0.01) -> 
     anchors, count = costs.shape
     apart = np.abs(np.arange(count)[:, None] - np.arange(count))
     change = weight * (np.minimum(apart, count - apart) * (8 / count)) ** 2
-    return cheapest_path(costs, np.broadcast_to(change, (anchors - 1, count, count)))
+    return viterbi_path(costs, np.broadcast_to(change, (anchors - 1, count, count)))
 
 
 def estimate_initial_poses(
@@ -648,11 +653,11 @@ def standing_clip(times: Tensor, body: BodyDiscs, up: Tensor, observed: Observat
     heights = []
     for row in range(len(times)):
         seen = observed(row)
-        place, height = (positions[-1], None) if seen is None else place_and_height(seen, up)
+        place, height = (positions[-1], None) if seen is None else locate_person(seen, up)
         positions.append(place)
         heights += [] if height is None else [height]
     upright = Rotation.align_vectors(up[None].numpy(), np.array([[0.0, 1.0, 0.0]]))[0]
-    poses = usual_pose(len(joints))[0].to(joints).repeat(len(times), 1, 1)
+    poses = usual_pose_statistics(len(joints))[0].to(joints).repeat(len(times), 1, 1)
     poses[:, 0] = torch.from_numpy(upright.as_rotvec()).to(poses)
     scale = float(np.median(heights)) / STATURE if heights else 1.0
     trans = torch.stack(positions[1:]) - scale * joints[0]  # the root turns about the pelvis
@@ -665,7 +670,7 @@ def up_of(seen: ObservedFrame) -> Tensor:
     return up / up.norm()
 
 
-def place_and_height(seen: ObservedFrame, up: Tensor) -> tuple[Tensor, float | None]:
+def locate_person(seen: ObservedFrame, up: Tensor) -> tuple[Tensor, float | None]:
     """Return the place (3,) of the pelvis in the world and the height of the person, None if one
     camera sees them.
 
@@ -736,15 +741,17 @@ def _fitted_frame(
     ``levels`` are the factors by which what is seen is made smaller, one after the other.
     """
     one = MotionClip(clip.times[row : row + 1], pose[None], trans[None], clip.scale[row : row + 1])
-    fitting = Fitting(one, body, pose_prior(one, is_given=False))
+    fitting = BodyFit(one, body, pose_prior(one, is_given=False))
     learned = fitting.start()
     for level in levels:
-        look = in_turn({0: seen.shrunk(level)})
+        look = rotate_views({0: seen.shrunk(level)})
         learned = fitting.run(learned, ("poses", "trans"), STEPS, look)
     with torch.no_grad():
         error = float(fitting.error(learned, {0: seen}) + fitting.penalty(learned))
     found = pose.clone()
-    found[:NUM_TURNED] = compose_rotations(pose[:NUM_TURNED], learned["poses"][0].detach())
+    found[:NUM_FITTED_JOINTS] = compose_rotations(
+        pose[:NUM_FITTED_JOINTS], learned["poses"][0].detach()
+    )
     return found, trans + learned["trans"][0].detach(), error
 
 
@@ -784,7 +791,7 @@ def _followed(
         if seen is None:
             continue
         starts = [poses[row]]
-        if roots is not None and _angle_between(poses[row, 0], roots[row]) > OFF_COURSE:
+        if roots is not None and _angle_between(poses[row, 0], roots[row]) > MAX_HEADING_ERROR:
             others = torch.stack([poses[row], standing.poses[row]])
             others[:, 0] = roots[row]
             starts = list(others)
@@ -801,7 +808,7 @@ def _extrapolated(poses: Tensor, row: int) -> Tensor:
     Four fifths of the last rotation are expected again, so that legs which pass each other are not
     exchanged. What was put on the path of headings was no motion.
     """
-    if row < 2 or _angle_between(poses[row - 2, 0], poses[row - 1, 0]) > OFF_COURSE:
+    if row < 2 or _angle_between(poses[row - 2, 0], poses[row - 1, 0]) > MAX_HEADING_ERROR:
         return poses[row - 1].clone()
     before, last = poses[row - 2 : row].double()
     return compose_rotations(last, 0.8 * compose_rotations(-before, last)).to(poses)
@@ -813,13 +820,19 @@ def _angle_between(a: Tensor, b: Tensor) -> float:
 
 
 RESOLUTION = 48  # texels per side of the atlas whose discs are drawn
-GAIN, GAIN_OF_SHAPE = 0.01, 0.03
+MIN_GAIN, MIN_SHAPE_GAIN = 0.01, 0.03
 """Gain of IoU for which more is learned, and for which given poses are touched at all.
 
 Below the first, renders of new poses were worse by 0.1 to 0.3 dB on two people. A body of another
 shape explains thick clothes, too: with exact poses it gained 0.02, and lost 2.7 dB in new poses.
 """
-SHAPE = ("log_scale", "betas", "padding", "offset", "shift")  # what is the same in all frames
+SHARED_PARAMETERS = (
+    "log_scale",
+    "betas",
+    "padding",
+    "offset",
+    "shift",
+)  # what is the same in all frames
 
 
 @dataclass(frozen=True)
@@ -828,11 +841,11 @@ class FitEffort:
 
     side: int = 128  # of the squares around the person that are looked at, px
     steps: int = 120  # least number of steps of Adam of a stage
-    visits: int = 18  # how often a frame is drawn where its pose is learned
+    draws_per_frame: int = 18  # how often a frame is drawn where its pose is learned
 
     def steps_for(self, clip: MotionClip) -> int:
         """Return the number of steps that draws every frame often enough."""
-        return max(self.steps, -(-self.visits * len(clip) // FRAMES))
+        return max(self.steps, -(-self.draws_per_frame * len(clip) // FRAMES_PER_STEP))
 
 
 @dataclass(frozen=True)
@@ -840,11 +853,11 @@ class CaptureFit:
     """A fit of a capture's clip of training."""
 
     motion: CapturedMotion  # the given clip, F frames
-    chosen: TriedFit  # the candidate that was taken
-    tried: tuple[TriedFit, ...]  # all candidates; the first one has the poses as given
+    chosen: CandidateFit  # the candidate that was taken
+    tried: tuple[CandidateFit, ...]  # all candidates; the first one has the poses as given
     # views left out of the fit, on which the candidates were measured; 0: measured on those fitted
     # to
-    held_out: int
+    num_held_out: int
 
     @property
     def betas(self) -> Tensor:
@@ -854,7 +867,7 @@ class CaptureFit:
     @property
     def clip(self) -> MotionClip:
         """The clip that was fitted, with its corrections."""
-        return fitted_motion(self.chosen.learned, self.motion.clip, own_frames=True)
+        return apply_fit(self.chosen.learned, self.motion.clip, own_frames=True)
 
 
 def fit_capture(
@@ -894,27 +907,27 @@ def fit_capture(
         motion = _unposed(views, body.joints)
     else:
         motion = captured_motion(capture.root, capture.body["train"], views, body.joints)
-    seen = look_at(capture, motion, options, effort, keypoints or {}, joints or {})
+    seen = crop_views(capture, motion, options, effort, keypoints or {}, joints or {})
     discs = body_discs(body, RESOLUTION)
-    shape = list(SHAPE)
+    shape = list(SHARED_PARAMETERS)
     if one_camera:
         shape.remove("log_scale")
     if shape_known:
         shape.remove("betas")
     if capture.body is not None:
-        fitting = Fitting(motion.clip, discs, pose_prior(motion.clip, is_given=True))
+        fitting = BodyFit(motion.clip, discs, pose_prior(motion.clip, is_given=True))
         tried = _from_given(fitting, seen, shape, report, effort)
-        first_gain = GAIN if shape_known else GAIN_OF_SHAPE
+        first_gain = MIN_GAIN if shape_known else MIN_SHAPE_GAIN
     else:
         clip = estimate_initial_poses(motion.clip.times, discs, seen.used.get, report)
         motion = CapturedMotion(clip, motion.frames)
-        fitting = Fitting(clip, discs, pose_prior(clip, is_given=False))
+        fitting = BodyFit(clip, discs, pose_prior(clip, is_given=False))
         tried = _from_silhouettes(fitting, seen, shape, report, effort)
         first_gain = 0.0
-    return CaptureFit(motion, _simplest_of_the_best(tried, first_gain), tried, seen.held_out)
+    return CaptureFit(motion, _simplest_of_the_best(tried, first_gain), tried, seen.num_held_out)
 
 
-def _simplest_of_the_best(tried: Sequence[TriedFit], first_gain: float) -> TriedFit:
+def _simplest_of_the_best(tried: Sequence[CandidateFit], first_gain: float) -> CandidateFit:
     """Return the candidate after which none is clearly better: ``tried`` is ordered from simple to
     complex.
 
@@ -923,21 +936,21 @@ def _simplest_of_the_best(tried: Sequence[TriedFit], first_gain: float) -> Tried
     """
     best = tried[0]
     for candidate in tried[1:]:
-        gain = first_gain if best is tried[0] else GAIN
+        gain = first_gain if best is tried[0] else MIN_GAIN
         best = candidate if candidate.iou > best.iou + gain else best
     return best
 
 
 def _from_given(
-    fitting: Fitting,
+    fitting: BodyFit,
     seen: FitViews,
     shape: Sequence[str],
     report: ReportProgress,
     effort: FitEffort,
-) -> tuple[TriedFit, ...]:
+) -> tuple[CandidateFit, ...]:
     """Return candidates from given poses, from simple to complex."""
     start = fitting.start()
-    halves = in_turn(seen.halves())
+    halves = rotate_views(seen.halves())
     # Clothes and hair are no sign of wrong poses.
     dressed = fitting.run(start, ("padding",), effort.steps, halves, report)
     tried = [fitting.measured("the poses as given", dressed, seen.judged)]
@@ -952,10 +965,10 @@ def _from_given(
     ):
         # The last quarter of the steps, at low rates, shows whether all of them are worth it.
         found = fitting.run(
-            tried[-1].learned, learned, -(-steps // 4), seen.used.get, report, fallen=0.75
+            tried[-1].learned, learned, -(-steps // 4), seen.used.get, report, schedule_start=0.75
         )
         candidate = fitting.measured(name, found, seen.judged)
-        if candidate.iou > max(x.iou for x in tried) + 0.75 * GAIN:
+        if candidate.iou > max(x.iou for x in tried) + 0.75 * MIN_GAIN:
             found = fitting.run(found, learned, steps, seen.used.get, report)
             candidate = fitting.measured(name, found, seen.judged)
         tried.append(candidate)
@@ -963,12 +976,12 @@ def _from_given(
 
 
 def _from_silhouettes(
-    fitting: Fitting,
+    fitting: BodyFit,
     seen: FitViews,
     shape: Sequence[str],
     report: ReportProgress,
     effort: FitEffort,
-) -> tuple[TriedFit, ...]:
+) -> tuple[CandidateFit, ...]:
     """Return candidates from poses that were found frame by frame.
 
     These are off by more than given ones: they get three times the steps, at rates of twice as much
@@ -979,7 +992,7 @@ def _from_silhouettes(
     learned = (*shape, "poses", "trans")
     steps = 3 * effort.steps_for(fitting.clip)
     for look in (seen.halves().get, seen.used.get):
-        found = fitting.run(found, learned, steps, look, report, fallen=-0.3)
+        found = fitting.run(found, learned, steps, look, report, schedule_start=-0.3)
     return first, fitting.measured("one shape, and poses of every frame", found, seen.judged)
 
 
@@ -989,7 +1002,7 @@ class FitViews:
 
     used: dict[int, ObservedFrame]
     judged: dict[int, ObservedFrame]
-    held_out: int  # number of views to judge by; 0: they are those to fit to
+    num_held_out: int  # number of views to judge by; 0: they are those to fit to
 
     def halves(self) -> dict[int, ObservedFrame]:
         """Return the frames to fit to at half the size."""
@@ -1034,7 +1047,7 @@ def _unposed(views: Sequence[View], joints: Tensor) -> CapturedMotion:
     )
 
 
-def look_at(
+def crop_views(
     capture: Capture,
     motion: CapturedMotion,
     options: DataConfig,
@@ -1071,14 +1084,14 @@ def look_at(
 
     def observed(rows: dict[int, list[int]]) -> dict[int, ObservedFrame]:
         frames = {
-            row: observed_frame([images[i] for i in own], side, size, marked, positions.get(row))
+            row: crop_frame([images[i] for i in own], side, size, marked, positions.get(row))
             for row, own in rows.items()
         }
         return {row: frame for row, frame in frames.items() if frame is not None}
 
-    held_out = sum(map(len, left_out.values()))
+    num_held_out = sum(map(len, left_out.values()))
     frames = observed(used)
-    return FitViews(frames, observed(left_out) if held_out else frames, held_out)
+    return FitViews(frames, observed(left_out) if num_held_out else frames, num_held_out)
 
 
 def _border_covered(image: Image) -> float:
@@ -1091,7 +1104,7 @@ def _border_covered(image: Image) -> float:
 
 
 @dataclass(frozen=True)
-class NewClip:
+class PlacedClip:
     """Another clip of a fitted person."""
 
     motion: CapturedMotion  # its poses as given, with what holds for all frames; a row per frame
@@ -1107,14 +1120,14 @@ class NewClip:
         )
 
 
-def placed_clip(
+def place_new_poses(
     capture: Capture,
     options: DataConfig,
     body: BodyTemplate,
     found: CaptureFit,
     report: ReportProgress,
     effort: FitEffort = FitEffort(),
-) -> NewClip | None:
+) -> PlacedClip | None:
     """Return the clip of ``pose`` moved to its silhouettes, if it looks better there; None without
     such a clip.
 
@@ -1124,26 +1137,26 @@ def placed_clip(
     if not views or capture.body is None:
         return None
     motion = captured_motion(capture.root, capture.body["pose"], views, body.joints)
-    seen = look_at(capture.replace(splits={"train": views}), motion, options, effort, {}, {})
-    fitting = Fitting(
+    seen = crop_views(capture.replace(splits={"train": views}), motion, options, effort, {}, {})
+    fitting = BodyFit(
         motion.clip, body_discs(body, RESOLUTION), pose_prior(motion.clip, is_given=True)
     )
     start = fitting.start()
     with torch.no_grad():
-        for name in (*SHAPE, "turns"):
+        for name in (*SHARED_PARAMETERS, "turns"):
             start[name].copy_(found.chosen.learned[name])
     # Three numbers are learned: few steps are enough.
     moved = fitting.run(start, ("shift",), min(effort.steps, 40), seen.used.get, report)
     before, after = (fitting.measured("", x, seen.judged) for x in (start, moved))
     is_better = after.iou > before.iou + 0.001
-    clip = fitted_motion(
-        moved if is_better else start, motion.of_frames(motion.frames), own_frames=False
+    clip = apply_fit(
+        moved if is_better else start, motion.clip_of_frames(motion.frames), own_frames=False
     )
-    return NewClip(replace(motion, clip=clip), before.iou, after.iou if is_better else None)
+    return PlacedClip(replace(motion, clip=clip), before.iou, after.iou if is_better else None)
 
 
-def fitted_clips(
-    capture: Capture, body: BodyTemplate, found: CaptureFit, new_poses: NewClip | None
+def collect_fitted_clips(
+    capture: Capture, body: BodyTemplate, found: CaptureFit, new_poses: PlacedClip | None
 ) -> dict[Split, CapturedMotion]:
     """Return the clip of training, with the frames of val and test, and that of ``pose``, if the
     capture has one.
@@ -1157,11 +1170,11 @@ def fitted_clips(
     fitted = replace(found.motion, clip=found.clip)
     if capture.body is not None:
         motion = captured_motion(capture.root, capture.body["train"], views, body.joints)
-        clip = fitted_motion(found.chosen.learned, motion.of_frames(frames), own_frames=False)
+        clip = apply_fit(found.chosen.learned, motion.clip_of_frames(frames), own_frames=False)
     else:
         clip = MotionClip.joined([fitted.clip.at(times[frame]) for frame in frames])
     rows = [row for row, frame in enumerate(frames) if frame in fitted.rows]
-    clip = clip.with_rows(rows, fitted.of_frames([frames[row] for row in rows]))
+    clip = clip.replace_rows(rows, fitted.clip_of_frames([frames[row] for row in rows]))
     clips: dict[Split, CapturedMotion] = {"train": CapturedMotion(clip, frames)}
     if new_poses is not None:
         clips["pose"] = new_poses.motion

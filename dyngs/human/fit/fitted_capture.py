@@ -33,18 +33,18 @@ from dyngs.data.images.images import straight_uint8
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import is_capture, read_capture
 from dyngs.data.times import evenly_spaced
-from dyngs.human.avatar.pose_fit import SILHOUETTES, fit_poses_to_images
+from dyngs.human.avatar.pose_fit import SILHOUETTE_COMPARISON, fit_poses_to_images
 from dyngs.human.avatar.posing import frame_pose
 from dyngs.human.avatar.scene import HumanScene
-from dyngs.human.body.body import NUM_FITTED, BodyTemplate
+from dyngs.human.body.body import NUM_FITTED_SHAPES, BodyTemplate
 from dyngs.human.body.body_reader import has_same_shape_space, load_template, rest_shape
 from dyngs.human.fit.capture_fit import (
     CaptureFit,
     body_discs,
-    render_silhouettes,
+    collect_fitted_clips,
     fit_capture,
-    fitted_clips,
-    placed_clip,
+    place_new_poses,
+    render_silhouettes,
 )
 from dyngs.human.fit.keypoints import read_joints, read_keypoints
 from dyngs.human.keys import HumanModel
@@ -107,13 +107,13 @@ def write_fitted_capture(
     """
     model = given.template
     if given.person is not None and model.body is None:
-        model = template_of_run(given.person)
+        model = read_run_template(given.person)
     body = load_template(model)
     _require_texels(model, body)
-    person = None if given.person is None else known_shape(given.person, body)
+    person = None if given.person is None else read_known_shape(given.person, body)
     with new_folder(out) as folder:
         masks = folder / ".masks"
-        capture = read_person(options, given, masks)
+        capture = read_person_capture(options, given, masks)
         capture = capture.replace(splits=numbered(capture.splits))
         views = capture.splits["train"]
         # The fit begins with the shape of a known person, or with that of the capture.
@@ -121,7 +121,7 @@ def write_fitted_capture(
         if first is None and body.name != "anny" and capture.body is not None:
             given_body = capture.body["train"]
             first = given_body if has_same_shape_space(body, given_body) else None
-        shaped = with_shape(body, first)
+        shaped = apply_known_shape(body, first)
         found = fit_capture(
             capture,
             options,
@@ -132,14 +132,14 @@ def write_fitted_capture(
             one_camera=capture.format == FORMAT,
             shape_known=person is not None,
         )
-        betas = shape_of(body, first)
+        betas = known_betas(body, first)
         betas[: len(found.betas)] += found.betas
-        new_poses = placed_clip(capture, options, shaped, found, report)
-        clips = fitted_clips(capture, shaped, found, new_poses)
-        by_avatar: list[AvatarPoses] = []
+        new_poses = place_new_poses(capture, options, shaped, found, report)
+        clips = collect_fitted_clips(capture, shaped, found, new_poses)
+        by_avatar: list[AvatarPoseFit] = []
         if given.avatar is not None:
             for split, clip in clips.items():
-                posed = posed_by_avatar(given.avatar, capture.splits[split], options, clip)
+                posed = fit_poses_by_avatar(given.avatar, capture.splits[split], options, clip)
                 clips[split] = posed.clip
                 by_avatar.append(posed)
         if with_images:
@@ -150,7 +150,7 @@ def write_fitted_capture(
                 for split, clip in clips.items()
             }
         for split, clip in clips.items():
-            write_body(folder / f"body_{split}.npz", clip, body, betas.numpy(), capture)
+            write_body_file(folder / f"body_{split}.npz", clip, body, betas.numpy(), capture)
         write_image(folder / "fit_overlays.png", _overlays(capture, options, shaped, found))
         shutil.rmtree(masks, ignore_errors=True)
         chosen = found.chosen
@@ -160,7 +160,7 @@ def write_fitted_capture(
             "frames": len(found.motion.clip),
             "taken": chosen.name,
             "iou": {candidate.name: round(candidate.iou, 4) for candidate in found.tried},
-            "views_left_out": found.held_out,
+            "views_left_out": found.num_held_out,
             "new_poses": new_poses and {"iou": new_poses.iou, "iou_moved": new_poses.iou_moved},
             "by_avatar": [
                 {"iou": x.before, "iou_posed": x.after, "views_left_out": x.left_out}
@@ -177,7 +177,7 @@ def write_fitted_capture(
     worst = int(np.nanargmin(chosen.per_frame))
     lines = [
         f"{'' if body.name == 'anny' else _called(model, body) + ', '}{counted(len(found.motion.clip), 'frame')}; "
-        f"overlap of silhouettes (IoU) on {_judged_on(found.held_out)}: {tried}",
+        f"overlap of silhouettes (IoU) on {_judged_on(found.num_held_out)}: {tried}",
         f"taken: {chosen.name}; worst frame {found.motion.frames[worst]} with {chosen.per_frame[worst]:.3f}; look at "
         f"{out / 'fit_overlays.png'}",
         *(x.summary() for x in (new_poses, *by_avatar) if x is not None),
@@ -189,7 +189,7 @@ def _judged_on(left_out: int) -> str:
     return f"{counted(left_out, 'view')} left out of the fit" if left_out else "the views fitted to"
 
 
-def template_of_run(path: Path) -> HumanModel:
+def read_run_template(path: Path) -> HumanModel:
     """Return what names the template of an avatar's run, of anything else the free one."""
     model = load_resolved(path).model if (path / RESOLVED_NAME).is_file() else None
     if not isinstance(model, HumanModel):
@@ -211,7 +211,7 @@ def _require_texels(model: HumanModel, body: BodyTemplate) -> None:
         )
 
 
-def known_shape(path: Path, body: BodyTemplate) -> BodyFrames:
+def read_known_shape(path: Path, body: BodyTemplate) -> BodyFrames:
     """Return the body parameters of a person, of whom only the shape counts, which is one of
     ``body``.
 
@@ -237,7 +237,7 @@ def known_shape(path: Path, body: BodyTemplate) -> BodyFrames:
     return found
 
 
-def with_shape(body: BodyTemplate, known: BodyFrames | None) -> BodyTemplate:
+def apply_known_shape(body: BodyTemplate, known: BodyFrames | None) -> BodyTemplate:
     """Return the template that is fitted: its mean shape is that of a known person.
 
     Of a file of SMPL's family it has the first ``NUM_FITTED`` shape parameters.
@@ -249,12 +249,12 @@ def with_shape(body: BodyTemplate, known: BodyFrames | None) -> BodyTemplate:
         return body
     return replace(
         body,
-        shape_dirs=body.shape_dirs[..., :NUM_FITTED],
-        joint_shape_dirs=body.joint_shape_dirs[..., :NUM_FITTED],
+        shape_dirs=body.shape_dirs[..., :NUM_FITTED_SHAPES],
+        joint_shape_dirs=body.joint_shape_dirs[..., :NUM_FITTED_SHAPES],
     )
 
 
-def shape_of(body: BodyTemplate, known: BodyFrames | None) -> torch.Tensor:
+def known_betas(body: BodyTemplate, known: BodyFrames | None) -> torch.Tensor:
     """Return the known shape parameters (B,) of a template with B of them; 0 for those that are not
     known."""
     betas = torch.zeros(body.num_shapes, device="cpu")
@@ -269,7 +269,7 @@ def _at_most(options: DataConfig, longest_side: int) -> DataConfig:
     return options.model_copy(update={"longest_side": longest_side, "downscale": 1})
 
 
-def read_person(
+def read_person_capture(
     options: DataConfig, given: FitInputs, work: Path, say: Callable[[str], None] = show
 ) -> Capture:
     """Return a capture with silhouettes: of a capture, or a video or a folder of images of one
@@ -322,13 +322,13 @@ def read_person(
     return capture.replace(splits={**capture.splits, "train": kept})
 
 
-LONGEST_SIDE = 320
+SILHOUETTE_SIDE_PX = 320
 """Of the images whose silhouettes are looked at, px, at most; an avatar trained on smaller ones is
 compared at that size, since its edges are those of its images."""
 
 
 @dataclass(frozen=True)
-class AvatarPoses:
+class AvatarPoseFit:
     """Poses that an avatar found; taken where they are better than those before."""
 
     clip: CapturedMotion  # of all frames; as it was where the overlap did not grow
@@ -347,9 +347,9 @@ class AvatarPoses:
         )
 
 
-def posed_by_avatar(
+def fit_poses_by_avatar(
     avatar: KnownAvatar, views: Sequence[View], options: DataConfig, start: CapturedMotion
-) -> AvatarPoses:
+) -> AvatarPoseFit:
     """Return the poses of a clip in which the avatar has the silhouettes of its images, where that
     is better.
 
@@ -366,23 +366,25 @@ def posed_by_avatar(
     chosen = [some[i] for i in evenly_spaced(len(some), 3)]
     left_out = [group[-1] for group in chosen] if enough else []
     others = [view for group in chosen for view in group if view not in left_out]
-    sides = (LONGEST_SIDE, options.longest_side, avatar.longest_side)
+    sides = (SILHOUETTE_SIDE_PX, options.longest_side, avatar.longest_side)
     small = _at_most(options, min(side for side in sides if side))
     tested = ImageLoader(left_out or others, small)
-    scene = avatar.scene.playing(start.clip)
+    scene = avatar.scene.with_motion(start.clip)
 
     def fitted(views: Sequence[View]) -> HumanScene:
         nothing = scene.gaussians.means.new_zeros(3)
-        return fit_poses_to_images(scene, ImageLoader(views, small), nothing, SILHOUETTES)[0]
+        return fit_poses_to_images(
+            scene, ImageLoader(views, small), nothing, SILHOUETTE_COMPARISON
+        )[0]
 
     before = _overlap(scene, tested)
     after = _overlap(fitted(others), tested)
     clip = start.clip
     if after > before:
-        found = fitted([view for group in groups.values() for view in group]).played
+        found = fitted([view for group in groups.values() for view in group]).replacement_clip
         if found is not None:
-            clip = clip.with_rows(torch.searchsorted(times, found.times).tolist(), found)
-    return AvatarPoses(replace(start, clip=clip), before, after, len(left_out))
+            clip = clip.replace_rows(torch.searchsorted(times, found.times).tolist(), found)
+    return AvatarPoseFit(replace(start, clip=clip), before, after, len(left_out))
 
 
 @torch.no_grad()
@@ -448,7 +450,7 @@ def write_split(
     write_text(out / f"transforms_{split}.json", json.dumps({"frames": frames}, indent=1) + "\n")
 
 
-def write_body(
+def write_body_file(
     path: Path,
     found: CapturedMotion,
     body: BodyTemplate,
@@ -488,8 +490,8 @@ def _overlays(
     images = ImageLoader(views, _at_most(options, 400))
     discs = body_discs(body, 72)
     nothing = torch.zeros_like(discs.weights[:, 0])
-    mean = discs.in_shape(torch.zeros_like(found.betas), nothing)
-    shaped = discs.in_shape(found.betas, nothing)
+    mean = discs.with_shape(torch.zeros_like(found.betas), nothing)
+    shaped = discs.with_shape(found.betas, nothing)
     fitted = found.clip
     sheets = []
     for i in evenly_spaced(len(views), 8):

@@ -199,7 +199,7 @@ class MotionClip:
         rows = [(x.times, x.poses, x.trans, x.scale) for x in clips]
         return MotionClip(*(torch.cat(parts) for parts in zip(*rows, strict=True)))
 
-    def with_rows(self, rows: Sequence[int], frames: MotionClip) -> MotionClip:
+    def replace_rows(self, rows: Sequence[int], frames: MotionClip) -> MotionClip:
         """Return the clip with ``frames`` (R of them) in place of its R ``rows``."""
         index = torch.tensor(rows, device="cpu")
         names = ("times", "poses", "trans", "scale")
@@ -246,7 +246,7 @@ class CapturedMotion:
         """The row of the clip that shows each frame."""
         return {frame: min(row, len(self.clip) - 1) for row, frame in enumerate(self.frames)}
 
-    def of_frames(self, frames: Sequence[int]) -> MotionClip:
+    def clip_of_frames(self, frames: Sequence[int]) -> MotionClip:
         """Return a clip with a row for each of the ``frames``, also of who never moves."""
         return self.clip.select(torch.tensor([self.rows[x] for x in frames], device="cpu"))
 
@@ -286,7 +286,7 @@ def captured_motion(
     )
 
 
-def same_bodies(a: BodyFrames, b: BodyFrames) -> bool:
+def has_same_parameters(a: BodyFrames, b: BodyFrames) -> bool:
     """Return whether both hold the same body parameters for the same frames."""
     pairs = ((getattr(a, name), getattr(b, name)) for name in ("poses", "trans", "scale"))
     return a.frames == b.frames and all(np.array_equal(x, y) for x, y in pairs)

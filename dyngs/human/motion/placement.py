@@ -66,7 +66,7 @@ def moved(
     return replace(clip, poses=poses, trans=trans, scale=unit * clip.scale)
 
 
-def upright(clip: MotionClip, like: MotionClip, joints: Tensor) -> MotionClip:
+def rotate_clip_to_y_up(clip: MotionClip, like: MotionClip, joints: Tensor) -> MotionClip:
     """Return a clip in the world of the person of ``like`` turned about the origin so that y is up
     there.
 
@@ -171,7 +171,9 @@ def floor_contact(clip: MotionClip, soles: Tensor, up: Tensor, fps: float) -> Te
     return torch.from_numpy(binary_opening(is_still, np.ones((shortest, 1)))).to(soles.device)
 
 
-def reduce_foot_sliding(clip: MotionClip, soles: Tensor, up: Tensor, fps: float) -> tuple[MotionClip, str]:
+def reduce_foot_sliding(
+    clip: MotionClip, soles: Tensor, up: Tensor, fps: float
+) -> tuple[MotionClip, str]:
     """Return the clip with the root moved along the floor so that feet that touch it stay; and a
     line about how far they slide, before and after.
 

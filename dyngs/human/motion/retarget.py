@@ -28,7 +28,7 @@ from dyngs.human.motion.motion import (
     require_frame_count,
     require_frame_rate,
 )
-from dyngs.human.motion.placement import shortest_arc_rotation, place_on_floor
+from dyngs.human.motion.placement import place_on_floor, shortest_arc_rotation
 
 _OURS = (
     "pelvis spine1 spine2 spine3 neck head *_collar *_shoulder *_elbow *_wrist *_hip *_knee *_ankle *_foot "

@@ -26,9 +26,9 @@ from dyngs.human.body.body_reader import rest_shape
 from dyngs.human.body.mesh import rasterize, vertex_normals
 from dyngs.human.body.skinning import apply_transforms, blend_transforms, joint_transforms
 from dyngs.human.motion.motion import CapturedMotion, captured_motion
-from dyngs.human.predict.gps.rectification import cropped, cut_out
+from dyngs.human.predict.gps.rectification import crop_image, crop_to_person
 
-KEY_POINTS = 22
+NUM_KEY_POINTS = 22
 """Joints that are key points: those of the body, which SMPL, SMPL-H and SMPL-X have in common."""
 MULTIPLE = 8  # Sides of images are padded to multiples of so many pixels
 MARGIN = 8  # px of background around a person
@@ -104,7 +104,7 @@ class Person:
             pose = self.pose_in(view)
             vertices, joints = self.posed(self.body.vertices, pose)
             shift = pose.trans / pose.scale
-            body = PosedBody(joints[:KEY_POINTS] + shift, vertices + shift, self.body.faces)
+            body = PosedBody(joints[:NUM_KEY_POINTS] + shift, vertices + shift, self.body.faces)
             self._bodies[view.frame] = body, float(pose.scale)
         return self._bodies[view.frame]
 
@@ -135,7 +135,9 @@ def captured_person(capture: Capture, template: BodyTemplate, images: ImageLoade
 def read_captured_person(data: DataConfig, template: BodyTemplate) -> Person:
     """Return the person of a capture with depth maps; see ``person_in``."""
     capture = read_capture(data)
-    return captured_person(capture, template, ImageLoader(capture.splits["train"], data, with_maps=True))
+    return captured_person(
+        capture, template, ImageLoader(capture.splits["train"], data, with_maps=True)
+    )
 
 
 def metric(cameras: Cameras, scale: float) -> Cameras:
@@ -146,9 +148,9 @@ def metric(cameras: Cameras, scale: float) -> Cameras:
     return replace(cameras, cam_from_world=pose)
 
 
-def sources_of(images: Sequence[Image], scale: float) -> Sources:
+def crop_source_images(images: Sequence[Image], scale: float) -> Sources:
     """Return images of a world of which ``scale`` units are a metre."""
-    parts = [cropped(image, MARGIN) for image in images]
+    parts = [crop_to_person(image, MARGIN) for image in images]
     height, width = (
         -(-max(getattr(part.cameras, side) for part in parts) // MULTIPLE) * MULTIPLE
         for side in ("height", "width")
@@ -178,14 +180,14 @@ def window(image: Image, left: int, top: int, side: int) -> Image:
     height = min(side, camera.height)
     left = min(max(left, 0), camera.width - width)
     top = min(max(top, 0), camera.height - height)
-    return cut_out(image, top, left, height, width)
+    return crop_image(image, top, left, height, width)
 
 
-OUTWARDS, INWARDS = 0.06, 0.04  # How far the copies are from the mesh, m
+DILATION, EROSION = 0.06, 0.04  # How far the copies are from the mesh, m
 _NEAREST = 0.05  # Least depth of what is drawn, m
 
 
-class Boundaries:
+class BodyBoundaries:
     """The meshes of a body, and of a dilated and an eroded copy."""
 
     def __init__(self, body: PosedBody) -> None:
@@ -212,8 +214,8 @@ class Boundaries:
 
         Where they come in; where they are surely inside, or come out; where they meet the body.
         """
-        outer = self._body + OUTWARDS * self._normals
-        inner = self._body - INWARDS * self._normals
+        outer = self._body + DILATION * self._normals
+        inner = self._body - EROSION * self._normals
         begin = depths(outer, self._faces, camera)
         out = depths(outer, self._faces, camera, last=True)
         # what is thinner than the copy is eroded is turned inside out: its back faces lie before
@@ -221,7 +223,7 @@ class Boundaries:
         # do; nobody is inside before the body
         surely = depths(inner, self._faces, camera, front_faces=True)
         met = self.depth(camera)
-        inside = torch.minimum(torch.maximum(surely, met + INWARDS / 2), out)
+        inside = torch.minimum(torch.maximum(surely, met + EROSION / 2), out)
         end = torch.where(met.isfinite(), inside, out)
         return begin, torch.maximum(end, begin), met
 

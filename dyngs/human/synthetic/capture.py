@@ -182,7 +182,7 @@ class Outfit:
     size: float = 1.0  # of the person, relative to the template
 
 
-def random_outfit(seed: int, is_usual: bool = False) -> Outfit:
+def random_outfit(seed: int, is_everyday: bool = False) -> Outfit:
     """Return the outfit of ``seed``. 0 is the bare template, painted; others have clothes with
     offsets of up to 4 cm, differ in cut and pattern, and are 0.88 to 1.04 times as tall.
 
@@ -190,7 +190,7 @@ def random_outfit(seed: int, is_usual: bool = False) -> Outfit:
     what is mixed up.
     """
     palette = _palette(seed)
-    if is_usual:
+    if is_everyday:
         palette = _usual(palette, np.random.default_rng([seed, 4]))
     if seed == 0:
         return Outfit(palette)
@@ -426,7 +426,7 @@ class DirectionalLight:
     """A distant lamp and light from all sides."""
 
     # (3,) direction to the lamp, of any length
-    towards: tuple[float, float, float] = (0.35, 0.75, 0.56)
+    direction: tuple[float, float, float] = (0.35, 0.75, 0.56)
     # sRGB factors by channel, (3,) or one; ambient + diffuse where the surface faces the lamp
     ambient: tuple[float, ...] = (0.6,)
     diffuse: tuple[float, ...] = (0.45,)
@@ -452,7 +452,7 @@ class HumanOptions:
     # alternately low and high, 3.5 m away
     scene_seed: int | None = None
     # left mostly as right, back as front and bare hands, instead of clothes that differ everywhere
-    usual_clothes: bool = False
+    everyday_clothes: bool = False
     with_depth: bool = False  # whether there are depth maps
 
 
@@ -487,7 +487,7 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
             "a synthetic person needs size, frames and cameras of at least 1, a seed of at least 0"
         )
     body, betas = _person(options.body_seed)
-    outfit, clothed, texture = _dressed(body, options.seed, options.usual_clothes)
+    outfit, clothed, texture = _dressed(body, options.seed, options.everyday_clothes)
     train, test = _cameras(options)
     clips = {"train": (options.num_frames, {"train": train, "test": test})}
     if options.num_pose_frames and test:
@@ -520,10 +520,10 @@ def _person(seed: int | None) -> tuple[BodyTemplate, Tensor]:
 
 @lru_cache(maxsize=4)  # several captures of a person, of other clips or cameras, are painted once
 def _dressed(
-    body: BodyTemplate, seed: int, usual_clothes: bool
+    body: BodyTemplate, seed: int, everyday_clothes: bool
 ) -> tuple[Outfit, BodyTemplate, np.ndarray]:
     """Return the clothes of ``seed``, the body with them on, and its texture (S, S, 3)."""
-    outfit = random_outfit(seed, usual_clothes)
+    outfit = random_outfit(seed, everyday_clothes)
     return outfit, dress_body(body, outfit), paint_texture(body, outfit)
 
 
@@ -547,7 +547,11 @@ def random_light(seed: int | None) -> DirectionalLight:
 
 
 def render_mesh(
-    mesh: PosedMesh, world_from_cam: np.ndarray, size: int, samples: int, light: DirectionalLight = DirectionalLight()
+    mesh: PosedMesh,
+    world_from_cam: np.ndarray,
+    size: int,
+    samples: int,
+    light: DirectionalLight = DirectionalLight(),
 ) -> np.ndarray:
     """Return sRGB values and straight alpha (size, size, 4) in [0, 1], of ``samples`` x ``samples``
     per pixel.
@@ -673,7 +677,7 @@ def _shaded(mesh: PosedMesh, fragments: Fragments, light: DirectionalLight) -> n
     normal = normalized(
         interpolate(fragments.barycentric, mesh.normals[mesh.faces[fragments.faces]])
     )
-    facing = np.maximum(normal @ normalized(np.array(light.towards)), 0.0)
+    facing = np.maximum(normal @ normalized(np.array(light.direction)), 0.0)
     received = np.array(light.ambient) + np.array(light.diffuse) * facing[:, None]
     return np.minimum(_sampled(mesh.texture, uv) * received, 1.0)
 
@@ -688,7 +692,7 @@ def _sampled(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     return np.stack(channels, axis=-1)
 
 
-SHARD = 100
+PEOPLE_PER_FOLDER = 100
 """People in a folder."""
 _MOST = 10**6  # People of one seed, so that those of two seeds share nothing
 
@@ -731,7 +735,7 @@ def write_people(
             f"{out}: holds people of other options ({PEOPLE_FILE}); name a new folder, or give the same"
         )
     for number in range(options.people):
-        person = out / f"s{number // SHARD:04d}" / f"p{number:06d}"
+        person = out / f"s{number // PEOPLE_PER_FOLDER:04d}" / f"p{number:06d}"
         if not person.is_dir():
             write_human_capture(person, person_options(options, number))
         report("people", number + 1, options.people)
@@ -750,6 +754,6 @@ def person_options(options: PeopleOptions, number: int) -> HumanOptions:
         seed=seed,
         body_seed=seed,
         scene_seed=seed,
-        usual_clothes=number % 2 == 1,
+        everyday_clothes=number % 2 == 1,
         with_depth=True,
     )

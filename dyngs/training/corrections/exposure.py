@@ -34,7 +34,12 @@ from dyngs.gaussians.optimizer import AdamState
 from dyngs.models.model import Correction, Look, Loss, RenderedView
 from dyngs.models.renderable import Rendering
 from dyngs.ops.adam import Count
-from dyngs.training.corrections.cells import cell_camera, distances, project_to_pixels, points_of
+from dyngs.training.corrections.cells import (
+    camera_distances,
+    cell_camera,
+    project_to_pixels,
+    unproject_pixels,
+)
 
 WARM_UP = 0.25
 """Fraction of the run in which images are taken as they are: before, the rendering shows too little
@@ -92,7 +97,9 @@ class ViewExposures(Loss, Correction):
             return view
         if view.step == self._begins + 1 and self._images is not None:
             self._find_gains(self._images, view)
-        shown = apply_affine_colour(self.affine(view.index), view.image, view.rendering, view.background)
+        shown = apply_affine_colour(
+            self.affine(view.index), view.image, view.rendering, view.background
+        )
         # no sensor shows more than white
         white = view.image.composite(view.background) >= SATURATED
         return replace(view, rendered=torch.where(white, shown.clamp_max(1.0), shown))
@@ -126,7 +133,7 @@ class ViewExposures(Loss, Correction):
     def load_state(self, state: dict[str, Tensor]) -> None:
         visits = require_tensor("visits", state["visits"], self._visits.shape, torch.int64)
         values = require_tensor("values", state["values"], self._values.shape, torch.float32)
-        self._adam = AdamState.restored(state, {"values": values})
+        self._adam = AdamState.from_state(state, {"values": values})
         self._visits, self._values = visits.clone(), values.clone().requires_grad_()
 
 
@@ -174,7 +181,7 @@ def estimate_log_gains(
         draw: renders the scene from cameras at a time, with expected depth.
     """
     cells = [_cells_of(images, index, draw) for index in which]
-    distance = distances([x.camera for x in cells])
+    distance = camera_distances([x.camera for x in cells])
     places = [
         _places(cells, i, distance[i].argsort(stable=True)[:COMPARED])
         for i in evenly_spaced(len(cells), DRAWN_FROM)
@@ -211,7 +218,7 @@ def _places(cells: Sequence[_Cells], index: int, compared: Tensor) -> _Places:
     """Return what the views ``compared`` show of the known cells of one view."""
     own = cells[index]
     which = own.known.nonzero()[:, 0]
-    world = points_of(own.camera, which, own.depth[which])
+    world = unproject_pixels(own.camera, which, own.depth[which])
     colours = []
     shown = []
     for other in (cells[i] for i in compared.tolist()):

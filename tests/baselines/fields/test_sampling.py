@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.baselines.fields.nerf import by_weights, crossed, sample_evenly
+from dyngs.baselines.fields.nerf import intersect_space, sample_by_weights, sample_evenly
 from dyngs.ops.rays import Rays, Space
 
 SPACE = Space((0.0, 0.0, 0.0), 1.0, 1, 1)
@@ -20,7 +20,7 @@ def test_each_part_of_the_way_has_one_sample(count: int, seed: int, cascades: in
     space = Space((0.0, 0.0, 0.0), 1.0, cascades, 1)
     shifts = torch.rand(1, count, generator=torch.Generator().manual_seed(seed))
     found = sample_evenly(ACROSS, space, 0.05, shifts)[0].double()
-    begin, end = (float(x) for x in crossed(ACROSS, space, 0.05))
+    begin, end = (float(x) for x in intersect_space(ACROSS, space, 0.05))
     parts = (
         (found - begin) / (end - begin)
         if cascades == 1
@@ -35,7 +35,7 @@ def test_more_samples_go_where_the_weights_are() -> None:
     distances = torch.linspace(2, 4, 21)[None]
     weights = torch.zeros(1, 21)
     weights[0, 10], weights[0, 5] = 3.0, 1.0
-    found = by_weights(distances, weights, torch.full((1, 400), 0.5))[0]
+    found = sample_by_weights(distances, weights, torch.full((1, 400), 0.5))[0]
     assert len(found) == 421
     assert torch.equal(found, found.sort().values)
     near = [int(((found - float(distances[0, i])).abs() < 0.0501).sum()) for i in (10, 5)]

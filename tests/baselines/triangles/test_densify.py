@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from small_triangles import bent, triangle
 
-from dyngs.baselines.triangles.training import TriangleStatistics, change, useless
+from dyngs.baselines.triangles.training import TriangleStatistics, densify, prunable
 
 
 def seen(count: int) -> TriangleStatistics:
@@ -26,19 +26,19 @@ def test_a_good_triangle_is_useful_and_others_are_not() -> None:
     points[3, 2] = torch.nan
     tallies = seen(5)
     tallies.seen[4] = 0
-    assert useless(points, tallies, 1.0).tolist() == [False, True, True, True, True]
+    assert prunable(points, tallies, 1.0).tolist() == [False, True, True, True, True]
     hidden = seen(1)
     hidden.cells[0, 3:] = 0
-    assert useless(good, hidden, 1.0).tolist() == [True]
+    assert prunable(good, hidden, 1.0).tolist() == [True]
     for shown, goes in ((0.4, True), (0.6, False)):
         sliver = seen(1)
         sliver.cells *= shown * 10 / 36  # px of each of the 10 views
-        assert useless(good, sliver, 1.0).tolist() == [goes]
+        assert prunable(good, sliver, 1.0).tolist() == [goes]
 
 
 def test_those_with_the_largest_gradients_are_split_within_the_limit() -> None:
     patches = bent(6)
-    kept, added = change(patches, seen(6), 1.0, 12, 1)
+    kept, added = densify(patches, seen(6), 1.0, 12, 1)
     assert kept.tolist() == [0, 1, 2, 3]
     assert len(added["points"]) == 8
     assert torch.equal(added["harmonics"][:4], patches.harmonics[4].expand(4, -1, -1))

@@ -140,7 +140,7 @@ def test_a_capture_that_shows_no_surface_is_refused(
     capture: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Gaussians of images that show nothing need hundreds of steps until they have faded."""
-    monkeypatch.setattr("dyngs.baselines.triangles.training.fused", lambda *_: None)
+    monkeypatch.setattr("dyngs.baselines.triangles.training.fuse_depths", lambda *_: None)
     few = ["model.gaussian_steps=2", "run.dir=run"]
     assert main(["train", f"data.root={capture}", "model.kind=bg_triangle", *few]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()[-1:]

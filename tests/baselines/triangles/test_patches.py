@@ -8,7 +8,7 @@ import pytest
 import torch
 from small_triangles import bent
 
-from dyngs.baselines.triangles.scene import Patches, evaluated, quarters
+from dyngs.baselines.triangles.scene import Patches, evaluate_patches, subdivide
 from dyngs.core.state import tensors_of
 from dyngs.ops.patches import lattice, patch_values
 
@@ -16,7 +16,7 @@ from dyngs.ops.patches import lattice, patch_values
 def test_quarters_are_the_same_surface() -> None:
     """Every point of a quarter is the point of the whole at its place."""
     points = bent(2).points.double()
-    parts = quarters(points)
+    parts = subdivide(points)
     assert parts.shape == (8, 6, 3)
     places, faces = lattice(2)
     inner = lattice(4)[0]
@@ -24,17 +24,21 @@ def test_quarters_are_the_same_surface() -> None:
     for n, face in enumerate(faces):
         a, b, c = places[face]
         at = inner[:, :1] * a + inner[:, 1:] * b + third * c
-        torch.testing.assert_close(evaluated(parts[n::4], inner), evaluated(points, at))
+        torch.testing.assert_close(
+            evaluate_patches(parts[n::4], inner), evaluate_patches(points, at)
+        )
 
 
 def test_a_texture_begins_with_the_colours_that_were_there() -> None:
     patches = bent(3)
-    textured = patches.textured(4)
+    with_texture = patches.with_texture(4)
     places, _ = lattice(4)
     ids = torch.arange(3, dtype=torch.int32).repeat_interleave(len(places))
     uv = places.float().repeat(3, 1)
-    torch.testing.assert_close(textured.colours_at(ids, uv), patch_values(patches.colours, ids, uv))
-    assert textured.texture == 4
+    torch.testing.assert_close(
+        with_texture.colours_at(ids, uv), patch_values(patches.colours, ids, uv)
+    )
+    assert with_texture.texture == 4
 
 
 @pytest.mark.parametrize(
@@ -49,6 +53,6 @@ def test_a_texture_begins_with_the_colours_that_were_there() -> None:
     ],
 )
 def test_what_does_not_fit_is_refused(name: str, value: torch.Tensor) -> None:
-    stored = tensors_of(bent(4).textured(3).state())
+    stored = tensors_of(bent(4).with_texture(3).state())
     with pytest.raises(ValueError, match=r"'\w+'"):
-        Patches.restored(stored | {name: value})
+        Patches.from_state(stored | {name: value})

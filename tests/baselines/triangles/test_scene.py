@@ -81,14 +81,14 @@ def test_what_has_no_area_is_not_drawn_and_spoils_no_gradient() -> None:
     nan = SQUARE[0].clone()
     nan[0, 2, 1] = torch.nan
     wide = triangle((-1e5, 1e5, -9), (1e5, 1e5, -9), (0, -1e5, -9))
-    useless = [
+    prunable = [
         triangle(*[(0.2, 0.1, -1)] * 3),
         triangle((-1, 0, -1), (0, 0, -1), (1, 0, -1)),
         nan,
         wide,
     ]
     alone = scene_of(SQUARE[0])
-    together = scene_of(SQUARE[0], *useless)
+    together = scene_of(SQUARE[0], *prunable)
     points = together.patches.points.clone().requires_grad_()
     drawn = replace(together, patches=replace(together.patches, points=points)).render(camera())
     assert torch.equal(drawn.rgb, alone.render(camera()).rgb)

@@ -43,7 +43,7 @@ def test_bodies_move_rigidly_and_others_as_without_them(kind: str) -> None:
         places, quats = (x.detach().double().numpy() for x in field.poses(time))
         turns = Rotation.from_quat(quats[:, [1, 2, 3, 0]])
         offsets = field.offsets(gaussians.means, time)
-        alone = field.others.offsets(gaussians.means, time)
+        alone = field.inner_field.offsets(gaussians.means, time)
         moved = apply_offsets(gaussians, offsets).detach()
         for body in range(2):
             own = torch.tensor([i for i, label in enumerate(LABELS.tolist()) if label == body])
@@ -73,7 +73,7 @@ def test_bodies_turn_into_the_light_and_out_of_it() -> None:
     field.parameters["albedo"].data[:] = torch.arange(1.0, 10.0)[:, None]
     for time in TIMES:
         found = field.offsets(means, time)
-        alone = field.others.offsets(means, time)
+        alone = field.inner_field.offsets(means, time)
         assert found.colors is not None
         assert alone.colors is not None
         arms = means + found.means - field.poses(time)[0][LABELS.clamp_min(0)]
@@ -89,7 +89,7 @@ def test_gradients_reach_the_motion_and_the_gaussians() -> None:
     out = field.offsets(means, 0.37)
     assert out.quats is not None
     assert out.colors is not None
-    lit = field.shaded(cloud(), torch.arange(len(LABELS)), None, 0.37).sh.sum()
+    lit = field.apply_shading(cloud(), torch.arange(len(LABELS)), None, 0.37).sh.sum()
     (
         lit
         + out.means.square().sum()
@@ -99,7 +99,7 @@ def test_gradients_reach_the_motion_and_the_gaussians() -> None:
     ).backward()
     assert all(x.grad is not None and bool(x.grad.any()) for x in field.parameters.leaves)
     assert means.grad is not None
-    assert len(field.leaves) == len(field.parameters.leaves) + len(field.others.leaves)
+    assert len(field.leaves) == len(field.parameters.leaves) + len(field.inner_field.leaves)
     before = [x.detach().clone() for x in field.leaves]
     field.step(1, 0.0)
     assert sum(not torch.equal(x, y) for x, y in zip(field.leaves, before, strict=True)) >= 3

@@ -11,16 +11,16 @@ from dyngs.deform.bodies.paths import find_paths
 
 
 def test_a_ball_is_found_at_all_times() -> None:
-    shots, centers, _ = rolling()
-    (path, *_) = find_paths(shots, shots.differences())
+    frame_stack, centers, _ = rolling()
+    (path, *_) = find_paths(frame_stack, frame_stack.differences())
     assert np.linalg.norm(path.centers - centers, axis=1).max() < 0.25 * 0.28
     assert path.radius == pytest.approx(0.28, rel=0.1)
 
 
 def test_a_ball_that_hops_is_followed_through_its_bounces() -> None:
     """Smoothness alone would cut the corners where it leaves the plate again."""
-    shots, centers, _ = hopping()
-    path = find_paths(shots, shots.differences())[0]
+    frame_stack, centers, _ = hopping()
+    path = find_paths(frame_stack, frame_stack.differences())[0]
     errors = np.linalg.norm(path.centers - centers, axis=1)
     assert np.median(errors) < 0.1 * 0.28
     assert errors.max() < 0.6 * 0.28

@@ -18,7 +18,9 @@ def left_at(
     *points: tuple[float, float, float], shade: tuple[float, ...], label: int = -1
 ) -> list[float]:
     labels = torch.full((len(points),), label)
-    return light_fraction(torch.tensor(points), labels, BALL, RADIUS, SUN, torch.tensor(shade)).tolist()
+    return light_fraction(
+        torch.tensor(points), labels, BALL, RADIUS, SUN, torch.tensor(shade)
+    ).tolist()
 
 
 def test_direct_light_is_hidden_behind_a_ball_and_nowhere_else() -> None:

@@ -9,12 +9,12 @@ import torch
 from static_balls import BLACK, Ball, cameras, drawn, filmed
 
 from dyngs.data.loader import Image
-from dyngs.deform.fixed_cameras.hulls import LONGEST_SIDE, changes, build_fixed_camera_clip
+from dyngs.deform.fixed_cameras.hulls import LONGEST_SIDE, build_fixed_camera_clip, changes
 
 TIMES = tuple(i / 8 for i in range(9))
 
 
-def still(noise: float = 0.0, count: int = 9) -> np.ndarray:
+def static(noise: float = 0.0, count: int = 9) -> np.ndarray:
     """Images (T, H, W, 3) of one camera, nothing moves."""
     shown = [drawn(cameras(1)[0], [], noise, seed) for seed in range(count)]
     return (255 * torch.stack(shown)).round().to(torch.uint8).numpy()
@@ -22,7 +22,7 @@ def still(noise: float = 0.0, count: int = 9) -> np.ndarray:
 
 def with_patch(factor: tuple[float, float, float], at: int = 0) -> np.ndarray:
     """The same with the light in a square changed in the image ``at``."""
-    images = still().copy()
+    images = static().copy()
     images[at, 20:40, 20:40] = (
         (images[at, 20:40, 20:40] * np.array(factor)).clip(0, 255).astype(np.uint8)
     )

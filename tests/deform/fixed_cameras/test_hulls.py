@@ -17,7 +17,9 @@ def hulls(*balls: Ball, count: int = 8) -> list[Blob]:
     """Of the last of some moments; before, the balls were not there."""
     times = [i / (MOMENTS - 1) for i in range(MOMENTS)]
     clips = filmed(lambda t: balls if t == 1.0 else [], times, count)
-    return sorted(extract_blobs(silhouettes_at(clips, 1.0), LOW, HIGH), key=lambda blob: -blob.radius)
+    return sorted(
+        extract_blobs(silhouettes_at(clips, 1.0), LOW, HIGH), key=lambda blob: -blob.radius
+    )
 
 
 # of four, three suffice: their hull has corners

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from dyngs.deform.fixed_cameras.hulls import MAX_GAP, Blob, linked
+from dyngs.deform.fixed_cameras.hulls import MAX_GAP, Blob, link_tracks
 
 TIMES = tuple(i / 19 for i in range(20))
 RED = (0.9, 0.1, 0.1)
@@ -37,21 +37,25 @@ def along(path: Path, times: Sequence[float] = TIMES) -> list[list[Blob]]:
 )
 def test_one_thing_is_one_track(path: Path) -> None:
     """That goes about its own diameter from one time to the next."""
-    (track,) = linked(TIMES, along(path))
+    (track,) = link_tracks(TIMES, along(path))
     assert track.times == TIMES
-    assert track.travels
+    assert track.is_travelling
     np.testing.assert_allclose(track.centers, [path(t) for t in TIMES])
 
 
 def test_it_may_be_lost_for_a_while() -> None:
     gone = TIMES[8 : 8 + MAX_GAP]
-    (track,) = linked(
+    (track,) = link_tracks(
         TIMES, along(lambda t: (4 * t, 0.0, 0.0), [t for t in TIMES if t not in gone])
     )
     assert len(track.times) == len(TIMES) - MAX_GAP
     gone = TIMES[8 : 9 + MAX_GAP]
     assert (
-        len(linked(TIMES, along(lambda t: (4 * t, 0.0, 0.0), [t for t in TIMES if t not in gone])))
+        len(
+            link_tracks(
+                TIMES, along(lambda t: (4 * t, 0.0, 0.0), [t for t in TIMES if t not in gone])
+            )
+        )
         == 2
     )
 
@@ -60,7 +64,7 @@ def test_two_that_cross_are_told_apart() -> None:
     """By velocity, where colours are alike; by colour, where they come from one place."""
     for color in (RED, BLUE):
         found = [[blob((3 * t, 0.1, 0)), blob((3 - 3 * t, -0.1, 0), color=color)] for t in TIMES]
-        tracks = linked(TIMES, found)
+        tracks = link_tracks(TIMES, found)
         assert [len(track.times) for track in tracks] == [20, 20]
         for track in tracks:
             assert np.abs(np.diff(track.centers[:, 1])).max() == 0
@@ -72,6 +76,6 @@ def test_what_jumps_to_and_fro_does_not_travel() -> None:
     found = [
         [blob((0.9 * (i % 3 == 0), 0.0, 0.0), 0.1 + 0.1 * (i == 5))] for i in range(len(TIMES))
     ]
-    assert not any(track.travels for track in linked(TIMES, found))
+    assert not any(track.is_travelling for track in link_tracks(TIMES, found))
     once = [[blob((0.9 * (i > 9), 0.0, 0.0))] for i in range(len(TIMES))]
-    assert not any(track.travels for track in linked(TIMES, once))
+    assert not any(track.is_travelling for track in link_tracks(TIMES, once))

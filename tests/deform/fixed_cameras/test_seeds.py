@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from static_balls import Ball, filmed
 
-from dyngs.deform.fixed_cameras.initial_motion import find_tracks, track_gaussians, improves_images
+from dyngs.deform.fixed_cameras.initial_motion import find_tracks, improves_images, track_gaussians
 
 TIMES = tuple(i / 7 for i in range(8))
 BALL = Ball((0.0, 0.0, 0.0), 0.3)
@@ -27,9 +27,9 @@ def test_seeds_cover_a_ball_at_each_time_and_pay() -> None:
     """On its surface, in its colour of that time; at another place or time they would not pay."""
     clips = filmed(lambda t: [ball_at(t)], TIMES, 7)
     (track,) = find_tracks(clips, *BOX)
-    moments = track_gaussians(track, clips, 4.0, num_terms=4)
-    assert [one.time for one in moments] == list(TIMES)
-    for one in moments:
+    timed_gaussians = track_gaussians(track, clips, 4.0, num_terms=4)
+    assert [one.time for one in timed_gaussians] == list(TIMES)
+    for one in timed_gaussians:
         now = one.gaussians
         ball = ball_at(one.time)
         apart = (now.means - torch.tensor(ball.center)).norm(dim=1)
@@ -41,4 +41,4 @@ def test_seeds_cover_a_ball_at_each_time_and_pay() -> None:
         torch.testing.assert_close(one.velocity, torch.tensor([0.0, 0.0, 1.8]), rtol=0, atol=0.2)
         beside = now.replace(means=now.means + torch.tensor([0.0, 0.9, 0.0]))
         assert not improves_images(beside, one.time, clips)
-    assert not improves_images(moments[0].gaussians, TIMES[-1], clips)
+    assert not improves_images(timed_gaussians[0].gaussians, TIMES[-1], clips)

@@ -10,7 +10,7 @@ from flat_wall import BLACK, cameras_before_wall, seen_from
 from torch import Tensor
 
 from dyngs.data.loader import Image
-from dyngs.gaussians.colour.network import fit_affine_colour, apply_affine_colour
+from dyngs.gaussians.colour.network import apply_affine_colour, fit_affine_colour
 from dyngs.models.renderable import Rendering
 
 WARM = torch.tensor([[1.2, 0.05, 0.0, 0.02], [0.0, 1.0, -0.03, -0.01], [0.02, 0.0, 0.8, 0.03]])

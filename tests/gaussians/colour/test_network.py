@@ -41,7 +41,7 @@ def plain(gaussians: Gaussians) -> Gaussians:
     return gaussians.replace(sh=gaussians.sh[:, :1])
 
 
-@pytest.mark.parametrize("sees_normals", [False, True])
+@pytest.mark.parametrize("uses_normals", [False, True])
 def test_a_zero_last_layer_changes_nothing(uses_normals: bool) -> None:
     scene = random_scene()
     gaussians = plain(scene.gaussians)

@@ -181,23 +181,23 @@ def test_harmonics_that_do_not_pay_are_dropped(seven_views: Path, name: str) -> 
     )
     trainer = _coloured(seven_views, COLOURS[name], busy)
     seen = set()
-    findings = {}
+    messages = {}
     counts = set()
     for step in range(1, 41):
         report = trainer.step()
         counts.add(len(trainer.model.scene.gaussians))
-        if report.finding is not None:
-            findings[step] = report.finding
+        if report.message is not None:
+            messages[step] = report.message
             dropped = trainer.model.colours.frozen_harmonics()
         if step <= MEASURED_AFTER:
             seen.add(report.image.name)
     assert len(seen) == 6
-    assert list(findings) == [MEASURED_AFTER]
+    assert list(messages) == [MEASURED_AFTER]
     assert len(counts) > 4
     sh = trainer.model.scene.gaussians.sh
     frozen = trainer.model.colours.frozen_harmonics()
     if name == "none pays":
-        assert "does not pay" in findings[MEASURED_AFTER]
+        assert "does not pay" in messages[MEASURED_AFTER]
         assert sh.shape[1] == 1
     else:
         assert dropped is not None

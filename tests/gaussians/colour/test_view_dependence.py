@@ -68,7 +68,7 @@ def find(
 def test_a_matte_scene_keeps_none() -> None:
     """What was learned of the view is noise: it is worth less than nothing."""
     found = find(balls(0.05 * noise(0)), balls(torch.zeros(24, 3, 3)))
-    assert not found.keeps.any()
+    assert not found.kept_harmonics.any()
     assert found.gain_all < 0
     assert found.gain_kept == 0
     assert "does not pay" in str(found)
@@ -77,10 +77,10 @@ def test_a_matte_scene_keeps_none() -> None:
 def test_only_the_glossy_part_keeps_them() -> None:
     rest = 0.3 * noise(1) * GLOSSY[:, None, None]
     found = find(balls(rest + 0.01 * noise(2)), balls(rest))
-    assert found.keeps[GLOSSY].float().mean() > 0.8, (
+    assert found.kept_harmonics[GLOSSY].float().mean() > 0.8, (
         "all but those that are hardly seen or hardly glossy"
     )
-    assert not found.keeps[~GLOSSY].any()
+    assert not found.kept_harmonics[~GLOSSY].any()
     assert found.gain_kept > 3
     assert "pays for 2" in str(found)
 
@@ -93,7 +93,7 @@ def test_the_mean_of_what_is_seen_takes_their_place() -> None:
     lone.sh[:, 2] = 0.5  # along z: one camera sees all from about the same side
     seen = looks([0.0], lone, lone)
     found = find_view_dependent(seen, looks([0.01], lone, lone), RenderOptions(), BLACK, 300.0)
-    assert not found.keeps.any(), "300 dB may be given away"
+    assert not found.kept_harmonics.any(), "300 dB may be given away"
     plain = model.replace(
         sh=torch.cat([lone.sh[:, :1] + found.offsets[:, None] / SH_C0, rest], dim=1)
     )
@@ -111,11 +111,11 @@ def test_the_fewest_that_are_worth_nearly_everything(
     changes = torch.rand(count, generator=g)
     worths = torch.randn(count, generator=g)
     without = float(worths.clamp_min(0).sum()) + 1
-    keeps = select_worthwhile(changes, worths, without, tolerance)
+    kept_harmonics = select_worthwhile(changes, worths, without, tolerance)
     order = changes.argsort(descending=True, stable=True)
     errors = [without - float(worths[order[:k]].double().sum()) for k in range(count + 1)]
     limit = min(errors) * 10 ** (tolerance / 10) * (1 + 1e-9)
-    chosen = int(keeps.sum())
-    assert set(torch.nonzero(keeps)[:, 0].tolist()) == set(order[:chosen].tolist())
+    chosen = int(kept_harmonics.sum())
+    assert set(torch.nonzero(kept_harmonics)[:, 0].tolist()) == set(order[:chosen].tolist())
     assert errors[chosen] <= limit + 1e-5
     assert all(error > limit - 1e-5 for error in errors[:chosen])

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.posing import (
-    FINER,
+    FINE_FACTOR,
     Anchors,
     skinning_weights,
     surface_gaussians,
@@ -93,7 +93,7 @@ def test_hands_and_feet_have_smaller_texels_of_the_same_surface_where_pixels_are
     body = default_template()
     plain = atlas_texels(body, FINE)
     coarse, fine = surface_texels(body, FINE, body.vertices, 0.002)
-    assert fine.resolution == FINER * coarse.resolution
+    assert fine.resolution == FINE_FACTOR * coarse.resolution
     parts = {JOINT_NAMES[i] for i in fine.weights.argmax(1).unique().tolist()}
     assert {"left_wrist", "right_index3", "left_foot", "right_ankle"} <= parts
     assert not parts & {"head", "spine3", "left_elbow", "left_knee", "left_eye"}

@@ -12,13 +12,13 @@ from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.human.avatar.observations import (
+    effective_view_counts,
     filled,
-    linked_neighbours,
-    mirror_images,
+    find_mirror_gaussians,
     nearest_neighbours,
-    sightings,
-    smoothed,
-    strains,
+    rigidity_errors,
+    same_part_neighbours,
+    smooth_over_neighbours,
 )
 from dyngs.human.avatar.posing import Anchors
 from dyngs.human.body.atlas import atlas_texels
@@ -49,7 +49,7 @@ def test_neighbours_are_the_nearest_others(positions: np.ndarray, count: int) ->
 def test_no_gaussian_of_an_arm_is_linked_to_the_trunk_or_of_a_finger_to_another() -> None:
     body = load_template(HumanModel())
     texels = atlas_texels(body, 96)
-    near = linked_neighbours(texels.points, texels.weights)
+    near = same_part_neighbours(texels.points, texels.weights)
     first = texels.weights.argmax(1)
     names = JOINT_NAMES[: len(body.parents)]
     part = {
@@ -124,12 +124,14 @@ def test_a_view_counts_as_about_one_whatever_its_size_and_what_is_behind_counts_
         & (anchors.points[:, 1] < 0.07)
     )
     for size, focal in ((60, 300.0), (240, 1200.0)):
-        seen = sightings([(opaque, camera(1.0, size, focal))], sizes, 1.0, RenderOptions())
+        seen = effective_view_counts(
+            [(opaque, camera(1.0, size, focal))], sizes, 1.0, RenderOptions()
+        )
         assert 0.3 < float(seen[:count][inner].mean()) < 2.5
         assert float(seen[count:][inner].max()) < 0.02
-    twice = sightings([(opaque, camera())] * 2, sizes, 1.0, RenderOptions())
+    twice = effective_view_counts([(opaque, camera())] * 2, sizes, 1.0, RenderOptions())
     torch.testing.assert_close(
-        twice, 2 * sightings([(opaque, camera())], sizes, 1.0, RenderOptions())
+        twice, 2 * effective_view_counts([(opaque, camera())], sizes, 1.0, RenderOptions())
     )
 
 
@@ -171,9 +173,9 @@ def test_without_a_seen_mirror_image_a_gap_is_filled_smoothly_and_from_its_own_p
     colours = torch.where(left[:, None], torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1]))
     noisy = torch.where(gap[:, None], torch.randn(len(anchors), 3), colours)
     weights = torch.stack([~left, left], dim=1).float()
-    found = smoothed(noisy, (~gap).float(), anchors, weights)
+    found = smooth_over_neighbours(noisy, (~gap).float(), anchors, weights)
     torch.testing.assert_close(found, colours, atol=1e-3, rtol=0)
-    _, is_image = mirror_images(anchors, 0.5)
+    _, is_image = find_mirror_gaussians(anchors, 0.5)
     assert not bool(is_image.any())
     new = filled(gaussians.replace(sh=noisy[:, None]), anchors, weights, 0.5, (~gap).float())
     torch.testing.assert_close(new["sh"][:, 0], colours, atol=1e-3, rtol=0)
@@ -185,7 +187,7 @@ def test_strains_are_those_of_a_loop_and_so_are_their_gradients() -> None:
     means, moved, points = torch.randn(3, 7, 3, generator=generator, dtype=torch.float64).unbind(0)
     near = torch.tensor([1, 2, 0, 0, 5, 4, 6])
     scale = torch.tensor(1.5, dtype=torch.float64)  # the last is alone
-    found = strains(means, moved, points, near, scale)
+    found = rigidity_errors(means, moved, points, near, scale)
     changes = []
     unlike = []
     for i, j in enumerate(near.tolist()):
@@ -196,4 +198,4 @@ def test_strains_are_those_of_a_loop_and_so_are_their_gradients() -> None:
     torch.testing.assert_close(found[0].item(), sum(changes) / 7, rtol=1e-6, atol=0)
     torch.testing.assert_close(found[1].item(), sum(unlike) / 7)
     leaves = means.requires_grad_(), moved.requires_grad_()
-    assert torch.autograd.gradcheck(lambda a, b: strains(a, b, points, near, scale), leaves)
+    assert torch.autograd.gradcheck(lambda a, b: rigidity_errors(a, b, points, near, scale), leaves)

@@ -15,7 +15,7 @@ from torch import Tensor
 from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.data.capture import Capture, Silhouette, View
 from dyngs.data.loader import ImageLoader
-from dyngs.human.avatar.training import OutlineLoss, outline_loss
+from dyngs.human.avatar.training import OutlineLoss, make_outline_loss
 from dyngs.human.keys import HumanModel
 from dyngs.io.write import write_image
 from dyngs.models.kind import RunStart
@@ -23,7 +23,7 @@ from dyngs.models.model import Drawn, Look
 from dyngs.models.renderable import Rendering
 
 SIDE = 40
-FRAMES = 9
+PLATE_FRAMES = 9
 RED = (200.0, 20.0, 20.0)
 GENERATOR = torch.Generator()
 
@@ -45,7 +45,7 @@ def views(folder: Path, grown: int, light: float = 0.0) -> list[View]:
     """Return views of the square, whose masks are too large by ``grown`` px; ``light`` grey levels
     come every frame."""
     found = []
-    for frame in range(FRAMES):
+    for frame in range(PLATE_FRAMES):
         photo = np.where(person(frame)[..., None], RED, behind() + light * frame)
         image = folder / f"{frame}.png"
         mask = folder / f"m{frame}.png"
@@ -79,20 +79,20 @@ def loss_of(loss: OutlineLoss, seen: list[View], frame: int, alpha: Tensor, rgb:
 @pytest.mark.parametrize("grown", [-1, 1])
 def test_the_true_person_costs_least_though_the_mask_is_wrong(tmp_path: Path, grown: int) -> None:
     seen = views(tmp_path, grown)
-    loss = outline_loss(run(seen))
+    loss = make_outline_loss(run(seen))
     assert loss is not None
     alpha = torch.from_numpy(person(2)).float()
     rgb = torch.tensor(RED).expand(SIDE, SIDE, 3) / 255
     assert float(loss_of(loss, seen, 2, alpha, rgb)) < 1e-3
-    cut_out = torch.from_numpy(person(2, grown)).float()
-    assert float(loss_of(loss, seen, 2, cut_out, rgb)) > 5e-3
+    crop_image = torch.from_numpy(person(2, grown)).float()
+    assert float(loss_of(loss, seen, 2, crop_image, rgb)) > 5e-3
 
 
 def test_the_opacity_is_moved_towards_the_true_one(tmp_path: Path) -> None:
     """Of a pixel that the mask has and the person does not, opacity falls; far from the mask
     nothing is asked."""
     seen = views(tmp_path, 1)
-    loss = outline_loss(run(seen))
+    loss = make_outline_loss(run(seen))
     assert loss is not None
     alpha = (torch.from_numpy(person(2, 1)).float() * 0.9).requires_grad_()
     loss_of(loss, seen, 2, alpha, torch.tensor(RED).expand(SIDE, SIDE, 3) / 255).backward()

@@ -13,7 +13,7 @@ from posed_person import WHITE, Shown, disturbed, images_of, joints_of, person_a
 
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import ImageLoader
-from dyngs.human.avatar.pose_fit import LEAST_GAIN, LEAST_MOVE, PoseRefit
+from dyngs.human.avatar.pose_fit import MIN_JOINT_SHIFT, MIN_LOSS_DECREASE, PoseRefit
 from dyngs.human.avatar.scene import HumanScene
 
 
@@ -31,22 +31,22 @@ def refit_to(scene: HumanScene, cameras: list[Cameras]) -> PoseRefit:
 def trained_on(scene: HumanScene) -> HumanScene:
     """The same person whose clip of training is the one with turned joints, and some corrections of
     it."""
-    clip = disturbed(scene).played
+    clip = disturbed(scene).replacement_clip
     assert clip is not None
-    copied = scene.learned.restored({name: x.tensor for name, x in scene.learned.state().items()})
+    copied = scene.learned.with_state({name: x.tensor for name, x in scene.learned.state().items()})
     return replace(scene, clip=clip, learned=copied)
 
 
 def test_views_left_out_gain_from_wrong_poses_only(truth: tuple[HumanScene, list[Cameras]]) -> None:
     scene, cameras = truth
     refit = refit_to(scene, cameras)
-    assert refit.suits(scene)
-    gain, move = refit.tried(scene)
-    assert gain < LEAST_GAIN
-    assert move < LEAST_MOVE
-    gain, move = refit.tried(trained_on(scene))
-    assert gain > LEAST_GAIN + 1
-    assert move > 5 * LEAST_MOVE
+    assert refit.applies_to(scene)
+    gain, move = refit.measure_gain(scene)
+    assert gain < MIN_LOSS_DECREASE
+    assert move < MIN_JOINT_SHIFT
+    gain, move = refit.measure_gain(trained_on(scene))
+    assert gain > MIN_LOSS_DECREASE + 1
+    assert move > 5 * MIN_JOINT_SHIFT
 
 
 def test_one_row_comes_nearer_to_the_truth_and_all_else_stays(
@@ -59,7 +59,7 @@ def test_one_row_comes_nearer_to_the_truth_and_all_else_stays(
         start.learned["trans"].fill_(0.002)
     true = joints_of(scene, scene.played_clip, 1)
     before = float((joints_of(start, start.played_clip, 1) - true).norm(dim=1).mean())
-    found = refit_to(scene, cameras).refitted(start, 1)
+    found = refit_to(scene, cameras).refit_frame(start, 1)
     after = float((joints_of(found, found.played_clip, 1) - true).norm(dim=1).mean())
     assert after < 0.6 * before
     for name in ("poses", "trans"):

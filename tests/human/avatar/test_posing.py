@@ -19,14 +19,14 @@ from torch import Tensor
 from dyngs.core.conventions import SH_C0
 from dyngs.gaussians import Gaussians
 from dyngs.human.avatar.posing import (
-    TERMS,
+    NUM_LIGHT_TERMS,
     Anchors,
     BodyPose,
     Skeleton,
     blended_rotations,
+    pose_blend_offsets,
     pose_blend_shapes,
     pose_gaussians,
-    pose_blend_offsets,
     rotate_sh,
     skinning_weights,
     texel_gaussians,
@@ -44,7 +44,7 @@ from tests.bare_person import bare_scene
 def from_the_left() -> Tensor:
     """Twice as bright as even light where the surface faces +x, black where it faces -x; red
     only."""
-    factors = torch.zeros(TERMS, 3)
+    factors = torch.zeros(NUM_LIGHT_TERMS, 3)
     factors[0, 0] = 1.0
     return factors
 
@@ -62,7 +62,7 @@ def colours(sh: Tensor) -> Tensor:
 
 def test_gradients_are_those_of_finite_differences() -> None:
     make = torch.Generator().manual_seed(1)
-    shapes = ((3, 1, 3), (3, 3, 3), (3, 3), (TERMS, 3))
+    shapes = ((3, 1, 3), (3, 3, 3), (3, 3), (NUM_LIGHT_TERMS, 3))
     values = [
         torch.randn(shape, generator=make, dtype=torch.float64).requires_grad_() for shape in shapes
     ]
@@ -71,9 +71,9 @@ def test_gradients_are_those_of_finite_differences() -> None:
 
 def test_a_person_is_lit_in_the_world() -> None:
     scene = bare_scene(light=True)
-    dark, _ = scene.in_frame(0)
+    dark, _ = scene.gaussians_in_frame(0)
     scene.learned["light"].data.copy_(from_the_left())
-    lit, _ = scene.in_frame(0)
+    lit, _ = scene.gaussians_in_frame(0)
     assert torch.equal(lit.means, dark.means)
     ratio = colours(lit.sh) / colours(dark.sh)
     torch.testing.assert_close(ratio[:, 1:], torch.ones_like(ratio[:, 1:]), atol=1e-5, rtol=0)

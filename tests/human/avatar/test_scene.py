@@ -57,7 +57,7 @@ def stirred() -> HumanScene:
 
 def reloaded(scene: HumanScene) -> HumanScene:
     """The scene of what is stored of it."""
-    return HumanScene.restored(scene.gaussians, part_of(tensors_of(scene.state()), "model"))
+    return HumanScene.from_state(scene.gaussians, part_of(tensors_of(scene.state()), "model"))
 
 
 def seen(gaussians: Gaussians) -> Tensor:
@@ -73,9 +73,9 @@ def test_two_clips_of_the_same_pose_give_the_same_image() -> None:
     other = random_clip(6, seed=6)
     for name in ("poses", "trans", "scale"):
         getattr(other, name)[4] = getattr(one, name)[1]
-    first, second = (seen(scene.playing(c).at(t)) for c, t in ((one, 0.5), (other, 0.8)))
+    first, second = (seen(scene.with_motion(c).at(t)) for c, t in ((one, 0.5), (other, 0.8)))
     assert torch.equal(first, second)
-    assert float((first - seen(scene.playing(one).at(0.0))).abs().max()) > 0.05
+    assert float((first - seen(scene.with_motion(one).at(0.0))).abs().max()) > 0.05
     assert float(first.max()) > 0.2
 
 

@@ -195,7 +195,7 @@ def test_what_is_hardly_seen_is_filled_after_the_last_step_and_nothing_else_chan
         trainer = build_trainer(tiny(capture, steps=4, fill_unseen=fill))
         reports = [trainer.step() for _ in range(step)]
         found = {name: x.clone() for name, x in trainer.checkpoint().tensors.items()}
-        return found, reports[-1].finding or ""
+        return found, reports[-1].message or ""
 
     assert same(after(3, True)[0], after(3, False)[0])
     (filled, line), (plain, silence) = after(4, True), after(4, False)
@@ -228,10 +228,10 @@ def turned(capture: Path, out: Path) -> Path:
 def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pose_fit, "STARTS", (10 / 240,))
+    monkeypatch.setattr(pose_fit, "REFIT_STARTS", (10 / 240,))
     config = tiny(turned(capture, tmp_path / "turned"), steps=240)
     trainer = build_trainer(config)
-    lines = [trainer.step().finding or "" for _ in range(16)]
+    lines = [trainer.step().message or "" for _ in range(16)]
     assert "poses are fitted to the images again" in lines[9]
     assert "".join(lines[:9] + lines[10:]) == ""
     straight = {name: x.clone() for name, x in trainer.checkpoint().tensors.items()}
@@ -247,12 +247,12 @@ def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(
 def test_poses_that_views_gain_nothing_from_stay_for_good(
     capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pose_fit, "STARTS", (10 / 240, 14 / 240))
+    monkeypatch.setattr(pose_fit, "REFIT_STARTS", (10 / 240, 14 / 240))
     trainer = build_trainer(tiny(capture, steps=240))
     given = human(trainer).clip.poses.clone()
-    lines = [trainer.step().finding or "" for _ in range(12)]
+    lines = [trainer.step().message or "" for _ in range(12)]
     assert lines[9].startswith("poses stay")
     resumed = build_trainer(tiny(capture, steps=240))
     resumed.restore(trainer.checkpoint())
-    assert all(resumed.step().finding is None for _ in range(4)), "it is not tried again"
+    assert all(resumed.step().message is None for _ in range(4)), "it is not tried again"
     assert torch.equal(human(resumed).clip.poses, given)

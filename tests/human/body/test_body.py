@@ -17,10 +17,10 @@ from torch import Tensor
 
 from dyngs.human.body.body import (
     BONE_UNIT,
-    SIDED,
+    PAIRED_JOINTS,
     BodyTemplate,
     apply_shape,
-    bone_shapes,
+    bone_shape_directions,
     posed_vertices,
 )
 from dyngs.human.body.body_reader import default_template
@@ -170,19 +170,19 @@ def bare_template() -> tuple[BodyTemplate, np.ndarray, np.ndarray]:
     body = default_template()
     arrays = (x.double().numpy() for x in (body.vertices, body.joints, body.weights))
     vertices, joints, weights = arrays
-    return body, *bone_shapes(vertices, joints, body.parents, weights)
+    return body, *bone_shape_directions(vertices, joints, body.parents, weights)
 
 
 def test_both_sides_move_as_mirror_images() -> None:
     _, _, joints = bare_template()
-    for name in SIDED:
+    for name in PAIRED_JOINTS:
         left, right = (joints[JOINT_NAMES.index(f"{side}_{name}")] for side in ("left", "right"))
         assert np.array_equal(left * np.array([-1, 1, 1])[:, None], right)
 
 
 def test_a_bone_moves_all_that_is_below_it_and_nothing_else() -> None:
     _, _, joints = bare_template()
-    knee = joints[:, :, 3 * SIDED.index("knee") + 1]
+    knee = joints[:, :, 3 * PAIRED_JOINTS.index("knee") + 1]
     moved = {name for name, move in zip(JOINT_NAMES, knee, strict=True) if move.any()}
     assert moved == {
         f"{side}_{name}" for side in ("left", "right") for name in ("knee", "ankle", "foot")

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dyngs.human.detect.detect_person import fix_left_right_swaps
 from dyngs.human.detect.detector import Detection
-from dyngs.human.detect.detect_person import with_sides
 from tests.detections import person
 
 LEFT = [1, 3, 5, 7, 9, 11, 13, 15]
@@ -31,7 +31,7 @@ def test_sides_swapped_in_a_few_images_are_put_right(
         if t in wrong:
             points[sides[0] + sides[1]] = points[sides[1] + sides[0]]
         seen.append(Detection(points, NOBODY))
-    found, changed = with_sides(seen)
+    found, changed = fix_left_right_swaps(seen)
     assert changed == len(wrong)
     for x, y in zip(found, true, strict=True):
         assert x is not None
@@ -42,8 +42,8 @@ def test_who_turns_around_keeps_their_sides() -> None:
     turning = [
         person(100, width=float(np.cos(np.pi * min(max(t - 10, 0), 10) / 10))) for t in range(30)
     ]
-    found, changed = with_sides([*turning[:5], None, *turning[6:]])
+    found, changed = fix_left_right_swaps([*turning[:5], None, *turning[6:]])
     assert changed == 0
     assert found[5] is None
-    none, changed = with_sides([None, None])
+    none, changed = fix_left_right_swaps([None, None])
     assert (none, changed) == ([None, None], 0)

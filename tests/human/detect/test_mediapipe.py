@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.human.detect.detector import LANDMARKS, VARIABLE, MediaPipe
+from dyngs.human.detect.detector import LANDMARKS, MEDIAPIPE_VARIABLE, MediaPipe
 from dyngs.io.write import write_image
 
 SCRIPT = """#!{python}
@@ -93,7 +93,8 @@ def _has_mediapipe() -> bool:
 
 
 @pytest.mark.skipif(
-    VARIABLE not in os.environ, reason=f"{VARIABLE} names no environment with MediaPipe"
+    MEDIAPIPE_VARIABLE not in os.environ,
+    reason=f"{MEDIAPIPE_VARIABLE} names no environment with MediaPipe",
 )
 def test_the_real_one_finds_nobody_in_noise(tmp_path: Path) -> None:
     path = tmp_path / "noise" / "000000.png"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from dyngs.human.detect.detect_person import capture_warnings
 from dyngs.human.detect.detector import Detection
-from dyngs.human.detect.detect_person import warnings_of
 from tests.detections import person
 
 SIZE = 400
@@ -27,7 +27,7 @@ def turning(count: int, height: float = 200.0) -> list[Detection | None]:
 
 def test_a_good_clip_has_no_warning() -> None:
     people = turning(12)
-    assert warnings_of(clip(people), people) == []
+    assert capture_warnings(clip(people), people) == []
 
 
 @pytest.mark.parametrize(
@@ -40,6 +40,6 @@ def test_a_good_clip_has_no_warning() -> None:
     ],
 )
 def test_what_is_bad_is_said(people: list[Detection | None], said: str) -> None:
-    found = warnings_of(clip(people), people)
+    found = capture_warnings(clip(people), people)
     assert len(found) == 1
     assert said in found[0]

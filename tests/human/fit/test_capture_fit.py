@@ -23,26 +23,33 @@ from dyngs.human.body.body_reader import default_template, read_body, rest_shape
 from dyngs.human.body.skinning import axis_angle_to_matrix, joint_transforms
 from dyngs.human.fit import capture_fit
 from dyngs.human.fit.capture_fit import (
-    GAIN,
+    MIN_GAIN,
     RESOLUTION,
+    BodyFit,
+    CandidateFit,
     CaptureFit,
     FitEffort,
-    Fitting,
-    TriedFit,
     body_discs,
+    collect_fitted_clips,
     fit_capture,
-    fitted_clips,
-    placed_clip,
+    place_new_poses,
     pose_prior,
     split_views,
 )
-from dyngs.human.fit.fitted_capture import with_shape
+from dyngs.human.fit.fitted_capture import apply_known_shape
 from dyngs.human.motion.motion import captured_motion
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.io.write import write_image
 
 OPTIONS = HumanOptions(
-    size=96, num_frames=4, num_pose_frames=0, num_cameras=5, num_test=1, seed=1, samples=1, body_seed=5
+    size=96,
+    num_frames=4,
+    num_pose_frames=0,
+    num_cameras=5,
+    num_test=1,
+    seed=1,
+    samples=1,
+    body_seed=5,
 )
 
 
@@ -62,7 +69,7 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> tuple[Capture, Capture]:
 @lru_cache(maxsize=1)
 def found(capture_root: Path) -> CaptureFit:
     capture = read_capture(DataConfig(root=capture_root))
-    effort = FitEffort(side=64, steps=30, visits=18)
+    effort = FitEffort(side=64, steps=30, draws_per_frame=18)
     return fit_capture(
         capture, DataConfig(root=capture_root), default_template(), lambda *_: None, effort=effort
     )
@@ -106,14 +113,14 @@ def test_a_body_file_finds_its_own_shape(
         *write_smpl_like(tmp_path, "smplx"), tmp_path / "person", options, betas, monkeypatch
     )
     capture = read_capture(DataConfig(root=root))
-    body = with_shape(read_body(*smpl_files), None)
+    body = apply_known_shape(read_body(*smpl_files), None)
     assert capture.body is not None
     wrong = {split: replace(given, betas=np.zeros(10)) for split, given in capture.body.items()}
-    effort = FitEffort(side=64, steps=30, visits=6)
+    effort = FitEffort(side=64, steps=30, draws_per_frame=6)
     fit = fit_capture(
         capture.replace(body=wrong), DataConfig(root=root), body, lambda *_: None, effort=effort
     )
-    assert fit.chosen.iou > fit.tried[0].iou + GAIN
+    assert fit.chosen.iou > fit.tried[0].iou + MIN_GAIN
     assert body.shape_dirs is not None
     truth, found = (body.vertices + body.shape_dirs @ x for x in (betas, fit.betas))
     size = float(fit.chosen.learned["log_scale"].detach())
@@ -125,7 +132,7 @@ def test_a_body_file_finds_its_own_shape(
 
 def test_the_same_capture_gives_the_same_fit(wrong: tuple[Capture, Capture]) -> None:
     options = DataConfig(root=wrong[1].root)
-    effort = FitEffort(side=32, steps=2, visits=0)
+    effort = FitEffort(side=32, steps=2, draws_per_frame=0)
     body = default_template()
     first, again = (
         fit_capture(wrong[1], options, body, lambda *_: None, effort=effort).chosen.learned
@@ -156,7 +163,7 @@ def test_without_given_poses_every_frame_has_its_own(
 ) -> None:
     monkeypatch.setattr(capture_fit, "STEPS", 1)
     capture = wrong[1].replace(body=None)
-    effort = FitEffort(side=32, steps=1, visits=0)
+    effort = FitEffort(side=32, steps=1, draws_per_frame=0)
     fit = fit_capture(
         capture, DataConfig(root=capture.root), default_template(), lambda *_: None, effort=effort
     )
@@ -164,7 +171,7 @@ def test_without_given_poses_every_frame_has_its_own(
     assert fit.motion.frames == (0, 1, 2, 3)
     poses = fit.clip.poses
     assert len({tuple(pose.flatten().tolist()) for pose in poses}) == 4
-    clips = fitted_clips(capture, default_template(), fit, None)
+    clips = collect_fitted_clips(capture, default_template(), fit, None)
     assert clips["train"].frames == (0, 1, 2, 3)
     assert torch.equal(clips["train"].clip.poses, poses)
 
@@ -218,10 +225,10 @@ def as_given(capture: Capture) -> CaptureFit:
     motion = captured_motion(
         capture.root, capture.body["train"], capture.splits["train"], body.joints
     )
-    fitting = Fitting(
+    fitting = BodyFit(
         motion.clip, body_discs(body, RESOLUTION), pose_prior(motion.clip, is_given=True)
     )
-    candidate = TriedFit("the poses as given", fitting.start(), 0.9, (0.9, 0.9))
+    candidate = CandidateFit("the poses as given", fitting.start(), 0.9, (0.9, 0.9))
     return CaptureFit(motion, candidate, (candidate,), 0)
 
 
@@ -238,7 +245,9 @@ def test_a_clip_that_stands_elsewhere_is_moved_to_its_silhouettes(capture: Captu
     wrong = moved(capture, AWAY)
     fit = as_given(capture)
     body = default_template()
-    found = placed_clip(wrong, DataConfig(root=capture.root), body, fit, lambda *_: None, EFFORT)
+    found = place_new_poses(
+        wrong, DataConfig(root=capture.root), body, fit, lambda *_: None, EFFORT
+    )
     assert found is not None
     assert found.iou_moved is not None
     assert found.iou_moved > found.iou + 0.02
@@ -246,7 +255,7 @@ def test_a_clip_that_stands_elsewhere_is_moved_to_its_silhouettes(capture: Captu
     assert wrong.body is not None
     views = wrong.splits["pose"]
     given = captured_motion(wrong.root, wrong.body["pose"], views, body.joints).clip
-    clip = fitted_clips(wrong, body, fit, found)["pose"].clip
+    clip = collect_fitted_clips(wrong, body, fit, found)["pose"].clip
     shift = clip.trans - given.trans
     torch.testing.assert_close(shift, shift[:1].expand_as(shift), atol=1e-6, rtol=0)
     assert np.abs(shift[0].numpy() + AWAY).max() < 0.008, (

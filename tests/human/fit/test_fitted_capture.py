@@ -20,9 +20,9 @@ from dyngs.data.readers.transforms import read_frame_file, read_views
 from dyngs.human.body.body_reader import load_template, rest_shape
 from dyngs.human.fit.fitted_capture import (
     FitInputs,
-    read_person,
     ensure_fitted_body,
-    write_body,
+    read_person_capture,
+    write_body_file,
     write_fitted_capture,
     write_split,
 )
@@ -151,7 +151,7 @@ def clip(folder: Path, empty: int = 2, count: int = 12) -> Path:
 
 def test_a_plain_clip_gets_masks_and_loses_empty_frames(tmp_path: Path) -> None:
     said: list[str] = []
-    capture = read_person(
+    capture = read_person_capture(
         DataConfig(root=clip(tmp_path / "c")), FitInputs(), tmp_path / "m", said.append
     )
     assert capture.format == FORMAT
@@ -163,7 +163,7 @@ def test_a_plain_clip_gets_masks_and_loses_empty_frames(tmp_path: Path) -> None:
 
 
 def test_photos_and_found_masks_are_written_apart(tmp_path: Path) -> None:
-    capture = read_person(
+    capture = read_person_capture(
         DataConfig(root=clip(tmp_path / "c")), FitInputs(), tmp_path / "m", lambda _: None
     )
     views = capture.splits["train"]
@@ -190,14 +190,14 @@ def test_masks_of_a_folder_replace_those_of_a_capture(tmp_path: Path) -> None:
     given = read_capture(DataConfig(root=root, test_every=0))
     for view in given.splits["train"]:
         write_image(tmp_path / "m" / f"{view.name}.png", np.full((32, 32, 1), 255, np.uint8))
-    capture = read_person(
+    capture = read_person_capture(
         DataConfig(root=root, test_every=0), FitInputs(masks=tmp_path / "m"), tmp_path / "w"
     )
     assert capture.format != FORMAT
     assert all(view.silhouette is not None for view in capture.splits["train"])
     (tmp_path / "m" / f"{given.splits['train'][0].name}.png").unlink()
     with pytest.raises(DyngsError, match="no mask for 1 of 4 images"):
-        read_person(
+        read_person_capture(
             DataConfig(root=root, test_every=0), FitInputs(masks=tmp_path / "m"), tmp_path / "w"
         )
 
@@ -209,7 +209,7 @@ def test_a_fit_far_from_the_origin_is_written_exactly(data: DataConfig, tmp_path
     clip = captured_motion(data.root, capture.body["train"], capture.splits["train"], body.joints)
     offset = np.array([500_000.0, 4_600_000.0, 120.0])
     far = capture.replace(world_offset=offset, world_scale=0.25)
-    write_body(tmp_path / "body.npz", clip, body, np.zeros(10), far)
+    write_body_file(tmp_path / "body.npz", clip, body, np.zeros(10), far)
     near = moved(read_body_file(tmp_path / "body.npz"), offset, 4.0)
     np.testing.assert_allclose(near.trans, clip.clip.trans.numpy(), rtol=0, atol=1e-8)
     np.testing.assert_array_equal(near.scale, clip.clip.scale.numpy())

@@ -20,12 +20,12 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.body_reader import default_template, read_body
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.fit.fitted_capture import (
-    AvatarPoses,
+    AvatarPoseFit,
     KnownAvatar,
-    known_shape,
-    posed_by_avatar,
-    shape_of,
-    with_shape,
+    apply_known_shape,
+    fit_poses_by_avatar,
+    known_betas,
+    read_known_shape,
 )
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
@@ -49,9 +49,9 @@ def fitted(folder: Path, kind: str = "anny") -> Path:
 
 def test_the_template_gets_the_shape(tmp_path: Path) -> None:
     body = default_template()
-    known = known_shape(fitted(tmp_path / "a"), body)
-    shaped = with_shape(body, known)
-    betas = shape_of(body, known)
+    known = read_known_shape(fitted(tmp_path / "a"), body)
+    shaped = apply_known_shape(body, known)
+    betas = known_betas(body, known)
     assert body.joint_shape_dirs is not None
     assert torch.allclose(shaped.joints, body.joints + body.joint_shape_dirs @ betas, atol=1e-5)
     assert betas[-1] == 1
@@ -60,17 +60,17 @@ def test_the_template_gets_the_shape(tmp_path: Path) -> None:
 
 def test_others_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="no fitted person there"):
-        known_shape(tmp_path, default_template())
+        read_known_shape(tmp_path, default_template())
     with pytest.raises(DyngsError, match="of another template"):
-        known_shape(fitted(tmp_path / "b", "smplx"), default_template())
+        read_known_shape(fitted(tmp_path / "b", "smplx"), default_template())
 
 
 def test_a_body_of_smpl_has_the_first_ten_shapes(tmp_path: Path) -> None:
     body = read_body(write_npz(tmp_path / "x.npz", model("smplx", directions=30)))
-    cut = with_shape(body, None)
+    cut = apply_known_shape(body, None)
     assert (body.num_shapes, cut.num_shapes) == (30, 10)
     assert torch.equal(cut.vertices, body.vertices)
-    assert with_shape(default_template(), None).num_shapes == default_template().num_shapes
+    assert apply_known_shape(default_template(), None).num_shapes == default_template().num_shapes
 
 
 SIZE = 64
@@ -121,9 +121,9 @@ def views(avatar: HumanScene, person: Path, tmp_path_factory: pytest.TempPathFac
     return found
 
 
-def posed(avatar: HumanScene, views: list[View], clip: MotionClip) -> AvatarPoses:
+def posed(avatar: HumanScene, views: list[View], clip: MotionClip) -> AvatarPoseFit:
     start = CapturedMotion(clip, (0, 1, 2))
-    return posed_by_avatar(KnownAvatar(avatar, None), views, DataConfig(root=Path()), start)
+    return fit_poses_by_avatar(KnownAvatar(avatar, None), views, DataConfig(root=Path()), start)
 
 
 def turned(clip: MotionClip) -> MotionClip:
@@ -143,7 +143,7 @@ def error(clip: MotionClip, truth: MotionClip) -> Tensor:
 def test_disturbed_poses_are_found_again(
     avatar: HumanScene, views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 4)
+    monkeypatch.setattr(pose_fit, "MAX_WINDOWS", 4)
     start = turned(avatar.clip)
     found = posed(avatar, views, start)
     assert found.left_out == 2
@@ -160,7 +160,7 @@ def test_worse_poses_are_not_taken(
 ) -> None:
     """Left-out views that show somebody else (a person who stands still) decide against what the
     others ask for."""
-    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 2)
+    monkeypatch.setattr(pose_fit, "MAX_WINDOWS", 2)
     start = replace(avatar.clip, trans=avatar.clip.trans + AWAY)
     first = {view.frame: view for view in reversed(views)}
     others = [view for view in views if view not in first.values()]

@@ -18,8 +18,8 @@ from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.human.fit.capture_fit import (
     BodyDiscs,
     body_discs,
+    crop_frame,
     longest_box_side,
-    observed_frame,
 )
 
 
@@ -36,7 +36,7 @@ def test_a_point_of_the_world_falls_on_the_same_part_of_the_person() -> None:
     shown = image(slice(10, 30), slice(20, 28))
     side = longest_box_side([shown])
     assert side == 20
-    frame = observed_frame([shown], side, 10)
+    frame = crop_frame([shown], side, 10)
     assert frame is not None
     corner = torch.tensor([[20.0, 10.0, 1.0], [28.0, 30.0, 1.0]])  # of the box, in the image
     directions = torch.linalg.solve(shown.cameras.intrinsics[0], corner.T)
@@ -50,7 +50,7 @@ def test_a_point_of_the_world_falls_on_the_same_part_of_the_person() -> None:
 
 
 def test_what_lies_outside_of_the_image_is_not_known() -> None:
-    frame = observed_frame([image(slice(0, 20), slice(0, 5))], 20, 25)
+    frame = crop_frame([image(slice(0, 20), slice(0, 5))], 20, 25)
     assert frame is not None
     assert frame.known[0, :, 12:].mean() > 0.8
     assert not frame.known[0, :, 0].any(), "left of the image"
@@ -73,7 +73,10 @@ def test_pose_blend_shapes_move_the_surface_as_they_move_the_mesh(
     def away(drawn: BodyDiscs) -> torch.Tensor:
         """Distances of points of the skin from where the mesh has them, m."""
         posed = (
-            replace(drawn, discs=skin).in_shape(shape, torch.zeros(len(texels))).in_pose(pose).means
+            replace(drawn, discs=skin)
+            .with_shape(shape, torch.zeros(len(texels)))
+            .in_pose(pose)
+            .means
         )
         mesh = posed_vertices(body, poses[None], place[None])[0]
         return (

@@ -15,11 +15,11 @@ from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.fit import capture_fit
 from dyngs.human.fit.capture_fit import (
-    KEYPOINT,
+    KEYPOINT_STD,
     LIMIT_WEIGHT,
-    MISTAKEN,
+    OUTLIER_ERROR,
     BodyDiscs,
-    Fitting,
+    BodyFit,
     ObservedFrame,
     body_discs,
     keypoint_error,
@@ -50,11 +50,11 @@ def clip(elbow: float = 0.0) -> MotionClip:
     return MotionClip(torch.zeros(1, dtype=torch.float64), poses, torch.zeros(1, 3), torch.ones(1))
 
 
-def fitting_of(clip: MotionClip, body: BodyDiscs, *, is_given: bool = True) -> Fitting:
-    return Fitting(clip, body, pose_prior(clip, is_given=is_given))
+def fitting_of(clip: MotionClip, body: BodyDiscs, *, is_given: bool = True) -> BodyFit:
+    return BodyFit(clip, body, pose_prior(clip, is_given=is_given))
 
 
-def joints_at(learned: Parameters, fitting: Fitting) -> torch.Tensor:
+def joints_at(learned: Parameters, fitting: BodyFit) -> torch.Tensor:
     """The joints (J, 3) of the first frame of a fit."""
     return posed_joints(fitting.shaped(learned).skeleton, fitting.pose(learned, 0))
 
@@ -66,7 +66,7 @@ def test_key_points_in_place_cost_nothing_and_others_their_distance() -> None:
     positions[0, :2] = torch.tensor([[0.5, 0.5, 1.0], [0.5 + 1.6 * 0.125, 0.5 - 1.6 * 0.25, 1.0]])
     assert float(keypoint_error(joints, positions, camera())) == pytest.approx(0, abs=1e-6)
     moved = positions.clone()
-    moved[0, 0, 0] += 3 * KEYPOINT
+    moved[0, 0, 0] += 3 * KEYPOINT_STD
     assert float(keypoint_error(joints, moved, camera())) == pytest.approx(
         (math.sqrt(10) - 1) / 2, rel=1e-4
     )
@@ -88,8 +88,8 @@ def test_a_wrong_mask_among_right_ones_moves_the_person_less(
     masks = torch.cat([alpha, alpha, alpha, alpha.roll(3, dims=2)])
     seen = ObservedFrame(views, masks, torch.ones_like(masks))
     moved = []
-    for scale in (MISTAKEN, 1e9 * MISTAKEN):
-        monkeypatch.setattr(capture_fit, "MISTAKEN", scale)
+    for scale in (OUTLIER_ERROR, 1e9 * OUTLIER_ERROR):
+        monkeypatch.setattr(capture_fit, "OUTLIER_ERROR", scale)
         found = fitting.run(fitting.start(), ("trans",), 80, lambda _: seen)
         moved.append(abs(float(found["trans"][0, 0].detach())))
     assert moved[0] < 0.5 * moved[1]
@@ -137,7 +137,7 @@ def test_joints_beyond_what_anybody_does_cost_much_more(body: BodyDiscs) -> None
     expected = limited.expected
     row = JOINT_NAMES.index("left_collar")
 
-    def cost(deviations: float, fitting: Fitting) -> float:
+    def cost(deviations: float, fitting: BodyFit) -> float:
         learned = fitting.start().values()
         learned["poses"] = expected.centre.clone()
         learned["poses"][0, row, 1] += deviations * expected.spread[row, 1]

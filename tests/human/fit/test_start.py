@@ -20,16 +20,16 @@ from dyngs.human.body.body_reader import default_template
 from dyngs.human.fit.capture_fit import (
     STATURE,
     BodyDiscs,
-    Fitting,
+    BodyFit,
     ObservedFrame,
     body_discs,
     estimate_initial_poses,
     likely_headings,
-    place_and_height,
+    locate_person,
     pose_prior,
     standing_clip,
     up_of,
-    usual_pose,
+    usual_pose_statistics,
 )
 from dyngs.human.motion.motion import MotionClip
 
@@ -81,7 +81,7 @@ def ring(count: int, centre: torch.Tensor, distance: float = 4.0) -> Cameras:
 
 def standing(place: torch.Tensor, heading: float, scale: float = 1.0) -> MotionClip:
     """One frame of the usual pose with the pelvis at ``place``."""
-    poses = usual_pose(55)[0][None].clone()
+    poses = usual_pose_statistics(55)[0][None].clone()
     poses[0, 0] = torch.tensor([0.0, heading, 0.0])
     joints = default_template().joints
     time = torch.zeros(1, dtype=torch.float64)
@@ -89,7 +89,7 @@ def standing(place: torch.Tensor, heading: float, scale: float = 1.0) -> MotionC
 
 
 def seen_by(body: BodyDiscs, clip: MotionClip, cameras: Cameras) -> ObservedFrame:
-    fitting = Fitting(clip, body, pose_prior(clip, is_given=True))
+    fitting = BodyFit(clip, body, pose_prior(clip, is_given=True))
     with torch.no_grad():
         alpha = fitting.silhouettes(fitting.start(), 0, cameras)
     return ObservedFrame(cameras, alpha, torch.ones_like(alpha))
@@ -99,7 +99,7 @@ def test_place_and_size_of_who_stands_somewhere(body: BodyDiscs) -> None:
     place = torch.tensor([1.0, 2.0, -3.0])
     seen = seen_by(body, standing(place, 0.3, scale=1.2), ring(4, place))
     assert up_of(seen) == pytest.approx([0, 1, 0], abs=1e-6)
-    found, height = place_and_height(seen, up_of(seen))
+    found, height = locate_person(seen, up_of(seen))
     assert found == pytest.approx(place, abs=0.2)  # the middle of the box is not the pelvis
     assert height == pytest.approx(1.2 * STATURE, rel=0.1)
     clip = standing_clip(torch.zeros(1, dtype=torch.float64), body, up_of(seen), lambda _: seen)

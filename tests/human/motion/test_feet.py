@@ -12,7 +12,7 @@ from torch import Tensor
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.motion import MotionClip
-from dyngs.human.motion.placement import reduce_foot_sliding, floor_contact, sole_points
+from dyngs.human.motion.placement import floor_contact, reduce_foot_sliding, sole_points
 
 FPS = 30.0
 BODY = default_template()

@@ -21,8 +21,8 @@ from dyngs.human.motion.motion import MotionClip, motion_clip
 from dyngs.human.motion.placement import (
     place_like,
     place_on_floor,
+    rotate_clip_to_y_up,
     up_direction,
-    upright,
 )
 
 
@@ -80,7 +80,7 @@ def test_upright_turns_a_world_whose_z_is_up() -> None:
         )
         return x.scale[:, None, None] * moved + x.trans[:, None]
 
-    turned = upright(clip, clip, joints)
+    turned = rotate_clip_to_y_up(clip, clip, joints)
     torch.testing.assert_close(positions(turned), positions(clip) @ y_from_z.T, atol=1e-5, rtol=0)
     assert torch.equal(up_direction(turned), torch.tensor([0.0, 1.0, 0.0]))
 

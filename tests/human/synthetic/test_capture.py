@@ -93,6 +93,6 @@ def test_the_parameters_pose_the_template_as_the_images_show_it(root: Path) -> N
             for found, expected in ((columns_seen, positions[:, 0]), (rows_seen, positions[:, 1])):
                 assert expected.min() - 0.5 <= found.min() + 0.5 <= expected.min() + 2
                 assert expected.max() - 2 <= found.max() + 0.5 <= expected.max() + 0.5
-            hull = ConvexHull(positions).equations
+            visual_hull = ConvexHull(positions).equations
             centers = np.stack([columns_seen, rows_seen], axis=-1) + 0.5
-            assert (centers @ hull[:, :2].T + hull[:, 2] <= 1e-9).all()
+            assert (centers @ visual_hull[:, :2].T + visual_hull[:, 2] <= 1e-9).all()

@@ -37,10 +37,10 @@ from dyngs.human.predict.fields.network import (
     between,
     blended,
     mean_and_variance,
-    ray_pieces,
-    sample_shifts,
+    sample_offsets,
+    split_rays,
 )
-from dyngs.human.predict.people import OUTWARDS, Boundaries, PosedBody
+from dyngs.human.predict.people import DILATION, BodyBoundaries, PosedBody
 from dyngs.models.volume import rays_of
 from dyngs.ops.rays import Rays
 
@@ -88,9 +88,9 @@ class EgHumanNerf(FieldNetwork):
 
     needs_depth = True
 
-    def prepared(self, seen: SourceFeatures, body: PosedBody) -> tuple[Boundaries, Tensor]:
+    def prepared(self, seen: SourceFeatures, body: PosedBody) -> tuple[BodyBoundaries, Tensor]:
         """Return the boundaries of the body, and its depths (V, 1, H, W) in the images, m."""
-        boundaries = Boundaries(body)
+        boundaries = BodyBoundaries(body)
         sources = seen.sources
         depths = torch.stack([boundaries.depth(sources.camera(i)) for i in range(len(sources))])
         return boundaries, depths[:, None].clamp(max=_FAR).to(sources.rgba)
@@ -107,7 +107,7 @@ class EgHumanNerf(FieldNetwork):
         first = first.clamp_min(NEAR)
         which = (last > first).nonzero()[:, 0]
         found = []
-        for some in ray_pieces(which):
+        for some in split_rays(which):
             limits = first[some], last[some], body[some]
             found.append(self._along(known, rays[some], limits, generator))
         canvas = [
@@ -153,7 +153,7 @@ class EgHumanNerf(FieldNetwork):
             where in its interval a sample is, how near the ray comes to the body, which says
             whether clothes are met beside it, and if silhouettes hold the sample, and any of the
             ray."""
-            along = (body - at).clamp(-OUTWARDS, OUTWARDS) / OUTWARDS
+            along = (body - at).clamp(-DILATION, DILATION) / DILATION
             place = (at - first) / (last - first)
             limit = PARAMS.limit
             parts = [prior / limit, prior.abs() / limit, along, place, closest / limit, held]
@@ -162,7 +162,7 @@ class EgHumanNerf(FieldNetwork):
             return torch.cat([rows, alpha], -1)
 
         count = PARAMS.samples
-        shifts = sample_shifts(len(rays), count, generator=generator)
+        shifts = sample_offsets(len(rays), count, generator=generator)
         at = first + (last - first) * (torch.arange(count, device="cpu") + shifts).to(first) / count
         _, looked, prior = look(at)
         closest = prior.amin(1, keepdim=True)

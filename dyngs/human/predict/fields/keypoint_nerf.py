@@ -32,12 +32,12 @@ from dyngs.human.predict.fields.network import (
     between,
     blended,
     mean_and_variance,
-    ray_pieces,
-    sample_shifts,
+    sample_offsets,
+    split_rays,
 )
-from dyngs.human.predict.people import KEY_POINTS, PosedBody, Sources
+from dyngs.human.predict.people import NUM_KEY_POINTS, PosedBody, Sources
 from dyngs.models.volume import kept_samples, rays_of, reached_samples, thinned_samples
-from dyngs.ops.rays import Rays, Samples, Space, Steps, composite, march
+from dyngs.ops.rays import MarchSteps, Rays, Samples, Space, composite, march
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class KeypointNerfParams:
 
 PARAMS = KeypointNerfParams()
 AROUND = 0.3  # m around the bones that a person fills
-CODE = KEY_POINTS * (1 + 2 * PARAMS.octaves)
+CODE = NUM_KEY_POINTS * (1 + 2 * PARAMS.octaves)
 HINTS = 4  # What is known of a sample from the bones and the silhouettes
 
 
@@ -77,14 +77,14 @@ class KeypointNerf(FieldNetwork):
         begin(self, generator)
 
     def prepared(self, seen: SourceFeatures, body: PosedBody) -> tuple[Space, Tensor]:
-        return hull(seen, body.key_points)
+        return visual_hull(seen, body.key_points)
 
     def picture(
         self, known: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
     ) -> FieldPicture:
         rays, _ = rays_of(camera)
-        shifts = sample_shifts(len(rays), generator=generator).to(rays.origins)
-        pieces = ray_pieces(torch.arange(len(rays), device=shifts.device))
+        shifts = sample_offsets(len(rays), generator=generator).to(rays.origins)
+        pieces = split_rays(torch.arange(len(rays), device=shifts.device))
         found = [self._along(known, rays[some], shifts[some]) for some in pieces]
         colour, through, depth = (torch.cat(x) for x in zip(*found, strict=True))
         shape = camera.height, camera.width
@@ -97,7 +97,7 @@ class KeypointNerf(FieldNetwork):
         (R,)."""
         seen = known.seen
         space, occupied = known.own
-        samples = march(rays, shifts, space, occupied, Steps(NEAR, PARAMS.step))
+        samples = march(rays, shifts, space, occupied, MarchSteps(NEAR, PARAMS.step))
         learns = torch.is_grad_enabled()
         with torch.no_grad():  # which samples are worth it takes their densities alone
             shown = seen.alpha(places(samples, space)) > PARAMS.visible
@@ -125,7 +125,7 @@ class KeypointNerf(FieldNetwork):
         Densities begin with those of limbs of one thickness.
         """
         looked = known.seen.look(points)
-        bone = from_bones(points, known.body.key_points)[:, None]
+        bone = distance_to_bones(points, known.body.key_points)[:, None]
         per_image = self.per_image(torch.cat([code, looked.features], -1))
         held = torch.stack([looked.alpha.amin(0), looked.alpha.mean(0)], -1)
         hints = torch.cat([bone / PARAMS.reach, (bone / PARAMS.reach).square(), held], -1)
@@ -175,7 +175,7 @@ def spatial_code(points: Tensor, key_points: Tensor, sources: Sources) -> Tensor
 
 
 @torch.no_grad()
-def hull(seen: SourceFeatures, key_points: Tensor) -> tuple[Space, Tensor]:
+def visual_hull(seen: SourceFeatures, key_points: Tensor) -> tuple[Space, Tensor]:
     """Return a cube, and which of its cells hold a place that all images show as the person.
 
     They are no further than ``AROUND`` from the bones between the key points (J, 3).
@@ -202,11 +202,11 @@ def hull(seen: SourceFeatures, key_points: Tensor) -> tuple[Space, Tensor]:
         found = grid_sample(alpha, places_in, mode="nearest", align_corners=False)[0, 0, 0]
         occupied &= found > PARAMS.visible
     where = occupied.nonzero()[:, 0]
-    occupied[where] = from_bones(middles[where], key_points) < AROUND
+    occupied[where] = distance_to_bones(middles[where], key_points) < AROUND
     return space, occupied.view(space.shape)
 
 
-def from_bones(points: Tensor, key_points: Tensor) -> Tensor:
+def distance_to_bones(points: Tensor, key_points: Tensor) -> Tensor:
     """Return the distance (M,) of points (M, 3) to the nearest bone, m; ``key_points`` (J, 3)."""
     nearest = (points - key_points[0]).norm(dim=1)
     for joint, parent in enumerate(JOINT_PARENTS[1 : len(key_points)], start=1):

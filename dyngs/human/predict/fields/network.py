@@ -142,12 +142,12 @@ def blended(logits: Tensor, colours: Tensor) -> Tensor:
     return (logits.softmax(0)[..., None] * colours).sum(0)
 
 
-def ray_pieces(rays: Tensor) -> Sequence[Tensor]:
+def split_rays(rays: Tensor) -> Sequence[Tensor]:
     """Return the indices of rays that are drawn together: all where something is learned."""
     return [rays] if torch.is_grad_enabled() else rays.split(CHUNK)
 
 
-def sample_shifts(*shape: int, generator: torch.Generator | None) -> Tensor:
+def sample_offsets(*shape: int, generator: torch.Generator | None) -> Tensor:
     """Return where samples lie in their part of a ray, in [0, 1): at random, or in the middle."""
     if generator is None:
         return torch.full(shape, 0.5, device="cpu")

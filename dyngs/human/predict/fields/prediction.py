@@ -27,16 +27,22 @@ from dyngs.human.fit.fitted_capture import ensure_fitted_body
 from dyngs.human.predict.fields.eg_human_nerf import EgHumanNerf
 from dyngs.human.predict.fields.keypoint_nerf import AROUND, KeypointNerf
 from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
-from dyngs.human.predict.gps.rectification import MIN_ANGLE, angle, moments, spread, well_spread
+from dyngs.human.predict.gps.rectification import (
+    MIN_ANGLE,
+    angle_between_views,
+    moments,
+    spread,
+    spread_around_person,
+)
 from dyngs.human.predict.keys import FieldPredictorModel, PredictedFieldModel
 from dyngs.human.predict.people import (
     MULTIPLE,
     Person,
     PosedBody,
     Sources,
+    crop_source_images,
     metric,
     read_captured_person,
-    sources_of,
     window,
 )
 from dyngs.models.checkpoint import Checkpoint
@@ -214,20 +220,20 @@ class FieldPredictor(Predictor[FieldNetwork]):
         self._person = person
 
     def chosen(self, count: int) -> list[int]:
-        return well_spread(self.views, count)
+        return spread_around_person(self.views, count)
 
     def predict(self, views: Sequence[int]) -> PredictedField:
         shown = [self.views[i] for i in views]
         first = shown[0]
         if len({(view.frame, view.time) for view in shown}) > 1 or all(
-            angle(first, view) < MIN_ANGLE for view in shown
+            angle_between_views(first, view) < MIN_ANGLE for view in shown
         ):
             raise DyngsError(
                 f"{self.name}: a field is predicted from two views of one moment at least, that look from different "
                 "directions; give --views A,B"
             )
         body, scale = self._person.body_in(first)
-        sources = sources_of([self._person.images[i] for i in views], scale)
+        sources = crop_source_images([self._person.images[i] for i in views], scale)
         return PredictedField(self.network, sources, body, scale, background=self.background)
 
     def run_config(self, views: Sequence[int]) -> Config:
@@ -259,7 +265,9 @@ class FieldLearner(Learner[FieldNetwork]):
         sources, target = self._views(known, generator)
         body, scale = known.body_in(known.views[target])
         body = fields_moved_to(body, self.device)
-        given = fields_moved_to(sources_of([known.images[i] for i in sources], scale), self.device)
+        given = fields_moved_to(
+            crop_source_images([known.images[i] for i in sources], scale), self.device
+        )
         image = _part(known.images[target], generator).to(self.device)
         background = self.drawn_background(generator)
         seen = self.network.look(given, body)

@@ -43,7 +43,7 @@ from dyngs.human.body.mesh import vertex_normals
 from dyngs.human.fit.fitted_capture import ensure_fitted_body
 from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.human.predict.gps.rectification import spread
-from dyngs.human.predict.people import Person, depths, captured_person
+from dyngs.human.predict.people import Person, captured_person, depths
 from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
 from dyngs.models.prediction import (
     Encoder,
@@ -145,7 +145,7 @@ def mirror_texels(texels: Texels) -> Tensor:
     return torch.from_numpy(np.asarray(found, dtype=np.int64)).to(texels.index.device)
 
 
-def colours_nearby(texels: Texels, rgb: Tensor, seen: Tensor) -> Tensor:
+def fill_unseen_colours(texels: Texels, rgb: Tensor, seen: Tensor) -> Tensor:
     """Return ``rgb`` (P, 3) where ``seen`` (P,) is positive, elsewhere the mean of seen texels that
     are near at rest.
 
@@ -178,7 +178,9 @@ def _positions(texels: Texels) -> np.ndarray:
 
 
 _GRAZING = 0.15  # cosine below which a texel does not count as seen
-HULL_LIMIT = 0.06  # largest distance from the edge of a silhouette that is told apart, m
+MAX_SILHOUETTE_DISTANCE = (
+    0.06  # largest distance from the edge of a silhouette that is told apart, m
+)
 # depth tolerance of the visibility test: in m, and in pixels along the surface
 _TOLERANCE, _TOLERANCE_PX = 0.01, 1.5
 
@@ -196,7 +198,7 @@ class TexelMaps:
     inside: Tensor
     # (K, P) least signed distance over the views to the edge of the silhouette, positive inside, m
     # in the body's size, at most ``HULL_LIMIT`` and at least its negative
-    hull: Tensor
+    silhouette_distance: Tensor
     # (P, 3) unit vectors from one scaffold to the next in the first view's pose, relative to the
     # pelvis
     offsets: Tensor
@@ -213,7 +215,7 @@ def observe_texels(person: AtlasPerson, images: Iterable[tuple[Image, BodyPose]]
     faces = person.person.body.faces.cpu().numpy()
     colour = torch.zeros(*shape, 3, device=device)
     weight, seen, inside, in_frames = (torch.zeros(shape, device=device) for _ in range(4))
-    hull = torch.full(shape, HULL_LIMIT, device=device)
+    silhouette_distance = torch.full(shape, MAX_SILHOUETTE_DISTANCE, device=device)
     offsets: list[Tensor] = []
     for image, pose in images:
         camera = image.cameras
@@ -245,13 +247,21 @@ def observe_texels(person: AtlasPerson, images: Iterable[tuple[Image, BodyPose]]
             inside[level] += (covered > 0.5).float()
             in_frames[level] += in_frame.float()
             # m of the body, within the frame
-            to_edge = torch.where(in_frame, found[:, 4] * depth / focal / scale, HULL_LIMIT)
-            hull[level] = torch.minimum(hull[level], to_edge)
+            to_edge = torch.where(
+                in_frame, found[:, 4] * depth / focal / scale, MAX_SILHOUETTE_DISTANCE
+            )
+            silhouette_distance[level] = torch.minimum(silhouette_distance[level], to_edge)
     rgb = (colour / weight.clamp_min(1e-6)[..., None]).clamp(0, 1)
     fraction = torch.where(in_frames > 0, inside / in_frames.clamp_min(1), 1.0)
-    nearby = colours_nearby(person.texels, rgb[0], seen[0])
+    nearby = fill_unseen_colours(person.texels, rgb[0], seen[0])
     return TexelMaps(
-        rgb, seen, fraction, hull.clamp_min(-HULL_LIMIT), offsets[0], nearby, len(offsets)
+        rgb,
+        seen,
+        fraction,
+        silhouette_distance.clamp_min(-MAX_SILHOUETTE_DISTANCE),
+        offsets[0],
+        nearby,
+        len(offsets),
     )
 
 
@@ -396,7 +406,9 @@ def num_input_channels(scaffolds: int) -> int:
 def network_inputs(person: AtlasPerson, maps: TexelMaps, guesses: Tensor) -> Tensor:
     """Return the input (D, S, S): per scaffold colour, cosine, silhouettes; then offsets, points,
     and ``guesses`` (3, P, 3) of colours."""
-    measured = torch.stack([maps.seen, maps.inside, maps.hull / HULL_LIMIT], dim=-1)
+    measured = torch.stack(
+        [maps.seen, maps.inside, maps.silhouette_distance / MAX_SILHOUETTE_DISTANCE], dim=-1
+    )
     scaffolds = torch.cat([maps.rgb, measured], dim=-1)
     ones = torch.ones(len(person.texels), 1, device=scaffolds.device)
     rest = [
@@ -410,7 +422,7 @@ def network_inputs(person: AtlasPerson, maps: TexelMaps, guesses: Tensor) -> Ten
     return to_atlas(torch.cat([*scaffolds, *rest], dim=1), person.texels)
 
 
-def guessed_colours(person: AtlasPerson, maps: TexelMaps, mean: Tensor) -> Tensor:
+def guess_unseen_colours(person: AtlasPerson, maps: TexelMaps, mean: Tensor) -> Tensor:
     """Return three guesses (3, P, 3) of the colours of texels that no image shows: the mean colours
     (3, S, S) of the training people, those of seen texels nearby, and those of the other side where
     it is seen, else as nearby."""
@@ -436,7 +448,7 @@ def predict_avatar(
     scene = person.scene.select(rows)
     first = scene.gaussians
     texel = rows % len(person.texels)
-    guesses = guessed_colours(person, maps, mean)
+    guesses = guess_unseen_colours(person, maps, mean)
     raw = network(network_inputs(person, maps, guesses))
     raw = torch.cat([from_atlas(level, person.texels) for level in raw]).index_select(0, rows)
     part = dict(zip(HEADS, raw.split(tuple(HEADS.values()), dim=1), strict=True))
@@ -457,12 +469,12 @@ def predict_avatar(
     return replace(scene, gaussians=gaussians)
 
 
-SOURCE_SETS = 6  # choices of source views per person in training; their maps are kept
+VIEW_CHOICES_PER_PERSON = 6  # choices of source views per person in training; their maps are kept
 TARGET_VIEWS = 2  # images of one time step that a prediction is compared with in each step
 SQUARED_WEIGHT = 1.0  # Weight of the mean squared error in the loss, which counts edges more
-MEAN_VIEWS = 8  # Images of each person that the mean colours are taken from
-ADAPTING_STEPS = 10  # Steps of training on the images of one person before a prediction
-ADAPTING_RATE = 1e-4
+MEAN_COLOUR_VIEWS = 8  # Images of each person that the mean colours are taken from
+ADAPTATION_STEPS = 10  # Steps of training on the images of one person before a prediction
+ADAPTATION_RATE = 1e-4
 """Highest learning rate of Adam per image of one person, which falls linearly: a single one says
 little about the other sides."""
 # Opacity below which a predicted Gaussian is left out, as the preset for one person has it
@@ -501,10 +513,10 @@ class PersonPredictor(Predictor[AtlasNetwork]):
     ) -> int:
         """Train the network until its prediction shows the images better that it is predicted
         from."""
-        steps = ADAPTING_STEPS if steps is None else steps
+        steps = ADAPTATION_STEPS if steps is None else steps
         images = [self._person.person.images[i] for i in views]
         maps = self._person.observe(views)
-        rate = ADAPTING_RATE * len(views)
+        rate = ADAPTATION_RATE * len(views)
         optimizer = torch.optim.Adam(self.network.parameters(), lr=rate)
         for step in range(steps):
             scene = self._scene(maps)
@@ -526,7 +538,9 @@ class PersonPredictor(Predictor[AtlasNetwork]):
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
         assert isinstance(config.model, HumanModel)
         frames = self._person.person.motion.frames
-        model.start_from(scene, HumanTraining(config.model, frames, RateSchedule(config.train.steps)))
+        model.start_from(
+            scene, HumanTraining(config.model, frames, RateSchedule(config.train.steps))
+        )
 
     def _scene(self, maps: TexelMaps) -> HumanScene:
         return predict_avatar(self._person, maps, self.mean, self.network)
@@ -540,31 +554,31 @@ class AtlasLearner(Learner[AtlasNetwork]):
         config: Config,
         network: AtlasNetwork,
         people: list[AtlasPerson],
-        choices: list[list[list[int]]],
+        source_choices: list[list[list[int]]],
         mean: Tensor,
         device: torch.device = CPU,
     ) -> None:
         """``choices`` are views to predict each person from; their maps are kept."""
         super().__init__(config, network, [x.person.name for x in people], device)
         self.people = people
-        self.choices = choices
+        self.source_choices = source_choices
         self.mean = mean
         self._moved = [fields_moved_to(x, device) for x in people]
         self._maps = cache(self._observed)
 
     def _observed(self, person: int, choice: int) -> TexelMaps:
-        maps = self.people[person].observe(self.choices[person][choice])
+        maps = self.people[person].observe(self.source_choices[person][choice])
         return fields_moved_to(maps, self.device)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
         filmed = self.people[person].person
-        choice = random_index(len(self.choices[person]), generator)
-        targets = self._targets(filmed, self.choices[person][choice], generator)
+        choice = random_index(len(self.source_choices[person]), generator)
+        targets = self._targets(filmed, self.source_choices[person][choice], generator)
         background = self.drawn_background(generator)
         maps = self._maps(person, choice)
         scene = predict_avatar(self._moved[person], maps, self.mean, self.network)
         row = filmed.motion.rows[-1 if targets[0].frame is None else targets[0].frame]
-        gaussians, posing = scene.in_frame(row, scene.given_weights())
+        gaussians, posing = scene.gaussians_in_frame(row, scene.template_weights())
         frame = RestPose(scene.gaussians.means, posing.rotations[0])
         moment = GaussianTimeStep(gaussians, targets[0].time, frame)
         loss, rendered, truth = _images_error(
@@ -598,10 +612,10 @@ def learner(config: Config, generator: torch.Generator) -> AtlasLearner:
     model: Any = config.model
     body = load_template(human_options(model))
     network = new_network(model, generator).to(device)
-    people = [read_person(data, model, body) for data in captures_in(config.data)]
-    choices = [_choices(person, model.source_views, generator) for person in people]
+    people = [read_atlas_person(data, model, body) for data in captures_in(config.data)]
+    source_choices = [_choices(person, model.source_views, generator) for person in people]
     mean = mean_colours(people, model.resolution).to(device)
-    return AtlasLearner(config, network, people, choices, mean, device)
+    return AtlasLearner(config, network, people, source_choices, mean, device)
 
 
 def predictor(
@@ -619,8 +633,10 @@ def predictor(
     model: Any = config.model
     network = new_network(model, torch.Generator())
     mean = load_network(network, checkpoint, model.resolution)
-    data = ensure_fitted_body(data, human_options(model), only_if_needed=True, say=say, report=report)
-    person = read_person(data, model, load_template(human_options(model)))
+    data = ensure_fitted_body(
+        data, human_options(model), only_if_needed=True, say=say, report=report
+    )
+    person = read_atlas_person(data, model, load_template(human_options(model)))
     return PersonPredictor(config, network, mean, person, data)
 
 
@@ -652,7 +668,9 @@ def human_options(model: HumanPredictorModel) -> HumanModel:
     )
 
 
-def read_person(data: DataConfig, model: HumanPredictorModel, body: BodyTemplate) -> AtlasPerson:
+def read_atlas_person(
+    data: DataConfig, model: HumanPredictorModel, body: BodyTemplate
+) -> AtlasPerson:
     """Return the person of one capture."""
     capture = read_capture(data)
     images = ImageLoader(capture.splits["train"], data)
@@ -668,7 +686,7 @@ def mean_colours(people: list[AtlasPerson], resolution: int) -> Tensor:
     total = torch.zeros(3, resolution, resolution, device="cpu")
     count = torch.zeros(1, resolution, resolution, device="cpu")
     for person in people:
-        maps = person.observe(spread_views(person, MEAN_VIEWS))
+        maps = person.observe(spread_views(person, MEAN_COLOUR_VIEWS))
         is_seen = (maps.seen[0] > 0).float()[:, None]
         total += to_atlas(maps.rgb[0] * is_seen, person.texels)
         count += to_atlas(is_seen, person.texels)
@@ -683,10 +701,13 @@ def _choices(person: AtlasPerson, source_views: int, generator: torch.Generator)
     Every other choice has fewer than ``source_views``, in turn each number from 1.
     """
     firsts = torch.randint(
-        len(person.person.views), (SOURCE_SETS,), generator=generator, device="cpu"
+        len(person.person.views), (VIEW_CHOICES_PER_PERSON,), generator=generator, device="cpu"
     ).tolist()
     fewer = list(range(1, source_views)) or [source_views]
-    counts = [fewer[i // 2 % len(fewer)] if i % 2 else source_views for i in range(SOURCE_SETS)]
+    counts = [
+        fewer[i // 2 % len(fewer)] if i % 2 else source_views
+        for i in range(VIEW_CHOICES_PER_PERSON)
+    ]
     return [spread_views(person, count, first) for count, first in zip(counts, firsts, strict=True)]
 
 

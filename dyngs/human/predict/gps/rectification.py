@@ -41,9 +41,9 @@ def neighbours(name: str, views: Sequence[View], chosen: Sequence[int]) -> list[
 
     Raises DyngsError, for the capture ``name``: a view without a neighbour that suits.
     """
-    ordered = around(views, chosen)
+    ordered = order_around_person(views, chosen)
     steps = [*pairwise(ordered), *([(ordered[-1], ordered[0])] if len(ordered) > 2 else [])]
-    pairs = [pair for step in steps if (pair := as_pair(views, *step)) is not None]
+    pairs = [pair for step in steps if (pair := order_as_pair(views, *step)) is not None]
     alone = set(chosen) - {i for pair in pairs for i in pair}
     if alone:
         raise DyngsError(
@@ -53,7 +53,7 @@ def neighbours(name: str, views: Sequence[View], chosen: Sequence[int]) -> list[
     return pairs
 
 
-def as_pair(views: Sequence[View], one: int, other: int) -> tuple[int, int] | None:
+def order_as_pair(views: Sequence[View], one: int, other: int) -> tuple[int, int] | None:
     """Return two views as left and right, as seen by both; None: depth cannot be found from
     them."""
     first = views[one]
@@ -62,19 +62,19 @@ def as_pair(views: Sequence[View], one: int, other: int) -> tuple[int, int] | No
     across = first.cam_from_world[0, :3] + second.cam_from_world[0, :3]
     along = line @ across
     is_level = along and abs(along) >= _LEVEL * np.linalg.norm(line) * np.linalg.norm(across)
-    is_near = MIN_ANGLE <= angle(first, second) <= MAX_ANGLE
+    is_near = MIN_ANGLE <= angle_between_views(first, second) <= MAX_ANGLE
     if not is_level or not is_near or (first.frame, first.time) != (second.frame, second.time):
         return None
     return (one, other) if along > 0 else (other, one)
 
 
-def angle(one: View, other: View) -> float:
+def angle_between_views(one: View, other: View) -> float:
     """Return the angle between the view axes, degrees."""
     cosine = one.cam_from_world[2, :3] @ other.cam_from_world[2, :3]
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
-def around(views: Sequence[View], chosen: Sequence[int]) -> list[int]:
+def order_around_person(views: Sequence[View], chosen: Sequence[int]) -> list[int]:
     """Return the ``chosen`` views in their order around the vertical, which is the mean of what is
     up in the images."""
     poses = np.stack([views[i].cam_from_world for i in chosen])
@@ -91,7 +91,7 @@ def moments(views: Sequence[View]) -> dict[tuple[int | None, float | None], list
     found: dict[tuple[int | None, float | None], list[int]] = {}
     for i, view in enumerate(views):
         found.setdefault((view.frame, view.time), []).append(i)
-    return {moment: around(views, own) for moment, own in found.items()}
+    return {moment: order_around_person(views, own) for moment, own in found.items()}
 
 
 def spread(ring: Sequence[int], count: int, first: int = 0) -> list[int]:
@@ -99,7 +99,7 @@ def spread(ring: Sequence[int], count: int, first: int = 0) -> list[int]:
     return [ring[(first + round(i * len(ring) / count)) % len(ring)] for i in range(count)]
 
 
-def well_spread(views: Sequence[View], count: int) -> list[int]:
+def spread_around_person(views: Sequence[View], count: int) -> list[int]:
     """Return ``count`` views, evenly around the person, at the first of the moments that most views
     show."""
     ring = max(moments(views).values(), key=len)
@@ -109,17 +109,17 @@ def well_spread(views: Sequence[View], count: int) -> list[int]:
 def best_pair(views: Sequence[View]) -> list[int]:
     """Return the two neighbours, of the moment that most views show, that suit depth best."""
     ring = max(moments(views).values(), key=len)
-    pairs = [pair for pair in combinations(ring, 2) if as_pair(views, *pair) is not None]
+    pairs = [pair for pair in combinations(ring, 2) if order_as_pair(views, *pair) is not None]
     return list(
         min(
             pairs,
-            key=lambda pair: abs(angle(views[pair[0]], views[pair[1]]) - _BEST_ANGLE),
+            key=lambda pair: abs(angle_between_views(views[pair[0]], views[pair[1]]) - _BEST_ANGLE),
             default=ring[:2],
         )
     )
 
 
-def lessons(views: Sequence[View]) -> list[tuple[tuple[int, int], list[int]]]:
+def training_pairs(views: Sequence[View]) -> list[tuple[tuple[int, int], list[int]]]:
     """Return the pairs to train on, each with the views that stand between its two, of which there
     is at least one."""
     found = []
@@ -127,18 +127,18 @@ def lessons(views: Sequence[View]) -> list[tuple[tuple[int, int], list[int]]]:
         for start, first in enumerate(ring):
             for step in range(2, len(ring)):
                 last = ring[(start + step) % len(ring)]
-                if angle(views[first], views[last]) > MAX_ANGLE:
+                if angle_between_views(views[first], views[last]) > MAX_ANGLE:
                     break
-                pair = as_pair(views, first, last)
+                pair = order_as_pair(views, first, last)
                 if pair is not None:
                     between = [ring[(start + k) % len(ring)] for k in range(1, step)]
                     found.append((pair, between))
     return found
 
 
-FACTOR = 16
+SIZE_MULTIPLE = 16
 """Windows are multiples of so many pixels."""
-SOLID = 0.5  # Alpha from which a pixel belongs to the person
+MIN_ALPHA = 0.5  # Alpha from which a pixel belongs to the person
 _REACHED = 0.1  # Alpha from which a point may be part of the person: outlines are not cut off
 _MARGIN = 8  # px around the person
 _FEWEST = 16  # Pixels of a person that can be rectified
@@ -177,7 +177,7 @@ class RectifiedPair:
     @property
     def solid(self) -> Tensor:
         """(2, 1, H, W) bool: the pixels of the person."""
-        return self.alpha > SOLID
+        return self.alpha > MIN_ALPHA
 
     @property
     def shift(self) -> Tensor:
@@ -205,7 +205,7 @@ class RectifiedPair:
         return (depth[:, 0, ..., None] * rays) @ self.rect_from_world + self.centers[:, None, None]
 
 
-def rectified(left: Image, right: Image, person_px: int) -> RectifiedPair:
+def rectify_views(left: Image, right: Image, person_px: int) -> RectifiedPair:
     """Return the windows of two images in which the person is ``person_px`` pixels high.
 
     Raises DyngsError: no silhouettes, or views that do not show the same person from where their
@@ -230,7 +230,8 @@ def rectified(left: Image, right: Image, person_px: int) -> RectifiedPair:
     height = float(boxes[:, 1, 1].max() - boxes[:, 1, 0].min())
     focal = person_px / height
     rows, columns = (
-        FACTOR * math.ceil((focal * side + 2 * _MARGIN) / FACTOR) for side in (height, widths)
+        SIZE_MULTIPLE * math.ceil((focal * side + 2 * _MARGIN) / SIZE_MULTIPLE)
+        for side in (height, widths)
     )
     middle = torch.stack([boxes[:, 0].mean(1), boxes[:, 1].mean().expand(2)], dim=1)
     half = torch.tensor([columns / 2, rows / 2], dtype=torch.float64, device="cpu")
@@ -255,11 +256,11 @@ def rectified(left: Image, right: Image, person_px: int) -> RectifiedPair:
 def _at_size(image: Image, person_px: int) -> Image:
     """Return the image shrunk by a whole number where the person is at least twice as high as
     ``person_px``."""
-    if image.alpha is None or int((image.alpha > SOLID).sum()) < _FEWEST:
+    if image.alpha is None or int((image.alpha > MIN_ALPHA).sum()) < _FEWEST:
         raise DyngsError(
             f"{image.name}: shows no silhouette of a person; give it alpha or a mask of the person, see docs/human.md"
         )
-    rows = (image.alpha > SOLID).any(1).nonzero()
+    rows = (image.alpha > MIN_ALPHA).any(1).nonzero()
     return image.shrunk(max(1, int(rows.max() - rows.min() + 1) // person_px))
 
 
@@ -267,7 +268,7 @@ def _box(image: Image, turn: Tensor) -> Tensor:
     """Return the lowest and highest x and y (2, 2) of the person in the turned camera, at depth
     1."""
     assert image.alpha is not None
-    rows, columns = (image.alpha > SOLID).nonzero(as_tuple=True)
+    rows, columns = (image.alpha > MIN_ALPHA).nonzero(as_tuple=True)
     pixels = torch.stack([columns + 0.5, rows + 0.5, torch.ones_like(rows)], dim=1).double()
     camera = image.cameras
     inverse = torch.linalg.inv(camera.intrinsics[0].double())
@@ -335,7 +336,7 @@ def is_inside(image: Image, points: Tensor) -> Tensor:
     return beyond | (alpha > _REACHED)
 
 
-def cropped(image: Image, margin: int) -> Image:
+def crop_to_person(image: Image, margin: int) -> Image:
     """Return the part of an image, with its camera, that shows what is not transparent, and
     ``margin`` px around it."""
     assert image.alpha is not None
@@ -346,10 +347,10 @@ def cropped(image: Image, margin: int) -> Image:
         (max(0, int(x[0]) - margin), min(size, int(x[-1]) + 1 + margin))
         for x, size in zip((rows, columns), image.alpha.shape, strict=True)
     )
-    return cut_out(image, top, left, bottom - top, right - left)
+    return crop_image(image, top, left, bottom - top, right - left)
 
 
-def cut_out(image: Image, top: int, left: int, height: int, width: int) -> Image:
+def crop_image(image: Image, top: int, left: int, height: int, width: int) -> Image:
     """Return a part of an image, with its camera and maps, that begins at a row and column."""
     camera = image.cameras
     intrinsics = camera.intrinsics.clone()

@@ -40,18 +40,18 @@ from dyngs.data.times import distinct_times
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import FilterUpdate
 from dyngs.gaussians.scene import render_options
-from dyngs.gaussians.static_scene import Sides, StaticScene
+from dyngs.gaussians.static_scene import StaticScene, ViewSides
 from dyngs.gaussians.static_training import StaticTraining
 from dyngs.human.predict.gps.rectification import (
     MAX_ANGLE,
     RectifiedPair,
     best_pair,
-    cropped,
+    crop_to_person,
     is_inside,
-    lessons,
     neighbours,
-    rectified,
-    well_spread,
+    rectify_views,
+    spread_around_person,
+    training_pairs,
 )
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.prediction import (
@@ -139,7 +139,7 @@ def offsets_of(shift: Tensor) -> list[int]:
     ]
 
 
-def sweep(rgb: Tensor, alpha: Tensor, offsets: Sequence[int]) -> Tensor:
+def plane_sweep_costs(rgb: Tensor, alpha: Tensor, offsets: Sequence[int]) -> Tensor:
     """Return (2, 2 D, h, w): per offset the difference of colours, and how much of the other view
     there is background.
 
@@ -244,7 +244,9 @@ class GpsNetwork(nn.Module):
         images = pixel_unshuffle(torch.cat([(2 * pair.rgb - 1) * inside, pair.alpha], dim=1), 2)
         levels = self.encoder(images)
         around = offsets_of(pair.shift)
-        offsets, fused = self.stereo(levels, sweep(pair.rgb, pair.alpha, around), around, inside)
+        offsets, fused = self.stereo(
+            levels, plane_sweep_costs(pair.rgb, pair.alpha, around), around, inside
+        )
         if not with_gaussians:
             return offsets, None
         depth = pixel_unshuffle(torch.cat([offsets[-1] / _RANGE * inside, inside], dim=1), 2)
@@ -255,7 +257,7 @@ class GpsNetwork(nn.Module):
         return offsets, pixel_shuffle(self.heads(features), 2)
 
 
-def gaussians_of(pair: RectifiedPair, offsets: Tensor, raw: Tensor) -> Gaussians:
+def surface_gaussians_of_pair(pair: RectifiedPair, offsets: Tensor, raw: Tensor) -> Gaussians:
     """Return the Gaussians of the pixels of the person in both views, differentiable in
     their ``offsets`` (2, 1, H, W) and ``raw`` values (2, 8, H, W).
 
@@ -316,7 +318,7 @@ class GpsPredictor(Predictor[GpsNetwork]):
         self._capture = capture
 
     def chosen(self, count: int) -> list[int]:
-        return best_pair(self.views) if count == 2 else well_spread(self.views, count)
+        return best_pair(self.views) if count == 2 else spread_around_person(self.views, count)
 
     @torch.no_grad()
     def predict(self, views: Sequence[int]) -> StaticScene:
@@ -336,16 +338,16 @@ class GpsPredictor(Predictor[GpsNetwork]):
             )
         return StaticScene(
             gaussians=gaussians,
-            sides=Sides.joined(found, centers) if len(pairs) > 1 else None,
+            sides=ViewSides.joined(found, centers) if len(pairs) > 1 else None,
             options=render_options(self.config.model),
             background=self.background,
         )
 
     def _surface(self, left: Image, right: Image) -> Gaussians:
         """Return the surface that two views show, inside both silhouettes."""
-        pair = rectified(left, right, self.section.person_px)
+        pair = rectify_views(left, right, self.section.person_px)
         offsets, raw = self.network(pair)
-        gaussians = gaussians_of(pair, offsets[-1], raw)
+        gaussians = surface_gaussians_of_pair(pair, offsets[-1], raw)
         inside = is_inside(left, gaussians.means) & is_inside(right, gaussians.means)
         return gaussians.select(inside & (gaussians.opacities >= _FAINT))
 
@@ -383,7 +385,7 @@ class GpsLearner(Learner[GpsNetwork]):
         target = between[random_index(len(between), generator)]
         background = self.drawn_background(generator)
         left, right = (images[i] for i in pair)
-        windows = rectified(left, right, self.section.person_px)
+        windows = rectify_views(left, right, self.section.person_px)
         windows = fields_moved_to(windows, self.device)
         only_depth = step <= round(DEPTH_FRACTION * self.config.train.steps)
         offsets, raw = self.network(windows, with_gaussians=not only_depth)
@@ -391,8 +393,8 @@ class GpsLearner(Learner[GpsNetwork]):
         if only_depth:
             found = _picture(windows, offsets[-1].detach())
             return Example(depth_loss, left, found, _picture(windows, windows.offsets))
-        gaussians = gaussians_of(windows, offsets[-1], raw)
-        image = cropped(images[target], _AROUND).to(self.device)
+        gaussians = surface_gaussians_of_pair(windows, offsets[-1], raw)
+        image = crop_to_person(images[target], _AROUND).to(self.device)
         options = replace(render_options(self.config.model), nonfinite="trust")
         drawn = StaticScene(gaussians=gaussians).render(
             image.cameras, options=options, background=background
@@ -406,7 +408,7 @@ class GpsLearner(Learner[GpsNetwork]):
 def _lessons(data: DataConfig) -> tuple[ImageLoader, list[tuple[tuple[int, int], list[int]]]]:
     """Return the images of a person with depth maps, and pairs of them with the views in between."""
     views = _with_silhouettes(data).splits["train"]
-    pairs = lessons(views)
+    pairs = training_pairs(views)
     if not pairs:
         raise DyngsError(
             f"{data.root}: no view stands between two others that are at most {MAX_ANGLE:g} degrees apart, which a "

@@ -8,9 +8,9 @@ import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.human.predict.people import (
-    INWARDS,
-    OUTWARDS,
-    Boundaries,
+    DILATION,
+    EROSION,
+    BodyBoundaries,
     Person,
     PosedBody,
     depths,
@@ -83,13 +83,13 @@ def test_boundaries_of_a_ball_are_balls() -> None:
     body = PosedBody(
         torch.zeros(22, 3), torch.from_numpy(vertices).float(), torch.from_numpy(faces.copy())
     )
-    begin, end, met = Boundaries(body).interval(camera())
+    begin, end, met = BodyBoundaries(body).interval(camera())
     middle = begin[12, 16], met[12, 16], end[12, 16]
-    expected = (DISTANCE - RADIUS - OUTWARDS, DISTANCE - RADIUS, DISTANCE - RADIUS + INWARDS)
+    expected = (DISTANCE - RADIUS - DILATION, DISTANCE - RADIUS, DISTANCE - RADIUS + EROSION)
     torch.testing.assert_close(torch.stack(middle), torch.tensor(expected), atol=2e-3, rtol=0)
     outside = met.isinf() & begin.isfinite()
     assert bool(outside.any())
-    expected_end = true_depths(RADIUS + OUTWARDS, 1.0)
+    expected_end = true_depths(RADIUS + DILATION, 1.0)
     sure = outside & expected_end.isfinite() & true_depths(RADIUS, 1.0).isinf()
     assert float((end - expected_end)[sure].abs().median()) < 5e-3, (
         "what misses the body comes out again"
@@ -102,14 +102,14 @@ def test_a_thin_body_ends_behind_its_front() -> None:
     body = PosedBody(
         torch.zeros(22, 3), torch.from_numpy(vertices).float(), torch.from_numpy(faces.copy())
     )
-    _, end, met = Boundaries(body).interval(camera())
+    _, end, met = BodyBoundaries(body).interval(camera())
     assert float(end[12, 16]) > float(met[12, 16])
 
 
 def test_the_surface_of_a_dressed_person_lies_in_between(person: Person) -> None:
     body, scale = person.body_in(person.views[0])
     image = person.images[0]
-    begin, end, met = Boundaries(body).interval(metric(image.cameras, scale))
+    begin, end, met = BodyBoundaries(body).interval(metric(image.cameras, scale))
     assert image.depth is not None
     assert image.alpha is not None
     solid = (image.alpha > 0.99) & (image.depth > 0)

@@ -14,7 +14,7 @@ from dyngs.human.predict.fields.eg_human_nerf import (
     opacities,
 )
 from dyngs.human.predict.fields.network import EncodedPerson
-from dyngs.human.predict.people import Boundaries, Person, metric, sources_of, window
+from dyngs.human.predict.people import BodyBoundaries, Person, crop_source_images, metric, window
 
 
 def network_with() -> EgHumanNerf:
@@ -23,7 +23,7 @@ def network_with() -> EgHumanNerf:
 
 def known(network: EgHumanNerf, person: Person) -> EncodedPerson:
     body, scale = person.body_in(person.views[0])
-    return network.look(sources_of([person.images[i] for i in (0, 2, 4)], scale), body)
+    return network.look(crop_source_images([person.images[i] for i in (0, 2, 4)], scale), body)
 
 
 def test_the_surface_is_where_the_distance_first_crosses_zero() -> None:
@@ -68,7 +68,7 @@ def test_an_untrained_network_shows_the_body(person: Person) -> None:
     torch.testing.assert_close(
         part.transmittance, whole.transmittance[10:26, 8:24], atol=1e-4, rtol=1e-3
     )
-    seen = Boundaries(body).depth(camera)
+    seen = BodyBoundaries(body).depth(camera)
     alpha = 1 - whole.transmittance
     assert float(alpha[seen.isfinite()].mean()) > 0.8
     assert float(alpha[seen.isinf()].mean()) < 0.1

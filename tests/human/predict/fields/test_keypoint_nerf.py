@@ -14,7 +14,14 @@ from dyngs.human.predict.fields.keypoint_nerf import (
     spatial_code,
 )
 from dyngs.human.predict.fields.network import EncodedPerson
-from dyngs.human.predict.people import Person, PosedBody, Sources, metric, sources_of, window
+from dyngs.human.predict.people import (
+    Person,
+    PosedBody,
+    Sources,
+    crop_source_images,
+    metric,
+    window,
+)
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +31,7 @@ def network() -> KeypointNerf:
 
 def given(person: Person, views: tuple[int, ...] = (0, 2, 4)) -> tuple[Sources, PosedBody, float]:
     body, scale = person.body_in(person.views[0])
-    return sources_of([person.images[i] for i in views], scale), body, scale
+    return crop_source_images([person.images[i] for i in views], scale), body, scale
 
 
 def known(

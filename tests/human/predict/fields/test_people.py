@@ -12,8 +12,8 @@ from dyngs.human.avatar.observations import project_points
 from dyngs.human.predict.gps.rectification import moments, spread
 from dyngs.human.predict.people import (
     Person,
+    crop_source_images,
     metric,
-    sources_of,
 )
 
 
@@ -47,7 +47,7 @@ def test_sources_are_the_images_around_the_person(person: Person) -> None:
     """Padded to one size; what a point shows is what it shows in the whole image."""
     images = [person.images[i] for i in (0, 2, 5)]
     body, scale = person.body_in(person.views[0])
-    sources = sources_of(images, scale)
+    sources = crop_source_images(images, scale)
     height, width = sources.rgba.shape[2:]
     assert (height % 8, width % 8, len(sources)) == (0, 0, 3)
     for i, image in enumerate(images):

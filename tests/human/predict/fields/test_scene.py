@@ -18,7 +18,7 @@ from dyngs.human.predict.fields.prediction import (
     restore,
 )
 from dyngs.human.predict.keys import PredictedFieldModel
-from dyngs.human.predict.people import Person, sources_of
+from dyngs.human.predict.people import Person, crop_source_images
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, restored_model
 from dyngs.models.renderable import DrawOptions
 
@@ -28,7 +28,7 @@ KINDS = sorted(NETWORKS)
 @pytest.fixture(params=KINDS)
 def scene(request: pytest.FixtureRequest, person: Person) -> PredictedField:
     body, scale = person.body_in(person.views[0])
-    sources = sources_of([person.images[i] for i in (0, 2, 4)], scale)
+    sources = crop_source_images([person.images[i] for i in (0, 2, 4)], scale)
     network = NETWORKS[request.param](torch.Generator().manual_seed(0))
     return PredictedField(network, sources, body, scale, background=torch.ones(3))
 

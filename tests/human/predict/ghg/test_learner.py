@@ -46,9 +46,9 @@ def test_training_lowers_the_loss(folder: Path, tmp_path: Path) -> None:
 def test_choices_are_as_many_as_asked_for(folder: Path, tmp_path: Path) -> None:
     """Every other one of fewer images."""
     atlas = assembled(config(folder, tmp_path, source_views=3))
-    assert [[len(choice) for choice in choices] for choices in atlas.choices] == [
-        [3, 1, 3, 2, 3, 1]
-    ] * 2
+    assert [
+        [len(choice) for choice in source_choices] for source_choices in atlas.source_choices
+    ] == [[3, 1, 3, 2, 3, 1]] * 2
     assert [person.person.name for person in atlas.people] == ["p1", "p2"]
 
 

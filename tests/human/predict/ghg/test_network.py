@@ -16,7 +16,7 @@ from dyngs.human.predict.ghg.network import (
     AtlasNetwork,
     AtlasPerson,
     TexelMaps,
-    guessed_colours,
+    guess_unseen_colours,
     network_inputs,
     num_input_channels,
     predict_avatar,
@@ -109,7 +109,7 @@ def test_unseen_texels_are_painted_and_mistrusted_ones_too(shown: Shown) -> None
     ]
     torch.testing.assert_close(trusting[seen], maps.rgb[0][seen])
     fractions = torch.tensor([0.0, 2.0, 0.0]).softmax(0)
-    guess = (fractions[:, None, None] * guessed_colours(sitter, maps, MEAN)).sum(0)
+    guess = (fractions[:, None, None] * guess_unseen_colours(sitter, maps, MEAN)).sum(0)
     torch.testing.assert_close(trusting[~seen], guess[~seen] + 0.5)
     wary = predicted(shown, {"colour": 0.5, "image_weight": -50.0}).gaussians.base_rgb
     torch.testing.assert_close(wary[: len(sitter.texels)], guess + 0.5)
@@ -129,12 +129,12 @@ def test_all_heads_learn(shown: Shown) -> None:
 
 def test_inputs_hold_everything_in_the_atlas(shown: Shown) -> None:
     sitter, maps = shown
-    found = network_inputs(sitter, maps, guessed_colours(sitter, maps, MEAN))
+    found = network_inputs(sitter, maps, guess_unseen_colours(sitter, maps, MEAN))
     assert found.shape == (num_input_channels(2), NET.resolution, NET.resolution)
     assert found[-2].sum() == len(sitter.texels)
     torch.testing.assert_close(found[-1], found[-2] / 3)
     changed_maps = replace(maps, rgb=1 - maps.rgb)
-    other = network_inputs(sitter, changed_maps, guessed_colours(sitter, changed_maps, MEAN))
+    other = network_inputs(sitter, changed_maps, guess_unseen_colours(sitter, changed_maps, MEAN))
     changed = (found != other).flatten(1).any(1)
     level = [True] * 3 + [False] * 3
     other_side = [True] * 3

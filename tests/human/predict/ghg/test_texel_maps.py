@@ -25,10 +25,10 @@ from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.body.mesh import interpolate, rasterize
 from dyngs.human.keys import HumanPredictorModel
 from dyngs.human.predict.ghg.network import (
-    HULL_LIMIT,
+    MAX_SILHOUETTE_DISTANCE,
     AtlasPerson,
     atlas_person,
-    colours_nearby,
+    fill_unseen_colours,
     observe_texels,
 )
 from dyngs.human.predict.people import captured_person
@@ -55,7 +55,7 @@ def test_unseen_texels_take_colours_from_their_surroundings() -> None:
     rgb = torch.where(
         (points[:, 1] > 0)[:, None], torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 1.0])
     )
-    found = colours_nearby(texels(), rgb * (seen > 0)[:, None], seen)
+    found = fill_unseen_colours(texels(), rgb * (seen > 0)[:, None], seen)
     assert torch.equal(found[seen > 0], rgb[seen > 0])
     away = (seen == 0) & (points[:, 1].abs() > 0.15)
     assert away.sum() > 100
@@ -149,10 +149,14 @@ def test_distances_from_the_edge_are_those_of_the_outline() -> None:
         (normals[:, 0] * points[:, 0].sign() > 0.98) & (points[:, 1] < -0.1) & (points[:, 1] > -0.7)
     )
     assert outer.sum() > 10
-    assert maps.hull[0, outer].abs().max() < 0.025
-    torch.testing.assert_close(maps.hull[1, outer].mean(), torch.tensor(-0.04), atol=0.008, rtol=0)
+    assert maps.silhouette_distance[0, outer].abs().max() < 0.025
+    torch.testing.assert_close(
+        maps.silhouette_distance[1, outer].mean(), torch.tensor(-0.04), atol=0.008, rtol=0
+    )
     middle = (points[:, 1] - 0.3).abs() < 0.05
-    assert (maps.hull[:, middle & (points[:, 0].abs() < 0.05)] == HULL_LIMIT).all()
+    assert (
+        maps.silhouette_distance[:, middle & (points[:, 0].abs() < 0.05)] == MAX_SILHOUETTE_DISTANCE
+    ).all()
     assert maps.count == 1
 
 

@@ -11,12 +11,12 @@ import pytest
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import View
 from dyngs.human.predict.gps.rectification import (
-    around,
-    as_pair,
     best_pair,
-    lessons,
     neighbours,
-    well_spread,
+    order_around_person,
+    order_as_pair,
+    spread_around_person,
+    training_pairs,
 )
 
 
@@ -42,7 +42,7 @@ RING = [view_at(x) for x in (90, 0, 45, 315, 135, 180, 225, 270)]
 
 
 def test_order_around_the_vertical_starts_anywhere() -> None:
-    degrees = [float(RING[i].name[3:]) for i in around(RING, range(8))]
+    degrees = [float(RING[i].name[3:]) for i in order_around_person(RING, range(8))]
     steps = np.diff([*degrees, degrees[0]]) % 360
     assert len(set(steps.tolist())) == 1
     assert steps[0] in (45, 315)
@@ -60,31 +60,31 @@ def test_order_around_the_vertical_starts_anywhere() -> None:
     ],
 )
 def test_what_does_not_suit_is_refused(one: View, other: View) -> None:
-    assert as_pair([one, other], 0, 1) is None
+    assert order_as_pair([one, other], 0, 1) is None
     for chosen in ([0, 1], [0]):
         with pytest.raises(DyngsError, match=rf"^ann: {one.name} has no neighbour"):
             neighbours("ann", [one, other], chosen)
 
 
 def test_views_are_chosen_around_the_ring() -> None:
-    assert len(neighbours("ann", RING, well_spread(RING, 8))) == 8
+    assert len(neighbours("ann", RING, spread_around_person(RING, 8))) == 8
     two = best_pair(RING)
     assert len(neighbours("ann", RING, two)) == 1
     dense = [view_at(10 * i) for i in range(36)]
     left, right = neighbours("ann", dense, best_pair(dense))[0]
     turned = (float(dense[right].name[3:]) - float(dense[left].name[3:])) % 360
     assert turned == 30
-    assert len(neighbours("ann", dense, well_spread(dense, 12))) == 12
+    assert len(neighbours("ann", dense, spread_around_person(dense, 12))) == 12
     later = [replace(view, frame=1, name=f"later_{view.name}") for view in dense]
-    assert {dense[i % 36].frame for i in well_spread([*dense[:5], *later], 9)} == {0}
-    assert all(i >= 5 for i in well_spread([*dense[:5], *later], 9)), (
+    assert {dense[i % 36].frame for i in spread_around_person([*dense[:5], *later], 9)} == {0}
+    assert all(i >= 5 for i in spread_around_person([*dense[:5], *later], 9)), (
         "of the moment that most views show"
     )
 
 
 def test_lessons_have_views_in_between() -> None:
     dense = [view_at(15 * i) for i in range(24)]
-    found = lessons(dense)
+    found = training_pairs(dense)
     assert len(found) == 48, "two and three steps of 15 degrees"
     for pair, between in found:
         left, right = (float(dense[i].name[3:]) for i in pair)
@@ -92,4 +92,6 @@ def test_lessons_have_views_in_between() -> None:
         assert {(float(dense[i].name[3:]) - left) % 360 for i in between} == {
             15 * (k + 1.0) for k in range(len(between))
         }
-    assert lessons(RING) == [], "45 degrees apart, so that nothing is between neighbours that suit"
+    assert training_pairs(RING) == [], (
+        "45 degrees apart, so that nothing is between neighbours that suit"
+    )

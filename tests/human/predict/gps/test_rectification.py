@@ -12,14 +12,14 @@ from ray_traced_ball import CENTER, RADIUS, SIZE, ball, exact_depth, pose_at
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.human.predict.gps.rectification import RectifiedPair, cropped, rectified
+from dyngs.human.predict.gps.rectification import RectifiedPair, crop_to_person, rectify_views
 
 
 @pytest.fixture(params=[(0, 30, 0.0, 0.0), (-10, 35, 0.15, 4.0), (170, 192, -0.1, -3.0)])
 def pair(request: pytest.FixtureRequest) -> RectifiedPair:
     """Level cameras; cameras at other heights, rolled; behind the ball."""
     first, second, rise, roll = request.param
-    return rectified(ball(pose_at(first)), ball(pose_at(second, 1.1 + rise, 3.2, roll)), 64)
+    return rectify_views(ball(pose_at(first)), ball(pose_at(second, 1.1 + rise, 3.2, roll)), 64)
 
 
 def test_true_depth_gives_back_the_points(pair: RectifiedPair) -> None:
@@ -62,7 +62,7 @@ def test_depth_maps_become_true_offsets(pair: RectifiedPair) -> None:
     assert error.abs().quantile(0.9) < 0.5, (
         "at the outline, where depth is steep, that of the nearest pixel"
     )
-    without = rectified(*(replace(ball(pose_at(x)), depth=None) for x in (0, 30)), 64)
+    without = rectify_views(*(replace(ball(pose_at(x)), depth=None) for x in (0, 30)), 64)
     assert without.offsets.isnan().all()
 
 
@@ -72,16 +72,16 @@ def test_views_that_cannot_show_the_same_are_refused() -> None:
     camera = right.cameras
     longer = camera.intrinsics * torch.tensor([[1.4], [1.4], [1.0]])
     with pytest.raises(DyngsError, match="a and b: do not show the same person"):
-        rectified(left, replace(right, cameras=replace(camera, intrinsics=longer)), 64)
+        rectify_views(left, replace(right, cameras=replace(camera, intrinsics=longer)), 64)
     with pytest.raises(DyngsError, match="a and b: do not show the same person"):
-        rectified(
+        rectify_views(
             replace(left, cameras=aside(left.cameras, 25)),
             replace(right, cameras=aside(camera, -25)),
             64,
         )
     for alpha in (None, torch.zeros(SIZE, SIZE)):
         with pytest.raises(DyngsError, match="b: shows no silhouette"):
-            rectified(left, replace(right, alpha=alpha), 64)
+            rectify_views(left, replace(right, alpha=alpha), 64)
 
 
 def aside(camera: Cameras, degrees: float) -> Cameras:
@@ -96,7 +96,7 @@ def aside(camera: Cameras, degrees: float) -> Cameras:
 
 def test_a_crop_is_the_same_part_of_the_view() -> None:
     whole = ball(pose_at(0))
-    part = cropped(whole, 4)
+    part = crop_to_person(whole, 4)
     assert whole.alpha is not None
     assert part.alpha is not None
     assert part.alpha.sum() == whole.alpha.sum()

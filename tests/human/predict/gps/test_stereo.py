@@ -11,8 +11,8 @@ from dyngs.human.predict.gps.stereo import (
     QUARTER,
     StereoNetwork,
     offsets_of,
+    plane_sweep_costs,
     refined,
-    sweep,
 )
 from dyngs.models.prediction import Encoder
 
@@ -36,7 +36,7 @@ def plane(offset: int) -> tuple[Tensor, Tensor]:
 def test_colours_agree_at_the_true_offset_in_both_views(index: int) -> None:
     offsets = offsets_of(SHIFT)
     rgb, alpha = plane(offsets[index])
-    colours, beside = sweep(rgb, alpha, offsets).split(NUM_OFFSETS, dim=1)
+    colours, beside = plane_sweep_costs(rgb, alpha, offsets).split(NUM_OFFSETS, dim=1)
     both = (alpha[:, :, ::4, ::4] > 0) & (beside[:, index : index + 1] == 0)
     inner = both[:, 0] & (torch.arange(32) > 5) & (torch.arange(32) < 27)
     assert inner.float().mean() > 0.2
@@ -50,7 +50,7 @@ def test_what_the_other_view_shows_beside_the_person_is_known() -> None:
     offsets = offsets_of(SHIFT)
     rgb, alpha = plane(0)
     # of columns 20 to 23 of 128, and two on either side
-    beside = sweep(rgb, alpha, offsets)[:, NUM_OFFSETS:, 8, 5]
+    beside = plane_sweep_costs(rgb, alpha, offsets)[:, NUM_OFFSETS:, 8, 5]
     for side, found in zip((1, -1), beside, strict=True):
         shown = [{16 <= column - side * x < 112 for column in range(18, 26)} for x in offsets]
         assert {
@@ -71,7 +71,10 @@ def test_the_untrained_network_finds_what_is_plain() -> None:
     rgb, alpha = plane(offsets[25])
     with torch.no_grad():
         found, _ = stereo(
-            encoder(torch.rand(2, 4, 32, 64)), sweep(rgb, alpha, offsets), offsets, alpha
+            encoder(torch.rand(2, 4, 32, 64)),
+            plane_sweep_costs(rgb, alpha, offsets),
+            offsets,
+            alpha,
         )
     for x in found:
         assert (x[..., 48:80] - offsets[25]).abs().max() < 1

@@ -7,20 +7,20 @@ import pytest
 import torch
 from ray_traced_ball import CENTER, RADIUS, ball, exact_depth, pose_at
 
-from dyngs.human.predict.gps.rectification import RectifiedPair, rectified
-from dyngs.human.predict.gps.stereo import GpsNetwork, gaussians_of, offset_loss
+from dyngs.human.predict.gps.rectification import RectifiedPair, rectify_views
+from dyngs.human.predict.gps.stereo import GpsNetwork, offset_loss, surface_gaussians_of_pair
 
 
 @pytest.fixture(scope="module")
 def pair() -> RectifiedPair:
-    return rectified(ball(pose_at(0)), ball(pose_at(30)), 40)
+    return rectify_views(ball(pose_at(0)), ball(pose_at(30)), 40)
 
 
 def test_true_offsets_put_gaussians_on_the_surface(pair: RectifiedPair) -> None:
     depth = exact_depth(pair)
     offsets = pair.focal * pair.baseline / depth - pair.shift
     raw = torch.zeros(*offsets.shape[:1], 8, *offsets.shape[2:])
-    found = gaussians_of(pair, offsets, raw)
+    found = surface_gaussians_of_pair(pair, offsets, raw)
     assert len(found) == int(pair.solid.sum())
     inner = (pair.alpha[pair.solid] > 0.999) & (pair.seen_by_other(offsets)[pair.solid] > 0.999)
     assert found.opacities[inner].min() > 0.85
@@ -37,7 +37,9 @@ def test_what_the_other_view_does_not_show_is_transparent(pair: RectifiedPair) -
     is wrong with it."""
     offsets = pair.focal * pair.baseline / exact_depth(pair) - pair.shift
     raw = torch.zeros(2, 8, *offsets.shape[2:])
-    right, wrong = (gaussians_of(pair, offsets + d, raw).opacities for d in (0.0, 15.0))
+    right, wrong = (
+        surface_gaussians_of_pair(pair, offsets + d, raw).opacities for d in (0.0, 15.0)
+    )
     known = pair.alpha[pair.solid] > 0.999
     assert right[known].mean() > 0.8
     beside = pair.seen_by_other(offsets + 15.0)[pair.solid] == 0
@@ -63,7 +65,7 @@ def test_gradients_reach_every_weight(pair: RectifiedPair) -> None:
     assert {name.partition(".")[0] for name in given} == {"encoder", "stereo"}
     network.zero_grad()
     offsets, raw = network(pair)
-    found = gaussians_of(pair, offsets[-1], raw)
+    found = surface_gaussians_of_pair(pair, offsets[-1], raw)
     sum(x.square().mean() for x in found.tensors().values()).backward()
     assert [
         name

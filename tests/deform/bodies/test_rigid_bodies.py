@@ -16,35 +16,37 @@ from dyngs.deform.fields import create_field
 def test_a_rolling_ball_begins_on_its_way() -> None:
     """The seeds lie on the ball in the middle of the clip, and the field takes them along the true
     motion."""
-    shots, centers, turns = rolling()
-    found = find_bodies(shots, 400, 4)
+    frame_stack, centers, turns = rolling()
+    found = find_bodies(frame_stack, 400, 4)
     assert found is not None
     assert found.explains_all_motion
-    assert found.finding.startswith("1 body turns by ")
+    assert found.message.startswith("1 body turns by ")
     (seeds,) = found.seeds
     assert 100 < len(seeds) <= 400
-    middle = len(shots) // 2
+    middle = len(frame_stack) // 2
     arms = seeds.means.numpy() - centers[middle]
     assert np.linalg.norm(arms, axis=1).max() < 1.3 * 0.28
     others = 5
-    setup = FieldSetup(torch.zeros(3), torch.ones(3), len(shots), others + len(seeds), 1.0)
+    setup = FieldSetup(torch.zeros(3), torch.ones(3), len(frame_stack), others + len(seeds), 1.0)
     field = found.within(create_field(tiny_options("control_nodes"), setup, torch.Generator()))
     assert field.rest.labels.tolist() == [-1] * others + [0] * len(seeds)
     means = torch.cat([torch.zeros(others, 3), seeds.means])
-    for t in (0, 5, middle, len(shots) - 1):
+    for t in (0, 5, middle, len(frame_stack) - 1):
         with torch.no_grad():
-            moved = (means + field.offsets(means, float(shots.times[t])).means)[others:].numpy()
+            moved = (means + field.offsets(means, float(frame_stack.times[t])).means)[
+                others:
+            ].numpy()
         expected = arms @ (turns[t] @ turns[middle].T).T + centers[t]
         # At the ends of the clip, which have neighbours on one side only, more.
         assert (
             np.linalg.norm(moved - expected, axis=1).mean()
-            < (0.4 if t in (0, len(shots) - 1) else 0.25) * 0.28
+            < (0.4 if t in (0, len(frame_stack) - 1) else 0.25) * 0.28
         )
 
 
 def test_what_slides_is_not_made_to_turn() -> None:
     """It is left to others, or a body with hardly any turn: its path, too, is found from the
     images."""
-    shots, _, _ = rolling(turns=False)
-    found = find_bodies(shots, 400, 4)
-    assert found is None or angles_deg(found.bodies[0].turning.rotations).max() < 12
+    frame_stack, _, _ = rolling(turns=False)
+    found = find_bodies(frame_stack, 400, 4)
+    assert found is None or angles_deg(found.bodies[0].rotation.rotations).max() < 12

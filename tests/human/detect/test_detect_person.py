@@ -19,8 +19,12 @@ from dyngs.data.capture import Capture, all_views
 from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.human.detect import detect_person as module
+from dyngs.human.detect.detect_person import (
+    detect_person,
+    ensure_detected_person,
+    write_detected_person,
+)
 from dyngs.human.detect.detector import Detection
-from dyngs.human.detect.detect_person import detect_person, ensure_detected_person, write_detected_person
 from dyngs.human.fit.keypoints import JOINTS, read_keypoints
 from dyngs.io.write import write_image
 from tests.detections import person
@@ -88,9 +92,11 @@ def overlap(folder: Path, number: int) -> float:
 def test_masks_and_key_points_of_all_views(
     clip: Path, tmp_path: Path, side: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "SIDE", side)
+    monkeypatch.setattr(module, "DETECTOR_SIDE_PX", side)
     said: list[str] = []
-    found = detect_person(capture_of(clip), Rough(), tmp_path / "found", report_nothing, said.append)
+    found = detect_person(
+        capture_of(clip), Rough(), tmp_path / "found", report_nothing, said.append
+    )
     assert found.masks is not None
     assert found.keypoints is not None
     seen = [number for number in range(COUNT) if number != 4]
@@ -136,7 +142,9 @@ def test_a_capture_of_the_person_comes_out(
 ) -> None:
     monkeypatch.setattr("dyngs.human.fit.capture_fit.STEPS", 2)
     out = tmp_path / "ann"
-    result = write_detected_person(DataConfig(root=clip, frames="0:10:4"), out, Rough(), say=[].append)
+    result = write_detected_person(
+        DataConfig(root=clip, frames="0:10:4"), out, Rough(), say=[].append
+    )
     assert result.root == out
     capture = read_capture(DataConfig(root=out))
     assert capture.body is not None

@@ -23,10 +23,10 @@ def crossing(time: float) -> tuple[float, float, float]:
 
 def test_one_ball_begins_at_each_time() -> None:
     found = started(lambda t: [Ball(crossing(t))])
-    assert found.finding is not None
-    assert "found at 12 of 12 times" in found.finding
+    assert found.message is not None
+    assert "found at 12 of 12 times" in found.message
     for time in TIMES:
-        now = [one for one in found.moments if one.time == time]
+        now = [one for one in found.timed_gaussians if one.time == time]
         center = torch.cat([one.gaussians.means for one in now]).median(0).values
         assert (center - torch.tensor(crossing(time))).norm() < 0.1
 
@@ -37,4 +37,4 @@ def test_where_nothing_changes_nothing_begins(count: int, limit: int) -> None:
     at = (lambda _: (0.0, 0.0, 0.0)) if count == 6 and limit else crossing
     found = started(lambda t: [Ball(at(t))], count, limit)
     assert found == InitialMotion()
-    assert found.finding is None
+    assert found.message is None

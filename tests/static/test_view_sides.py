@@ -14,7 +14,7 @@ from splat_scenes import cloud
 from dyngs.core.state import tensors_of
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.gaussians.static_scene import Sides, StaticScene
+from dyngs.gaussians.static_scene import StaticScene, ViewSides
 
 PARTS = [cloud(40), cloud(60)]
 EYES = [torch.tensor([4.0, 0.0, 1.5]), torch.tensor([-4.0, 0.0, 1.5])]
@@ -22,7 +22,7 @@ RING = ring_of(4, np.zeros(3)).to(dtype=torch.float32)  # from +x on, anticlockw
 
 
 def two_sides() -> StaticScene:
-    return StaticScene(gaussians=Gaussians.joined(PARTS), sides=Sides.joined(PARTS, EYES))
+    return StaticScene(gaussians=Gaussians.joined(PARTS), sides=ViewSides.joined(PARTS, EYES))
 
 
 @pytest.mark.parametrize(("camera", "side"), [(0, 0), (2, 1)])
@@ -56,14 +56,14 @@ def test_images_teach_their_own_side_alone() -> None:
 
 def test_sides_follow_their_gaussians_and_are_stored() -> None:
     kept = torch.arange(0, 100, 3)
-    scene = two_sides().edited(TopologyEdit.select(kept))
+    scene = two_sides().apply_edit(TopologyEdit.select(kept))
     tensors = {name.removeprefix("model."): x for name, x in tensors_of(scene.state()).items()}
-    again = StaticScene.restored(scene.gaussians, tensors)
+    again = StaticScene.from_state(scene.gaussians, tensors)
     assert again.sides is not None
     assert torch.equal(again.sides.of, (kept >= 40).long())
     assert torch.equal(again.render(RING).rgb, scene.render(RING).rgb)
     assert not torch.equal(again.render(RING).rgb, replace(again, sides=None).render(RING).rgb)
-    assert StaticScene.restored(scene.gaussians, {}).sides is None
+    assert StaticScene.from_state(scene.gaussians, {}).sides is None
 
 
 @pytest.mark.parametrize(
@@ -81,4 +81,4 @@ def test_sides_that_do_not_fit_are_refused(name: str, value: torch.Tensor) -> No
         name.removeprefix("model."): x for name, x in tensors_of(two_sides().state()).items()
     }
     with pytest.raises(ValueError, match=name):
-        Sides.stored(tensors | {f"sides.{name}": value}, 100)
+        ViewSides.from_state(tensors | {f"sides.{name}": value}, 100)

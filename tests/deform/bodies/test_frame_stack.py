@@ -15,35 +15,37 @@ from tiny_fields import cloud
 from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
-from dyngs.deform.bodies.paths import FrameStack, render_frame_stack, one_camera
+from dyngs.deform.bodies.paths import FrameStack, one_camera, render_frame_stack
 from dyngs.gaussians.rendering import RenderOptions
 
 
 def test_rays_go_through_the_points_that_they_show() -> None:
-    shots, centers, _ = rolling()
-    which = np.arange(len(shots))
-    pixels, depths = shots.projected(which, centers)
-    ways = shots.rays(which, pixels)
-    apart = np.cross(centers - shots.centers, ways)
+    frame_stack, centers, _ = rolling()
+    which = np.arange(len(frame_stack))
+    pixels, depths = frame_stack.project(which, centers)
+    ways = frame_stack.rays(which, pixels)
+    apart = np.cross(centers - frame_stack.centers, ways)
     assert np.linalg.norm(apart, axis=1).max() < 1e-6
-    assert depths == pytest.approx(((centers - shots.centers) * shots.poses[:, 2, :3]).sum(1))
+    assert depths == pytest.approx(
+        ((centers - frame_stack.centers) * frame_stack.poses[:, 2, :3]).sum(1)
+    )
 
 
 def test_pixels_on_a_ball_see_its_surface() -> None:
     """They differ from the static model, unless something hides the ball."""
-    shots, centers, _ = rolling()
-    rows, columns, normals = shots.ball_pixels(3, centers[3], 0.28)
+    frame_stack, centers, _ = rolling()
+    rows, columns, normals = frame_stack.ball_pixels(3, centers[3], 0.28)
     assert len(rows) > 50
     assert np.linalg.norm(normals, axis=1) == pytest.approx(1)
     points = centers[3] + 0.28 * normals
-    pixels, _ = shots.projected(np.full(len(rows), 3), points)
+    pixels, _ = frame_stack.project(np.full(len(rows), 3), points)
     assert pixels == pytest.approx(np.stack([columns, rows], axis=1) + 0.5)
-    inside = shots.differences()[3, rows, columns]
-    assert inside.mean() > 2 * shots.differences()[3].mean()
-    values = {name: x for name, x in vars(shots).items() if name != "centers"}
-    hidden = FrameStack(**values | {"depths": np.full_like(shots.depths, 0.1)})
+    inside = frame_stack.differences()[3, rows, columns]
+    assert inside.mean() > 2 * frame_stack.differences()[3].mean()
+    values = {name: x for name, x in vars(frame_stack).items() if name != "centers"}
+    hidden = FrameStack(**values | {"depths": np.full_like(frame_stack.depths, 0.1)})
     assert not len(hidden.ball_pixels(3, centers[3], 0.28)[0])
-    assert not len(shots.ball_pixels(3, np.array([50.0, 0, 0]), 0.28)[0])
+    assert not len(frame_stack.ball_pixels(3, np.array([50.0, 0, 0]), 0.28)[0])
 
 
 def test_one_camera_shows_each_time_once() -> None:
@@ -66,12 +68,12 @@ def test_masked_pixels_are_as_the_static_model_has_them() -> None:
     mask = torch.zeros(8, 8)
     mask[:4] = 1
     image = Image("a", camera, rgb, torch.ones(8, 8), mask, 0.5)
-    shots = render_frame_stack([image], gaussians, RenderOptions(), torch.ones(3))
-    assert np.array_equal(shots.alphas[0, :4], np.ones((4, 8)))
-    assert np.array_equal(shots.alphas[0, 4:], shots.static_alphas[0, 4:])
-    assert np.array_equal(shots.images[0, :4], rgb[:4].numpy())
-    assert np.array_equal(shots.images[0, 4:], shots.still[0, 4:])
-    assert shots.times.tolist() == [0.5]
+    frame_stack = render_frame_stack([image], gaussians, RenderOptions(), torch.ones(3))
+    assert np.array_equal(frame_stack.alphas[0, :4], np.ones((4, 8)))
+    assert np.array_equal(frame_stack.alphas[0, 4:], frame_stack.static_alphas[0, 4:])
+    assert np.array_equal(frame_stack.images[0, :4], rgb[:4].numpy())
+    assert np.array_equal(frame_stack.images[0, 4:], frame_stack.static[0, 4:])
+    assert frame_stack.times.tolist() == [0.5]
 
 
 def one_camera_of(size: int) -> Cameras:

@@ -57,7 +57,9 @@ def test_extent_is_the_published_one() -> None:
 
 def test_points_give_their_published_start() -> None:
     grid = np.stack(np.meshgrid(*[np.arange(3.0)] * 3, indexing="ij"), -1).reshape(-1, 3) * 0.5
-    gaussians = initial_gaussians(_with_points(grid), PointsInit(), InitialValues(), 3, _generator())
+    gaussians = initial_gaussians(
+        _with_points(grid), PointsInit(), InitialValues(), 3, _generator()
+    )
     # Every point of a grid of pitch 0.5 has three neighbours at 0.5.
     torch.testing.assert_close(gaussians.scales, torch.full((27, 3), 0.5))
     torch.testing.assert_close(gaussians.opacities, torch.full((27,), 0.1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from small_triangles import camera, triangle
 
-from dyngs.baselines.triangles.training import TriangleStatistics, outlines
+from dyngs.baselines.triangles.training import TriangleStatistics, near_outline
 from dyngs.ops.patches import PatchSamples, visible_patches
 
 BEHIND = triangle((-1, -1, -9), (1, -1, -9), (0, 1, -9))
@@ -25,14 +25,14 @@ def test_what_is_seen_is_counted() -> None:
     assert tallies.seen.tolist() == [2, 0]
     assert tallies.cells[1].sum() == 0
     assert tallies.cells[0].sum() == 2 * len(places.ids) / 4, "four drawn pixels a pixel"
-    expected = float((~outlines(places)).sum()) / 4  # drawn pixels are quarters of the image's
+    expected = float((~near_outline(places)).sum()) / 4  # drawn pixels are quarters of the image's
     torch.testing.assert_close(tallies.edges, torch.tensor([expected, 0.0]))
 
 
 def test_outlines_are_where_ids_change() -> None:
     found = torch.zeros(32, 32, dtype=torch.bool)
     places = places_of(LARGE)
-    found[places.rows[0] >= 0] = outlines(places)
+    found[places.rows[0] >= 0] = near_outline(places)
     assert not found[:4, :4].any()
     assert found.any()
-    assert len(outlines(places_of(BEHIND))) == 0
+    assert len(near_outline(places_of(BEHIND))) == 0

@@ -24,24 +24,24 @@ def errors_deg(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
 def test_a_rolling_ball_is_followed_in_its_rotation() -> None:
     """It turns by more than a full turn; of its turn from image to image nothing is known
     beforehand."""
-    shots, centers, truth = rolling()
-    turning = estimate_rotation(shots, Path(centers, RADIUS, 1.0))
-    errors = errors_deg(turning.rotations, truth)
+    frame_stack, centers, truth = rolling()
+    rotation = estimate_rotation(frame_stack, Path(centers, RADIUS, 1.0))
+    errors = errors_deg(rotation.rotations, truth)
     assert np.median(errors) < 4
     assert errors.max() < 12
-    assert turning.disagreement < 0.4 * turning.standing
+    assert rotation.disagreement < 0.4 * rotation.standing
 
 
 def test_two_turns_about_any_axis_are_followed() -> None:
     """No rolling and no heading says beforehand how fast."""
-    shots, centers, truth = hopping()
-    errors = errors_deg(estimate_rotation(shots, Path(centers, RADIUS, 1.0)).rotations, truth)
+    frame_stack, centers, truth = hopping()
+    errors = errors_deg(estimate_rotation(frame_stack, Path(centers, RADIUS, 1.0)).rotations, truth)
     assert np.median(errors) < 6
     assert errors.max() < 20
 
 
 def test_what_slides_does_not_turn() -> None:
-    shots, centers, _ = rolling(turns=False)
-    turning = estimate_rotation(shots, Path(centers, RADIUS, 1.0))
-    assert angles_deg(turning.rotations).max() < 10
-    assert turning.disagreement > 0.85 * turning.standing
+    frame_stack, centers, _ = rolling(turns=False)
+    rotation = estimate_rotation(frame_stack, Path(centers, RADIUS, 1.0))
+    assert angles_deg(rotation.rotations).max() < 10
+    assert rotation.disagreement > 0.85 * rotation.standing

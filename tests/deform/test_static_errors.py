@@ -19,11 +19,11 @@ from dyngs.data.capture import View
 from dyngs.data.loader import Image
 from dyngs.deform.static_errors import (
     MIN_SAME,
-    group_fixed_cameras,
     changed_fraction,
-    static_errors,
+    group_fixed_cameras,
     otsu_threshold,
     select_comparison_views,
+    static_errors,
 )
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
@@ -82,8 +82,8 @@ def left_half() -> Tensor:
 def scores_of(gaussians: Gaussians, images: list[Image], background: Tensor) -> Tensor:
     """(N,) of cameras that do not stay in place."""
     found = static_errors(lambda _: gaussians, images, OPTIONS, background)
-    assert torch.equal(found.most, found.usual)
-    return found.most
+    assert torch.equal(found.peak, found.typical)
+    return found.peak
 
 
 @settings(max_examples=25, deadline=None)
@@ -140,9 +140,9 @@ def test_what_a_still_model_has_not_learned_is_no_motion() -> None:
     """Wrong by far, but in all images alike; with too few images to know, it may be motion."""
     ball = balls(sideways(0.0))
     found = static_errors(lambda _: ball, in_place(*[0.4] * MIN_SAME), OPTIONS, BLACK)
-    assert (float(found.most), float(found.usual)) == pytest.approx((0.0, 0.0), abs=1e-6)
+    assert (float(found.peak), float(found.typical)) == pytest.approx((0.0, 0.0), abs=1e-6)
     few = static_errors(lambda _: ball, in_place(*[0.4] * (MIN_SAME - 1)), OPTIONS, BLACK)
-    assert float(few.most) == pytest.approx(0.4, rel=1e-3)
+    assert float(few.peak) == pytest.approx(0.4, rel=1e-3)
 
 
 def test_what_is_hidden_at_times_does_not_move() -> None:
@@ -150,15 +150,17 @@ def test_what_is_hidden_at_times_does_not_move() -> None:
     found = static_errors(
         lambda _: balls(sideways(0.0)), in_place(*[0.0] * 8, 0.3, 0.3), OPTIONS, BLACK
     )
-    assert (float(found.most), float(found.usual)) == pytest.approx((0.3, 0.0), rel=1e-3, abs=1e-6)
+    assert (float(found.peak), float(found.typical)) == pytest.approx(
+        (0.3, 0.0), rel=1e-3, abs=1e-6
+    )
 
 
 def test_what_changes_again_and_again_moves() -> None:
     found = static_errors(
         lambda _: balls(sideways(0.0)), in_place(*[0.0] * 6, 0.1, 0.2, 0.3, 0.4), OPTIONS, BLACK
     )
-    assert float(found.most) == pytest.approx(0.4, rel=1e-3)
-    assert float(found.usual) == pytest.approx(0.1, rel=1e-3)
+    assert float(found.peak) == pytest.approx(0.4, rel=1e-3)
+    assert float(found.typical) == pytest.approx(0.1, rel=1e-3)
 
 
 def views(*cameras: int) -> list[View]:
@@ -227,8 +229,8 @@ def test_the_fraction_of_each_gaussian_in_the_mask() -> None:
     found = static_errors(
         lambda _: two_balls(), [masked_image(left())], RenderOptions(), BLACK, sure=0.06
     )
-    torch.testing.assert_close(found.most, torch.tensor([0.12, 0.0]), rtol=0, atol=2e-3)
-    torch.testing.assert_close(found.usual, found.most)
+    torch.testing.assert_close(found.peak, torch.tensor([0.12, 0.0]), rtol=0, atol=2e-3)
+    torch.testing.assert_close(found.typical, found.peak)
 
 
 def test_what_is_covered_at_times_only_is_not_usual() -> None:
@@ -238,5 +240,5 @@ def test_what_is_covered_at_times_only_is_not_usual() -> None:
         + [masked_image(None)]
     )
     found = static_errors(lambda _: two_balls(), images, RenderOptions(), BLACK, sure=0.06)
-    assert float(found.most[0]) > 0.1
-    assert float(found.usual.max()) == 0
+    assert float(found.peak[0]) > 0.1
+    assert float(found.typical.max()) == 0
