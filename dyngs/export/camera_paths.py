@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError, printable
+from dyngs.core.errors import DyngsError, format_one_line
 from dyngs.data.geometry import cam_from_opengl, checked_pose, inverse_rigid, pinhole_matrix
 from dyngs.io.fields import entry, float_array, is_number, numbers_of, read_json, require_at_most
 
@@ -102,7 +102,7 @@ def parse_times(text: str) -> tuple[float, ...]:
         start, stop, count = 0.0, 0.0, 0
     if not (math.isfinite(start) and math.isfinite(stop) and 1 <= count <= _MAX_FRAMES):
         raise DyngsError(
-            f"{printable(repr(text), 60)} is no range of times; write START:STOP:COUNT, for instance 0:1:60 for 60 "
+            f"{format_one_line(repr(text), 60)} is no range of times; write START:STOP:COUNT, for instance 0:1:60 for 60 "
             "evenly spaced times"
         )
     return tuple(np.linspace(start, stop, count).tolist())
@@ -166,7 +166,7 @@ def _as_document(found: Any, file: Path) -> tuple[dict[str, Any], tuple[str, ...
     kind = str(found.get("camera_type", found.get("camera_model")))
     panoramic = ("fisheye", "equirectangular", "spherical", "omni", "vr180")
     if any(name in kind.lower() for name in panoramic):
-        raise DyngsError(f"{file}: cameras of a path are pinholes, not {printable(kind, 40)}")
+        raise DyngsError(f"{file}: cameras of a path are pinholes, not {format_one_line(kind, 40)}")
     if "camera_path" in found:
         return _of_nerfstudio(found, file), (
             "nerfstudio's path is taken to be in the coordinates of the capture; its viewer may have turned, shifted "
@@ -246,7 +246,7 @@ def _number(
     """Return the number at ``key``. Raises DyngsError unless it is in [low, high]."""
     value = keys.get(key, default)
     if not is_number(value) or not low <= value <= high:
-        problem = "is missing" if value is None else f"is {printable(repr(value), 60)}"
+        problem = "is missing" if value is None else f"is {format_one_line(repr(value), 60)}"
         raise DyngsError(
             f"{where}: '{key}' {problem}; it must be a number from {low:g} to {high:g}"
         )

@@ -54,8 +54,8 @@ from dyngs.io.gltf import GlbDocument
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import atomic_file
 from dyngs.ops.quaternions import align_quat_signs, rotation_matrices, unit_quats
-from dyngs.runs.folder import inputs_of
-from dyngs.runs.opened import Opened
+from dyngs.runs.folder import collect_inputs
+from dyngs.runs.opened import OpenedScene
 
 PER_LEAF = MERGED**7  # Gaussians of a leaf at level 0
 PER_FILE = MERGED**9  # at most, at each level
@@ -148,7 +148,7 @@ DEFAULT_WRITE_OPTIONS = WriteOptions()
 
 
 def choose_write_options(
-    opened: Opened,
+    opened: OpenedScene,
     target: str,
     up: str | None = None,
     from_up: str | None = None,
@@ -181,7 +181,7 @@ def choose_write_options(
     return how, f"up is {wanted} in the file ({turned}, says {who})"
 
 
-def find_up_direction(opened: Opened) -> tuple[tuple[float, ...], str] | None:
+def find_up_direction(opened: OpenedScene) -> tuple[tuple[float, ...], str] | None:
     """Return the direction (3,) that is up and what says so: an axis where one is within 30
     degrees; None: nothing.
 
@@ -198,7 +198,7 @@ def find_up_direction(opened: Opened) -> tuple[tuple[float, ...], str] | None:
 
 
 def write_run_splats(
-    opened: Opened,
+    opened: OpenedScene,
     path: Path,
     time: float = 0.0,
     part: Part = "all",
@@ -210,13 +210,13 @@ def write_run_splats(
     has one, states the render mode, and the time if something moves. Raises DyngsError: the part is
     empty, or an unknown suffix.
     """
-    inputs_of(opened).require_output(path)
+    collect_inputs(opened).require_output(path)
     splat = splats_at(opened, scene_part(opened.scene, part), time, how)
     return write_splats(path, splat, sh_degree=how.sh_degree)
 
 
 def write_run_sequence(
-    opened: Opened,
+    opened: OpenedScene,
     folder: Path,
     times: Sequence[float],
     part: Part = "all",
@@ -230,7 +230,7 @@ def write_run_sequence(
     """
     digits = max(4, len(str(len(times) - 1)))
     names = [f"frame_{i:0{digits}d}{suffix}" for i in range(len(times))]
-    inputs = inputs_of(opened)
+    inputs = collect_inputs(opened)
     for path in (folder, *(folder / name for name in names)):
         inputs.require_output(path)
     others = sorted(file.name for file in folder.glob(f"[!.]*{suffix}") if file.name not in names)
@@ -246,7 +246,7 @@ def write_run_sequence(
 
 
 def write_run_levels(
-    opened: Opened,
+    opened: OpenedScene,
     folder: Path,
     time: float = 0.0,
     part: Part = "all",
@@ -257,7 +257,7 @@ def write_run_levels(
 
     Raises DyngsError: the part is empty, or the folder holds something.
     """
-    inputs_of(opened).require_output(folder)
+    collect_inputs(opened).require_output(folder)
     splat = splats_at(opened, scene_part(opened.scene, part), time, how)
     whole, notes = fitted(folder, format_named("sog"), splat, how.sh_degree)
     return write_sog_levels(folder, whole), notes
@@ -275,7 +275,7 @@ def scene_part(scene: GaussianScene, part: Part) -> GaussianScene:
 
 
 def splats_at(
-    opened: Opened, scene: GaussianScene, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
+    opened: OpenedScene, scene: GaussianScene, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
 ) -> SplatFile:
     """Return what a file of Gaussians is to hold of a scene at one time, in the axes that are asked
     for.
@@ -361,7 +361,7 @@ FOURDGS_FPS = 30.0
 
 
 def write_4dgs(
-    opened: Opened,
+    opened: OpenedScene,
     path: Path,
     times: Sequence[float],
     part: Part = "all",
@@ -372,7 +372,7 @@ def write_4dgs(
 
     Raises DyngsError: the package is missing, the part is empty, or the file cannot be written.
     """
-    inputs_of(opened).require_output(path)
+    collect_inputs(opened).require_output(path)
     model, delta, files = _fourdgs(path)
     scene = scene_part(opened.scene, part)
     splats = tuple(splats_at(opened, scene, time, how) for time in times)
@@ -435,7 +435,7 @@ def _fourdgs(path: Path) -> tuple[Any, Any, Any]:
 
 @torch.no_grad()
 def write_rigid_bodies(
-    opened: Opened, path: Path, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
+    opened: OpenedScene, path: Path, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
 ) -> Written:
     """Write a run at a time in [0, 1] as .glb: a node for each body, with its motion as an
     animation, one for the rest.
@@ -443,7 +443,7 @@ def write_rigid_bodies(
     Without the animation the file shows the scene at ``time``. Raises DyngsError: no body turns in
     this run, or the file cannot be written.
     """
-    inputs_of(opened).require_output(path)
+    collect_inputs(opened).require_output(path)
     scene = field_scene_of(opened.scene)
     field = None if scene is None else find_body_field(scene.field)
     if scene is None or field is None:

@@ -14,7 +14,7 @@ from pydantic import ConfigDict, TypeAdapter
 from dyngs.api.train import train
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
-from dyngs.core.errors import DyngsError, printable, reading
+from dyngs.core.errors import DyngsError, format_one_line, wrap_read_errors
 from dyngs.io.child import home_of_dyngs
 from dyngs.io.containment import following_links_of_runs, follows_links_of_runs
 from dyngs.io.fields import read_limited
@@ -92,7 +92,7 @@ def run_tasks(
 
 def read_stored(path: Path, kind: TypeAdapter[T]) -> T:
     """Return a result. Raises DyngsError: the file is damaged."""
-    with reading(path, "it is no result of a study: remove it to have it measured again"):
+    with wrap_read_errors(path, "it is no result of a study: remove it to have it measured again"):
         return kind.validate_json(read_limited(path))
 
 
@@ -113,7 +113,7 @@ def require_same_study(
         write_stored(path, facts)
         return
     here = json.loads(json.dumps(facts))
-    with reading(path, "what its folder holds is not known; give another --out"):
+    with wrap_read_errors(path, "what its folder holds is not known; give another --out"):
         known = json.loads(read_limited(path))
         differing = [
             f"{key} is {_shown(known.get(key))} there and {_shown(here[key])} here"
@@ -126,4 +126,4 @@ def require_same_study(
 
 def _shown(value: object) -> str:
     text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-    return printable(text, 80) or "none"
+    return format_one_line(text, 80) or "none"

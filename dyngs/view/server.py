@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
-from dyngs.core.errors import DyngsError, printable
-from dyngs.runs.opened import Opened
+from dyngs.core.errors import DyngsError, format_one_line
+from dyngs.runs.opened import OpenedScene
 from dyngs.view.session import BrowserCamera, RenderScheduler, SentImage, Session
 from dyngs.view.source import SceneSource
 from dyngs.view.views import fitting_fov, initial_viewpoint, orbit_center, pose_of, views_of
@@ -174,7 +174,7 @@ class BrowserConnection:
     """One browser: its connection, its session, and the images that went to it; ``opened`` is what
     it sees first."""
 
-    def __init__(self, client: viser.ClientHandle, opened: Opened, target: float) -> None:
+    def __init__(self, client: viser.ClientHandle, opened: OpenedScene, target: float) -> None:
         self.client = client
         self.loaded = opened
         self.session = Session(opened, self.send, target)
@@ -244,7 +244,7 @@ def _window(camera: viser.CameraHandle) -> tuple[int, int]:
 def escape_markdown(text: str) -> str:
     """Return Markdown that shows ``text`` of others letter by letter: no HTML, which viser would
     render with its scripts, no links, images or emphasis."""
-    return _PUNCTUATION.sub(r"\\\1", _IN_LINKS.sub("\u200b", printable(text)))
+    return _PUNCTUATION.sub(r"\\\1", _IN_LINKS.sub("\u200b", format_one_line(text)))
 
 
 class Viewer:
@@ -259,7 +259,7 @@ class Viewer:
     """
 
     def __init__(
-        self, source: SceneSource, first: Opened, serving: ServerOptions = ServerOptions()
+        self, source: SceneSource, first: OpenedScene, serving: ServerOptions = ServerOptions()
     ) -> None:
         require_viser()
         import viser

@@ -21,7 +21,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.geometry import checked_pose
 from dyngs.export.camera_paths import Keyframes, interpolate_keyframes, resize_cameras
-from dyngs.runs.opened import Opened
+from dyngs.runs.opened import OpenedScene
 from dyngs.view.layers import Layer, Part, ViewRequest, draw
 from dyngs.view.views import camera_at, nearest_view, views_of
 
@@ -138,7 +138,7 @@ class Recording:
         time = 0.0 if made.times is None else float(made.times[0])
         return Cameras(pose, matrix, *size), time
 
-    def document(self, size: tuple[int, int], fps: float, opened: Opened) -> str:
+    def document(self, size: tuple[int, int], fps: float, opened: OpenedScene) -> str:
         """Return the path as JSON that ``dyngs render --path`` reads (docs/camera_paths.md), in the
         coordinates of the capture; ``size`` of its images, px."""
         keys: list[dict[str, Any]] = []
@@ -178,7 +178,7 @@ class Session:
 
     def __init__(
         self,
-        opened: Opened,
+        opened: OpenedScene,
         send: Callable[[SentImage], None],
         target: float = 1 / 14,
         clock: Callable[[], float] = time.monotonic,
@@ -224,7 +224,7 @@ class Session:
         self.on_play(self.timeline.playing)
         self._note_change()
 
-    def show(self, opened: Opened) -> None:
+    def show(self, opened: OpenedScene) -> None:
         """Look at another scene, at the same time."""
         self.opened = opened
         self.change_timeline(seconds=opened.seconds)
@@ -234,7 +234,7 @@ class Session:
         self._preview = recording, self._clock()
         self._note_change()
 
-    def update_scene(self, opened: Opened, *, refreshes: bool) -> None:
+    def update_scene(self, opened: OpenedScene, *, refreshes: bool) -> None:
         """Look at a newer state of the scene; ``refreshes``: draw it, as large, even if nothing
         else has changed."""
         self.opened = opened

@@ -18,7 +18,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.export.choose_path import framing_points, orbit_cameras_around
 from dyngs.human.avatar.scene import as_human_scene
 from dyngs.models.views import training_cameras
-from dyngs.runs.opened import Opened, scene_of_split
+from dyngs.runs.opened import OpenedScene, scene_of_split
 
 MAX_FOV = math.radians(160)
 
@@ -55,7 +55,7 @@ class Viewpoint:
     up: np.ndarray
 
 
-def views_of(opened: Opened) -> CapturedViews:
+def views_of(opened: OpenedScene) -> CapturedViews:
     """Return the views of a scene's capture, if there is one; without images where a person is in
     other poses."""
     if opened.captured is None:
@@ -64,7 +64,7 @@ def views_of(opened: Opened) -> CapturedViews:
     return found if opened.as_captured else replace(found, images=None)
 
 
-def _views_of_capture(opened: Opened) -> CapturedViews:
+def _views_of_capture(opened: OpenedScene) -> CapturedViews:
     """Return the views of all splits that show what the scene plays: a person may be filmed in
     other clips, too."""
     if opened.missing is not None:
@@ -90,13 +90,13 @@ def captured_views(
     )
 
 
-def initial_viewpoint(opened: Opened) -> Viewpoint:
+def initial_viewpoint(opened: OpenedScene) -> Viewpoint:
     """Return where to begin: at the first camera of the capture, else where all of the scene is in
     view."""
     return (opened.captured or opened).once("viewpoint", lambda: _viewpoint(opened))
 
 
-def _viewpoint(opened: Opened) -> Viewpoint:
+def _viewpoint(opened: OpenedScene) -> Viewpoint:
     shown = views_of(opened)
     cameras = opened.cameras
     person = as_human_scene(opened.renderable)
@@ -114,13 +114,13 @@ def _viewpoint(opened: Opened) -> Viewpoint:
     return Viewpoint(start, center, float(np.median(apart)), up)
 
 
-def has_timeline(opened: Opened) -> bool:
+def has_timeline(opened: OpenedScene) -> bool:
     """Return whether there are times to choose from, now or later."""
     may_move = opened.in_training and len(opened.renderable.times) > 1
     return may_move or not opened.renderable.is_static or opened.person is not None
 
 
-def nearest_view(opened: Opened, camera: Cameras, time: float) -> int:
+def nearest_view(opened: OpenedScene, camera: Cameras, time: float) -> int:
     """Return which view of the capture is nearest to one camera in position, viewing direction and,
     where the scene moves, time.
 

@@ -31,8 +31,8 @@ from dyngs.io.formats.similarity import AXES
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import write_text
 from dyngs.models.views import training_cameras
-from dyngs.runs.folder import inputs_of
-from dyngs.runs.opened import Opened
+from dyngs.runs.folder import collect_inputs
+from dyngs.runs.opened import OpenedScene
 
 
 def fill_template(page: str, pieces: Mapping[str, str]) -> str:
@@ -76,7 +76,7 @@ class WrittenPage:
 
 
 def write_page(
-    opened: Opened,
+    opened: OpenedScene,
     path: Path,
     *,
     title: str | None = None,
@@ -89,7 +89,7 @@ def write_page(
     ``views``: cameras to begin with and to go through, each a batch of one; without any, those of
     the capture, or around the scene.
     """
-    inputs_of(opened).require_output(path)
+    collect_inputs(opened).require_output(path)
     lists = PackedArrays()
     header = _header(opened, time, views, lists)
     text = _assembled(opened, header, lists, title)
@@ -98,7 +98,7 @@ def write_page(
 
 
 def write_page_folder(
-    opened: Opened,
+    opened: OpenedScene,
     folder: Path,
     *,
     most: int | None = None,
@@ -135,7 +135,7 @@ def write_page_folder(
     return WrittenPage(folder / PAGE, size, header, _notes(opened, header))
 
 
-def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
+def _notes(opened: OpenedScene, header: dict[str, Any]) -> tuple[str, ...]:
     notes: list[str] = []
     if opened.missing is not None:
         notes.append(
@@ -156,10 +156,10 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _header(
-    opened: Opened, time: float, views: Sequence[Cameras], lists: PackedArrays
+    opened: OpenedScene, time: float, views: Sequence[Cameras], lists: PackedArrays
 ) -> dict[str, Any]:
     views, target = _beginning(opened, views)
-    found = opened.renderable.page_lists()
+    found = opened.renderable.page_data()
     if found is not None:
         told, own = found
         for name, (rows, bits) in own.items():
@@ -171,7 +171,7 @@ def _header(
     return told | _shown(opened, time, views, target)
 
 
-def _beginning(opened: Opened, views: Sequence[Cameras]) -> tuple[Sequence[Cameras], list[float]]:
+def _beginning(opened: OpenedScene, views: Sequence[Cameras]) -> tuple[Sequence[Cameras], list[float]]:
     """Return the cameras to begin with and to go through, each a batch of one, and the point to
     look at: ``views`` if there are any, else those of the capture, else around the scene."""
     cameras = opened.cameras
@@ -193,7 +193,7 @@ def _beginning(opened: Opened, views: Sequence[Cameras]) -> tuple[Sequence[Camer
 
 
 def _shown(
-    opened: Opened, time: float, views: Sequence[Cameras], target: list[float]
+    opened: OpenedScene, time: float, views: Sequence[Cameras], target: list[float]
 ) -> dict[str, Any]:
     upward = np.array(AXES["z"]) if opened.up is None else opened.up[0]
     return {
@@ -226,7 +226,7 @@ def _view(camera: Cameras) -> dict[str, Any]:
 
 
 def _assembled(
-    opened: Opened, header: dict[str, Any], lists: PackedArrays, title: str | None
+    opened: OpenedScene, header: dict[str, Any], lists: PackedArrays, title: str | None
 ) -> str:
     """Return the text of the page. All that stems from a run is escaped; scripts are allowed by
     their hash alone."""
