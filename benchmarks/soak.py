@@ -178,7 +178,11 @@ def forked(
     try:
         meet(pid, wrap_read_errors)
         status = _waited(pid)
-        counted = os.read(wrap_read_errors, 64) if select.select([wrap_read_errors], [], [], 0)[0] else b""
+        counted = (
+            os.read(wrap_read_errors, 64)
+            if select.select([wrap_read_errors], [], [], 0)[0]
+            else b""
+        )
     finally:
         os.close(wrap_read_errors)
     said = errors.read_text(errors="replace")

@@ -141,10 +141,10 @@ def list_choices(annotation: Any) -> list[str]:
 
 
 def default_text(info: FieldInfo) -> str:
-    return "" if info.default is PydanticUndefined else as_written(info.default)
+    return "" if info.default is PydanticUndefined else format_yaml_value(info.default)
 
 
-def as_written(value: object) -> str:
+def format_yaml_value(value: object) -> str:
     """Return a value as one writes it in YAML."""
     match value:
         case Enum():
@@ -154,7 +154,7 @@ def as_written(value: object) -> str:
         case None:
             return "null"
         case list() | tuple():
-            return f"[{', '.join(as_written(item) for item in value)}]"
+            return f"[{', '.join(format_yaml_value(item) for item in value)}]"
         case float():
             return f"{value:g}"
         case _:

@@ -19,13 +19,13 @@ from pydantic import TypeAdapter
 from dyngs.api.budget.size import has_file
 from dyngs.config import Config
 from dyngs.config.io import find_preset, load_config, load_resolved
-from dyngs.core.errors import DyngsError, format_one_line, show
+from dyngs.core.errors import DyngsError, format_one_line, log_info
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.view_scores import SceneRenderer
-from dyngs.models.kind import PredictsScenes, capability, kind_of
+from dyngs.models.kind import PredictsScenes, capability, find_kind
 from dyngs.models.views import evaluation_background
 from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.folder import EXPORT_FOLDER
@@ -119,7 +119,7 @@ class ModelComparison:
             try:
                 config = load_config(file, words)
                 validate_limits(config)
-                problem = kind_of(config.model).refusal(capture)
+                problem = find_kind(config.model).refusal(capture)
                 if capability(config.model, PredictsScenes) is not None:
                     problem = "is a network, which is trained on many people"
             except DyngsError as error:
@@ -177,10 +177,10 @@ class ModelComparison:
             if isinstance(result, DyngsError):
                 left_out[study_scene.name] = str(result)
                 del study_scenes[study_scene.name]
-                show(f"{study_scene.name}: left out: {result}")
+                log_info(f"{study_scene.name}: left out: {result}")
             else:
                 done = f"{result.steps:,} steps in {result.seconds:.0f} s"
-                show(f"{study_scene.name}: {result.psnr:.2f} dB, {done}")
+                log_info(f"{study_scene.name}: {result.psnr:.2f} dB, {done}")
         if not study_scenes:
             name, problem = next(iter(left_out.items()))
             raise DyngsError(f"no model could be trained; {name}: {problem}")
@@ -195,7 +195,7 @@ class ModelComparison:
         if not (self.out / "points" / f"{folder.name}.json").is_file():
             said_path = self.out / "said" / f"{folder.name}.txt"
             said_path.parent.mkdir(parents=True, exist_ok=True)
-            show(f"training {folder.name}: {self.limit}")
+            log_info(f"training {folder.name}: {self.limit}")
             with said_path.open("a", encoding="utf-8") as said, redirect_stdout(said):
                 train_to_end(config, folder, [QualityCurve(self, folder)])
             side = load_resolved(folder).data.longest_side

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field, TypeAdapter
 
-from dyngs.core.errors import counted, show
+from dyngs.core.errors import format_count, log_info
 from dyngs.core.metrics import load_lpips
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
@@ -184,7 +184,7 @@ class SceneMeasurer:
             groups = [[]]
         for group in groups:
             together = [0, *group]
-            show(f"timing {counted(len(together), 'scene')} in turn")
+            log_info(f"timing {format_count(len(together), 'scene')} in turn")
             drawn = [self._drawn(study_scenes[i].run_dir, study_scenes[i].make()) for i in together]
             loader = drawn[0][1]
             images = [loader[i] for i in evenly_spaced(len(loader), self.timed_views)]

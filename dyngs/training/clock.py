@@ -17,7 +17,7 @@ from functools import partial
 from statistics import fmean
 
 from dyngs.config import Config
-from dyngs.models.schedule import image_divisor, scaled
+from dyngs.models.schedule import image_divisor, scale_step
 
 FIXED, PER_MEGAPIXEL, PER_GAUSSIAN = 6.0, 300.0, 7e-4
 """Cost of a step: of any one, of 1e6 pixels that are drawn, of a Gaussian. Milliseconds on two
@@ -150,7 +150,7 @@ class TimeForecast:
         detail for more; at most up to the configured cap.
         """
         now = self._marks[-1]
-        stop = scaled(config.strategy.stop, config.train.steps)
+        stop = scale_step(config.strategy.stop, config.train.steps)
         if now.step >= stop:
             return now.num_gaussians
         added = max(now.num_gaussians - since.num_gaussians, 0) / max(now.step - since.step, 1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dyngs.config import Config
 from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
-from dyngs.models.kind import HasGaussians, HasSizeLimit, capability, kind_of
+from dyngs.models.kind import HasGaussians, HasSizeLimit, capability, find_kind
 
 # Fraction of the limit that is kept free for the random Gaussians with which motion begins
 RANDOM_FRACTION = 0.1
@@ -21,7 +21,7 @@ FEWEST = 500  # Fewest Gaussians that a limit on the size must have room for
 
 def validate_limits(config: Config) -> None:
     """Raise DyngsError where limits or choices of ``config`` contradict it or each other."""
-    uses = kind_of(config.model).uses
+    uses = find_kind(config.model).uses
     for key, value in _given(config).items():
         if key not in uses:
             raise DyngsError(

@@ -9,7 +9,7 @@ import torch
 from dyngs.capture.initial_points import with_first_points
 from dyngs.capture.inspection import before_training
 from dyngs.config import Config, PointsInit, RandomInit
-from dyngs.core.errors import warn
+from dyngs.core.errors import log_warning
 from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader, usual_threads
 from dyngs.data.read import read_capture, require_images
@@ -17,11 +17,11 @@ from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.initialization import InitialGaussians, scene_geometry
 from dyngs.gaussians.model import GaussianModel
-from dyngs.models.kind import HasMotion, StartContext, kind_of
+from dyngs.models.kind import HasMotion, StartContext, find_kind
 from dyngs.models.views import (
     background_colour,
-    resolve_background,
     background_coloured_fraction,
+    resolve_background,
     training_cameras,
     training_times,
 )
@@ -75,7 +75,7 @@ def build_trainer(
             capture.splits["train"], config.data, with_maps=True, decoding_threads=usual_threads()
         )
     priors = PriorLosses()
-    kind = kind_of(config.model)
+    kind = find_kind(config.model)
     if "train.priors" in kind.uses:
         moves = isinstance(kind, HasMotion) and len(set(training_times(capture))) > 1
         priors = load_priors(config, capture, images.views, moves=moves)
@@ -150,7 +150,7 @@ def add_initial_points(capture: Capture, config: Config, *, log_messages: bool =
     """Return ``capture`` as ``prepared`` does, for a kind whose Gaussians begin at points; others
     need none."""
     lines: list[str] = []
-    if "init" in kind_of(config.model).uses:
+    if "init" in find_kind(config.model).uses:
         init = config.init
         if isinstance(init, PointsInit):
             capture, lines = with_first_points(capture, config.data, init)
@@ -165,7 +165,7 @@ def add_initial_points(capture: Capture, config: Config, *, log_messages: bool =
                 else [f"init.kind=random draws points around the origin, but {why}: give auto"]
             )
     for line in [*lines, *before_training(capture)] if log_messages else []:
-        warn(line)
+        log_warning(line)
     return capture
 
 

@@ -21,7 +21,7 @@ from dyngs.core.tensor_checks import require_indices
 from dyngs.data.capture import Capture
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.models.checkpoint import CONFIG_ADVICE, Checkpoint, CheckpointInfo, checkpoint_settings
-from dyngs.models.model import Correction, LossInput, Loss, Model, RenderedView
+from dyngs.models.model import Correction, Loss, LossInput, Model, RenderedView
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour
@@ -246,7 +246,7 @@ class Trainer(Generic[M]):
             model.replace_scene(model.scene.without_masks())
             model.stop_growing()
         if edit.kept is not None:
-            model.keep(edit.kept, self.done)
+            model.select_gaussians(edit.kept, self.done)
         if edit.masks is not None:
             model.replace_scene(replace(model.scene, masks=edit.masks))
 

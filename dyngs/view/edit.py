@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dyngs.api.edit import write_part
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.geometry import look_at, perpendicular, with_poses
 from dyngs.export.edit.crop import Box, gaussians_in_region
 from dyngs.gaussians.scene import GaussianScene
@@ -42,7 +42,11 @@ def world_of(opened: OpenedScene) -> Similarity:
 
 
 def pick_point(
-    opened: OpenedScene, origin: np.ndarray, direction: np.ndarray, pixel: float, request: ViewRequest
+    opened: OpenedScene,
+    origin: np.ndarray,
+    direction: np.ndarray,
+    pixel: float,
+    request: ViewRequest,
 ) -> np.ndarray | None:
     """Return the point (3,) of the scene that a ray meets, at the depth that is drawn there; None:
     it meets nothing.
@@ -135,7 +139,7 @@ class EditState:
             lines.append(f"distance: **{length:.4g} {'m' if self.whole.scaled else 'units'}**")
             lines.append(f'`--scale "{texts[0]} {texts[1]} LENGTHm"`')
         lines.append(f"box: `--crop {low} {high}`")
-        total = counted(len(self.whole.scene), "Gaussian")
+        total = format_count(len(self.whole.scene), "Gaussian")
         lines.append(f"{len(self.rows):,} of {total} left")
         return "\n\n".join(lines)
 
@@ -279,7 +283,9 @@ class EditControls:
     def _delete(self, *, inside: bool) -> None:
         gone = self.editing.delete(inside=inside)
         self._show()
-        self._connection.notify("Deleted", f"{counted(gone, 'Gaussian')}; Undo brings them back")
+        self._connection.notify(
+            "Deleted", f"{format_count(gone, 'Gaussian')}; Undo brings them back"
+        )
 
     def _undo(self) -> None:
         if self.editing.steps:

@@ -18,7 +18,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.kind import PredictsScenes, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
-from dyngs.runs.opened import Captured, OpenedScene
+from dyngs.runs.opened import OpenedScene, SourceCapture
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
 from dyngs.view.server import ServerOptions, Viewer, free_port, require_viser
@@ -120,7 +120,7 @@ def opened_training(trainer: Trainer[Any]) -> OpenedScene:
     config = trainer.config
     views = trainer.images.views
     shown = captured_views(views, config.data, trainer.images)
-    captured = Captured(config.data, trainer.capture)
+    captured = SourceCapture(config.data, trainer.capture)
     captured.once("views", lambda: shown)
     with torch.no_grad():
         scene = _shell(trainer.model.scene, background_colour(trainer.background))

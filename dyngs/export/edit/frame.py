@@ -73,7 +73,9 @@ def parse_number(text: str, option: str) -> float:
     except ValueError:
         found = math.nan
     if not math.isfinite(found):
-        raise DyngsError(f"{option}: {format_one_line(repr(text), 60)} is no number; write it as 1.25")
+        raise DyngsError(
+            f"{option}: {format_one_line(repr(text), 60)} is no number; write it as 1.25"
+        )
     return found
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.export.splat_files import find_up_direction, splats_at
 from dyngs.gaussians.rendering import splat_options
 from dyngs.io.formats.formats import format_to_read, read_splats
@@ -41,7 +41,7 @@ def merge_scenes(
             tell(
                 f"{file}: was trained for another low-pass filter ({other.mode.value}); it is drawn as the rest is"
             )
-        tell(f"{file}: {counted(len(gaussians), 'Gaussian')} added")
+        tell(f"{file}: {format_count(len(gaussians), 'Gaussian')} added")
         parts.append(gaussians.detach())
     degree = max(part.sh_degree for part in parts)
     return replace(splat, gaussians=joined([with_degree(part, degree) for part in parts]))

@@ -15,7 +15,7 @@ import numpy as np
 
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
-from dyngs.core.errors import counted
+from dyngs.core.errors import format_count
 from dyngs.data.geometry import look_at_point
 from dyngs.export.choose_path import (
     framing_points,
@@ -116,7 +116,7 @@ def write_page_folder(
     require_new_folder(folder)
     lists = PackedArrays(chunked=True)
     if most is not None or opened.renderable.has_levels:
-        levelled = LevelScene.of(opened.renderable, most)
+        levelled = LevelScene.from_scene(opened.renderable, most)
         colour = levelled.scene.colour
         header = add_levels(levelled.levels, colour, lists) | _drawn(levelled.options)
         header["levels"]["most"] = most
@@ -171,7 +171,9 @@ def _header(
     return told | _shown(opened, time, views, target)
 
 
-def _beginning(opened: OpenedScene, views: Sequence[Cameras]) -> tuple[Sequence[Cameras], list[float]]:
+def _beginning(
+    opened: OpenedScene, views: Sequence[Cameras]
+) -> tuple[Sequence[Cameras], list[float]]:
     """Return the cameras to begin with and to go through, each a batch of one, and the point to
     look at: ``views`` if there are any, else those of the capture, else around the scene."""
     cameras = opened.cameras
@@ -248,7 +250,7 @@ def _assembled(
         "fetched": " connect-src 'self';" if fetches else "",  # nothing, but for its parts
     }
     size = len(page) + sum(len(x) for x in fixed.values())
-    about = counted(header["count"], "triangle" if "texture" in header else "Gaussian")
+    about = format_count(header["count"], "triangle" if "texture" in header else "Gaussian")
     return fill_template(
         page, fixed | {"about": about + ("" if fetches else f", {size / 1e6:.1f} MB")}
     )
