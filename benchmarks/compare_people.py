@@ -29,7 +29,7 @@ from dyngs.cli.output import numbers_table, print_messages, print_tables
 from dyngs.config import DataConfig
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.conventions import ignore_progress
-from dyngs.core.errors import DyngsError, counted, show
+from dyngs.core.errors import DyngsError, format_count, log_info
 from dyngs.core.metrics import psnr, ssim
 from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
@@ -118,7 +118,9 @@ def compare_people(bench: PeopleBench, out: Path) -> Table:
                 own = {key: getattr(given, key) for key in changed}
                 data = config.data.model_copy(update={"root": person.root, "test_every": 0} | own)
                 kind = require_network(config, Path(name))
-                make = partial(kind.networks()[1], config, checkpoint, data, show, ignore_progress)
+                make = partial(
+                    kind.networks()[1], config, checkpoint, data, log_info, ignore_progress
+                )
                 views = make().views
                 methods: dict[str, Method] = {name: partial(_predicted, make, False)}
                 if config.model.kind == "human_predictor":

@@ -29,7 +29,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import split_views
 from dyngs.evaluate.view_scores import right_half_scores
-from dyngs.gaussians.colour.network import fit_affine_colour, apply_affine_colour
+from dyngs.gaussians.colour.network import apply_affine_colour, fit_affine_colour
 from dyngs.io.write import write_image
 from dyngs.models.views import evaluation_background
 from dyngs.runs.checkpoint import load_run

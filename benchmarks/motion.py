@@ -61,7 +61,6 @@ from dyngs.gaussians.initialization import InitialValues, initial_gaussians, sce
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import RateSchedule
-from dyngs.gaussians.initialization import InitialValues, initial_gaussians, surroundings
 from dyngs.gaussians.static_training import StaticTraining
 from dyngs.models.static_section import StaticModel
 from dyngs.models.views import training_cameras, training_times

@@ -22,11 +22,17 @@ from statistics import median
 
 import torch
 
-from dyngs.api.prune import file_of, prune_run, prune_to_loss
+from dyngs.api.prune import export_folder, prune_run, prune_to_loss
 from dyngs.api.scene_file import write_scene_file
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.evaluate.report import RunMetrics, compared, evaluate_run, scene_of_split, split_views
+from dyngs.evaluate.report import (
+    RunMetrics,
+    compare_runs,
+    evaluate_run,
+    scene_of_split,
+    split_views,
+)
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.stored_file import read_scene, tensors_to_store

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from dyngs.cli.output import numbers_table, print_tables
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import counted, wrap_read_errors
+from dyngs.core.errors import format_count, wrap_read_errors
 from dyngs.core.state import move_fields_to
 from dyngs.io.numpy_files import read_arrays
 from dyngs.ops.native import active_isa, kernel_threads

@@ -47,7 +47,7 @@ import torch
 from dyngs.cli import main as dyngs
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.runs.checkpoint import checkpoint_paths, has_only_scene_file, load_run
-from dyngs.runs.folder import REQUESTED_NAME, EXPORT_FOLDER
+from dyngs.runs.folder import EXPORT_FOLDER, REQUESTED_NAME
 
 OPERATIONS = (
     "os.rename",

@@ -20,8 +20,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from browser import Browser, Page, missing
 
-from dyngs.view.server import Browsing, ServerOptions, Viewer
-from dyngs.view.source import first_of, open_source
+from dyngs.view.server import BrowserConnection, ServerOptions, Viewer
+from dyngs.view.source import load_first, open_source
 
 WARM_UP = 3.0
 """Seconds before measuring, in which the image finds its size."""
@@ -60,7 +60,7 @@ def rows(path: Path, size: tuple[int, int], seconds: float) -> list[str]:
     source = open_source(path)
     found = []
     with (
-        Viewer(source, first_of(source), ServerOptions()) as viewer,
+        Viewer(source, load_first(source), ServerOptions()) as viewer,
         Browser(timeout=60) as browser,
     ):
         page = browser.open(None, *size)
