@@ -22,7 +22,7 @@ CHOICES = ("auto", "cpu", "cuda")
 OLDEST = (7, 5)  # compute capability of the oldest supported GPUs
 
 _TORCH = "install a torch for CUDA, see pytorch.org"
-_BUILD = "install dyngs with `pip install . -C cmake.define.DYNGS_CUDA=ON`, which needs nvcc (docs/gpu.md)"
+_BUILD = "install dyngs with `pip install . -C cmake.define.DYNGS_CUDA=ON`, which needs nvcc (`dyngs docs gpu`)"
 
 
 def select_device(choice: str) -> torch.device:

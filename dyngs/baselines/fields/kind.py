@@ -49,7 +49,7 @@ class NgpModel(FieldModel):
 
     kind: Literal["ngp"] = Field(
         default="ngp",
-        description="radiance field: hash grid and small networks (Instant-NGP; docs/family.md)",
+        description="radiance field: hash grid and small networks (Instant-NGP)",
     )
 
 
@@ -57,7 +57,7 @@ class NerfModel(FieldModel):
     """NeRF (Mildenhall et al. 2020)."""
 
     kind: Literal["nerf"] = Field(
-        default="nerf", description="radiance field: two large networks (NeRF; docs/family.md)"
+        default="nerf", description="radiance field: two large networks (NeRF)"
     )
 
 

@@ -18,7 +18,7 @@ class BgTriangleModel(ModelSection):
 
     kind: Literal["bg_triangle"] = Field(
         default="bg_triangle",
-        description="curved triangles with sharp edges (BG-Triangle; docs/family.md)",
+        description="curved triangles with sharp edges (BG-Triangle)",
     )
     max_triangles: int = Field(
         default=4000, ge=4, le=1_000_000, description="maximum number of triangles"
