@@ -30,7 +30,6 @@ from dyngs.data.scene_space import (
     MIN_VIEWS,
     camera_extent,
     cube_half_side,
-    camera_extent,
     cube_mismatch_reason,
     sample_points_in_frusta,
 )
