@@ -62,7 +62,7 @@ def test_a_gpu_that_can_be_used_is(machine: pytest.MonkeyPatch) -> None:
     assert gpu_status() == {
         "torch for": "CUDA 13.0",
         "kernels for GPUs": "built",
-        "driver": "there",
+        "driver": "found",
         "GPU": "GPU, 8 GB",
     }
 
@@ -70,7 +70,8 @@ def test_a_gpu_that_can_be_used_is(machine: pytest.MonkeyPatch) -> None:
 def test_a_torch_for_the_cpu_alone(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(torch.version, "cuda", None)
     assert re.search(
-        r"device cuda: this torch \(.*\) is built without CUDA: install a torch for CUDA", refused()
+        r"device cuda is not usable: this torch \(.*\) is built without CUDA: install a torch for CUDA",
+        refused(),
     )
     assert gpu_status()["GPU"] == "none"
 
@@ -96,7 +97,7 @@ def test_a_driver_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
     core = SimpleNamespace(runtime_version=lambda: 13000, driver_version=lambda: 12040)
     machine.setattr(device, "cuda_core", lambda: core)
     assert (
-        "built with CUDA 13.0, but the driver knows 12.4 at most: update the driver, or build"
+        "need CUDA 13.0, but the driver supports only 12.4: update the driver, or build"
         in refused()
     )
 
@@ -106,11 +107,11 @@ def test_a_gpu_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
     assert re.search(r"GPU is older than compute capability 7\.5", refused())
 
 
-def test_auto_says_why_only_where_a_gpu_seems_to_be(machine: pytest.MonkeyPatch) -> None:
+def test_auto_explains_cpu_only_with_a_driver(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(device, "has_cuda_core", lambda: False)
     line = cpu_fallback_reason("auto")
     assert line is not None
-    assert line.startswith("computing on the CPU: dyngs was built without")
+    assert line.startswith("training on the CPU: dyngs was built without")
     assert cpu_fallback_reason("cpu") is None
     machine.setattr(device, "has_nvidia_driver", lambda: False)
     assert cpu_fallback_reason("auto") is None
@@ -121,7 +122,7 @@ def test_other_choices_are_refused() -> None:
         select_device("tpu")
 
 
-def test_on_a_gpu_torch_is_told_to_repeat_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_torch_is_deterministic_on_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     """And only there, only inside, and only if that is wanted."""
     told: list[tuple[bool, bool]] = []
     monkeypatch.delenv("CUBLAS_WORKSPACE_CONFIG", raising=False)
@@ -174,7 +175,7 @@ def test_blocks_are_reused_without_page_faults() -> None:
     assert int(after) < int(before) / 10
 
 
-def test_numbers_are_as_they_were_when_they_were_asked_for() -> None:
+def test_readback_is_a_snapshot() -> None:
     x = torch.tensor([1.0, 2.5], requires_grad=True)
     read = AsyncReadback(x)
     with torch.no_grad():

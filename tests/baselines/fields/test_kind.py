@@ -88,7 +88,7 @@ def test_its_surface_is_a_mesh_with_colours(
         (["prune", "RUN", "--out", "OUT/pruned"], "Gaussians"),
     ],
 )
-def test_what_does_not_go_is_refused(
+def test_invalid_arguments_are_refused(
     run: Path, tmp_path: Path, command: list[str], said: str, request: pytest.FixtureRequest
 ) -> None:
     request.getfixturevalue("monkeypatch").setattr("dyngs.baselines.fields.scene.CELLS", 24)
@@ -108,11 +108,11 @@ def test_what_does_not_go_is_refused(
         (["train.exposure=always"], "has no effect with model.kind=ngp"),
         (["camera.refine=always"], "has no effect with model.kind=ngp"),
         (["budget.max_gaussians=10"], "has no effect with model.kind=ngp"),
-        (["model.time=true"], "the images have no times"),
+        (["model.time=true"], "model.time=true needs images at several times"),
         (["model.sizes=huge"], "one of tiny, cpu, published"),
     ],
 )
-def test_what_cannot_be_trained_is_refused(
+def test_unsuitable_captures_are_refused(
     capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], keys: list[str], said: str
 ) -> None:
     assert main(["train", f"data.root={capture}", f"run.dir={tmp_path / 'run'}", *NGP, *keys]) == 2
@@ -135,4 +135,4 @@ def test_one_camera_position_is_refused(
     meta["frames"] = [frame | {"file_path": f"./train/{i}"} for i in range(3)]
     (one / "transforms_train.json").write_text(json.dumps(meta), encoding="utf-8")
     assert main(["train", f"data.root={one}", f"run.dir={tmp_path / 'run'}", *NGP]) == 2
-    assert "single camera position" in capsys.readouterr().err
+    assert "the same camera position" in capsys.readouterr().err

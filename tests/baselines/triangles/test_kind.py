@@ -33,7 +33,7 @@ def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return dyngs.train(config_of(capture, *STEPS, "model.gaussian_steps=300", f"run.dir={folder}"))
 
 
-def test_it_learns_and_keeps_to_its_number(run: Path) -> None:
+def test_training_improves_and_respects_max_triangles(run: Path) -> None:
     assert evaluate_run(run).psnr > 18
     scene = open_run(run).renderable
     assert isinstance(scene, TriangleScene)
@@ -54,7 +54,7 @@ def test_a_run_that_is_cut_ends_with_the_same_bytes(capture: Path, tmp_path: Pat
     assert path.read_bytes() == whole
 
 
-def test_a_file_of_it_is_as_small_as_asked(capture: Path, tmp_path: Path) -> None:
+def test_file_fits_requested_size(capture: Path, tmp_path: Path) -> None:
     """Half of what its 72 values a triangle take at the usual precision: it begins with fewer, and
     is no larger."""
     run = tmp_path / "run"
@@ -72,7 +72,7 @@ def test_a_file_of_it_is_as_small_as_asked(capture: Path, tmp_path: Path) -> Non
 
 def test_a_file_that_is_too_small_is_refused(capture: Path, tmp_path: Path) -> None:
     with pytest.raises(
-        DyngsError, match=r"budget.max_mb=0.005: has no room for 100 triangles; 0.0098 would do"
+        DyngsError, match=r"budget.max_mb=0.005 is too small for 100 triangles; 0.0098 would do"
     ):
         dyngs.train(config_of(capture, "budget.max_mb=0.005", f"run.dir={tmp_path / 'run'}"))
     assert not (tmp_path / "run" / "config.yaml").exists()
@@ -110,7 +110,7 @@ def test_it_is_a_mesh_with_colours(run: Path, tmp_path: Path, suffix: str) -> No
         ),
     ],
 )
-def test_what_does_not_go_is_refused(
+def test_invalid_arguments_are_refused(
     run: Path,
     capture: Path,
     tmp_path: Path,
@@ -127,12 +127,12 @@ def test_what_does_not_go_is_refused(
     assert said in lines[0]
 
 
-def test_points_in_one_place_are_refused(capture: Path, tmp_path: Path) -> None:
+def test_coincident_points_are_refused(capture: Path, tmp_path: Path) -> None:
     same = tmp_path / "capture"
     shutil.copytree(capture, same)
     trimesh.PointCloud(np.zeros((20, 3))).export(same / "points3d.ply")
     more = ("model.gaussian_steps=0", f"run.dir={tmp_path / 'run'}")
-    with pytest.raises(DyngsError, match="first points are all in one place"):
+    with pytest.raises(DyngsError, match="initial points coincide"):
         dyngs.train(config_of(same, *more))
 
 
@@ -144,4 +144,4 @@ def test_a_capture_that_shows_no_surface_is_refused(
     few = ["model.gaussian_steps=2", "run.dir=run"]
     assert main(["train", f"data.root={capture}", "model.kind=bg_triangle", *few]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
-    assert "2 steps of Gaussians show no surface" in line
+    assert "no surface found after 2 steps of Gaussian training" in line
