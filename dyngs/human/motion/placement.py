@@ -46,14 +46,14 @@ def place_like(
     up = up_direction(like)
     unit = like.scale.mean()
     rotation = _turn_between(joints.new_tensor([0.0, 1.0, 0.0]), up)
-    there = moved(clip, rotation, unit, torch.zeros_like(joints[0]), joints[0])
+    there = transform_clip(clip, rotation, unit, torch.zeros_like(joints[0]), joints[0])
     ours, theirs = (_joints_of(x, joints, parents) for x in (there, like))
     shift = theirs[:, 0].mean(0) - ours[:, 0].mean(0)
     rise = (theirs @ up).amin() - (ours @ up).amin()
     return replace(there, trans=there.trans + shift + (rise - shift @ up) * up)
 
 
-def moved(
+def transform_clip(
     clip: MotionClip, rotation: Tensor, unit: float | Tensor, shift: Tensor, pelvis: Tensor
 ) -> MotionClip:
     """Return a clip as it is in the world x -> unit * rotation x + shift; ``pelvis``: (3,) of the
@@ -74,7 +74,7 @@ def rotate_clip_to_y_up(clip: MotionClip, like: MotionClip, joints: Tensor) -> M
     rest, m.
     """
     rotation = _turn_between(up_direction(like), joints.new_tensor([0.0, 1.0, 0.0]))
-    return moved(clip, rotation, 1.0, torch.zeros_like(joints[0]), joints[0])
+    return transform_clip(clip, rotation, 1.0, torch.zeros_like(joints[0]), joints[0])
 
 
 def rest_clip(like: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> MotionClip:

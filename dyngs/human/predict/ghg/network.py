@@ -34,7 +34,7 @@ from dyngs.gaussians.scene import GaussianTimeStep, render_options
 from dyngs.gaussians.schedule import RateSchedule
 from dyngs.human.avatar.observations import FACING_EXPONENT, project_points
 from dyngs.human.avatar.posing import BodyPose, Skeleton, pose_blend_shapes, texel_gaussians
-from dyngs.human.avatar.scene import HumanScene, first_scene
+from dyngs.human.avatar.scene import HumanScene, initial_human_scene
 from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.body.atlas import Texels, atlas_texels
 from dyngs.human.body.body import BodyTemplate
@@ -96,7 +96,7 @@ def atlas_person(person: Person, model: HumanPredictorModel) -> AtlasPerson:
         texels=texels,
         mirror=mirror_texels(texels),
         heights=heights,
-        scene=first_scene(
+        scene=initial_human_scene(
             gaussians, anchors, skeleton, person.motion.clip, pose_blend_shapes(body)
         ),
     )
