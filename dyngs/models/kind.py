@@ -172,8 +172,8 @@ class HasBody(ModelKind):
         self,
         data: DataConfig,
         section: Any,
-        say: Callable[[str], None],
-        report: ReportProgress,
+        log: Callable[[str], None],
+        on_progress: ReportProgress,
     ) -> DataConfig:
         """Return the options of a capture with body parameters: found, and fitted to the
         silhouettes."""

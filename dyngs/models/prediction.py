@@ -118,7 +118,7 @@ class Predictor(ABC, Generic[N]):
     def chosen(self, count: int) -> list[int]:
         """Return the indices of ``count`` of the views that suit a prediction."""
 
-    def adapt(self, views: Sequence[int], steps: int | None, report: ReportProgress) -> int:
+    def adapt(self, views: Sequence[int], steps: int | None, on_progress: ReportProgress) -> int:
         """Train the network for ``steps`` on these images alone, None: as many as usual; return how
         many these were."""
         if steps:

@@ -193,11 +193,11 @@ def test_a_fitted_capture_says_how_good_it_is(tmp_path: Path, capsys: PrintedOut
     root = write_human_capture(tmp_path / "person", options)
     assert main(["data", "fit", str(root), str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out
-    assert "2 frames; overlap of silhouettes (IoU) on 2 views left out of the fit" in printed
-    assert "taken: the poses as given" in printed, "they are exact"
+    assert "2 frames; silhouette IoU on 2 held-out views" in printed
+    assert "chosen: given poses" in printed, "they are exact"
     assert f"next: dyngs train human data.root={tmp_path / 'out'}" in printed
     report = json.loads((tmp_path / "out" / "fit_report.json").read_text())
-    assert report["taken"] == "the poses as given"
+    assert report["taken"] == "given poses"
     assert set(report["iou_per_frame"]) == {"0", "1"}
     body = str(tmp_path / "out" / "body_train.npz")
     assert main(["data", "motion", body, str(tmp_path / "moves.npz")]) == 0, (
@@ -263,7 +263,7 @@ def test_a_body_file_of_ones_own_is_fitted_trained_and_known_again(
     body, uv = map(str, smpl_files)
     assert main(["data", "fit", str(root), str(fitted), "--template", body, "--uv", uv]) == 0
     printed = capsys.readouterr().out
-    assert printed.startswith("smpl (smpl.npz), 1 frame; overlap of silhouettes")
+    assert printed.startswith("smpl (smpl.npz), 1 frame; silhouette IoU")
     keys = [f"model.body={body}", f"model.uv={uv}"]
     assert (
         printed.splitlines()[-1] == f"next: dyngs train human data.root={fitted} {' '.join(keys)}"

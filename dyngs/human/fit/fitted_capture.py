@@ -157,11 +157,11 @@ def write_fitted_capture(
             "betas": [round(beta, 4) for beta in betas.tolist()],
             "frames": len(fit.motion.clip),
             "taken": chosen.name,
-            "iou": {candidate.name: round(candidate.iou, 4) for candidate in fit.tried},
+            "iou": {candidate.name: round(candidate.iou, 4) for candidate in fit.candidates},
             "views_left_out": fit.num_held_out,
             "new_poses": new_poses and {"iou": new_poses.iou, "iou_moved": new_poses.iou_moved},
             "by_avatar": [
-                {"iou": x.before, "iou_posed": x.after, "views_left_out": x.left_out}
+                {"iou": x.before, "iou_posed": x.after, "views_left_out": x.num_held_out}
                 for x in by_avatar
             ],
             "iou_per_frame": {
@@ -171,7 +171,7 @@ def write_fitted_capture(
             },
         }
         write_text(folder / "fit_report.json", json.dumps(fields, indent=1) + "\n")
-    candidates = ", ".join(f"{candidate.iou:.3f} {candidate.name}" for candidate in fit.tried)
+    candidates = ", ".join(f"{candidate.iou:.3f} {candidate.name}" for candidate in fit.candidates)
     worst = int(np.nanargmin(chosen.per_frame))
     label = "" if body.name == "anny" else f"{_template_label(model, body)}, "
     lines = [

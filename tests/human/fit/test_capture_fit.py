@@ -120,7 +120,7 @@ def test_a_body_file_finds_its_own_shape(
     fit = fit_capture(
         capture.replace(body=wrong), DataConfig(root=root), body, lambda *_: None, effort=effort
     )
-    assert fit.chosen.iou > fit.tried[0].iou + MIN_GAIN
+    assert fit.chosen.iou > fit.candidates[0].iou + MIN_GAIN
     assert body.shape_dirs is not None
     truth, found = (body.vertices + body.shape_dirs @ x for x in (betas, fit.betas))
     size = float(fit.chosen.learned["log_scale"].detach())
@@ -167,7 +167,7 @@ def test_without_given_poses_every_frame_has_its_own(
     fit = fit_capture(
         capture, DataConfig(root=capture.root), default_template(), lambda *_: None, effort=effort
     )
-    assert fit.tried[0].name == "poses found frame by frame"
+    assert fit.candidates[0].name == "frame-by-frame poses"
     assert fit.motion.frames == (0, 1, 2, 3)
     poses = fit.clip.poses
     assert len({tuple(pose.flatten().tolist()) for pose in poses}) == 4
@@ -228,7 +228,7 @@ def as_given(capture: Capture) -> CaptureFit:
     fitting = BodyFit(
         motion.clip, body_discs(body, RESOLUTION), pose_prior(motion.clip, is_given=True)
     )
-    candidate = CandidateFit("the poses as given", fitting.start(), 0.9, (0.9, 0.9))
+    candidate = CandidateFit("given poses", fitting.initial_parameters(), 0.9, (0.9, 0.9))
     return CaptureFit(motion, candidate, (candidate,), 0)
 
 

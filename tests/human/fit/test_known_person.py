@@ -146,9 +146,9 @@ def test_disturbed_poses_are_found_again(
     monkeypatch.setattr(pose_fit, "MAX_WINDOWS", 4)
     start = turned(avatar.clip)
     found = posed(avatar, views, start)
-    assert found.left_out == 2
+    assert found.num_held_out == 2
     assert found.after > found.before + 0.1
-    assert "taken; overlap on 2 views left out of the fit" in found.summary()
+    assert "used; silhouette IoU on 2 held-out views" in found.summary()
     after = found.clip.clip
     assert error(after, avatar.clip)[:2].max() < 0.025 < error(start, avatar.clip).min()
     assert torch.equal(after.poses[2], start.poses[2]), "no image shows that frame"

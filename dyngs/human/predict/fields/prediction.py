@@ -327,19 +327,19 @@ def predictor(
     config: Config,
     checkpoint: Checkpoint,
     data: DataConfig,
-    say: Callable[[str], None],
-    report: ReportProgress,
+    log: Callable[[str], None],
+    on_progress: ReportProgress,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
     body is fitted.
 
-    ``say`` and ``report`` receive the messages and the progress of that fit.
+    ``log`` and ``on_progress`` receive the messages and the progress of that fit.
     """
     model: Any = config.model
     network = NETWORKS[model.kind](torch.Generator())
     load_weights(network, checkpoint)
     if model.body is None:
-        data = ensure_fitted_body(data, only_if_needed=True, say=say, report=report)
+        data = ensure_fitted_body(data, only_if_needed=True, log=log, on_progress=on_progress)
     return FieldPredictor(config, network, read_captured_person(data, template_of(model)), data)
 
 

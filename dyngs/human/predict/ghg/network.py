@@ -509,7 +509,7 @@ class PersonPredictor(Predictor[AtlasNetwork]):
         self,
         views: Sequence[int],
         steps: int | None = None,
-        report: ReportProgress = report_nothing,
+        on_progress: ReportProgress = report_nothing,
     ) -> int:
         """Train the network until its prediction shows the images better that it is predicted
         from."""
@@ -524,7 +524,7 @@ class PersonPredictor(Predictor[AtlasNetwork]):
             loss = _images_error(scene, time_steps, images, self.background, self.config)[0]
             if not updated(optimizer, self.network, loss, rate * (1.0 - step / steps)):
                 break
-            report("training on the images", step + 1, steps)
+            on_progress("training on the images", step + 1, steps)
         return steps
 
     def run_config(self, views: Sequence[int]) -> Config:
@@ -622,19 +622,19 @@ def predictor(
     config: Config,
     checkpoint: Checkpoint,
     data: DataConfig,
-    say: Callable[[str], None],
-    report: ReportProgress,
+    log: Callable[[str], None],
+    on_progress: ReportProgress,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
     body is fitted.
 
-    ``say`` and ``report`` receive the messages and the progress of that fit.
+    ``log`` and ``on_progress`` receive the messages and the progress of that fit.
     """
     model: Any = config.model
     network = new_network(model, torch.Generator())
     mean = load_network(network, checkpoint, model.resolution)
     data = ensure_fitted_body(
-        data, human_options(model), only_if_needed=True, say=say, report=report
+        data, human_options(model), only_if_needed=True, log=log, on_progress=on_progress
     )
     person = read_atlas_person(data, model, load_template(human_options(model)))
     return PersonPredictor(config, network, mean, person, data)

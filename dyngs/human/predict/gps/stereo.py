@@ -447,8 +447,8 @@ def predictor(
     config: Config,
     checkpoint: Checkpoint,
     data: DataConfig,
-    say: Callable[[str], None],
-    report: ReportProgress,
+    log: Callable[[str], None],
+    on_progress: ReportProgress,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the capture of ``data``."""
     network = GpsNetwork(torch.Generator())
