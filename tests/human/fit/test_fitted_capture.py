@@ -67,7 +67,7 @@ def test_a_capture_is_fitted_once(data: DataConfig) -> None:
     assert "fitted to the silhouettes first" in said[0]
     again = ensure_fitted_body(data, log=said.append)
     assert again == fitted
-    assert "the fit of before" in said[-1]
+    assert "using the cached fit" in said[-1]
 
 
 @pytest.fixture
@@ -157,9 +157,7 @@ def test_a_plain_clip_gets_masks_and_loses_empty_frames(tmp_path: Path) -> None:
     assert capture.format == FORMAT
     assert capture.has_alpha
     assert [view.name for view in capture.splits["train"]] == [f"f{i:02d}" for i in range(2, 12)]
-    assert any(
-        "2 frames in which hardly anybody is seen are left out, first f00" in line for line in said
-    )
+    assert any("skipped 2 frames with (almost) empty masks, first f00" in line for line in said)
 
 
 def test_photos_and_found_masks_are_written_apart(tmp_path: Path) -> None:

@@ -59,9 +59,9 @@ def test_the_template_gets_the_shape(tmp_path: Path) -> None:
 
 
 def test_others_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match="no fitted person there"):
+    with pytest.raises(DyngsError, match="no fitted body"):
         read_known_shape(tmp_path, default_template())
-    with pytest.raises(DyngsError, match="of another template"):
+    with pytest.raises(DyngsError, match="another template than"):
         read_known_shape(fitted(tmp_path / "b", "smplx"), default_template())
 
 

@@ -184,8 +184,8 @@ class EgHumanNerf(FieldNetwork):
         # Images in which the sample is occluded, unless it is occluded in all.
         excluded = 1e4 * (hidden & ~hidden.all(0))
         directions = rays.directions.repeat_interleave(near.shape[1], 0)
-        directions = relative_directions(directions, points, features.sources.centers)
-        facts = torch.cat([hidden[..., None].to(directions), directions], -1)
+        relative = relative_directions(directions, points, features.sources.centers)
+        facts = torch.cat([hidden[..., None].to(relative), relative], -1)
         logits = self.attention(torch.cat([pixel_features.features, facts], -1))[..., 0]
         weights = (logits - excluded).softmax(0)
         known_here = [

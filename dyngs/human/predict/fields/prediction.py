@@ -30,7 +30,6 @@ from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
 from dyngs.human.predict.gps.rectification import (
     MIN_ANGLE,
     angle_between_views,
-    moments,
     spread,
     spread_around_person,
 )
@@ -284,7 +283,7 @@ class FieldLearner(Learner[FieldNetwork]):
     def _views(self, person: Person, generator: torch.Generator) -> tuple[list[int], int]:
         """Choose source views of one time step, every other time evenly around the person, and a
         target view."""
-        rings = [ring for ring in moments(person.views).values() if len(ring) > FEWEST_VIEWS]
+        rings = [ring for ring in views_by_time(person.views).values() if len(ring) > FEWEST_VIEWS]
         ring = rings[random_index(len(rings), generator)]
         max_count = min(self.section.source_views, len(ring) - 1)
         count = FEWEST_VIEWS + random_index(max_count - FEWEST_VIEWS + 1, generator)
@@ -299,7 +298,7 @@ class FieldLearner(Learner[FieldNetwork]):
     def _open(self, data: DataConfig) -> Person:
         """Return a person to train on. Raises DyngsError: too few views, or no depth maps."""
         captured = read_captured_person(data, self._template)
-        if all(len(ring) <= FEWEST_VIEWS for ring in moments(captured.views).values()):
+        if all(len(ring) <= FEWEST_VIEWS for ring in views_by_time(captured.views).values()):
             raise DyngsError(f"{data.root}: training needs a time step with three or more views")
         if self.network.needs_depth and any(view.depth_path is None for view in captured.views):
             raise DyngsError(

@@ -364,8 +364,8 @@ class GpsPredictor(Predictor[GpsNetwork]):
         model = preset.model.model_copy(
             update={name: getattr(self.config.model, name) for name in shared_keys}
         )
-        views = all_views({k: x for k, x in self._capture.splits.items() if k != "pose"})
-        times = distinct_times(views).values()
+        filmed = all_views({k: x for k, x in self._capture.splits.items() if k != "pose"})
+        times = distinct_times(filmed).values()
         data = self.data_of_moment(self.views[views[0]].time, times)
         return preset.model_copy(update={"data": data, "model": model})
 
