@@ -251,7 +251,7 @@ def test_poses_that_views_gain_nothing_from_stay_for_good(
     trainer = assemble(tiny(capture, steps=240))
     given = human(trainer).clip.poses.clone()
     lines = [trainer.step().finding or "" for _ in range(12)]
-    assert lines[9].startswith("poses stay")
+    assert lines[9].startswith("body poses not refitted")
     resumed = assemble(tiny(capture, steps=240))
     resumed.restore(trainer.checkpoint())
     assert all(resumed.step().finding is None for _ in range(4)), "it is not tried again"

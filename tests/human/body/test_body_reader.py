@@ -275,8 +275,8 @@ def with_parents(change: dict[int, int]) -> Arrays:
 
 
 WRONG: dict[str, tuple[Arrays, str]] = {
-    "cycle": (with_parents({4: 7, 7: 4}), "list parents before"),
-    "two roots": (with_parents({5: -1}), "list parents before"),
+    "cycle": (with_parents({4: 7, 7: 4}), "parents before"),
+    "two roots": (with_parents({5: -1}), "parents before"),
     "numbering": (
         changed("kintree_table", lambda x: with_entry(x, (1, 4), 5)),
         "must number joints",

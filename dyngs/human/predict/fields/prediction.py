@@ -32,6 +32,7 @@ from dyngs.human.predict.gps.rectification import (
     angle_between_views,
     spread,
     spread_around_person,
+    views_by_time,
 )
 from dyngs.human.predict.keys import FieldPredictorModel, PredictedFieldModel
 from dyngs.human.predict.people import (

@@ -73,10 +73,10 @@ def test_the_cells_hold_the_body_and_nothing_far_away(
     """What two opposite images leave open is closed by the bones."""
     for views in ((0, 2, 4), (0, 4)):
         own = known(network, person, views)
-        space, occupied = own.own
+        space, occupied = own.extra
         cells = (space.unit(own.body.vertices) * space.cells).long()
         x, y, z = cells.unbind(1)
-        shown = (own.seen.alpha(own.body.vertices) > 0.5).all(0)
+        shown = (own.features.alpha(own.body.vertices) > 0.5).all(0)
         assert float(shown.float().mean()) > 0.5, "at 40 px many vertices lie on the outline"
         assert bool(occupied[0, z, y, x][shown].all())
         assert 0.001 < float(occupied.float().mean()) < 0.15
