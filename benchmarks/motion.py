@@ -67,7 +67,7 @@ from dyngs.models.views import training_cameras, training_times
 from dyngs.ops.adam import Count
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths
-from dyngs.training.new_trainer import GaussianTrainer, assemble
+from dyngs.training.new_trainer import GaussianTrainer, build_trainer
 
 PRESET = Path(__file__).parents[1] / "configs" / "dynamic.yaml"
 REST = 1.0
@@ -172,7 +172,7 @@ class TrueMotion(DeformationField):
 class OracleTraining(StaticTraining):
     """Training of colours and Gaussians while the motion is given."""
 
-    moves_by = ("true motion", "optim")
+    deformation_name = ("true motion", "optim")
 
     def __init__(self, steps: int) -> None:
         super().__init__(FilterUpdate())
@@ -191,7 +191,7 @@ def oracle(name: SceneName, config: Config, seed: int = 0) -> GaussianTrainer:
     sizes = config.train.model_copy(update={"initial_downscale": 1})
     config = config.model_copy(update={"model": model, "init": init, "train": sizes})
     capture = read_capture(config.data)  # in the unit of the files, in which the true motion is
-    trainer = assemble(config, capture)
+    trainer = build_trainer(config, capture)
     points, colours, labels = surface_points(name, capture.splits["train"], seed)
     start = replace(scene_geometry(capture), points=points, points_rgb=colours)
     generator = torch.Generator().manual_seed(seed)

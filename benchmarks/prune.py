@@ -22,11 +22,11 @@ from statistics import median
 
 import torch
 
-from dyngs.api.prune import file_of, prune_run, prune_within
+from dyngs.api.prune import file_of, prune_run, prune_to_loss
 from dyngs.api.scene_file import write_scene_file
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.evaluate.report import Cost, compared, evaluate_run, scene_of_split, split_views
+from dyngs.evaluate.report import RunMetrics, compared, evaluate_run, scene_of_split, split_views
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.runs.stored_file import drawable, read_scene
@@ -49,7 +49,7 @@ ROWS = {
 }
 
 
-def line(name: str, run: Path, cost: Cost, before: Cost, threads: int) -> str:
+def line(name: str, run: Path, cost: RunMetrics, before: RunMetrics, threads: int) -> str:
     """Return a row of the table without its last column."""
     test = evaluate_run(run, threads=threads).psnr
     faster = cost.fps / before.fps
@@ -70,7 +70,7 @@ def promises(given: argparse.Namespace) -> None:
         if not checkpoint_paths(out):
             overrides = (*given.overrides, f"run.threads={given.threads}")
             began = time.perf_counter()
-            promise = prune_within(given.run_dir, out, most, overrides)
+            promise = prune_to_loss(given.run_dir, out, most, overrides)
             print(f"\n{promise}\n{time.perf_counter() - began:.0f} s\n", flush=True)
         before, after = compared([given.run_dir, file_of(out)], given.threads)
         print(line(f"{most:g} dB allowed", file_of(out), after, before, given.threads), end="")

@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from browser import Browser, Page, missing
 
-from dyngs.view.server import Browsing, Serving, Viewer
+from dyngs.view.server import Browsing, ServerOptions, Viewer
 from dyngs.view.source import first_of, open_source
 
 WARM_UP = 3.0
@@ -59,7 +59,7 @@ def rows(path: Path, size: tuple[int, int], seconds: float) -> list[str]:
     """Return a row of Markdown for each way of looking at a run or file."""
     source = open_source(path)
     found = []
-    with Viewer(source, first_of(source), Serving()) as viewer, Browser(timeout=60) as browser:
+    with Viewer(source, first_of(source), ServerOptions()) as viewer, Browser(timeout=60) as browser:
         page = browser.open(None, *size)
         page.driven.add_init_script(COUNT_UPLOADS)
         page.driven.goto(viewer.link)

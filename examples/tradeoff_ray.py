@@ -17,7 +17,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from dyngs.study.runs import done_in_turn
+from dyngs.study.runs import run_tasks
 
 
 def measured(words: list[str], run: str) -> tuple[int, str]:
@@ -44,7 +44,7 @@ def main() -> int:
     words += ["--threads", str(arguments.cpus)]
     runs = [str(run.absolute()) for run in arguments.runs]
     failed = False
-    for run, result in done_in_turn(partial(measured, words), runs, arguments.cpus):
+    for run, result in run_tasks(partial(measured, words), runs, arguments.cpus):
         code, said = result if isinstance(result, tuple) else (2, str(result))
         failed |= code != 0
         print(f"{run}: {said}", flush=True)

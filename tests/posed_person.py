@@ -19,7 +19,7 @@ from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.body.skinning import apply_transforms, joint_transforms
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import MotionClip
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 
 WHITE = torch.ones(3)
 SIZE = 64
@@ -55,7 +55,7 @@ def person_and_cameras(person: Path) -> tuple[HumanScene, list[Cameras]]:
         train=TrainConfig(steps=10),
         run=RunConfig(threads=1),
     )
-    trainer = assemble(config)
+    trainer = build_trainer(config)
     assert isinstance(trainer.model.scene, HumanScene)
     cameras = {
         tuple(x.cam_from_world.flatten().tolist()): x for x in (p.cameras for p in trainer.images)

@@ -125,7 +125,7 @@ def resumed(run: Path) -> int:
 def summed() -> int:
     """Sum tensors and gradients over the processes, and compare what is the same in all."""
     module.CHUNK = 5  # so that small tensors go through in parts
-    with Processes.of_torchrun() as processes:
+    with Processes.from_torchrun() as processes:
         rank = processes.rank
         size = processes.size
         values = torch.tensor([0.1, 1e8, -1e8, 3.0, 1e-8, 7.0, 2.0]) * (1 + rank)

@@ -15,7 +15,7 @@ from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.training.clock import Stopwatch
 from dyngs.training.events import StepDone, StepReport
 from dyngs.training.loop import Loop
-from dyngs.training.trainer import Edit
+from dyngs.training.trainer import TrainingEdit
 
 IMAGE = Image("view", camera(2, 2), torch.zeros(2, 2, 3), None, None, None)
 
@@ -43,7 +43,7 @@ class Counting:
         self.done = step
         return report_of(step, finding=self.findings.get(step))
 
-    def apply(self, edit: Edit) -> None:
+    def apply(self, edit: TrainingEdit) -> None:
         """Do nothing."""
 
     def checkpoint(self) -> Checkpoint:

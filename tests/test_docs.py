@@ -183,7 +183,7 @@ def require_overrides(*overrides: str) -> None:
 def require_sound(command: Command, arguments: argparse.Namespace) -> None:
     """Nothing, if what a parsed command names besides its options can be: keys, variations, times,
     presets."""
-    from dyngs.export.camera_paths import parse_times, path_file
+    from dyngs.export.camera_paths import parse_times, camera_path_file
     from dyngs.study.tradeoff import parse_goal, parse_requirements, parse_variations
 
     for word in command.words:
@@ -206,7 +206,7 @@ def require_sound(command: Command, arguments: argparse.Namespace) -> None:
     if getattr(arguments, "times", None) is not None:
         parse_times(arguments.times)
     if getattr(arguments, "path", None) is not None and command.verb == "render":
-        path_file(arguments.path)
+        camera_path_file(arguments.path)
 
 
 def test_every_command_is_parsed_with_its_configuration(

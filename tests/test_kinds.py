@@ -19,7 +19,7 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config.io import load_config, packaged_presets
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import (
@@ -36,7 +36,7 @@ from dyngs.io.write import write_image
 from dyngs.models.static_section import StaticModel
 from dyngs.models.views import training_times
 from dyngs.training.losses import SilhouetteLoss
-from dyngs.training.new_trainer import assemble, with_points
+from dyngs.training.new_trainer import build_trainer, with_points
 
 
 @pytest.fixture(scope="module")
@@ -74,12 +74,12 @@ def _dynamic(capture: Path, **changes: object) -> Config:
 def test_times_make_a_dynamic_model(capture: Path, tmp_path: Path) -> None:
     root = _with_times(capture, tmp_path / "timed", [0.5, 0.0, 1.0, 0.5, 0.25])
     assert training_times(read_capture(DataConfig(root=root))) == (0.0, 0.25, 0.5, 0.5, 1.0)
-    trainer = assemble(_dynamic(root))
+    trainer = build_trainer(_dynamic(root))
     assert isinstance(trainer.model.scene, DynamicScene)
     assert isinstance(trainer.model.training, DynamicTraining)
     assert trainer.model.scene.times == (0.0, 0.25, 0.5, 1.0)
     assert trainer.model.training.schedule.rates.steps == 12
-    assert isinstance(assemble(_dynamic(root, model=StaticModel())).model.scene, StaticScene)
+    assert isinstance(build_trainer(_dynamic(root, model=StaticModel())).model.scene, StaticScene)
 
 
 def test_opacity_is_trained_in_all_presets_but_that_of_the_published_protocol(
@@ -96,7 +96,7 @@ def test_opacity_is_trained_in_all_presets_but_that_of_the_published_protocol(
     def weight_and_findings(
         name: str, *keys: str, restored: bool = False
     ) -> tuple[float, list[str]]:
-        trainer = assemble(load_config(name, [*few, *keys]), restored=restored)
+        trainer = build_trainer(load_config(name, [*few, *keys]), restored=restored)
         losses = [x for x in trainer.losses if isinstance(x, SilhouetteLoss)]
         return losses[0].weight, trainer.findings
 
@@ -120,7 +120,7 @@ def test_opacity_counts_less_before_motion_is_followed_unless_things_are_white(
         write_image(file, pixels)
 
     def early_fraction(config: Config) -> float:
-        return next(x.early for x in assemble(config).losses if isinstance(x, SilhouetteLoss))
+        return next(x.early for x in build_trainer(config).losses if isinstance(x, SilhouetteLoss))
 
     assert early_fraction(_dynamic(root)) == early
     assert early_fraction(_dynamic(root, model=StaticModel())) == early, "both begin alike"
@@ -136,20 +136,20 @@ def test_points_are_triangulated_where_several_cameras_show_a_moment(tmp_path: P
     config = _dynamic(root, init=PointsInit(num_random=7))
     found = with_points(read_capture(config.data), config).points
     assert found is not None
-    assert len(assemble(config).model.scene) == len(found.xyz) > 7
+    assert len(build_trainer(config).model.scene) == len(found.xyz) > 7
     without = config.model_copy(update={"init": PointsInit(num_random=7, triangulate=0)})
-    assert len(assemble(without).model.scene) == 7
+    assert len(build_trainer(without).model.scene) == 7
 
 
 def test_the_coarse_phase_is_static_training(capture: Path, tmp_path: Path) -> None:
     """Until something moves, a dynamic run is a static one, byte by byte, on all views."""
     root = _with_times(capture, tmp_path / "timed", [0.0, 0.25, 0.5, 0.75, 1.0])
     static, dynamic = (
-        assemble(_dynamic(root, model=m)) for m in (StaticModel(), DynamicModel(motion_from=1.0))
+        build_trainer(_dynamic(root, model=m)) for m in (StaticModel(), DynamicModel(motion_from=1.0))
     )
     for _ in range(8):
         assert static.step().loss == dynamic.step().loss
-    mine, others = (tensors_of(trainer.model.state()) for trainer in (static, dynamic))
+    mine, others = (strip_roles(trainer.model.state()) for trainer in (static, dynamic))
     moments = [name for name in mine if name.startswith("exp_avg")]
     assert moments
     assert all(torch.equal(mine[name], others[name]) for name in moments)

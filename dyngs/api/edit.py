@@ -12,22 +12,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.compress.clean import at_end, cleaned_file, cleaned_run
+from dyngs.compress.clean import restore_final_trainer, clean_file, clean_run
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, counted, show
-from dyngs.export.edit.crop import Region, held_by
+from dyngs.export.edit.crop import Region, gaussians_in_region
 from dyngs.export.edit.frame import Frame, GeoFrame, gps_frame
 from dyngs.export.edit.merge import merged
-from dyngs.export.images import compare_run, compare_splats
+from dyngs.export.images import compare_file_with_run, compare_file_with_source
 from dyngs.export.splat_files import (
     SUFFIX,
     UP,
-    Writing,
-    read_moment,
+    WriteOptions,
+    read_4dgs_frame,
     splats_at,
     up_of,
-    write_moving,
+    write_4dgs,
 )
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
@@ -58,12 +58,12 @@ from dyngs.runs.checkpoint import (
 from dyngs.runs.folder import (
     LOG_NAME,
     RunFrame,
-    inputs_of,
+    collect_inputs,
     require_empty,
     write_config,
     write_frame,
 )
-from dyngs.runs.opened import Opened, open_scene, opened_file
+from dyngs.runs.opened import OpenedScene, open_scene, scene_from_file
 
 Tell = Callable[[str], None]
 
@@ -121,7 +121,7 @@ class EditSource:
     ``rows``: (N,) indices of the Gaussians that are left, of a run; None: all.
     """
 
-    opened: Opened
+    opened: OpenedScene
     splat: SplatFile | None = None
     usual: str | None = None
     rows: torch.Tensor | None = None
@@ -139,7 +139,7 @@ class EditSource:
         before = torch.arange(len(scene), device="cpu") if self.rows is None else self.rows
         return replace(
             self,
-            opened=self.opened.showing(scene.select(rows.to(scene.device))),
+            opened=self.opened.with_scene(scene.select(rows.to(scene.device))),
             rows=before[rows.cpu()],
         )
 
@@ -168,7 +168,7 @@ def edit_scene(
     if known_format(out) is None and not moves and out.suffix:
         wanted = f"give a name in {all_suffixes()} or {SUFFIX}, or without a suffix for a run"
         raise DyngsError(f"{out}: edits end in a file of Gaussians or a run; {wanted}")
-    inputs_of(source, *edits.merge, *reads).require_output(out)
+    collect_inputs(source, *edits.merge, *reads).require_output(out)
     found = _opened(source, data_root)
     for note in found.opened.notes:
         tell(note)
@@ -176,9 +176,9 @@ def edit_scene(
         edits = replace(edits, geo=gps_frame(found.opened))
     if edits.max_loss is not None:
         if found.splat is None:
-            found = found.kept(cleaned_run(source, edits.max_loss, edits.threads, data_root, tell))
+            found = found.kept(clean_run(source, edits.max_loss, edits.threads, data_root, tell))
         else:
-            found = found.kept(cleaned_file(found.opened.scene.gaussians, tell))
+            found = found.kept(clean_file(found.opened.scene.gaussians, tell))
     found = _cropped(found, source, edits, tell)
     if not out.suffix:
         return EditedFile(_written_run(found, source, out, edits, data_root, tell))
@@ -186,7 +186,7 @@ def edit_scene(
 
 
 def write_part(
-    opened: Opened, rows: torch.Tensor, out: Path, time: float | None = None
+    opened: OpenedScene, rows: torch.Tensor, out: Path, time: float | None = None
 ) -> EditedFile:
     """Write the Gaussians ``rows`` (N,) of a scene, at ``time`` if it moves, upright for viewers of
     the format.
@@ -203,7 +203,7 @@ def _opened(source: Path, data_root: Path | None) -> EditSource:
     own = format_to_read(source)
     if own is not None and data_root is None:
         splat = read_splats(source, nonfinite="skip")
-        opened = opened_file(splat, source)
+        opened = scene_from_file(splat, source)
         info = replace(opened.info, world_offset=splat.file_offset)
         return EditSource(replace(opened, info=info), splat, own.up)
     return EditSource(open_scene(source, data_root=data_root))
@@ -213,7 +213,7 @@ def _cropped(found: EditSource, source: Path, edits: Edits, tell: Tell) -> EditS
     if edits.region is None:
         return found
     scene: GaussianScene = found.opened.scene
-    rows = held_by(edits.region, scene, found.opened.world) ^ edits.outside
+    rows = gaussians_in_region(edits.region, scene, found.opened.world) ^ edits.outside
     count = int(rows.sum())
     if not count:
         points = found.opened.world.points(scene.at(None).means.cpu().numpy())
@@ -253,7 +253,7 @@ def _written(found: EditSource, out: Path, edits: Edits, tell: Tell) -> EditedFi
         is_new = edits.has_frame
         edited = moved_file(splat, how, up) if is_new else turned_file(splat, how.turn, up)
     written = write_splats(out, edited)
-    return EditedFile(written.path, compare_splats(splat, written), written.notes)
+    return EditedFile(written.path, compare_file_with_source(splat, written), written.notes)
 
 
 def _written_moving(found: EditSource, out: Path, edits: Edits, tell: Tell) -> EditedFile:
@@ -265,9 +265,9 @@ def _written_moving(found: EditSource, out: Path, edits: Edits, tell: Tell) -> E
             f"give a name in {all_suffixes()}"
         )
     how, up = _frame(found, edits, UP, tell)
-    writing = Writing(edit=how, up=up) if edits.has_frame else Writing(turn=how.turn, up=up)
-    splats, notes = write_moving(found.opened, out, scene.times, how=writing)
-    redrawn = compare_run(found.opened, scene, scene.times[0], splats[0], read_moment(out, 0))
+    writing = WriteOptions(edit=how, up=up) if edits.has_frame else WriteOptions(turn=how.turn, up=up)
+    splats, notes = write_4dgs(found.opened, out, scene.times, how=writing)
+    redrawn = compare_file_with_run(found.opened, scene, scene.times[0], splats[0], read_4dgs_frame(out, 0))
     return EditedFile(out, redrawn, notes)
 
 
@@ -319,7 +319,7 @@ def _part(config: Config, run_dir: Path, rows: Tensor) -> Checkpoint:
         kernel_threads(config.run.threads or num_cores()),
         deterministic(select_device(config.run.device), True),
     ):
-        trainer = at_end(config, run_dir)
+        trainer = restore_final_trainer(config, run_dir)
         kept = torch.zeros(trainer.num_gaussians, dtype=torch.bool, device=trainer.device)
         kept[rows.to(trainer.device)] = True
         trainer.model.keep(kept, trainer.done)

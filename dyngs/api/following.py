@@ -24,7 +24,7 @@ from dyngs.ops.device import deterministic, keep_freed_memory, select_device
 from dyngs.ops.native import kernel_threads
 from dyngs.training.events import Event, TopologyChanged
 from dyngs.training.loop import Interrupts, Trainable
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.processes import EXIT_INTERRUPTED, Processes
 from dyngs.training.trainer import Trainer
 
@@ -73,8 +73,8 @@ class Leader:
 def together(lead: Callable[[Processes], int]) -> int:
     """Return the exit code of the processes that ``torchrun`` started: the first calls ``lead``,
     the others follow."""
-    with Processes.of_torchrun() as processes:
-        if not processes.is_first:
+    with Processes.from_torchrun() as processes:
+        if not processes.is_rank_zero:
             return EXIT_INTERRUPTED if follow(processes) else 0
         try:
             code = lead(processes)
@@ -112,7 +112,7 @@ def _follow_run(
 ) -> tuple[Order, bytes]:
     bytewise = deterministic(select_device(config.run.device), config.run.deterministic)
     with kernel_threads(config.run.threads or 1), bytewise:
-        trainer = assemble(config, restored=True)
+        trainer = build_trainer(config, restored=True)
         trainer.join(processes)
         while True:
             order, payload = _heard(processes)
@@ -131,18 +131,18 @@ def _follow_run(
 def _tell(processes: Processes, order: Order, payload: bytes = b"") -> None:
     if processes.size == 1:
         return
-    processes.send_(torch.tensor([order, len(payload)], dtype=torch.int64, device="cpu"))
+    processes.broadcast_(torch.tensor([order, len(payload)], dtype=torch.int64, device="cpu"))
     if payload:
-        processes.send_(torch.frombuffer(bytearray(payload), dtype=torch.uint8))
+        processes.broadcast_(torch.frombuffer(bytearray(payload), dtype=torch.uint8))
 
 
 def _heard(processes: Processes) -> tuple[Order, bytes]:
     head = torch.zeros(2, dtype=torch.int64, device="cpu")
-    processes.send_(head)
+    processes.broadcast_(head)
     order, length = head.tolist()
     payload = torch.zeros(length, dtype=torch.uint8, device="cpu")
     if length:
-        processes.send_(payload)
+        processes.broadcast_(payload)
     return Order(order), payload.numpy().tobytes()
 
 

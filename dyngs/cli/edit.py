@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import print_written
-from dyngs.core.errors import DyngsError, as_word, show
+from dyngs.core.errors import DyngsError, quote_path, show
 
 if TYPE_CHECKING:
     from dyngs.api.edit import Edits
@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Edit, and print what was done and how the file differs from the scene."""
     with heavy_imports():
         from dyngs.api.edit import edit_scene
-        from dyngs.cli.splats import print_redrawn
+        from dyngs.cli.splats import print_image_difference
 
     source = args.run_of_scene_file(arguments.source)
     reads = [] if arguments.geo in (None, _EXIF) else [arguments.geo]
@@ -96,10 +96,10 @@ def run(arguments: argparse.Namespace) -> int:
     if written.redrawn is None:
         print(f"written: {written.path}")
     else:
-        print_redrawn(written.notes, [written.redrawn])
+        print_image_difference(written.notes, [written.redrawn])
         print_written(written.path)
     if written.redrawn is None or written.path.suffix.lower() == ".ply":
-        print(f"next:    dyngs view {as_word(written.path)}")
+        print(f"next:    dyngs view {quote_path(written.path)}")
     return 0
 
 
@@ -111,8 +111,8 @@ def _edits(arguments: argparse.Namespace) -> Edits:
     """Return what the options ask for. Raises DyngsError: they do not go together, or are no points
     or numbers."""
     from dyngs.api.edit import Edits
-    from dyngs.export.edit.crop import region_of
-    from dyngs.export.edit.frame import Frame, direction, geo_frame, number, point, scale_of
+    from dyngs.export.edit.crop import parse_region
+    from dyngs.export.edit.frame import Frame, direction, control_point_frame, number, point, parse_scale
 
     alone = [
         f"--{name}" for name in ("up", "origin", "scale") if getattr(arguments, name) is not None
@@ -131,15 +131,15 @@ def _edits(arguments: argparse.Namespace) -> Edits:
         raise DyngsError(f"--max-loss {max_loss:g}: give the dB that may be lost, 0 or more")
     return Edits(
         max_loss=max_loss if arguments.clean else None,
-        region=None if arguments.crop is None else region_of(arguments.crop),
+        region=None if arguments.crop is None else parse_region(arguments.crop),
         outside=arguments.outside,
         merge=tuple(arguments.merge),
         frame=Frame(
             None if arguments.up is None else direction(arguments.up),
             None if arguments.origin is None else point(arguments.origin, "--origin"),
-            1.0 if arguments.scale is None else scale_of(arguments.scale),
+            1.0 if arguments.scale is None else parse_scale(arguments.scale),
         ),
-        geo=None if arguments.geo in (None, _EXIF) else geo_frame(arguments.geo),
+        geo=None if arguments.geo in (None, _EXIF) else control_point_frame(arguments.geo),
         gps=arguments.geo == _EXIF,
         undo=arguments.undo,
         time=arguments.time,

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import print_notes, print_written
-from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_redrawn
-from dyngs.core.errors import DyngsError, as_word, counted
+from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_image_difference
+from dyngs.core.errors import DyngsError, quote_path, counted
 
 if TYPE_CHECKING:
     from dyngs.data.capture import Split, View
     from dyngs.export.splat_files import Part
-    from dyngs.runs.opened import Opened
+    from dyngs.runs.opened import OpenedScene
 
 _OTHER_SUFFIXES = {
     f".{MOVING}": MOVING,
@@ -123,7 +123,7 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument("--segments", type=kind, metavar="N", help=about)
     about = "--format html, sog: a folder for a web server, of which a page or PlayCanvas fetches what is seen"
     parser.add_argument("--folder", action="store_true", help=about)
-    args.add_most_drawn(
+    args.add_max_gaussians_drawn(
         parser, "--folder: so many Gaussians of an image are drawn at most, as on phones"
     )
     about = "a person at rest, with joints and skinning weights: .ply, .glb"
@@ -233,7 +233,7 @@ def _target(arguments: argparse.Namespace, name: str) -> Path:
     return out
 
 
-def _open(arguments: argparse.Namespace) -> Opened:
+def _open(arguments: argparse.Namespace) -> OpenedScene:
     from dyngs.runs.opened import open_scene
 
     return open_scene(arguments.run_dir, data_root=args.data_root(arguments))
@@ -243,20 +243,20 @@ def _is_sequence(arguments: argparse.Namespace) -> bool:
     return arguments.times is not None or (arguments.motion is not None and arguments.time is None)
 
 
-def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
+def _moved(arguments: argparse.Namespace, opened: OpenedScene) -> OpenedScene:
     if getattr(opened.renderable, "sides", None) is not None:
         line = "of the sides that it was found from dyngs draws the one nearest to the camera, a file all: less sharply"
         print_notes((line,))
-    return args.in_motion(arguments, opened)
+    return args.play_motion(arguments, opened)
 
 
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
     """Return the requested times, clamped to [0, 1], or None."""
-    from dyngs.export.camera_paths import clamped_times, parse_times
+    from dyngs.export.camera_paths import clamp_times, parse_times
 
     if arguments.times is None and arguments.time is None:
         return None
-    inside, warnings = clamped_times(
+    inside, warnings = clamp_times(
         (arguments.time,) if arguments.times is None else parse_times(arguments.times)
     )
     print_notes((), warnings)
@@ -268,17 +268,17 @@ def _part(arguments: argparse.Namespace) -> Part:
 
 
 def _export_splats(
-    arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...] | None, kind: str
+    arguments: argparse.Namespace, opened: OpenedScene, times: tuple[float, ...] | None, kind: str
 ) -> list[Path]:
     """Write a sequence if several times of a moving scene are requested, else one file; return the
     paths."""
-    from dyngs.export.images import compare_run
+    from dyngs.export.images import compare_file_with_run
     from dyngs.export.splat_files import (
         scene_part,
         write_run_levels,
         write_run_sequence,
         write_run_splats,
-        writing_of,
+        choose_write_options,
     )
     from dyngs.io.formats.formats import format_named, known_format, read_splats
 
@@ -291,7 +291,7 @@ def _export_splats(
             "the colours of the run are a network; spherical harmonics of degree 3 are fitted to it"
         )
         print_notes((line,))
-    how, line = writing_of(opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
+    how, line = choose_write_options(opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
     out: Path | None = arguments.out
     is_sequence = _is_sequence(arguments)
@@ -324,10 +324,10 @@ def _export_splats(
             path = out / f"{stem}{suffix}" if out.is_dir() else out
         written = [write_run_splats(opened, path, moments[0], part, how)]
     found = [
-        compare_run(opened, scene, moments[i], written[i].splat, read_splats(written[i].path))
+        compare_file_with_run(opened, scene, moments[i], written[i].splat, read_splats(written[i].path))
         for i in _shown(len(written))
     ]
-    print_redrawn(written[0].notes, found)
+    print_image_difference(written[0].notes, found)
     return [one.path for one in written]
 
 
@@ -337,35 +337,35 @@ def _shown(count: int) -> list[int]:
 
 
 def _export_moving(
-    arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...]
+    arguments: argparse.Namespace, opened: OpenedScene, times: tuple[float, ...]
 ) -> list[Path]:
     """Write all times as one file of moving Gaussians."""
-    from dyngs.export.images import compare_run
+    from dyngs.export.images import compare_file_with_run
     from dyngs.export.splat_files import (
         SUFFIX,
         UP,
-        read_moment,
+        read_4dgs_frame,
         scene_part,
-        write_moving,
-        writing_of,
+        write_4dgs,
+        choose_write_options,
     )
 
-    how, line = writing_of(opened, UP, arguments.up, arguments.from_up)
+    how, line = choose_write_options(opened, UP, arguments.up, arguments.from_up)
     print_notes((line,))
     part = _part(arguments)
     scene = scene_part(opened.scene, part)
     path = _target(arguments, f"splats{SUFFIX}")
-    splats, notes = write_moving(opened, path, times, part, how)
+    splats, notes = write_4dgs(opened, path, times, part, how)
     found = [
-        compare_run(opened, scene, times[i], splats[i], read_moment(path, i))
+        compare_file_with_run(opened, scene, times[i], splats[i], read_4dgs_frame(path, i))
         for i in _shown(len(times))
     ]
-    print_redrawn(notes, found)
+    print_image_difference(notes, found)
     return [path]
 
 
 def _export_tracks(
-    arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...] | None
+    arguments: argparse.Namespace, opened: OpenedScene, times: tuple[float, ...] | None
 ) -> list[Path]:
     from dyngs.export.splat_files import tracks_of, write_tracks
 
@@ -414,12 +414,12 @@ def _export_dyngs(arguments: argparse.Namespace) -> None:
 
 def _export_avatar(arguments: argparse.Namespace) -> None:
     from dyngs.human.avatar.avatar_file import write_avatar
-    from dyngs.runs.folder import inputs_of
+    from dyngs.runs.folder import collect_inputs
     from dyngs.runs.opened import open_run
 
     path = _target(arguments, "avatar.safetensors")
-    run = open_run(arguments.run_dir).in_own_frame()
-    inputs_of(run).require_output(path)
+    run = open_run(arguments.run_dir).in_edit_frame()
+    collect_inputs(run).require_output(path)
     print_written(write_avatar(run.renderable, run.config.model, run.info, path))
 
 
@@ -435,24 +435,24 @@ def _export_network(arguments: argparse.Namespace) -> None:
 
 def _export_bodies(arguments: argparse.Namespace) -> None:
     """Write a moving scene with its bodies as animated nodes."""
-    from dyngs.export.images import compare_run
-    from dyngs.export.splat_files import write_bodies, writing_of
+    from dyngs.export.images import compare_file_with_run
+    from dyngs.export.splat_files import write_rigid_bodies, choose_write_options
     from dyngs.io.formats.formats import format_named, read_splats
 
     out = _target(arguments, "bodies.glb")
     opened = _open(arguments)
     time = (_times(arguments) or (0.0,))[0]
-    how, line = writing_of(opened, format_named("glb").up, arguments.up, arguments.from_up)
-    written = write_bodies(opened, out, time, how)
+    how, line = choose_write_options(opened, format_named("glb").up, arguments.up, arguments.from_up)
+    written = write_rigid_bodies(opened, out, time, how)
     print_notes((line,))
-    found = compare_run(opened, opened.scene, time, written.splat, read_splats(written.path))
-    print_redrawn(written.notes, [found])
+    found = compare_file_with_run(opened, opened.scene, time, written.splat, read_splats(written.path))
+    print_image_difference(written.notes, [found])
     print_written(written.path)
 
 
 def _export_rigged(arguments: argparse.Namespace) -> None:
     """Write a person as a skinned mesh, or as Gaussians with joints."""
-    from dyngs.export.rigged.people import Played, write_mesh, write_rigged_splats
+    from dyngs.export.rigged.people import AnimationInfo, write_mesh, write_rigged_splats
     from dyngs.runs.opened import FRAME_RATE
 
     is_ply = arguments.joints and _kind(arguments) == "ply"
@@ -463,8 +463,8 @@ def _export_rigged(arguments: argparse.Namespace) -> None:
         raise DyngsError(
             "--motion does not go with --joints in a .ply, which has the rest pose; give --out FILE.glb"
         )
-    opened = _moved(arguments, _open(arguments)).in_own_frame()
-    played = None if motion is None else Played(motion.stem, opened.fps or FRAME_RATE)
+    opened = _moved(arguments, _open(arguments)).in_edit_frame()
+    played = None if motion is None else AnimationInfo(motion.stem, opened.fps or FRAME_RATE)
     print_notes((write_rigged_splats if arguments.joints else write_mesh)(opened, out, played))
     print_written(out)
 
@@ -486,7 +486,7 @@ def _has_surface(arguments: argparse.Namespace) -> bool:
 
 def _export_surface(arguments: argparse.Namespace) -> None:
     """Write the surface of a scene, at several times one file each."""
-    from dyngs.export.surface_file import upright_surface, write_surface
+    from dyngs.export.surface_file import surface_write_options, write_surface
     from dyngs.gaussians.surface import count_holes
     from dyngs.models.renderable import SurfaceOptions
 
@@ -497,7 +497,7 @@ def _export_surface(arguments: argparse.Namespace) -> None:
         )
     opened = _open(arguments)
     options = SurfaceOptions(arguments.level, arguments.cells, arguments.segments)
-    how, line = upright_surface(
+    how, line = surface_write_options(
         opened, ".ply" if arguments.times else out.suffix, arguments.up, arguments.from_up
     )
     print_notes((line,))
@@ -523,7 +523,7 @@ def _export_page(arguments: argparse.Namespace) -> None:
         out = arguments.out or arguments.run_dir / "scene"
         if out.suffix.lower() == ".html":
             raise DyngsError(f"{out}: --folder writes a folder; give --out {out.with_suffix('')}")
-        where = f"for any web server, such as `python -m http.server -d {as_word(out)}`"
+        where = f"for any web server, such as `python -m http.server -d {quote_path(out)}`"
     else:
         out = _target(arguments, "scene.html")
         where = "it plays in any browser with WebGL 2, offline"
@@ -541,7 +541,7 @@ def _export_page(arguments: argparse.Namespace) -> None:
 def _export_cameras(arguments: argparse.Namespace) -> None:
     """Write the cameras of a run as a transforms.json, refined where training refined them."""
     from dyngs.data.capture import all_views
-    from dyngs.evaluate.report import found_corrections
+    from dyngs.evaluate.report import load_camera_corrections
     from dyngs.export.cameras import NAME, write_cameras
     from dyngs.runs.opened import open_run
 
@@ -554,7 +554,7 @@ def _export_cameras(arguments: argparse.Namespace) -> None:
         raise DyngsError(
             f"{path}: would stand in for the cameras of the capture; give another folder"
         )
-    found = found_corrections(source, run, capture.splits["train"])
+    found = load_camera_corrections(source, run, capture.splits["train"])
     if found is None and run.config.camera.refine == "always":
         raise DyngsError(
             f"{source}: refined cameras lie in checkpoints, and there is none; restore one or train again"
@@ -566,11 +566,11 @@ def _export_cameras(arguments: argparse.Namespace) -> None:
     if found is not None:
         line = "training cameras as training found them; others have the capture's poses, and known lenses"
         for name, views in splits.items():
-            splits[name] = [found.corrected_view(view) for view in views]
+            splits[name] = [found.correct_view(view) for view in views]
     print_notes((line,))
     written = write_cameras(path, capture, splits, run.world)
     count = counted(len(all_views(capture.splits)), "camera")
-    root = as_word(path.parent)
+    root = quote_path(path.parent)
     print(
         f"written: {written} ({count}); `data.root={root} data.follow_links=true` trains with them"
     )

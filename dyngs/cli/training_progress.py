@@ -8,11 +8,11 @@ import time
 from contextlib import suppress
 from typing import IO, Any
 
-from dyngs.core.errors import escaped
+from dyngs.core.errors import escape_control_characters
 from dyngs.models.schedule import image_divisor
-from dyngs.training.clock import Forecast
+from dyngs.training.clock import TimeForecast
 from dyngs.training.events import Evaluated, Event, Message, Started, StepDone, TotalChanged
-from dyngs.training.run_log import record_of
+from dyngs.training.run_log import log_record
 
 PLAIN_LINES = 10
 """Number of lines that a run prints without a terminal."""
@@ -31,7 +31,7 @@ class TrainingProgress:
 
     def __init__(self, stream: IO[str] | None = None) -> None:
         self._stream = sys.stderr if stream is None else stream
-        self._forecast: Forecast | None = None
+        self._forecast: TimeForecast | None = None
         self._psnr: float | None = None
         self._start = self._total = self._next_line = 0
         self._since = 0.0
@@ -73,9 +73,9 @@ class TrainingProgress:
         if self._forecast is None:  # the first step loads and compiles what others find there
             height, width = event.report.truth.shape[:2]
             pixels = height * width * image_divisor(config.train, step) ** 2
-            self._forecast = Forecast(step, now, count, pixels)
+            self._forecast = TimeForecast(step, now, count, pixels)
         self._forecast.observe(config, step, now, count)
-        record = record_of(event)
+        record = log_record(event)
         if record.psnr is not None:  # one image says little: views differ by several dB
             before = record.psnr if self._psnr is None else self._psnr
             self._psnr = 0.95 * before + 0.05 * record.psnr
@@ -94,7 +94,7 @@ class TrainingProgress:
 
     def say(self, line: str) -> None:
         """Show ``line`` above the progress bar."""
-        line = escaped(line)
+        line = escape_control_characters(line)
         with suppress(OSError):
             if self._bar is not None:
                 self._bar.console.print(line, markup=False, highlight=False)

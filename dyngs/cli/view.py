@@ -33,7 +33,7 @@ def add_parser(commands: args.Commands) -> None:
     add_serving_arguments(parser)
     about = "motion file for a person, or a folder of them"
     parser.add_argument("--motion", type=args.input_path, metavar="PATH", help=about)
-    args.add_most_drawn(
+    args.add_max_gaussians_drawn(
         parser, "of a large still scene: so many are drawn at most while anything moves"
     )
     args.add_up(parser)
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
         import torch
 
         from dyngs.view.controls import motion_files
-        from dyngs.view.server import Serving, Viewer
+        from dyngs.view.server import ServerOptions, Viewer
         from dyngs.view.source import first_of, open_source
 
     if arguments.threads > 0:
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
             f"--motion goes with a person (model.kind=human), {first.name} is none; leave it out"
         )
     print_notes(first.notes)
-    serving = Serving(arguments.host, arguments.port, motions)
+    serving = ServerOptions(arguments.host, arguments.port, motions)
     with Viewer(source, first, serving) as viewer:
         print_lines(f"viewing: {first.name}\n         {viewer.link}\n         Ctrl-C ends it")
         wait_for_interrupt()

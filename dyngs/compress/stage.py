@@ -31,13 +31,13 @@ from dyngs.deform.scene import field_scene_of
 from dyngs.gaussians.rendering import RenderOptions, contributions, sensitivities
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.models.kind import Moves, capability
+from dyngs.models.kind import HasMotion, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
 from dyngs.ops.device import copy_async
 from dyngs.training.loop import Loop
 from dyngs.training.new_trainer import GaussianTrainer
-from dyngs.training.trainer import Edit, Trainer
+from dyngs.training.trainer import TrainingEdit, Trainer
 
 # Slope of the hyperbolic tangent: second differences of a profile are small numbers
 STEEPNESS = 4.0
@@ -97,7 +97,7 @@ def _neighbours(x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def importance(views: ScoringViews, *, slopes: bool) -> Importance:
+def measure_importance(views: ScoringViews, *, slopes: bool) -> Importance:
     """Return the contribution of each Gaussian to the images of ``views``; ``slopes`` cost the
     larger half."""
     scene = views.scene
@@ -147,18 +147,18 @@ MASKED_BELOW = 0.5
 (docs/prune.md)."""
 
 
-def prune_stage(loop: Loop) -> Edit | None:
+def prune_stage(loop: Loop) -> TrainingEdit | None:
     """Editor that prunes and masks when training ends and fine-tuning begins."""
     trainer = loop.trainer
     assert isinstance(trainer, Trainer)
     config = trainer.config
     if trainer.done != config.train.steps or trainer.done >= loop.total:
         return None
-    return pruning(trainer)
+    return build_pruning_edit(trainer)
 
 
 @torch.no_grad()
-def pruning(trainer: GaussianTrainer) -> Edit:
+def build_pruning_edit(trainer: GaussianTrainer) -> TrainingEdit:
     """Return the edit that prunes and masks the Gaussians of ``trainer`` by its config."""
     scene = trainer.model.scene.without_masks()
     options = trainer.config.prune
@@ -174,7 +174,7 @@ def pruning(trainer: GaussianTrainer) -> Edit:
     return replace(edit, message=f"{message}{left}, {cost}{_let_through(edit)}")
 
 
-def _let_through(edit: Edit) -> str:
+def _let_through(edit: TrainingEdit) -> str:
     masks = edit.masks
     if masks is None:
         return ""
@@ -184,17 +184,17 @@ def _let_through(edit: Edit) -> str:
 
 
 @torch.no_grad()
-def removal(trainer: GaussianTrainer, scores: Tensor | None) -> Edit:
+def removal(trainer: GaussianTrainer, scores: Tensor | None) -> TrainingEdit:
     """Return the edit that leaves all but the fraction ``prune.fraction`` with the lowest ``scores``
     (N,), and masks them if requested; from then on their number stays."""
     options = trainer.config.prune
     whole = trainer.model.scene.without_masks()
     kept = None if scores is None else highest(scores, options.fraction)
     masks = None
-    moves = capability(trainer.config.model, Moves) is not None and not whole.is_static
+    moves = capability(trainer.config.model, HasMotion) is not None and not whole.is_static
     if options.mask_times > 1 and moves:
         masks = _masks(trainer, whole, kept)
-    return Edit(kept=kept, masks=masks, stops_growing=True)
+    return TrainingEdit(kept=kept, masks=masks, stops_densification=True)
 
 
 @torch.no_grad()
@@ -203,7 +203,7 @@ def scores_of(trainer: GaussianTrainer, options: PruneConfig | None = None) -> T
     of docs/prune.md."""
     score = (options or PruneConfig()).score
     scene = trainer.model.scene.without_masks()
-    found = importance(scoring_views(trainer, scene), slopes=score == "sensitivity")
+    found = measure_importance(scoring_views(trainer, scene), slopes=score == "sensitivity")
     match score:
         case "variation":
             return found.variation
@@ -273,15 +273,15 @@ def _masks(trainer: GaussianTrainer, scene: GaussianScene, kept: Tensor | None) 
     last = len(scene.times) - 1
     count = min(options.mask_times, len(scene.times))
     times = [scene.times[round(k * last / (count - 1))] for k in range(count)]
-    fractions = importance(scoring_views(trainer, scene, times), slopes=False).fractions
+    fractions = measure_importance(scoring_views(trainer, scene, times), slopes=False).fractions
     seen = fractions > MASKED_BELOW
     moved = field_scene_of(scene)
     if moved is not None and moved.field is not None and moved.field.can_fade:
-        seen |= there_after(scene, times, trainer.model.options.alpha_min).to(seen.device)
+        seen |= visible_between_times(scene, times, trainer.model.options.alpha_min).to(seen.device)
     return VisibilityMasks.pack(tuple(times), seen if kept is None else seen[:, kept])
 
 
-def there_after(scene: GaussianScene, times: Sequence[float], alpha_min: float) -> Tensor:
+def visible_between_times(scene: GaussianScene, times: Sequence[float], alpha_min: float) -> Tensor:
     """Return (K, N) bool: which Gaussians are more opaque than ``alpha_min`` between one of K key
     times and the next.
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.core.metrics import Lpips, LpipsNet, load_lpips, psnr
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.loader import Image, ImageLoader
@@ -23,23 +23,23 @@ from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import (
     POSE_METRICS,
     REGION_METRICS,
-    Drawing,
+    SceneRenderer,
     PoseScores,
     Regions,
     TimeScore,
     ViewScore,
-    means_of,
+    mean_scores,
     psnr_per_time,
     score_views,
-    seconds_in_turn,
+    time_renders,
     temporal_scores,
 )
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.human.avatar.pose_fit import IMAGE_COMPARISON, SILHOUETTE_COMPARISON, fit_poses_to_images
 from dyngs.human.avatar.scene import as_human_scene
 from dyngs.io.write import write_text
-from dyngs.models.checkpoint import OTHER_CONFIG, read_capture_of
-from dyngs.models.kind import Moves, capability
+from dyngs.models.checkpoint import CONFIG_ADVICE, read_run_capture
+from dyngs.models.kind import HasMotion, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.ops.device import CPU, select_device
@@ -52,16 +52,16 @@ from dyngs.runs.checkpoint import (
     latest_checkpoint,
     load_run,
 )
-from dyngs.runs.folder import inputs_of
+from dyngs.runs.folder import collect_inputs
 from dyngs.runs.opened import scene_of_split, split_views
 from dyngs.training.corrections.camera_refinement import (
     CameraCorrections,
     CameraRefinement,
-    fitted_to_image,
+    fit_camera_to_image,
 )
 
 
-def found_corrections(
+def load_camera_corrections(
     run_dir: Path, run: LoadedRun, trained_on: Sequence[View]
 ) -> CameraCorrections | None:
     """Return the corrections of a run's cameras; None where it refined none, or has no
@@ -70,13 +70,13 @@ def found_corrections(
         return None
     checkpoint = latest_checkpoint(run_dir)
     refinement = CameraRefinement(trained_on, run.info.extent, run.config.train.steps)
-    with reading(checkpoint.name, OTHER_CONFIG):
+    with wrap_read_errors(checkpoint.name, CONFIG_ADVICE):
         refinement.load_state(checkpoint.part("cameras"))
     return refinement.corrections
 
 
-def scores_from_own_poses(
-    drawing: Drawing, images: ImageLoader, size: float, lpips: Lpips
+def score_fitted_poses(
+    drawing: SceneRenderer, images: ImageLoader, size: float, lpips: Lpips
 ) -> dict[str, Any]:
     """Return the fields of a report on images from poses that were fitted to them: of a person from
     body poses, else from cameras; ``size`` of the scene is in world units.
@@ -98,21 +98,21 @@ def scores_from_own_poses(
             each = (images[i] for i in range(len(images)))
             views, _ = score_views(fitted, each, drawing.options, background, lpips)
             found[name] = PoseScores(
-                **means_of(views), updates=fmean(updates), per_view=tuple(views)
+                **mean_scores(views), updates=fmean(updates), per_view=tuple(views)
             )
         return found | {"psnr_own_poses": found["own_poses"].psnr}
     scene = require_gaussians(drawing.scene, "what cameras are fitted to")
     options = scene.options
     scores: list[float] = []
     for image in (images[i] for i in range(len(images))):
-        cameras = fitted_to_image(scene, image, background, size, options=options).cameras
+        cameras = fit_camera_to_image(scene, image, background, size, options=options).cameras
         with torch.no_grad():
             rendering = scene.render(cameras, image.time, options=options, background=background)
         scores.append(psnr(rendering.rgb[0], image.composite(background), image.mask))
     return {"psnr_own_poses": fmean(scores)}
 
 
-def images_of_split(
+def load_split_images(
     capture: Capture, views: Sequence[View], run_dir: Path, run: LoadedRun
 ) -> ImageLoader:
     """Return the images of ``views``, a split of ``capture``, with the cameras that training found,
@@ -122,9 +122,9 @@ def images_of_split(
     camera that stands still; all other poses are those of the capture.
     """
     images = ImageLoader(views, run.config.data)
-    found = found_corrections(run_dir, run, capture.splits["train"])
+    found = load_camera_corrections(run_dir, run, capture.splits["train"])
     if found is not None:
-        images.corrected = lambda index, cameras: found.applied_to(images.views[index], cameras)
+        images.corrected = lambda index, cameras: found.correct_cameras(images.views[index], cameras)
     return images
 
 
@@ -235,20 +235,20 @@ def evaluate_run(
     if it was read already.
     """
     draws_on = select_device(device)
-    inputs_of(run_dir).require_output(report_path(run_dir, split))
+    collect_inputs(run_dir).require_output(report_path(run_dir, split))
     if refine_poses and split == "train":
         raise DyngsError(
             f"{run_dir}: --refine is for images that were not trained on; name them with --split test, val or pose"
         )
     run = load_run(run_dir, data_root)
-    capture = capture or read_capture_of(run.config.data, run.info)
+    capture = capture or read_run_capture(run.config.data, run.info)
     views = split_views(capture, split)
     background, colour = evaluation_background(run.config.data.background, capture.has_alpha)
     scene = scene_of_split(run, capture, split).to(draws_on)
-    drawing = Drawing(scene, scene.options, colour.to(draws_on))
+    drawing = SceneRenderer(scene, scene.options, colour.to(draws_on))
     if threads:
         torch.set_num_threads(threads)
-    loader = images_of_split(capture, views, run_dir, run)
+    loader = load_split_images(capture, views, run_dir, run)
     loader.device = draws_on
     regions = Regions(views, loader, drawing.background)
     images = (loader[i] for i in range(len(loader)))
@@ -260,8 +260,8 @@ def evaluate_run(
     tracks = _track_scores(run, capture, scene, views)
     fitted = {}
     if split != "train" and (refine_poses or run.config.camera.refine == "always"):
-        fitted = scores_from_own_poses(drawing, loader, run.info.extent, lpips)
-    means = means_of(scores, MEAN_METRICS)
+        fitted = score_fitted_poses(drawing, loader, run.info.extent, lpips)
+    means = mean_scores(scores, MEAN_METRICS)
     reasons |= {name: metric.reason for name, metric in temporal.items() if metric.reason}
     reasons |= {name: regions.reason(name) for name in REGION_METRICS if means[name] is None}
     if means["psnr_right"] is None:
@@ -371,7 +371,7 @@ def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
         )
     if run.config.data.background == "random":
         notes.append("trained on random backgrounds, evaluated on black")
-    if capability(run.config.model, Moves) is not None and run.renderable.is_static:
+    if capability(run.config.model, HasMotion) is not None and run.renderable.is_static:
         notes.append(
             "the model is dynamic, but nothing moves in it: it is drawn as fast as a static one"
         )
@@ -386,7 +386,7 @@ ROUNDS = 3
 
 
 @dataclass(frozen=True)
-class Cost:
+class RunMetrics:
     """Quality, size and speed of a run."""
 
     num_gaussians: int
@@ -401,12 +401,12 @@ class Cost:
 
 def compared(
     folders: Sequence[Path], threads: int, device: torch.device = CPU, data_root: Path | None = None
-) -> list[Cost]:
+) -> list[RunMetrics]:
     """Return the costs of runs on the capture of the first; drawn in turn, so that load affects all
     alike."""
     runs = [load_run(folder, data_root) for folder in folders]
     data = runs[0].config.data
-    capture = read_capture_of(data, runs[0].info)
+    capture = read_run_capture(data, runs[0].info)
     background = evaluation_background(data.background, capture.has_alpha)[1].to(device)
     psnrs: dict[str, list[float]] = {}
     seconds = np.zeros(0)
@@ -418,13 +418,13 @@ def compared(
             drawings = []
             for run in runs:
                 scene = scene_of_split(run, capture, split).to(device)
-                drawings.append(Drawing(scene, scene.options, background))
+                drawings.append(SceneRenderer(scene, scene.options, background))
             psnrs[split] = [
                 fmean(_psnr(drawing, image) for image in images) for drawing in drawings
             ]
-            seconds = seconds_in_turn(drawings, images, ROUNDS)
+            seconds = time_renders(drawings, images, ROUNDS)
     return [
-        Cost(
+        RunMetrics(
             num_gaussians=len(run.scene),
             psnr_train=psnrs["train"][i],
             psnr_test=psnrs["test"][i] if "test" in psnrs else None,
@@ -436,6 +436,6 @@ def compared(
     ]
 
 
-def _psnr(drawing: Drawing, image: Image) -> float:
+def _psnr(drawing: SceneRenderer, image: Image) -> float:
     truth = image.composite(drawing.background)
     return psnr(drawing.image(image.cameras, image.time), truth, image.mask)

@@ -88,7 +88,7 @@ class Regions:
         found = [_psnr_inside(part, image, rendered, truth) for part in parts]
         return dict(zip(REGION_METRICS, found, strict=True))
 
-    def scores_of_things(self, image: Image, rendered: Tensor, truth: Tensor) -> dict[int, float]:
+    def object_scores(self, image: Image, rendered: Tensor, truth: Tensor) -> dict[int, float]:
         """Return the PSNR of a view, dB, on each thing that its motion mask tells apart and that it
         shows, by label."""
         if image.labels is None:
@@ -153,7 +153,7 @@ def _opened(shown: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Drawing:
+class SceneRenderer:
     """A scene and how it is drawn."""
 
     scene: Renderable
@@ -169,8 +169,8 @@ class Drawing:
         return rendering.rgb[0]
 
 
-def seconds_in_turn(
-    drawings: Sequence[Drawing], images: Sequence[Image], rounds: int
+def time_renders(
+    drawings: Sequence[SceneRenderer], images: Sequence[Image], rounds: int
 ) -> np.ndarray:
     """Return the seconds (D, ``rounds`` * I) that each of D drawings takes for each image.
 
@@ -284,7 +284,7 @@ def score_views(
         values |= background_scores(image, rendering, background)
         if regions is not None:
             values |= regions.scores(image, rendered, truth)
-            values["psnr_things"] = regions.scores_of_things(image, rendered, truth)
+            values["psnr_things"] = regions.object_scores(image, rendered, truth)
         score = ViewScore(
             name=image.name,
             width=image.cameras.width,
@@ -355,7 +355,7 @@ def right_half_scores(image: Image, rendering: Rendering, background: Tensor) ->
 POSE_METRICS = tuple(x.name for x in fields(PoseScores) if x.name not in ("updates", "per_view"))
 
 
-def means_of(scores: Sequence[ViewScore], names: Sequence[str] = POSE_METRICS) -> dict[str, Any]:
+def mean_scores(scores: Sequence[ViewScore], names: Sequence[str] = POSE_METRICS) -> dict[str, Any]:
     """Return the means of metrics over at least one view; None where a view has none, but for
     regions: these are over the views that have one."""
     means = {}
@@ -405,7 +405,7 @@ def psnr_per_time(scores: Iterable[tuple[float | None, float]]) -> tuple[TimeSco
     )
 
 
-def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> MetricValue:
+def flicker(drawing: SceneRenderer, cameras: Cameras, times: Sequence[float]) -> MetricValue:
     """Return the mean of |R_{k+1} - 2 R_k + R_{k-1}| x 255: the second difference in time at one
     camera, without truth.
 
@@ -433,7 +433,7 @@ def flicker(drawing: Drawing, cameras: Cameras, times: Sequence[float]) -> Metri
     return MetricValue(fmean(values))
 
 
-def flicker_error(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) -> MetricValue:
+def flicker_error(drawing: SceneRenderer, loader: ImageLoader, views: Sequence[View]) -> MetricValue:
     """Return the mean of |(R_{k+1} - R_k) - (G_{k+1} - G_k)| x 255: the error of changes in time,
     at fixed cameras.
 
@@ -460,7 +460,7 @@ def flicker_error(drawing: Drawing, loader: ImageLoader, views: Sequence[View]) 
 
 
 def temporal_scores(
-    drawing: Drawing, loader: ImageLoader, views: Sequence[View]
+    drawing: SceneRenderer, loader: ImageLoader, views: Sequence[View]
 ) -> dict[str, MetricValue]:
     """Return ``flicker`` before the first camera of a split, at the training times, and
     ``flicker_error``."""

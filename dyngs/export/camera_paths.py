@@ -13,13 +13,13 @@ import numpy as np
 import torch
 
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError, printable
+from dyngs.core.errors import DyngsError, format_one_line
 from dyngs.data.geometry import cam_from_opengl, checked_pose, inverse_rigid, pinhole_matrix
 from dyngs.io.fields import entry, float_array, is_number, numbers_of, read_json, require_at_most
 
 _MAX_FRAMES = 100_000
 """A longer path is taken for a typing mistake."""
-PLACED_PATHS = ("orbit", "spiral", "along")
+AUTOMATIC_PATHS = ("orbit", "spiral", "along")
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class CameraPath:
         return len(self.cameras)
 
 
-def clamped_times(times: Sequence[float]) -> tuple[tuple[float, ...], tuple[str, ...]]:
+def clamp_times(times: Sequence[float]) -> tuple[tuple[float, ...], tuple[str, ...]]:
     """Return ``times`` within [0, 1], and a line where one was not."""
     inside = tuple(min(max(float(time), 0.0), 1.0) for time in times)
     count = sum(a != b for a, b in zip(times, inside, strict=True))
@@ -53,7 +53,7 @@ def with_times(path: CameraPath, times: Sequence[float]) -> CameraPath:
         raise DyngsError(
             f"the camera path has {len(path)} cameras, but there are {len(times)} times; give as many"
         )
-    inside, notes = clamped_times(times)
+    inside, notes = clamp_times(times)
     return replace(path, times=inside, notes=(*path.notes, *notes))
 
 
@@ -76,13 +76,13 @@ def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
     return replace(cameras, intrinsics=intrinsics, width=width, height=height)
 
 
-def path_file(path: str) -> Path | None:
+def camera_path_file(path: str) -> Path | None:
     """Return the JSON file that ``path`` names; None for a path that is placed: orbit, spiral,
     along."""
-    if path in PLACED_PATHS:
+    if path in AUTOMATIC_PATHS:
         return None
     if not path.endswith(".json"):
-        names = ", ".join(PLACED_PATHS)
+        names = ", ".join(AUTOMATIC_PATHS)
         raise DyngsError(
             f"no camera path {path!r}; use {names}, or a .json file (docs/camera_paths.md)"
         )
@@ -102,7 +102,7 @@ def parse_times(text: str) -> tuple[float, ...]:
         start, stop, count = 0.0, 0.0, 0
     if not (math.isfinite(start) and math.isfinite(stop) and 1 <= count <= _MAX_FRAMES):
         raise DyngsError(
-            f"{printable(repr(text), 60)} is no range of times; write START:STOP:COUNT, for instance 0:1:60 for 60 "
+            f"{format_one_line(repr(text), 60)} is no range of times; write START:STOP:COUNT, for instance 0:1:60 for 60 "
             "evenly spaced times"
         )
     return tuple(np.linspace(start, stop, count).tolist())
@@ -166,7 +166,7 @@ def _as_document(found: Any, file: Path) -> tuple[dict[str, Any], tuple[str, ...
     kind = str(found.get("camera_type", found.get("camera_model")))
     panoramic = ("fisheye", "equirectangular", "spherical", "omni", "vr180")
     if any(name in kind.lower() for name in panoramic):
-        raise DyngsError(f"{file}: cameras of a path are pinholes, not {printable(kind, 40)}")
+        raise DyngsError(f"{file}: cameras of a path are pinholes, not {format_one_line(kind, 40)}")
     if "camera_path" in found:
         return _of_nerfstudio(found, file), (
             "nerfstudio's path is taken to be in the coordinates of the capture; its viewer may have turned, shifted "
@@ -246,7 +246,7 @@ def _number(
     """Return the number at ``key``. Raises DyngsError unless it is in [low, high]."""
     value = keys.get(key, default)
     if not is_number(value) or not low <= value <= high:
-        problem = "is missing" if value is None else f"is {printable(repr(value), 60)}"
+        problem = "is missing" if value is None else f"is {format_one_line(repr(value), 60)}"
         raise DyngsError(
             f"{where}: '{key}' {problem}; it must be a number from {low:g} to {high:g}"
         )

@@ -14,7 +14,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
 from dyngs.export.camera_paths import (
     CameraPath,
-    path_file,
+    camera_path_file,
     pick_cameras,
     read_path,
     resize_cameras,
@@ -28,7 +28,7 @@ from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.io.formats.similarity import AXES
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import training_cameras
-from dyngs.runs.opened import Opened, cameras_for_paths, split_views
+from dyngs.runs.opened import OpenedScene, cameras_for_paths, split_views
 
 DEFAULT_FRAMES = 120
 DEFAULT_SIZE = (960, 720)
@@ -54,7 +54,7 @@ class PathOptions:
     split: str | None = None  # split of that view; None: test, or val or train if there is none
 
 
-def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
+def choose_path(opened: OpenedScene, options: PathOptions) -> CameraPath:
     """Return the cameras and times along which a scene is rendered, with notes about defaults that
     were chosen.
 
@@ -75,7 +75,7 @@ def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
     if options.path is None:
         path = _fixed_camera(opened, options)
     else:
-        file = path_file(options.path)
+        file = camera_path_file(options.path)
         if file is None:
             path = _placed(opened, options.path, options)
         else:
@@ -97,7 +97,7 @@ def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
     return replace(path, notes=notes, fps=path.fps if opened.fps is None else opened.fps)
 
 
-def view_to_show(capture: Capture, name: str | None = None, split: str | None = None) -> View:
+def select_view(capture: Capture, name: str | None = None, split: str | None = None) -> View:
     """Return the view called ``name``, by default the first one.
 
     ``name``: of a view, of its image as written by ``dyngs render RUN``, or its number in the
@@ -121,7 +121,7 @@ def view_to_show(capture: Capture, name: str | None = None, split: str | None = 
     )
 
 
-def orbit_around(opened: Opened, count: int, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
+def orbit_cameras_around(opened: OpenedScene, count: int, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
     """Return ``count`` cameras with images of ``size`` on a circle around a scene, a person in all
     of their motion.
 
@@ -144,10 +144,10 @@ def points_at(scene: Renderable, time: float | None = None) -> Tensor:
     return scene.at(time).means if isinstance(scene, GaussianScene) else scene.bounds
 
 
-def in_front_of(opened: Opened, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
+def frontal_cameras(opened: OpenedScene, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
     """Return three neighbours on a circle around a scene, of which the second sees a person's
     front."""
-    ring = orbit_around(opened, _RING, size)
+    ring = orbit_cameras_around(opened, _RING, size)
     front = 0
     person = as_human_scene(opened.renderable)
     if person is not None:
@@ -156,19 +156,19 @@ def in_front_of(opened: Opened, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras
     return pick_cameras(ring, [(front + i) % _RING for i in (-1, 0, 1)])
 
 
-def _fixed_camera(opened: Opened, options: PathOptions) -> CameraPath:
+def _fixed_camera(opened: OpenedScene, options: PathOptions) -> CameraPath:
     times = opened.renderable.times
     if opened.captured is None:
-        camera = in_front_of(opened, options.size or DEFAULT_SIZE).select(1)
+        camera = frontal_cameras(opened, options.size or DEFAULT_SIZE).select(1)
     else:
-        view = view_to_show(opened.capture, options.view, options.split)
+        view = select_view(opened.capture, options.view, options.split)
         (camera,) = training_cameras([view], opened.config.data)
         times = (view.time or 0.0,) if opened.fps is None else times
     times = times if options.times is None else options.times
     return with_times(CameraPath(pick_cameras(camera, [0] * len(times))), times)
 
 
-def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
+def _placed(opened: OpenedScene, name: str, options: PathOptions) -> CameraPath:
     """Return the path called ``name`` (orbit, spiral, along), placed by the training cameras or by
     the scene."""
     scene = opened.renderable
@@ -177,8 +177,8 @@ def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
     if opened.captured is None:
         size = options.size or DEFAULT_SIZE
         if name == "orbit":
-            return CameraPath(orbit_around(opened, frames, size))
-        return CameraPath(spiral_path(in_front_of(opened, size), frames))
+            return CameraPath(orbit_cameras_around(opened, frames, size))
+        return CameraPath(spiral_path(frontal_cameras(opened, size), frames))
     views = opened.capture.splits["train"]
     cameras = cameras_for_paths(views, opened.config.data)
     if name == "spiral":
@@ -190,7 +190,7 @@ def _placed(opened: Opened, name: str, options: PathOptions) -> CameraPath:
     path, is_all_around = orbit_path(cameras, frames, up)
     if opened.person is None or is_all_around:
         return path
-    around = orbit_around(opened, frames, (cameras.width, cameras.height))
+    around = orbit_cameras_around(opened, frames, (cameras.width, cameras.height))
     return CameraPath(
         around, notes=("the person was filmed from one side: the orbit goes all around them",)
     )

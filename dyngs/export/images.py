@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import ReportProgress, report_nothing, srgb_encoded
+from dyngs.core.conventions import ProgressCallback, ignore_progress, encode_srgb
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import ImageLoader
@@ -28,8 +28,8 @@ from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.write import to_uint8, write_image
 from dyngs.models.renderable import DrawOptions, Renderable, TimeStep
 from dyngs.ops.device import CPU
-from dyngs.runs.folder import inputs_of
-from dyngs.runs.opened import Opened, split_views
+from dyngs.runs.folder import collect_inputs
+from dyngs.runs.opened import OpenedScene, split_views
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def render_frame(
     )
 
 
-def path_frames(
+def render_path(
     scene: Renderable, path: CameraPath, options: DrawOptions | None = None
 ) -> Iterator[DrawnImage]:
     """Yield the frames along a path one by one, so that memory does not grow with their number.
@@ -92,11 +92,11 @@ def path_frames(
 
 
 def write_path_images(
-    opened: Opened,
+    opened: OpenedScene,
     path: CameraPath,
     out_dir: Path | None,
     output: OutputOptions = OutputOptions(),
-    report: ReportProgress = report_nothing,
+    report: ProgressCallback = ignore_progress,
 ) -> list[Path]:
     """Render a scene along a path to ``frame_0000.png`` and so on, and to a video if requested;
     return the paths.
@@ -114,7 +114,7 @@ def write_path_images(
     digits = max(4, len(str(len(path) - 1)))
 
     def frames() -> Iterator[tuple[str, DrawnImage]]:
-        for i, frame in enumerate(path_frames(scene, path, options)):
+        for i, frame in enumerate(render_path(scene, path, options)):
             yield f"frame_{i:0{digits}d}", frame
             report("frames", i + 1, len(path))
 
@@ -122,11 +122,11 @@ def write_path_images(
 
 
 def write_split_images(
-    opened: Opened,
+    opened: OpenedScene,
     split: str,
     out_dir: Path,
     output: OutputOptions = OutputOptions(),
-    report: ReportProgress = report_nothing,
+    report: ProgressCallback = ignore_progress,
     device: torch.device = CPU,
 ) -> list[Path]:
     """Render a split of a run to ``NAME.png`` per view and ``sheet.png`` (truth, render, error);
@@ -138,7 +138,7 @@ def write_split_images(
     """
     views = split_views(opened.capture, split)
     loader = ImageLoader(views, opened.config.data)
-    scene = opened.of_split(split).renderable.to(device)
+    scene = opened.for_split(split).renderable.to(device)
     options = _with_depth(scene, output)
     shown = np.linspace(0, len(loader) - 1, min(len(loader), 12)).round().astype(int)
     rows: list[tuple[str, np.ndarray, np.ndarray]] = []
@@ -158,7 +158,7 @@ def write_split_images(
                 rows.append((label, (truth * counts).numpy(), (rendered * counts).numpy()))
 
     sheet = out_dir / "sheet.png"
-    inputs_of(opened).require_output(sheet)
+    collect_inputs(opened).require_output(sheet)
     written = _write_images(opened, frames(), out_dir, output)
     write_image(sheet, contact_sheet(rows))
     return [*written, sheet]
@@ -196,7 +196,7 @@ def file_stems(names: Sequence[str]) -> list[str]:
 
 
 def _write_images(
-    opened: Opened,
+    opened: OpenedScene,
     frames: Iterable[tuple[str, DrawnImage]],
     out_dir: Path | None,
     output: OutputOptions,
@@ -206,7 +206,7 @@ def _write_images(
     """Write named frames as images and a video; return the paths. ``one_range``: depth colours of
     all frames have the range of the first one."""
     limits = None
-    inputs = inputs_of(opened)
+    inputs = collect_inputs(opened)
     for out in (out_dir, output.video):
         if out is not None:
             inputs.require_output(out)
@@ -316,11 +316,11 @@ def color_map(values: np.ndarray, name: str) -> np.ndarray:
     source = oiio.ImageBuf(np.ascontiguousarray(clipped, dtype=np.float32))
     colored = oiio.ImageBufAlgo.color_map(source, 0, name)
     linear = np.asarray(colored.get_pixels(oiio.FLOAT))[..., :3]  # tables are in linear light
-    return to_uint8(srgb_encoded(np.clip(linear, 0.0, 1.0)))
+    return to_uint8(encode_srgb(np.clip(linear, 0.0, 1.0)))
 
 
-def compare_run(
-    opened: Opened, scene: GaussianScene, time: float, meant: SplatFile, read: SplatFile
+def compare_file_with_run(
+    opened: OpenedScene, scene: GaussianScene, time: float, meant: SplatFile, read: SplatFile
 ) -> float:
     """Return the PSNR, dB, of a file and a scene at one time, seen by four cameras of its capture,
     else from an orbit; 100 where they are equal.
@@ -342,7 +342,7 @@ def compare_run(
     return _compare(wanted, frame.cameras(cameras), read, scene.options.near * frame.scale)
 
 
-def compare_splats(splat: SplatFile, written: Written) -> float:
+def compare_file_with_source(splat: SplatFile, written: Written) -> float:
     """Return the PSNR, dB, of a file and what it was converted from, seen from an orbit.
 
     Raises DyngsError: the file cannot be read.

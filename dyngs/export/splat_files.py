@@ -54,8 +54,8 @@ from dyngs.io.gltf import GlbDocument
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import atomic_file
 from dyngs.ops.quaternions import align_quat_signs, rotation_matrices, unit_quats
-from dyngs.runs.folder import inputs_of
-from dyngs.runs.opened import Opened
+from dyngs.runs.folder import collect_inputs
+from dyngs.runs.opened import OpenedScene
 
 PER_LEAF = MERGED**7  # Gaussians of a leaf at level 0
 PER_FILE = MERGED**9  # at most, at each level
@@ -132,7 +132,7 @@ Part = Literal["all", "moving", "still"]
 
 
 @dataclass(frozen=True)
-class Writing:
+class WriteOptions:
     """How Gaussians are written."""
 
     # unit quaternion wxyz, from the axes of the capture, or of the frame of an edited run, to those
@@ -144,16 +144,16 @@ class Writing:
     edit: Similarity = UNMOVED  # made after ``turn``, and stored so that it can be undone
 
 
-AS_THEY_ARE = Writing()
+DEFAULT_WRITE_OPTIONS = WriteOptions()
 
 
-def writing_of(
-    opened: Opened,
+def choose_write_options(
+    opened: OpenedScene,
     target: str,
     up: str | None = None,
     from_up: str | None = None,
     sh_degree: int | None = None,
-) -> tuple[Writing, str]:
+) -> tuple[WriteOptions, str]:
     """Return how a scene is written, and a line about which way is up in the file.
 
     ``target``: axis that viewers of the format take for up. ``up``: axis requested instead; "keep":
@@ -165,23 +165,23 @@ def writing_of(
     if up == "keep" or (edited is not None and edited.fixed and up is None):
         own = None if edited is None else edited.up
         known = "" if own is None else f", {own} up"
-        return Writing(
+        return WriteOptions(
             up=own, sh_degree=sh_degree
         ), f"axes are those of the {frame.removesuffix('ed run')}{known}"
     found = up_of(opened) if from_up is None else (axis_of(from_up), "--from-up")
     if found is None:
         line = "nothing says which way is up in this run, so axes are those of the capture; --from-up=AXIS tells it"
-        return Writing(sh_degree=sh_degree), line
+        return WriteOptions(sh_degree=sh_degree), line
     direction, who = found
     wanted = target if up is None else up
     here = next((name for name, axis in AXES.items() if axis == direction), "a slanted direction")
     turned = f"turned, it was {here} in the {frame}"
     turned = f"the axes of the {frame} are kept" if here == wanted else turned
-    how = Writing(turn_between(direction, axis_of(wanted)), wanted, sh_degree)
+    how = WriteOptions(turn_between(direction, axis_of(wanted)), wanted, sh_degree)
     return how, f"up is {wanted} in the file ({turned}, says {who})"
 
 
-def up_of(opened: Opened) -> tuple[tuple[float, ...], str] | None:
+def up_of(opened: OpenedScene) -> tuple[tuple[float, ...], str] | None:
     """Return the direction (3,) that is up and what says so: an axis where one is within 30
     degrees; None: nothing.
 
@@ -198,7 +198,7 @@ def up_of(opened: Opened) -> tuple[tuple[float, ...], str] | None:
 
 
 def write_run_splats(
-    opened: Opened, path: Path, time: float = 0.0, part: Part = "all", how: Writing = AS_THEY_ARE
+    opened: OpenedScene, path: Path, time: float = 0.0, part: Part = "all", how: WriteOptions = DEFAULT_WRITE_OPTIONS
 ) -> Written:
     """Write a run at a time in [0, 1] as a file of Gaussians; its suffix names the format.
 
@@ -206,17 +206,17 @@ def write_run_splats(
     has one, states the render mode, and the time if something moves. Raises DyngsError: the part is
     empty, or an unknown suffix.
     """
-    inputs_of(opened).require_output(path)
+    collect_inputs(opened).require_output(path)
     splat = splats_at(opened, scene_part(opened.scene, part), time, how)
     return write_splats(path, splat, sh_degree=how.sh_degree)
 
 
 def write_run_sequence(
-    opened: Opened,
+    opened: OpenedScene,
     folder: Path,
     times: Sequence[float],
     part: Part = "all",
-    how: Writing = AS_THEY_ARE,
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
     suffix: str = ".ply",
 ) -> list[Written]:
     """Write a sequence ``frame_0000.ply`` and so on, one file per time in [0, 1], for players.
@@ -226,7 +226,7 @@ def write_run_sequence(
     """
     digits = max(4, len(str(len(times) - 1)))
     names = [f"frame_{i:0{digits}d}{suffix}" for i in range(len(times))]
-    inputs = inputs_of(opened)
+    inputs = collect_inputs(opened)
     for path in (folder, *(folder / name for name in names)):
         inputs.require_output(path)
     others = sorted(file.name for file in folder.glob(f"[!.]*{suffix}") if file.name not in names)
@@ -242,14 +242,14 @@ def write_run_sequence(
 
 
 def write_run_levels(
-    opened: Opened, folder: Path, time: float = 0.0, part: Part = "all", how: Writing = AS_THEY_ARE
+    opened: OpenedScene, folder: Path, time: float = 0.0, part: Part = "all", how: WriteOptions = DEFAULT_WRITE_OPTIONS
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Write a run at a time as a new folder of .sog in levels of detail; return Gaussians by level,
     and notes.
 
     Raises DyngsError: the part is empty, or the folder holds something.
     """
-    inputs_of(opened).require_output(folder)
+    collect_inputs(opened).require_output(folder)
     splat = splats_at(opened, scene_part(opened.scene, part), time, how)
     whole, notes = fitted(folder, format_named("sog"), splat, how.sh_degree)
     return write_sog_levels(folder, whole), notes
@@ -267,7 +267,7 @@ def scene_part(scene: GaussianScene, part: Part) -> GaussianScene:
 
 
 def splats_at(
-    opened: Opened, scene: GaussianScene, time: float, how: Writing = AS_THEY_ARE
+    opened: OpenedScene, scene: GaussianScene, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
 ) -> SplatFile:
     """Return what a file of Gaussians is to hold of a scene at one time, in the axes that are asked
     for.
@@ -352,19 +352,19 @@ UP = "-y"
 FPS = 30.0
 
 
-def write_moving(
-    opened: Opened,
+def write_4dgs(
+    opened: OpenedScene,
     path: Path,
     times: Sequence[float],
     part: Part = "all",
-    how: Writing = AS_THEY_ARE,
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> tuple[tuple[SplatFile, ...], tuple[str, ...]]:
     """Write a run at T >= 1 times in [0, 1] as one .4dgs, each shown for 1/30 s; return what it is
     meant to hold at each time, and notes about what the format could not hold.
 
     Raises DyngsError: the package is missing, the part is empty, or the file cannot be written.
     """
-    inputs_of(opened).require_output(path)
+    collect_inputs(opened).require_output(path)
     model, delta, files = _fourdgs(path)
     scene = scene_part(opened.scene, part)
     splats = tuple(splats_at(opened, scene, time, how) for time in times)
@@ -400,7 +400,7 @@ def write_moving(
     return splats, notes
 
 
-def read_moment(path: Path, index: int) -> SplatFile:
+def read_4dgs_frame(path: Path, index: int) -> SplatFile:
     """Return what a .4dgs that dyngs wrote shows at its time number ``index``, read by the package
     fourdgs.
 
@@ -426,14 +426,14 @@ def _fourdgs(path: Path) -> tuple[Any, Any, Any]:
 
 
 @torch.no_grad()
-def write_bodies(opened: Opened, path: Path, time: float, how: Writing = AS_THEY_ARE) -> Written:
+def write_rigid_bodies(opened: OpenedScene, path: Path, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS) -> Written:
     """Write a run at a time in [0, 1] as .glb: a node for each body, with its motion as an
     animation, one for the rest.
 
     Without the animation the file shows the scene at ``time``. Raises DyngsError: no body turns in
     this run, or the file cannot be written.
     """
-    inputs_of(opened).require_output(path)
+    collect_inputs(opened).require_output(path)
     scene = field_scene_of(opened.scene)
     field = None if scene is None else find_body_field(scene.field)
     if scene is None or field is None:

@@ -14,38 +14,38 @@ from dyngs.baselines.fields.kind import NgpModel
 from dyngs.baselines.fields.scene import space_of
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
-from dyngs.export.splat_files import AS_THEY_ARE, Writing, writing_of
+from dyngs.export.splat_files import DEFAULT_WRITE_OPTIONS, WriteOptions, choose_write_options
 from dyngs.gaussians.surface import extract_surface, opaque_box
 from dyngs.io.formats.ply import double_ply
 from dyngs.io.formats.similarity import Similarity, far_offset
 from dyngs.io.write import atomic_file
 from dyngs.models.renderable import Surface, SurfaceOptions
 from dyngs.models.views import training_cameras
-from dyngs.runs.folder import inputs_of
-from dyngs.runs.opened import Opened
+from dyngs.runs.folder import collect_inputs
+from dyngs.runs.opened import OpenedScene
 
 SUFFIXES = ".ply", ".glb", ".obj"
 
 
-def upright_surface(
-    opened: Opened, suffix: str, up: str | None, from_up: str | None
-) -> tuple[Writing, str]:
+def surface_write_options(
+    opened: OpenedScene, suffix: str, up: str | None, from_up: str | None
+) -> tuple[WriteOptions, str]:
     """Return how the mesh of a scene is turned, and a line about it, as of ``writing_of``.
 
     Viewers take y for up in .glb and .obj; those of .ply have no convention, so it stays in the
     axes of the capture.
     """
     usual = "keep" if suffix.lower() == ".ply" else None
-    return writing_of(opened, "y", up or usual, from_up)
+    return choose_write_options(opened, "y", up or usual, from_up)
 
 
 def write_surface(
-    opened: Opened,
+    opened: OpenedScene,
     out: Path,
     *,
     time: float = 0.0,
     options: SurfaceOptions | None = None,
-    how: Writing = AS_THEY_ARE,
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> Surface:
     """Write the surface of a scene at ``time`` and return it.
 
@@ -66,7 +66,7 @@ def write_surface(
         raise DyngsError(
             f"{out}: a mesh of a surface is one file that ends in {', '.join(SUFFIXES)}"
         )
-    inputs_of(opened).require_output(out)
+    collect_inputs(opened).require_output(out)
     surface = scene.own_surface(time, options) or _fused_surface(opened, time, options.cells)
     vertices = Similarity(how.turn).points(opened.world.points(surface.vertices))
     colours = np.round(255 * surface.colours.clip(0, 1)).astype(np.uint8)
@@ -96,7 +96,7 @@ def _mesh_bytes(suffix: str, vertices: np.ndarray, faces: np.ndarray, colours: n
     return scene.export(file_type="glb")
 
 
-def _fused_surface(opened: Opened, time: float, cells: int | None) -> Surface:
+def _fused_surface(opened: OpenedScene, time: float, cells: int | None) -> Surface:
     """Return what training cameras see of Gaussians; what they frame, where there is a
     background."""
     scene = opened.scene

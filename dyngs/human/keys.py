@@ -55,7 +55,7 @@ class HumanModel(_OnTemplate):
     )
 
     @property
-    def moving_bytes(self) -> int:
+    def bytes_per_moving_gaussian(self) -> int:
         """Memory per Gaussian while ``refine`` is on: anchor, skinning weights, gradients and posed
         Gaussian."""
         return 2600

@@ -19,21 +19,21 @@ from pydantic import TypeAdapter
 from dyngs.api.budget.size import has_file
 from dyngs.config import Config
 from dyngs.config.io import find_preset, load_config, load_resolved
-from dyngs.core.errors import DyngsError, printable, show
+from dyngs.core.errors import DyngsError, format_one_line, show
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
-from dyngs.evaluate.view_scores import Drawing
-from dyngs.models.kind import Predicts, capability, kind_of
+from dyngs.evaluate.view_scores import SceneRenderer
+from dyngs.models.kind import PredictsScenes, capability, kind_of
 from dyngs.models.views import evaluation_background
 from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.folder import EXPORT_FOLDER
 from dyngs.runs.opened import scene_of_split, split_views
-from dyngs.study.measure import Bench, Measurement, Subject
-from dyngs.study.runs import done_in_turn, finished, read_stored, require_same_study, write_stored
+from dyngs.study.measure import SceneMeasurer, Measurement, Subject
+from dyngs.study.runs import run_tasks, finished, read_stored, require_same_study, write_stored
 from dyngs.training.events import Event, StepDone
-from dyngs.training.limits import require_possible
+from dyngs.training.limits import validate_limits
 from dyngs.training.trainer import Trainer
 
 MOST_STEPS = 1_000_000
@@ -97,7 +97,7 @@ class ModelComparison:
         for word in self.overrides:
             if word.startswith(tuple(keys)):
                 raise DyngsError(
-                    f"{printable(word, 80)}: the comparison sets this itself; see its options"
+                    f"{format_one_line(word, 80)}: the comparison sets this itself; see its options"
                 )
         of_data = [word for word in self.overrides if word.startswith("data.")]
         data = load_config(None, [*of_data, fixed[0]]).data
@@ -113,14 +113,14 @@ class ModelComparison:
             name = re.sub(r"[^\w.-]", "_", file.stem).lstrip(".-") or "model"
             if name in configs or name in left_out:
                 raise DyngsError(
-                    f"--models: {printable(word, 60)} makes two models called {name}; rename one"
+                    f"--models: {format_one_line(word, 60)} makes two models called {name}; rename one"
                 )
             words = [*self.overrides, *fixed, f"run.dir={self.run_dir(name)}"]
             try:
                 config = load_config(file, words)
-                require_possible(config)
+                validate_limits(config)
                 problem = kind_of(config.model).refusal(capture)
-                if capability(config.model, Predicts) is not None:
+                if capability(config.model, PredictsScenes) is not None:
                     problem = "is a network, which is trained on many people"
             except DyngsError as error:
                 problem = str(error)
@@ -158,7 +158,7 @@ class ModelComparison:
         Raises:
             DyngsError: no model could be trained.
         """
-        bench = Bench(
+        bench = SceneMeasurer(
             self.out,
             self.split,
             self.threads,
@@ -173,7 +173,7 @@ class ModelComparison:
         }
         missing = [x for x in subjects.values() if not bench.point(x.slug).is_file()]
         left_out = dict[str, str]()
-        for subject, result in done_in_turn(bench.measure, missing, ray_cores):
+        for subject, result in run_tasks(bench.measure, missing, ray_cores):
             if isinstance(result, DyngsError):
                 left_out[subject.name] = str(result)
                 del subjects[subject.name]
@@ -227,7 +227,7 @@ class QualityCurve:
             self._drawn = done
             start = time.perf_counter()
             score = self._score(event.loop.trainer)
-            event.loop.watch.pause(time.perf_counter() - start)
+            event.loop.stopwatch.pause(time.perf_counter() - start)
             before = [point for point in self.points() if point[0] < event.step]
             write_stored(self._path, [*before, (event.step, event.seconds, score)])
 
@@ -244,7 +244,7 @@ class QualityCurve:
         scene = trainer.model.scene.on_background(background.to(trainer.device))
         shown = LoadedRun(trainer.config, scene, trainer.done, 0.0, trainer.info)
         scene = scene_of_split(shown, capture, self._split)
-        drawing = Drawing(scene, scene.options, background.to(trainer.device))
+        drawing = SceneRenderer(scene, scene.options, background.to(trainer.device))
         return fmean(
             psnr(drawing.image(x.cameras, x.time).cpu(), x.composite(background), x.mask)
             for x in self._images

@@ -16,17 +16,17 @@ from dyngs.core.errors import counted, show
 from dyngs.core.metrics import load_lpips
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
-from dyngs.evaluate.report import images_of_split
-from dyngs.evaluate.view_scores import Drawing, Regions, score_views, seconds_in_turn
+from dyngs.evaluate.report import load_split_images
+from dyngs.evaluate.view_scores import SceneRenderer, Regions, score_views, time_renders
 from dyngs.io.write import write_image
-from dyngs.models.checkpoint import read_capture_of
+from dyngs.models.checkpoint import read_run_capture
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background
 from dyngs.ops.device import select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.checkpoint import SCENE_FILE, has_only_scene_file, load_run
 from dyngs.runs.opened import scene_of_split, split_views
-from dyngs.study.runs import AS_STORED, read_stored, write_stored
+from dyngs.study.runs import STORED_CONFIG, read_stored, write_stored
 
 SERIES = 12
 """Scenes timed together with the first one; bounds the memory needed."""
@@ -53,7 +53,7 @@ class Measurement:
             other.
     """
 
-    __pydantic_config__ = AS_STORED
+    __pydantic_config__ = STORED_CONFIG
     name: str
     num_views: int
     psnr: float
@@ -88,7 +88,7 @@ class Subject:
 
 
 @dataclass(frozen=True)
-class Bench:
+class SceneMeasurer:
     """How the scenes of a study are measured.
 
     Attributes:
@@ -161,18 +161,18 @@ class Bench:
             views=tuple(views),
         )
 
-    def _drawn(self, run_dir: Path, folder: Path) -> tuple[Drawing, ImageLoader]:
+    def _drawn(self, run_dir: Path, folder: Path) -> tuple[SceneRenderer, ImageLoader]:
         """Return how the scene in a folder is drawn, and the images of the run that it is compared
         with."""
         run = load_run(run_dir)
         device = select_device(self.device)
-        capture = read_capture_of(run.config.data, run.info)
+        capture = read_run_capture(run.config.data, run.info)
         views = split_views(capture, self.split)
-        loader = images_of_split(capture, views, run_dir, run)
+        loader = load_split_images(capture, views, run_dir, run)
         loader.device = device
         _, background = evaluation_background(run.config.data.background, capture.has_alpha)
         scene = scene_of_split(load_run(folder), capture, self.split).to(device)
-        return Drawing(scene, scene.options, background.to(device)), loader
+        return SceneRenderer(scene, scene.options, background.to(device)), loader
 
     def with_speeds(self, subjects: Sequence[Subject]) -> list[Measurement]:
         """Return the measurements of all, the missing speeds measured in turn with the first one,
@@ -189,7 +189,7 @@ class Bench:
             loader = drawn[0][1]
             images = [loader[i] for i in evenly_spaced(len(loader), self.timed_views)]
             with kernel_threads(self.threads or num_cores()):
-                seconds = seconds_in_turn([drawing for drawing, _ in drawn], images, self.rounds)
+                seconds = time_renders([drawing for drawing, _ in drawn], images, self.rounds)
             for i, own in zip(together, seconds, strict=True):
                 if found[i].ms is None:
                     gain = median((seconds[0] / own).tolist())

@@ -15,7 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dyngs.core.errors import escaped, printable
+from dyngs.core.errors import escape_control_characters, format_one_line
 from dyngs.export.html.page import filled, script_safe, source_hash
 from dyngs.io.write import write_text
 from dyngs.study.measure import TRUTH, Measurement
@@ -91,7 +91,7 @@ def table_of(
     return Table(title, ["", *(columns[key][0] for key in shown)], cells)
 
 
-def shown_views(out: Path, results: Sequence[Measurement]) -> list[dict[str, Any]]:
+def page_views(out: Path, results: Sequence[Measurement]) -> list[dict[str, Any]]:
     """Return the views that a page shows, each with its images: the truth first, then those of the
     models."""
 
@@ -117,7 +117,7 @@ def write_report(stem: Path, report: Report) -> list[Path]:
         f"\nLeft out: {markdown_text(f'{name}: {why}')}\n" for name, why in report.left_out.items()
     )
     tables = "\n".join(markdown_table(table.head, table.cells) for table in report.tables)
-    svg = "" if report.figure is None else svg_of(report.figure)
+    svg = "" if report.figure is None else figure_to_svg(report.figure)
     values = {"rows": list(report.rows), **report.values, "left_out": dict(report.left_out)}
     texts = {
         "csv": csv_text(report.rows),
@@ -181,7 +181,7 @@ def csv_text(rows: Sequence[Mapping[str, object]]) -> str:
 def _no_formula(value: object) -> object:
     if not isinstance(value, str):
         return value
-    return escaped(f"'{value}" if value.lstrip()[:1] in ("=", "+", "-", "@") else value)
+    return escape_control_characters(f"'{value}" if value.lstrip()[:1] in ("=", "+", "-", "@") else value)
 
 
 def html_table(head: Sequence[str], cells: Cells) -> str:
@@ -199,13 +199,13 @@ def markdown_table(head: Sequence[str], cells: Cells) -> str:
 
 def markdown_text(text: str) -> str:
     """Return ``text`` as one line of Markdown in which names are no HTML, links or columns."""
-    return re.sub(r"([\\`*<>\[\]|&])", r"\\\1", printable(text))
+    return re.sub(r"([\\`*<>\[\]|&])", r"\\\1", format_one_line(text))
 
 
 # Plots
 
 
-def svg_of(figure: Figure) -> str:
+def figure_to_svg(figure: Figure) -> str:
     """Return a figure as an SVG element; equal figures give equal text."""
     import matplotlib
 

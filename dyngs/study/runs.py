@@ -14,7 +14,7 @@ from pydantic import ConfigDict, TypeAdapter
 from dyngs.api.train import train
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
-from dyngs.core.errors import DyngsError, printable, reading
+from dyngs.core.errors import DyngsError, format_one_line, wrap_read_errors
 from dyngs.io.child import home_of_dyngs
 from dyngs.io.containment import following_links_of_runs, follows_links_of_runs
 from dyngs.io.fields import read_limited
@@ -24,7 +24,7 @@ from dyngs.training.events import Listener
 
 T = TypeVar("T")
 R = TypeVar("R")
-AS_STORED = ConfigDict(extra="forbid", allow_inf_nan=False)
+STORED_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
 """How the dataclasses of results are read: nothing else, and only numbers."""
 STUDY_FILE = "study.json"
 """What a study is about, in its folder."""
@@ -43,7 +43,7 @@ def finished(config: Config, out: Path, listeners: Sequence[Listener] = ()) -> P
     return train(begun.model_copy(update={"run": run}), resume_from=out, listeners=listeners)
 
 
-def done_in_turn(
+def run_tasks(
     do: Callable[[T], R], tasks: Sequence[T], ray_cores: int | None = None
 ) -> Iterator[tuple[T, R | DyngsError]]:
     """Yield each task and what ``do`` makes of it, or why it cannot, as they end.
@@ -92,7 +92,7 @@ def done_in_turn(
 
 def read_stored(path: Path, kind: TypeAdapter[T]) -> T:
     """Return a result. Raises DyngsError: the file is damaged."""
-    with reading(path, "it is no result of a study: remove it to have it measured again"):
+    with wrap_read_errors(path, "it is no result of a study: remove it to have it measured again"):
         return kind.validate_json(read_limited(path))
 
 
@@ -111,7 +111,7 @@ def require_same_study(out: Path, facts: Mapping[str, object], compared: Sequenc
         write_stored(path, facts)
         return
     here = json.loads(json.dumps(facts))
-    with reading(path, "what its folder holds is not known; give another --out"):
+    with wrap_read_errors(path, "what its folder holds is not known; give another --out"):
         known = json.loads(read_limited(path))
         differing = [
             f"{key} is {_shown(known.get(key))} there and {_shown(here[key])} here"
@@ -124,4 +124,4 @@ def require_same_study(out: Path, facts: Mapping[str, object], compared: Sequenc
 
 def _shown(value: object) -> str:
     text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-    return printable(text, 80) or "none"
+    return format_one_line(text, 80) or "none"

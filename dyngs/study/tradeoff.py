@@ -21,15 +21,15 @@ from pydantic.dataclasses import dataclass
 
 from dyngs.api.prune import prune_run
 from dyngs.api.scene_file import write_scene_file
-from dyngs.compress.stage import pruning
+from dyngs.compress.stage import build_pruning_edit
 from dyngs.config import BudgetConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.core.conventions import num_sh_terms
-from dyngs.core.errors import DyngsError, printable, show
+from dyngs.core.errors import DyngsError, format_one_line, show
 from dyngs.core.section import CutOff
-from dyngs.core.state import tensors_of
-from dyngs.models.checkpoint import read_capture_of, restored_model, settings_of
-from dyngs.models.kind import HasGaussians, Moves, capability
+from dyngs.core.state import strip_roles
+from dyngs.models.checkpoint import read_run_capture, restore_model, checkpoint_settings
+from dyngs.models.kind import HasGaussians, HasMotion, capability
 from dyngs.ops.device import select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.checkpoint import (
@@ -41,11 +41,11 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
-from dyngs.runs.folder import inputs_of, write_config
+from dyngs.runs.folder import collect_inputs, write_config
 from dyngs.runs.opened import split_views
-from dyngs.study.measure import SCORES, Bench, Measurement, Subject
-from dyngs.study.runs import AS_STORED, done_in_turn, finished, require_same_study
-from dyngs.training.new_trainer import assemble
+from dyngs.study.measure import SCORES, SceneMeasurer, Measurement, Subject
+from dyngs.study.runs import STORED_CONFIG, run_tasks, finished, require_same_study
+from dyngs.training.new_trainer import build_trainer
 
 MIN_DOUBLINGS = 0.05
 """Smaller gains (3.5 %) count as none."""
@@ -60,7 +60,7 @@ Row = dict[str, Any]
 Value = float | int | str
 
 
-@dataclass(frozen=True, config=AS_STORED)
+@dataclass(frozen=True, config=STORED_CONFIG)
 class Variant:
     """Changes of a run; the defaults change nothing.
 
@@ -132,7 +132,7 @@ def parse_variations(words: Sequence[str]) -> dict[str, tuple[Value, ...]]:
     found: dict[str, tuple[Value, ...]] = {}
     for word in words:
         name, equals, listed = word.partition("=")
-        shown = f"--vary {printable(word, 60)}"
+        shown = f"--vary {format_one_line(word, 60)}"
         if name not in SETTINGS:
             raise DyngsError(f"{shown}: no such setting; there are {', '.join(SETTINGS)}")
         found[name] = SETTINGS[name]
@@ -146,7 +146,7 @@ def parse_variations(words: Sequence[str]) -> dict[str, tuple[Value, ...]]:
     return found or SETTINGS
 
 
-def own_settings(run_dir: Path) -> dict[str, Value | None]:
+def current_settings(run_dir: Path) -> dict[str, Value | None]:
     """Return the settings that can be varied in a run, with its own values. Raises DyngsError: none
     can."""
     if has_only_scene_file(run_dir):
@@ -163,12 +163,12 @@ def own_settings(run_dir: Path) -> dict[str, Value | None]:
         "storage": None,
         "alpha_min": scene.options.alpha_min,
     }
-    if capability(config.model, Moves) is not None and not scene.is_static:
+    if capability(config.model, HasMotion) is not None and not scene.is_static:
         own["mask_times"] = config.prune.mask_times
     return own
 
 
-def single_changes(
+def single_setting_variants(
     settings: Mapping[str, Sequence[Value]], own: Mapping[str, Value | None], finetune: int
 ) -> list[Variant]:
     """Return one variant per setting and value that applies to a run with the settings ``own`` and
@@ -219,10 +219,10 @@ class Tradeoff:
             DyngsError: no such run or split, or the folder holds measurements of another run.
         """
         load_resolved(self.run_dir)  # what is no run is refused before anything else
-        inputs_of(self.run_dir).require_output(self.out)
-        own = own_settings(self.run_dir)  # refuses what cannot be varied before anything is written
+        collect_inputs(self.run_dir).require_output(self.out)
+        own = current_settings(self.run_dir)  # refuses what cannot be varied before anything is written
         run = load_run(self.run_dir)
-        split_views(read_capture_of(run.config.data, run.info), self.split)
+        split_views(read_run_capture(run.config.data, run.info), self.split)
         newest = checkpoint_paths(self.run_dir)[-1]
         source = {
             "run": str(self.run_dir.absolute()),
@@ -232,7 +232,7 @@ class Tradeoff:
             "device": select_device(self.device).type,
         }
         require_same_study(self.out, source, ("sha256", "split", "device"))
-        singles = [Variant(), *single_changes(self.settings, own, self.finetune)]
+        singles = [Variant(), *single_setting_variants(self.settings, own, self.finetune)]
         idle = self.settings.keys() - {name for variant in singles for name in variant.settings}
         if idle:
             show(f"nothing to vary in this run: {', '.join(sorted(idle))}")
@@ -243,12 +243,12 @@ class Tradeoff:
     def _measured(
         self, variants: Sequence[Variant], ray_cores: int | None
     ) -> dict[Variant, Measurement]:
-        bench = Bench(self.out, self.split, self.threads, self.device, rounds=self.rounds)
+        bench = SceneMeasurer(self.out, self.split, self.threads, self.device, rounds=self.rounds)
         subjects = [
             Subject(v.name, v.slug, self.run_dir, partial(self.folder, v)) for v in variants
         ]
         missing = [subject for subject in subjects if not bench.point(subject.slug).is_file()]
-        for subject, found in done_in_turn(bench.measure, missing, ray_cores):
+        for subject, found in run_tasks(bench.measure, missing, ray_cores):
             if isinstance(found, DyngsError):
                 raise found
             show(f"{subject.name}: {found.psnr:.2f} dB, {found.mb:.2f} MB")
@@ -294,14 +294,14 @@ class Tradeoff:
             steps = f"train.steps={start.info.step}"
             config = load_resolved(source, [steps, *self._pruning(wanted)])
             with kernel_threads(self.threads or num_cores()):
-                capture = read_capture_of(config.data, start.info)
-                trainer = assemble(config, capture, restored=True)
+                capture = read_run_capture(config.data, start.info)
+                trainer = build_trainer(config, capture, restored=True)
                 trainer.restore(start)
-                trainer.apply(pruning(trainer))
+                trainer.apply(build_pruning_edit(trainer))
                 checkpoint = trainer.checkpoint()
         # optimizer, sampler and random state are left out
-        tensors = tensors_of(restored_model(checkpoint, config.model).state())
-        checkpoint = replace(checkpoint, tensors=tensors, settings=settings_of(config))
+        tensors = strip_roles(restore_model(checkpoint, config.model).state())
+        checkpoint = replace(checkpoint, tensors=tensors, settings=checkpoint_settings(config))
         save_checkpoint(folder, checkpoint, seconds_at(source, checkpoint.info.step))
         write_config(config, folder)  # marks the folder as complete
 
@@ -457,7 +457,7 @@ def parse_requirements(text: str) -> list[Requirement]:
             bound = math.nan
         if match is None or not math.isfinite(bound):
             raise DyngsError(
-                f"--require {printable(part.strip(), 60)!r} is no condition; write for instance "
+                f"--require {format_one_line(part.strip(), 60)!r} is no condition; write for instance "
                 "psnr>=30,fps>=20,mb<=5"
             )
         found.append(replace(parse_goal(match[1], smallest=match[2] == "<="), bound=bound))
@@ -467,7 +467,7 @@ def parse_requirements(text: str) -> list[Requirement]:
 def parse_goal(name: str, *, smallest: bool) -> Requirement:
     """Return the goal of ``--minimize`` or ``--maximize``."""
     if name not in METRICS:
-        raise DyngsError(f"{printable(name, 60)}: no such metric; there are {', '.join(METRICS)}")
+        raise DyngsError(f"{format_one_line(name, 60)}: no such metric; there are {', '.join(METRICS)}")
     return Requirement(name, smallest)
 
 

@@ -75,7 +75,7 @@ def step_cost(config: Config, step: int, pixels: float, num_gaussians: float) ->
     something."""
     drawn = pixels / image_divisor(config.train, max(step, 1)) ** 2
     cost = FIXED + PER_MEGAPIXEL * 1e-6 * drawn + PER_GAUSSIAN * num_gaussians
-    begins = config.model.moves_after(config.train.steps)
+    begins = config.model.motion_start_step(config.train.steps)
     return cost if begins is None or step <= begins else MOTION * cost
 
 
@@ -99,7 +99,7 @@ class _Mark:
     num_gaussians: int
 
 
-class Forecast:
+class TimeForecast:
     """Prediction of the seconds that a run still takes, by its pace so far.
 
     Args:

@@ -81,7 +81,7 @@ class StepDone:
 
     @property
     def seconds(self) -> float:
-        return self.loop.watch.seconds
+        return self.loop.stopwatch.seconds
 
 
 @dataclass(frozen=True)

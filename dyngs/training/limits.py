@@ -9,7 +9,7 @@ from __future__ import annotations
 from dyngs.config import Config
 from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
-from dyngs.models.kind import HasGaussians, LimitsSize, capability, kind_of
+from dyngs.models.kind import HasGaussians, HasSizeLimit, capability, kind_of
 
 # Fraction of the limit that is kept free for the random Gaussians with which motion begins
 RANDOM_FRACTION = 0.1
@@ -19,7 +19,7 @@ docs/storage.md."""
 FEWEST = 500  # Fewest Gaussians that a limit on the size must have room for
 
 
-def require_possible(config: Config) -> None:
+def validate_limits(config: Config) -> None:
     """Raise DyngsError where limits or choices of ``config`` contradict it or each other."""
     uses = kind_of(config.model).uses
     for key, value in _given(config).items():
@@ -34,7 +34,7 @@ def require_possible(config: Config) -> None:
                     f"train.batch_size={config.train.batch_size}: {key}={value} follows one image per step; give "
                     f"{key}=never, or one process"
                 )
-    if config.train.minutes is not None and config.prune.is_wanted:
+    if config.train.minutes is not None and config.prune.is_enabled:
         raise DyngsError(
             "train.minutes: how long the stage of prune.* takes cannot be foreseen; leave that out and run "
             "`dyngs prune` afterwards"
@@ -66,26 +66,26 @@ def _of_single_images(config: Config) -> dict[str, str]:
     }
 
 
-def within_cap(config: Config, cap: int | None) -> Config:
+def apply_gaussian_cap(config: Config, cap: int | None) -> Config:
     """Return ``config`` with all numbers of Gaussians lowered to ``cap``; None: as it is."""
     changes = {}
     if cap is None:
         return config
-    added = config.model.added_for_motion
+    added = config.model.num_added_for_motion
     made_of = capability(config.model, HasGaussians)
     if made_of is not None and added:
         added = min(added, int(RANDOM_FRACTION * cap))
-        changes["model"] = made_of.adding(config.model, added)
+        changes["model"] = made_of.with_added_gaussians(config.model, added)
     cap -= added
     return config.model_copy(update=changes | {"strategy": config.strategy.limited(cap)})
 
 
-def most_gaussians(config: Config, num_times: int) -> int | None:
+def gaussian_limit(config: Config, num_times: int) -> int | None:
     """Return the largest number of Gaussians at the end by the limits of the run; None without
     one."""
     limits = [config.budget.max_gaussians] if config.budget.max_gaussians is not None else []
     megabytes = config.budget.max_mb
-    if megabytes is not None and capability(config.model, LimitsSize) is not None:
+    if megabytes is not None and capability(config.model, HasSizeLimit) is not None:
         limits.append(room(config, num_times, megabytes))
     return min(limits, default=None)
 
@@ -98,7 +98,7 @@ def room(config: Config, num_times: int, megabytes: float) -> int:
         DyngsError: fewer than ``FEWEST``; says which size has room for them.
     """
     each = SHAPE_BYTES + HARMONIC_BYTES * 3 * (num_sh_terms(config.stored_sh_degree) - 1)
-    kind = capability(config.model, LimitsSize)
+    kind = capability(config.model, HasSizeLimit)
     assert kind is not None
     fixed, whole = (
         FIELD_BYTES * kind.num_shared(config.model, num_times, moving) for moving in (0, 1)

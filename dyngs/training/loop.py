@@ -22,7 +22,7 @@ from dyngs.training.events import (
     TopologyChanged,
     TotalChanged,
 )
-from dyngs.training.trainer import Edit
+from dyngs.training.trainer import TrainingEdit
 
 
 class Trainable(Protocol):
@@ -53,7 +53,7 @@ class Trainable(Protocol):
         """Train on one image, or one choice of them."""
         ...
 
-    def apply(self, edit: Edit) -> None:
+    def apply(self, edit: TrainingEdit) -> None:
         """Change the training between two steps."""
         ...
 
@@ -66,7 +66,7 @@ class Trainable(Protocol):
         ...
 
 
-Editor = Callable[["Loop"], Edit | None]
+Editor = Callable[["Loop"], TrainingEdit | None]
 """Returns the change of the training that it requests between two steps, if any."""
 
 
@@ -85,7 +85,7 @@ class Loop:
         self,
         trainer: Trainable,
         total: int,
-        watch: Stopwatch,
+        stopwatch: Stopwatch,
         advice: Callable[[], str] | None = None,
         *,
         stages: Sequence[Editor] = (),
@@ -94,7 +94,7 @@ class Loop:
     ) -> None:
         self.trainer = trainer
         self.total = total
-        self.watch = watch
+        self.stopwatch = stopwatch
         self._advice = advice
         self._stages = stages
         self._limits = limits
@@ -132,7 +132,7 @@ class Loop:
             if edit.steps is not None:
                 self.total = edit.steps
                 self.emit(TotalChanged(self.total))
-            elif edit.kept is not None or edit.stops_growing:
+            elif edit.kept is not None or edit.stops_densification:
                 self.emit(TopologyChanged(trainer.done, before, trainer.num_gaussians))
 
     def _step(self) -> StepReport:

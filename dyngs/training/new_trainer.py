@@ -17,11 +17,11 @@ from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.initialization import InitialGaussians, scene_geometry
 from dyngs.gaussians.model import GaussianModel
-from dyngs.models.kind import Moves, RunStart, kind_of
+from dyngs.models.kind import HasMotion, StartContext, kind_of
 from dyngs.models.views import (
     background_colour,
-    resolved_background,
-    share_alike,
+    resolve_background,
+    background_coloured_fraction,
     training_cameras,
     training_times,
 )
@@ -30,8 +30,8 @@ from dyngs.training.corrections.camera_refinement import CameraRefinement
 from dyngs.training.corrections.exposure import ViewExposures
 from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
-from dyngs.training.priors import UsedPriors, used_priors
-from dyngs.training.trainer import Parts, Trainer
+from dyngs.training.priors import PriorLosses, load_priors
+from dyngs.training.trainer import TrainerParts, Trainer
 
 GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
 
@@ -45,7 +45,7 @@ FULL_OPACITY_FROM = 0.6
 ALIKE_IMAGES = 12  # number of images in which colours are compared with the background
 
 
-def assemble(
+def build_trainer(
     config: Config,
     capture: Capture | None = None,
     *,
@@ -74,14 +74,14 @@ def assemble(
         images = ImageLoader(
             capture.splits["train"], config.data, with_maps=True, decoding_threads=usual_threads()
         )
-    priors = UsedPriors()
+    priors = PriorLosses()
     kind = kind_of(config.model)
     if "train.priors" in kind.uses:
-        moves = isinstance(kind, Moves) and len(set(training_times(capture))) > 1
-        priors = used_priors(config, capture, images.views, moves=moves)
+        moves = isinstance(kind, HasMotion) and len(set(training_times(capture))) > 1
+        priors = load_priors(config, capture, images.views, moves=moves)
     if not priors.masks:
         images = images.without_motion_masks()
-    background = resolved_background(config, capture)
+    background = resolve_background(config, capture)
     extent = scene_geometry(capture).extent
     findings = [priors.message] if priors.message else []
     published = capture.has_alpha and config.train.alpha_weight == 0 and background != "random"
@@ -92,8 +92,8 @@ def assemble(
         )
     early = _early_opacity(config, capture, images, background)
 
-    def parts(config: Config) -> Parts:
-        start = RunStart(
+    def parts(config: Config) -> TrainerParts:
+        start = StartContext(
             config, uncapped or config, capture, images, background, extent, generator, first
         )
         model = kind.start(start)
@@ -102,10 +102,10 @@ def assemble(
         refinement = None
         if config.camera.refine == "always":
             refinement = CameraRefinement(views, extent, steps)
-            applied_to = refinement.corrections.applied_to
-            images.corrected = lambda index, cameras: applied_to(views[index], cameras)
+            correct_cameras = refinement.corrections.correct_cameras
+            images.corrected = lambda index, cameras: correct_cameras(views[index], cameras)
         robust = None
-        may_mask = "train.robust" in kind.uses and not isinstance(kind, Moves)
+        may_mask = "train.robust" in kind.uses and not isinstance(kind, HasMotion)
         if config.train.robust == "always" and may_mask:
             cameras = training_cameras(views, config.data)
             robust = RobustMasks(images, cameras, steps, images.corrected)
@@ -121,11 +121,11 @@ def assemble(
             RegularizerLoss(),
         ]
         found = (robust, exposures, refinement)
-        return Parts(model, losses, [x for x in found if x is not None])
+        return TrainerParts(model, losses, [x for x in found if x is not None])
 
     return Trainer(
         config=config,
-        parts_of=parts,
+        build_parts=parts,
         capture=capture,
         images=images,
         background=background,
@@ -183,5 +183,5 @@ def _early_opacity(config: Config, capture: Capture, images: ImageLoader, backgr
     ):
         return 1.0
     shown = (images[i] for i in evenly_spaced(len(images), ALIKE_IMAGES))
-    alike = share_alike(shown, background_colour(background))
+    alike = background_coloured_fraction(shown, background_colour(background))
     return 1.0 if alike is None or alike >= MANY_ALIKE else EARLY_OPACITY

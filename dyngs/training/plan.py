@@ -10,7 +10,7 @@ from dyngs.config import Config, TrainConfig
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.capture import Capture
 from dyngs.gaussians.initialization import InitialGaussians
-from dyngs.models.kind import ExtendsTo, capability
+from dyngs.models.kind import HasSchedules, capability
 from dyngs.models.schedule import PUBLISHED_STEPS, Length, scaled
 from dyngs.training.corrections.exposure import WARM_UP
 
@@ -60,7 +60,7 @@ def with_steps(config: Config, steps: int) -> Config:
     return config.model_copy(update={"train": config.train.model_copy(update={"steps": steps})})
 
 
-def with_length(config: Config, done: int, steps: int) -> Config:
+def extend_config(config: Config, done: int, steps: int) -> Config:
     """Return the configuration with which a run goes on, after ``done`` steps, to ``steps``; no
     limit of time holds.
 
@@ -80,9 +80,9 @@ def with_length(config: Config, done: int, steps: int) -> Config:
         )
     _require_exposures_stay(config, length)
     changed: dict[str, object] = {"train": _train(config.train, length)}
-    extends = capability(config.model, ExtendsTo)
+    extends = capability(config.model, HasSchedules)
     if extends is not None:
-        changed["model"] = extends.extended(config.model, length)
+        changed["model"] = extends.extend_schedules(config.model, length)
     return config.model_copy(update=changed)
 
 

@@ -19,7 +19,7 @@ from dyngs.data.tracks import ImageTracks, read_tracks
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.models.model import Look, Loss
+from dyngs.models.model import LossInput, Loss
 from dyngs.models.views import training_cameras
 
 SOFT_PX = 0.5  # Charbonnier's constant, px: smaller errors count quadratically
@@ -67,9 +67,9 @@ class PointTracks:
         return self.cameras[other], self.xy[index][both], self.xy[other][both]
 
 
-def used_priors(
+def load_priors(
     config: Config, capture: Capture, views: Sequence[View], *, moves: bool
-) -> UsedPriors:
+) -> PriorLosses:
     """Return the priors of the training ``views`` that ``train.priors`` names; those of motion only
     where anything ``moves``."""
     wanted = config.train.priors if moves else {"depth"}.intersection(config.train.priors)
@@ -88,7 +88,7 @@ def used_priors(
         tracks = _point_tracks(config, read_tracks(capture.tracks_path), views)
     found = {"depth maps": depth, "optical flow": flow_to, "tracks": tracks, "motion masks": masks}
     names = ", ".join(name for name, x in found.items() if x)
-    return UsedPriors(depth, flow_to, tracks, masks, names and f"priors that are used: {names}")
+    return PriorLosses(depth, flow_to, tracks, masks, names and f"priors that are used: {names}")
 
 
 def _timed_camera(view: View, config: Config) -> TimedCamera:
@@ -123,7 +123,7 @@ def _scale(size: View | Cameras, wanted: Cameras) -> Tensor:
 
 
 @dataclass(frozen=True)
-class UsedPriors(Loss):
+class PriorLosses(Loss):
     """Losses of the priors that a run uses."""
 
     depth: bool = False  # whether depth maps are used
@@ -136,7 +136,7 @@ class UsedPriors(Loss):
     def needs_depth(self, image: Image) -> bool:
         return self.depth and image.depth is not None
 
-    def __call__(self, look: Look) -> dict[str, Tensor]:
+    def __call__(self, look: LossInput) -> dict[str, Tensor]:
         found: dict[str, Tensor | None] = {}
         image = look.image
         rendering = look.drawn.rendering
@@ -148,7 +148,7 @@ class UsedPriors(Loss):
             found |= self._motion(scene, look)
         return {name: x for name, x in found.items() if x is not None}
 
-    def _motion(self, scene: GaussianScene, look: Look) -> dict[str, Tensor | None]:
+    def _motion(self, scene: GaussianScene, look: LossInput) -> dict[str, Tensor | None]:
         image = look.image
         here = image.cameras
         first, last = look.model.window(look.step)
@@ -162,7 +162,7 @@ class UsedPriors(Loss):
         def drawn(other: TimedCamera) -> Tensor:
             start, end = (canonical.time_step(t).gaussians for t in (image.time, other.time))
             there = other.cameras.resized(here.width, here.height)
-            return displacements(start, end, here, there, options)
+            return render_displacements(start, end, here, there, options)
 
         found: dict[str, Tensor | None] = {}
         target = self.flow_to.get(look.index)
@@ -196,13 +196,13 @@ def depth_error(
     if int(counts.sum()) < MIN_PIXELS:
         return None
     inverse = 1 / drawn[counts].clamp_min(_TINY)
-    target = aligned(1 / given[counts].clamp_min(_TINY), inverse.detach())
+    target = align_scale_shift(1 / given[counts].clamp_min(_TINY), inverse.detach())
     if target is None:
         return None
     return (inverse - target).abs().mean() / inverse.detach().median().clamp_min(_TINY)
 
 
-def aligned(given: Tensor, wanted: Tensor) -> Tensor | None:
+def align_scale_shift(given: Tensor, wanted: Tensor) -> Tensor | None:
     """Return ``a given + b`` nearest to ``wanted``, both (P,); None where that would turn near and
     far about.
 
@@ -223,7 +223,7 @@ def aligned(given: Tensor, wanted: Tensor) -> Tensor | None:
     return a * given + b if bool(a > 0) else None
 
 
-def displacements(
+def render_displacements(
     start: Gaussians, end: Gaussians, here: Cameras, there: Cameras, options: RenderOptions
 ) -> Tensor:
     """Return (H, W, 3): mean displacement (x, y) in px of the images' size, and the sum of weights

@@ -47,7 +47,7 @@ class Processes:
         self._store: Store | None = None
 
     @staticmethod
-    def of_torchrun() -> Processes:
+    def from_torchrun() -> Processes:
         """Return the processes that ``torchrun`` has started, this one alone without it. Raises
         DyngsError."""
         if any(name not in os.environ for name in (*_NAMES, "MASTER_ADDR", "MASTER_PORT")):
@@ -60,7 +60,7 @@ class Processes:
             ) from None
 
     @property
-    def is_first(self) -> bool:
+    def is_rank_zero(self) -> bool:
         """Whether this is the process that reads what was asked for, writes files, and speaks."""
         return self.rank == 0
 
@@ -147,7 +147,7 @@ class Processes:
         """Return whether any process has reported a signal to stop."""
         return self._count(STOP) > 0
 
-    def send_(self, values: Tensor) -> None:
+    def broadcast_(self, values: Tensor) -> None:
         """Replace the values of a tensor by those of the first process."""
         if self.size > 1:
             with self._connected():

@@ -62,7 +62,7 @@ class RunLog:
         match event:
             case StepDone() if event.step % self._every == 0 or event.is_last:
                 plotted = ("loss", "psnr", "num_gaussians")
-                self._append(asdict(record_of(event)), "train", plotted)
+                self._append(asdict(log_record(event)), "train", plotted)
             case Evaluated(step, split, psnr, ssim):
                 scores = {"step": step, "split": split, "psnr": psnr, "ssim": ssim}
                 self._append(scores, split, ("psnr", "ssim"))
@@ -84,7 +84,7 @@ class RunLog:
             self._board.close()
 
 
-def record_of(event: StepDone) -> LogRecord:
+def log_record(event: StepDone) -> LogRecord:
     quality = event.report.psnr
     return LogRecord(
         step=event.step,

@@ -15,13 +15,13 @@ from torch import Tensor
 
 from dyngs.config import Config
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError, reading
-from dyngs.core.state import Role, prefixed, tensors_of, with_role
+from dyngs.core.errors import DyngsError, wrap_read_errors
+from dyngs.core.state import Role, add_prefix, strip_roles, with_role
 from dyngs.core.tensor_checks import require_indices
 from dyngs.data.capture import Capture
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, settings_of
-from dyngs.models.model import Correction, Look, Loss, Model, RenderedView
+from dyngs.models.checkpoint import CONFIG_ADVICE, Checkpoint, CheckpointInfo, checkpoint_settings
+from dyngs.models.model import Correction, LossInput, Loss, Model, RenderedView
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour
@@ -56,7 +56,7 @@ class ViewSampler:
             if wanted(index):
                 return index
 
-    def coming(self, count: int, wanted: Callable[[int], bool]) -> list[int]:
+    def peek(self, count: int, wanted: Callable[[int], bool]) -> list[int]:
         """Return up to ``count`` views of this epoch that come next, by what is ``wanted`` now;
         nothing is drawn."""
         rest = self._order[self._position :].tolist()
@@ -73,7 +73,7 @@ class ViewSampler:
 
 
 @dataclass(frozen=True)
-class Edit:
+class TrainingEdit:
     """A change of a training between two steps, as a limit or the pruning stage requests it.
 
     Attributes:
@@ -88,7 +88,7 @@ class Edit:
     message: str = ""
     kept: Tensor | None = None
     masks: Any = None
-    stops_growing: bool = False
+    stops_densification: bool = False
     steps: int | None = None
     config: Config | None = None
 
@@ -96,7 +96,7 @@ class Edit:
 M = TypeVar("M", bound=Model[Any])
 
 
-class Parts(NamedTuple):
+class TrainerParts(NamedTuple):
     """Parts of a trainer that depend on the schedules of a run.
 
     The order of the losses decides the last bits of gradients.
@@ -124,7 +124,7 @@ class Trainer(Generic[M]):
     """
 
     config: Config
-    parts_of: Callable[[Config], Parts]
+    build_parts: Callable[[Config], TrainerParts]
     capture: Capture
     images: ImageLoader
     background: str
@@ -147,7 +147,7 @@ class Trainer(Generic[M]):
 
     def _begin(self, config: Config) -> None:
         self.config = config
-        self.model, self.losses, self.corrections = self.parts_of(config)
+        self.model, self.losses, self.corrections = self.build_parts(config)
         self.place(self.device)
 
     @property
@@ -174,8 +174,8 @@ class Trainer(Generic[M]):
         updated = self.model.update(step)
         self.bad_gradients = self.bad_gradients + updated.bad
         self.done = step
-        if updated.is_rearranged:
-            self.processes.require_same(tensors_of(self.model.scene.state()), f"after step {step}")
+        if updated.topology_changed:
+            self.processes.require_same(strip_roles(self.model.scene.state()), f"after step {step}")
         findings = [*self.findings, updated.finding or ""]
         self.findings.clear()
         finding = "\n".join(line for line in findings if line)
@@ -219,7 +219,7 @@ class Trainer(Generic[M]):
         image = view.image
         rendered = view.rendered
         truth = image.composite(background)
-        look = Look(index, step, image, drawn, rendered, truth, self.model, self.generator)
+        look = LossInput(index, step, image, drawn, rendered, truth, self.model, self.generator)
         terms: dict[str, Tensor] = {}
         for loss in self.losses:
             terms |= loss(look)
@@ -227,14 +227,14 @@ class Trainer(Generic[M]):
         with torch.autograd.set_multithreading_enabled(False):
             # a GPU's nodes in this thread, too: no handing over
             reduce(add, terms.values()).backward()
-        value = check.loss(step, image, self.model.moves_by)
+        value = check.loss(step, image, self.model.deformation_name)
         drawn.after_backward()
         for correction in self.corrections:
             bad = correction.after_backward(index, step, image)
             self.bad_gradients = self.bad_gradients + bad
         return StepReport(step, value, image, rendered.detach(), truth)
 
-    def apply(self, edit: Edit) -> None:
+    def apply(self, edit: TrainingEdit) -> None:
         """Change the training between two steps."""
         model: Any = self.model
         if edit.steps is not None:
@@ -242,7 +242,7 @@ class Trainer(Generic[M]):
         if edit.config is not None:
             self.config = edit.config
             model.set_render_options(edit.config.model)
-        if edit.stops_growing:
+        if edit.stops_densification:
             model.replace_scene(model.scene.without_masks())
             model.stop_growing()
         if edit.kept is not None:
@@ -257,10 +257,10 @@ class Trainer(Generic[M]):
             return
         step = self.done + 1
         seen = self.model.window(step)
-        self.begin_again(config, self.checkpoint())
+        self.restart(config, self.checkpoint())
         self.model.extend(seen, step)
 
-    def begin_again(self, config: Config, checkpoint: Checkpoint) -> None:
+    def restart(self, config: Config, checkpoint: Checkpoint) -> None:
         """Go back to ``checkpoint``, on the schedules of ``config``."""
         self._begin(config)
         self.restore(checkpoint)
@@ -284,21 +284,21 @@ class Trainer(Generic[M]):
     def checkpoint(self) -> Checkpoint:
         state = self.model.state()
         for name, part in self._image_parts().items():
-            state |= prefixed(name, with_role(part.state(), Role.TRAINING))
+            state |= add_prefix(name, with_role(part.state(), Role.TRAINING))
         state |= with_role({"rng": self.generator.get_state()}, Role.TRAINING)
-        tensors = {name: x.cpu() for name, x in tensors_of(state).items()}
-        return Checkpoint(self.info, tensors, settings=settings_of(self.config))
+        tensors = {name: x.cpu() for name, x in strip_roles(state).items()}
+        return Checkpoint(self.info, tensors, settings=checkpoint_settings(self.config))
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go back to where ``checkpoint`` was taken."""
-        with reading(checkpoint.name, OTHER_CONFIG):
+        with wrap_read_errors(checkpoint.name, CONFIG_ADVICE):
             try:
                 self.model.restore(checkpoint)
                 for name, part in self._image_parts().items():
                     part.load_state(checkpoint.part(name))
                 self.generator.set_state(checkpoint.tensors["rng"])
             except KeyError as missing:
-                raise DyngsError(f"{checkpoint.name} lacks {missing}; {OTHER_CONFIG}") from None
+                raise DyngsError(f"{checkpoint.name} lacks {missing}; {CONFIG_ADVICE}") from None
         self.done = checkpoint.info.step
         self.place(self.device)
 
@@ -343,8 +343,8 @@ class Trainer(Generic[M]):
             batch = self.config.train.batch_size
             count = self.images.decoded_ahead * self.processes.size
             fraction = self.processes.share(batch)
-            coming = self.sampler.coming(count, self._wanted(step))
-            self.images.expect([view for i, view in enumerate(coming) if i % batch in fraction])
+            peek = self.sampler.peek(count, self._wanted(step))
+            self.images.expect([view for i, view in enumerate(peek) if i % batch in fraction])
         return image
 
     def _wanted(self, step: int) -> Callable[[int], bool]:
@@ -353,14 +353,14 @@ class Trainer(Generic[M]):
         def may_train(index: int) -> bool:
             return self.model.trains_on(times[index], step)
 
-        def is_wanted(index: int) -> bool:
+        def is_enabled(index: int) -> bool:
             return (
                 may_train(index)
-                and not self.model.holds_out(index, step)
+                and not self.model.is_held_out(index, step)
                 and index not in self.held_out
             )
 
-        return is_wanted if any(is_wanted(i) for i in range(len(self.images))) else may_train
+        return is_enabled if any(is_enabled(i) for i in range(len(self.images))) else may_train
 
 
 @contextmanager

@@ -19,12 +19,12 @@ from dyngs.human.avatar.scene import as_human_scene
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.motion import compose_rotations
 from dyngs.io.write import to_uint8
-from dyngs.runs.opened import Opened
+from dyngs.runs.opened import OpenedScene
 from dyngs.view.edit import EditControls, can_be_edited
 from dyngs.view.layers import LAYERS, PARTS, draw
 from dyngs.view.session import Keyframe, Recording
-from dyngs.view.source import Source
-from dyngs.view.views import centers_of, has_timeline, pose_of, viewpoint_of, views_of
+from dyngs.view.source import SceneSource
+from dyngs.view.views import centers_of, has_timeline, pose_of, initial_viewpoint, views_of
 
 if TYPE_CHECKING:
     import viser
@@ -48,9 +48,9 @@ HELP = """\
 class Controls:
     """Controls of one browser; ``show`` makes them anew for another scene."""
 
-    def __init__(self, browsing: Browsing, source: Source, motions: Mapping[str, Path]) -> None:
+    def __init__(self, browsing: Browsing, source: SceneSource, motions: Mapping[str, Path]) -> None:
         self._browsing, self._source, self._motions = browsing, source, motions
-        self._frusta = Frusta(browsing)
+        self._frusta = CameraFrusta(browsing)
         self._folders: list[Any] = []
         self._edits: EditControls | None = None
         gui = browsing.client.gui
@@ -63,7 +63,7 @@ class Controls:
         browsing.status = gui.add_markdown("")
         self.show(browsing.loaded)
 
-    def show(self, opened: Opened) -> None:
+    def show(self, opened: OpenedScene) -> None:
         """Make the controls that a scene needs."""
         for handle in self._folders:
             handle.remove()
@@ -112,12 +112,12 @@ class Controls:
     def _change(self, **changes: Any) -> None:
         """Show something else, which frusta may cover."""
         self._browsing.session.change(**changes)
-        self._frusta.hide_what_covers()
+        self._frusta.hide_covering_frusta()
 
-    def _add_edits(self, opened: Opened) -> None:
+    def _add_edits(self, opened: OpenedScene) -> None:
         self._edits = EditControls(self._browsing, opened)
 
-    def _add_display(self, gui: viser.GuiApi, opened: Opened) -> None:
+    def _add_display(self, gui: viser.GuiApi, opened: OpenedScene) -> None:
         session = self._browsing.session
         scene = opened.renderable if isinstance(opened.renderable, GaussianScene) else None
         layers = [name for name in LAYERS if name != "error" or len(views_of(opened))]
@@ -163,7 +163,7 @@ class Controls:
         speed.on_update(lambda _: session.change_timeline(speed=float(speed.value)))
         self._browsing.time_slider = slider
 
-    def _add_capture(self, gui: viser.GuiApi, opened: Opened) -> None:
+    def _add_capture(self, gui: viser.GuiApi, opened: OpenedScene) -> None:
         session = self._browsing.session
         hint = "frusta with their images; click one to go there"
         cameras = gui.add_checkbox("Cameras", False, hint=hint)
@@ -205,7 +205,7 @@ class Controls:
             elif choice == BY_SLIDERS:
                 opened = posed(opened, angles)
             elif choice != AS_CAPTURED:
-                opened = opened.in_motion(self._motions[choice], keep_feet=bool(feet.value))
+                opened = opened.play_motion(self._motions[choice], keep_feet=bool(feet.value))
             browsing.session.show(opened)
 
         def play(_: Any) -> None:
@@ -267,15 +267,15 @@ class Controls:
         gui.add_button("Save path", hint=hint).on_click(save)
 
 
-def _add_help(gui: viser.GuiApi, opened: Opened) -> None:
-    from dyngs.view.server import as_text
+def _add_help(gui: viser.GuiApi, opened: OpenedScene) -> None:
+    from dyngs.view.server import escape_markdown
 
     gui.add_markdown(HELP)
     for note in opened.notes:
-        gui.add_markdown(f"*{as_text(note)}*")
+        gui.add_markdown(f"*{escape_markdown(note)}*")
 
 
-def posed(opened: Opened, angles: Mapping[str, Sequence[float]]) -> Opened:
+def posed(opened: OpenedScene, angles: Mapping[str, Sequence[float]]) -> OpenedScene:
     """Return a person in the rest pose with joints rotated by ``angles``: degrees about x, y and z,
     in this order, by joint."""
     from scipy.spatial.transform import Rotation
@@ -290,7 +290,7 @@ def posed(opened: Opened, angles: Mapping[str, Sequence[float]]) -> Opened:
         turned = Rotation.from_euler("xyz", degrees, degrees=True)
         turns[0, JOINT_NAMES.index(name)] = turns.new_tensor(turned.as_rotvec())
     poses = compose_rotations(clip.poses, turns)
-    return rest.showing(person.with_motion(replace(clip, poses=poses)))
+    return rest.with_scene(person.with_motion(replace(clip, poses=poses)))
 
 
 def motion_files(path: Path | None) -> dict[str, Path]:
@@ -312,15 +312,15 @@ MOST_FRUSTA = 120
 """Frusta that are shown at most, spread evenly over the cameras."""
 
 
-class Frusta:
+class CameraFrusta:
     """Frusta of one browser."""
 
     def __init__(self, browsing: Browsing) -> None:
         self._browsing = browsing
         self._handles: list[tuple[Any, np.ndarray, float]] = []
-        browsing.on_move = self.hide_what_covers
+        browsing.on_move = self.hide_covering_frusta
 
-    def show(self, opened: Opened) -> None:
+    def show(self, opened: OpenedScene) -> None:
         """Add the frusta, image by image, as the thread that draws finds time; of a camera that
         stands still one."""
         self.remove()
@@ -328,7 +328,7 @@ class Frusta:
         views = views_of(opened).views
         poses = np.stack([view.cam_from_world for view in views])
         centers = centers_of(poses)
-        size = 0.05 * viewpoint_of(opened).extent
+        size = 0.05 * initial_viewpoint(opened).extent
         # Cameras of a video stand close together.
         spread = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
         size = min(size, 0.15 * spread) if spread > 1e-3 * size else size
@@ -342,7 +342,7 @@ class Frusta:
         for handle, _, _ in handles:
             handle.remove()
 
-    def hide_what_covers(self) -> None:
+    def hide_covering_frusta(self) -> None:
         """Hide the frusta that the browser's camera stands in, and all where the image is of
         another camera."""
         session = self._browsing.session
@@ -355,7 +355,7 @@ class Frusta:
             is_near = float(np.linalg.norm(position - eye.position)) < 1.5 * size
             handle.visible = not (is_elsewhere or is_near)
 
-    def _add(self, opened: Opened, index: int, size: float, handles: list[Any]) -> None:
+    def _add(self, opened: OpenedScene, index: int, size: float, handles: list[Any]) -> None:
         if handles is not self._handles:
             return  # removed meanwhile
         shown = views_of(opened)
@@ -380,7 +380,7 @@ class Frusta:
         )
         handle.on_click(lambda _: self._go(index))
         handles.append((handle, position, size))
-        self.hide_what_covers()
+        self.hide_covering_frusta()
 
     def _go(self, index: int) -> None:
         browsing = self._browsing

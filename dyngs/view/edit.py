@@ -18,12 +18,12 @@ from torch import Tensor
 from dyngs.api.edit import write_part
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.geometry import look_at, perpendicular, with_poses
-from dyngs.export.edit.crop import Box, held_by
+from dyngs.export.edit.crop import Box, gaussians_in_region
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.similarity import UNMOVED, Similarity
-from dyngs.runs.opened import Opened
+from dyngs.runs.opened import OpenedScene
 from dyngs.view.layers import Shot, depth_of
-from dyngs.view.views import camera_at, viewpoint_of
+from dyngs.view.views import camera_at, initial_viewpoint
 
 if TYPE_CHECKING:
     from dyngs.view.server import Browsing
@@ -35,14 +35,14 @@ _CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 _EDGES = np.array([(a, b) for a, b in combinations(_CORNERS, 2) if np.abs(a - b).sum() == 1])
 
 
-def world_of(opened: Opened) -> Similarity:
+def world_of(opened: OpenedScene) -> Similarity:
     """Return the way from a scene to the coordinates that `dyngs edit` means: of a file those of
     the file itself."""
     return UNMOVED if opened.captured is None else opened.world
 
 
 def picked(
-    opened: Opened, origin: np.ndarray, direction: np.ndarray, pixel: float, shot: Shot
+    opened: OpenedScene, origin: np.ndarray, direction: np.ndarray, pixel: float, shot: Shot
 ) -> np.ndarray | None:
     """Return the point (3,) of the scene that a ray meets, at the depth that is drawn there; None:
     it meets nothing.
@@ -64,7 +64,7 @@ def picked(
 
 
 @dataclass
-class Editing:
+class EditState:
     """Picked points, a box, and what is left of the scene ``whole`` after what was deleted.
 
     Attributes:
@@ -73,7 +73,7 @@ class Editing:
         steps: (K,) indices into ``whole`` of the Gaussians that were left after each deletion.
     """
 
-    whole: Opened
+    whole: OpenedScene
     centre: np.ndarray
     size: np.ndarray
     points: list[np.ndarray] = field(default_factory=list)
@@ -89,12 +89,12 @@ class Editing:
         return self.steps[-1] if self.steps else torch.arange(len(self.whole.scene), device="cpu")
 
     @property
-    def left(self) -> Opened:
+    def left(self) -> OpenedScene:
         """The scene that is left."""
         if not self.steps:
             return self.whole
         scene: GaussianScene = self.whole.scene
-        return self.whole.showing(scene.select(self.rows.to(scene.device)))
+        return self.whole.with_scene(scene.select(self.rows.to(scene.device)))
 
     def pick(self, point: np.ndarray) -> None:
         """Add a picked point (3,); a third one is the first of a new pair."""
@@ -103,7 +103,7 @@ class Editing:
     def delete(self, *, inside: bool) -> int:
         """Delete what the box holds, or all else; return how many Gaussians go. Raises DyngsError:
         all would."""
-        kept = held_by(self.box, self.left.scene, world_of(self.whole)) ^ inside
+        kept = gaussians_in_region(self.box, self.left.scene, world_of(self.whole)) ^ inside
         if not bool(kept.any()):
             held = "all of the scene" if inside else "nothing"
             raise DyngsError(f"nothing would be left: the box holds {held}")
@@ -145,7 +145,7 @@ class Editing:
         return ",".join(f"{x:.{digits}g}" for x in point)
 
 
-def can_be_edited(opened: Opened) -> bool:
+def can_be_edited(opened: OpenedScene) -> bool:
     """Return whether a scene has Gaussians of which a part can be saved: not those of people, or in
     training."""
     is_file = opened.path is not None and opened.path.exists()
@@ -156,12 +156,12 @@ def can_be_edited(opened: Opened) -> bool:
 class EditControls:
     """Controls and marks of one browser for one scene; ``remove`` takes the marks away."""
 
-    def __init__(self, browsing: Browsing, opened: Opened) -> None:
-        begin = viewpoint_of(opened)
+    def __init__(self, browsing: Browsing, opened: OpenedScene) -> None:
+        begin = initial_viewpoint(opened)
         world = world_of(opened)
         extent = begin.extent * world.scale
         size = np.full(3, float(f"{0.5 * extent:.2g}"))
-        self.editing = Editing(opened, world.points(begin.center), size)
+        self.editing = EditState(opened, world.points(begin.center), size)
         self._browsing, self._extent = browsing, begin.extent
         self._back = world.inverse()
         self._marks = dict[str, Any]()

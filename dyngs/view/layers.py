@@ -14,7 +14,7 @@ from dyngs.export.images import color_map, depth_to_rgb
 from dyngs.gaussians.levels import LevelScene
 from dyngs.io.write import to_uint8
 from dyngs.models.renderable import Rendering, TimeStep
-from dyngs.runs.opened import Opened
+from dyngs.runs.opened import OpenedScene
 from dyngs.view.views import views_of
 
 Layer = Literal["colour", "depth", "alpha", "error"]
@@ -45,7 +45,7 @@ class Shot:
     is_moving: bool = False
 
 
-def draw(opened: Opened, shot: Shot) -> np.ndarray:
+def draw(opened: OpenedScene, shot: Shot) -> np.ndarray:
     """Return the image (H, W, 3) uint8 of a shot."""
     if shot.view is None:
         return _layer(opened, shot)
@@ -70,7 +70,7 @@ def draw(opened: Opened, shot: Shot) -> np.ndarray:
     return made
 
 
-def truth_in_window(opened: Opened, view: int, size: tuple[int, int]) -> np.ndarray | None:
+def truth_in_window(opened: OpenedScene, view: int, size: tuple[int, int]) -> np.ndarray | None:
     """Return the true image of a view as large as it fits into a window of ``size``, px: (H, W, 4)
     uint8, transparent next to it."""
     from PIL import Image, ImageOps
@@ -84,7 +84,7 @@ def truth_in_window(opened: Opened, view: int, size: tuple[int, int]) -> np.ndar
 
 
 @torch.no_grad()
-def _layer(opened: Opened, shot: Shot) -> np.ndarray:
+def _layer(opened: OpenedScene, shot: Shot) -> np.ndarray:
     """Return one layer (H, W, 3) uint8; for the error it is the colours."""
     match shot.layer:
         case "depth":
@@ -96,7 +96,7 @@ def _layer(opened: Opened, shot: Shot) -> np.ndarray:
     return to_uint8(pixels.clamp(0, 1).cpu().numpy())
 
 
-def coarser(opened: Opened, most: int) -> Opened:
+def coarser(opened: OpenedScene, most: int) -> OpenedScene:
     """Return a still scene of which at most ``most`` Gaussians are drawn while anything moves.
     Raises DyngsError."""
     opened = opened.noted(f"while anything moves, at most {most:,} Gaussians are drawn")
@@ -104,7 +104,7 @@ def coarser(opened: Opened, most: int) -> Opened:
     return opened
 
 
-def _rendering(opened: Opened, shot: Shot, **options: Any) -> Rendering:
+def _rendering(opened: OpenedScene, shot: Shot, **options: Any) -> Rendering:
     """Return a rendering, on the CPU; the scene at the last time is kept."""
     part = shot.part
     scene = opened.renderable
@@ -121,7 +121,7 @@ def _rendering(opened: Opened, shot: Shot, **options: Any) -> Rendering:
 
 
 @torch.no_grad()
-def depth_of(opened: Opened, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
+def depth_of(opened: OpenedScene, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
     """Return the expected depth (H, W), world units along the axis of the camera, and the opacity
     (H, W) there."""
     made = _rendering(opened, shot, depth="expected")

@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
-from dyngs.core.errors import DyngsError, printable
-from dyngs.runs.opened import Opened
-from dyngs.view.session import Drawer, Eye, Sent, Session
-from dyngs.view.source import Source
-from dyngs.view.views import fitting_fov, look_point, pose_of, viewpoint_of, views_of
+from dyngs.core.errors import DyngsError, format_one_line
+from dyngs.runs.opened import OpenedScene
+from dyngs.view.session import RenderScheduler, BrowserCamera, SentImage, Session
+from dyngs.view.source import SceneSource
+from dyngs.view.views import fitting_fov, orbit_center, pose_of, initial_viewpoint, views_of
 
 if TYPE_CHECKING:
     import viser
@@ -32,7 +32,7 @@ COOKIE = "dyngs_view"
 
 
 @dataclass(frozen=True)
-class Gate:
+class AccessPolicy:
     """Decision on requests, of HTTP or of a websocket, by their paths with the query and their
     headers.
 
@@ -72,10 +72,10 @@ class Gate:
         return f"{COOKIE}={self.token}; Path=/; HttpOnly; SameSite=Strict"
 
 
-def gate_for(host: str) -> Gate:
+def access_policy_for(host: str) -> AccessPolicy:
     """Return the gate of a server on ``host``: with a new token unless that is this machine
     alone."""
-    return Gate() if is_loopback(host) else Gate(secrets.token_urlsafe(24))
+    return AccessPolicy() if is_loopback(host) else AccessPolicy(secrets.token_urlsafe(24))
 
 
 def is_loopback(host: str) -> bool:
@@ -116,7 +116,7 @@ def free_port(host: str, port: int | None) -> int:
 
 
 @contextmanager
-def guarded(gate: Gate) -> Iterator[None]:
+def enforce_access(gate: AccessPolicy) -> Iterator[None]:
     """Let the servers that viser starts meanwhile ask ``gate`` first: about pages and websockets
     alike.
 
@@ -152,7 +152,7 @@ _IN_LINKS = re.compile(r"(?=://|@)|(?<=www)(?=\.)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
-class Serving:
+class ServerOptions:
     """How the page is served.
 
     Attributes:
@@ -174,7 +174,7 @@ class Browsing:
     """One browser: its connection, its session, and the images that went to it; ``opened`` is what
     it sees first."""
 
-    def __init__(self, client: viser.ClientHandle, opened: Opened, target: float) -> None:
+    def __init__(self, client: viser.ClientHandle, opened: OpenedScene, target: float) -> None:
         self.client = client
         self.loaded = opened
         self.session = Session(opened, self.send, target)
@@ -186,7 +186,7 @@ class Browsing:
         self._shown_at = 0.0  # when the status was set, and the images until then
         self._shown_count = 0
 
-    def send(self, sent: Sent) -> None:
+    def send(self, sent: SentImage) -> None:
         """Pass an image to the browser; the status and the time slider follow every half second."""
         quality = 95 if sent.is_refined else 75
         self.client.scene.set_background_image(sent.image, format="jpeg", jpeg_quality=quality)
@@ -198,7 +198,7 @@ class Browsing:
             shown = "still" if sent.is_refined else f"{rate:.0f} images/s"
             view = self.session.shown_view
             if view is not None:
-                shown += f", truth: {as_text(views_of(self.session.opened).names[view])}"
+                shown += f", truth: {escape_markdown(views_of(self.session.opened).names[view])}"
             if self.status is not None:
                 text = f"{width} x {height} px, {1000 * sent.seconds:.0f} ms, {shown}"
                 self.status.content = text
@@ -212,21 +212,21 @@ class Browsing:
         """Take over the camera of the browser."""
         camera = self.client.camera
         wxyz, position = tuple(camera.wxyz.tolist()), tuple(camera.position.tolist())
-        self.session.move(Eye(wxyz, position, float(camera.fov), _window(camera)))
+        self.session.move(BrowserCamera(wxyz, position, float(camera.fov), _window(camera)))
         self.on_move()
 
     def go_to(self, index: int | None) -> None:
         """Move the browser's camera to a view of the capture; None: to where it began."""
         opened = self.session.opened
         handle = self.client.camera
-        begin = viewpoint_of(opened)
+        begin = initial_viewpoint(opened)
         camera = begin.start if index is None else views_of(opened).cameras[index]
         wxyz, position = pose_of(camera)
         with self.client.atomic():
             width, height = _window(handle)
             handle.fov = fitting_fov(camera, width / height)
             handle.position = position
-            handle.look_at = look_point(camera, begin)
+            handle.look_at = orbit_center(camera, begin)
             handle.wxyz = wxyz
         self.camera_moved()
 
@@ -241,10 +241,10 @@ def _window(camera: viser.CameraHandle) -> tuple[int, int]:
     return max(16, int(camera.image_width)), max(16, int(camera.image_height))
 
 
-def as_text(text: str) -> str:
+def escape_markdown(text: str) -> str:
     """Return Markdown that shows ``text`` of others letter by letter: no HTML, which viser would
     render with its scripts, no links, images or emphasis."""
-    return _PUNCTUATION.sub(r"\\\1", _IN_LINKS.sub("\u200b", printable(text)))
+    return _PUNCTUATION.sub(r"\\\1", _IN_LINKS.sub("\u200b", format_one_line(text)))
 
 
 class Viewer:
@@ -258,16 +258,16 @@ class Viewer:
         DyngsError: viser is not installed, or the port cannot be had.
     """
 
-    def __init__(self, source: Source, first: Opened, serving: Serving = Serving()) -> None:
+    def __init__(self, source: SceneSource, first: OpenedScene, serving: ServerOptions = ServerOptions()) -> None:
         require_viser()
         import viser
 
         self.source, self.first, self.serving = source, first, serving
-        self.drawer = Drawer()
+        self.drawer = RenderScheduler()
         self._browsing: dict[int, Browsing] = {}
-        gate = gate_for(serving.host)
+        gate = access_policy_for(serving.host)
         port = free_port(serving.host, serving.port)
-        with guarded(gate), quiet():
+        with enforce_access(gate), quiet():
             self.server = viser.ViserServer(host=serving.host, port=port, verbose=False)
         self.link = link_to(serving.host, self.server.get_port(), gate.token)
         self._prepare()
@@ -302,12 +302,12 @@ class Viewer:
             server._websock_server.unregister_handler(kind)
         server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
         server.gui.main_panel.dock_right()  # next to the image, not over it
-        begin = viewpoint_of(self.first)
+        begin = initial_viewpoint(self.first)
         start = begin.start
         server.scene.set_up_direction(tuple(begin.up))
         camera = server.initial_camera
         _, camera.position = pose_of(start)
-        camera.look_at = look_point(start, begin)
+        camera.look_at = orbit_center(start, begin)
         camera.up = begin.up
         camera.fov = fitting_fov(start, start.width / start.height)
         camera.near = 1e-3 * begin.extent

@@ -21,12 +21,12 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.geometry import checked_pose
 from dyngs.export.camera_paths import Keyframes, interpolate_keyframes, resize_cameras
-from dyngs.runs.opened import Opened
+from dyngs.runs.opened import OpenedScene
 from dyngs.view.layers import Layer, Part, Shot, draw
 from dyngs.view.views import camera_at, nearest_view, views_of
 
 _LOG = logging.getLogger(__name__)
-STILL_AFTER = 0.2
+REFINE_DELAY = 0.2
 """Seconds without change after which the image is refined."""
 _SMALLEST_AREA = 320 * 240
 """Pixels of an image at least: where Gaussians take all the time, a smaller one would hardly come
@@ -35,7 +35,7 @@ _LONGEST_SIDE = 1600  # px of an image at most
 
 
 @dataclass(frozen=True)
-class Eye:
+class BrowserCamera:
     """The camera of a browser: wxyz and position as in ``camera_at``, vertical field of view in
     rad, window in px."""
 
@@ -138,7 +138,7 @@ class Recording:
         time = 0.0 if made.times is None else float(made.times[0])
         return Cameras(pose, matrix, *size), time
 
-    def document(self, size: tuple[int, int], fps: float, opened: Opened) -> str:
+    def document(self, size: tuple[int, int], fps: float, opened: OpenedScene) -> str:
         """Return the path as JSON that ``dyngs render --path`` reads (docs/camera_paths.md), in the
         coordinates of the capture; ``size`` of its images, px."""
         keys: list[dict[str, Any]] = []
@@ -159,7 +159,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Sent:
+class SentImage:
     """An image for the browser: (H, W, 3) uint8, whether it is a refined one, and the seconds that
     it took."""
 
@@ -178,8 +178,8 @@ class Session:
 
     def __init__(
         self,
-        opened: Opened,
-        send: Callable[[Sent], None],
+        opened: OpenedScene,
+        send: Callable[[SentImage], None],
         target: float = 1 / 14,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -197,12 +197,12 @@ class Session:
         self.on_play: Callable[[bool], None] = lambda playing: None
         self.on_error: Callable[[str], None] = lambda message: None
         self.opened, self.look = opened, Display()
-        self.eye: Eye | None = None
+        self.eye: BrowserCamera | None = None
         self.timeline = Timeline(seconds=opened.seconds)
         self.closed = False
         self.failure: str | None = None
 
-    def move(self, eye: Eye) -> None:
+    def move(self, eye: BrowserCamera) -> None:
         """Look from ``eye`` from now on."""
         if eye != self.eye:
             self.eye = eye
@@ -224,7 +224,7 @@ class Session:
         self.on_play(self.timeline.playing)
         self._note_change()
 
-    def show(self, opened: Opened) -> None:
+    def show(self, opened: OpenedScene) -> None:
         """Look at another scene, at the same time."""
         self.opened = opened
         self.change_timeline(seconds=opened.seconds)
@@ -234,7 +234,7 @@ class Session:
         self._preview = recording, self._clock()
         self._note_change()
 
-    def take(self, opened: Opened, *, refreshes: bool) -> None:
+    def take(self, opened: OpenedScene, *, refreshes: bool) -> None:
         """Look at a newer state of the scene; ``refreshes``: draw it, as large, even if nothing
         else has changed."""
         self.opened = opened
@@ -273,7 +273,7 @@ class Session:
         if self._is_moving or self._is_stale:
             return soonest
         if not self._is_refined:
-            return max(soonest, self._changed_at + STILL_AFTER - now)
+            return max(soonest, self._changed_at + REFINE_DELAY - now)
         return None
 
     def draw_next(self) -> None:
@@ -289,14 +289,14 @@ class Session:
         if self.timeline.playing and not self.timeline.loops and self.time == 1.0:
             self.change_timeline(playing=False)
         version = self._changed_at
-        is_moving = self._is_moving or start < version + STILL_AFTER
+        is_moving = self._is_moving or start < version + REFINE_DELAY
         full = self._full_size
         size = _scaled(full, math.sqrt(self._area / math.prod(full))) if is_moving else full
         self._is_stale = False
         self._is_refined = True  # if it fails, it is not tried again
         image = draw(self.opened, replace(self.shot(size), is_moving=is_moving))
         if not self.closed:
-            self._send(Sent(image, not is_moving, self._clock() - start))
+            self._send(SentImage(image, not is_moving, self._clock() - start))
         now = self._clock()
         if is_moving:
             factor = min(max(self._target / max(now - start, 1e-9), 0.5), 2.0)
@@ -343,7 +343,7 @@ def _scaled(size: tuple[int, int], factor: float) -> tuple[int, int]:
     return width, height
 
 
-class Drawer:
+class RenderScheduler:
     """The one thread that draws for all browsers: whoever waits longest is next, and gets the
     newest state. What went wrong for one session goes to its ``on_error``, the others go on.
     """

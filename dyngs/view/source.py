@@ -14,16 +14,16 @@ from dyngs.io.formats.formats import format_to_read
 from dyngs.io.outputs import command_for
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
-from dyngs.runs.opened import Opened, open_scene
+from dyngs.runs.opened import OpenedScene, open_scene
 from dyngs.view.layers import coarser
 
 
 @dataclass(frozen=True)
-class Source:
+class SceneSource:
     """Names of scenes, at least one, and what loads the scene of a name."""
 
     names: tuple[str, ...]
-    load: Callable[[str], Opened]
+    load: Callable[[str], OpenedScene]
 
 
 def open_source(
@@ -32,7 +32,7 @@ def open_source(
     device: torch.device = CPU,
     data_root: Path | None = None,
     most: int | None = None,
-) -> Source:
+) -> SceneSource:
     """Return what is to be seen of a run, a file or a folder of runs; the first scene is not loaded
     yet.
 
@@ -54,16 +54,16 @@ def open_source(
         instead = f"{known}; then " if known else ""
         raise DyngsError(f"{path}: no runs there; {instead}give a run, a file, or a folder of runs")
 
-    def load(name: str) -> Opened:
+    def load(name: str) -> OpenedScene:
         opened = open_to_view(runs[name], name, up, data_root).to(device)
         return opened if most is None else coarser(opened, most)
 
-    return Source(tuple(runs), load)
+    return SceneSource(tuple(runs), load)
 
 
 def open_to_view(
     path: Path, name: str, up: str | None = None, data_root: Path | None = None
-) -> Opened:
+) -> OpenedScene:
     """Open a run or a file; where its capture is gone, a note says what lacks.
 
     Args:
@@ -84,7 +84,7 @@ def open_to_view(
     return opened
 
 
-def first_of(source: Source) -> Opened:
+def first_of(source: SceneSource) -> OpenedScene:
     """Return the first scene that can be loaded; a note says which could not. Raises DyngsError."""
     failed: list[DyngsError] = []
     for name in source.names:

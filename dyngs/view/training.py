@@ -15,22 +15,22 @@ from torch import Tensor
 from dyngs.config import Config
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.models.kind import Predicts, capability
+from dyngs.models.kind import PredictsScenes, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
-from dyngs.runs.opened import Captured, Opened
+from dyngs.runs.opened import Captured, OpenedScene
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
-from dyngs.view.server import Serving, Viewer, free_port, require_viser
-from dyngs.view.session import Drawer
-from dyngs.view.source import Source
+from dyngs.view.server import ServerOptions, Viewer, free_port, require_viser
+from dyngs.view.session import RenderScheduler
+from dyngs.view.source import SceneSource
 from dyngs.view.views import captured_views
 
 REFRESH_SECONDS = 1.0
 """Seconds between two images of a browser in which nothing moves but the scene."""
 
 
-class DrawnBetweenSteps:
+class BetweenStepRenderer:
     """Draws for browsers in the thread that trains, between two steps, since steps change the scene
     in place.
 
@@ -41,7 +41,7 @@ class DrawnBetweenSteps:
 
     def __init__(
         self,
-        drawer: Drawer,
+        drawer: RenderScheduler,
         fraction: float = 0.2,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
@@ -63,7 +63,7 @@ class DrawnBetweenSteps:
         with torch.no_grad():
             for session in sessions:
                 shell = _shell(scene, session.opened.background)
-                session.take(session.opened.showing(shell), refreshes=refreshes)
+                session.take(session.opened.with_scene(shell), refreshes=refreshes)
             while self._drawer.draw_one():
                 if self._clock() - start > REFRESH_SECONDS * self._fraction:
                     break
@@ -80,8 +80,8 @@ class TrainingView:
     cannot be had.
     """
 
-    def __init__(self, config: Config, serving: Serving, say: Callable[[str], None]) -> None:
-        if capability(config.model, Predicts) is not None:
+    def __init__(self, config: Config, serving: ServerOptions, say: Callable[[str], None]) -> None:
+        if capability(config.model, PredictsScenes) is not None:
             raise DyngsError(
                 "--view shows scenes, and a network has none; `dyngs predict` makes one"
             )
@@ -89,7 +89,7 @@ class TrainingView:
         free_port(serving.host, serving.port)  # now, not after reading the capture
         self._say = say
         self._serving = replace(serving, in_thread=False, target=0.05)
-        self._drawn: DrawnBetweenSteps | None = None
+        self._drawn: BetweenStepRenderer | None = None
         self._stack = ExitStack()
 
     def __enter__(self) -> TrainingView:
@@ -107,15 +107,15 @@ class TrainingView:
         begins = self._drawn is None
         if self._drawn is None:
             first = opened_training(trainer)
-            source = Source((first.name,), lambda _: first)
+            source = SceneSource((first.name,), lambda _: first)
             viewer = self._stack.enter_context(Viewer(source, first, self._serving))
             self._say(f"viewing: {viewer.link} (until the training ends)")
-            self._drawn = DrawnBetweenSteps(viewer.drawer)
+            self._drawn = BetweenStepRenderer(viewer.drawer)
         if self._drawn.after_step(trainer.model.scene) or begins:
-            event.loop.watch.pause(time.perf_counter() - start)
+            event.loop.stopwatch.pause(time.perf_counter() - start)
 
 
-def opened_training(trainer: Trainer[Any]) -> Opened:
+def opened_training(trainer: Trainer[Any]) -> OpenedScene:
     """Return the scene of a trainer with the views that it is trained on."""
     config = trainer.config
     views = trainer.images.views
@@ -124,7 +124,7 @@ def opened_training(trainer: Trainer[Any]) -> Opened:
     captured.once("views", lambda: shown)
     with torch.no_grad():
         scene = _shell(trainer.model.scene, background_colour(trainer.background))
-    return Opened(
+    return OpenedScene(
         config,
         scene,
         trainer.done,

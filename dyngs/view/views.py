@@ -15,10 +15,10 @@ from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.geometry import inverse_rigid, look_at_point, pinhole_matrix, world_from_cam
 from dyngs.data.loader import ImageLoader
-from dyngs.export.choose_path import orbit_around, points_at
+from dyngs.export.choose_path import orbit_cameras_around, points_at
 from dyngs.human.avatar.scene import as_human_scene
 from dyngs.models.views import training_cameras
-from dyngs.runs.opened import Opened, scene_of_split
+from dyngs.runs.opened import OpenedScene, scene_of_split
 
 MAX_FOV = math.radians(160)
 
@@ -55,7 +55,7 @@ class Viewpoint:
     up: np.ndarray
 
 
-def views_of(opened: Opened) -> CapturedViews:
+def views_of(opened: OpenedScene) -> CapturedViews:
     """Return the views of a scene's capture, if there is one; without images where a person is in
     other poses."""
     if opened.captured is None:
@@ -64,7 +64,7 @@ def views_of(opened: Opened) -> CapturedViews:
     return found if opened.as_captured else replace(found, images=None)
 
 
-def _views_of_capture(opened: Opened) -> CapturedViews:
+def _views_of_capture(opened: OpenedScene) -> CapturedViews:
     """Return the views of all splits that show what the scene plays: a person may be filmed in
     other clips, too."""
     if opened.missing is not None:
@@ -90,13 +90,13 @@ def captured_views(
     )
 
 
-def viewpoint_of(opened: Opened) -> Viewpoint:
+def initial_viewpoint(opened: OpenedScene) -> Viewpoint:
     """Return where to begin: at the first camera of the capture, else where all of the scene is in
     view."""
     return (opened.captured or opened).once("viewpoint", lambda: _viewpoint(opened))
 
 
-def _viewpoint(opened: Opened) -> Viewpoint:
+def _viewpoint(opened: OpenedScene) -> Viewpoint:
     shown = views_of(opened)
     cameras = opened.cameras
     person = as_human_scene(opened.renderable)
@@ -107,20 +107,20 @@ def _viewpoint(opened: Opened) -> Viewpoint:
             center = person.at(None).means.double().cpu().numpy().mean(0)
     else:
         means = points_at(opened.renderable).double().cpu().numpy()
-        start = cameras = orbit_around(opened, 1)
+        start = cameras = orbit_cameras_around(opened, 1)
         center = np.median(means[np.isfinite(means).all(1)], axis=0)
     apart = np.linalg.norm(cameras.centers.double().cpu().numpy() - center, axis=1)
     up = np.array([0.0, 0.0, 1.0]) if opened.up is None else opened.up[0]
     return Viewpoint(start, center, float(np.median(apart)), up)
 
 
-def has_timeline(opened: Opened) -> bool:
+def has_timeline(opened: OpenedScene) -> bool:
     """Return whether there are times to choose from, now or later."""
     may_move = opened.in_training and len(opened.renderable.times) > 1
     return may_move or not opened.renderable.is_static or opened.person is not None
 
 
-def nearest_view(opened: Opened, camera: Cameras, time: float) -> int:
+def nearest_view(opened: OpenedScene, camera: Cameras, time: float) -> int:
     """Return which view of the capture is nearest to one camera in position, viewing direction and,
     where the scene moves, time.
 
@@ -131,7 +131,7 @@ def nearest_view(opened: Opened, camera: Cameras, time: float) -> int:
     poses = np.stack([view.cam_from_world for view in shown.views])
     own = camera.cam_from_world[0].double().cpu().numpy()
     apart = np.linalg.norm(centers_of(poses) - centers_of(own[None]), axis=1)
-    cost = apart / max(viewpoint_of(opened).extent, 1e-9)
+    cost = apart / max(initial_viewpoint(opened).extent, 1e-9)
     cost += 0.5 * np.arccos(np.clip(poses[:, 2, :3] @ own[2, :3], -1, 1))
     if not opened.renderable.is_static:
         times = [view.time for view in shown.views]
@@ -183,7 +183,7 @@ def fitting_fov(camera: Cameras, aspect: float) -> float:
     return min(2 * math.atan(half), MAX_FOV)
 
 
-def look_point(camera: Cameras, begin: Viewpoint) -> np.ndarray:
+def orbit_center(camera: Cameras, begin: Viewpoint) -> np.ndarray:
     """Return the point (3,) on the axis of one camera to orbit around: as far away as the centre of
     the scene is deep."""
     (pose,) = world_from_cam(camera)

@@ -16,8 +16,8 @@ from splat_scenes import cloud, readable
 from dyngs.api.edit import Edits, edit_scene
 from dyngs.core.errors import DyngsError
 from dyngs.export.edit.crop import Box, Sphere
-from dyngs.export.edit.frame import Frame, geo_frame
-from dyngs.export.splat_files import read_moment
+from dyngs.export.edit.frame import Frame, control_point_frame
+from dyngs.export.splat_files import read_4dgs_frame
 from dyngs.io.formats.formats import Format, read_splats, write_splats
 from dyngs.io.formats.splat_file import SplatFile
 
@@ -65,7 +65,7 @@ def test_control_points_far_away(plain: Path, tmp_path: Path) -> None:
     (tmp_path / "geo.txt").write_text("\n".join(" ".join(map(repr, row)) for row in rows.tolist()))
     told: list[str] = []
     edit_scene(
-        plain, tmp_path / "a.ply", Edits(geo=geo_frame(tmp_path / "geo.txt")), tell=told.append
+        plain, tmp_path / "a.ply", Edits(geo=control_point_frame(tmp_path / "geo.txt")), tell=told.append
     )
     found = read_splats(tmp_path / "a.ply")
     line = next(text for text in told if text.startswith("offset, to be added"))
@@ -125,8 +125,8 @@ def test_all_times_of_a_moving_run(tmp_path: Path) -> None:
     run = write_moving_run(tmp_path)
     edits = Edits(region=Sphere((0.0, 0.0, 0.0), 0.2), frame=Frame(scale=3.0, up=(0.0, -1.0, 0.0)))
     assert edit_scene(run, path, edits, tell=silent).redrawn > 40
-    assert len(read_moment(path, 2).gaussians) == 3
-    assert float(read_moment(path, 4).gaussians.means[0, 0]) == pytest.approx(
+    assert len(read_4dgs_frame(path, 2).gaussians) == 3
+    assert float(read_4dgs_frame(path, 4).gaussians.means[0, 0]) == pytest.approx(
         3 * float(moved_x((1,), 1.0)), abs=0.01
     )
 

@@ -24,7 +24,7 @@ from dyngs.export.splat_files import write_run_splats
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.densify import Densifier
 from dyngs.runs.opened import open_run
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.plan import RunPlan
 
 BOX = (-9.0, -9.0, -9.0, 0.0, 9.0, 9.0)
@@ -134,8 +134,8 @@ def test_what_is_outside_the_box_keeps_its_bytes(capture: Path, run: Path, tmp_p
     assert first.frozen is not None
     frozen, free = (first.gaussians.select(x) for x in (first.frozen, ~first.frozen))
     assert 0 < len(frozen) < len(first.frozen)
-    trainer = assemble(config, first=first)
-    again = assemble(config, restored=True)
+    trainer = build_trainer(config, first=first)
+    again = build_trainer(config, restored=True)
     for one in (trainer, again):
         if one is again:
             again.restore(trainer.checkpoint())

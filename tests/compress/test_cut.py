@@ -13,7 +13,7 @@ from dyngs.compress.search import PruneChoice, apply_choice
 from dyngs.config import Config
 from dyngs.gaussians.scene import restore_scene
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -26,7 +26,7 @@ def config(moving: Path) -> Config:
 
 @pytest.fixture(scope="module")
 def end(config: Config) -> Checkpoint:
-    trainer = assemble(config)
+    trainer = build_trainer(config)
     while trainer.done < config.train.steps:
         trainer.step()
     return trainer.checkpoint()
@@ -34,7 +34,7 @@ def end(config: Config) -> Checkpoint:
 
 @pytest.fixture
 def trainer(config: Config, end: Checkpoint) -> Trainer:
-    trainer = assemble(config, restored=True)
+    trainer = build_trainer(config, restored=True)
     trainer.restore(end)
     return trainer
 

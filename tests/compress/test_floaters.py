@@ -16,7 +16,7 @@ from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.camera import Cameras
 from dyngs.gaussians import Gaussians
 from dyngs.runs.checkpoint import load_run
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 
@@ -37,7 +37,7 @@ def config_of(root: Path, *keys: str) -> Config:
 def trainer(still: Path) -> Trainer:
     """The start of a run, whose Gaussians fill a cube, with one more: close before the first
     camera."""
-    trainer = assemble(config_of(still))
+    trainer = build_trainer(config_of(still))
     cameras = trainer.images[0].cameras
     before = cameras.centers[0] + 0.3 * cameras.cam_from_world[0, 2, :3]
     gaussians = trainer.model.scene.gaussians.detach()

@@ -11,10 +11,10 @@ from dyngs.compress.search import (
     Candidate,
     PruneChoice,
     Search,
-    evenly_held_out,
+    held_out_indices,
 )
 from dyngs.config import PruneConfig
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -24,19 +24,19 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def trainer(moving: Path) -> Trainer:
     """At the end of its run, untrained: what is searched does not matter here."""
     config = busy_config(moving, moving, "control_nodes")
-    trainer = assemble(config.model_copy(update={"prune": PruneConfig(steps=3)}))
+    trainer = build_trainer(config.model_copy(update={"prune": PruneConfig(steps=3)}))
     trainer.done = config.train.steps
     return trainer
 
 
 def test_views_held_out_are_spread_and_few() -> None:
-    assert evenly_held_out(1) == ()
-    assert evenly_held_out(2) == (1,)
-    assert evenly_held_out(16) == (4, 12)
-    assert len(evenly_held_out(100)) == 12
-    assert len(evenly_held_out(10_000)) == 32
-    assert 0 not in evenly_held_out(100)
-    assert 99 not in evenly_held_out(100)
+    assert held_out_indices(1) == ()
+    assert held_out_indices(2) == (1,)
+    assert held_out_indices(16) == (4, 12)
+    assert len(held_out_indices(100)) == 12
+    assert len(held_out_indices(10_000)) == 32
+    assert 0 not in held_out_indices(100)
+    assert 99 not in held_out_indices(100)
 
 
 @pytest.mark.parametrize("allowed", [0.0, 0.05, 0.31, 0.69, 9.0])

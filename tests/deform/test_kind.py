@@ -9,7 +9,7 @@ import pytest
 import dyngs
 from dyngs.deform.training import DynamicTraining
 from dyngs.gaussians.model import GaussianModel
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,7 @@ def test_bodies_are_sought_in_as_many_images_as_the_run_is_long(
         f"train.minutes={minutes}",
         "init.num_random=20",
     )
-    model = assemble(dyngs.load_config("dynamic", keys)).model
+    model = build_trainer(dyngs.load_config("dynamic", keys)).model
     assert isinstance(model, GaussianModel)
     assert isinstance(model.training, DynamicTraining)
     shots = model.training.capture.frame_stack(model.scene.gaussians)

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from dyngs.config import TrainConfig
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, Offsets, apply_offsets
 from dyngs.deform.keys import DynamicModel
@@ -30,7 +30,7 @@ from dyngs.deform.networks import Hexplane
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.scene import restore_scene
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -54,7 +54,7 @@ def scene_of(rows: Tensor, field: DeformationField) -> DynamicScene:
 
 def fine_trainer(capture: Path, kind: str, **model: object) -> Trainer:
     """After ten steps, eight of them without motion."""
-    trainer = assemble(busy_config(capture, capture, kind, **model))
+    trainer = build_trainer(busy_config(capture, capture, kind, **model))
     for _ in range(10):
         trainer.step()
     return trainer
@@ -86,7 +86,7 @@ def test_two_training_times(tmp_path: Path, kind: str) -> None:
     model = config.model.model_copy(
         update={"deform": config.model.deform.model_copy(update=automatic)}
     )
-    trainer = assemble(config.model_copy(update={"model": model}))
+    trainer = build_trainer(config.model_copy(update={"model": model}))
     seen = {trainer.step().image.time for _ in range(12)}
     assert seen == {0.0, 1.0}
     assert isinstance(trainer.model.scene, DynamicScene)
@@ -134,12 +134,12 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
     keep = torch.ones(len(trainer.model.scene), dtype=torch.bool)
     keep[trainer.model.scene.rows] = False
     assert not keep.all()
-    trainer.model.densifier = assemble(trainer.config).model.densifier
+    trainer.model.densifier = build_trainer(trainer.config).model.densifier
     trainer.model.keep(keep, trainer.done)
     for _ in range(2):
         assert trainer.step().loss > 0
         assert trainer.num_moving == 0
-    other = assemble(trainer.config)
+    other = build_trainer(trainer.config)
     other.restore(trainer.checkpoint())
     assert other.step().loss == trainer.step().loss
 
@@ -163,7 +163,7 @@ def test_gradients_that_are_not_finite_are_left_out(kind: str) -> None:
         assert grad is not None
         grad.view(-1)[0] = float("nan")
     assert field.parameters.step(1, 0.0) == len(field.parameters.values())
-    assert all(x.isfinite().all() for x in tensors_of(field.parameters.state()).values())
+    assert all(x.isfinite().all() for x in strip_roles(field.parameters.state()).values())
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
@@ -195,7 +195,7 @@ def test_a_run_of_one_step(capture: Path, is_filtered: bool) -> None:
     and filtered."""
     config = busy_config(capture, capture, "hexplane", filter_3d=is_filtered)
     config = config.model_copy(update={"train": TrainConfig(steps=1)})
-    trainer = assemble(config)
+    trainer = build_trainer(config)
     trainer.step()
     scene = restore_scene(trainer.checkpoint(), config.model)
     assert not scene.is_static

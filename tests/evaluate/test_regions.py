@@ -107,7 +107,7 @@ def test_each_thing_of_labelled_masks_has_a_score_of_its_own() -> None:
     rendered = truth.clone()
     rendered[:6, :6] -= 0.1
     rendered[6:12, :6] -= 0.01
-    scores = regions_of([image]).scores_of_things(image, rendered, truth)
+    scores = regions_of([image]).object_scores(image, rendered, truth)
     assert scores == {1: pytest.approx(20.0, abs=1e-3), 7: pytest.approx(40.0, abs=1e-2)}, (
         "a single pixel says nothing"
     )

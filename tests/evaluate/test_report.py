@@ -23,7 +23,7 @@ from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.evaluate.report import (
     evaluate_run,
-    images_of_split,
+    load_split_images,
     report_path,
     split_views,
 )
@@ -283,7 +283,7 @@ def test_training_images_have_the_refined_cameras(run: tuple[Path, str]) -> None
     loaded = load_run(folder)
     capture = read_capture(loaded.config.data)
     views = capture.splits["train"]
-    refined = images_of_split(capture, views, folder, loaded)[0].cameras
+    refined = load_split_images(capture, views, folder, loaded)[0].cameras
     given = ImageLoader(views, loaded.config.data)[0].cameras
     moved = float((refined.cam_from_world - given.cam_from_world).abs().max())
     assert (moved > 0) == (refine == "always")

@@ -20,7 +20,7 @@ from dyngs.config import DataConfig
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.evaluate.view_scores import (
-    Drawing,
+    SceneRenderer,
     TimeScore,
     flicker,
     flicker_error,
@@ -30,8 +30,8 @@ from dyngs.evaluate.view_scores import (
 from dyngs.gaussians.rendering import RenderOptions
 
 
-def drawing(scene) -> Drawing:
-    return Drawing(scene, RenderOptions(), torch.zeros(3))
+def drawing(scene) -> SceneRenderer:
+    return SceneRenderer(scene, RenderOptions(), torch.zeros(3))
 
 
 def even(count: int) -> tuple[float, ...]:

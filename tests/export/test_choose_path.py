@@ -19,32 +19,32 @@ from dyngs.config import Config, DataConfig, RunConfig, TrainConfig
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import ImageLoader
-from dyngs.export.choose_path import PathOptions, choose_path, orbit_around, view_to_show
+from dyngs.export.choose_path import PathOptions, choose_path, orbit_cameras_around, select_view
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.keys import HumanModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.io.formats.formats import write_splats
 from dyngs.io.formats.splat_file import SplatFile
-from dyngs.runs.opened import Opened, cameras_for_paths, open_run, open_scene, opened_scene
+from dyngs.runs.opened import OpenedScene, cameras_for_paths, open_run, open_scene, wrap_scene
 
 MODEL = HumanModel(resolution=24, sh_degree=0, fit=False)
 TRAIN = TrainConfig(steps=1)
 
 
 @pytest.fixture(scope="module")
-def moving_run(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+def moving_run(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
     return open_run(write_moving_run(tmp_path_factory.mktemp("moving")))
 
 
 @pytest.fixture(scope="module")
-def still_run(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+def still_run(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
     return open_run(write_moving_run(tmp_path_factory.mktemp("still"), moves=False))
 
 
 @pytest.mark.parametrize("name", ["orbit", "spiral"])
 def test_time_runs_along_a_path_unless_told_otherwise(
-    name: str, moving_run: Opened, still_run: Opened
+    name: str, moving_run: OpenedScene, still_run: OpenedScene
 ) -> None:
     path = choose_path(moving_run, PathOptions(name, 5))
     assert path.times == (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -60,7 +60,7 @@ def test_time_runs_along_a_path_unless_told_otherwise(
     assert (still.times, still.notes) == (None, ())
 
 
-def test_times_of_a_file_are_overridden(moving_run: Opened, tmp_path: Path) -> None:
+def test_times_of_a_file_are_overridden(moving_run: OpenedScene, tmp_path: Path) -> None:
     cameras = cameras_for_paths(moving_run.capture.splits["train"], moving_run.config.data)
     file = tmp_path / "path.json"
     frames = [
@@ -79,7 +79,7 @@ def test_times_of_a_file_are_overridden(moving_run: Opened, tmp_path: Path) -> N
         choose_path(moving_run, PathOptions(str(file), times=(0.0, 0.5, 1.0)))
 
 
-def test_a_camera_that_stands_still(moving_run: Opened) -> None:
+def test_a_camera_that_stands_still(moving_run: OpenedScene) -> None:
     capture = moving_run.capture
     wanted = ImageLoader(capture.splits["test"], DataConfig(root=capture.root))[1]
     path = choose_path(moving_run, PathOptions(None, times=(0.0, 0.5, 1.0), view="1"))
@@ -96,26 +96,26 @@ def test_a_camera_that_stands_still(moving_run: Opened) -> None:
     assert (len(small), small.width, small.height) == (1, 8, 4)
 
 
-def test_views_are_found_by_name_image_and_number(moving_run: Opened) -> None:
+def test_views_are_found_by_name_image_and_number(moving_run: OpenedScene) -> None:
     capture = moving_run.capture
     test = capture.splits["test"]
     train = capture.splits["train"]
-    assert view_to_show(capture) is test[0]
-    assert view_to_show(capture, test[2].name) is test[2]
-    assert view_to_show(capture, "r_002") is test[2]
-    assert view_to_show(capture, "2") is test[2]
+    assert select_view(capture) is test[0]
+    assert select_view(capture, test[2].name) is test[2]
+    assert select_view(capture, "r_002") is test[2]
+    assert select_view(capture, "2") is test[2]
     # no split given: names are looked for in all
-    assert view_to_show(capture, train[3].name) is train[3]
-    assert view_to_show(capture, "r_004") is train[4]
-    assert view_to_show(capture, "4", "train") is train[4]
-    assert view_to_show(capture.replace(splits={"train": train, "test": ()})) is train[0]
+    assert select_view(capture, train[3].name) is train[3]
+    assert select_view(capture, "r_004") is train[4]
+    assert select_view(capture, "4", "train") is train[4]
+    assert select_view(capture.replace(splits={"train": train, "test": ()})) is train[0]
     for name, split in (("9", None), ("r_9", None), ("-1", None), (train[0].name, "test")):
         with pytest.raises(
             DyngsError, match=rf"no view '{name}'; the split test has 3 views: .*\(0\) to .*\(2\)"
         ):
-            view_to_show(capture, name, split)
+            select_view(capture, name, split)
     with pytest.raises(DyngsError, match="'val' has no views"):
-        view_to_show(capture, None, "val")
+        select_view(capture, None, "val")
 
 
 def some_gaussians(count: int = 50) -> Gaussians:
@@ -156,9 +156,9 @@ def test_an_orbit_shows_the_same_frames_in_any_unit(factor: float, tmp_path: Pat
 
 
 def test_a_single_gaussian_is_in_view_whole() -> None:
-    one = opened_scene(StaticScene(gaussians=some_gaussians(1)))
+    one = wrap_scene(StaticScene(gaussians=some_gaussians(1)))
     size = math.exp(-3)
-    distance = float((orbit_around(one, 1).centers[0] - one.scene.gaussians.means[0]).norm())
+    distance = float((orbit_cameras_around(one, 1).centers[0] - one.scene.gaussians.means[0]).norm())
     assert size < distance < 10 * size
 
 

@@ -24,7 +24,7 @@ from dyngs.export.images import (
     contact_sheet,
     depth_to_rgb,
     file_stems,
-    path_frames,
+    render_path,
     render_frame,
     write_path_images,
     write_split_images,
@@ -32,7 +32,7 @@ from dyngs.export.images import (
 from dyngs.export.video import video_writer
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.runs.opened import Opened, open_run, opened_scene
+from dyngs.runs.opened import OpenedScene, open_run, wrap_scene
 
 BALLS = StaticScene(gaussians=two_balls())
 LABEL, GAP = 22, 6  # px, of contact sheets
@@ -49,7 +49,7 @@ def write_balls(
     cameras: Cameras, out: Path | None, output: OutputOptions | None = None
 ) -> list[Path]:
     path = CameraPath(cameras)
-    return write_path_images(opened_scene(BALLS), path, out, output or OutputOptions())
+    return write_path_images(wrap_scene(BALLS), path, out, output or OutputOptions())
 
 
 def standing(*times: float) -> CameraPath:
@@ -61,7 +61,7 @@ def names(folder: Path) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+def run(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
     return open_run(write_moving_run(tmp_path_factory.mktemp("moving"), standing=True))
 
 
@@ -70,21 +70,21 @@ def test_frames_are_the_renders_one_by_one() -> None:
     options = RenderOptions(depth="expected")
     background = torch.tensor([0.1, 0.2, 0.9])
     together = render(two_balls(), cameras, options, background=background)
-    frames = list(path_frames(replace(BALLS, background=background), CameraPath(cameras), options))
+    frames = list(render_path(replace(BALLS, background=background), CameraPath(cameras), options))
     assert len(frames) == 3
     assert together.depth is not None
     for i, frame in enumerate(frames):
         np.testing.assert_allclose(frame.rgb, together.rgb[i].clamp(0, 1), atol=1e-6)
         np.testing.assert_allclose(frame.alpha, together.alpha[i], atol=1e-6)
         np.testing.assert_allclose(frame.depth, together.depth[i], rtol=1e-5)
-    assert next(path_frames(BALLS, CameraPath(cameras))).depth is None
+    assert next(render_path(BALLS, CameraPath(cameras))).depth is None
 
 
 def test_each_frame_shows_the_scene_at_its_time_and_equal_times_deform_once() -> None:
     motion = Sliding()
     scene = moving_scene(motion)
     times = (0.0, 0.3, 0.3, 1.0)
-    frames = list(path_frames(scene, standing(*times)))
+    frames = list(render_path(scene, standing(*times)))
     assert motion.calls == 3
     for frame, time in zip(frames, times, strict=True):
         np.testing.assert_array_equal(frame.rgb, render_frame(scene, camera(), time).rgb)
@@ -97,7 +97,7 @@ def test_path_writes_numbered_images_depth_alpha_and_video(tmp_path: Path) -> No
     written = write_balls(cameras, tmp_path / "out", output)
     assert len(written) == 4 * 4 + 1
     assert all(p.is_file() for p in written)
-    frame = next(path_frames(BALLS, CameraPath(cameras), RenderOptions(depth="expected")))
+    frame = next(render_path(BALLS, CameraPath(cameras), RenderOptions(depth="expected")))
     image = read_image(tmp_path / "out" / "frame_0000.png")
     np.testing.assert_allclose(image, frame.rgb, atol=0.5 / 255 + 1e-6)
     depth = read_image(tmp_path / "out" / "frame_0000_depth.exr")
@@ -129,7 +129,7 @@ def test_depth_colours_share_one_range_along_a_path(tmp_path: Path) -> None:
     assert b[9, 10, 2] > b[9, 10, 0]
 
 
-def test_split_of_a_run(run: Opened, tmp_path: Path) -> None:
+def test_split_of_a_run(run: OpenedScene, tmp_path: Path) -> None:
     output = OutputOptions(depth=True, alpha=True, video=tmp_path / "test.mp4")
     written = write_split_images(run, "test", tmp_path / "out", output)
     stems = ["r_000", "r_001", "r_002"]

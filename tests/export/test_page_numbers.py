@@ -16,13 +16,13 @@ from scene_kinds import scene_of_kind
 
 from dyngs.deform.field import Offsets
 from dyngs.export import html
-from dyngs.export.html.numbers import CHUNK, Lists, add_scene, fitted_curves
+from dyngs.export.html.scene_data import CHUNK, PackedArrays, add_scene, fit_splines
 from dyngs.human.avatar.scene import as_human_scene
 from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.ops.quaternions import rotation_matrices
 
 
-def read(lists: Lists, name: str) -> NDArray[Any]:
+def read(lists: PackedArrays, name: str) -> NDArray[Any]:
     """A list as ``data.js`` reads it."""
     told = lists.layout[name]
     data = zlib.decompress(base64.b64decode(lists.text()))[told["at"] :]
@@ -45,7 +45,7 @@ def read(lists: Lists, name: str) -> NDArray[Any]:
 
 def test_rotations_of_a_clip_begin_with_their_scalar_part() -> None:
     scene = scene_of_kind("human")
-    lists = Lists()
+    lists = PackedArrays()
     add_scene(scene, lists, 0.01)
     found = torch.from_numpy(read(lists, "clip_quats").reshape(-1, 4))
     person = as_human_scene(scene)
@@ -60,7 +60,7 @@ def test_quantised_lists_err_by_half_a_step(bits: Literal[8, 16], rows: int) -> 
     values = np.random.default_rng(0).normal(size=(rows, 3)).astype(np.float32)
     values[:, 1] = 7.25  # the same everywhere: exact
     values[0, 0] = 1000.0  # far away: spoils its own chunk alone
-    lists = Lists()
+    lists = PackedArrays()
     lists.exact("before", np.arange(5, dtype=np.uint8)[:, None])
     lists.quantised("values", values, bits)
     found = read(lists, "values")
@@ -77,14 +77,14 @@ def test_pieces_are_added_until_places_are_near() -> None:
     def swinging(time: float) -> Offsets:
         return Offsets(torch.tensor([[torch.tensor(30 * time).sin(), 0.0, 0.0]]))
 
-    coarse, error = fitted_curves(swinging, 300, 0.5)
-    fine, smaller = fitted_curves(swinging, 300, 0.001)
+    coarse, error = fit_splines(swinging, 300, 0.5)
+    fine, smaller = fit_splines(swinging, 300, 0.001)
     assert coarse["means"].shape[1] < fine["means"].shape[1]
     assert error <= 0.5
     assert smaller <= 0.001
-    limited, _ = fitted_curves(swinging, 20, 0.0)
+    limited, _ = fit_splines(swinging, 20, 0.0)
     assert limited["means"].shape == (1, 2 * 19 + 3, 3)
-    _, between_few_times = fitted_curves(swinging, 3, 0.01)
+    _, between_few_times = fit_splines(swinging, 3, 0.01)
     assert between_few_times <= 0.01
 
 

@@ -28,18 +28,18 @@ from synthetic_bodies import model, write_npz
 
 from dyngs.core.errors import DyngsError
 from dyngs.export.rigged.people import (
-    Played,
+    AnimationInfo,
     add_animation,
     anchor_normals,
     body_mesh,
     mesh_document,
     rest_vertices,
-    rig_of,
+    build_rig,
     surface_normals,
     write_mesh,
     write_rigged_splats,
 )
-from dyngs.export.rigged.surface import MARGINS, FittedSurface, fitted_surface
+from dyngs.export.rigged.surface import MARGINS, FittedSurface, fit_surface
 from dyngs.export.rigged.texture import (
     BakedTexels,
     bake_texels,
@@ -92,7 +92,7 @@ def test_a_motion_becomes_an_animation(tmp_path: Path) -> None:
     shapes = PoseBlendShapes(torch.zeros(486, 3 * len(template().vertices)), template().faces)
     scene = replace(bare_scene(resolution=24), shapes=shapes)
     run = playing(bare_run(scene), random_clip(4, seed=5))
-    notes = write_mesh(run, tmp_path / "ann.glb", Played("dance", 10.0))
+    notes = write_mesh(run, tmp_path / "ann.glb", AnimationInfo("dance", 10.0))
     assert notes[-1] == "offsets that depend on the pose are left out: glTF's skins have none"
     found = SkinnedGlb(tmp_path / "ann.glb")
     animation = found.json["animations"][0]
@@ -103,7 +103,7 @@ def test_a_motion_becomes_an_animation(tmp_path: Path) -> None:
     assert abs(min(found.posed(frame)[:, 1].min() for frame in range(4))) < 1e-5
     assert found.image().shape == (96, 96, 3)
     assert found.json["extensionsUsed"] == ["KHR_materials_unlit"]
-    write_mesh(run, tmp_path / "again.glb", Played("dance", 10.0))
+    write_mesh(run, tmp_path / "again.glb", AnimationInfo("dance", 10.0))
     assert (tmp_path / "again.glb").read_bytes() == (tmp_path / "ann.glb").read_bytes()
 
 
@@ -119,9 +119,9 @@ def scene_of(scale: float = 1.0) -> HumanScene:
 def written(path: Path, scene: HumanScene) -> SkinnedGlb:
     body = template()
     with torch.no_grad():
-        rig = rig_of(scene, body.vertices)
+        rig = build_rig(scene, body.vertices)
         document = mesh_document(body, rig, body.vertices, GREY)
-        add_animation(document, scene, rig, body.vertices, body.weights, Played("dance", 10.0))
+        add_animation(document, scene, rig, body.vertices, body.weights, AnimationInfo("dance", 10.0))
         document.write(path)
     return SkinnedGlb(path)
 
@@ -263,7 +263,7 @@ def test_the_skin_moves_gaussians_as_the_avatar_does(tmp_path: Path) -> None:
     run = playing(bare_run(), random_clip(3, 0.7, seed=2))
     scene = run.scene
     assert isinstance(scene, HumanScene)
-    notes = write_rigged_splats(run, tmp_path / "ann.glb", Played("walk", 25.0))
+    notes = write_rigged_splats(run, tmp_path / "ann.glb", AnimationInfo("walk", 25.0))
     assert len(notes) == 1
     assert "viewers may show the rest pose" in notes[0]
     found = SkinnedGlb(tmp_path / "ann.glb")
@@ -291,7 +291,7 @@ NORMALS = anchor_normals(bare_scene().anchors, BODY, BODY.vertices)
 def fitted(gaussians: Gaussians) -> FittedSurface:
     scene = bare_scene().with_gaussians(gaussians)
     samples = atlas(2 * RESOLUTION)
-    return fitted_surface(
+    return fit_surface(
         gaussians, BODY, BODY.vertices, samples, bake_texels(scene, samples, NORMALS)
     )
 

@@ -34,40 +34,40 @@ from dyngs.deform.bodies.field import BodyField, BodyRestPose
 from dyngs.deform.fields import WindowedField
 from dyngs.deform.scene import DynamicScene
 from dyngs.export.cameras import NAME, write_cameras
-from dyngs.export.images import compare_run, compare_splats
+from dyngs.export.images import compare_file_with_run, compare_file_with_source
 from dyngs.export.splat_files import (
     Part,
-    Writing,
-    read_moment,
+    WriteOptions,
+    read_4dgs_frame,
     scene_part,
     splats_at,
     tracks_of,
     up_of,
-    write_bodies,
-    write_moving,
+    write_rigid_bodies,
+    write_4dgs,
     write_run_sequence,
     write_run_splats,
     write_tracks,
-    writing_of,
+    choose_write_options,
 )
 from dyngs.gaussians.rendering import render
 from dyngs.io.formats.formats import read_splats, upright, write_splats
 from dyngs.io.formats.similarity import AXES, Similarity, turn_between
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.gltf import GltfFile
-from dyngs.runs.opened import Captured, Opened, open_run, opened_scene
+from dyngs.runs.opened import Captured, OpenedScene, open_run, wrap_scene
 
 ALL = (0, 1, 2, 3, 4)
 STILL_ROWS = (0, 2, 4)
 
 
 @pytest.fixture(scope="module")
-def moving(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+def moving(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
     return open_run(write_moving_run(tmp_path_factory.mktemp("moving"), offset=(100.0, 0.0, -5.0)))
 
 
 @pytest.fixture(scope="module")
-def near(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+def near(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
     return open_run(write_moving_run(tmp_path_factory.mktemp("near")))
 
 
@@ -76,7 +76,7 @@ def x_of(path: Path) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("time", [0.0, 0.3, 1.0])
-def test_one_moment(moving: Opened, time: float, tmp_path: Path) -> None:
+def test_one_moment(moving: OpenedScene, time: float, tmp_path: Path) -> None:
     splat = read_splats(write_run_splats(moving, tmp_path / "a.ply", time).path)
     torch.testing.assert_close(splat.gaussians.means[:, 0], moved_x(ALL, time))
     assert torch.equal(splat.gaussians.means[:, 1:], row_of_balls().means[:, 1:])
@@ -85,7 +85,7 @@ def test_one_moment(moving: Opened, time: float, tmp_path: Path) -> None:
     assert splat.eps2d == moving.config.model.eps2d
 
 
-def test_parts_together_are_the_whole(moving: Opened, tmp_path: Path) -> None:
+def test_parts_together_are_the_whole(moving: OpenedScene, tmp_path: Path) -> None:
     parts: dict[Part, tuple[int, ...]] = {"moving": MOVING_ROWS, "still": STILL_ROWS}
     for part, rows in parts.items():
         path = write_run_splats(moving, tmp_path / f"{part}.ply", 0.7, part).path
@@ -98,7 +98,7 @@ def test_parts_together_are_the_whole(moving: Opened, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("part", "rows"), [("all", ALL), ("moving", MOVING_ROWS)])
-def test_a_sequence(moving: Opened, part: Part, rows: tuple[int, ...], tmp_path: Path) -> None:
+def test_a_sequence(moving: OpenedScene, part: Part, rows: tuple[int, ...], tmp_path: Path) -> None:
     times = (0.0, 0.25, 1.0)
     files = write_run_sequence(moving, tmp_path / "new" / "seq", times, part)
     paths = [one.path for one in files]
@@ -110,7 +110,7 @@ def test_a_sequence(moving: Opened, part: Part, rows: tuple[int, ...], tmp_path:
 
 
 def test_a_sequence_of_the_same_length_is_replaced_and_others_are_refused(
-    moving: Opened, tmp_path: Path
+    moving: OpenedScene, tmp_path: Path
 ) -> None:
     folder = tmp_path / "seq"
     write_run_sequence(moving, folder, (0.0, 0.5))
@@ -125,21 +125,21 @@ def test_a_sequence_of_the_same_length_is_replaced_and_others_are_refused(
         write_run_sequence(moving, folder / "notes.txt", (0.0, 0.5))
 
 
-def test_up_is_what_the_cameras_or_the_user_say(near: Opened) -> None:
+def test_up_is_what_the_cameras_or_the_user_say(near: OpenedScene) -> None:
     found = up_of(near)
     assert found is not None
     name = next(name for name, axis in AXES.items() if axis == found[0])
-    how, line = writing_of(near, "y")
+    how, line = choose_write_options(near, "y")
     assert how.turn == turn_between(found[0], AXES["y"])
     assert f"it was {name} in the capture" in line or name == "y"
-    assert "the axes of the capture are kept" in writing_of(near, name)[1]
+    assert "the axes of the capture are kept" in choose_write_options(near, name)[1]
     lost = replace(near, captured=Captured(near.config.data, DyngsError("gone")))
     assert up_of(lost) is None
-    how, line = writing_of(lost, "y", sh_degree=2)
+    how, line = choose_write_options(lost, "y", sh_degree=2)
     assert (how.turn, how.up, how.sh_degree) == ((1.0, 0.0, 0.0, 0.0), None, 2)
     assert "--from-up=AXIS tells it" in line
-    assert writing_of(lost, "y", from_up="z")[0].turn == turn_between(AXES["z"], AXES["y"])
-    assert writing_of(lost, "y", "keep", "z")[0].turn == (1.0, 0.0, 0.0, 0.0)
+    assert choose_write_options(lost, "y", from_up="z")[0].turn == turn_between(AXES["z"], AXES["y"])
+    assert choose_write_options(lost, "y", "keep", "z")[0].turn == (1.0, 0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -148,7 +148,7 @@ def test_edits_of_every_kind_of_scene_are_exact(kind: str) -> None:
     between."""
     scene = replace(scene_of_kind(kind), colour=None)
     edit = Similarity((0.6, 0.0, 0.8, 0.0), 2.5, (3.0, -1.0, 0.5))
-    splat = splats_at(opened_scene(scene), scene, 0.3, Writing(edit=edit, up="y"))
+    splat = splats_at(wrap_scene(scene), scene, 0.3, WriteOptions(edit=edit, up="y"))
     seen = onlooker()
     before = scene.render(seen, 0.3, background=torch.zeros(3)).rgb
     options = replace(scene.options, near=scene.options.near * edit.scale)
@@ -158,17 +158,17 @@ def test_edits_of_every_kind_of_scene_are_exact(kind: str) -> None:
     assert (splat.edited, splat.up) == (edit, "y")
 
 
-def test_a_file_drawn_again_is_compared_with_its_run(near: Opened, tmp_path: Path) -> None:
-    for how in (Writing(), Writing(turn_between(AXES["z"], AXES["-y"]), "-y")):
+def test_a_file_drawn_again_is_compared_with_its_run(near: OpenedScene, tmp_path: Path) -> None:
+    for how in (WriteOptions(), WriteOptions(turn_between(AXES["z"], AXES["-y"]), "-y")):
         written = write_run_splats(near, tmp_path / "a.ply", 0.7, how=how)
         read = read_splats(written.path)
-        assert compare_run(near, near.scene, 0.7, written.splat, read) > 80
+        assert compare_file_with_run(near, near.scene, 0.7, written.splat, read) > 80
         # another time is seen as such
-        assert compare_run(near, near.scene, 0.0, written.splat, read) < 40
+        assert compare_file_with_run(near, near.scene, 0.0, written.splat, read) < 40
     splat = SplatFile(cloud(300), up="z")
     exact = write_splats(tmp_path / "a.ply", upright(splat, None, tmp_path / "a.ply"))
-    assert compare_splats(splat, exact) > 80
-    assert compare_splats(splat, write_splats(tmp_path / "a.splat", splat)) < 30
+    assert compare_file_with_source(splat, exact) > 80
+    assert compare_file_with_source(splat, write_splats(tmp_path / "a.splat", splat)) < 30
 
 
 def expected(times: tuple[float, ...], speed: float = 1.0) -> np.ndarray:
@@ -215,12 +215,12 @@ def test_a_file_of_tracks_holds_arrays_without_pickle(tmp_path: Path) -> None:
     assert path.read_bytes() == first
 
 
-def test_moving_files(tmp_path: Path, near: Opened, capsys: pytest.CaptureFixture[str]) -> None:
+def test_moving_files(tmp_path: Path, near: OpenedScene, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("fourdgs")
     times = [i / 9 for i in range(10)]  # more than one group of key frame and deltas
-    splats, _ = write_moving(near, tmp_path / "a.4dgs", times)
+    splats, _ = write_4dgs(near, tmp_path / "a.4dgs", times)
     for i in (0, 3, 8, 9):
-        read = read_moment(tmp_path / "a.4dgs", i).gaussians
+        read = read_4dgs_frame(tmp_path / "a.4dgs", i).gaussians
         meant = splats[i].gaussians
         torch.testing.assert_close(read.means[:, 0], moved_x(ALL, times[i]), rtol=0, atol=0.01)
         torch.testing.assert_close(read.base_rgb, meant.base_rgb.clamp(0, 1), rtol=0, atol=0.01)
@@ -234,7 +234,7 @@ def test_moving_files(tmp_path: Path, near: Opened, capsys: pytest.CaptureFixtur
 
 
 @pytest.fixture(scope="module")
-def rolling(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+def rolling(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
     """Of five balls the second and the fourth are one body, which turns by 0.9 times half a turn
     and moves aside."""
     opened = open_run(write_moving_run(tmp_path_factory.mktemp("rolling")))
@@ -246,14 +246,14 @@ def rolling(tmp_path_factory: pytest.TempPathFactory) -> Opened:
     rest = BodyRestPose(torch.tensor([[0.1, 0.2, 0.0]]), torch.ones(1), labels)
     field = BodyField(sliding_nodes(), rest, {"places": places[None], "quats": quats[None]})
     assert isinstance(opened.scene, DynamicScene)
-    return opened.showing(replace(opened.scene, field=WindowedField(field, len(MOVING_ROWS))))
+    return opened.with_scene(replace(opened.scene, field=WindowedField(field, len(MOVING_ROWS))))
 
 
-@pytest.mark.parametrize("how", [Writing(), Writing((0.5, 0.5, 0.5, 0.5), "y")])
+@pytest.mark.parametrize("how", [WriteOptions(), WriteOptions((0.5, 0.5, 0.5, 0.5), "y")])
 def test_the_animation_of_bodies_shows_the_scene_at_all_times(
-    tmp_path: Path, rolling: Opened, how: Writing
+    tmp_path: Path, rolling: OpenedScene, how: WriteOptions
 ) -> None:
-    written = write_bodies(rolling, tmp_path / "a.glb", 0.25, how)
+    written = write_rigid_bodies(rolling, tmp_path / "a.glb", 0.25, how)
     found = read_splats(written.path).gaussians
     order = [*MOVING_ROWS, *STILL_ROWS]  # the reader begins with the last node
     for name, x in found.tensors().items():  # without the animation

@@ -15,13 +15,13 @@ from tiny_fields import busy_config, write_tiny_capture
 from torch import Tensor
 
 from dyngs.config import FixedStrategy
-from dyngs.core.state import Role, part_of, tensors_of
+from dyngs.core.state import Role, part_of, strip_roles
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import restore_colour_network
 from dyngs.gaussians.scene import GaussianScene, restore_scene
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.models.static_section import StaticModel
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 
 TIMES = (None, 0.0, 0.37, 0.5, 1.0)
 
@@ -67,7 +67,7 @@ def test_what_is_stored_gives_the_same_images(kind: str, drawing: bool) -> None:
     state = scene.drawing_state() if drawing else scene.state()
     found = replace(
         restored(kind, state),
-        colour=restore_colour_network(part_of(tensors_of(state), "model.colour")),
+        colour=restore_colour_network(part_of(strip_roles(state), "model.colour")),
     )
     assert type(found) is type(scene)
     assert found.times == scene.times
@@ -206,7 +206,7 @@ def test_what_is_trained_is_what_is_loaded(model: str, tmp_path: Path) -> None:
     config = config.model_copy(update={"strategy": FixedStrategy()})
     if model == "static":
         config = config.model_copy(update={"model": StaticModel(sh_degree=1)})
-    trainer = assemble(config)
+    trainer = build_trainer(config)
     for _ in range(11):
         trainer.step()
     loaded = restore_scene(trainer.checkpoint(), config.model)

@@ -25,7 +25,7 @@ from dyngs.export.images import OutputOptions, write_path_images
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.runs.opened import open_run
 from dyngs.view.layers import Shot, draw
-from dyngs.view.views import viewpoint_of
+from dyngs.view.views import initial_viewpoint
 
 ROOT = Path(__file__).parents[2]
 
@@ -108,7 +108,7 @@ def test_it_is_evaluated_drawn_and_viewed(run: Path, tmp_path: Path) -> None:
     opened = open_run(run)
     path = choose_path(opened, PathOptions(num_frames=3))
     assert len(write_path_images(opened, path, tmp_path, OutputOptions(depth=True))) == 3 * 3
-    start = viewpoint_of(opened).start
+    start = initial_viewpoint(opened).start
     for shot in (Shot(start), Shot(start, layer="depth"), Shot(start, layer="error", view=0)):
         assert draw(opened, shot).std() > 0
 

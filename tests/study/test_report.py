@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from browser import Browser, needs_browser
 
-from dyngs.core.errors import escaped
+from dyngs.core.errors import escape_control_characters
 from dyngs.io.write import write_image
 from dyngs.study.report import (
     Report,
@@ -22,7 +22,7 @@ from dyngs.study.report import (
     markdown_table,
     page_text,
     plot_variants,
-    svg_of,
+    figure_to_svg,
 )
 from dyngs.study.tradeoff import Row
 
@@ -52,7 +52,7 @@ def test_csv_holds_no_formulas(text: str) -> None:
     (row,) = csv.reader(
         io.StringIO(csv_text([{"name": text, "dB": -1.5}]).partition("\n")[2], newline="")
     )
-    assert row == [f"'{escaped(text)}", "-1.5"]
+    assert row == [f"'{escape_control_characters(text)}", "-1.5"]
 
 
 def test_markdown_shows_names_as_they_are() -> None:
@@ -81,7 +81,7 @@ def test_lines_of_a_plot_join_the_run_with_a_setting() -> None:
         assert len(front.get_xdata()) == 3
         found = {line.get_label(): len(line.get_xdata()) for line in lines}
         assert found == {"the run itself": 1, "prune": 3, "sh_degree": 2}
-    text = svg_of(figure)
+    text = figure_to_svg(figure)
     assert "<image" not in text
     assert 'href="http' not in text
 

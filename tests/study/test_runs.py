@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.study.runs import STUDY_FILE, done_in_turn, require_same_study
+from dyngs.study.runs import STUDY_FILE, run_tasks, require_same_study
 
 
 def reciprocal(number: float) -> float:
@@ -21,10 +21,10 @@ def reciprocal(number: float) -> float:
 
 def test_tasks_are_done_as_they_are_asked_for_and_a_failure_stops_no_other() -> None:
     begun: list[int] = []
-    results = done_in_turn(begun.append, [1, 2, 3])
+    results = run_tasks(begun.append, [1, 2, 3])
     assert next(results) == (1, None)
     assert begun == [1]
-    found = dict(done_in_turn(reciprocal, [2.0, 0.0, 4.0]))
+    found = dict(run_tasks(reciprocal, [2.0, 0.0, 4.0]))
     assert (found[2.0], found[4.0]) == (0.5, 0.25)
     assert str(found[0.0]) == "nothing to divide by"
 
@@ -45,7 +45,7 @@ def test_ray_imports_no_module_of_the_current_folder(
     )
     monkeypatch.setitem(sys.modules, "ray", fake)
     monkeypatch.chdir(tmp_path)
-    assert list(done_in_turn(lambda _: os.getcwd(), ["a"], 1)) == [("a", str(tmp_path))]
+    assert list(run_tasks(lambda _: os.getcwd(), ["a"], 1)) == [("a", str(tmp_path))]
     assert tmp_path not in map(Path, importing)
     assert len(importing) == 1
     assert os.getcwd() == str(tmp_path)

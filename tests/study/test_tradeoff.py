@@ -26,12 +26,12 @@ from dyngs.study.tradeoff import (
     choose,
     combinations,
     exchange_rates,
-    own_settings,
+    current_settings,
     pareto_mask,
     parse_goal,
     parse_requirements,
     parse_variations,
-    single_changes,
+    single_setting_variants,
     slope,
     table_rows,
 )
@@ -125,7 +125,7 @@ def test_the_folder_of_a_variant_is_drawn_as_it_was_measured(found: Found, study
 def test_masks_that_a_run_has_stay(found: Found, study: Tradeoff, tmp_path: Path) -> None:
     run = study.out / "training" / Variant(mask_times=3, finetune=2).slug
     masked = replace(study, run_dir=run, out=tmp_path)
-    assert own_settings(run)["mask_times"] == 3
+    assert current_settings(run)["mask_times"] == 3
     for variant in (Variant(prune=0.5), Variant(prune=0.5, finetune=1)):
         scene = load_run(masked.folder(variant)).scene
         assert scene.masks is not None
@@ -134,7 +134,7 @@ def test_masks_that_a_run_has_stay(found: Found, study: Tradeoff, tmp_path: Path
 
 def test_a_stored_run_cannot_be_varied(found: Found, study: Tradeoff) -> None:
     with pytest.raises(DyngsError, match=r"only scene\.dyngs is there; give the run that it"):
-        own_settings(study.folder(Variant(storage=2.0)))
+        current_settings(study.folder(Variant(storage=2.0)))
 
 
 def test_a_damaged_point_says_what_to_do(found: Found, tmp_path: Path) -> None:
@@ -180,14 +180,14 @@ def test_the_setting_of_a_variant() -> None:
 
 
 def test_single_changes_differ_from_the_run() -> None:
-    names = [v.name for v in single_changes(parse_variations([]), OWN, 0)]
+    names = [v.name for v in single_setting_variants(parse_variations([]), OWN, 0)]
     assert len(names) == len(set(names))
     assert {"sh_degree=0", "sh_degree=1", "mask_times=16", "prune=0.3"} <= set(names)
     assert not {"sh_degree=2", "mask_times=6"} & set(names)
     still = {"sh_degree": 0, "storage": None}
-    fewer = [v.name for v in single_changes(parse_variations([]), still, 0)]
+    fewer = [v.name for v in single_setting_variants(parse_variations([]), still, 0)]
     assert fewer == ["storage=auto", "storage=1", "storage=3"]
-    tuned = single_changes(parse_variations(["prune=0.5", "sh_degree=0"]), OWN, 7)
+    tuned = single_setting_variants(parse_variations(["prune=0.5", "sh_degree=0"]), OWN, 7)
     assert tuned == [Variant(prune=0.5), Variant(prune=0.5, finetune=7), Variant(sh_degree=0)]
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dyngs.config import Config, DataConfig, DefaultStrategy, TrainConfig
-from dyngs.training.clock import Forecast, SaveTimer, step_cost
+from dyngs.training.clock import TimeForecast, SaveTimer, step_cost
 
 CONFIG = Config(
     data=DataConfig(root=Path("nowhere")),
@@ -19,7 +19,7 @@ PIXELS = 1e6
 
 def test_small_images_first() -> None:
     """Steps of known cost, one second per unit, are foreseen before the images grow."""
-    forecast = Forecast(0, 0.0, 1000, PIXELS)
+    forecast = TimeForecast(0, 0.0, 1000, PIXELS)
     seconds = 0.0
     for step in range(1, 101):
         if step == 30:
@@ -32,7 +32,7 @@ def test_small_images_first() -> None:
 
 
 def test_pauses_do_not_count() -> None:
-    one, other = (Forecast(0, 0.0, 0, PIXELS) for _ in range(2))
+    one, other = (TimeForecast(0, 0.0, 0, PIXELS) for _ in range(2))
     one.observe(CONFIG, 5, 10.0, 0)
     other.pause(100.0)
     other.observe(CONFIG, 5, 110.0, 0)

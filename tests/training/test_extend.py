@@ -32,7 +32,7 @@ from dyngs.human.synthetic.capture import write_human_capture
 from dyngs.models.schedule import image_divisor
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.training.plan import describe_extension, with_length
+from dyngs.training.plan import describe_extension, extend_config
 from dyngs.training.trainer import StepReport, Trainer
 
 ALL_KINDS = ("default", "mcmc", "control_nodes", "human")
@@ -141,7 +141,7 @@ def test_what_cannot_be_is_refused_and_changes_nothing(captures: Path, tmp_path:
     assert (run / "config.yaml").read_bytes() == before
     config = _config(captures, run, "default")
     with pytest.raises(DyngsError, match="pruned"):
-        with_length(config, 20, 40)
+        extend_config(config, 20, 40)
     (run / "checkpoints" / "step_0000012.safetensors").unlink()
     (run / "timing.json").unlink()
     with pytest.raises(DyngsError, match="no checkpoint"):
@@ -160,9 +160,9 @@ def test_what_has_begun_keeps_its_step() -> None:
         for steps in (done + 10, 1050, 9000):
             if steps == 9000 and done < 1000:
                 with pytest.raises(DyngsError, match="1,000 before anything moves"):
-                    with_length(config, done, steps)
+                    extend_config(config, done, steps)
                 continue
-            new = with_length(config, done, steps)
+            new = extend_config(config, done, steps)
             assert isinstance(new.model, DynamicModel)
             now = deform_schedule(new.model, RateSchedule(steps))
             assert now.coarse_end == (350 if steps < 9000 else 1000)
@@ -179,14 +179,14 @@ def test_what_has_begun_keeps_its_step() -> None:
 def test_exposures_that_are_learned_stay_so() -> None:
     options = TrainConfig(steps=1000, exposure="always")
     config = Config(data=DataConfig(root=Path("x")), train=options)
-    assert with_length(config, 1000, 3000).train.exposure == "always"
+    assert extend_config(config, 1000, 3000).train.exposure == "always"
     with pytest.raises(DyngsError, match="exposures were learned after"):
-        with_length(config, 1000, 1_000_000)
+        extend_config(config, 1000, 1_000_000)
 
 
 def test_what_a_shorter_run_would_have_begun_by_now_begins_next() -> None:
     model = DynamicModel(motion_from=0.5)
     config = Config(data=DataConfig(root=Path("x")), model=model, train=TrainConfig(steps=10_000))
-    new = with_length(config, 4000, 5000)
+    new = extend_config(config, 4000, 5000)
     assert isinstance(new.model, DynamicModel)
     assert deform_schedule(new.model, RateSchedule(5000)).coarse_end == 4001

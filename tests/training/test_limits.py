@@ -24,8 +24,8 @@ from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.keys import DynamicModel
 from dyngs.human.keys import HumanPredictorModel
 from dyngs.models.static_section import StaticModel
-from dyngs.training.limits import most_gaussians, require_possible, within_cap
-from dyngs.training.new_trainer import assemble
+from dyngs.training.limits import gaussian_limit, validate_limits, apply_gaussian_cap
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 NOTHING = Config(data=DataConfig(root=Path("nowhere")))
@@ -77,8 +77,8 @@ def test_none_are_added_beyond_a_cap(
 ) -> None:
     """The run begins with 60."""
     config = still_config(still, tmp_path, strategy)
-    assert largest_count(assemble(config)) > 90
-    assert largest_count(assemble(within_cap(config, cap), uncapped=config)) == most
+    assert largest_count(build_trainer(config)) > 90
+    assert largest_count(build_trainer(apply_gaussian_cap(config, cap), uncapped=config)) == most
 
 
 @pytest.mark.parametrize("model", [StaticModel(), DynamicModel()])
@@ -87,15 +87,15 @@ def test_a_size_without_room_is_refused_and_the_one_named_is_not(
 ) -> None:
     config = NOTHING.model_copy(update={"model": model})
     with pytest.raises(DyngsError, match=r"budget.max_mb=0.001: .* would do") as refused:
-        most_gaussians(limited(config, max_mb=0.001), 20)
+        gaussian_limit(limited(config, max_mb=0.001), 20)
     would_do = float(str(refused.value).split(";")[1].split()[0])
-    found = most_gaussians(limited(config, max_mb=would_do), 20)
+    found = gaussian_limit(limited(config, max_mb=would_do), 20)
     assert found is not None
     assert found >= 500
 
 
 def test_what_contradicts_is_refused(tmp_path: Path) -> None:
-    require_possible(NOTHING)
+    validate_limits(NOTHING)
     network = NOTHING.model_copy(update={"model": HumanPredictorModel()})
     both = NOTHING.model_copy(
         update={"prune": PruneConfig(fraction=0.5), "run": RunConfig(dir=tmp_path / "run")}
@@ -114,4 +114,4 @@ def test_what_contradicts_is_refused(tmp_path: Path) -> None:
 def test_cameras_are_refined_by_still_and_moving_scenes_alone(preset: str) -> None:
     config = load_config(packaged_preset(preset), ["data.root=capture", "camera.refine=always"])
     with pytest.raises(DyngsError, match=r"camera\.refine=always"):
-        require_possible(config)
+        validate_limits(config)

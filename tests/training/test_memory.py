@@ -24,7 +24,7 @@ from dyngs.training.memory import (
     memory_forecasts,
     resident_memory,
 )
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 
 GB = 10**9
 PLENTY = MemoryForecast(
@@ -46,11 +46,11 @@ def config_of(still: Path, **changes: object) -> Config:
 
 
 def test_a_run_is_forecast_before_it_begins(still: Path) -> None:
-    (found,) = memory_forecasts(assemble(config_of(still)))
+    (found,) = memory_forecasts(build_trainer(config_of(still)))
     assert found.count == 60
     assert found.gaussians == 60 * 4 * 7 * 59
     assert found.warning() is None
-    (none,) = memory_forecasts(assemble(config_of(still, data=DataConfig(root=still, cache_mb=0))))
+    (none,) = memory_forecasts(build_trainer(config_of(still, data=DataConfig(root=still, cache_mb=0))))
     assert none.images < found.images
 
 
@@ -60,7 +60,7 @@ def test_on_a_gpu_the_scene_is_forecast_there_and_the_rest_here(
     monkeypatch.setattr("dyngs.training.new_trainer.select_device", lambda _: GPU)
     monkeypatch.setattr(memory, "gpu_memory", lambda _: (3 * GB, 8 * GB))
     with pretend_gpu():
-        gpu, machine = memory_forecasts(assemble(config_of(still)))
+        gpu, machine = memory_forecasts(build_trainer(config_of(still)))
     assert (gpu.free, gpu.program) == (3 * GB, 0)
     assert gpu.count == 60
     assert machine.count == machine.gaussians == 0

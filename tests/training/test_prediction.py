@@ -12,7 +12,7 @@ from tiny_people import config, people
 
 from dyngs.api.train import train
 from dyngs.runs.checkpoint import checkpoint_paths, load_checkpoint
-from dyngs.training.prediction import NetworkTrainer, network_trainer, rate_at
+from dyngs.training.prediction import NetworkTrainer, network_trainer, one_cycle_rate
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +54,6 @@ def test_a_gradient_too_large_to_square_leaves_the_step_out(folder: Path, tmp_pa
 
 
 def test_the_rate_goes_up_and_down() -> None:
-    rates = [rate_at(2e-3, step, 100) for step in range(1, 101)]
+    rates = [one_cycle_rate(2e-3, step, 100) for step in range(1, 101)]
     assert max(rates) == pytest.approx(2e-3) == rates[4]
     assert rates[0] < rates[3] < rates[4] > rates[5] > rates[98] > rates[99] > 0

@@ -19,7 +19,7 @@ from dyngs.export.images import write_split_images
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.folder import EXPORT_FOLDER
 from dyngs.runs.opened import open_run
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -32,7 +32,7 @@ def config_of(kind: str, root: Path, *more: str) -> Config:
 def trained(config: Config, monkeypatch: pytest.MonkeyPatch, device: torch.device) -> Trainer:
     """The trainer after all steps."""
     monkeypatch.setattr("dyngs.training.new_trainer.select_device", lambda _: device)
-    trainer = assemble(config)
+    trainer = build_trainer(config)
     while trainer.done < config.train.steps:
         trainer.step()
     return trainer
@@ -112,15 +112,15 @@ def test_a_run_goes_on_there_from_a_checkpoint(
 ) -> None:
     config = config_of("static", still, *STATIC, "camera.refine=always", "train.exposure=always")
     monkeypatch.setattr("dyngs.training.new_trainer.select_device", lambda _: torch.device("cpu"))
-    begun = assemble(config)
-    expected = assemble(config)
+    begun = build_trainer(config)
+    expected = build_trainer(config)
     for _ in range(10):
         begun.step()
     stored = begun.checkpoint()
     expected.restore(stored)
     with pretend_gpu():
         monkeypatch.setattr("dyngs.training.new_trainer.select_device", lambda _: GPU)
-        resumed = assemble(config, restored=True)
+        resumed = build_trainer(config, restored=True)
         resumed.restore(stored)
         for _ in range(10):
             expected.step()

@@ -13,25 +13,25 @@ from dyngs.data.loader import Image
 from dyngs.data.read import read_capture
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.models.model import Drawn, Look, Model
+from dyngs.models.model import Drawn, LossInput, Model
 from dyngs.training.priors import (
     PointTracks,
     TimedCamera,
-    UsedPriors,
+    PriorLosses,
     depth_error,
-    displacements,
+    render_displacements,
     track_error,
-    used_priors,
+    load_priors,
 )
 
 HERE = camera(32, 24)
 GENERATOR = torch.Generator().manual_seed(0)
 
 
-def found(root: Path, *changes: str, moves: bool = True) -> UsedPriors:
+def found(root: Path, *changes: str, moves: bool = True) -> PriorLosses:
     config = load_config("dynamic", [f"data.root={root}", "data.test_every=0", *changes])
     capture = read_capture(config.data)
-    return used_priors(config, capture, capture.splits["train"], moves=moves)
+    return load_priors(config, capture, capture.splits["train"], moves=moves)
 
 
 def test_priors_of_a_capture_are_used(tmp_path: Path) -> None:
@@ -46,7 +46,7 @@ def test_priors_of_a_capture_are_used(tmp_path: Path) -> None:
 def test_priors_that_are_not_requested_are_not_read(tmp_path: Path) -> None:
     with_priors(tmp_path)
     (tmp_path / "tracks.npz").write_bytes(b"")
-    assert found(tmp_path, "train.priors=[]") == UsedPriors()
+    assert found(tmp_path, "train.priors=[]") == PriorLosses()
     assert found(tmp_path, "train.priors=[depth]").message.endswith(": depth maps")
 
 
@@ -81,21 +81,21 @@ class Seen:
 
 
 def terms(
-    priors: UsedPriors, own: Image, *, until: float = 1.0, speed: float = 0.5
+    priors: PriorLosses, own: Image, *, until: float = 1.0, speed: float = 0.5
 ) -> dict[str, float]:
     of = scene(speed)
     depth: Literal["none", "expected"] = "expected" if priors.needs_depth(own) else "none"
     rendering = of.render(HERE, 0.0, options=RenderOptions(nonfinite="trust", depth=depth))
     rgb = rendering.rgb[0]
     model = cast(Model[Any], Seen(of, until))
-    look = Look(0, 1, own, Drawn(rendering), rgb, rgb, model, GENERATOR)
+    look = LossInput(0, 1, own, Drawn(rendering), rgb, rgb, model, GENERATOR)
     return {name: float(x.detach()) for name, x in priors(look).items()}
 
 
 def test_flow_of_a_motion_that_is_not_there_costs() -> None:
     """Flow says that nothing moves: right at speed 0, wrong at another."""
     own = image(flow=torch.zeros(24, 32, 2))
-    priors = UsedPriors(flow_to={0: TimedCamera(HERE, 0.5)})
+    priors = PriorLosses(flow_to={0: TimedCamera(HERE, 0.5)})
     assert terms(priors, own, speed=0.0)["flow"] < 1e-6
     assert terms(priors, own)["flow"] > 0.001
     assert terms(priors, own, until=0.4) == {}
@@ -103,9 +103,9 @@ def test_flow_of_a_motion_that_is_not_there_costs() -> None:
 
 def test_depth_is_drawn_only_where_it_is_needed() -> None:
     own = image(depth=torch.ones(24, 32))
-    assert not UsedPriors().needs_depth(own)
-    assert not UsedPriors(depth=True).needs_depth(image())
-    assert UsedPriors(depth=True).needs_depth(own)
+    assert not PriorLosses().needs_depth(own)
+    assert not PriorLosses(depth=True).needs_depth(image())
+    assert PriorLosses(depth=True).needs_depth(own)
 
 
 def test_tracks_pair_views_of_other_times_that_share_points() -> None:
@@ -164,7 +164,7 @@ def test_what_is_drawn_is_the_displacement_of_the_gaussian_that_shows() -> None:
     here = camera(32, 24)
     start = row_of_balls(1)
     moved = start.replace(means=start.means + torch.tensor([0.1, 0.0, 0.0]))
-    drawn = displacements(start, moved, here, here, RenderOptions())
+    drawn = render_displacements(start, moved, here, here, RenderOptions())
     pose = here.cam_from_world[0]
     before, after = (x.means[0] @ pose[:3, :3].T + pose[:3, 3] for x in (start, moved))
     focal = here.intrinsics[0].diagonal()[:2]

@@ -32,7 +32,7 @@ from dyngs.io.tensor_file import write_tensors
 from dyngs.io.write import write_image
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import _KIND, load_checkpoint
-from dyngs.training.new_trainer import GaussianTrainer, assemble
+from dyngs.training.new_trainer import GaussianTrainer, build_trainer
 from dyngs.training.trainer import ViewSampler
 
 
@@ -44,7 +44,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _trainer(capture: Path, **data: object) -> GaussianTrainer:
-    return assemble(
+    return build_trainer(
         Config(
             data=DataConfig(root=capture, **data),  # type: ignore[arg-type]
             model=StaticModel(sh_degree=1),
@@ -86,7 +86,7 @@ class _LiftedScene(GaussianScene):
 class _Lifted(SceneTraining[_LiftedScene]):
     """How it is trained; what it has done is part of its state."""
 
-    moves_by = ("field", "model.deform")
+    deformation_name = ("field", "model.deform")
 
     def __init__(self) -> None:
         self.steps: list[int] = []

@@ -27,8 +27,8 @@ from dyngs.export.images import render_frame
 from dyngs.gaussians import levels
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.runs.opened import Opened, open_run, open_scene
-from dyngs.view.controls import Frusta
+from dyngs.runs.opened import OpenedScene, open_run, open_scene
+from dyngs.view.controls import CameraFrusta
 from dyngs.view.layers import (
     LAYERS,
     PARTS,
@@ -41,16 +41,16 @@ from dyngs.view.views import (
     camera_at,
     fitting_fov,
     has_timeline,
-    look_point,
+    orbit_center,
     nearest_view,
     pose_of,
-    viewpoint_of,
+    initial_viewpoint,
     views_of,
 )
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+def run(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
     return open_run(write_moving_run(tmp_path_factory.mktemp("run")))
 
 
@@ -62,7 +62,7 @@ def test_colours_are_those_of_dyngs_render() -> None:
 
 
 @pytest.mark.parametrize("layer", LAYERS)
-def test_a_gpu_draws_every_layer_alike(run: Opened, layer: str) -> None:
+def test_a_gpu_draws_every_layer_alike(run: OpenedScene, layer: str) -> None:
     view = 0 if layer in ("colour", "error") else None
     shots = [Shot(camera(), 0.5, layer, part, view, 0.5) for part in PARTS]  # type: ignore[arg-type]
     expected = [draw(run, shot) for shot in shots]
@@ -88,7 +88,7 @@ def test_many_gaussians_are_drawn_in_levels_while_anything_moves(
     assert not np.array_equal(coarse, draw(whole, shot))
     assert np.array_equal(draw(whole, moving), draw(whole, shot))
     assert np.array_equal(draw(opened, shot), draw(whole, shot))
-    edited = opened.showing(opened.scene.select(torch.arange(1000)))
+    edited = opened.with_scene(opened.scene.select(torch.arange(1000)))
     assert np.array_equal(draw(edited, moving), draw(edited, shot))
     with pytest.raises(DyngsError, match="for still scenes"):
         coarser(balls(), 300)
@@ -104,7 +104,7 @@ def test_the_moment_of_a_time_is_computed_once() -> None:
     assert asked.calls == 2
 
 
-def test_the_line_divides_render_and_truth(run: Opened) -> None:
+def test_the_line_divides_render_and_truth(run: OpenedScene) -> None:
     def shown(divide: float) -> np.ndarray:
         return draw(run, Shot(camera(64, 64), 0.0, view=2, divide=divide))
 
@@ -140,9 +140,9 @@ def test_a_window_shows_the_whole_image(aspect: float) -> None:
 def test_the_point_to_orbit_lies_on_the_axis_as_deep_as_the_scene(unit: float) -> None:
     one = looking((0, -4 * unit, 0))
     begin = Viewpoint(one, np.array([unit, 0, unit]), 2 * unit, np.array([0, 0, 1.0]))
-    assert look_point(one, begin) / unit == pytest.approx([0, 0, 0], abs=1e-6)
+    assert orbit_center(one, begin) / unit == pytest.approx([0, 0, 0], abs=1e-6)
     behind = replace(begin, center=np.array([0.0, -9 * unit, 0]))
-    assert look_point(one, behind) / unit == pytest.approx([0, -3.8, 0], abs=1e-6)
+    assert orbit_center(one, behind) / unit == pytest.approx([0, -3.8, 0], abs=1e-6)
 
 
 def test_the_nearest_view_is_near_in_place_direction_and_time(tmp_path: Path) -> None:
@@ -153,17 +153,17 @@ def test_the_nearest_view_is_near_in_place_direction_and_time(tmp_path: Path) ->
         assert nearest_view(opened, shown.cameras[index], time) == index
     assert {view.time for view in shown.views} == {*TRAIN_TIMES, *TEST_TIMES}
     assert has_timeline(opened)
-    begin = viewpoint_of(opened)
+    begin = initial_viewpoint(opened)
     assert torch.equal(begin.start.cam_from_world, shown.cameras[0].cam_from_world)
     assert views_of(replace(opened, as_captured=False)).images is None
 
 
 def test_a_frustum_that_the_camera_stands_in_is_hidden() -> None:
     session, _ = looking_at_balls()
-    frusta = Frusta(SimpleNamespace(session=session))  # type: ignore[arg-type]
+    frusta = CameraFrusta(SimpleNamespace(session=session))  # type: ignore[arg-type]
     assert session.eye is not None
     here, there = (SimpleNamespace(visible=True) for _ in range(2))
     eye = np.array(session.eye.position)
     frusta._handles = [(here, eye + 0.01, 0.2), (there, eye + 1.0, 0.2)]
-    frusta.hide_what_covers()
+    frusta.hide_covering_frusta()
     assert (here.visible, there.visible) == (False, True)

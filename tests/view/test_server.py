@@ -24,13 +24,13 @@ from dyngs.core.metrics import ssim
 from dyngs.view.server import (
     COOKIE,
     Browsing,
-    Gate,
-    Serving,
+    AccessPolicy,
+    ServerOptions,
     Viewer,
-    as_text,
+    escape_markdown,
     free_port,
-    gate_for,
-    guarded,
+    access_policy_for,
+    enforce_access,
     is_loopback,
     link_to,
     quiet,
@@ -62,7 +62,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def viewer(run: Path) -> Iterator[Viewer]:
     source = open_source(run)
-    with Viewer(source, source.load(source.names[0]), Serving()) as viewer:
+    with Viewer(source, source.load(source.names[0]), ServerOptions()) as viewer:
         yield viewer
 
 
@@ -203,7 +203,7 @@ def test_texts_of_strangers_are_shown_and_never_run(browser: Browser, tmp_path: 
     )
     for folder, wanted in ((run, "truth: "), (other, "without the capture")):
         source = open_source(folder)
-        with Viewer(source, source.load(source.names[0]), Serving()) as viewer:
+        with Viewer(source, source.load(source.names[0]), ServerOptions()) as viewer:
             page = browser.open(viewer.link, *SIZE)
             until(lambda viewer=viewer: any(one.num_sent for one in viewer.browsing), page)
             (browsing,) = viewer.browsing
@@ -236,7 +236,7 @@ def test_texts_of_strangers_are_shown_and_never_run(browser: Browser, tmp_path: 
 
 
 def test_with_a_token_only_who_has_it_may() -> None:
-    gate = Gate("secret")
+    gate = AccessPolicy("secret")
     other = {"Host": "box:8080"}
     assert gate.refusal("/?token=secret", other) is None
     assert gate.refusal("/", other | {"Cookie": f"a=b; {COOKIE}=secret"}) is None
@@ -251,15 +251,15 @@ def test_with_a_token_only_who_has_it_may() -> None:
         assert gate.refusal(path, headers) is not None
     assert "HttpOnly" in (gate.cookie("/?token=secret") or "")
     assert gate.cookie("/") is None
-    assert Gate().cookie("/?token=x") is None
+    assert AccessPolicy().cookie("/?token=x") is None
 
 
 def test_only_a_server_for_others_has_a_token() -> None:
     assert [is_loopback(host) for host in ("localhost", "127.0.0.1", "::1")] == [True] * 3
     assert [is_loopback(host) for host in ("0.0.0.0", "::", "192.168.1.7", "box")] == [False] * 4
-    assert gate_for("127.0.0.1").token is None
-    first = gate_for("0.0.0.0").token
-    second = gate_for("0.0.0.0").token
+    assert access_policy_for("127.0.0.1").token is None
+    first = access_policy_for("0.0.0.0").token
+    second = access_policy_for("0.0.0.0").token
     assert first is not None
     assert len(first) >= 24
     assert first != second
@@ -291,7 +291,7 @@ def test_a_free_port_is_found_and_a_taken_one_refused() -> None:
 def test_this_machine_may_open_the_page_and_pages_of_others_may_not(
     host: str, more: dict[str, str], is_let_in: bool
 ) -> None:
-    assert (Gate().refusal("/", {"Host": host} | more) is None) == is_let_in
+    assert (AccessPolicy().refusal("/", {"Host": host} | more) is None) == is_let_in
 
 
 def test_the_server_asks_the_gate() -> None:
@@ -300,7 +300,7 @@ def test_the_server_asks_the_gate() -> None:
     from websockets.sync.client import connect
 
     port = free_port("127.0.0.1", None)
-    with guarded(Gate("secret")), quiet():
+    with enforce_access(AccessPolicy("secret")), quiet():
         server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
     version = f"viser-v{viser.__version__}"
     try:
@@ -327,6 +327,6 @@ def test_the_server_asks_the_gate() -> None:
 @pytest.mark.parametrize("text", ["Größe 12", "a_b*c <i>x</i> [y](z) &lt;", string.punctuation])
 def test_every_mark_of_others_is_escaped_and_nothing_else(text: str) -> None:
     shown = "".join(f"\\{c}" if c in string.punctuation else c for c in text)
-    assert as_text(text) == shown.replace("\\@", "\u200b\\@")
-    assert as_text("a\n\n<b>\x1b") == r"a \<b\>\\x1b"
-    assert as_text("http://x.y WWW.x") == "http\u200b\\:\\/\\/x\\.y WWW\u200b\\.x"
+    assert escape_markdown(text) == shown.replace("\\@", "\u200b\\@")
+    assert escape_markdown("a\n\n<b>\x1b") == r"a \<b\>\\x1b"
+    assert escape_markdown("http://x.y WWW.x") == "http\u200b\\:\\/\\/x\\.y WWW\u200b\\.x"

@@ -20,16 +20,16 @@ from dyngs.core.errors import DyngsError
 from dyngs.export.camera_paths import read_path
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.similarity import UNMOVED, Similarity
-from dyngs.runs.opened import Opened
+from dyngs.runs.opened import OpenedScene
 from dyngs.view import session
 from dyngs.view.layers import Shot, draw
 from dyngs.view.session import (
-    STILL_AFTER,
-    Drawer,
-    Eye,
+    REFINE_DELAY,
+    RenderScheduler,
+    BrowserCamera,
     Keyframe,
     Recording,
-    Sent,
+    SentImage,
     Session,
     Timeline,
 )
@@ -43,20 +43,20 @@ class Clock:
         return self.now
 
 
-def opened(scene: GaussianScene | None = None) -> Opened:
+def opened(scene: GaussianScene | None = None) -> OpenedScene:
     return opened_at(scene or moving_scene(Sliding()))
 
 
-def eye(x: float = 0.0, size: tuple[int, int] = (400, 300)) -> Eye:
+def eye(x: float = 0.0, size: tuple[int, int] = (400, 300)) -> BrowserCamera:
     wxyz, position = pose_of(camera())
-    return Eye(tuple(wxyz), (x, *position[1:].tolist()), 0.7, size)
+    return BrowserCamera(tuple(wxyz), (x, *position[1:].tolist()), 0.7, size)
 
 
 class Looked:
     """A session on a clock that stands still, and what it sent."""
 
     def __init__(self, scene: GaussianScene | None = None) -> None:
-        self.clock, self.sent = Clock(), list[Sent]()
+        self.clock, self.sent = Clock(), list[SentImage]()
         self.session = Session(opened(scene), self.sent.append, clock=self.clock)
 
     def after(self, seconds: float) -> None:
@@ -83,7 +83,7 @@ def test_small_while_moving_then_whole_and_then_nothing_until_something_changes(
     assert first.image.shape[0] < 900
     due = looked.session.due()
     assert due is not None
-    assert 0 < due <= STILL_AFTER
+    assert 0 < due <= REFINE_DELAY
     looked.after(due)
     looked.after(0.1)
     looked.after(0.1)
@@ -251,7 +251,7 @@ def test_a_path_through_a_moved_still_scene(tmp_path: Path) -> None:
 
 def test_each_gets_a_turn_and_the_thread_ends() -> None:
     before = threading.active_count()
-    drawer = Drawer()
+    drawer = RenderScheduler()
     browsers = [looking_at_balls() for _ in range(3)]
     drawer.start()
     for one, _ in browsers:
@@ -271,7 +271,7 @@ def test_each_gets_a_turn_and_the_thread_ends() -> None:
 
 def test_a_fault_of_one_is_told_once_and_the_others_go_on() -> None:
     told: list[tuple[Session, str]] = []
-    drawer = Drawer()
+    drawer = RenderScheduler()
     (bad, _), (worse, _), (good, sent) = (looking_at_balls() for _ in range(3))
 
     def fail(error: Exception) -> None:

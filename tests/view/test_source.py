@@ -16,9 +16,9 @@ from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
 from dyngs.view.controls import motion_files
-from dyngs.view.session import Drawer, Session
+from dyngs.view.session import RenderScheduler, Session
 from dyngs.view.source import first_of, open_source
-from dyngs.view.training import DrawnBetweenSteps, opened_training
+from dyngs.view.training import BetweenStepRenderer, opened_training
 
 
 def test_a_folder_of_runs_is_a_picker(tmp_path: Path) -> None:
@@ -61,11 +61,11 @@ class Onlooker:
     keeps still."""
 
     def __init__(self) -> None:
-        self.drawer = Drawer()
+        self.drawer = RenderScheduler()
         # an image is due after each step, however fast the machine is
         ticks = itertools.count(step=100.0)
         self.clock = lambda: next(ticks)
-        self.drawn = DrawnBetweenSteps(self.drawer, fraction=0.9, clock=self.clock)
+        self.drawn = BetweenStepRenderer(self.drawer, fraction=0.9, clock=self.clock)
         self.seen: list[bytes] = []
 
     def __call__(self, event: Event) -> None:
@@ -111,7 +111,7 @@ def test_training_gives_the_same_bytes_whoever_looks(
 def test_images_take_no_more_than_their_share() -> None:
     threads = threading.active_count()
     now = [0.0]
-    drawer = Drawer()
+    drawer = RenderScheduler()
     session, sent = looking_at_balls()
     scene = session.opened.scene
 
@@ -119,7 +119,7 @@ def test_images_take_no_more_than_their_share() -> None:
         now[0] += 0.01  # whatever is done takes a while
         return now[0]
 
-    drawn = DrawnBetweenSteps(drawer, fraction=0.25, clock=clock)
+    drawn = BetweenStepRenderer(drawer, fraction=0.25, clock=clock)
     assert drawn.after_step(scene) == 0.0
     assert now == [0.0]  # without browsers not even the clock is read
     drawer.add(session)

@@ -15,7 +15,7 @@ from dyngs.compress.stage import highest, quality_of, scores_of
 from dyngs.config import Config
 from dyngs.core.errors import counted
 from dyngs.training.loop import Loop
-from dyngs.training.trainer import Edit, Trainer
+from dyngs.training.trainer import TrainingEdit, Trainer
 
 REMOVED_FROM = 0.7  # Fraction of the run from which Gaussians beyond the limit are removed
 
@@ -34,11 +34,11 @@ class CountLimit:
         self.before = 0
         self.lost = 0.0
 
-    def __call__(self, loop: Loop) -> Edit | None:
+    def __call__(self, loop: Loop) -> TrainingEdit | None:
         trainer = loop.trainer
         assert isinstance(trainer, Trainer)
         count = trainer.num_gaussians
-        used = 0.0 if self._seconds is None else loop.watch.seconds / self._seconds
+        used = 0.0 if self._seconds is None else loop.stopwatch.seconds / self._seconds
         if count <= self.most or not is_late(trainer.config, trainer.done, used):
             return None
         kept = highest(scores_of(trainer), 1 - self.most / count)
@@ -48,7 +48,7 @@ class CountLimit:
         self.lost -= gain
         name = _name(trainer.config, self.most)
         left = counted(self.most, "Gaussian")
-        return Edit(f"{name}: {count:,} -> {left}; {gain:+.2f} dB on training views", kept)
+        return TrainingEdit(f"{name}: {count:,} -> {left}; {gain:+.2f} dB on training views", kept)
 
     def state(self) -> dict[str, Tensor]:
         """Return the state for a checkpoint; empty where nothing was removed."""

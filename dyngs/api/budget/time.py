@@ -16,10 +16,10 @@ from typing import Any
 from dyngs.config import Config
 from dyngs.core.errors import counted
 from dyngs.data.loader import ImageLoader
-from dyngs.training.clock import Forecast, Stopwatch
+from dyngs.training.clock import TimeForecast, Stopwatch
 from dyngs.training.loop import Loop
 from dyngs.training.plan import RunPlan, with_steps
-from dyngs.training.trainer import Edit, Trainer
+from dyngs.training.trainer import TrainingEdit, Trainer
 
 FEWEST = 200  # Steps that must fit; otherwise the images are shrunk
 SMALLEST_SIDE = 64  # Longest side, px, below which images are not shrunk
@@ -28,7 +28,7 @@ WARM_UP = 2  # Steps before those that are measured before training
 
 
 def fit_minutes(
-    plan: RunPlan, watch: Stopwatch, build: Callable[[RunPlan], Trainer[Any]]
+    plan: RunPlan, stopwatch: Stopwatch, build: Callable[[RunPlan], Trainer[Any]]
 ) -> tuple[RunPlan, str | None, ImageLoader]:
     """Return the plan with as many steps as fit into its time, a message, and its training images.
 
@@ -44,7 +44,7 @@ def fit_minutes(
     while True:
         trainer = build(plan)
         forecast = _measured(trainer, 0.05 * seconds)
-        left = AIM * seconds - watch.seconds
+        left = AIM * seconds - stopwatch.seconds
         steps = fitting_steps(forecast, plan.resolved, 0, left, asked)
         side = max(map(max, trainer.images.sizes))
         if steps >= min(FEWEST, asked) or side < 2 * SMALLEST_SIDE:
@@ -62,7 +62,7 @@ def fit_minutes(
     return replace(plan, resolved=resolved), message, trainer.images
 
 
-def _measured(trainer: Trainer[Any], seconds: float) -> Forecast:
+def _measured(trainer: Trainer[Any], seconds: float) -> TimeForecast:
     """Time a few steps of ``trainer``, for at most ``seconds``, and return a forecast."""
     begun = time.perf_counter()
     last = min(WARM_UP + 20, trainer.config.train.steps)
@@ -79,12 +79,12 @@ def _measured(trainer: Trainer[Any], seconds: float) -> Forecast:
     return forecast
 
 
-def _forecast(trainer: Trainer[Any], now: float) -> Forecast:
+def _forecast(trainer: Trainer[Any], now: float) -> TimeForecast:
     pixels = fmean(width * height for width, height in trainer.images.sizes)
-    return Forecast(trainer.done, now, trainer.num_gaussians, pixels)
+    return TimeForecast(trainer.done, now, trainer.num_gaussians, pixels)
 
 
-def fitting_steps(forecast: Forecast, config: Config, done: int, seconds: float, most: int) -> int:
+def fitting_steps(forecast: TimeForecast, config: Config, done: int, seconds: float, most: int) -> int:
     """Return the largest number of steps, ``done`` to ``most``, whose rest after ``done`` fits in
     ``seconds``."""
     low = done
@@ -110,14 +110,14 @@ class TimeLimit:
         self.seconds = seconds
         self.most_steps = most_steps
         self._corrects = corrects
-        self._forecast: Forecast | None = None
+        self._forecast: TimeForecast | None = None
 
-    def __call__(self, loop: Loop) -> Edit | None:
+    def __call__(self, loop: Loop) -> TrainingEdit | None:
         trainer = loop.trainer
         assert isinstance(trainer, Trainer)
         config = trainer.config
         done = trainer.done
-        now = loop.watch.seconds
+        now = loop.stopwatch.seconds
         if done >= loop.total:
             return None
         if self._forecast is None:  # the first step loads and compiles what others find there
@@ -125,7 +125,7 @@ class TimeLimit:
             return None
         self._forecast.observe(config, done, now, trainer.num_gaussians)
         if now + 2 * self._forecast.mean_step > self.seconds:
-            return Edit(steps=done)
+            return TrainingEdit(steps=done)
         if not self._corrects or 4 * done < loop.total:
             return None
         self._corrects = False
@@ -135,14 +135,14 @@ class TimeLimit:
         new = with_steps(config, found)
         if is_small or found <= done or events_before(config, done) != events_before(new, done):
             return None
-        return Edit(
+        return TrainingEdit(
             f"train.minutes: {found:,} instead of {counted(loop.total, 'step')}", steps=found
         )
 
     def reached(self, loop: Loop) -> str:
         """Return the line about ``train.minutes`` after a run."""
         done = loop.trainer.done
-        asked = f"asked {self.seconds / 60:g}, got {loop.watch.seconds / 60:.2f}"
+        asked = f"asked {self.seconds / 60:g}, got {loop.stopwatch.seconds / 60:.2f}"
         line = f"train.minutes: {asked}: {done:,} of {counted(self.most_steps, 'step')}"
         return line if done < self.most_steps else f"{line}: all, it cost nothing"
 
@@ -159,5 +159,5 @@ class TimeLimit:
 def events_before(config: Config, done: int) -> list[bool]:
     """Return which of the events that happen once in a run have happened after ``done`` steps."""
     steps = config.train.steps
-    once = (config.model.moves_after(steps), config.colour.measured_after(steps))
+    once = (config.model.motion_start_step(steps), config.colour.measurement_step(steps))
     return [done >= step for step in once if step is not None]

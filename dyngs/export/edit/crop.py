@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError, printable
+from dyngs.core.errors import DyngsError, format_one_line
 from dyngs.data.times import evenly_spaced
 from dyngs.export.edit.frame import Point, number, point
 from dyngs.gaussians.scene import GaussianScene
@@ -43,7 +43,7 @@ class Sphere:
 Region = Box | Sphere
 
 
-def region_of(words: Sequence[str]) -> Region:
+def parse_region(words: Sequence[str]) -> Region:
     """Return what ``--crop`` names: "x,y,z x,y,z" (box), or "x,y,z RADIUS" (sphere).
 
     Raises DyngsError: none of these.
@@ -51,7 +51,7 @@ def region_of(words: Sequence[str]) -> Region:
     text = " ".join(words)
     parts = text.split()
     if len(parts) != 2:
-        shown = printable(repr(text), 60)
+        shown = format_one_line(repr(text), 60)
         raise DyngsError(f"--crop: {shown}: give two corners x,y,z x,y,z, or a centre and a radius")
     first = point(parts[0], "--crop")
     if "," in parts[1]:
@@ -69,7 +69,7 @@ def region_of(words: Sequence[str]) -> Region:
     return Sphere(first, radius)
 
 
-def held_by(region: Region, scene: GaussianScene, world: Similarity) -> Tensor:
+def gaussians_in_region(region: Region, scene: GaussianScene, world: Similarity) -> Tensor:
     """Return (N,) bool which Gaussians have their centre in ``region``, at one training time or
     more.
 

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, printable
+from dyngs.core.errors import DyngsError, format_one_line
 from dyngs.data.capture import all_views
 from dyngs.data.scene_space import MAX_DISTANCE
 from dyngs.io.fields import read_limited
 from dyngs.io.formats.similarity import AXES, Similarity, similarity_of_matrix, turn_between
-from dyngs.runs.opened import Opened
+from dyngs.runs.opened import OpenedScene
 
 _FACTORS = (1e-9, 1e9)
 _MOST_BYTES = 1 << 20  # of a file of control points
@@ -59,7 +59,7 @@ def point(text: str, option: str) -> Point:
     except ValueError:
         x = y = z = math.nan
     if not all(map(math.isfinite, (x, y, z))):
-        shown = printable(repr(text), 60)
+        shown = format_one_line(repr(text), 60)
         raise DyngsError(
             f"{option}: {shown} is no point; write three numbers x,y,z without spaces, such as 0,-1.5,2"
         )
@@ -73,7 +73,7 @@ def number(text: str, option: str) -> float:
     except ValueError:
         found = math.nan
     if not math.isfinite(found):
-        raise DyngsError(f"{option}: {printable(repr(text), 60)} is no number; write it as 1.25")
+        raise DyngsError(f"{option}: {format_one_line(repr(text), 60)} is no number; write it as 1.25")
     return found
 
 
@@ -88,7 +88,7 @@ def direction(text: str) -> Point | str:
     return found
 
 
-def scale_of(text: str) -> float:
+def parse_scale(text: str) -> float:
     """Return the factor that ``--scale`` names: itself, or "x,y,z x,y,z LENGTH", two points of the
     scene and what their distance is to be. Raises DyngsError."""
     words = text.split()
@@ -101,7 +101,7 @@ def scale_of(text: str) -> float:
     if not low <= factor <= high:
         what = "a factor, or two points and their distance: 'x,y,z x,y,z LENGTH'"
         raise DyngsError(
-            f"--scale: {printable(repr(text), 60)} is no factor from {low:g} to {high:g}; give {what}"
+            f"--scale: {format_one_line(repr(text), 60)} is no factor from {low:g} to {high:g}; give {what}"
         )
     return factor
 
@@ -156,7 +156,7 @@ def _residuals(
     return residuals, f"{found}; residuals {each}; root mean square {mean:.3g}"
 
 
-def geo_frame(path: Path) -> GeoFrame:
+def control_point_frame(path: Path) -> GeoFrame:
     """Return the frame of control points. Raises DyngsError: no such file, or they do not determine
     it."""
     points, world = np.split(_control_points(path), 2, axis=1)
@@ -192,7 +192,7 @@ def _control_points(path: Path) -> np.ndarray:
             row = []
         if len(row) != 6 or not np.isfinite(row).all():
             raise DyngsError(
-                f"{path}: {printable(repr(line), 60)} is not six numbers x,y,z,X,Y,Z (scene, then world)"
+                f"{path}: {format_one_line(repr(line), 60)} is not six numbers x,y,z,X,Y,Z (scene, then world)"
             )
         rows.append(row)
     return np.array(rows, np.float64).reshape(-1, 6)
@@ -206,7 +206,7 @@ _RADIUS, _FLATTENING = 6378137.0, 1 / 298.257223563  # of WGS84: semi-major axis
 _INSTEAD = "give control points (--geo FILE), or --up and --scale"
 
 
-def gps_frame(opened: Opened) -> GeoFrame:
+def gps_frame(opened: OpenedScene) -> GeoFrame:
     """Return the frame with x east, y north, z up, in metres, by least squares of the cameras'
     positions.
 
@@ -217,7 +217,7 @@ def gps_frame(opened: Opened) -> GeoFrame:
     found = []
     views = [v for v in all_views(opened.capture.splits) if v.image_path is not None]
     for view in views:
-        position = position_of(view.image_path)
+        position = read_gps_position(view.image_path)
         if position is not None:
             found.append((position, -view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3]))
     if len(found) < FEWEST:
@@ -253,7 +253,7 @@ def gps_frame(opened: Opened) -> GeoFrame:
     return GeoFrame(similarity, notes)
 
 
-def position_of(path: Path) -> Point | None:
+def read_gps_position(path: Path) -> Point | None:
     """Return latitude, longitude (degrees) and altitude (m) that EXIF of a photo states; None: not
     all of them."""
     from PIL import Image

@@ -17,8 +17,8 @@ from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import counted
 from dyngs.data.geometry import look_at_point
-from dyngs.export.choose_path import in_front_of, orbit_around, points_at, view_to_show
-from dyngs.export.html.numbers import Lists, add_levels, add_scene, block_files
+from dyngs.export.choose_path import frontal_cameras, orbit_cameras_around, points_at, select_view
+from dyngs.export.html.scene_data import PackedArrays, add_levels, add_scene, block_files
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.human.avatar.scene import as_human_scene
@@ -26,8 +26,8 @@ from dyngs.io.formats.similarity import AXES
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import write_text
 from dyngs.models.views import training_cameras
-from dyngs.runs.folder import inputs_of
-from dyngs.runs.opened import Opened
+from dyngs.runs.folder import collect_inputs
+from dyngs.runs.opened import OpenedScene
 
 
 def filled(page: str, pieces: Mapping[str, str]) -> str:
@@ -71,7 +71,7 @@ class WrittenPage:
 
 
 def write_page(
-    opened: Opened,
+    opened: OpenedScene,
     path: Path,
     *,
     title: str | None = None,
@@ -84,8 +84,8 @@ def write_page(
     ``views``: cameras to begin with and to go through, each a batch of one; without any, those of
     the capture, or around the scene.
     """
-    inputs_of(opened).require_output(path)
-    lists = Lists()
+    collect_inputs(opened).require_output(path)
+    lists = PackedArrays()
     header = _header(opened, time, views, lists)
     text = _assembled(opened, header, lists, title)
     write_text(path, text)
@@ -93,7 +93,7 @@ def write_page(
 
 
 def write_folder(
-    opened: Opened,
+    opened: OpenedScene,
     folder: Path,
     *,
     most: int | None = None,
@@ -109,7 +109,7 @@ def write_folder(
     DyngsError: ``most`` of another scene, or a folder that exists already.
     """
     require_new_folder(folder)
-    lists = Lists(chunked=True)
+    lists = PackedArrays(chunked=True)
     if most is not None or opened.renderable.has_levels:
         levelled = LevelScene.of(opened.renderable, most)
         colour = levelled.scene.colour
@@ -130,7 +130,7 @@ def write_folder(
     return WrittenPage(folder / PAGE, size, header, _notes(opened, header))
 
 
-def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
+def _notes(opened: OpenedScene, header: dict[str, Any]) -> tuple[str, ...]:
     notes: list[str] = []
     if opened.missing is not None:
         notes.append(
@@ -150,9 +150,9 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _header(opened: Opened, time: float, views: Sequence[Cameras], lists: Lists) -> dict[str, Any]:
+def _header(opened: OpenedScene, time: float, views: Sequence[Cameras], lists: PackedArrays) -> dict[str, Any]:
     views, target = _beginning(opened, views)
-    found = opened.renderable.page_lists()
+    found = opened.renderable.page_data()
     if found is not None:
         told, own = found
         for name, (rows, bits) in own.items():
@@ -164,7 +164,7 @@ def _header(opened: Opened, time: float, views: Sequence[Cameras], lists: Lists)
     return told | _shown(opened, time, views, target)
 
 
-def _beginning(opened: Opened, views: Sequence[Cameras]) -> tuple[Sequence[Cameras], list[float]]:
+def _beginning(opened: OpenedScene, views: Sequence[Cameras]) -> tuple[Sequence[Cameras], list[float]]:
     """Return the cameras to begin with and to go through, each a batch of one, and the point to
     look at: ``views`` if there are any, else those of the capture, else around the scene."""
     cameras = opened.cameras
@@ -173,20 +173,20 @@ def _beginning(opened: Opened, views: Sequence[Cameras]) -> tuple[Sequence[Camer
         distinct = {view.cam_from_world.tobytes(): view for view in capture.splits["train"][::-1]}
         others = list(distinct.values())[::-1]
         rows = np.linspace(0, len(others) - 1, min(len(others), MOST_VIEWS)).round().astype(int)
-        chosen = (view_to_show(capture), *(others[i] for i in rows))
+        chosen = (select_view(capture), *(others[i] for i in rows))
         return training_cameras(chosen, opened.config.data), look_at_point(cameras).tolist()
     target = np.median(points_at(opened.renderable).cpu().numpy(), axis=0)
     if not views:
-        ring = orbit_around(opened, _RING)
+        ring = orbit_cameras_around(opened, _RING)
         views = [ring.select(i) for i in range(_RING)]
         if opened.person is not None:
-            views = [in_front_of(opened).select(1), *views]
+            views = [frontal_cameras(opened).select(1), *views]
             target = look_at_point(ring)
     return views, target.tolist()
 
 
 def _shown(
-    opened: Opened, time: float, views: Sequence[Cameras], target: list[float]
+    opened: OpenedScene, time: float, views: Sequence[Cameras], target: list[float]
 ) -> dict[str, Any]:
     upward = np.array(AXES["z"]) if opened.up is None else opened.up[0]
     return {
@@ -218,15 +218,15 @@ def _view(camera: Cameras) -> dict[str, Any]:
     }
 
 
-def _assembled(opened: Opened, header: dict[str, Any], lists: Lists, title: str | None) -> str:
+def _assembled(opened: OpenedScene, header: dict[str, Any], lists: PackedArrays, title: str | None) -> str:
     """Return the text of the page. All that stems from a run is escaped; scripts are allowed by
     their hash alone."""
     if title is None:
         title = opened.name if opened.captured is not None else Path(opened.name).stem
     red, green, blue = (round(255 * min(max(x, 0.0), 1.0)) for x in header["background"])
-    style = text_of("page.css").replace("{{background}}", f"rgb({red}, {green}, {blue})")
+    style = read_asset("page.css").replace("{{background}}", f"rgb({red}, {green}, {blue})")
     script = element_script()
-    page = text_of("page.html")
+    page = read_asset("page.html")
     fetches = "levels" in header or "chunk" in header.get("curves", {})
     fixed = {
         "style": style,
@@ -261,13 +261,13 @@ SHADERS += ("harmonics.glsl", "triangles.vert.glsl", "triangles.frag.glsl")
 def element_script() -> str:
     """Return the script: it needs nothing else, leaves no other name behind, and is ASCII, as pages
     may be of any."""
-    texts = {"STYLE": text_of("scene.css"), "SHADERS": {name: text_of(name) for name in SHADERS}}
+    texts = {"STYLE": read_asset("scene.css"), "SHADERS": {name: read_asset(name) for name in SHADERS}}
     constants = [f"const {name} = {script_safe(value)};" for name, value in texts.items()]
-    parts = "\n".join([*constants, *map(text_of, SCRIPTS)])
+    parts = "\n".join([*constants, *map(read_asset, SCRIPTS)])
     script = f'// <dyngs-scene src="PAGE">: a scene of dyngs (Apache-2.0).\n(() => {{\n"use strict";\n{parts}}})();\n'
     return script.encode("ascii", "backslashreplace").decode("ascii")
 
 
-def text_of(name: str) -> str:
+def read_asset(name: str) -> str:
     """Return a file of this folder."""
     return (Path(__file__).parent / name).read_text(encoding="utf-8")

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dyngs.core.conventions import SH_C0
 from dyngs.core.errors import DyngsError
-from dyngs.export.rigged.surface import fitted_surface
+from dyngs.export.rigged.surface import fit_surface
 from dyngs.export.rigged.texture import (
     SEEN,
     bake_texels,
@@ -50,7 +50,7 @@ from dyngs.io.write import atomic_file
 from dyngs.models.kind import HasBody, capability
 from dyngs.ops.quaternions import align_quat_signs
 from dyngs.runs.checkpoint import LoadedRun
-from dyngs.runs.folder import inputs_of
+from dyngs.runs.folder import collect_inputs
 
 _MOST_ROWS = 4000  # anchors whose places determine the shape; each gives three equations
 
@@ -142,14 +142,14 @@ class Rig:
         return moved
 
 
-def rig_of(scene: HumanScene, vertices: Tensor) -> Rig:
+def build_rig(scene: HumanScene, vertices: Tensor) -> Rig:
     """Return the rig of a person whose surface at rest has ``vertices`` (V, 3), m."""
     scale = float(scene.clip.scale.mean()) * float(np.exp(scene.fit.log_scale))
     return Rig(scene.learned_skeleton, scale, -scale * float(vertices[:, 1].amin()))
 
 
 @dataclass(frozen=True)
-class Played:
+class AnimationInfo:
     """The motion that a file shows: its name and frame rate; the run plays it."""
 
     name: str
@@ -162,7 +162,7 @@ def add_animation(
     rig: Rig,
     vertices: Tensor,
     weights: Tensor,
-    played: Played,
+    played: AnimationInfo,
 ) -> None:
     """Add the motion that a person plays, y up, on the floor y = 0, around the origin, as an
     animation of the joints, which are the first nodes; joints that never turn have no channel.
@@ -248,7 +248,7 @@ _LARGEST = 2048  # texels along a side of the largest texture
 _MOST_SAMPLES = 512  # texels along a side of the atlas from which the surface is moved
 
 
-def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> tuple[str, ...]:
+def write_mesh(run: LoadedRun, path: Path, played: AnimationInfo | None = None) -> tuple[str, ...]:
     """Write the person of a run or avatar file as a skinned mesh with a texture, in T-pose, y up,
     facing +z; return a line about each thing that was chosen, or that glTF cannot hold.
 
@@ -257,7 +257,7 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> tupl
     the run of a person, or its template is missing or without texture coordinates.
     """
     scene, body = person_and_template(run, "--format mesh")
-    inputs_of(run).require_output(path)
+    collect_inputs(run).require_output(path)
     with torch.no_grad():
         vertices = rest_vertices(scene, body)
         normals = anchor_normals(scene.anchors, body, vertices)
@@ -266,10 +266,10 @@ def write_mesh(run: LoadedRun, path: Path, played: Played | None = None) -> tupl
         baked = bake_texels(scene, texels, normals)
         image = texture_image(fill_unseen(baked, texels), texels)
         samples = atlas_texels(body, min(size // 2, _MOST_SAMPLES), vertices)
-        surface = fitted_surface(
+        surface = fit_surface(
             scene.gaussians, body, vertices, samples, bake_texels(scene, samples, normals)
         )
-        rig = rig_of(scene, surface.vertices)
+        rig = build_rig(scene, surface.vertices)
         document = mesh_document(body, rig, surface.vertices, image)
         if played is not None:
             add_animation(document, scene, rig, surface.vertices, body.weights, played)
@@ -350,7 +350,7 @@ def mesh_document(body: BodyTemplate, rig: Rig, vertices: Tensor, image: np.ndar
 
 @torch.no_grad()
 def write_rigged_splats(
-    run: LoadedRun, path: Path, played: Played | None = None
+    run: LoadedRun, path: Path, played: AnimationInfo | None = None
 ) -> tuple[str, ...]:
     """Write the person of a run or avatar file at rest, with skinning weights: T-pose, y up, facing
     +z, soles at y = 0; return a line about each thing that the file cannot hold.
@@ -361,9 +361,9 @@ def write_rigged_splats(
     run of a person, or its template is missing.
     """
     scene, body = person_and_template(run, "--joints")
-    inputs_of(run).require_output(path)
+    collect_inputs(run).require_output(path)
     vertices = rest_vertices(scene, body)
-    rig = rig_of(scene, vertices)
+    rig = build_rig(scene, vertices)
     gaussians = scene.gaussians
     notes = ()
     if scene.colour is not None:

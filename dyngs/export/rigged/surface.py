@@ -49,7 +49,7 @@ class FittedSurface:
     plain: float  # the same for the template as it is
 
 
-def fitted_surface(
+def fit_surface(
     gaussians: Gaussians, body: BodyTemplate, vertices: Tensor, samples: Texels, baked: BakedTexels
 ) -> FittedSurface:
     """Return the surface whose silhouettes agree best with the Gaussians', of the template's and

@@ -13,7 +13,7 @@ from dyngs.human.motion.motion import motion_clip
 from dyngs.human.motion.placement import place_like, reduce_foot_sliding, sole_points, up_direction
 from dyngs.human.motion.retarget import read_motion
 from dyngs.models.checkpoint import CheckpointInfo
-from dyngs.models.kind import InMotion
+from dyngs.models.kind import PlayedMotion
 from dyngs.models.renderable import Renderable
 
 
@@ -24,7 +24,7 @@ def play_motion(
     path: Path,
     *,
     keep_feet: bool,
-) -> InMotion:
+) -> PlayedMotion:
     """Return the avatar animated by a motion file, see ``HasBody.in_motion``."""
     if not isinstance(renderable, HumanScene):
         raise DyngsError(f"{path}: motions can only be played by avatars (model.kind=human)")
@@ -49,4 +49,4 @@ def play_motion(
         clip, note = reduce_foot_sliding(clip, soles, up_direction(scene.clip), motion.fps)
         animated = scene.with_motion(clip)
         notes = (*notes, note)
-    return InMotion(animated.to(renderable.gaussians.means.device), motion.fps, notes)
+    return PlayedMotion(animated.to(renderable.gaussians.means.device), motion.fps, notes)

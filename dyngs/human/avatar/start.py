@@ -31,13 +31,13 @@ from dyngs.human.body.body_reader import load_template, rest_shape
 from dyngs.human.keys import NO_BODY, HumanModel
 from dyngs.human.motion.motion import CapturedMotion, captured_motion
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import RunStart
+from dyngs.models.kind import StartContext
 from dyngs.models.views import evaluation_background, training_cameras
 
 MAX_COLOUR_VIEWS = 50  # training images that the initial colours are averaged over
 
 
-def start(run: RunStart) -> GaussianModel:
+def start(run: StartContext) -> GaussianModel:
     """Create the avatar before the first training step.
 
     Raises DyngsError: the capture has no body parameters, or the template cannot be read.

@@ -41,8 +41,8 @@ from dyngs.human.avatar.posing import (
 )
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.keys import HumanModel
-from dyngs.models.kind import RunStart
-from dyngs.models.model import Look, Loss
+from dyngs.models.kind import StartContext
+from dyngs.models.model import LossInput, Loss
 from dyngs.models.views import background_colour
 from dyngs.ops.adam import Count
 from dyngs.ops.device import copy_async
@@ -89,7 +89,7 @@ class OutlineLoss(Loss):
             "background of other frames"
         )
 
-    def __call__(self, look: Look) -> Mapping[str, Tensor]:
+    def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
         rendered = look.rendered
         truth = look.truth
         plate = self._plates.get(self._photos.views[look.index].camera_id)
@@ -106,7 +106,7 @@ class OutlineLoss(Loss):
         return {"image": l1_ssim_loss(rendered, truth, self._ssim_weight, look.image.mask)}
 
 
-def make_outline_loss(run: RunStart) -> OutlineLoss | None:
+def make_outline_loss(run: StartContext) -> OutlineLoss | None:
     """Return the loss with background plates; None if masks come with the images or no camera is
     fixed."""
     views = run.images.views
@@ -226,7 +226,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         refit: schedule of pose refits.
     """
 
-    moves_by = ("pose", "model")
+    deformation_name = ("pose", "model")
 
     def __init__(
         self,

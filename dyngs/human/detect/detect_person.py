@@ -20,7 +20,7 @@ from dyngs.capture.fixed_camera import is_plain_clip, read_fixed_camera
 from dyngs.capture.masks import at_size, outlined
 from dyngs.capture.sfm.photos import digest_of
 from dyngs.config import DataConfig
-from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, counted, show
 from dyngs.data.capture import Capture, View, by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
@@ -166,7 +166,7 @@ def detect_person(
     capture: Capture,
     detector: Detector,
     folder: Path,
-    on_progress: ReportProgress,
+    on_progress: ProgressCallback,
     log: Callable[[str], None] = show,
 ) -> FitInputs:
     """Detect the person in all views; write masks and key points to ``folder`` and return their
@@ -250,7 +250,7 @@ def write_detected_person(
     options: DataConfig,
     out: Path,
     detector: Detector,
-    on_progress: ReportProgress = report_nothing,
+    on_progress: ProgressCallback = ignore_progress,
     log: Callable[[str], None] = show,
 ) -> FittedCapture:
     """Detect a person, fit the body, and write the fitted capture to the new folder ``out``.
@@ -273,7 +273,7 @@ def ensure_detected_person(
     data: DataConfig,
     *,
     log: Callable[[str], None] = show,
-    on_progress: ReportProgress = report_nothing,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> DataConfig:
     """Return options for the fitted capture of the person in a clip; the result is cached per
     clip.

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dyngs.config import DataConfig
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import RasterizeMode, ReportProgress, report_nothing
+from dyngs.core.conventions import RasterizeMode, ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import frame_number, numbered
 from dyngs.data.capture import Capture, Split, View
@@ -490,7 +490,7 @@ class BodyFit:
         learned: Sequence[str],
         steps: int,
         observed: Observations,
-        on_progress: ReportProgress = report_nothing,
+        on_progress: ProgressCallback = ignore_progress,
         schedule_start: float = 0.0,
     ) -> Parameters:
         """Return ``start`` after ``steps`` of Adam on the parameters named in ``learned``.
@@ -606,7 +606,7 @@ def estimate_initial_poses(
     times: Tensor,
     body: BodyDiscs,
     observed: Observations,
-    on_progress: ReportProgress = report_nothing,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> MotionClip:
     """Estimate the poses of F frames from silhouettes alone.
 
@@ -866,7 +866,7 @@ def fit_capture(
     capture: Capture,
     options: DataConfig,
     body: BodyTemplate,
-    on_progress: ReportProgress,
+    on_progress: ProgressCallback,
     keypoints: Keypoints | None = None,
     effort: FitEffort = FitEffort(),
     *,
@@ -943,7 +943,7 @@ def _from_given(
     body_fit: BodyFit,
     fit_views: FitViews,
     shape: Sequence[str],
-    on_progress: ReportProgress,
+    on_progress: ProgressCallback,
     effort: FitEffort,
 ) -> tuple[CandidateFit, ...]:
     """Return candidate fits that start from given poses, from simple to complex."""
@@ -984,7 +984,7 @@ def _from_silhouettes(
     body_fit: BodyFit,
     fit_views: FitViews,
     shape: Sequence[str],
-    on_progress: ReportProgress,
+    on_progress: ProgressCallback,
     effort: FitEffort,
 ) -> tuple[CandidateFit, ...]:
     """Return candidate fits that start from estimated poses.
@@ -1133,7 +1133,7 @@ def place_new_poses(
     options: DataConfig,
     body: BodyTemplate,
     fit: CaptureFit,
-    on_progress: ReportProgress,
+    on_progress: ProgressCallback,
     effort: FitEffort = FitEffort(),
 ) -> PlacedClip | None:
     """Fit the translation of the split ``pose`` to its silhouettes if that improves them.

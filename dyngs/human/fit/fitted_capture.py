@@ -24,8 +24,8 @@ from dyngs.capture.masks import with_background_masks
 from dyngs.capture.sfm.photos import digest_of
 from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
-from dyngs.core.conventions import ReportProgress, report_nothing
-from dyngs.core.errors import DyngsError, counted, reading, show
+from dyngs.core.conventions import ProgressCallback, ignore_progress
+from dyngs.core.errors import DyngsError, counted, wrap_read_errors, show
 from dyngs.data.body_frames import frame_number, numbered, read_body_file
 from dyngs.data.capture import BodyFrames, Capture, Split, View
 from dyngs.data.geometry import opengl_from_cam
@@ -90,7 +90,7 @@ class FittedCapture:
 def write_fitted_capture(
     options: DataConfig,
     out: Path,
-    on_progress: ReportProgress,
+    on_progress: ProgressCallback,
     inputs: FitInputs = FitInputs(),
     *,
     with_images: bool = True,
@@ -216,7 +216,7 @@ def read_known_shape(path: Path, body: BodyTemplate) -> BodyFrames:
     ``path`` is a capture or folder that ``dyngs data fit`` wrote, or the run of an avatar trained
     on one. Raises DyngsError: none of these, or the shape of another template.
     """
-    with reading(path, "give a capture that `dyngs data fit` wrote, or a run trained on it"):
+    with wrap_read_errors(path, "give a capture that `dyngs data fit` wrote, or a run trained on it"):
         folder = path
         if (path / RESOLVED_NAME).is_file():
             data = load_resolved(path).data
@@ -522,7 +522,7 @@ def ensure_fitted_body(
     *,
     only_if_needed: bool = False,
     log: Callable[[str], None] = show,
-    on_progress: ReportProgress = report_nothing,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> DataConfig:
     """Return options for the capture with a fitted body; the fit is cached per capture.
 
@@ -582,7 +582,7 @@ def _digest(data: DataConfig) -> str:
     Files above 100 MB, such as videos, hold neither bodies nor cameras and are skipped.
     """
     root = data.root.resolve()
-    with reading(root):
+    with wrap_read_errors(root):
         paths = [path for path in root.rglob("*") if path.is_file()]
         files = sorted(path for path in paths if path.stat().st_size < 100_000_000)
     names = (

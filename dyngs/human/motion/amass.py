@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.capture import ShapeSpace
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.joints import SMPLX_ROWS
@@ -61,7 +61,7 @@ def read_amass(
     Raises:
         DyngsError: names the file and what is missing or wrong.
     """
-    with reading(path, "give an AMASS file of a motion"):
+    with wrap_read_errors(path, "give an AMASS file of a motion"):
         keys = ("poses", *_PARTS, *_NAMED, "trans", "betas", *_ALIASES, "scale", "up_axis", *_RATES)
         # Other keys may hold objects and are not read.
         arrays = read_arrays(path, lambda names: [key for key in keys if key in names])

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
@@ -67,7 +67,7 @@ class CameraCorrections:
         self.lenses = torch.zeros(len(self._lenses), 3, device="cpu")
         poses_of_lens = Counter(lens for lens, _ in {(_lens_key(x), _pose_key(x)) for x in views})
         self._refined = {key for key, count in poses_of_lens.items() if count >= MIN_POSES}
-        self._common = common_motions(list(by_pose.values()), size)
+        self._common = common_motion_basis(list(by_pose.values()), size)
 
     def rows(self, view: View) -> tuple[int | None, int | None]:
         """Return the rows of the pose and of the lens of a view; None where nothing is known of it,
@@ -76,7 +76,7 @@ class CameraCorrections:
         row = self._lenses[lens] if lens in self._refined else None
         return self._poses.get(_pose_key(view)), row
 
-    def applied_to(self, view: View, cameras: Cameras) -> Cameras:
+    def correct_cameras(self, view: View, cameras: Cameras) -> Cameras:
         """Return ``cameras``, that of an image of any view of the capture at any scale, corrected.
 
         A view that was not trained on has the pose of a camera that stands still, or a lens, as
@@ -86,12 +86,12 @@ class CameraCorrections:
         own = torch.zeros(6, device="cpu") if pose is None else self.poses[pose]
         return corrected(cameras, own, None if lens is None else self.lenses[lens], self.size)
 
-    def corrected_view(self, view: View) -> View:
+    def correct_view(self, view: View) -> View:
         """Return ``view`` with its camera as ``applied_to`` has it, in float64."""
         pose, lens = (
             torch.from_numpy(x).double()[None] for x in (view.cam_from_world, view.intrinsics)
         )
-        camera = self.applied_to(view, Cameras(pose, lens, view.width, view.height))
+        camera = self.correct_cameras(view, Cameras(pose, lens, view.width, view.height))
         return replace(
             view,
             cam_from_world=camera.cam_from_world[0].numpy(),
@@ -143,7 +143,7 @@ def slopes(
     return torch.cat([turn, size * forces[:, 3]]), lens
 
 
-def common_motions(views: Sequence[View], size: float) -> Tensor:
+def common_motion_basis(views: Sequence[View], size: float) -> Tensor:
     """Return an orthonormal basis (6 P, C), C at most 7, of those corrections of all poses that
     change no image.
 
@@ -241,7 +241,7 @@ class CameraRefinement(Correction):
 
     def state(self) -> dict[str, Tensor]:
         updates = {f"updates.{name}": x for name, x in self._updates.items()}
-        return self._values() | updates | tensors_of(self._adam.state())
+        return self._values() | updates | strip_roles(self._adam.state())
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         for name, x in self._values().items():
@@ -263,7 +263,7 @@ FIRST_FIT_RATE, LAST_FIT_RATE = (
 FIT_SSIM_WEIGHT = 0.2
 
 
-def fitted_to_image(
+def fit_camera_to_image(
     scene: GaussianScene,
     image: Image,
     background: Tensor,

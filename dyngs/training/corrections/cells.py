@@ -34,7 +34,7 @@ def points_of(camera: Cameras, which: Tensor, depth: Tensor) -> Tensor:
     return (rays * depth[:, None] - pose[:3, 3]) @ pose[:3, :3]
 
 
-def pixels_of(camera: Cameras, world: Tensor) -> tuple[Tensor, Tensor]:
+def project_to_pixels(camera: Cameras, world: Tensor) -> tuple[Tensor, Tensor]:
     """Return (P,) the pixels, row by row, that show points (P, 3) of the world, -1 beyond the
     image; and their depths (P,)."""
     pose = camera.cam_from_world[0]

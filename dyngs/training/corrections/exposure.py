@@ -25,16 +25,16 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from dyngs.core.camera import Cameras
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.network import SATURATED, apply_affine_colour
 from dyngs.gaussians.optimizer import AdamState
-from dyngs.models.model import Correction, Look, Loss, RenderedView
+from dyngs.models.model import Correction, LossInput, Loss, RenderedView
 from dyngs.models.renderable import Rendering
 from dyngs.ops.adam import Count
-from dyngs.training.corrections.cells import cell_camera, distances, pixels_of, points_of
+from dyngs.training.corrections.cells import cell_camera, distances, project_to_pixels, points_of
 
 WARM_UP = 0.25
 """Fraction of the run in which images are taken as they are: before, the rendering shows too little
@@ -75,7 +75,7 @@ class ViewExposures(Loss, Correction):
     def _find_gains(self, images: ImageLoader, view: RenderedView) -> None:
         """Find the gains of all images at once."""
         looked_at = [i for i in range(len(self._visits)) if view.trains_on(i)]
-        gains = log_gains(images, looked_at, view.draw).exp()
+        gains = estimate_log_gains(images, looked_at, view.draw).exp()
         self._visits[looked_at] = 1
         diagonal = self._values.reshape(-1, 3, 4).diagonal(dim1=1, dim2=2)
         diagonal.copy_(gains - gains[looked_at].mean(0))
@@ -99,7 +99,7 @@ class ViewExposures(Loss, Correction):
         white = view.image.composite(view.background) >= SATURATED
         return replace(view, rendered=torch.where(white, shown.clamp_max(1.0), shown))
 
-    def __call__(self, look: Look) -> dict[str, Tensor]:
+    def __call__(self, look: LossInput) -> dict[str, Tensor]:
         return self.penalties(look.index)
 
     def penalties(self, index: int) -> dict[str, Tensor]:
@@ -122,7 +122,7 @@ class ViewExposures(Loss, Correction):
         return bad
 
     def state(self) -> dict[str, Tensor]:
-        moments = tensors_of(self._adam.state())
+        moments = strip_roles(self._adam.state())
         return {"values": self._values.detach(), "visits": self._visits} | moments
 
     def load_state(self, state: dict[str, Tensor]) -> None:
@@ -160,7 +160,7 @@ class _Places(NamedTuple):
 
 
 @torch.no_grad()
-def log_gains(
+def estimate_log_gains(
     images: ImageLoader, which: Sequence[int], draw: Callable[[Cameras, float | None], Rendering]
 ) -> Tensor:
     """Return (V, 3) log gains of the images ``which``, of mean 0; 0 of all others.
@@ -217,7 +217,7 @@ def _places(cells: Sequence[_Cells], index: int, compared: Tensor) -> _Places:
     colours = []
     shown = []
     for other in (cells[i] for i in compared.tolist()):
-        at, z = pixels_of(other.camera, world)
+        at, z = project_to_pixels(other.camera, world)
         cell = at.clamp_min(0)
         same = (other.depth[cell] - z).abs() < SAME_DEPTH * z
         shown.append((at >= 0) & other.known[cell] & same)

@@ -25,7 +25,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.tensor_checks import require_indices, require_tensor
 from dyngs.data.loader import ImageLoader
 from dyngs.models.model import Correction, RenderedView
-from dyngs.training.corrections.cells import CELLS, cell_camera, distances, pixels_of, points_of
+from dyngs.training.corrections.cells import CELLS, cell_camera, distances, project_to_pixels, points_of
 
 # An image is looked at each so many times that it is trained on; in between its mask stays
 EVERY = 4
@@ -59,7 +59,7 @@ class RobustMasks(Correction):
         steps: int,
         corrected: Callable[[int, Cameras], Cameras] | None = None,
     ) -> None:
-        self._others = OtherViews(images, cameras, corrected)
+        self._others = NeighbourViews(images, cameras, corrected)
         self._begins = WARM_UP * steps
         self._visits = torch.zeros(len(images), dtype=torch.int64, device="cpu")
         self._left_out = torch.zeros(len(images), CELLS, CELLS, dtype=torch.uint8, device="cpu")
@@ -158,7 +158,7 @@ FEWEST = 3  # Views that must see a place, at least
 SOLID = 0.5
 
 
-class OtherViews:
+class NeighbourViews:
     """Mean colours of the cells of all training images, and where cells of one are found in the
     others.
 
@@ -201,7 +201,7 @@ class OtherViews:
         order = self._distance[index].argsort(stable=True)[:NEAREST]
         found = [shown.new_full((shown.shape[1],), torch.nan)]
         for other in order[self._distance[index][order].isfinite()].tolist():
-            at, _ = pixels_of(self._camera(other), world)
+            at, _ = project_to_pixels(self._camera(other), world)
             cells = self._table(other).flatten(1)[:, at.clamp_min(0)]
             colours = cells[:3] + (1 - cells[3]) * background[:, None]
             is_seen = (at >= 0) & (cells[4] > SOLID)

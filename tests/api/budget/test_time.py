@@ -12,8 +12,8 @@ from dyngs.api.budget.time import fitting_steps
 from dyngs.api.train import train
 from dyngs.config import Config
 from dyngs.config.io import load_config, load_resolved, packaged_preset
-from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, seconds_at, step_of
-from dyngs.training.clock import Forecast
+from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, seconds_at, checkpoint_step
+from dyngs.training.clock import TimeForecast
 from dyngs.training.events import Event, Message
 from dyngs.training.trainer import Trainer
 
@@ -40,7 +40,7 @@ def slow(monkeypatch: pytest.MonkeyPatch, seconds: float, after: int = 0) -> Non
 
 def test_what_fits_fits_and_one_more_does_not(still: Path, tmp_path: Path) -> None:
     config = config_of(still, tmp_path, 1.0, "train.initial_downscale=4")
-    forecast = Forecast(0, 0.0, 100, 1000.0)
+    forecast = TimeForecast(0, 0.0, 100, 1000.0)
     forecast.observe(config, 10, 1.0, 100)
     found = fitting_steps(forecast, config, 10, 20.0, 5000)
 
@@ -73,7 +73,7 @@ def test_a_run_ends_in_time_and_says_what_all_steps_would_cost(
     checkpoint_paths(run)[-1].unlink()
     if checkpoint_paths(run):
         train(load_resolved(run), resume_from=run)
-        assert step_of(checkpoint_paths(run)[-1]) <= done
+        assert checkpoint_step(checkpoint_paths(run)[-1]) <= done
 
 
 def test_a_run_that_gets_slow_ends_in_time(

@@ -18,7 +18,7 @@ from dyngs.evaluate.report import evaluate_run
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.runs.opened import open_run
 from dyngs.view.layers import Shot, draw
-from dyngs.view.views import viewpoint_of
+from dyngs.view.views import initial_viewpoint
 
 STEPS = ["train.steps=30", "train.save_every=15"]
 
@@ -50,9 +50,9 @@ def test_it_is_evaluated_drawn_and_viewed(run: Path, tmp_path: Path) -> None:
     opened = open_run(run)
     for layer in ("colour", "depth"):
         shot = (
-            Shot(viewpoint_of(opened).start)
+            Shot(initial_viewpoint(opened).start)
             if layer == "colour"
-            else Shot(viewpoint_of(opened).start, layer="depth")
+            else Shot(initial_viewpoint(opened).start, layer="depth")
         )
         assert draw(opened, shot).std() > 0
 

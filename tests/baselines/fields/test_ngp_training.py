@@ -17,12 +17,12 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.models.volume import rays_of
 from dyngs.ops.native import kernel_threads
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 
 def trained(capture: Path, steps: int, *keys: str) -> Trainer[NgpTraining]:
-    trainer = assemble(config_of(capture, *NGP, f"train.steps={steps}", *keys))
+    trainer = build_trainer(config_of(capture, *NGP, f"train.steps={steps}", *keys))
     for _ in range(steps):
         trainer.step()
     return trainer
@@ -57,7 +57,7 @@ def test_views_that_were_held_out_are_learned(capture: Path) -> None:
 
 
 def test_untouched_rows_stay_as_they_are(capture: Path) -> None:
-    trainer = assemble(config_of(capture, *NGP))
+    trainer = build_trainer(config_of(capture, *NGP))
     table = trainer.model.scene.field.parameters["table"]
     before = table.detach().clone()
     for _ in range(3):
@@ -68,7 +68,7 @@ def test_untouched_rows_stay_as_they_are(capture: Path) -> None:
 
 def test_cells_that_no_camera_sees_are_never_occupied(capture: Path) -> None:
     config = config_of(capture, *NGP, "model.surroundings=always")
-    trainer = assemble(config)
+    trainer = build_trainer(config)
     field = trainer.model.scene.field
     seen = cells_in_view(field.space, trainer.capture.splits["train"])
     assert torch.equal(field.occupied, seen)
@@ -86,7 +86,7 @@ def test_a_cube_that_no_camera_sees_is_refused(capture: Path) -> None:
         replace(view, cam_from_world=away @ view.cam_from_world) for view in read.splits["train"]
     ]
     with pytest.raises(DyngsError, match="no training camera sees anything of the cube"):
-        assemble(config, replace(read, splits={**read.splits, "train": views}))
+        build_trainer(config, replace(read, splits={**read.splits, "train": views}))
 
 
 def test_the_same_bytes_on_any_number_of_threads(capture: Path) -> None:

@@ -12,10 +12,10 @@ from small_fields import NERF, NGP, config_of
 from dyngs.baselines.fields.kind import NgpModel
 from dyngs.baselines.fields.ngp import NgpField
 from dyngs.baselines.fields.scene import FieldScene
-from dyngs.models.checkpoint import restored_model
+from dyngs.models.checkpoint import restore_model
 from dyngs.models.renderable import DrawOptions
 from dyngs.ops.rays import Space
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 
 
 def scene_of(space: Space) -> FieldScene:
@@ -47,11 +47,11 @@ def test_depth_is_along_the_axis_of_the_camera_and_expected_is_divided_by_alpha(
 @pytest.mark.parametrize("keys", [NGP, NERF], ids=["ngp", "nerf"])
 def test_with_time_it_moves(moving: Path, keys: list[str]) -> None:
     """It learns the times of the capture, and its scene is drawn at any."""
-    trainer = assemble(config_of(moving, *keys, "model.time=true", "train.steps=20"))
+    trainer = build_trainer(config_of(moving, *keys, "model.time=true", "train.steps=20"))
     for _ in range(20):
         trainer.step()
     checkpoint = trainer.checkpoint()
-    scene = restored_model(checkpoint, trainer.config.model)
+    scene = restore_model(checkpoint, trainer.config.model)
     assert len(scene.times) > 1
     assert not scene.is_static
     image = trainer.images[0]

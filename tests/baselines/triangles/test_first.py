@@ -10,11 +10,11 @@ import torch
 from small_triangles import config_of
 
 from dyngs.baselines.triangles.training import TriangleTraining
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 
 
 def test_the_first_step_begins_on_the_surface(capture: Path) -> None:
-    trainer: Any = assemble(config_of(capture, "model.gaussian_steps=200"))
+    trainer: Any = build_trainer(config_of(capture, "model.gaussian_steps=200"))
     model: TriangleTraining = trainer.model
     before = len(model.scene.patches)
     trainer.step()

@@ -8,19 +8,19 @@ import torch
 from moving_scene import moving_scene, sliding_nodes, still_scene
 
 from dyngs.core.errors import DyngsError
-from dyngs.export.edit.crop import Box, Sphere, held_by, region_of
+from dyngs.export.edit.crop import Box, Sphere, gaussians_in_region, parse_region
 from dyngs.io.formats.similarity import Similarity
 
 POINTS = np.random.default_rng(0).uniform(-1.5, 1.5, (3000, 3))
 
 
 def test_boxes_and_spheres() -> None:
-    box = region_of(["1,-1,0", "-0.5,1,1"])
+    box = parse_region(["1,-1,0", "-0.5,1,1"])
     x, y, z = POINTS.T
     np.testing.assert_array_equal(
         box.holds(POINTS), (abs(y) <= 1) & (z >= 0) & (z <= 1) & (x >= -0.5) & (x <= 1)
     )
-    ball = region_of(["1,0,0 1.2m"])  # also as one word
+    ball = parse_region(["1,0,0 1.2m"])  # also as one word
     np.testing.assert_array_equal(ball.holds(POINTS), (x - 1) ** 2 + y**2 + z**2 <= 1.44)
     assert isinstance(box, Box)
     assert isinstance(ball, Sphere)
@@ -40,7 +40,7 @@ def test_boxes_and_spheres() -> None:
 )
 def test_regions_that_are_none(words: list[str], said: str) -> None:
     with pytest.raises(DyngsError, match=said) as caught:
-        region_of(words)
+        parse_region(words)
     assert "\n" not in str(caught.value)
 
 
@@ -50,5 +50,5 @@ def test_what_moves_is_held_if_it_ever_is() -> None:
         at = [scene.at(t).means for t in (0.0, 0.25, 0.5, 0.75, 1.0)]
         region = Sphere(tuple(at[2][1].tolist()), 1e-3)  # type: ignore[arg-type]
         inside = torch.stack([(x - at[2][1]).norm(dim=1) < 1e-3 for x in at]).any(0)
-        assert torch.equal(held_by(region, scene, Similarity()), inside)
-        assert not held_by(region, scene, Similarity(shift=(9.0, 0.0, 0.0))).any()
+        assert torch.equal(gaussians_in_region(region, scene, Similarity()), inside)
+        assert not gaussians_in_region(region, scene, Similarity(shift=(9.0, 0.0, 0.0))).any()

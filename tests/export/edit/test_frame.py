@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.export.edit.frame import direction, geo_frame, number, point, scale_of
+from dyngs.export.edit.frame import direction, control_point_frame, number, point, parse_scale
 from dyngs.io.formats.similarity import Similarity
 
 SCENE = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0.5, 0.5, 1]])
@@ -31,12 +31,12 @@ def table(path: Path, world: np.ndarray, scene: np.ndarray = SCENE, start: str =
         (lambda: number("x", "--max-loss"), "--max-loss: 'x' is no number"),
         (lambda: direction("0,0,0"), "has no direction"),
         (lambda: direction("up"), "'up' is no point"),
-        (lambda: scale_of("0,0,0 1,0,0"), "is no number"),
-        (lambda: scale_of("nan"), "'nan' is no number"),
-        (lambda: scale_of("0"), "is no factor"),
-        (lambda: scale_of("-2"), "is no factor"),
-        (lambda: scale_of("1e300"), "is no factor"),
-        (lambda: scale_of("1,1,1 1,1,1 2m"), "is no factor"),
+        (lambda: parse_scale("0,0,0 1,0,0"), "is no number"),
+        (lambda: parse_scale("nan"), "'nan' is no number"),
+        (lambda: parse_scale("0"), "is no factor"),
+        (lambda: parse_scale("-2"), "is no factor"),
+        (lambda: parse_scale("1e300"), "is no factor"),
+        (lambda: parse_scale("1,1,1 1,1,1 2m"), "is no factor"),
     ],
 )
 def test_words_that_mean_nothing(call: Callable[[], object], said: str) -> None:
@@ -46,7 +46,7 @@ def test_words_that_mean_nothing(call: Callable[[], object], said: str) -> None:
 
 
 def test_control_points(tmp_path: Path) -> None:
-    found = geo_frame(
+    found = control_point_frame(
         table(tmp_path / "a.csv", WORLD.points(SCENE), start="x,y,z,X,Y,Z\n# measured in May\n\n")
     )
     np.testing.assert_allclose(found.similarity.points(SCENE), WORLD.points(SCENE), atol=1e-9)
@@ -54,13 +54,13 @@ def test_control_points(tmp_path: Path) -> None:
     assert len(found.lines) == 1
     assert "4 control points: scale 20; residuals" in found.lines[0]
     bent = WORLD.points(SCENE) + np.array([[0.3, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]])
-    found = geo_frame(table(tmp_path / "b.csv", bent)).similarity
+    found = control_point_frame(table(tmp_path / "b.csv", bent)).similarity
     assert 0.01 < np.linalg.norm(found.points(SCENE) - bent, axis=1).max() < 0.3
 
 
 def test_coordinates_too_large_for_float32_get_an_offset(tmp_path: Path) -> None:
     world = WORLD.points(SCENE) + np.array([691000.25, 5334000.5, 520])
-    found = geo_frame(table(tmp_path / "a.csv", world))
+    found = control_point_frame(table(tmp_path / "a.csv", world))
     np.testing.assert_allclose(found.similarity.points(SCENE) + found.offset, world, atol=1e-6)
     assert np.abs(found.similarity.points(SCENE)).max() < 100
     assert "to be added to positions: 691002 5334018 507" in found.lines[1]
@@ -80,7 +80,7 @@ def test_coordinates_too_large_for_float32_get_an_offset(tmp_path: Path) -> None
 def test_control_points_that_are_none(text: str, said: str, tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text(text)
     with pytest.raises(DyngsError, match=said) as caught:
-        geo_frame(tmp_path / "a.txt")
+        control_point_frame(tmp_path / "a.txt")
     assert str(caught.value).startswith(f"{tmp_path / 'a.txt'}: ")
     with pytest.raises(DyngsError, match="no such file"):
-        geo_frame(tmp_path / "b.txt")
+        control_point_frame(tmp_path / "b.txt")

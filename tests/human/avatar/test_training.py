@@ -33,7 +33,7 @@ from dyngs.human.keys import HumanModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.runs.checkpoint import load_run, save_checkpoint
 from dyngs.runs.opened import open_run
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 BUSY = DefaultStrategy(start=1, stop=30_000, every=4, grow=False, prune_opacity=0.895)
@@ -80,14 +80,14 @@ def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
 
 def test_a_seed_decides_every_byte_and_resuming_changes_none(capture: Path) -> None:
     config = tiny(capture)
-    straight = tensors_after(assemble(config), 10)
-    assert same(straight, tensors_after(assemble(config), 10))
-    first = assemble(config)
+    straight = tensors_after(build_trainer(config), 10)
+    assert same(straight, tensors_after(build_trainer(config), 10))
+    first = build_trainer(config)
     tensors_after(first, 6)
-    resumed = assemble(config)
+    resumed = build_trainer(config)
     resumed.restore(first.checkpoint())
     assert same(straight, tensors_after(resumed, 4))
-    counts = {len(assemble(config).model.scene), len(straight["gaussians.means"])}
+    counts = {len(build_trainer(config).model.scene), len(straight["gaussians.means"])}
     assert len(counts) == 2, "some must be pruned, or this test shows little"
     learned = [
         straight[f"model.learned.{name}"]
@@ -98,7 +98,7 @@ def test_a_seed_decides_every_byte_and_resuming_changes_none(capture: Path) -> N
 
 def test_training_learns_and_evaluates_on_both_splits(capture: Path, tmp_path: Path) -> None:
     config = tiny(capture, tmp_path / "run", steps=60)
-    start = restore_scene(assemble(config).checkpoint(), config.model)
+    start = restore_scene(build_trainer(config).checkpoint(), config.model)
     run = load_run(train(config))
     assert isinstance(run.scene, HumanScene)
     assert isinstance(start, HumanScene)
@@ -116,7 +116,7 @@ def test_what_is_played_back_is_what_was_trained(
     capture: Path, tmp_path: Path, own_body: bool
 ) -> None:
     body = write_npz(tmp_path / "model.npz", model("smplx")) if own_body else None
-    trainer = assemble(tiny(capture, body=body))
+    trainer = build_trainer(tiny(capture, body=body))
     assert (human(trainer).shapes is not None) == own_body
     tensors_after(trainer, 8)
     image = trainer.images[4]
@@ -132,7 +132,7 @@ def test_what_is_played_back_is_what_was_trained(
 
 
 def test_what_all_frames_share_is_learned_before_poses_of_single_ones(capture: Path) -> None:
-    trainer = assemble(tiny(capture, steps=20))
+    trainer = build_trainer(tiny(capture, steps=20))
     early = tensors_after(trainer, 5)
     names = [f"model.learned.{name}" for name in ("turns", "joints", "poses", "trans")]
     assert [bool(early[name].any()) for name in names] == [True, True, False, False]
@@ -149,15 +149,15 @@ def test_a_capture_without_bodies_is_an_error(capture: Path, tmp_path: Path) -> 
         tmp_path / "still", StillOptions(size=16, num_train=2, num_test=1, samples=1)
     )
     with pytest.raises(DyngsError, match="has no body parameters"):
-        assemble(tiny(tmp_path / "still"))
+        build_trainer(tiny(tmp_path / "still"))
 
 
 def test_motions_rest_and_splits_are_played(capture: Path, tmp_path: Path) -> None:
-    trainer = assemble(tiny(capture))
+    trainer = build_trainer(tiny(capture))
     save_checkpoint(tmp_path, trainer.checkpoint(), 0.0)
     save_config(trainer.config, tmp_path / RESOLVED_NAME)
     run = open_run(tmp_path)
-    own = run.in_motion(capture / "body_train.npz")
+    own = run.play_motion(capture / "body_train.npz")
     assert len(own.scene.times) == 3
     first = run.scene.at(0.0)
     again = own.scene.at(0.0)
@@ -169,7 +169,7 @@ def test_motions_rest_and_splits_are_played(capture: Path, tmp_path: Path) -> No
 
 
 def test_a_fit_far_from_the_origin_is_played_exactly(capture: Path, tmp_path: Path) -> None:
-    trainer = assemble(tiny(capture))
+    trainer = build_trainer(tiny(capture))
     save_checkpoint(tmp_path, trainer.checkpoint(), 0.0)
     save_config(trainer.config, tmp_path / RESOLVED_NAME)
     near = open_run(tmp_path)
@@ -181,7 +181,7 @@ def test_a_fit_far_from_the_origin_is_played_exactly(capture: Path, tmp_path: Pa
     for name, shift in (("near", np.zeros(3)), ("far", np.array(offset))):
         write_npz(tmp_path / f"{name}.npz", fit | {"trans": fit["trans"] + shift})
     played = (
-        run.in_motion(tmp_path / f"{name}.npz").scene
+        run.play_motion(tmp_path / f"{name}.npz").scene
         for run, name in ((near, "near"), (far, "far"))
     )
     there, here = (scene.at(0.5).means for scene in played)
@@ -192,7 +192,7 @@ def test_what_is_hardly_seen_is_filled_after_the_last_step_and_nothing_else_chan
     capture: Path,
 ) -> None:
     def after(step: int, fill: bool) -> tuple[dict[str, Tensor], str]:
-        trainer = assemble(tiny(capture, steps=4, fill_unseen=fill))
+        trainer = build_trainer(tiny(capture, steps=4, fill_unseen=fill))
         reports = [trainer.step() for _ in range(step)]
         found = {name: x.clone() for name, x in trainer.checkpoint().tensors.items()}
         return found, reports[-1].finding or ""
@@ -230,16 +230,16 @@ def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(
 ) -> None:
     monkeypatch.setattr(pose_fit, "REFIT_STARTS", (10 / 240,))
     config = tiny(turned(capture, tmp_path / "turned"), steps=240)
-    trainer = assemble(config)
+    trainer = build_trainer(config)
     lines = [trainer.step().finding or "" for _ in range(16)]
     assert "refitting body poses" in lines[9]
     assert "".join(lines[:9] + lines[10:]) == ""
     straight = {name: x.clone() for name, x in trainer.checkpoint().tensors.items()}
-    given = assemble(config).checkpoint().tensors["model.clip.poses"]
+    given = build_trainer(config).checkpoint().tensors["model.clip.poses"]
     assert (straight["model.clip.poses"] != given).flatten(1).any(1).all(), "every frame"
-    first = assemble(config)
+    first = build_trainer(config)
     tensors_after(first, 11)
-    second = assemble(config)
+    second = build_trainer(config)
     second.restore(first.checkpoint())
     assert same(straight, tensors_after(second, 5))
 
@@ -248,11 +248,11 @@ def test_poses_that_views_gain_nothing_from_stay_for_good(
     capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pose_fit, "REFIT_STARTS", (10 / 240, 14 / 240))
-    trainer = assemble(tiny(capture, steps=240))
+    trainer = build_trainer(tiny(capture, steps=240))
     given = human(trainer).clip.poses.clone()
     lines = [trainer.step().finding or "" for _ in range(12)]
     assert lines[9].startswith("body poses not refitted")
-    resumed = assemble(tiny(capture, steps=240))
+    resumed = build_trainer(tiny(capture, steps=240))
     resumed.restore(trainer.checkpoint())
     assert all(resumed.step().finding is None for _ in range(4)), "it is not tried again"
     assert torch.equal(human(resumed).clip.poses, given)

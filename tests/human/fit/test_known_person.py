@@ -30,7 +30,7 @@ from dyngs.human.fit.fitted_capture import (
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion, MotionClip
 from dyngs.io.write import write_image
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 
@@ -90,7 +90,7 @@ def new_trainer(person: Path) -> Trainer:
     model = HumanModel(resolution=24, sh_degree=0)
     train = TrainConfig(steps=10)
     run = RunConfig(threads=1)
-    return assemble(
+    return build_trainer(
         Config(data=DataConfig(root=person), model=model, optim=OptimConfig(), train=train, run=run)
     )
 

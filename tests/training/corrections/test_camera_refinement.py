@@ -25,13 +25,13 @@ from dyngs.training.corrections.camera_refinement import (
     STARTS,
     CameraCorrections,
     CameraRefinement,
-    common_motions,
+    common_motion_basis,
     corrected,
-    fitted_to_image,
+    fit_camera_to_image,
     slopes,
     watched,
 )
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 SIZE = 2.5
@@ -144,7 +144,7 @@ def test_common_motions_change_no_image(seed: int) -> None:
         translation = -rotation @ moved - change @ camera[:3, 3]
         found.append(torch.cat([vector, translation / SIZE]) / small)
     correction = torch.stack(found).view(-1)
-    basis = common_motions(views, SIZE).double()
+    basis = common_motion_basis(views, SIZE).double()
     assert basis.shape == (36, 7)
     torch.testing.assert_close(
         basis @ (basis.T @ correction), correction, rtol=0, atol=1e-4 * float(correction.norm())
@@ -182,7 +182,7 @@ def test_disturbed_cameras_are_found() -> None:
     errors = []
     for step in range(1, steps + 1):
         index = step % len(views)
-        camera = watched(refinement.corrections.applied_to(views[index], camera_of(views[index])))
+        camera = watched(refinement.corrections.correct_cameras(views[index], camera_of(views[index])))
         error = (points_seen(camera, points.double()) - truth[index]).norm(dim=-1).mean()
         error.backward()
         refinement.after_backward(index, step, image_of(camera))
@@ -194,7 +194,7 @@ def test_disturbed_cameras_are_found() -> None:
 
 
 def trainer_of(root: Path, refine: str) -> Trainer:
-    return assemble(
+    return build_trainer(
         Config(
             data=DataConfig(root=root),
             camera=CameraConfig(refine=refine),  # type: ignore[arg-type]
@@ -243,7 +243,7 @@ def test_the_pose_of_a_render_is_found_again(left_only: bool) -> None:
     weights = torch.zeros(40, 48) if left_only else None
     if weights is not None:
         weights[:, :24] = 1
-    found = fitted_to_image(scene, wrong, BLACK, 3.0, weights=weights)
+    found = fit_camera_to_image(scene, wrong, BLACK, 3.0, weights=weights)
     before, after = (psnr(shown(scene, x), right.rgb_premultiplied) for x in (wrong, found))
     assert after > before + 10
     assert torch.equal(found.cameras.intrinsics, right.cameras.intrinsics)

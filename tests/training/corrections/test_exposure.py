@@ -16,7 +16,7 @@ from dyngs.models.model import RenderedView
 from dyngs.models.renderable import Rendering
 from dyngs.models.static_section import StaticModel
 from dyngs.training.corrections.exposure import WARM_UP, ViewExposures
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 BLACK = torch.zeros(3)
@@ -83,7 +83,7 @@ def test_a_state_of_other_images_is_refused(name: str) -> None:
 
 
 def trainer_of(root: Path, choice: str, model: StaticModel | DynamicModel) -> Trainer:
-    return assemble(
+    return build_trainer(
         Config(
             data=DataConfig(root=root),
             model=model,

@@ -24,8 +24,8 @@ from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
 from dyngs.models.renderable import Rendering
 from dyngs.training.corrections.cells import cell_camera
-from dyngs.training.corrections.exposure import log_gains
-from dyngs.training.corrections.robust import FEWEST, OtherViews
+from dyngs.training.corrections.exposure import estimate_log_gains
+from dyngs.training.corrections.robust import FEWEST, NeighbourViews
 
 
 def asked(
@@ -34,7 +34,7 @@ def asked(
     """Return the differences of other views from what a perfect model shows of view 1, for all of
     its cells."""
     cameras = cameras_before_wall(count, step)
-    others = OtherViews(seen_from(cameras), cameras)  # type: ignore[arg-type]
+    others = NeighbourViews(seen_from(cameras), cameras)  # type: ignore[arg-type]
     rgb = wall(cameras[1])
     more = torch.stack(
         [torch.full_like(rgb[..., 0], distance), torch.full_like(rgb[..., 0], alpha)], -1
@@ -67,7 +67,7 @@ def test_colours_lie_on_the_background_and_masked_cells_do_not_count() -> None:
     empty = type(image)(
         "e", image.cameras, torch.zeros_like(learned(image.cameras)), alpha, mask, None
     )
-    colours, counts = OtherViews([empty], [image.cameras]).cells_of(
+    colours, counts = NeighbourViews([empty], [image.cameras]).cells_of(
         0, torch.tensor([0.2, 0.4, 0.6])
     )  # type: ignore[arg-type]
     assert torch.allclose(colours, torch.tensor([0.2, 0.4, 0.6])[:, None, None].expand_as(colours))
@@ -91,8 +91,8 @@ def test_places_are_found_by_cameras_as_they_are_by_now() -> None:
     drawn = adaptive_avg_pool2d(torch.cat([rgb, more], -1).permute(2, 0, 1), grid)
     which = torch.ones(grid, dtype=torch.bool)
     images = seen_from(right)
-    given = OtherViews(images, right).difference(1, which, drawn, BLACK)  # type: ignore[arg-type]
-    found = OtherViews(images, wrong, lambda i, _: cell_camera(right[i])).difference(
+    given = NeighbourViews(images, right).difference(1, which, drawn, BLACK)  # type: ignore[arg-type]
+    found = NeighbourViews(images, wrong, lambda i, _: cell_camera(right[i])).difference(
         1, which, drawn, BLACK
     )  # type: ignore[arg-type]
     assert torch.equal(found, given)
@@ -117,7 +117,7 @@ def images_with(gains: Tensor) -> Any:
 
 
 def found(images: list[Image], which: list[int] | None = None) -> Tensor:
-    return log_gains(images, list(range(COUNT)) if which is None else which, drawn)  # type: ignore[arg-type]
+    return estimate_log_gains(images, list(range(COUNT)) if which is None else which, drawn)  # type: ignore[arg-type]
 
 
 def test_gains_of_images_that_only_neighbours_share_places_with() -> None:

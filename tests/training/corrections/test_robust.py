@@ -27,7 +27,7 @@ from dyngs.models.model import RenderedView
 from dyngs.models.renderable import Rendering
 from dyngs.models.static_section import StaticModel
 from dyngs.training.corrections.robust import WARM_UP, RobustMasks
-from dyngs.training.new_trainer import assemble
+from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
 COUNT, STEPS = 8, 100
@@ -132,7 +132,7 @@ def test_a_state_of_other_images_is_refused(name: str, wrong: Tensor) -> None:
 
 
 def trainer_of(root: Path, choice: str, model: DynamicModel | None = None) -> Trainer:
-    return assemble(
+    return build_trainer(
         Config(
             data=DataConfig(root=root),
             model=model or StaticModel(sh_degree=0),

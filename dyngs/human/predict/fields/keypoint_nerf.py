@@ -35,7 +35,7 @@ from dyngs.human.predict.fields.network import (
     split_rays,
 )
 from dyngs.human.predict.people import NUM_KEY_POINTS, PosedBody, Sources
-from dyngs.models.volume import kept_samples, rays_of, reached_samples, thinned_samples
+from dyngs.models.volume import select_samples, rays_of, reached_samples, thin_samples
 from dyngs.ops.rays import MarchSteps, Rays, Samples, Space, composite, march
 
 
@@ -100,12 +100,12 @@ class KeypointNerf(FieldNetwork):
         is_training = torch.is_grad_enabled()
         with torch.no_grad():  # densities alone decide which samples are rendered
             alpha = features.alpha(sample_positions(samples, space)) > PARAMS.visible
-            samples = kept_samples(samples, alpha.all(0))[0]
+            samples = select_samples(samples, alpha.all(0))[0]
             points = sample_positions(samples, space)
             code = spatial_code(points, person.body.key_points, features.sources)
             geometry = self._geometry(person, points, code)
             if is_training:
-                samples, which = thinned_samples(density(geometry), samples, shifts)
+                samples, which = thin_samples(density(geometry), samples, shifts)
             else:
                 samples, which = reached_samples(density(geometry), samples)
             points = points[which]

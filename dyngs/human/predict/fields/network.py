@@ -19,7 +19,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.initialisation import glorot
 from dyngs.data.loader import Image
 from dyngs.human.predict.people import PosedBody, Sources
-from dyngs.models.prediction import Encoder, begin_weights, upsampled
+from dyngs.models.prediction import Encoder, initialize_weights, upsample
 from dyngs.ops.perceptron import Layer, perceptron
 
 FINE = 8
@@ -55,7 +55,7 @@ class ImageEncoder(nn.Module):
 
     def forward(self, rgba: Tensor) -> tuple[Tensor, Tensor]:
         half, quarter, eighth = self.levels(rgba)
-        return self.fuse(torch.cat([quarter, upsampled(eighth)], 1)), self.fine(half)
+        return self.fuse(torch.cat([quarter, upsample(eighth)], 1)), self.fine(half)
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def sample_maps(maps: Tensor, grid: Tensor, mode: str = "bilinear") -> Tensor:
 
 def initialize_weights(network: nn.Module, generator: torch.Generator) -> None:
     """Initialise all weights from ``generator`` on the CPU; biases are 0."""
-    begin_weights(network, generator)
+    initialize_weights(network, generator)
     for layer in network.modules():
         if isinstance(layer, nn.Linear):
             with torch.no_grad():

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from dyngs.config import Config, DataConfig
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import ReportProgress
+from dyngs.core.conventions import ProgressCallback
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import Role, State, fields_moved_to, prefixed, with_role
+from dyngs.core.state import Role, State, move_fields_to, add_prefix, with_role
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.data.loader import Image
 from dyngs.data.read import captures_in
@@ -46,14 +46,14 @@ from dyngs.human.predict.people import (
     read_captured_person,
 )
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import RunStart
-from dyngs.models.model import Drawn, Model, Updated
+from dyngs.models.kind import StartContext
+from dyngs.models.model import Drawn, Model, UpdateResult
 from dyngs.models.prediction import (
     Example,
     Learner,
     Predictor,
     image_loss,
-    kept_open,
+    keep_captures_open,
     load_weights,
     random_index,
 )
@@ -110,7 +110,7 @@ class PredictedField(Renderable):
         tensors |= {f"sources.{name}": x for name, x in vars(self.sources).items()}
         tensors |= {f"body.{name}": x for name, x in vars(self.body).items()}
         tensors["numbers"] = torch.tensor([self.scale], dtype=torch.float64, device="cpu")
-        return prefixed("field", with_role(tensors, Role.SHARED))
+        return add_prefix("field", with_role(tensors, Role.SHARED))
 
     def render(
         self,
@@ -163,7 +163,7 @@ def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedFiel
 class PredictedModel(Model[PredictedField]):
     """Stands in for a trainable model; predicted fields cannot be trained."""
 
-    def __init__(self, run: RunStart) -> None:
+    def __init__(self, run: StartContext) -> None:
         assert isinstance(run.config.model, PredictedFieldModel)
         self._run_dir = run.config.run.dir
         self._section = run.config.model
@@ -187,8 +187,8 @@ class PredictedModel(Model[PredictedField]):
     def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
         raise self._untrained()
 
-    def update(self, step: int) -> Updated:
-        return Updated(0)
+    def update(self, step: int) -> UpdateResult:
+        return UpdateResult(0)
 
     @property
     def leaves(self) -> Sequence[Tensor]:
@@ -237,7 +237,7 @@ class FieldPredictor(Predictor[FieldNetwork]):
 
     def run_config(self, views: Sequence[int]) -> Config:
         times = distinct_times(self.views).values()
-        data = self.data_of_moment(self.views[views[0]].time, times)
+        data = self.data_at_time(self.views[views[0]].time, times)
         model = PredictedFieldModel.model_validate({"network": self.config.model.kind})
         return self.config.model_copy(update={"data": data, "model": model})
 
@@ -257,18 +257,18 @@ class FieldLearner(Learner[FieldNetwork]):
     ) -> None:
         super().__init__(config, network, [person.root.name for person in people], device)
         self._template = template_of(self.section)
-        self._opened = kept_open(self._open, people)
+        self._opened = keep_captures_open(self._open, people)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
         captured = self._opened(person)
         sources, target = self._views(captured, generator)
         body, scale = captured.body_in(captured.views[target])
-        body = fields_moved_to(body, self.device)
-        sources_in = fields_moved_to(
+        body = move_fields_to(body, self.device)
+        sources_in = move_fields_to(
             crop_source_images([captured.images[i] for i in sources], scale), self.device
         )
         image = _random_patch(captured.images[target], generator).to(self.device)
-        background = self.drawn_background(generator)
+        background = self.sample_background(generator)
         encoded = self.network.encode(sources_in, body)
         field_picture = self.network.render(
             encoded, cameras_in_metres(image.cameras, scale), generator
@@ -331,7 +331,7 @@ def predictor(
     checkpoint: Checkpoint,
     data: DataConfig,
     log: Callable[[str], None],
-    on_progress: ReportProgress,
+    on_progress: ProgressCallback,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the person of ``data``; the body is fitted if
     needed.

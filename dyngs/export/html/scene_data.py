@@ -41,7 +41,7 @@ CHUNK_BYTES = 1 << 19  # of splines that are fetched at once, before they are de
 CHUNK = 256  # rows of a list that share a range for each column: neighbours in space are alike
 
 
-class Lists:
+class PackedArrays:
     """A block of bytes to which lists are added, and where they lie in it.
 
     ``layout``: by name what ``data.js`` needs to know. ``chunks``: splines that are fetched when
@@ -49,7 +49,7 @@ class Lists:
     """
 
     def __init__(self, *, chunked: bool = False) -> None:
-        self.chunks: list[Lists] | None = [] if chunked else None
+        self.chunks: list[PackedArrays] | None = [] if chunked else None
         self.layout: dict[str, dict[str, Any]] = {}
         self._parts: list[bytes] = []
         self._size = 0
@@ -96,7 +96,7 @@ class Lists:
         self._size += len(data)
 
 
-def add_scene(scene: GaussianScene, lists: Lists, tolerance: float) -> dict[str, Any]:
+def add_scene(scene: GaussianScene, lists: PackedArrays, tolerance: float) -> dict[str, Any]:
     """Add the numbers of a scene to ``lists`` and return what the page needs to know about them.
 
     ``tolerance``: world units that a place may be off where motion is fitted.
@@ -123,7 +123,7 @@ def add_scene(scene: GaussianScene, lists: Lists, tolerance: float) -> dict[str,
     return told if scene.colour is None else told | _add_network(scene.colour, lists)
 
 
-def add_levels(levels: Levels, colour: ColourNetwork | None, lists: Lists) -> dict[str, Any]:
+def add_levels(levels: Levels, colour: ColourNetwork | None, lists: PackedArrays) -> dict[str, Any]:
     """Add where the blocks of ``levels`` are, and a colour network, and return what the page needs
     to know about all.
 
@@ -139,14 +139,14 @@ def add_levels(levels: Levels, colour: ColourNetwork | None, lists: Lists) -> di
     return told if colour is None else told | _add_network(colour, lists)
 
 
-def block_numbers(levels: Levels, block: Block, *, with_rest: bool) -> Lists:
+def block_numbers(levels: Levels, block: Block, *, with_rest: bool) -> PackedArrays:
     """Return the lists of a block, ``BLOCK`` rows each; the last ones of a block that has fewer are
     never seen."""
     gaussians = levels.of_block(block)
     rows = torch.arange(BLOCK, device="cpu").clamp_max(len(gaussians) - 1)
     padded = gaussians.select(rows)
     padded.logit_opacities[len(gaussians) :] = -MOST_LOGIT
-    lists = Lists()
+    lists = PackedArrays()
     _add_gaussians(padded, lists, with_rest=with_rest)
     return lists
 
@@ -159,7 +159,7 @@ def block_files(levels: Levels, *, with_rest: bool) -> Iterator[tuple[str, bytes
             yield f"{level}-{place}.bin", numbers.deflated()
 
 
-def _add_gaussians(gaussians: Gaussians, lists: Lists, *, with_rest: bool) -> dict[str, Any]:
+def _add_gaussians(gaussians: Gaussians, lists: PackedArrays, *, with_rest: bool) -> dict[str, Any]:
     unit = torch.nn.functional.normalize(gaussians.quats, dim=1)
     logits = gaussians.logit_opacities.clamp(-MOST_LOGIT, MOST_LOGIT)
     lists.quantised("means", _numpy(gaussians.means), 16)
@@ -174,7 +174,7 @@ def _add_gaussians(gaussians: Gaussians, lists: Lists, *, with_rest: bool) -> di
 
 
 def _add_motion(
-    scene: DynamicScene, order: Tensor, lists: Lists, tolerance: float
+    scene: DynamicScene, order: Tensor, lists: PackedArrays, tolerance: float
 ) -> dict[str, Any]:
     """Add the motion of a scene whose Gaussians are stored in ``order``, moving ones first."""
     if scene.field is None:
@@ -182,7 +182,7 @@ def _add_motion(
     place = torch.full((len(scene),), -1, device="cpu")
     place[scene.moving] = torch.arange(len(scene.moving), device="cpu")
     mine = place[order[: len(scene.moving)]]
-    curves = curves_of(
+    curves = motion_splines(
         scene.field, scene.gaussians.means[scene.moving], len(scene.times), tolerance
     )
     told: dict[str, Any] = {"curves": _add_curves(curves, mine, lists)}
@@ -196,7 +196,7 @@ def _add_motion(
     return told
 
 
-def _add_curves(curves: Curves, order: Tensor, lists: Lists) -> dict[str, Any]:
+def _add_curves(curves: MotionSplines, order: Tensor, lists: PackedArrays) -> dict[str, Any]:
     """Add splines of drivers, with the Gaussians that follow them, or their own ones, in ``order``
     (M,)."""
     count, points, _ = curves.heads["means"].shape
@@ -216,7 +216,7 @@ def _add_curves(curves: Curves, order: Tensor, lists: Lists) -> dict[str, Any]:
     else:
         for first in range(0, pieces, chunk):
             rows = torch.arange(first, first + chunk + SPAN - 1, device="cpu").clamp_max(points - 1)
-            chunks.append(Lists())
+            chunks.append(PackedArrays())
             _add_splines(splines, rows, chunks[-1])
         told |= {"chunk": chunk, "layout": chunks[0].layout}
     if curves.pivots is not None and curves.followed is not None and curves.fractions is not None:
@@ -230,7 +230,7 @@ def _add_curves(curves: Curves, order: Tensor, lists: Lists) -> dict[str, Any]:
 
 
 def _add_splines(
-    splines: dict[str, tuple[Tensor, int]], rows: Tensor | slice, lists: Lists
+    splines: dict[str, tuple[Tensor, int]], rows: Tensor | slice, lists: PackedArrays
 ) -> None:
     """Add the control points ``rows`` of all splines."""
     for name, (points, bits) in splines.items():
@@ -241,7 +241,7 @@ def _add_splines(
             lists.quantised(name, own, 16 if bits == 16 else 8)
 
 
-def _add_person(scene: HumanScene, order: Tensor, lists: Lists, tolerance: float) -> dict[str, Any]:
+def _add_person(scene: HumanScene, order: Tensor, lists: PackedArrays, tolerance: float) -> dict[str, Any]:
     from scipy.spatial.transform import Rotation
 
     clip = scene.played_clip
@@ -264,12 +264,12 @@ def _add_person(scene: HumanScene, order: Tensor, lists: Lists, tolerance: float
             found = pose_blend_offsets(scene.anchors, frame_pose(clip.at(time), 0), scene.shapes)
             return Offsets(torch.zeros_like(scene.gaussians.means) if found is None else found)
 
-        heads, error = fitted_curves(offsets, len(clip), tolerance)
-        told["curves"] = _add_curves(Curves(heads, error=error), order, lists)
+        heads, error = fit_splines(offsets, len(clip), tolerance)
+        told["curves"] = _add_curves(MotionSplines(heads, error=error), order, lists)
     return told
 
 
-def _add_network(network: ColourNetwork, lists: Lists) -> dict[str, Any]:
+def _add_network(network: ColourNetwork, lists: PackedArrays) -> dict[str, Any]:
     """Add the rows of all layers, padded to four columns, each layer's biases after its weights."""
     widest = max(max(layer.weight.shape) for layer in network.layers)
     width = -(-widest // 4) * 4
@@ -314,7 +314,7 @@ CHECKED = 0.95
 
 
 @dataclass(frozen=True)
-class Curves:
+class MotionSplines:
     """Offsets of S drivers, uniform cubic B-splines over the clip, and who follows them.
 
     Attributes:
@@ -339,23 +339,23 @@ class Curves:
 
 
 @torch.no_grad()
-def curves_of(field: DeformationField, means: Tensor, num_times: int, tolerance: float) -> Curves:
+def motion_splines(field: DeformationField, means: Tensor, num_times: int, tolerance: float) -> MotionSplines:
     """Return the motion of ``means`` (M, 3) as splines."""
     match field:
         case WindowedField(others=others):
-            return replace(curves_of(others, means, num_times, tolerance), windows=field.edges)
+            return replace(motion_splines(others, means, num_times, tolerance), windows=field.edges)
         case ControlNodes():
             return _curves_of_nodes(field, means)
         case FreePrimitives():  # straight lines and parabolas
-            return Curves(_fit(lambda time: field.offsets(means, time), 1), is_steep=True)
+            return MotionSplines(_fit(lambda time: field.offsets(means, time), 1), is_steep=True)
         case _:
-            heads, error = fitted_curves(
+            heads, error = fit_splines(
                 lambda time: field.offsets(means, time), num_times, tolerance
             )
-            return Curves(heads, error=error)
+            return MotionSplines(heads, error=error)
 
 
-def fitted_curves(
+def fit_splines(
     offsets_at: Callable[[float], Offsets], num_times: int, tolerance: float
 ) -> tuple[dict[str, Tensor], float]:
     """Return control points (S, P, size), by attribute, of the splines nearest to offsets, and the
@@ -400,10 +400,10 @@ def _error(points: Tensor, offsets_at: Callable[[float], Offsets], pieces: int) 
     return float(found.sort().values[int(CHECKED * (len(found) - 1))]) if len(found) else 0.0
 
 
-def _curves_of_nodes(field: ControlNodes, means: Tensor) -> Curves:
+def _curves_of_nodes(field: ControlNodes, means: Tensor) -> MotionSplines:
     nodes = field.nodes_for(means)
     more = 0, FOLLOWED - nodes.followed.shape[1]  # of which a Gaussian follows nothing
     followed, fractions = (
         torch.nn.functional.pad(x, more) for x in (nodes.followed, nodes.weights(means))
     )
-    return Curves(_fit(field.at, field.num_pieces), nodes.positions, followed, fractions)
+    return MotionSplines(_fit(field.at, field.num_pieces), nodes.positions, followed, fractions)
