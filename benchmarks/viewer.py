@@ -20,8 +20,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from browser import Browser, Page, missing
 
-from dyngs.view.server import Browsing, ServerOptions, Viewer
-from dyngs.view.source import first_of, open_source
+from dyngs.view.server import BrowserConnection, ServerOptions, Viewer
+from dyngs.view.source import load_first, open_source
 
 WARM_UP = 3.0
 """Seconds before measuring, in which the image finds its size."""
@@ -39,12 +39,12 @@ for (const name of ["texImage2D", "texSubImage2D"]) {
 
 
 def measure(
-    page: Page, browsing: Browsing, act: Callable[[int], None], seconds: float
+    page: Page, connection: BrowserConnection, act: Callable[[int], None], seconds: float
 ) -> tuple[float, float]:
     """Return the images per second that were sent and shown while ``act`` is called with 0, 1,
     ..."""
     for length in (WARM_UP, seconds):
-        sent = browsing.num_sent
+        sent = connection.num_sent
         shown = page.evaluate("window.uploads")
         start = time.monotonic()
         count = 0
@@ -52,20 +52,23 @@ def measure(
             act(count)
             count += 1
     took = time.monotonic() - start
-    return (browsing.num_sent - sent) / took, (page.evaluate("window.uploads") - shown) / took
+    return (connection.num_sent - sent) / took, (page.evaluate("window.uploads") - shown) / took
 
 
 def rows(path: Path, size: tuple[int, int], seconds: float) -> list[str]:
     """Return a row of Markdown for each way of looking at a run or file."""
     source = open_source(path)
     found = []
-    with Viewer(source, first_of(source), ServerOptions()) as viewer, Browser(timeout=60) as browser:
+    with (
+        Viewer(source, load_first(source), ServerOptions()) as viewer,
+        Browser(timeout=60) as browser,
+    ):
         page = browser.open(None, *size)
         page.driven.add_init_script(COUNT_UPLOADS)
         page.driven.goto(viewer.link)
-        while not viewer.browsing or not viewer.browsing[0].num_sent:
+        while not viewer.connections or not viewer.connections[0].num_sent:
             page.driven.wait_for_timeout(100)
-        (browsing,) = viewer.browsing
+        (connection,) = viewer.connections
         mouse = page.driven.mouse
         middle = (size[0] // 4, size[1] // 2)
 
@@ -75,13 +78,13 @@ def rows(path: Path, size: tuple[int, int], seconds: float) -> list[str]:
 
         mouse.move(*middle)
         mouse.down()
-        sent, shown = measure(page, browsing, orbit, seconds)
+        sent, shown = measure(page, connection, orbit, seconds)
         mouse.up()
         found.append(f"| {source.names[0]} | orbiting | {sent:.1f} | {shown:.1f} |")
-        if browsing.time_slider is not None:
+        if connection.time_slider is not None:
             page.click("text=Play")
             sent, shown = measure(
-                page, browsing, lambda _: page.driven.wait_for_timeout(100), seconds
+                page, connection, lambda _: page.driven.wait_for_timeout(100), seconds
             )
             found.append(f"| {source.names[0]} | playing | {sent:.1f} | {shown:.1f} |")
     return found

@@ -291,10 +291,10 @@ def read_a_path(root: Path) -> object:
 def read_a_point(root: Path) -> object:
     """The measurement and its row of the report."""
     from dyngs.study.measure import read_measurement
-    from dyngs.study.tradeoff import table_rows
+    from dyngs.study.tradeoff import build_rows
 
     measurement = read_measurement(only(root))
-    return table_rows([measurement]), measurement
+    return build_rows([measurement]), measurement
 
 
 def read_option_values(root: Path) -> object:

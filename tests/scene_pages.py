@@ -22,7 +22,7 @@ from PIL import Image
 from splat_scenes import cloud
 
 from dyngs.core.camera import Cameras
-from dyngs.export.html.page import ELEMENT, PAGE, WrittenPage, write_folder, write_page
+from dyngs.export.html.page import ELEMENT, PAGE, WrittenPage, write_page, write_page_folder
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
@@ -40,9 +40,7 @@ def write(
     options: RenderOptions | None = None,
 ) -> WrittenPage:
     scene = replace(scene, options=options or scene.options, background=torch.ones(3))
-    return write_page(
-        replace(wrap_scene(scene), stated_up="-y"), path, title=title, views=(view,)
-    )
+    return write_page(replace(wrap_scene(scene), stated_up="-y"), path, title=title, views=(view,))
 
 
 def shown(page: Page, view: Cameras, time: float, which: int = 0) -> torch.Tensor:
@@ -136,13 +134,13 @@ def levels_of_a_cloud(folder: Path, most: int | None = None) -> tuple[LevelScene
         gaussians=gaussians.replace(log_scales=gaussians.log_scales - 1), background=torch.ones(3)
     )
     view = large(camera(), 6)
-    written = write_folder(
+    written = write_page_folder(
         replace(wrap_scene(still), stated_up="-y"), folder, most=most, views=(view,)
     )
     assert written.num_bytes == sum(file.stat().st_size for file in folder.iterdir())
     blocks = [*(f"0-{i}.bin" for i in range(4)), "1-0.bin"]
     assert sorted(file.name for file in folder.iterdir()) == [*blocks, ELEMENT, PAGE]
-    return LevelScene.of(still, most), view
+    return LevelScene.from_scene(still, most), view
 
 
 def from_afar(view: Cameras, factor: float) -> Cameras:

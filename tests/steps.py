@@ -32,7 +32,7 @@ class Counting:
     num_gaussians: int = 1234
     num_moving: int = 56
     has_test_views: bool = False
-    findings: dict[int, str] = field(default_factory=dict)
+    messages: dict[int, str] = field(default_factory=dict)
     failures: dict[int, str] = field(default_factory=dict)
     config: Config = field(default_factory=lambda: CONFIG)
 
@@ -41,7 +41,7 @@ class Counting:
         if step in self.failures:
             raise DyngsError(self.failures[step])
         self.done = step
-        return report_of(step, finding=self.findings.get(step))
+        return report_of(step, message=self.messages.get(step))
 
     def apply(self, edit: TrainingEdit) -> None:
         """Do nothing."""
@@ -53,11 +53,11 @@ class Counting:
         self.done = checkpoint.info.step
 
 
-def report_of(step: int, difference: float = 0.1, finding: str | None = None) -> StepReport:
+def report_of(step: int, difference: float = 0.1, message: str | None = None) -> StepReport:
     """The report of ``step``: a loss of 0.5 and an image that is wrong by ``difference``
     everywhere."""
     truth = torch.zeros(2, 2, 3)
-    return StepReport(step, 0.5, IMAGE, truth + difference, truth, finding)
+    return StepReport(step, 0.5, IMAGE, truth + difference, truth, message)
 
 
 def step_done(step: int, total: int, difference: float = 0.1) -> StepDone:

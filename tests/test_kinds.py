@@ -36,7 +36,7 @@ from dyngs.io.write import write_image
 from dyngs.models.static_section import StaticModel
 from dyngs.models.views import training_times
 from dyngs.training.losses import SilhouetteLoss
-from dyngs.training.new_trainer import build_trainer, with_points
+from dyngs.training.new_trainer import add_initial_points, build_trainer
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_opacity_is_trained_in_all_presets_but_that_of_the_published_protocol(
     ) -> tuple[float, list[str]]:
         trainer = build_trainer(load_config(name, [*few, *keys]), restored=restored)
         losses = [x for x in trainer.losses if isinstance(x, SilhouetteLoss)]
-        return losses[0].weight, trainer.findings
+        return losses[0].weight, trainer.pending_messages
 
     assert weight_and_findings("static") == (0.1, [])
     weight, (line,) = weight_and_findings("blender")
@@ -134,7 +134,7 @@ def test_points_are_triangulated_where_several_cameras_show_a_moment(tmp_path: P
     options = DynamicOptions(size=96, num_times=2, num_cameras=8, num_test=0, samples=1)
     root = write_dynamic_capture("room", tmp_path / "room", options)
     config = _dynamic(root, init=PointsInit(num_random=7))
-    found = with_points(read_capture(config.data), config).points
+    found = add_initial_points(read_capture(config.data), config).points
     assert found is not None
     assert len(build_trainer(config).model.scene) == len(found.xyz) > 7
     without = config.model_copy(update={"init": PointsInit(num_random=7, triangulate=0)})
@@ -145,7 +145,8 @@ def test_the_coarse_phase_is_static_training(capture: Path, tmp_path: Path) -> N
     """Until something moves, a dynamic run is a static one, byte by byte, on all views."""
     root = _with_times(capture, tmp_path / "timed", [0.0, 0.25, 0.5, 0.75, 1.0])
     static, dynamic = (
-        build_trainer(_dynamic(root, model=m)) for m in (StaticModel(), DynamicModel(motion_from=1.0))
+        build_trainer(_dynamic(root, model=m))
+        for m in (StaticModel(), DynamicModel(motion_from=1.0))
     )
     for _ in range(8):
         assert static.step().loss == dynamic.step().loss

@@ -12,21 +12,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.compress.clean import restore_final_trainer, clean_file, clean_run
+from dyngs.compress.clean import clean_file, clean_run, restore_final_trainer
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
-from dyngs.core.errors import DyngsError, counted, show
+from dyngs.core.errors import DyngsError, format_count, log_info
 from dyngs.export.edit.crop import Region, gaussians_in_region
 from dyngs.export.edit.frame import Frame, GeoFrame, gps_frame
-from dyngs.export.edit.merge import merged
+from dyngs.export.edit.merge import merge_scenes
 from dyngs.export.images import compare_file_with_run, compare_file_with_source
 from dyngs.export.splat_files import (
-    SUFFIX,
-    UP,
+    FOURDGS_SUFFIX,
+    FOURDGS_UP,
     WriteOptions,
+    find_up_direction,
     read_4dgs_frame,
     splats_at,
-    up_of,
     write_4dgs,
 )
 from dyngs.gaussians.scene import GaussianScene
@@ -156,7 +156,7 @@ def edit_scene(
     edits: Edits,
     reads: Sequence[Path] = (),
     data_root: Path | None = None,
-    tell: Tell = show,
+    tell: Tell = log_info,
 ) -> EditedFile:
     """Edit a run or a file of Gaussians, and write the result; the suffix of ``out`` names the
     format, none is a run.
@@ -164,9 +164,11 @@ def edit_scene(
     ``reads``: more files that ``edits`` come from. Raises DyngsError: something cannot be done, and
     nothing is written.
     """
-    moves = out.name.lower().endswith(SUFFIX)
+    moves = out.name.lower().endswith(FOURDGS_SUFFIX)
     if known_format(out) is None and not moves and out.suffix:
-        wanted = f"give a name in {all_suffixes()} or {SUFFIX}, or without a suffix for a run"
+        wanted = (
+            f"give a name in {all_suffixes()} or {FOURDGS_SUFFIX}, or without a suffix for a run"
+        )
         raise DyngsError(f"{out}: edits end in a file of Gaussians or a run; {wanted}")
     collect_inputs(source, *edits.merge, *reads).require_output(out)
     found = _opened(source, data_root)
@@ -221,9 +223,9 @@ def _cropped(found: EditSource, source: Path, edits: Edits, tell: Tell) -> EditS
             ", ".join(f"{x:.10g}" for x in end.tolist()) for end in (points.min(0), points.max(0))
         )
         raise DyngsError(
-            f"{source}: --crop leaves none of {counted(len(scene), 'Gaussian')}; they lie between {low} and {high}"
+            f"{source}: --crop leaves none of {format_count(len(scene), 'Gaussian')}; they lie between {low} and {high}"
         )
-    tell(f"crop: {count:,} of {counted(len(scene), 'Gaussian')} stay")
+    tell(f"crop: {count:,} of {format_count(len(scene), 'Gaussian')} stay")
     return found.kept(rows)
 
 
@@ -236,11 +238,12 @@ def _written(found: EditSource, out: Path, edits: Edits, tell: Tell) -> EditedFi
         )
     if moving and edits.time is None:
         tell(
-            f"this is time 0 of a moving scene; --time T gives another one, --out {out.stem}{SUFFIX} all of them"
+            "time 0 of a moving scene is used; choose with --time T, or write all times with "
+            f"--out {out.stem}{FOURDGS_SUFFIX}"
         )
     splat = found.at(edits.time or 0.0)
     if edits.merge:
-        splat = merged(splat, _up(found, edits.frame), edits.merge, tell)
+        splat = merge_scenes(splat, _up(found, edits.frame), edits.merge, tell)
     if edits.undo:
         if splat.edited == UNMOVED:
             raise DyngsError(
@@ -261,13 +264,17 @@ def _written_moving(found: EditSource, out: Path, edits: Edits, tell: Tell) -> E
     scene = found.opened.scene
     if scene.is_static or edits.merge or edits.undo or edits.time is not None:
         raise DyngsError(
-            f"{out}: {SUFFIX} holds a scene that moves, at all times, without --merge, --undo and --time; "
+            f"{out}: {FOURDGS_SUFFIX} holds a scene that moves, at all times, without --merge, --undo and --time; "
             f"give a name in {all_suffixes()}"
         )
-    how, up = _frame(found, edits, UP, tell)
-    writing = WriteOptions(edit=how, up=up) if edits.has_frame else WriteOptions(turn=how.turn, up=up)
+    how, up = _frame(found, edits, FOURDGS_UP, tell)
+    writing = (
+        WriteOptions(edit=how, up=up) if edits.has_frame else WriteOptions(turn=how.turn, up=up)
+    )
     splats, notes = write_4dgs(found.opened, out, scene.times, how=writing)
-    redrawn = compare_file_with_run(found.opened, scene, scene.times[0], splats[0], read_4dgs_frame(out, 0))
+    redrawn = compare_file_with_run(
+        found.opened, scene, scene.times[0], splats[0], read_4dgs_frame(out, 0)
+    )
     return EditedFile(out, redrawn, notes)
 
 
@@ -322,7 +329,7 @@ def _part(config: Config, run_dir: Path, rows: Tensor) -> Checkpoint:
         trainer = restore_final_trainer(config, run_dir)
         kept = torch.zeros(trainer.num_gaussians, dtype=torch.bool, device=trainer.device)
         kept[rows.to(trainer.device)] = True
-        trainer.model.keep(kept, trainer.done)
+        trainer.model.select_gaussians(kept, trainer.done)
         return trainer.checkpoint()
 
 
@@ -332,7 +339,7 @@ def _up(found: EditSource, frame: Frame) -> tuple[float, ...] | None:
     if isinstance(frame.up, tuple):
         return frame.up
     if frame.up is None:
-        known_axis = up_of(found.opened)
+        known_axis = find_up_direction(found.opened)
         return None if known_axis is None else known_axis[0]
     known = None if found.splat is not None else found.opened.up
     if known is None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import print_written
-from dyngs.core.errors import DyngsError, quote_path, show
+from dyngs.core.errors import DyngsError, log_info, quote_path
 
 if TYPE_CHECKING:
     from dyngs.api.edit import Edits
@@ -104,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _note(text: str) -> None:
-    show(f"note: {text}")
+    log_info(f"note: {text}")
 
 
 def _edits(arguments: argparse.Namespace) -> Edits:
@@ -112,7 +112,14 @@ def _edits(arguments: argparse.Namespace) -> Edits:
     or numbers."""
     from dyngs.api.edit import Edits
     from dyngs.export.edit.crop import parse_region
-    from dyngs.export.edit.frame import Frame, direction, control_point_frame, number, point, parse_scale
+    from dyngs.export.edit.frame import (
+        Frame,
+        control_point_frame,
+        parse_direction,
+        parse_number,
+        parse_point,
+        parse_scale,
+    )
 
     alone = [
         f"--{name}" for name in ("up", "origin", "scale") if getattr(arguments, name) is not None
@@ -126,7 +133,7 @@ def _edits(arguments: argparse.Namespace) -> Edits:
         raise DyngsError("--outside goes with --crop, which names what is left out")
     if arguments.max_loss is not None and not arguments.clean:
         raise DyngsError("--max-loss goes with --clean")
-    max_loss = 0.1 if arguments.max_loss is None else number(arguments.max_loss, "--max-loss")
+    max_loss = 0.1 if arguments.max_loss is None else parse_number(arguments.max_loss, "--max-loss")
     if max_loss < 0:
         raise DyngsError(f"--max-loss {max_loss:g}: give the dB that may be lost, 0 or more")
     return Edits(
@@ -135,8 +142,8 @@ def _edits(arguments: argparse.Namespace) -> Edits:
         outside=arguments.outside,
         merge=tuple(arguments.merge),
         frame=Frame(
-            None if arguments.up is None else direction(arguments.up),
-            None if arguments.origin is None else point(arguments.origin, "--origin"),
+            None if arguments.up is None else parse_direction(arguments.up),
+            None if arguments.origin is None else parse_point(arguments.origin, "--origin"),
             1.0 if arguments.scale is None else parse_scale(arguments.scale),
         ),
         geo=None if arguments.geo in (None, _EXIF) else control_point_frame(arguments.geo),

@@ -13,7 +13,7 @@ from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import print_notes, print_written
 from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_image_difference
-from dyngs.core.errors import DyngsError, quote_path, counted
+from dyngs.core.errors import DyngsError, format_count, quote_path
 
 if TYPE_CHECKING:
     from dyngs.data.capture import Split, View
@@ -116,10 +116,10 @@ def add_parser(commands: args.Commands) -> None:
     about = "--format mesh of a radiance field: density of the surface (default: 25 per half extent / 1.5)"
     parser.add_argument("--level", type=float, metavar="X", help=about)
     about = "--format mesh of Gaussians or a field: cells along the longest side of the scene (default 192)"
-    kind = args.whole("a number of cells", 8, 1024)
+    kind = args.integer_type("a number of cells", 8, 1024)
     parser.add_argument("--cells", type=kind, metavar="N", help=about)
     about = "--format mesh of curved triangles: segments of an edge of each (default 6)"
-    kind = args.whole("a number of segments", 1, 64)
+    kind = args.integer_type("a number of segments", 1, 64)
     parser.add_argument("--segments", type=kind, metavar="N", help=about)
     about = "--format html, sog: a folder for a web server, of which a page or PlayCanvas fetches what is seen"
     parser.add_argument("--folder", action="store_true", help=about)
@@ -274,11 +274,11 @@ def _export_splats(
     paths."""
     from dyngs.export.images import compare_file_with_run
     from dyngs.export.splat_files import (
+        choose_write_options,
         scene_part,
         write_run_levels,
         write_run_sequence,
         write_run_splats,
-        choose_write_options,
     )
     from dyngs.io.formats.formats import format_named, known_format, read_splats
 
@@ -291,7 +291,9 @@ def _export_splats(
             "the colours of the run are a network; spherical harmonics of degree 3 are fitted to it"
         )
         print_notes((line,))
-    how, line = choose_write_options(opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree)
+    how, line = choose_write_options(
+        opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree
+    )
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
     out: Path | None = arguments.out
     is_sequence = _is_sequence(arguments)
@@ -324,7 +326,9 @@ def _export_splats(
             path = out / f"{stem}{suffix}" if out.is_dir() else out
         written = [write_run_splats(opened, path, moments[0], part, how)]
     found = [
-        compare_file_with_run(opened, scene, moments[i], written[i].splat, read_splats(written[i].path))
+        compare_file_with_run(
+            opened, scene, moments[i], written[i].splat, read_splats(written[i].path)
+        )
         for i in _shown(len(written))
     ]
     print_image_difference(written[0].notes, found)
@@ -342,19 +346,19 @@ def _export_moving(
     """Write all times as one file of moving Gaussians."""
     from dyngs.export.images import compare_file_with_run
     from dyngs.export.splat_files import (
-        SUFFIX,
-        UP,
+        FOURDGS_SUFFIX,
+        FOURDGS_UP,
+        choose_write_options,
         read_4dgs_frame,
         scene_part,
         write_4dgs,
-        choose_write_options,
     )
 
-    how, line = choose_write_options(opened, UP, arguments.up, arguments.from_up)
+    how, line = choose_write_options(opened, FOURDGS_UP, arguments.up, arguments.from_up)
     print_notes((line,))
     part = _part(arguments)
     scene = scene_part(opened.scene, part)
-    path = _target(arguments, f"splats{SUFFIX}")
+    path = _target(arguments, f"splats{FOURDGS_SUFFIX}")
     splats, notes = write_4dgs(opened, path, times, part, how)
     found = [
         compare_file_with_run(opened, scene, times[i], splats[i], read_4dgs_frame(path, i))
@@ -373,7 +377,9 @@ def _export_tracks(
     tracks = tracks_of(opened.scene, times or opened.scene.times or (0.0,), opened.world, part=part)
     count, moments, _ = tracks.positions.shape
     moving = f"{int(tracks.moving.sum()):,} of them moving"
-    print_notes((f"{counted(count, 'Gaussian')}, {moving}, at {counted(moments, 'time')}",))
+    print_notes(
+        (f"{format_count(count, 'Gaussian')}, {moving}, at {format_count(moments, 'time')}",)
+    )
     return [write_tracks(_target(arguments, "tracks.npz"), tracks)]
 
 
@@ -436,16 +442,20 @@ def _export_network(arguments: argparse.Namespace) -> None:
 def _export_bodies(arguments: argparse.Namespace) -> None:
     """Write a moving scene with its bodies as animated nodes."""
     from dyngs.export.images import compare_file_with_run
-    from dyngs.export.splat_files import write_rigid_bodies, choose_write_options
+    from dyngs.export.splat_files import choose_write_options, write_rigid_bodies
     from dyngs.io.formats.formats import format_named, read_splats
 
     out = _target(arguments, "bodies.glb")
     opened = _open(arguments)
     time = (_times(arguments) or (0.0,))[0]
-    how, line = choose_write_options(opened, format_named("glb").up, arguments.up, arguments.from_up)
+    how, line = choose_write_options(
+        opened, format_named("glb").up, arguments.up, arguments.from_up
+    )
     written = write_rigid_bodies(opened, out, time, how)
     print_notes((line,))
-    found = compare_file_with_run(opened, opened.scene, time, written.splat, read_splats(written.path))
+    found = compare_file_with_run(
+        opened, opened.scene, time, written.splat, read_splats(written.path)
+    )
     print_image_difference(written.notes, [found])
     print_written(written.path)
 
@@ -505,8 +515,8 @@ def _export_surface(arguments: argparse.Namespace) -> None:
         path = out / f"mesh_{i:04d}.ply" if arguments.times else out
         surface = write_surface(opened, path, time=time, options=options, how=how)
         holes = count_holes(surface)
-        closed = "closed" if holes == 0 else f"open at {counted(holes, 'place')}"
-        faces = counted(len(surface.faces), "triangle")
+        closed = "closed" if holes == 0 else f"open at {format_count(holes, 'place')}"
+        faces = format_count(len(surface.faces), "triangle")
         print_notes((f"{faces} with colours of {len(surface.vertices):,} vertices, {closed}",))
         print_written(path)
 
@@ -514,7 +524,7 @@ def _export_surface(arguments: argparse.Namespace) -> None:
 def _export_page(arguments: argparse.Namespace) -> None:
     """Write a page that plays in a browser by itself, or a folder whose page fetches a scene as it
     is seen."""
-    from dyngs.export.html.page import write_folder, write_page
+    from dyngs.export.html.page import write_page, write_page_folder
 
     most = arguments.max_gaussians_drawn
     if most is not None and not arguments.folder:
@@ -531,7 +541,7 @@ def _export_page(arguments: argparse.Namespace) -> None:
     opened = opened if arguments.from_up is None else replace(opened, stated_up=arguments.from_up)
     time = arguments.time or 0.0
     if arguments.folder:
-        written = write_folder(opened, out, most=most, time=time)
+        written = write_page_folder(opened, out, most=most, time=time)
     else:
         written = write_page(opened, out, time=time)
     print_notes(written.notes)
@@ -569,7 +579,7 @@ def _export_cameras(arguments: argparse.Namespace) -> None:
             splits[name] = [found.correct_view(view) for view in views]
     print_notes((line,))
     written = write_cameras(path, capture, splits, run.world)
-    count = counted(len(all_views(capture.splits)), "camera")
+    count = format_count(len(all_views(capture.splits)), "camera")
     root = quote_path(path.parent)
     print(
         f"written: {written} ({count}); `data.root={root} data.follow_links=true` trains with them"

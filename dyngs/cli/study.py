@@ -16,7 +16,7 @@ from dyngs.cli.output import (
     print_tables,
     redirect_messages,
 )
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 
 if TYPE_CHECKING:
     from dyngs.study.report import Report
@@ -60,11 +60,11 @@ def add_parser(commands: args.Commands) -> None:
     limit = parser.add_mutually_exclusive_group()
     about = "train each for so many minutes"
     limit.add_argument("--minutes", type=amount, metavar="M", help=about)
-    kind = args.whole("a number of steps", 1, 10**8)
+    kind = args.integer_type("a number of steps", 1, 10**8)
     limit.add_argument("--steps", type=kind, metavar="N", help="or so many steps")
     about = "or to a file of at most so many 1e6 bytes"
     limit.add_argument("--max-mb", type=amount, metavar="MB", help=about)
-    kind = args.whole("a number of views", 1, 20)
+    kind = args.integer_type("a number of views", 1, 20)
     about = "views on the page (default 4)"
     parser.add_argument("--views", type=kind, default=4, metavar="N", help=about)
     _add_common(parser, "compare/CAPTURE")
@@ -88,7 +88,7 @@ def add_tradeoff_parser(commands: args.Commands) -> None:
         ("combine", 0, 4, "combinations in each of three directions (default 4)"),
         ("rounds", 1, 5, "renders of each timed view (default 5)"),
     ):
-        kind = args.whole("a number", low, 10**9)
+        kind = args.integer_type("a number", low, 10**9)
         parser.add_argument(f"--{name}", type=kind, default=default, metavar="N", help=about)
     require = "requirements such as 'psnr>=30,fps>=20,mb<=5'; names the best run"
     parser.add_argument("--require", metavar="LIST", help=require)
@@ -109,7 +109,7 @@ def _add_common(parser: argparse.ArgumentParser, out: str) -> None:
         "do several at once by Ray (pip install 'dyngs[ray]'), with so many cores for each, on this machine or the "
         "cluster of RAY_ADDRESS, whose machines must share the files"
     )
-    kind = args.whole("a number of cores", 1, 1024)
+    kind = args.integer_type("a number of cores", 1, 1024)
     parser.add_argument("--ray", type=kind, metavar="CORES", help=about)
     args.add_json(parser)
 
@@ -127,8 +127,8 @@ def run_compare(arguments: argparse.Namespace) -> int:
     from dyngs.io.outputs import writing
     from dyngs.runs.folder import collect_inputs
     from dyngs.study.compare import ModelComparison
-    from dyngs.study.report import Report, can_plot, plot_curves, page_views, table_of
-    from dyngs.study.tradeoff import table_rows
+    from dyngs.study.report import Report, build_table, can_plot, page_views, plot_curves
+    from dyngs.study.tradeoff import build_rows
 
     capture = Path(os.path.abspath(arguments.capture))  # so that it has a name, also as . or ..
     out = (arguments.out or Path("compare", capture.name)).absolute()
@@ -156,14 +156,14 @@ def run_compare(arguments: argparse.Namespace) -> int:
             results, left_out, curves = comparison.run(configs, arguments.ray)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(_CONTINUES) from None
-    rows = sorted(table_rows(results), key=lambda row: -row["psnr"])
+    rows = sorted(build_rows(results), key=lambda row: -row["psnr"])
     views = f"{results[0].num_views} held-out views (split {comparison.split})"
     about = f"{capture.name}: {comparison.limit} each, {views}; PSNR in dB, seconds of training; {_FRONT}"
     report = Report(
         "Comparison",
         about,
         rows,
-        [table_of(about, rows)],
+        [build_table(about, rows)],
         left_out=unfit | left_out,
         views=page_views(out, results),
         figure=plot_curves(curves) if can_plot() and any(curves.values()) else None,
@@ -174,7 +174,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
 
 def _print_report(report: Report, stem: Path, *, is_json: bool) -> None:
     """Write the files of a study and print its tables, or its .json alone."""
-    from dyngs.study.report import MISSING, can_plot, write_report
+    from dyngs.study.report import MATPLOTLIB_MISSING, can_plot, write_report
 
     paths = write_report(stem, report)
     if is_json:
@@ -185,7 +185,7 @@ def _print_report(report: Report, stem: Path, *, is_json: bool) -> None:
         print_lines(f"left out: {name}: {problem}")
     print(f"written: {paths[0]} and {', '.join(path.suffix for path in paths[1:])}")
     if not can_plot():
-        print_notes((MISSING,))
+        print_notes((MATPLOTLIB_MISSING,))
 
 
 def run_tradeoff(arguments: argparse.Namespace) -> int:
@@ -204,7 +204,7 @@ def run_tradeoff(arguments: argparse.Namespace) -> int:
 
 def _tradeoff(arguments: argparse.Namespace, out: Path) -> int:
     from dyngs.study import tradeoff
-    from dyngs.study.report import RATES, Report, can_plot, plot_variants, table_of
+    from dyngs.study.report import RATES, Report, build_table, can_plot, plot_variants
 
     requirements = tradeoff.parse_requirements(arguments.require) if arguments.require else []
     metric = arguments.minimize or arguments.maximize
@@ -228,21 +228,21 @@ def _tradeoff(arguments: argparse.Namespace, out: Path) -> int:
         except KeyboardInterrupt:
             raise KeyboardInterrupt(_CONTINUES) from None
     variants = list(found)
-    rows = tradeoff.table_rows(list(found.values()))
+    rows = tradeoff.build_rows(list(found.values()))
     rates = tradeoff.exchange_rates(found)
-    about = f"{counted(found[variants[0]].num_views, 'view')}; {_FRONT}"
+    about = f"{format_count(found[variants[0]].num_views, 'view')}; {_FRONT}"
     settings = [variant.setting for variant in variants]
     report = Report(
         "Quality, speed and size",
         about,
         rows,
-        [table_of(about, rows), table_of("each setting alone", rates, RATES)],
+        [build_table(about, rows), build_table("each setting alone", rates, RATES)],
         {"exchange_rates": rates, "changes": [variant.changes for variant in variants]},
         figure=plot_variants(rows, settings) if can_plot() else None,
     )
     _print_report(report, out / "tradeoff", is_json=arguments.json)
     if arguments.require or metric:
-        number = tradeoff.choose(rows, requirements, goal)
+        number = tradeoff.choose_variant(rows, requirements, goal)
         best = rows[number]
         folder = study.folder(variants[number])
         if not arguments.json:

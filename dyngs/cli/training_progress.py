@@ -51,7 +51,7 @@ class TrainingProgress:
             case Evaluated():
                 self._since += event.seconds
                 if self._forecast is not None:
-                    self._forecast.pause(event.seconds)
+                    self._forecast.exclude(event.seconds)
             case Message():
                 self.say(event.text)
 

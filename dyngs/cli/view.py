@@ -46,7 +46,7 @@ def add_serving_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of how the page is served."""
     about = "address to listen on (default: this machine only); others get a link with a token"
     parser.add_argument("--host", default="127.0.0.1", help=about)
-    kind = args.whole("a port", 1, 65535)
+    kind = args.integer_type("a port", 1, 65535)
     parser.add_argument(
         "--port", type=kind, metavar="N", help="port (default: 8080, or the next that is free)"
     )
@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         from dyngs.view.controls import motion_files
         from dyngs.view.server import ServerOptions, Viewer
-        from dyngs.view.source import first_of, open_source
+        from dyngs.view.source import load_first, open_source
 
     if arguments.threads > 0:
         torch.set_num_threads(arguments.threads)
@@ -71,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
     root = args.data_root(arguments)
     most = arguments.max_gaussians_drawn
     source = open_source(arguments.source, arguments.up, device, root, most)
-    first = first_of(source)
+    first = load_first(source)
     if motions and first.person is None:
         raise DyngsError(
             f"--motion goes with a person (model.kind=human), {first.name} is none; leave it out"

@@ -23,16 +23,16 @@ from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import (
     POSE_METRICS,
     REGION_METRICS,
-    SceneRenderer,
     PoseScores,
     Regions,
+    SceneRenderer,
     TimeScore,
     ViewScore,
     mean_scores,
     psnr_per_time,
     score_views,
-    time_renders,
     temporal_scores,
+    time_renders,
 )
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.human.avatar.pose_fit import IMAGE_COMPARISON, SILHOUETTE_COMPARISON, fit_poses_to_images
@@ -124,7 +124,9 @@ def load_split_images(
     images = ImageLoader(views, run.config.data)
     found = load_camera_corrections(run_dir, run, capture.splits["train"])
     if found is not None:
-        images.corrected = lambda index, cameras: found.correct_cameras(images.views[index], cameras)
+        images.corrected = lambda index, cameras: found.correct_cameras(
+            images.views[index], cameras
+        )
     return images
 
 
@@ -399,7 +401,7 @@ class RunMetrics:
     stored: float | None = None
 
 
-def compared(
+def compare_runs(
     folders: Sequence[Path], threads: int, device: torch.device = CPU, data_root: Path | None = None
 ) -> list[RunMetrics]:
     """Return the costs of runs on the capture of the first; drawn in turn, so that load affects all

@@ -433,7 +433,9 @@ def flicker(drawing: SceneRenderer, cameras: Cameras, times: Sequence[float]) ->
     return MetricValue(fmean(values))
 
 
-def flicker_error(drawing: SceneRenderer, loader: ImageLoader, views: Sequence[View]) -> MetricValue:
+def flicker_error(
+    drawing: SceneRenderer, loader: ImageLoader, views: Sequence[View]
+) -> MetricValue:
     """Return the mean of |(R_{k+1} - R_k) - (G_{k+1} - G_k)| x 255: the error of changes in time,
     at fixed cameras.
 

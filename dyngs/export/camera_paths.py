@@ -102,7 +102,8 @@ def parse_times(text: str) -> tuple[float, ...]:
         start, stop, count = 0.0, 0.0, 0
     if not (math.isfinite(start) and math.isfinite(stop) and 1 <= count <= _MAX_FRAMES):
         raise DyngsError(
-            f"{format_one_line(repr(text), 60)} is no range of times; write START:STOP:COUNT, for instance 0:1:60 for 60 "
+            f"{format_one_line(repr(text), 60)} is no range of times; write START:STOP:COUNT, "
+            "for instance 0:1:60 for 60 "
             "evenly spaced times"
         )
     return tuple(np.linspace(start, stop, count).tolist())

@@ -121,7 +121,9 @@ def select_view(capture: Capture, name: str | None = None, split: str | None = N
     )
 
 
-def orbit_cameras_around(opened: OpenedScene, count: int, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
+def orbit_cameras_around(
+    opened: OpenedScene, count: int, size: tuple[int, int] = DEFAULT_SIZE
+) -> Cameras:
     """Return ``count`` cameras with images of ``size`` on a circle around a scene, a person in all
     of their motion.
 
@@ -130,7 +132,7 @@ def orbit_cameras_around(opened: OpenedScene, count: int, size: tuple[int, int] 
     scene = opened.renderable
     moves = opened.person is not None and not scene.is_static
     times = np.linspace(0, 1, 8).tolist() if moves else [None]
-    means = torch.cat([points_at(scene, time) for time in times]).cpu().numpy()
+    means = torch.cat([framing_points(scene, time) for time in times]).cpu().numpy()
     x, y, z = AXES["z"] if opened.up is None else opened.up[0].tolist()
     least = 0.0
     if isinstance(scene, GaussianScene):
@@ -138,7 +140,7 @@ def orbit_cameras_around(opened: OpenedScene, count: int, size: tuple[int, int] 
     return frame_orbit_for_points(means, count, size, (x, y, z), least)
 
 
-def points_at(scene: Renderable, time: float | None = None) -> Tensor:
+def framing_points(scene: Renderable, time: float | None = None) -> Tensor:
     """Return the points (K, 3) that a camera is placed by: the Gaussians, or the corners of the box
     of all else."""
     return scene.at(time).means if isinstance(scene, GaussianScene) else scene.bounds

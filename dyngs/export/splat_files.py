@@ -14,7 +14,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from dyngs.core.conventions import SH_C0
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.core.gaussians import Gaussians
 from dyngs.deform.bodies.field import BodyField, find_body_field
 from dyngs.deform.scene import field_scene_of
@@ -168,7 +168,7 @@ def choose_write_options(
         return WriteOptions(
             up=own, sh_degree=sh_degree
         ), f"axes are those of the {frame.removesuffix('ed run')}{known}"
-    found = up_of(opened) if from_up is None else (axis_of(from_up), "--from-up")
+    found = find_up_direction(opened) if from_up is None else (axis_of(from_up), "--from-up")
     if found is None:
         line = "nothing says which way is up in this run, so axes are those of the capture; --from-up=AXIS tells it"
         return WriteOptions(sh_degree=sh_degree), line
@@ -181,7 +181,7 @@ def choose_write_options(
     return how, f"up is {wanted} in the file ({turned}, says {who})"
 
 
-def up_of(opened: OpenedScene) -> tuple[tuple[float, ...], str] | None:
+def find_up_direction(opened: OpenedScene) -> tuple[tuple[float, ...], str] | None:
     """Return the direction (3,) that is up and what says so: an axis where one is within 30
     degrees; None: nothing.
 
@@ -198,7 +198,11 @@ def up_of(opened: OpenedScene) -> tuple[tuple[float, ...], str] | None:
 
 
 def write_run_splats(
-    opened: OpenedScene, path: Path, time: float = 0.0, part: Part = "all", how: WriteOptions = DEFAULT_WRITE_OPTIONS
+    opened: OpenedScene,
+    path: Path,
+    time: float = 0.0,
+    part: Part = "all",
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> Written:
     """Write a run at a time in [0, 1] as a file of Gaussians; its suffix names the format.
 
@@ -242,7 +246,11 @@ def write_run_sequence(
 
 
 def write_run_levels(
-    opened: OpenedScene, folder: Path, time: float = 0.0, part: Part = "all", how: WriteOptions = DEFAULT_WRITE_OPTIONS
+    opened: OpenedScene,
+    folder: Path,
+    time: float = 0.0,
+    part: Part = "all",
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Write a run at a time as a new folder of .sog in levels of detail; return Gaussians by level,
     and notes.
@@ -267,7 +275,10 @@ def scene_part(scene: GaussianScene, part: Part) -> GaussianScene:
 
 
 def splats_at(
-    opened: OpenedScene, scene: GaussianScene, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
+    opened: OpenedScene,
+    scene: GaussianScene,
+    time: float,
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> SplatFile:
     """Return what a file of Gaussians is to hold of a scene at one time, in the axes that are asked
     for.
@@ -347,9 +358,9 @@ def write_tracks(path: Path, tracks: Tracks) -> Path:
     return path
 
 
-SUFFIX = ".4dgs"
-UP = "-y"
-FPS = 30.0
+FOURDGS_SUFFIX = ".4dgs"
+FOURDGS_UP = "-y"
+FOURDGS_FPS = 30.0
 
 
 def write_4dgs(
@@ -368,7 +379,7 @@ def write_4dgs(
     model, delta, files = _fourdgs(path)
     scene = scene_part(opened.scene, part)
     splats = tuple(splats_at(opened, scene, time, how) for time in times)
-    duration = len(times) / FPS
+    duration = len(times) / FOURDGS_FPS
     samples = []
     for i, splat in enumerate(splats):
         gaussians = splat.gaussians
@@ -380,19 +391,19 @@ def write_4dgs(
             rotations=unit_rotations(gaussians.quats).numpy()[:, [1, 2, 3, 0]],
             colors=rgba.numpy(),
             motions=np.zeros((n, 3), np.float32),
-            mu_t=np.full(n, i / FPS, np.float32),
+            mu_t=np.full(n, i / FOURDGS_FPS, np.float32),
             # standard deviation in time: a Gaussian never fades
             sigma_t=np.full(n, 1e4 * duration, np.float32),
             win_lo=np.zeros(n, np.float32),
             win_hi=np.full(n, duration, np.float32),
         )
-        samples.append(delta.Sample(t0=i / FPS, ids=np.arange(n), gaussians=states))
+        samples.append(delta.Sample(t0=i / FOURDGS_FPS, ids=np.arange(n), gaussians=states))
     options = delta.KeyframeDeltaOptions(keyframe_every=8)
     data = files.write_sequence(samples, duration, kd=options, profile="fine", library="dyngs")
     with atomic_file(path) as temporary:
         temporary.write_bytes(data)
     notes = (
-        f"{counted(len(times), 'time')}, each shown for 1/{FPS:.0f} s",
+        f"{format_count(len(times), 'time')}, each shown for 1/{FOURDGS_FPS:.0f} s",
         *offset_notes(splats[0], "4dgs cannot state it"),
     )
     if any(bool(splat.gaussians.sh[:, 1:].any()) for splat in splats):
@@ -407,7 +418,7 @@ def read_4dgs_frame(path: Path, index: int) -> SplatFile:
     Raises DyngsError: the package is missing, or values that are not finite.
     """
     _, _, files = _fourdgs(path)
-    found = files.render_at(files.decode_streamed(path.read_bytes()), (index + 0.5) / FPS)
+    found = files.render_at(files.decode_streamed(path.read_bytes()), (index + 0.5) / FOURDGS_FPS)
     sh = ((found["rgb"] - 0.5) / SH_C0)[:, None]
     quats = found["rotations"][:, [3, 0, 1, 2]]
     gaussians = from_linear(found["centers"], quats, found["scales"], found["opacity"], sh)
@@ -426,7 +437,9 @@ def _fourdgs(path: Path) -> tuple[Any, Any, Any]:
 
 
 @torch.no_grad()
-def write_rigid_bodies(opened: OpenedScene, path: Path, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS) -> Written:
+def write_rigid_bodies(
+    opened: OpenedScene, path: Path, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
+) -> Written:
     """Write a run at a time in [0, 1] as .glb: a node for each body, with its motion as an
     animation, one for the rest.
 

@@ -118,7 +118,7 @@ class Predictor(ABC, Generic[N]):
     def chosen(self, count: int) -> list[int]:
         """Return the indices of ``count`` of the views that suit a prediction."""
 
-    def adapt(self, views: Sequence[int], steps: int | None, on_progress: ProgressCallback) -> int:
+    def adapt(self, views: Sequence[int], steps: int | None, report: ProgressCallback) -> int:
         """Train the network for ``steps`` on these images alone, None: as many as usual; return how
         many these were."""
         if steps:
@@ -249,7 +249,7 @@ def image_loss(
     return loss
 
 
-def updated(
+def optimizer_step(
     optimizer: torch.optim.Optimizer, network: nn.Module, loss: Tensor, rate: float
 ) -> bool:
     """Do a step at the learning rate ``rate``; return False, and do none, for gradients that are

@@ -19,19 +19,19 @@ from pydantic import TypeAdapter
 from dyngs.api.budget.size import has_file
 from dyngs.config import Config
 from dyngs.config.io import find_preset, load_config, load_resolved
-from dyngs.core.errors import DyngsError, format_one_line, show
+from dyngs.core.errors import DyngsError, format_one_line, log_info
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.view_scores import SceneRenderer
-from dyngs.models.kind import PredictsScenes, capability, kind_of
+from dyngs.models.kind import PredictsScenes, capability, find_kind
 from dyngs.models.views import evaluation_background
 from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.folder import EXPORT_FOLDER
 from dyngs.runs.opened import scene_of_split, split_views
-from dyngs.study.measure import SceneMeasurer, Measurement, Subject
-from dyngs.study.runs import run_tasks, finished, read_stored, require_same_study, write_stored
+from dyngs.study.measure import Measurement, SceneMeasurer, StudyScene
+from dyngs.study.runs import read_stored, require_same_study, run_tasks, train_to_end, write_stored
 from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import validate_limits
 from dyngs.training.trainer import Trainer
@@ -119,7 +119,7 @@ class ModelComparison:
             try:
                 config = load_config(file, words)
                 validate_limits(config)
-                problem = kind_of(config.model).refusal(capture)
+                problem = find_kind(config.model).refusal(capture)
                 if capability(config.model, PredictsScenes) is not None:
                     problem = "is a network, which is trained on many people"
             except DyngsError as error:
@@ -146,8 +146,8 @@ class ModelComparison:
         facts |= {"capture": str(self.capture), "out": None}
         others = [key for key in facts if key != "settings"]
         # settings follow from the others, unless a preset was changed
-        for compared in (others, ["settings"]):
-            require_same_study(self.out, facts, compared)
+        for compared_keys in (others, ["settings"]):
+            require_same_study(self.out, facts, compared_keys)
 
     def run(
         self, configs: dict[str, Config], ray_cores: int | None = None
@@ -167,25 +167,25 @@ class ModelComparison:
             ROUNDS,
             self.num_shown,
         )
-        subjects = {
-            name: Subject(name, name, self.run_dir(name), partial(self._trained, config))
+        study_scenes = {
+            name: StudyScene(name, name, self.run_dir(name), partial(self._trained, config))
             for name, config in configs.items()
         }
-        missing = [x for x in subjects.values() if not bench.point(x.slug).is_file()]
+        missing = [x for x in study_scenes.values() if not bench.point(x.slug).is_file()]
         left_out = dict[str, str]()
-        for subject, result in run_tasks(bench.measure, missing, ray_cores):
+        for study_scene, result in run_tasks(bench.measure, missing, ray_cores):
             if isinstance(result, DyngsError):
-                left_out[subject.name] = str(result)
-                del subjects[subject.name]
-                show(f"{subject.name}: left out: {result}")
+                left_out[study_scene.name] = str(result)
+                del study_scenes[study_scene.name]
+                log_info(f"{study_scene.name}: left out: {result}")
             else:
                 done = f"{result.steps:,} steps in {result.seconds:.0f} s"
-                show(f"{subject.name}: {result.psnr:.2f} dB, {done}")
-        if not subjects:
+                log_info(f"{study_scene.name}: {result.psnr:.2f} dB, {done}")
+        if not study_scenes:
             name, problem = next(iter(left_out.items()))
             raise DyngsError(f"no model could be trained; {name}: {problem}")
-        curves = {name: QualityCurve(self, self.run_dir(name)).points() for name in subjects}
-        return bench.with_speeds(list(subjects.values())), left_out, curves
+        curves = {name: QualityCurve(self, self.run_dir(name)).points() for name in study_scenes}
+        return bench.with_speeds(list(study_scenes.values())), left_out, curves
 
     def _trained(self, config: Config) -> Path:
         """Train a model, unless that is done; return the folder that it is drawn from: of limited
@@ -195,9 +195,9 @@ class ModelComparison:
         if not (self.out / "points" / f"{folder.name}.json").is_file():
             said_path = self.out / "said" / f"{folder.name}.txt"
             said_path.parent.mkdir(parents=True, exist_ok=True)
-            show(f"training {folder.name}: {self.limit}")
+            log_info(f"training {folder.name}: {self.limit}")
             with said_path.open("a", encoding="utf-8") as said, redirect_stdout(said):
-                finished(config, folder, [QualityCurve(self, folder)])
+                train_to_end(config, folder, [QualityCurve(self, folder)])
             side = load_resolved(folder).data.longest_side
             if side != config.data.longest_side:
                 raise DyngsError(
@@ -227,7 +227,7 @@ class QualityCurve:
             self._drawn = done
             start = time.perf_counter()
             score = self._score(event.loop.trainer)
-            event.loop.stopwatch.pause(time.perf_counter() - start)
+            event.loop.stopwatch.exclude(time.perf_counter() - start)
             before = [point for point in self.points() if point[0] < event.step]
             write_stored(self._path, [*before, (event.step, event.seconds, score)])
 

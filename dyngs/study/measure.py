@@ -12,12 +12,12 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field, TypeAdapter
 
-from dyngs.core.errors import counted, show
+from dyngs.core.errors import format_count, log_info
 from dyngs.core.metrics import load_lpips
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.report import load_split_images
-from dyngs.evaluate.view_scores import SceneRenderer, Regions, score_views, time_renders
+from dyngs.evaluate.view_scores import Regions, SceneRenderer, score_views, time_renders
 from dyngs.io.write import write_image
 from dyngs.models.checkpoint import read_run_capture
 from dyngs.models.renderable import Renderable
@@ -78,7 +78,7 @@ def read_measurement(path: Path) -> Measurement:
 
 
 @dataclass(frozen=True)
-class Subject:
+class StudyScene:
     """A scene of a study."""
 
     name: str
@@ -109,19 +109,19 @@ class SceneMeasurer:
         """Return the file of a measurement."""
         return self.out / "points" / f"{slug}.json"
 
-    def measure(self, subject: Subject) -> Measurement:
+    def measure(self, study_scene: StudyScene) -> Measurement:
         """Return the stored measurement of a subject, or make it without its speed."""
-        path = self.point(subject.slug)
+        path = self.point(study_scene.slug)
         if path.is_file():
             return read_measurement(path)
-        folder = subject.make()
+        folder = study_scene.make()
         with kernel_threads(self.threads or num_cores()), torch.no_grad():
-            measurement = self._measurement(subject, folder)
+            measurement = self._measurement(study_scene, folder)
         write_stored(path, asdict(measurement))
         return measurement
 
-    def _measurement(self, subject: Subject, folder: Path) -> Measurement:
-        drawing, loader = self._drawn(subject.run_dir, folder)
+    def _measurement(self, study_scene: StudyScene, folder: Path) -> Measurement:
+        drawing, loader = self._drawn(study_scene.run_dir, folder)
         background = drawing.background
         scores, _ = score_views(
             drawing.scene,
@@ -144,14 +144,14 @@ class SceneMeasurer:
             file = f"{len(views):02d}.png"
             write_image(images / TRUTH / file, image.composite(background).cpu().numpy())
             rendered = drawing.image(image.cameras, image.time)
-            write_image(images / subject.slug / file, rendered.cpu().numpy())
+            write_image(images / study_scene.slug / file, rendered.cpu().numpy())
             views.append((image.name, scores[i].psnr))
         mb = state_megabytes(drawing.scene)
         if has_only_scene_file(folder):
             mb = 1e-6 * (folder / SCENE_FILE).stat().st_size
-        run = load_run(subject.run_dir)
+        run = load_run(study_scene.run_dir)
         return Measurement(
-            name=subject.name,
+            name=study_scene.name,
             num_views=len(loader),
             **means,
             gaussians=_count(drawing.scene),
@@ -174,18 +174,18 @@ class SceneMeasurer:
         scene = scene_of_split(load_run(folder), capture, self.split).to(device)
         return SceneRenderer(scene, scene.options, background.to(device)), loader
 
-    def with_speeds(self, subjects: Sequence[Subject]) -> list[Measurement]:
+    def with_speeds(self, study_scenes: Sequence[StudyScene]) -> list[Measurement]:
         """Return the measurements of all, the missing speeds measured in turn with the first one,
         so that other load affects all alike."""
-        found = [self.measure(subject) for subject in subjects]
+        found = [self.measure(study_scene) for study_scene in study_scenes]
         missing = [i for i in range(1, len(found)) if found[i].ms is None]
         groups = [missing[i : i + SERIES] for i in range(0, len(missing), SERIES)]
         if not groups and found[0].ms is None:
             groups = [[]]
         for group in groups:
             together = [0, *group]
-            show(f"timing {counted(len(together), 'scene')} in turn")
-            drawn = [self._drawn(subjects[i].run_dir, subjects[i].make()) for i in together]
+            log_info(f"timing {format_count(len(together), 'scene')} in turn")
+            drawn = [self._drawn(study_scenes[i].run_dir, study_scenes[i].make()) for i in together]
             loader = drawn[0][1]
             images = [loader[i] for i in evenly_spaced(len(loader), self.timed_views)]
             with kernel_threads(self.threads or num_cores()):
@@ -194,7 +194,7 @@ class SceneMeasurer:
                 if found[i].ms is None:
                     gain = median((seconds[0] / own).tolist())
                     found[i] = replace(found[i], ms=1e3 * median(own.tolist()), gain=gain)
-                    write_stored(self.point(subjects[i].slug), asdict(found[i]))
+                    write_stored(self.point(study_scenes[i].slug), asdict(found[i]))
         return found
 
 

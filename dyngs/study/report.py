@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dyngs.core.errors import escape_control_characters, format_one_line
-from dyngs.export.html.page import filled, script_safe, source_hash
+from dyngs.export.html.page import fill_template, script_safe, source_hash
 from dyngs.io.write import write_text
 from dyngs.study.measure import TRUTH, Measurement
 from dyngs.study.tradeoff import SEVERAL, Row, pareto_mask
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MISSING = "the plot needs the package matplotlib; run pip install 'dyngs[plots]'"
+MATPLOTLIB_MISSING = "the plot needs the package matplotlib; run pip install 'dyngs[plots]'"
 COLUMNS = {
     "psnr": ("PSNR", ".2f"),
     "ssim": ("SSIM", ".4f"),
@@ -78,7 +78,7 @@ def can_plot() -> bool:
     return find_spec("matplotlib") is not None
 
 
-def table_of(
+def build_table(
     title: str, rows: Sequence[Row], columns: Mapping[str, tuple[str, str]] = COLUMNS
 ) -> Table:
     """Return a table of rows, without columns in which none has a figure; the Pareto front is
@@ -156,7 +156,7 @@ def page_text(report: Report, svg: str) -> str:
         "script": script,
         "script_hash": source_hash(script),
     }
-    return filled(_file("page.html"), pieces)
+    return fill_template(_file("page.html"), pieces)
 
 
 def _file(name: str) -> str:
@@ -181,7 +181,9 @@ def csv_text(rows: Sequence[Mapping[str, object]]) -> str:
 def _no_formula(value: object) -> object:
     if not isinstance(value, str):
         return value
-    return escape_control_characters(f"'{value}" if value.lstrip()[:1] in ("=", "+", "-", "@") else value)
+    return escape_control_characters(
+        f"'{value}" if value.lstrip()[:1] in ("=", "+", "-", "@") else value
+    )
 
 
 def html_table(head: Sequence[str], cells: Cells) -> str:

@@ -30,7 +30,7 @@ STUDY_FILE = "study.json"
 """What a study is about, in its folder."""
 
 
-def finished(config: Config, out: Path, listeners: Sequence[Listener] = ()) -> Path:
+def train_to_end(config: Config, out: Path, listeners: Sequence[Listener] = ()) -> Path:
     """Train the run in folder ``out`` to its end, from its last checkpoint if there is one; return
     ``out``.
 
@@ -100,7 +100,9 @@ def write_stored(path: Path, values: Mapping[str, Any] | Sequence[Any]) -> None:
     write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
 
 
-def require_same_study(out: Path, facts: Mapping[str, object], compared: Sequence[str]) -> None:
+def require_same_study(
+    out: Path, facts: Mapping[str, object], compared_keys: Sequence[str]
+) -> None:
     """Store the facts of a study in its folder ``out``, or compare them with those stored there.
 
     Raises:
@@ -115,7 +117,7 @@ def require_same_study(out: Path, facts: Mapping[str, object], compared: Sequenc
         known = json.loads(read_limited(path))
         differing = [
             f"{key} is {_shown(known.get(key))} there and {_shown(here[key])} here"
-            for key in compared
+            for key in compared_keys
             if known.get(key) != here[key]
         ]
     if differing:

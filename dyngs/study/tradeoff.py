@@ -25,10 +25,10 @@ from dyngs.compress.stage import build_pruning_edit
 from dyngs.config import BudgetConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.core.conventions import num_sh_terms
-from dyngs.core.errors import DyngsError, format_one_line, show
+from dyngs.core.errors import DyngsError, format_one_line, log_info
 from dyngs.core.section import CutOff
 from dyngs.core.state import strip_roles
-from dyngs.models.checkpoint import read_run_capture, restore_model, checkpoint_settings
+from dyngs.models.checkpoint import checkpoint_settings, read_run_capture, restore_model
 from dyngs.models.kind import HasGaussians, HasMotion, capability
 from dyngs.ops.device import select_device
 from dyngs.ops.native import kernel_threads, num_cores
@@ -43,8 +43,8 @@ from dyngs.runs.checkpoint import (
 )
 from dyngs.runs.folder import collect_inputs, write_config
 from dyngs.runs.opened import split_views
-from dyngs.study.measure import SCORES, SceneMeasurer, Measurement, Subject
-from dyngs.study.runs import STORED_CONFIG, run_tasks, finished, require_same_study
+from dyngs.study.measure import SCORES, Measurement, SceneMeasurer, StudyScene
+from dyngs.study.runs import STORED_CONFIG, require_same_study, run_tasks, train_to_end
 from dyngs.training.new_trainer import build_trainer
 
 MIN_DOUBLINGS = 0.05
@@ -220,7 +220,9 @@ class Tradeoff:
         """
         load_resolved(self.run_dir)  # what is no run is refused before anything else
         collect_inputs(self.run_dir).require_output(self.out)
-        own = current_settings(self.run_dir)  # refuses what cannot be varied before anything is written
+        own = current_settings(
+            self.run_dir
+        )  # refuses what cannot be varied before anything is written
         run = load_run(self.run_dir)
         split_views(read_run_capture(run.config.data, run.info), self.split)
         newest = checkpoint_paths(self.run_dir)[-1]
@@ -235,7 +237,7 @@ class Tradeoff:
         singles = [Variant(), *single_setting_variants(self.settings, own, self.finetune)]
         idle = self.settings.keys() - {name for variant in singles for name in variant.settings}
         if idle:
-            show(f"nothing to vary in this run: {', '.join(sorted(idle))}")
+            log_info(f"nothing to vary in this run: {', '.join(sorted(idle))}")
         found = self._measured(singles, self.ray_cores)
         # combinations share folders, so these are made one after another
         return self._measured([*singles, *combinations(found, self.combine)], None)
@@ -244,15 +246,19 @@ class Tradeoff:
         self, variants: Sequence[Variant], ray_cores: int | None
     ) -> dict[Variant, Measurement]:
         bench = SceneMeasurer(self.out, self.split, self.threads, self.device, rounds=self.rounds)
-        subjects = [
-            Subject(v.name, v.slug, self.run_dir, partial(self.folder, v)) for v in variants
+        study_scenes = [
+            StudyScene(v.name, v.slug, self.run_dir, partial(self.folder, v)) for v in variants
         ]
-        missing = [subject for subject in subjects if not bench.point(subject.slug).is_file()]
-        for subject, found in run_tasks(bench.measure, missing, ray_cores):
+        missing = [
+            study_scene
+            for study_scene in study_scenes
+            if not bench.point(study_scene.slug).is_file()
+        ]
+        for study_scene, found in run_tasks(bench.measure, missing, ray_cores):
             if isinstance(found, DyngsError):
                 raise found
-            show(f"{subject.name}: {found.psnr:.2f} dB, {found.mb:.2f} MB")
-        return dict(zip(variants, bench.with_speeds(subjects), strict=True))
+            log_info(f"{study_scene.name}: {found.psnr:.2f} dB, {found.mb:.2f} MB")
+        return dict(zip(variants, bench.with_speeds(study_scenes), strict=True))
 
     def folder(self, variant: Variant) -> Path:
         """Return the run folder of a variant; it is made if it does not exist.
@@ -309,7 +315,7 @@ class Tradeoff:
         """Prune and fine-tune the run."""
         out = self.out / "training" / wanted.slug
         if checkpoint_paths(out):
-            return finished(load_resolved(out), out)
+            return train_to_end(load_resolved(out), out)
         steps = f"prune.steps={wanted.finetune}"
         return prune_run(self.run_dir, out, [*self._pruning(wanted), steps])
 
@@ -336,7 +342,7 @@ def pareto_mask(goals: Sequence[Sequence[float]]) -> list[bool]:
     return [not any(dominates(other, own) for other in goals) for own in goals]
 
 
-def table_rows(measurements: Sequence[Measurement]) -> list[Row]:
+def build_rows(measurements: Sequence[Measurement]) -> list[Row]:
     """Return a row per measurement, by column. ``fps`` is that of the first one times the gain, so
     that scenes timed at another hour compare; ``on_front``: on the Pareto front of PSNR, speed and
     size."""
@@ -353,7 +359,7 @@ def table_rows(measurements: Sequence[Measurement]) -> list[Row]:
 # The cost of each setting, and combinations worth measuring
 
 
-def slope(losses_and_factors: Iterable[tuple[float, float]]) -> float | None:
+def db_per_doubling(losses_and_factors: Iterable[tuple[float, float]]) -> float | None:
     """Return dB lost per factor 2: the least-squares line through no loss at factor 1; None if
     less than 3.5 % is gained."""
     pairs = [(loss, math.log2(factor)) for loss, factor in losses_and_factors]
@@ -376,8 +382,8 @@ def exchange_rates(found: Mapping[Variant, Measurement]) -> list[Row]:
     return [
         {
             "name": setting,
-            "db_per_speed": slope((base.psnr - m.psnr, m.gain) for m in group),
-            "db_per_size": slope((base.psnr - m.psnr, base.mb / m.mb) for m in group),
+            "db_per_speed": db_per_doubling((base.psnr - m.psnr, m.gain) for m in group),
+            "db_per_size": db_per_doubling((base.psnr - m.psnr, base.mb / m.mb) for m in group),
             "speed": max(m.gain for m in group),
             "size": max(base.mb / m.mb for m in group),
         }
@@ -402,7 +408,7 @@ def combinations(found: Mapping[Variant, Measurement], count: int) -> list[Varia
         costs = []
         for strength, (variant, m) in enumerate(found.items()):
             loss = base.psnr - m.psnr
-            cost = slope([(loss, gain_of(m))])
+            cost = db_per_doubling([(loss, gain_of(m))])
             if loss <= MAX_LOSS_DB and cost is not None:
                 costs.append((cost, variant.slug, strength, variant))
         now = Variant()
@@ -467,11 +473,15 @@ def parse_requirements(text: str) -> list[Requirement]:
 def parse_goal(name: str, *, smallest: bool) -> Requirement:
     """Return the goal of ``--minimize`` or ``--maximize``."""
     if name not in METRICS:
-        raise DyngsError(f"{format_one_line(name, 60)}: no such metric; there are {', '.join(METRICS)}")
+        raise DyngsError(
+            f"{format_one_line(name, 60)}: no such metric; there are {', '.join(METRICS)}"
+        )
     return Requirement(name, smallest)
 
 
-def choose(rows: Sequence[Row], requirements: Sequence[Requirement], goal: Requirement) -> int:
+def choose_variant(
+    rows: Sequence[Row], requirements: Sequence[Requirement], goal: Requirement
+) -> int:
     """Return the number of the best row among those that meet all requirements; of equally good
     ones that with the higher PSNR."""
 

@@ -17,7 +17,7 @@ from functools import partial
 from statistics import fmean
 
 from dyngs.config import Config
-from dyngs.models.schedule import image_divisor, scaled
+from dyngs.models.schedule import image_divisor, scale_step
 
 FIXED, PER_MEGAPIXEL, PER_GAUSSIAN = 6.0, 300.0, 7e-4
 """Cost of a step: of any one, of 1e6 pixels that are drawn, of a Gaussian. Milliseconds on two
@@ -41,7 +41,7 @@ class Stopwatch:
     def seconds(self) -> float:
         return time.perf_counter() - self._since
 
-    def pause(self, seconds: float) -> None:
+    def exclude(self, seconds: float) -> None:
         """Leave ``seconds`` out (negative: count them in)."""
         self._since += seconds
 
@@ -64,7 +64,7 @@ class SaveTimer:
         interval = max(60 * self._minutes, self._duration / SAVE_FRACTION)
         return self._minutes > 0 and now - self._last >= interval
 
-    def saved(self, begin: float, end: float) -> None:
+    def record_save(self, begin: float, end: float) -> None:
         """Note that a checkpoint was written from ``begin`` to ``end``, seconds of training."""
         self._last = end
         self._duration = end - begin
@@ -110,7 +110,7 @@ class TimeForecast:
         self.pixels = pixels
         self._marks = [_Mark(step, seconds, 0.0, num_gaussians)]
 
-    def pause(self, seconds: float) -> None:
+    def exclude(self, seconds: float) -> None:
         """Leave ``seconds`` that were not spent training out."""
         self._marks = [replace(mark, seconds=mark.seconds + seconds) for mark in self._marks]
 
@@ -150,7 +150,7 @@ class TimeForecast:
         detail for more; at most up to the configured cap.
         """
         now = self._marks[-1]
-        stop = scaled(config.strategy.stop, config.train.steps)
+        stop = scale_step(config.strategy.stop, config.train.steps)
         if now.step >= stop:
             return now.num_gaussians
         added = max(now.num_gaussians - since.num_gaussians, 0) / max(now.step - since.step, 1)

@@ -31,7 +31,7 @@ class StepReport:
     # rendered, truth: (H, W, 3) on the same background
     rendered: Tensor
     truth: Tensor
-    finding: str | None = None  # lines about what was found out after the step, or None
+    message: str | None = None  # lines about what was found out after the step, or None
 
     @cached_property
     def psnr(self) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dyngs.config import Config
 from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
-from dyngs.models.kind import HasGaussians, HasSizeLimit, capability, kind_of
+from dyngs.models.kind import HasGaussians, HasSizeLimit, capability, find_kind
 
 # Fraction of the limit that is kept free for the random Gaussians with which motion begins
 RANDOM_FRACTION = 0.1
@@ -21,7 +21,7 @@ FEWEST = 500  # Fewest Gaussians that a limit on the size must have room for
 
 def validate_limits(config: Config) -> None:
     """Raise DyngsError where limits or choices of ``config`` contradict it or each other."""
-    uses = kind_of(config.model).uses
+    uses = find_kind(config.model).uses
     for key, value in _given(config).items():
         if key not in uses:
             raise DyngsError(
@@ -86,11 +86,11 @@ def gaussian_limit(config: Config, num_times: int) -> int | None:
     limits = [config.budget.max_gaussians] if config.budget.max_gaussians is not None else []
     megabytes = config.budget.max_mb
     if megabytes is not None and capability(config.model, HasSizeLimit) is not None:
-        limits.append(room(config, num_times, megabytes))
+        limits.append(max_gaussians_in_file(config, num_times, megabytes))
     return min(limits, default=None)
 
 
-def room(config: Config, num_times: int, megabytes: float) -> int:
+def max_gaussians_in_file(config: Config, num_times: int, megabytes: float) -> int:
     """Return the number of Gaussians that fit in a file of so many 1e6 bytes at the usual
     precision.
 

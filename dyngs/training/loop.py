@@ -114,7 +114,7 @@ class Loop:
         while self.trainer.done < self.total and not is_stopped():
             self._edit(self._stages)
             report = self._step()
-            for line in (report.finding or "").splitlines():
+            for line in (report.message or "").splitlines():
                 self.emit(Message(f"step {report.step}: {line}"))
             self._edit(self._limits)
             self.emit(StepDone(report, self))

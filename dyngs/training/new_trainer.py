@@ -9,7 +9,7 @@ import torch
 from dyngs.capture.initial_points import with_first_points
 from dyngs.capture.inspection import before_training
 from dyngs.config import Config, PointsInit, RandomInit
-from dyngs.core.errors import warn
+from dyngs.core.errors import log_warning
 from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader, usual_threads
 from dyngs.data.read import read_capture, require_images
@@ -17,11 +17,11 @@ from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.initialization import InitialGaussians, scene_geometry
 from dyngs.gaussians.model import GaussianModel
-from dyngs.models.kind import HasMotion, StartContext, kind_of
+from dyngs.models.kind import HasMotion, StartContext, find_kind
 from dyngs.models.views import (
     background_colour,
-    resolve_background,
     background_coloured_fraction,
+    resolve_background,
     training_cameras,
     training_times,
 )
@@ -31,7 +31,7 @@ from dyngs.training.corrections.exposure import ViewExposures
 from dyngs.training.corrections.robust import RobustMasks
 from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, SilhouetteLoss
 from dyngs.training.priors import PriorLosses, load_priors
-from dyngs.training.trainer import TrainerParts, Trainer
+from dyngs.training.trainer import Trainer, TrainerParts
 
 GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
 
@@ -68,14 +68,14 @@ def build_trainer(
             may end with; None: the same.
     """
     if capture is None:
-        capture = read_capture(config.data) if restored else prepared(config)
+        capture = read_capture(config.data) if restored else prepare_capture(config)
     generator = torch.Generator().manual_seed(config.run.seed)
     if images is None:
         images = ImageLoader(
             capture.splits["train"], config.data, with_maps=True, decoding_threads=usual_threads()
         )
     priors = PriorLosses()
-    kind = kind_of(config.model)
+    kind = find_kind(config.model)
     if "train.priors" in kind.uses:
         moves = isinstance(kind, HasMotion) and len(set(training_times(capture))) > 1
         priors = load_priors(config, capture, images.views, moves=moves)
@@ -83,10 +83,10 @@ def build_trainer(
         images = images.without_motion_masks()
     background = resolve_background(config, capture)
     extent = scene_geometry(capture).extent
-    findings = [priors.message] if priors.message else []
+    messages = [priors.message] if priors.message else []
     published = capture.has_alpha and config.train.alpha_weight == 0 and background != "random"
     if published and not restored:
-        findings.append(
+        messages.append(
             f"images are compared on {background} alone, as published (train.alpha_weight=0): {background} surfaces "
             "may be transparent"
         )
@@ -131,26 +131,26 @@ def build_trainer(
         background=background,
         extent=extent,
         generator=generator,
-        findings=findings,
+        pending_messages=messages,
         held_out=held_out,
         device=select_device(config.run.device),
     )
 
 
-def prepared(config: Config) -> Capture:
+def prepare_capture(config: Config) -> Capture:
     """Return the capture of a run with the points that its scene begins with, see
     ``with_first_points``.
 
     Problems of the capture and the source of its points are logged.
     """
-    return with_points(require_images(read_capture(config.data)), config)
+    return add_initial_points(require_images(read_capture(config.data)), config)
 
 
-def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Capture:
+def add_initial_points(capture: Capture, config: Config, *, log_messages: bool = True) -> Capture:
     """Return ``capture`` as ``prepared`` does, for a kind whose Gaussians begin at points; others
     need none."""
     lines: list[str] = []
-    if "init" in kind_of(config.model).uses:
+    if "init" in find_kind(config.model).uses:
         init = config.init
         if isinstance(init, PointsInit):
             capture, lines = with_first_points(capture, config.data, init)
@@ -164,8 +164,8 @@ def with_points(capture: Capture, config: Config, *, quiet: bool = False) -> Cap
                 if why is None
                 else [f"init.kind=random draws points around the origin, but {why}: give auto"]
             )
-    for line in [] if quiet else [*lines, *before_training(capture)]:
-        warn(line)
+    for line in [*lines, *before_training(capture)] if log_messages else []:
+        log_warning(line)
     return capture
 
 

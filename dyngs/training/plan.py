@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from dyngs.config import Config, TrainConfig
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.capture import Capture
 from dyngs.gaussians.initialization import InitialGaussians
 from dyngs.models.kind import HasSchedules, capability
-from dyngs.models.schedule import PUBLISHED_STEPS, Length, scaled
+from dyngs.models.schedule import PUBLISHED_STEPS, LengthChange, scale_step
 from dyngs.training.corrections.exposure import WARM_UP
 
 
@@ -68,7 +68,7 @@ def extend_config(config: Config, done: int, steps: int) -> Config:
         DyngsError: so many steps are done already, the run was pruned, or its motion began too
             early for that length.
     """
-    length = Length(done, config.train.steps, steps)
+    length = LengthChange(done, config.train.steps, steps)
     if done > length.was:
         raise DyngsError(
             f"train.steps={steps}: the run was pruned after step {length.was:,}, so its training cannot be made "
@@ -76,7 +76,7 @@ def extend_config(config: Config, done: int, steps: int) -> Config:
         )
     if steps <= done:
         raise DyngsError(
-            f"train.steps={steps}: {counted(done, 'step')} are done already; give more than that"
+            f"train.steps={steps}: {format_count(done, 'step')} are done already; give more than that"
         )
     _require_exposures_stay(config, length)
     changed: dict[str, object] = {"train": _train(config.train, length)}
@@ -86,7 +86,7 @@ def extend_config(config: Config, done: int, steps: int) -> Config:
     return config.model_copy(update=changed)
 
 
-def _require_exposures_stay(config: Config, length: Length) -> None:
+def _require_exposures_stay(config: Config, length: LengthChange) -> None:
     begun, begins = (round(WARM_UP * steps) for steps in (length.was, length.steps))
     if config.train.exposure == "always" and begun < length.done <= begins:
         raise DyngsError(
@@ -101,17 +101,17 @@ def describe_extension(before: Config, after: Config, done: int) -> str:
     no_limit = "" if before.train.minutes is None else "; train.minutes holds no longer"
     return (
         f"goes on from step {done:,} to {steps:,} instead of {before.train.steps:,}, on the schedules of "
-        f"{counted(steps, 'step')}{no_limit}"
+        f"{format_count(steps, 'step')}{no_limit}"
     )
 
 
-def _train(options: TrainConfig, length: Length) -> TrainConfig:
+def _train(options: TrainConfig, length: LengthChange) -> TrainConfig:
     changed: dict[str, object] = {"steps": length.steps, "minutes": None}
     full_at = max(options.resolution_grows_from, options.resolution_full_at)
     if options.initial_downscale > 1 and length.done >= options.resolution_grows_from * length.was:
         changed["resolution_grows_from"] = length.kept(options.resolution_grows_from * length.was)
         changed["resolution_full_at"] = length.kept(full_at * length.was)
     if length.steps > length.was:
-        pace = scaled(options.sh_every, length.was)
+        pace = scale_step(options.sh_every, length.was)
         changed["sh_every"] = max(1, pace * PUBLISHED_STEPS // length.steps)
     return options.model_copy(update=changed)

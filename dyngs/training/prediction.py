@@ -15,7 +15,7 @@ from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.models.checkpoint import CONFIG_ADVICE, Checkpoint, CheckpointInfo, checkpoint_settings
 from dyngs.models.kind import PredictsScenes, capability
-from dyngs.models.prediction import Learner, load_optimizer, optimizer_state, updated
+from dyngs.models.prediction import Learner, load_optimizer, optimizer_state, optimizer_step
 from dyngs.training.events import StepReport
 from dyngs.training.trainer import TrainingEdit, ViewSampler
 
@@ -61,7 +61,7 @@ class NetworkTrainer:
     def update(self, loss: Tensor, step: int) -> None:
         """Do a step of AdamW; none for gradients that are not finite."""
         rate = one_cycle_rate(self.learner.lr, step, self.config.train.steps)
-        self.bad_gradients += not updated(self.optimizer, self.learner.network, loss, rate)
+        self.bad_gradients += not optimizer_step(self.optimizer, self.learner.network, loss, rate)
 
     def apply(self, edit: TrainingEdit) -> None:
         """Do nothing: no limit is for networks."""

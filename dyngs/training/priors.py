@@ -19,7 +19,7 @@ from dyngs.data.tracks import ImageTracks, read_tracks
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.models.model import LossInput, Loss
+from dyngs.models.model import Loss, LossInput
 from dyngs.models.views import training_cameras
 
 SOFT_PX = 0.5  # Charbonnier's constant, px: smaller errors count quadratically

@@ -98,7 +98,7 @@ class Processes:
         if error is None:
             distributed.destroy_process_group()
 
-    def share(self, batch: int) -> range:
+    def views_of_process(self, batch: int) -> range:
         """Return which of the ``batch`` views of a step this process takes."""
         each, rest = divmod(batch, self.size)
         if rest or not each:

@@ -21,7 +21,7 @@ from dyngs.core.tensor_checks import require_indices
 from dyngs.data.capture import Capture
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.models.checkpoint import CONFIG_ADVICE, Checkpoint, CheckpointInfo, checkpoint_settings
-from dyngs.models.model import Correction, LossInput, Loss, Model, RenderedView
+from dyngs.models.model import Correction, Loss, LossInput, Model, RenderedView
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour
@@ -130,7 +130,7 @@ class Trainer(Generic[M]):
     background: str
     extent: float
     generator: torch.Generator
-    findings: list[str] = field(default_factory=list)
+    pending_messages: list[str] = field(default_factory=list)
     held_out: frozenset[int] = frozenset()
     device: torch.device = CPU
     processes: Processes = field(default_factory=Processes)
@@ -176,10 +176,10 @@ class Trainer(Generic[M]):
         self.done = step
         if updated.topology_changed:
             self.processes.require_same(strip_roles(self.model.scene.state()), f"after step {step}")
-        findings = [*self.findings, updated.finding or ""]
-        self.findings.clear()
-        finding = "\n".join(line for line in findings if line)
-        return replace(reports[0], loss=loss, finding=finding or None)
+        messages = [*self.pending_messages, updated.finding or ""]
+        self.pending_messages.clear()
+        message = "\n".join(line for line in messages if line)
+        return replace(reports[0], loss=loss, message=message or None)
 
     def _averaged(self, step: int, losses: Sequence[float]) -> float:
         """Return the mean loss over the views of a step, and average their gradients, too."""
@@ -246,7 +246,7 @@ class Trainer(Generic[M]):
             model.replace_scene(model.scene.without_masks())
             model.stop_growing()
         if edit.kept is not None:
-            model.keep(edit.kept, self.done)
+            model.select_gaussians(edit.kept, self.done)
         if edit.masks is not None:
             model.replace_scene(replace(model.scene, masks=edit.masks))
 
@@ -330,7 +330,7 @@ class Trainer(Generic[M]):
         batch = self.config.train.batch_size
         wanted = self._wanted(step)
         drawn = [self.sampler.next(self.generator, wanted) for _ in range(batch)]
-        fraction = self.processes.share(batch)
+        fraction = self.processes.views_of_process(batch)
         if batch == 1:
             return [(drawn[0], None)]
         seeds = torch.randint(2**62, (batch,), generator=self.generator, device="cpu").tolist()
@@ -342,9 +342,9 @@ class Trainer(Generic[M]):
         if self.images.decoded_ahead:
             batch = self.config.train.batch_size
             count = self.images.decoded_ahead * self.processes.size
-            fraction = self.processes.share(batch)
-            peek = self.sampler.peek(count, self._wanted(step))
-            self.images.expect([view for i, view in enumerate(peek) if i % batch in fraction])
+            fraction = self.processes.views_of_process(batch)
+            upcoming = self.sampler.peek(count, self._wanted(step))
+            self.images.expect([view for i, view in enumerate(upcoming) if i % batch in fraction])
         return image
 
     def _wanted(self, step: int) -> Callable[[int], bool]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.scene import as_human_scene
@@ -24,12 +24,12 @@ from dyngs.view.edit import EditControls, can_be_edited
 from dyngs.view.layers import LAYERS, PARTS, draw
 from dyngs.view.session import Keyframe, Recording
 from dyngs.view.source import SceneSource
-from dyngs.view.views import centers_of, has_timeline, pose_of, initial_viewpoint, views_of
+from dyngs.view.views import centers_of, has_timeline, initial_viewpoint, pose_of, views_of
 
 if TYPE_CHECKING:
     import viser
 
-    from dyngs.view.server import Browsing
+    from dyngs.view.server import BrowserConnection
 
 NEAREST = "nearest"
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
@@ -48,20 +48,22 @@ HELP = """\
 class Controls:
     """Controls of one browser; ``show`` makes them anew for another scene."""
 
-    def __init__(self, browsing: Browsing, source: SceneSource, motions: Mapping[str, Path]) -> None:
-        self._browsing, self._source, self._motions = browsing, source, motions
-        self._frusta = CameraFrusta(browsing)
+    def __init__(
+        self, connection: BrowserConnection, source: SceneSource, motions: Mapping[str, Path]
+    ) -> None:
+        self._connection, self._source, self._motions = connection, source, motions
+        self._frusta = CameraFrusta(connection)
         self._folders: list[Any] = []
         self._edits: EditControls | None = None
-        gui = browsing.client.gui
+        gui = connection.client.gui
         names = source.names
         if len(names) > 1:
-            first = browsing.loaded.name
+            first = connection.loaded.name
             chosen = first if first in names else names[0]
             runs = gui.add_dropdown("Run", names, initial_value=chosen)
             runs.on_update(lambda _: self._choose(str(runs.value)))
-        browsing.status = gui.add_markdown("")
-        self.show(browsing.loaded)
+        connection.status = gui.add_markdown("")
+        self.show(connection.loaded)
 
     def show(self, opened: OpenedScene) -> None:
         """Make the controls that a scene needs."""
@@ -71,9 +73,9 @@ class Controls:
         if self._edits is not None:
             self._edits.remove()
             self._edits = None
-        browsing = self._browsing
-        gui = browsing.client.gui
-        browsing.time_slider = None
+        connection = self._connection
+        gui = connection.client.gui
+        connection.time_slider = None
         parts = dict[str, Callable[[], None]]()
         parts["Show"] = lambda: self._add_display(gui, opened)
         if has_timeline(opened):
@@ -95,59 +97,59 @@ class Controls:
 
     def _choose(self, name: str) -> None:
         """Load another scene, in the thread that draws."""
-        browsing = self._browsing
-        note = browsing.client.add_notification("Loading", name, loading=True)
+        connection = self._connection
+        note = connection.client.add_notification("Loading", name, loading=True)
 
         def load() -> None:
             try:
-                browsing.loaded = self._source.load(name)
+                connection.loaded = self._source.load(name)
             finally:
                 note.remove()
-            browsing.session.show(browsing.loaded)
-            self.show(browsing.loaded)
-            browsing.go_to(None)
+            connection.session.show(connection.loaded)
+            self.show(connection.loaded)
+            connection.go_to(None)
 
-        browsing.session.ask(load)
+        connection.session.submit_job(load)
 
     def _change(self, **changes: Any) -> None:
         """Show something else, which frusta may cover."""
-        self._browsing.session.change(**changes)
+        self._connection.session.change(**changes)
         self._frusta.hide_covering_frusta()
 
     def _add_edits(self, opened: OpenedScene) -> None:
-        self._edits = EditControls(self._browsing, opened)
+        self._edits = EditControls(self._connection, opened)
 
     def _add_display(self, gui: viser.GuiApi, opened: OpenedScene) -> None:
-        session = self._browsing.session
+        session = self._connection.session
         scene = opened.renderable if isinstance(opened.renderable, GaussianScene) else None
         layers = [name for name in LAYERS if name != "error" or len(views_of(opened))]
-        if session.look.layer not in layers:
+        if session.display.layer not in layers:
             session.change(layer="colour")
         hint = "error: against the truth, at a camera of the capture"
-        layer = gui.add_dropdown("What", layers, initial_value=session.look.layer, hint=hint)
+        layer = gui.add_dropdown("What", layers, initial_value=session.display.layer, hint=hint)
         layer.on_update(lambda _: self._change(layer=layer.value))
         has_parts = scene is not None and 0 < scene.num_moving < len(scene)
         if has_parts or (scene is not None and opened.in_training and has_timeline(opened)):
-            part = gui.add_dropdown("Parts", PARTS, initial_value=session.look.part)
+            part = gui.add_dropdown("Parts", PARTS, initial_value=session.display.part)
             part.on_update(lambda _: session.change(part=part.value))
         else:
             session.change(part="all")
         screenshot = gui.add_button("Screenshot", hint="as .png, of the size of the window")
-        screenshot.on_click(lambda _: session.ask(self._screenshot))
-        gui.add_button("Back to start").on_click(lambda _: self._browsing.go_to(None))
+        screenshot.on_click(lambda _: session.submit_job(self._screenshot))
+        gui.add_button("Back to start").on_click(lambda _: self._connection.go_to(None))
 
     def _screenshot(self) -> None:
         """Send what is shown as a .png, in the thread that draws."""
         from PIL import Image
 
-        session = self._browsing.session
+        session = self._connection.session
         stream = io.BytesIO()
-        Image.fromarray(draw(session.opened, session.shot())).save(stream, "png")
+        Image.fromarray(draw(session.opened, session.view_request())).save(stream, "png")
         name = f"{session.opened.name}_{session.time:.3f}.png"
-        self._browsing.client.send_file_download(name, stream.getvalue(), save_immediately=True)
+        self._connection.client.send_file_download(name, stream.getvalue(), save_immediately=True)
 
     def _add_time(self, gui: viser.GuiApi) -> None:
-        session = self._browsing.session
+        session = self._connection.session
         timeline = session.timeline
         slider = gui.add_slider("Time", 0.0, 1.0, 0.001, round(session.time, 3))
         slider.on_update(
@@ -161,19 +163,19 @@ class Controls:
         hint = "1: as it was filmed"
         speed = gui.add_dropdown("Speed", SPEEDS, initial_value=f"{timeline.speed:g}", hint=hint)
         speed.on_update(lambda _: session.change_timeline(speed=float(speed.value)))
-        self._browsing.time_slider = slider
+        self._connection.time_slider = slider
 
     def _add_capture(self, gui: viser.GuiApi, opened: OpenedScene) -> None:
-        session = self._browsing.session
+        session = self._connection.session
         hint = "frusta with their images; click one to go there"
         cameras = gui.add_checkbox("Cameras", False, hint=hint)
         cameras.on_update(
             lambda _: self._frusta.show(opened) if cameras.value else self._frusta.remove()
         )
         hint = "with the true image, on the right of the line"
-        compare = gui.add_checkbox("Compare", session.look.comparing, hint=hint)
+        compare = gui.add_checkbox("Compare", session.display.comparing, hint=hint)
         compare.on_update(lambda _: self._change(comparing=bool(compare.value)))
-        divide = gui.add_slider("Divide", 0.0, 1.0, 0.01, session.look.divide)
+        divide = gui.add_slider("Divide", 0.0, 1.0, 0.01, session.display.divide)
         divide.on_update(lambda _: session.change(divide=float(divide.value)))
         names = (NEAREST, *views_of(opened).names)
         image = gui.add_dropdown("Image", names)
@@ -183,13 +185,13 @@ class Controls:
             index = names.index(image.value) - 1
             session.change(view=None if index < 0 else index)
             if index >= 0:
-                self._browsing.go_to(index)
+                self._connection.go_to(index)
 
         image.on_update(choose)
 
     def _add_motions(self, gui: viser.GuiApi) -> None:
         """Add the motion picker, for files by name, and the sliders of the pose."""
-        browsing = self._browsing
+        connection = self._connection
         motion = gui.add_dropdown("Motion", (AS_CAPTURED, AT_REST, BY_SLIDERS, *self._motions))
         hint = "in motions of files, feet on the floor do not slide"
         feet = gui.add_checkbox("Keep feet", False, hint=hint)
@@ -199,17 +201,17 @@ class Controls:
 
         def work() -> None:
             choice = str(motion.value)
-            opened = browsing.loaded
+            opened = connection.loaded
             if choice == AT_REST:
                 opened = opened.at_rest()
             elif choice == BY_SLIDERS:
-                opened = posed(opened, angles)
+                opened = pose_person(opened, angles)
             elif choice != AS_CAPTURED:
                 opened = opened.play_motion(self._motions[choice], keep_feet=bool(feet.value))
-            browsing.session.show(opened)
+            connection.session.show(opened)
 
         def play(_: Any) -> None:
-            browsing.session.ask(work)
+            connection.session.submit_job(work)
 
         def pick(_: Any) -> None:
             shown = angles.get(joint.value, [0.0] * 3)
@@ -229,8 +231,8 @@ class Controls:
             slider.on_update(turn)
 
     def _add_path(self, gui: viser.GuiApi) -> None:
-        browsing = self._browsing
-        session = browsing.session
+        connection = self._connection
+        session = connection.session
         recording = Recording()
         status = gui.add_markdown("no keyframes yet")
         hint = "from the keyframe that is added to the next one"
@@ -239,13 +241,13 @@ class Controls:
         def record(**changes: Any) -> None:
             nonlocal recording
             recording = replace(recording, **changes)
-            count = counted(len(recording), "keyframe")
+            count = format_count(len(recording), "keyframe")
             status.content = f"{count}, {recording.duration:.1f} s"
 
         def add(_: Any) -> None:
-            if session.eye is not None:
+            if session.browser_camera is not None:
                 time = None if session.opened.renderable.is_static else session.time
-                keyframe = Keyframe(session.eye.camera(), time, float(seconds.value))
+                keyframe = Keyframe(session.browser_camera.camera(), time, float(seconds.value))
                 record(keyframes=(*recording.keyframes, keyframe))
 
         def save(_: Any) -> None:
@@ -253,7 +255,7 @@ class Controls:
                 first = recording.keyframes[0].camera
                 size = first.width // 2 * 2, first.height // 2 * 2  # as videos need it
                 text = recording.document(size, 30.0, session.opened)
-                client = browsing.client
+                client = connection.client
                 client.send_file_download(FILE_NAME, text.encode(), save_immediately=True)
 
         gui.add_button("Add keyframe", hint="this camera, at this time").on_click(add)
@@ -275,14 +277,14 @@ def _add_help(gui: viser.GuiApi, opened: OpenedScene) -> None:
         gui.add_markdown(f"*{escape_markdown(note)}*")
 
 
-def posed(opened: OpenedScene, angles: Mapping[str, Sequence[float]]) -> OpenedScene:
+def pose_person(opened: OpenedScene, angles: Mapping[str, Sequence[float]]) -> OpenedScene:
     """Return a person in the rest pose with joints rotated by ``angles``: degrees about x, y and z,
     in this order, by joint."""
     from scipy.spatial.transform import Rotation
 
     rest = opened.at_rest()
     person = as_human_scene(rest.renderable)
-    clip = None if person is None else person.replacement_clip
+    clip = None if person is None else person.played
     if person is None or clip is None:
         return rest
     turns = torch.zeros_like(clip.poses)
@@ -315,10 +317,10 @@ MOST_FRUSTA = 120
 class CameraFrusta:
     """Frusta of one browser."""
 
-    def __init__(self, browsing: Browsing) -> None:
-        self._browsing = browsing
+    def __init__(self, connection: BrowserConnection) -> None:
+        self._connection = connection
         self._handles: list[tuple[Any, np.ndarray, float]] = []
-        browsing.on_move = self.hide_covering_frusta
+        connection.on_move = self.hide_covering_frusta
 
     def show(self, opened: OpenedScene) -> None:
         """Add the frusta, image by image, as the thread that draws finds time; of a camera that
@@ -334,7 +336,9 @@ class CameraFrusta:
         size = min(size, 0.15 * spread) if spread > 1e-3 * size else size
         indices = list({pose.tobytes(): i for i, pose in enumerate(poses)}.values())
         for index in (indices[i] for i in evenly_spaced(len(indices), MOST_FRUSTA)):
-            self._browsing.session.ask(lambda index=index: self._add(opened, index, size, handles))
+            self._connection.session.submit_job(
+                lambda index=index: self._add(opened, index, size, handles)
+            )
 
     def remove(self) -> None:
         handles = self._handles
@@ -345,14 +349,14 @@ class CameraFrusta:
     def hide_covering_frusta(self) -> None:
         """Hide the frusta that the browser's camera stands in, and all where the image is of
         another camera."""
-        session = self._browsing.session
-        eye = session.eye
-        if eye is None:
+        session = self._connection.session
+        browser_camera = session.browser_camera
+        if browser_camera is None:
             return
         is_elsewhere = session.shown_view is not None
         for handle, position, size in list(self._handles):
             # An image covers what is behind it up to 1.5 times the depth of its frustum.
-            is_near = float(np.linalg.norm(position - eye.position)) < 1.5 * size
+            is_near = float(np.linalg.norm(position - browser_camera.position)) < 1.5 * size
             handle.visible = not (is_elsewhere or is_near)
 
     def _add(self, opened: OpenedScene, index: int, size: float, handles: list[Any]) -> None:
@@ -364,7 +368,7 @@ class CameraFrusta:
         image = None
         if shown.thumbnails is not None:
             image = to_uint8(shown.thumbnails[index].composite(opened.background).numpy())
-        handle = self._browsing.client.scene.add_camera_frustum(
+        handle = self._connection.client.scene.add_camera_frustum(
             f"/cameras/{index}",
             fov=2 * float(np.arctan(0.5 * camera.height / camera.intrinsics[0, 1, 1])),
             aspect=camera.width / camera.height,
@@ -383,11 +387,11 @@ class CameraFrusta:
         self.hide_covering_frusta()
 
     def _go(self, index: int) -> None:
-        browsing = self._browsing
-        opened = browsing.session.opened
+        connection = self._connection
+        opened = connection.session.opened
         time = views_of(opened).views[index].time
-        browsing.go_to(index)
+        connection.go_to(index)
         if time is not None and not opened.renderable.is_static:
-            browsing.session.set_time(time)
-            if browsing.time_slider is not None:
-                browsing.time_slider.value = round(time, 3)
+            connection.session.set_time(time)
+            if connection.time_slider is not None:
+                connection.time_slider.value = round(time, 3)

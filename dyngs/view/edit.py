@@ -16,17 +16,17 @@ import torch
 from torch import Tensor
 
 from dyngs.api.edit import write_part
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.geometry import look_at, perpendicular, with_poses
 from dyngs.export.edit.crop import Box, gaussians_in_region
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.similarity import UNMOVED, Similarity
 from dyngs.runs.opened import OpenedScene
-from dyngs.view.layers import Shot, depth_of
+from dyngs.view.layers import ViewRequest, depth_of
 from dyngs.view.views import camera_at, initial_viewpoint
 
 if TYPE_CHECKING:
-    from dyngs.view.server import Browsing
+    from dyngs.view.server import BrowserConnection
 
 _SIZE = 9  # px, width and height of the image whose middle is picked
 _SOLID = 0.5  # opacity below which a ray meets nothing
@@ -41,8 +41,12 @@ def world_of(opened: OpenedScene) -> Similarity:
     return UNMOVED if opened.captured is None else opened.world
 
 
-def picked(
-    opened: OpenedScene, origin: np.ndarray, direction: np.ndarray, pixel: float, shot: Shot
+def pick_point(
+    opened: OpenedScene,
+    origin: np.ndarray,
+    direction: np.ndarray,
+    pixel: float,
+    request: ViewRequest,
 ) -> np.ndarray | None:
     """Return the point (3,) of the scene that a ray meets, at the depth that is drawn there; None:
     it meets nothing.
@@ -58,7 +62,7 @@ def picked(
     forward = direction / length
     camera = camera_at((1, 0, 0, 0), origin, 2 * math.atan(0.5 * _SIZE * pixel), (_SIZE, _SIZE))
     camera = with_poses(camera, look_at(origin, origin + forward, perpendicular(forward))[None])
-    found = depth_of(opened, Shot(camera, shot.time, part=shot.part))
+    found = depth_of(opened, ViewRequest(camera, request.time, part=request.part))
     depth, alpha = (float(x[_SIZE // 2, _SIZE // 2]) for x in found)
     return origin + depth * forward if alpha >= _SOLID else None
 
@@ -135,7 +139,7 @@ class EditState:
             lines.append(f"distance: **{length:.4g} {'m' if self.whole.scaled else 'units'}**")
             lines.append(f'`--scale "{texts[0]} {texts[1]} LENGTHm"`')
         lines.append(f"box: `--crop {low} {high}`")
-        total = counted(len(self.whole.scene), "Gaussian")
+        total = format_count(len(self.whole.scene), "Gaussian")
         lines.append(f"{len(self.rows):,} of {total} left")
         return "\n\n".join(lines)
 
@@ -156,16 +160,16 @@ def can_be_edited(opened: OpenedScene) -> bool:
 class EditControls:
     """Controls and marks of one browser for one scene; ``remove`` takes the marks away."""
 
-    def __init__(self, browsing: Browsing, opened: OpenedScene) -> None:
+    def __init__(self, connection: BrowserConnection, opened: OpenedScene) -> None:
         begin = initial_viewpoint(opened)
         world = world_of(opened)
         extent = begin.extent * world.scale
         size = np.full(3, float(f"{0.5 * extent:.2g}"))
         self.editing = EditState(opened, world.points(begin.center), size)
-        self._browsing, self._extent = browsing, begin.extent
+        self._connection, self._extent = connection, begin.extent
         self._back = world.inverse()
         self._marks = dict[str, Any]()
-        gui = browsing.client.gui
+        gui = connection.client.gui
         hint = "click on the scene: two points and their distance"
         pick = gui.add_checkbox("Pick points", False, hint=hint)
         hint = "drag its arrows; along the axes of the scene"
@@ -188,7 +192,7 @@ class EditControls:
             gui.add_button(name).on_click(lambda _, job=job: self._ask(job))
 
     def remove(self) -> None:
-        self._browsing.client.scene.remove_click_callback()
+        self._connection.client.scene.remove_click_callback()
         for mark in self._marks.values():
             mark.remove()
         self._marks.clear()
@@ -200,16 +204,16 @@ class EditControls:
             try:
                 job()
             except DyngsError as error:
-                self._browsing.notify("Not done", str(error))
+                self._connection.notify("Not done", str(error))
             self._refresh()
 
-        self._browsing.session.ask(work)
+        self._connection.session.submit_job(work)
 
     def _refresh(self) -> None:
         """Draw the picked points, the line between them, and the box; say where they are."""
         editing = self.editing
         editing.size = np.array(self._size.value, np.float64)
-        scene = self._browsing.client.scene
+        scene = self._connection.client.scene
         for name in ("A", "B", "line", "box"):
             if name in self._marks:
                 self._marks.pop(name).remove()
@@ -235,7 +239,7 @@ class EditControls:
         self._text.content = editing.description
 
     def _listen(self, listens: bool) -> None:
-        scene = self._browsing.client.scene
+        scene = self._connection.client.scene
         scene.remove_click_callback()
         if listens:
             scene.on_click()(lambda event: self._ask(lambda: self._pick(event)))
@@ -244,13 +248,13 @@ class EditControls:
             self._refresh()
 
     def _pick(self, event: Any) -> None:
-        session = self._browsing.session
-        if session.eye is None:
+        session = self._connection.session
+        if session.browser_camera is None:
             return
-        pixel = session.eye.fov / session.eye.size[1]
+        pixel = session.browser_camera.fov / session.browser_camera.size[1]
         origin = np.array(event.ray_origin, np.float64)
         direction = np.array(event.ray_direction, np.float64)
-        point = picked(session.opened, origin, direction, pixel, session.shot())
+        point = pick_point(session.opened, origin, direction, pixel, session.view_request())
         if point is None:
             raise DyngsError("the scene is not solid at this place")
         self.editing.pick(point)
@@ -258,7 +262,7 @@ class EditControls:
     def _show_box(self) -> None:
         """Show or hide the box and its gizmo, along the axes of the frame."""
         if self._box.value:
-            gizmo = self._browsing.client.scene.add_transform_controls(
+            gizmo = self._connection.client.scene.add_transform_controls(
                 "/edit/gizmo",
                 scale=0.3 * self._extent,
                 disable_rotations=True,
@@ -279,7 +283,9 @@ class EditControls:
     def _delete(self, *, inside: bool) -> None:
         gone = self.editing.delete(inside=inside)
         self._show()
-        self._browsing.notify("Deleted", f"{counted(gone, 'Gaussian')}; Undo brings them back")
+        self._connection.notify(
+            "Deleted", f"{format_count(gone, 'Gaussian')}; Undo brings them back"
+        )
 
     def _undo(self) -> None:
         if self.editing.steps:
@@ -287,10 +293,10 @@ class EditControls:
             self._show()
 
     def _show(self) -> None:
-        self._browsing.loaded = self.editing.left
-        self._browsing.session.show(self.editing.left)
+        self._connection.loaded = self.editing.left
+        self._connection.session.show(self.editing.left)
 
     def _save(self) -> None:
-        data = self.editing.file(self._browsing.session.time)
+        data = self.editing.file(self._connection.session.time)
         name = f"{self.editing.whole.name.removesuffix('.ply')}_edited.ply"
-        self._browsing.client.send_file_download(name, data, save_immediately=True)
+        self._connection.client.send_file_download(name, data, save_immediately=True)

@@ -24,7 +24,7 @@ PARTS: tuple[Part, ...] = get_args(Part)
 
 
 @dataclass(frozen=True)
-class Shot:
+class ViewRequest:
     """One image to draw.
 
     Attributes:
@@ -45,25 +45,25 @@ class Shot:
     is_moving: bool = False
 
 
-def draw(opened: OpenedScene, shot: Shot) -> np.ndarray:
+def draw(opened: OpenedScene, request: ViewRequest) -> np.ndarray:
     """Return the image (H, W, 3) uint8 of a shot."""
-    if shot.view is None:
-        return _layer(opened, shot)
+    if request.view is None:
+        return _layer(opened, request)
     views = views_of(opened)
-    size = shot.camera.width, shot.camera.height
-    camera = resize_cameras(views.cameras[shot.view], *size)
-    rgb = _layer(opened, replace(shot, camera=camera, time=views.views[shot.view].time))
-    truth = truth_in_window(opened, shot.view, size)
+    size = request.camera.width, request.camera.height
+    camera = resize_cameras(views.cameras[request.view], *size)
+    rgb = _layer(opened, replace(request, camera=camera, time=views.views[request.view].time))
+    truth = truth_in_window(opened, request.view, size)
     if truth is None:
         return rgb
     beside = truth[..., 3:] == 0
     truth = truth[..., :3]
-    if shot.layer == "error":
+    if request.layer == "error":
         difference = np.abs(rgb.astype(np.float32) - truth) * ~beside / 255.0
         return color_map(4.0 * difference.mean(axis=2), "magma")
     rgb = np.where(beside, rgb // 2, rgb)  # there is no truth: darker
     made = np.where(beside, rgb, truth)
-    column = round(min(max(shot.divide, 0.0), 1.0) * size[0])
+    column = round(min(max(request.divide, 0.0), 1.0) * size[0])
     made[:, :column] = rgb[:, :column]
     if 0 < column < size[0]:
         made[:, max(column - 1, 0) : column + 1] = (255, 200, 0)
@@ -84,45 +84,45 @@ def truth_in_window(opened: OpenedScene, view: int, size: tuple[int, int]) -> np
 
 
 @torch.no_grad()
-def _layer(opened: OpenedScene, shot: Shot) -> np.ndarray:
+def _layer(opened: OpenedScene, request: ViewRequest) -> np.ndarray:
     """Return one layer (H, W, 3) uint8; for the error it is the colours."""
-    match shot.layer:
+    match request.layer:
         case "depth":
-            return depth_to_rgb(*depth_of(opened, shot))
+            return depth_to_rgb(*depth_of(opened, request))
         case "alpha":
-            pixels = _rendering(opened, shot).alpha[0, ..., None].expand(-1, -1, 3)
+            pixels = _rendering(opened, request).alpha[0, ..., None].expand(-1, -1, 3)
         case _:
-            pixels = _rendering(opened, shot).rgb[0]
+            pixels = _rendering(opened, request).rgb[0]
     return to_uint8(pixels.clamp(0, 1).cpu().numpy())
 
 
-def coarser(opened: OpenedScene, most: int) -> OpenedScene:
+def with_levels(opened: OpenedScene, most: int) -> OpenedScene:
     """Return a still scene of which at most ``most`` Gaussians are drawn while anything moves.
     Raises DyngsError."""
     opened = opened.noted(f"while anything moves, at most {most:,} Gaussians are drawn")
-    opened.once("levels", lambda: LevelScene.of(opened.renderable, most))
+    opened.once("levels", lambda: LevelScene.from_scene(opened.renderable, most))
     return opened
 
 
-def _rendering(opened: OpenedScene, shot: Shot, **options: Any) -> Rendering:
+def _rendering(opened: OpenedScene, request: ViewRequest, **options: Any) -> Rendering:
     """Return a rendering, on the CPU; the scene at the last time is kept."""
-    part = shot.part
+    part = request.part
     scene = opened.renderable
     levels: LevelScene | None = opened.once("levels", lambda: None)
-    if levels is not None and shot.is_moving and part == "all" and not options:
-        return levels.render(shot.camera).to(device="cpu")
+    if levels is not None and request.is_moving and part == "all" and not options:
+        return levels.render(request.camera).to(device="cpu")
     if part != "all":
         scene = opened.once(part, lambda: opened.scene.part(part))
     kept: dict[str, tuple[float | None, TimeStep]] = opened.once("time steps", dict)
-    if part not in kept or kept[part][0] != shot.time:
-        kept[part] = shot.time, scene.time_step(shot.time)
+    if part not in kept or kept[part][0] != request.time:
+        kept[part] = request.time, scene.time_step(request.time)
     how = replace(scene.options, **options)
-    return scene.render(shot.camera, kept[part][1], options=how).to(device="cpu")
+    return scene.render(request.camera, kept[part][1], options=how).to(device="cpu")
 
 
 @torch.no_grad()
-def depth_of(opened: OpenedScene, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
+def depth_of(opened: OpenedScene, request: ViewRequest) -> tuple[np.ndarray, np.ndarray]:
     """Return the expected depth (H, W), world units along the axis of the camera, and the opacity
     (H, W) there."""
-    made = _rendering(opened, shot, depth="expected")
+    made = _rendering(opened, request, depth="expected")
     return np.zeros(0) if made.depth is None else made.depth[0].numpy(), made.alpha[0].numpy()

@@ -20,9 +20,9 @@ from urllib.parse import parse_qs, urlsplit
 
 from dyngs.core.errors import DyngsError, format_one_line
 from dyngs.runs.opened import OpenedScene
-from dyngs.view.session import RenderScheduler, BrowserCamera, SentImage, Session
+from dyngs.view.session import BrowserCamera, RenderScheduler, SentImage, Session
 from dyngs.view.source import SceneSource
-from dyngs.view.views import fitting_fov, orbit_center, pose_of, initial_viewpoint, views_of
+from dyngs.view.views import fitting_fov, initial_viewpoint, orbit_center, pose_of, views_of
 
 if TYPE_CHECKING:
     import viser
@@ -170,7 +170,7 @@ class ServerOptions:
     in_thread: bool = True
 
 
-class Browsing:
+class BrowserConnection:
     """One browser: its connection, its session, and the images that went to it; ``opened`` is what
     it sees first."""
 
@@ -258,24 +258,26 @@ class Viewer:
         DyngsError: viser is not installed, or the port cannot be had.
     """
 
-    def __init__(self, source: SceneSource, first: OpenedScene, serving: ServerOptions = ServerOptions()) -> None:
+    def __init__(
+        self, source: SceneSource, first: OpenedScene, serving: ServerOptions = ServerOptions()
+    ) -> None:
         require_viser()
         import viser
 
         self.source, self.first, self.serving = source, first, serving
         self.drawer = RenderScheduler()
-        self._browsing: dict[int, Browsing] = {}
+        self._connections: dict[int, BrowserConnection] = {}
         gate = access_policy_for(serving.host)
         port = free_port(serving.host, serving.port)
-        with enforce_access(gate), quiet():
+        with enforce_access(gate), silence_viser():
             self.server = viser.ViserServer(host=serving.host, port=port, verbose=False)
         self.link = link_to(serving.host, self.server.get_port(), gate.token)
         self._prepare()
 
     @property
-    def browsing(self) -> tuple[Browsing, ...]:
+    def connections(self) -> tuple[BrowserConnection, ...]:
         """All browsers that are connected."""
-        return tuple(self._browsing.values())
+        return tuple(self._connections.values())
 
     def __enter__(self) -> Viewer:
         if self.serving.in_thread:
@@ -286,10 +288,10 @@ class Viewer:
 
     def __exit__(self, *_: object) -> None:
         """Close the page; browsers that show it say so."""
-        for browsing in self.browsing:
-            self.drawer.remove(browsing.session)
+        for connection in self.connections:
+            self.drawer.remove(connection.session)
         self.drawer.stop()
-        with quiet():
+        with silence_viser():
             self.server.stop()
 
     def _prepare(self) -> None:
@@ -316,23 +318,23 @@ class Viewer:
     def _connected(self, client: viser.ClientHandle) -> None:
         from dyngs.view.controls import Controls
 
-        browsing = Browsing(client, self.first, self.serving.target)
-        self._browsing[client.client_id] = browsing
-        Controls(browsing, self.source, self.serving.motions)
+        connection = BrowserConnection(client, self.first, self.serving.target)
+        self._connections[client.client_id] = connection
+        Controls(connection, self.source, self.serving.motions)
 
         async def moved(_: viser.CameraHandle) -> None:
-            browsing.camera_moved()
+            connection.camera_moved()
 
         client.camera.on_update(moved)
-        self.drawer.add(browsing.session)
-        browsing.go_to(None)
+        self.drawer.add(connection.session)
+        connection.go_to(None)
         if client.client_id not in self.server.get_clients():  # it went while all this was made
             self._gone(client)
 
     def _gone(self, client: viser.ClientHandle) -> None:
-        browsing = self._browsing.pop(client.client_id, None)
-        if browsing is not None:
-            self.drawer.remove(browsing.session)
+        connection = self._connections.pop(client.client_id, None)
+        if connection is not None:
+            self.drawer.remove(connection.session)
 
 
 def require_viser() -> None:
@@ -346,7 +348,7 @@ def require_viser() -> None:
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
+def silence_viser() -> Iterator[None]:
     """Keep viser from printing its own lines."""
     import rich
 

@@ -22,7 +22,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.geometry import checked_pose
 from dyngs.export.camera_paths import Keyframes, interpolate_keyframes, resize_cameras
 from dyngs.runs.opened import OpenedScene
-from dyngs.view.layers import Layer, Part, Shot, draw
+from dyngs.view.layers import Layer, Part, ViewRequest, draw
 from dyngs.view.views import camera_at, nearest_view, views_of
 
 _LOG = logging.getLogger(__name__)
@@ -87,7 +87,7 @@ class Display:
     """What is shown.
 
     Attributes:
-        layer, part, divide: as in ``Shot``.
+        layer, part, divide: as in ``ViewRequest``.
         comparing: show the truth next to the render.
         view: index of the view that is compared with; None: the nearest.
     """
@@ -196,22 +196,22 @@ class Session:
         self.on_change: Callable[[], None] = lambda: None
         self.on_play: Callable[[bool], None] = lambda playing: None
         self.on_error: Callable[[str], None] = lambda message: None
-        self.opened, self.look = opened, Display()
-        self.eye: BrowserCamera | None = None
+        self.opened, self.display = opened, Display()
+        self.browser_camera: BrowserCamera | None = None
         self.timeline = Timeline(seconds=opened.seconds)
         self.closed = False
         self.failure: str | None = None
 
-    def move(self, eye: BrowserCamera) -> None:
+    def move(self, browser_camera: BrowserCamera) -> None:
         """Look from ``eye`` from now on."""
-        if eye != self.eye:
-            self.eye = eye
+        if browser_camera != self.browser_camera:
+            self.browser_camera = browser_camera
             self._note_change()
 
     def change(self, **changes: Any) -> None:
         """Show something else: attributes of ``Display``."""
         with self._lock:
-            self.look = replace(self.look, **changes)
+            self.display = replace(self.display, **changes)
         self._note_change()
 
     def set_time(self, time: float) -> None:
@@ -234,13 +234,13 @@ class Session:
         self._preview = recording, self._clock()
         self._note_change()
 
-    def take(self, opened: OpenedScene, *, refreshes: bool) -> None:
+    def update_scene(self, opened: OpenedScene, *, refreshes: bool) -> None:
         """Look at a newer state of the scene; ``refreshes``: draw it, as large, even if nothing
         else has changed."""
         self.opened = opened
         self._is_stale |= refreshes
 
-    def ask(self, job: Callable[[], None]) -> None:
+    def submit_job(self, job: Callable[[], None]) -> None:
         """Have ``job`` run by the thread that draws, before the next image."""
         self._jobs.append(job)
         self.on_change()
@@ -253,18 +253,22 @@ class Session:
     @property
     def shown_view(self) -> int | None:
         """Index of the view whose truth is shown; None without any."""
-        look = self.look
-        eye = self.eye
+        display = self.display
+        browser_camera = self.browser_camera
         opened = self.opened
-        has_truth = look.comparing or look.layer == "error"
-        if eye is None or not has_truth or not len(views_of(opened)):
+        has_truth = display.comparing or display.layer == "error"
+        if browser_camera is None or not has_truth or not len(views_of(opened)):
             return None
-        return nearest_view(opened, eye.camera(), self.time) if look.view is None else look.view
+        return (
+            nearest_view(opened, browser_camera.camera(), self.time)
+            if display.view is None
+            else display.view
+        )
 
     def due(self) -> float | None:
         """Return in how many seconds something is to be drawn; 0: now, None: not before something
         changes."""
-        if self.closed or self.eye is None:
+        if self.closed or self.browser_camera is None:
             return None
         if self._jobs:
             return 0.0
@@ -278,7 +282,7 @@ class Session:
 
     def draw_next(self) -> None:
         """Do what is due: a job, or the next image."""
-        if self.closed or self.eye is None:
+        if self.closed or self.browser_camera is None:
             return
         if self._jobs:
             self._jobs.popleft()()
@@ -294,7 +298,7 @@ class Session:
         size = _scaled(full, math.sqrt(self._area / math.prod(full))) if is_moving else full
         self._is_stale = False
         self._is_refined = True  # if it fails, it is not tried again
-        image = draw(self.opened, replace(self.shot(size), is_moving=is_moving))
+        image = draw(self.opened, replace(self.view_request(size), is_moving=is_moving))
         if not self.closed:
             self._send(SentImage(image, not is_moving, self._clock() - start))
         now = self._clock()
@@ -303,22 +307,24 @@ class Session:
             self._area = max(math.prod(size) * math.sqrt(factor), _SMALLEST_AREA)
         self._is_refined = not is_moving and version == self._changed_at
 
-    def shot(self, size: tuple[int, int] | None = None) -> Shot:
+    def view_request(self, size: tuple[int, int] | None = None) -> ViewRequest:
         """Return what is shown now as an image of ``size``; None: that of the window."""
-        if self.eye is None:
+        if self.browser_camera is None:
             raise ValueError("there is no camera yet")
-        look = self.look
+        display = self.display
         size = size or self._full_size
-        camera = self.eye.camera(size)
+        camera = self.browser_camera.camera(size)
         view = self.shown_view
         time = self.time
         if self._preview is not None:
             recording, start = self._preview
             camera, time = recording.at(self._clock() - start, size)
             view = None
-        layer = "colour" if look.layer == "error" and view is None else look.layer
+        layer = "colour" if display.layer == "error" and view is None else display.layer
         shown = None if self.opened.renderable.is_static else time
-        return Shot(camera, shown, layer, look.part, view, look.divide if look.comparing else 1.0)
+        return ViewRequest(
+            camera, shown, layer, display.part, view, display.divide if display.comparing else 1.0
+        )
 
     @property
     def _is_moving(self) -> bool:
@@ -327,7 +333,7 @@ class Session:
 
     @property
     def _full_size(self) -> tuple[int, int]:
-        size = (640, 480) if self.eye is None else self.eye.size
+        size = (640, 480) if self.browser_camera is None else self.browser_camera.size
         return _scaled(size, _LONGEST_SIDE / max(size))
 
     def _note_change(self) -> None:

@@ -15,7 +15,7 @@ from dyngs.io.outputs import command_for
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.opened import OpenedScene, open_scene
-from dyngs.view.layers import coarser
+from dyngs.view.layers import with_levels
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def open_source(
 
     def load(name: str) -> OpenedScene:
         opened = open_to_view(runs[name], name, up, data_root).to(device)
-        return opened if most is None else coarser(opened, most)
+        return opened if most is None else with_levels(opened, most)
 
     return SceneSource(tuple(runs), load)
 
@@ -84,7 +84,7 @@ def open_to_view(
     return opened
 
 
-def first_of(source: SceneSource) -> OpenedScene:
+def load_first(source: SceneSource) -> OpenedScene:
     """Return the first scene that can be loaded; a note says which could not. Raises DyngsError."""
     failed: list[DyngsError] = []
     for name in source.names:

@@ -18,7 +18,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.kind import PredictsScenes, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
-from dyngs.runs.opened import Captured, OpenedScene
+from dyngs.runs.opened import OpenedScene, SourceCapture
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
 from dyngs.view.server import ServerOptions, Viewer, free_port, require_viser
@@ -63,7 +63,7 @@ class BetweenStepRenderer:
         with torch.no_grad():
             for session in sessions:
                 shell = _shell(scene, session.opened.background)
-                session.take(session.opened.with_scene(shell), refreshes=refreshes)
+                session.update_scene(session.opened.with_scene(shell), refreshes=refreshes)
             while self._drawer.draw_one():
                 if self._clock() - start > REFRESH_SECONDS * self._fraction:
                     break
@@ -112,7 +112,7 @@ class TrainingView:
             self._say(f"viewing: {viewer.link} (until the training ends)")
             self._drawn = BetweenStepRenderer(viewer.drawer)
         if self._drawn.after_step(trainer.model.scene) or begins:
-            event.loop.stopwatch.pause(time.perf_counter() - start)
+            event.loop.stopwatch.exclude(time.perf_counter() - start)
 
 
 def opened_training(trainer: Trainer[Any]) -> OpenedScene:
@@ -120,7 +120,7 @@ def opened_training(trainer: Trainer[Any]) -> OpenedScene:
     config = trainer.config
     views = trainer.images.views
     shown = captured_views(views, config.data, trainer.images)
-    captured = Captured(config.data, trainer.capture)
+    captured = SourceCapture(config.data, trainer.capture)
     captured.once("views", lambda: shown)
     with torch.no_grad():
         scene = _shell(trainer.model.scene, background_colour(trainer.background))

@@ -15,7 +15,7 @@ from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.geometry import inverse_rigid, look_at_point, pinhole_matrix, world_from_cam
 from dyngs.data.loader import ImageLoader
-from dyngs.export.choose_path import orbit_cameras_around, points_at
+from dyngs.export.choose_path import framing_points, orbit_cameras_around
 from dyngs.human.avatar.scene import as_human_scene
 from dyngs.models.views import training_cameras
 from dyngs.runs.opened import OpenedScene, scene_of_split
@@ -106,7 +106,7 @@ def _viewpoint(opened: OpenedScene) -> Viewpoint:
         if person is not None:
             center = person.at(None).means.double().cpu().numpy().mean(0)
     else:
-        means = points_at(opened.renderable).double().cpu().numpy()
+        means = framing_points(opened.renderable).double().cpu().numpy()
         start = cameras = orbit_cameras_around(opened, 1)
         center = np.median(means[np.isfinite(means).all(1)], axis=0)
     apart = np.linalg.norm(cameras.centers.double().cpu().numpy() - center, axis=1)

@@ -65,7 +65,10 @@ def test_control_points_far_away(plain: Path, tmp_path: Path) -> None:
     (tmp_path / "geo.txt").write_text("\n".join(" ".join(map(repr, row)) for row in rows.tolist()))
     told: list[str] = []
     edit_scene(
-        plain, tmp_path / "a.ply", Edits(geo=control_point_frame(tmp_path / "geo.txt")), tell=told.append
+        plain,
+        tmp_path / "a.ply",
+        Edits(geo=control_point_frame(tmp_path / "geo.txt")),
+        tell=told.append,
     )
     found = read_splats(tmp_path / "a.ply")
     line = next(text for text in told if text.startswith("offset, to be added"))
@@ -105,7 +108,7 @@ def test_a_moving_run(tmp_path: Path) -> None:
     told = []
     frame = Edits(frame=Frame(scale=3.0, up=(0.0, -1.0, 0.0)))
     edit_scene(run, tmp_path / "a.ply", frame, tell=told.append)
-    assert "this is time 0 of a moving scene" in told[0]
+    assert "time 0 of a moving scene" in told[0]
     edit_scene(run, tmp_path / "a.ply", replace(frame, time=0.75), tell=told.append)
     rows = list(MOVING_ROWS)
     moved = read_splats(tmp_path / "a.ply").gaussians.means[rows, 0]

@@ -16,7 +16,13 @@ from dyngs.core.errors import DyngsError
 from dyngs.export.cameras import write_cameras
 from dyngs.export.choose_path import PathOptions, choose_path
 from dyngs.export.edit.frame import Frame
-from dyngs.export.splat_files import DEFAULT_WRITE_OPTIONS, splats_at, tracks_of, write_run_splats, choose_write_options
+from dyngs.export.splat_files import (
+    DEFAULT_WRITE_OPTIONS,
+    choose_write_options,
+    splats_at,
+    tracks_of,
+    write_run_splats,
+)
 from dyngs.gaussians.rendering import render, splat_options
 from dyngs.io.formats.formats import read_splats
 from dyngs.io.formats.similarity import Similarity
@@ -80,7 +86,9 @@ def test_files_have_the_up_of_their_format_and_can_be_undone(tmp_path: Path) -> 
     np.testing.assert_allclose(splat.frame.rotation @ [0.0, 0.6, 0.8], [0, -1, 0], atol=1e-7)
     back = splat.edited.inverse().gaussians(splat.gaussians)
     torch.testing.assert_close(back.means, opened.scene.at(0.0).means, rtol=0, atol=1e-5)
-    assert choose_write_options(opened, "-y", up="keep")[0] == replace(DEFAULT_WRITE_OPTIONS, up="z")
+    assert choose_write_options(opened, "-y", up="keep")[0] == replace(
+        DEFAULT_WRITE_OPTIONS, up="z"
+    )
 
 
 def test_paths_are_in_the_frame_that_people_see(tmp_path: Path) -> None:

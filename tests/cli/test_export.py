@@ -167,7 +167,7 @@ def test_a_page_has_the_full_name_of_its_run(run: Path, tmp_path: Path) -> None:
         ("--format html --max-change 3", "--max-change does not go with --format html"),
         ("--format html --out page.pdf", "give --out page.html"),
         ("--format html --motion walk.bvh", "needs the run of a person"),
-        ("--format html --folder --max-gaussians-drawn 9", "for still scenes"),
+        ("--format html --folder --max-gaussians-drawn 9", "need a static scene"),
         ("--format html --folder --out page.html", "writes a folder; give --out page"),
         ("--format html --max-gaussians-drawn 9", "goes with --folder"),
         ("--folder", "--folder does not go with --format ply"),

@@ -9,7 +9,7 @@ from tiny_fields import busy_config
 
 from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import train
-from dyngs.evaluate.report import compared, evaluate_run
+from dyngs.evaluate.report import compare_runs, evaluate_run
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def test_a_run_and_its_file(moving: Path, tmp_path: Path) -> None:
     run = train(busy_config(moving, tmp_path / "run", "control_nodes"))
     file = write_scene_file(run, tmp_path / "file").path
-    costs = compared([run, file.parent], 1)
+    costs = compare_runs([run, file.parent], 1)
     for folder, cost in zip((run, file.parent), costs, strict=True):
         report = evaluate_run(folder, "test", threads=1)
         assert cost.num_gaussians == report.num_gaussians

@@ -158,7 +158,9 @@ def test_an_orbit_shows_the_same_frames_in_any_unit(factor: float, tmp_path: Pat
 def test_a_single_gaussian_is_in_view_whole() -> None:
     one = wrap_scene(StaticScene(gaussians=some_gaussians(1)))
     size = math.exp(-3)
-    distance = float((orbit_cameras_around(one, 1).centers[0] - one.scene.gaussians.means[0]).norm())
+    distance = float(
+        (orbit_cameras_around(one, 1).centers[0] - one.scene.gaussians.means[0]).norm()
+    )
     assert size < distance < 10 * size
 
 

@@ -24,8 +24,8 @@ from dyngs.export.images import (
     contact_sheet,
     depth_to_rgb,
     file_stems,
-    render_path,
     render_frame,
+    render_path,
     write_path_images,
     write_split_images,
 )

@@ -36,8 +36,14 @@ from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr, ssim
-from dyngs.export.html import numbers
-from dyngs.export.html.page import ELEMENT, MOST_VIEWS, element_script, write_folder, write_page
+from dyngs.export.html import scene_data
+from dyngs.export.html.page import (
+    ELEMENT,
+    MOST_VIEWS,
+    element_script,
+    write_page,
+    write_page_folder,
+)
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
@@ -193,9 +199,9 @@ def test_only_a_new_folder_is_written_and_no_moving_scene(tmp_path: Path) -> Non
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine").touch()
     with pytest.raises(DyngsError, match="exists already"):
-        write_folder(still, tmp_path / "full")
+        write_page_folder(still, tmp_path / "full")
     with pytest.raises(DyngsError, match="for still scenes"):
-        write_folder(wrap_scene(sliding_scene()), tmp_path / "new", most=9)
+        write_page_folder(wrap_scene(sliding_scene()), tmp_path / "new", most=9)
     assert [path.name for path in tmp_path.rglob("*")] == ["full", "mine"]
 
 
@@ -264,9 +270,9 @@ def test_a_long_clip_is_fetched_as_it_is_played(
 ) -> None:
     scene = scene_of_kind("hexplane")
     view = large(onlooker())
-    monkeypatch.setattr(numbers, "CHUNK_BYTES", 60)
+    monkeypatch.setattr(scene_data, "CHUNK_BYTES", 60)
     scene = replace(scene, background=torch.ones(3))
-    written = write_folder(
+    written = write_page_folder(
         replace(wrap_scene(scene), stated_up="-y"), tmp_path / "clip", views=(view,)
     )
     curves = written.header["curves"]

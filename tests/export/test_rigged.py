@@ -32,9 +32,9 @@ from dyngs.export.rigged.people import (
     add_animation,
     anchor_normals,
     body_mesh,
+    build_rig,
     mesh_document,
     rest_vertices,
-    build_rig,
     surface_normals,
     write_mesh,
     write_rigged_splats,
@@ -121,7 +121,9 @@ def written(path: Path, scene: HumanScene) -> SkinnedGlb:
     with torch.no_grad():
         rig = build_rig(scene, body.vertices)
         document = mesh_document(body, rig, body.vertices, GREY)
-        add_animation(document, scene, rig, body.vertices, body.weights, AnimationInfo("dance", 10.0))
+        add_animation(
+            document, scene, rig, body.vertices, body.weights, AnimationInfo("dance", 10.0)
+        )
         document.write(path)
     return SkinnedGlb(path)
 

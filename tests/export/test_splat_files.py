@@ -38,24 +38,24 @@ from dyngs.export.images import compare_file_with_run, compare_file_with_source
 from dyngs.export.splat_files import (
     Part,
     WriteOptions,
+    choose_write_options,
+    find_up_direction,
     read_4dgs_frame,
     scene_part,
     splats_at,
     tracks_of,
-    up_of,
-    write_rigid_bodies,
     write_4dgs,
+    write_rigid_bodies,
     write_run_sequence,
     write_run_splats,
     write_tracks,
-    choose_write_options,
 )
 from dyngs.gaussians.rendering import render
 from dyngs.io.formats.formats import read_splats, upright, write_splats
 from dyngs.io.formats.similarity import AXES, Similarity, turn_between
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.gltf import GltfFile
-from dyngs.runs.opened import Captured, OpenedScene, open_run, wrap_scene
+from dyngs.runs.opened import OpenedScene, SourceCapture, open_run, wrap_scene
 
 ALL = (0, 1, 2, 3, 4)
 STILL_ROWS = (0, 2, 4)
@@ -126,19 +126,21 @@ def test_a_sequence_of_the_same_length_is_replaced_and_others_are_refused(
 
 
 def test_up_is_what_the_cameras_or_the_user_say(near: OpenedScene) -> None:
-    found = up_of(near)
+    found = find_up_direction(near)
     assert found is not None
     name = next(name for name, axis in AXES.items() if axis == found[0])
     how, line = choose_write_options(near, "y")
     assert how.turn == turn_between(found[0], AXES["y"])
     assert f"it was {name} in the capture" in line or name == "y"
     assert "the axes of the capture are kept" in choose_write_options(near, name)[1]
-    lost = replace(near, captured=Captured(near.config.data, DyngsError("gone")))
-    assert up_of(lost) is None
+    lost = replace(near, captured=SourceCapture(near.config.data, DyngsError("gone")))
+    assert find_up_direction(lost) is None
     how, line = choose_write_options(lost, "y", sh_degree=2)
     assert (how.turn, how.up, how.sh_degree) == ((1.0, 0.0, 0.0, 0.0), None, 2)
     assert "--from-up=AXIS tells it" in line
-    assert choose_write_options(lost, "y", from_up="z")[0].turn == turn_between(AXES["z"], AXES["y"])
+    assert choose_write_options(lost, "y", from_up="z")[0].turn == turn_between(
+        AXES["z"], AXES["y"]
+    )
     assert choose_write_options(lost, "y", "keep", "z")[0].turn == (1.0, 0.0, 0.0, 0.0)
 
 
@@ -215,7 +217,9 @@ def test_a_file_of_tracks_holds_arrays_without_pickle(tmp_path: Path) -> None:
     assert path.read_bytes() == first
 
 
-def test_moving_files(tmp_path: Path, near: OpenedScene, capsys: pytest.CaptureFixture[str]) -> None:
+def test_moving_files(
+    tmp_path: Path, near: OpenedScene, capsys: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("fourdgs")
     times = [i / 9 for i in range(10)]  # more than one group of key frame and deltas
     splats, _ = write_4dgs(near, tmp_path / "a.4dgs", times)

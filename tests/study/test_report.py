@@ -18,11 +18,11 @@ from dyngs.study.report import (
     Report,
     Table,
     csv_text,
+    figure_to_svg,
     html_table,
     markdown_table,
     page_text,
     plot_variants,
-    figure_to_svg,
 )
 from dyngs.study.tradeoff import Row
 

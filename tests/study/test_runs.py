@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.study.runs import STUDY_FILE, run_tasks, require_same_study
+from dyngs.study.runs import STUDY_FILE, require_same_study, run_tasks
 
 
 def reciprocal(number: float) -> float:

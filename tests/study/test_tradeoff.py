@@ -23,17 +23,17 @@ from dyngs.study.tradeoff import (
     Row,
     Tradeoff,
     Variant,
-    choose,
+    build_rows,
+    choose_variant,
     combinations,
-    exchange_rates,
     current_settings,
+    db_per_doubling,
+    exchange_rates,
     pareto_mask,
     parse_goal,
     parse_requirements,
     parse_variations,
     single_setting_variants,
-    slope,
-    table_rows,
 )
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -236,14 +236,14 @@ def test_every_point_is_on_the_front_or_beaten_by_one_that_is(goals: list[tuple[
 
 def test_speed_size_and_quality_count() -> None:
     points = [BASE, measured(29.0, 2.0, 4.0), measured(28.0, 2.0, 8.0)]
-    assert [row["on_front"] for row in table_rows(points)] == [True, True, False]
+    assert [row["on_front"] for row in build_rows(points)] == [True, True, False]
 
 
 @given(st.floats(-3, 3), st.lists(st.integers(1, 4), min_size=1, max_size=5))
 def test_slope_of_points_on_a_line_is_that_line(per_doubling: float, doublings: list[int]) -> None:
     points = [(per_doubling * k, 2.0**k) for k in doublings]
-    assert slope(points) == pytest.approx(per_doubling, abs=1e-9)
-    assert slope([(1.0, 1.01), (2.0, 1.0)]) is None
+    assert db_per_doubling(points) == pytest.approx(per_doubling, abs=1e-9)
+    assert db_per_doubling([(1.0, 1.01), (2.0, 1.0)]) is None
 
 
 def test_exchange_rates_are_those_of_single_settings() -> None:
@@ -317,9 +317,9 @@ def test_what_is_no_condition_is_refused(text: str, message: str) -> None:
 
 def test_the_best_of_what_qualifies() -> None:
     asked = parse_requirements("psnr>=30")
-    assert choose(ROWS, asked, parse_goal("mb", smallest=True)) == 1
-    assert choose(ROWS, asked, Requirement("psnr", False)) == 0
-    assert choose(ROWS, (), Requirement("fps", False)) == 2
+    assert choose_variant(ROWS, asked, parse_goal("mb", smallest=True)) == 1
+    assert choose_variant(ROWS, asked, Requirement("psnr", False)) == 0
+    assert choose_variant(ROWS, (), Requirement("fps", False)) == 2
 
 
 @pytest.mark.parametrize(
@@ -336,4 +336,4 @@ def test_the_best_of_what_qualifies() -> None:
 )
 def test_what_is_missed_is_named(asked: str, message: str) -> None:
     with pytest.raises(DyngsError, match=message):
-        choose(ROWS, parse_requirements(asked), Requirement("mb", True))
+        choose_variant(ROWS, parse_requirements(asked), Requirement("mb", True))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from dyngs.config import Config, DataConfig, DefaultStrategy, TrainConfig
-from dyngs.training.clock import TimeForecast, SaveTimer, step_cost
+from dyngs.training.clock import SaveTimer, TimeForecast, step_cost
 
 CONFIG = Config(
     data=DataConfig(root=Path("nowhere")),
@@ -34,7 +34,7 @@ def test_small_images_first() -> None:
 def test_pauses_do_not_count() -> None:
     one, other = (TimeForecast(0, 0.0, 0, PIXELS) for _ in range(2))
     one.observe(CONFIG, 5, 10.0, 0)
-    other.pause(100.0)
+    other.exclude(100.0)
     other.observe(CONFIG, 5, 110.0, 0)
     assert one.seconds(CONFIG, 100) == pytest.approx(other.seconds(CONFIG, 100))
 
@@ -43,7 +43,7 @@ def test_checkpoints_are_due_by_time_and_less_often_where_they_are_slow() -> Non
     timer = SaveTimer(1.0, 0.0)
     assert not timer.is_due(59)
     assert timer.is_due(60)
-    timer.saved(60, 70)
+    timer.record_save(60, 70)
     assert not timer.is_due(140)
     assert timer.is_due(270)
     assert not SaveTimer(0.0, 0.0).is_due(1e9)

@@ -159,7 +159,7 @@ def test_what_has_begun_keeps_its_step() -> None:
     for done in (360, 500, 700, 1000):
         for steps in (done + 10, 1050, 9000):
             if steps == 9000 and done < 1000:
-                with pytest.raises(DyngsError, match="1,000 before anything moves"):
+                with pytest.raises(DyngsError, match="trains 1,000 static steps"):
                     extend_config(config, done, steps)
                 continue
             new = extend_config(config, done, steps)

@@ -24,7 +24,7 @@ from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.keys import DynamicModel
 from dyngs.human.keys import HumanPredictorModel
 from dyngs.models.static_section import StaticModel
-from dyngs.training.limits import gaussian_limit, validate_limits, apply_gaussian_cap
+from dyngs.training.limits import apply_gaussian_cap, gaussian_limit, validate_limits
 from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 

@@ -34,7 +34,7 @@ def test_events_come_in_order_and_all_listeners_hear_them() -> None:
     """What was found in a step is told before that the step is done; listeners are told in the
     order they came in."""
     told: list[tuple[str, Event]] = []
-    trainer = Counting(findings={2: "something"})
+    trainer = Counting(messages={2: "something"})
     loop = looped(
         trainer, 3, lambda e: told.append(("first", e)), lambda e: told.append(("second", e))
     )

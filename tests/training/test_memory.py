@@ -50,7 +50,9 @@ def test_a_run_is_forecast_before_it_begins(still: Path) -> None:
     assert found.count == 60
     assert found.gaussians == 60 * 4 * 7 * 59
     assert found.warning() is None
-    (none,) = memory_forecasts(build_trainer(config_of(still, data=DataConfig(root=still, cache_mb=0))))
+    (none,) = memory_forecasts(
+        build_trainer(config_of(still, data=DataConfig(root=still, cache_mb=0)))
+    )
     assert none.images < found.images
 
 

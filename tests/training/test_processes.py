@@ -15,16 +15,16 @@ from dyngs.training.processes import Processes, _checksum
 
 def test_views_are_shared_evenly_in_order_and_each_once() -> None:
     for size, batch in ((1, 1), (1, 5), (2, 2), (4, 12)):
-        fractions = [Processes(rank, size).share(batch) for rank in range(size)]
+        fractions = [Processes(rank, size).views_of_process(batch) for rank in range(size)]
         assert [view for fraction in fractions for view in fraction] == list(range(batch))
         assert len({len(fraction) for fraction in fractions}) == 1
     with pytest.raises(
         DyngsError,
         match="batch_size=3 views cannot be shared evenly among 2 processes; give a mult",
     ):
-        Processes(0, 2).share(3)
+        Processes(0, 2).views_of_process(3)
     with pytest.raises(DyngsError, match="cannot be shared"):
-        Processes(0, 2).share(0)
+        Processes(0, 2).views_of_process(0)
 
 
 @pytest.mark.parametrize("changed", [0, 1, 5])

@@ -16,7 +16,7 @@ from view_sessions import Page, looking_at_balls, opened_at
 
 from dyngs.human.body.joints import SMPLX_ROWS
 from dyngs.runs.opened import OpenedScene, open_run
-from dyngs.view.controls import BODY_JOINTS, BY_SLIDERS, Controls, posed
+from dyngs.view.controls import BODY_JOINTS, BY_SLIDERS, Controls, pose_person
 from dyngs.view.layers import draw
 from dyngs.view.source import SceneSource
 from dyngs.view.views import views_of
@@ -48,7 +48,7 @@ def test_sliders_pose_a_person_from_the_rest_pose() -> None:
     assert page.controls["y"].value == 0.0
     page.set("Joint", "left_elbow")
     assert page.controls["y"].value == 90.0
-    zero = posed(page.loaded, {"pelvis": (0.0, 0.0, 0.0)})
+    zero = pose_person(page.loaded, {"pelvis": (0.0, 0.0, 0.0)})
     rest = page.loaded.at_rest().scene.at(None).means
     assert torch.allclose(zero.scene.at(None).means, rest, atol=1e-6)
 
@@ -78,22 +78,22 @@ def test_a_screenshot_is_what_is_shown() -> None:
     page.set("Screenshot")
     ((name, data),) = page.files.items()
     assert name == "balls_0.000.png"
-    shown = draw(page.session.opened, page.session.shot())
+    shown = draw(page.session.opened, page.session.view_request())
     assert np.array_equal(np.asarray(Image.open(io.BytesIO(data))), shown)
 
 
 def test_an_image_is_chosen_by_name(tmp_path: Path) -> None:
     page = page_of(open_run(write_moving_run(tmp_path)))
-    assert page.session.shot().view is None
+    assert page.session.view_request().view is None
     page.set("Compare", True)
-    nearest = page.session.shot().view
+    nearest = page.session.view_request().view
     assert nearest is not None
     names = views_of(page.session.opened).names
     other = (nearest + 1) % len(names)
     page.set("Image", names[other])
-    assert page.session.shot().view == other
+    assert page.session.view_request().view == other
     assert page.went_to == [other]
     page.set("Image", "nearest")
-    assert page.session.shot().view == nearest
+    assert page.session.view_request().view == nearest
     page.set("Loop", False)
     assert not page.session.timeline.loops

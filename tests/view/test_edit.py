@@ -18,10 +18,10 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import read_splats
 from dyngs.runs.opened import OpenedScene, open_run, open_scene, wrap_scene
-from dyngs.view.edit import EditState, can_be_edited, picked
-from dyngs.view.layers import Shot
+from dyngs.view.edit import EditState, can_be_edited, pick_point
+from dyngs.view.layers import ViewRequest
 
-SHOT = Shot(camera())
+SHOT = ViewRequest(camera())
 
 
 def editing(
@@ -54,7 +54,7 @@ def test_a_ray_meets_the_wall_where_geometry_says(
     """From the side to the size of its Gaussians, 0.03, of which the nearer ones cover the
     others."""
     origin = np.array([0.3, 0.2, -1.0])
-    found = picked(wall, origin, 5 * (np.array(aim) - origin), 0.002, SHOT)
+    found = pick_point(wall, origin, 5 * (np.array(aim) - origin), 0.002, SHOT)
     assert found is not None
     np.testing.assert_allclose(found, aim, atol=error)
 
@@ -64,7 +64,7 @@ def test_what_moves_is_picked_where_it_is_shown(tmp_path: Path) -> None:
     for time in (0.0, 1.0):
         x = float(moved_x((3,), time))
         there = replace(SHOT, time=time)
-        found = picked(opened, np.array([x, 0.0, -4.0]), np.array([0.0, 0, 1]), 0.01, there)
+        found = pick_point(opened, np.array([x, 0.0, -4.0]), np.array([0.0, 0, 1]), 0.01, there)
         assert found is not None
         np.testing.assert_allclose(found, [x, 0, 0], atol=0.02)
 

@@ -32,19 +32,19 @@ from dyngs.view.controls import CameraFrusta
 from dyngs.view.layers import (
     LAYERS,
     PARTS,
-    Shot,
-    coarser,
+    ViewRequest,
     draw,
+    with_levels,
 )
 from dyngs.view.views import (
     Viewpoint,
     camera_at,
     fitting_fov,
     has_timeline,
-    orbit_center,
-    nearest_view,
-    pose_of,
     initial_viewpoint,
+    nearest_view,
+    orbit_center,
+    pose_of,
     views_of,
 )
 
@@ -56,7 +56,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
 
 def test_colours_are_those_of_dyngs_render() -> None:
     opened = balls()
-    shown = draw(opened, Shot(camera(80, 56), 0.3))
+    shown = draw(opened, ViewRequest(camera(80, 56), 0.3))
     wanted = render_frame(opened.scene, camera(80, 56), 0.3).rgb
     assert np.abs(shown / 255.0 - wanted).max() <= 0.5 / 255 + 1e-6
 
@@ -64,11 +64,11 @@ def test_colours_are_those_of_dyngs_render() -> None:
 @pytest.mark.parametrize("layer", LAYERS)
 def test_a_gpu_draws_every_layer_alike(run: OpenedScene, layer: str) -> None:
     view = 0 if layer in ("colour", "error") else None
-    shots = [Shot(camera(), 0.5, layer, part, view, 0.5) for part in PARTS]  # type: ignore[arg-type]
-    expected = [draw(run, shot) for shot in shots]
+    shots = [ViewRequest(camera(), 0.5, layer, part, view, 0.5) for part in PARTS]  # type: ignore[arg-type]
+    expected = [draw(run, request) for request in shots]
     with pretend_gpu():
         there = run.to(GPU)
-        found = [draw(there, shot) for shot in shots]
+        found = [draw(there, request) for request in shots]
     for a, b in zip(found, expected, strict=True):
         assert np.array_equal(a, b)
 
@@ -78,35 +78,35 @@ def test_many_gaussians_are_drawn_in_levels_while_anything_moves(
 ) -> None:
     monkeypatch.setattr(levels, "BLOCK", 16)
     whole = opened_at(StaticScene(gaussians=cloud(2000)))
-    opened = coarser(whole, 300)
-    shot = Shot(camera(80, 56))
-    moving = replace(shot, is_moving=True)
+    opened = with_levels(whole, 300)
+    request = ViewRequest(camera(80, 56))
+    moving = replace(request, is_moving=True)
     assert "at most 300 Gaussians" in opened.notes[-1]
-    few = render_frame(LevelScene.of(whole.renderable, 300), camera(80, 56), None).rgb
+    few = render_frame(LevelScene.from_scene(whole.renderable, 300), camera(80, 56), None).rgb
     coarse = draw(opened, moving)
     assert np.abs(coarse / 255.0 - few).max() <= 0.5 / 255 + 1e-6
-    assert not np.array_equal(coarse, draw(whole, shot))
-    assert np.array_equal(draw(whole, moving), draw(whole, shot))
-    assert np.array_equal(draw(opened, shot), draw(whole, shot))
+    assert not np.array_equal(coarse, draw(whole, request))
+    assert np.array_equal(draw(whole, moving), draw(whole, request))
+    assert np.array_equal(draw(opened, request), draw(whole, request))
     edited = opened.with_scene(opened.scene.select(torch.arange(1000)))
-    assert np.array_equal(draw(edited, moving), draw(edited, shot))
+    assert np.array_equal(draw(edited, moving), draw(edited, request))
     with pytest.raises(DyngsError, match="for still scenes"):
-        coarser(balls(), 300)
+        with_levels(balls(), 300)
 
 
 def test_the_moment_of_a_time_is_computed_once() -> None:
     opened = balls()
     asked = opened.scene.field  # type: ignore[attr-defined]
     for _ in range(3):
-        draw(opened, Shot(camera(), 0.5))
+        draw(opened, ViewRequest(camera(), 0.5))
     assert asked.calls == 1
-    draw(opened, Shot(camera(), 0.6))
+    draw(opened, ViewRequest(camera(), 0.6))
     assert asked.calls == 2
 
 
 def test_the_line_divides_render_and_truth(run: OpenedScene) -> None:
     def shown(divide: float) -> np.ndarray:
-        return draw(run, Shot(camera(64, 64), 0.0, view=2, divide=divide))
+        return draw(run, ViewRequest(camera(64, 64), 0.0, view=2, divide=divide))
 
     both = shown(0.5)
     render = shown(1.0)
@@ -117,9 +117,9 @@ def test_the_line_divides_render_and_truth(run: OpenedScene) -> None:
 
 
 def looking(
-    eye: tuple[float, float, float], target: tuple[float, float, float] = (0, 0, 0)
+    browser_camera: tuple[float, float, float], target: tuple[float, float, float] = (0, 0, 0)
 ) -> Cameras:
-    pose = np.linalg.inv(look_at(np.array(eye), np.array(target), np.array([0.0, 0, 1])))
+    pose = np.linalg.inv(look_at(np.array(browser_camera), np.array(target), np.array([0.0, 0, 1])))
     return Cameras(torch.from_numpy(pose).float()[None], camera().intrinsics, 20, 14)
 
 
@@ -161,9 +161,9 @@ def test_the_nearest_view_is_near_in_place_direction_and_time(tmp_path: Path) ->
 def test_a_frustum_that_the_camera_stands_in_is_hidden() -> None:
     session, _ = looking_at_balls()
     frusta = CameraFrusta(SimpleNamespace(session=session))  # type: ignore[arg-type]
-    assert session.eye is not None
+    assert session.browser_camera is not None
     here, there = (SimpleNamespace(visible=True) for _ in range(2))
-    eye = np.array(session.eye.position)
-    frusta._handles = [(here, eye + 0.01, 0.2), (there, eye + 1.0, 0.2)]
+    browser_camera = np.array(session.browser_camera.position)
+    frusta._handles = [(here, browser_camera + 0.01, 0.2), (there, browser_camera + 1.0, 0.2)]
     frusta.hide_covering_frusta()
     assert (here.visible, there.visible) == (False, True)

@@ -23,17 +23,17 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import ssim
 from dyngs.view.server import (
     COOKIE,
-    Browsing,
     AccessPolicy,
+    BrowserConnection,
     ServerOptions,
     Viewer,
-    escape_markdown,
-    free_port,
     access_policy_for,
     enforce_access,
+    escape_markdown,
+    free_port,
     is_loopback,
     link_to,
-    quiet,
+    silence_viser,
 )
 from dyngs.view.session import Keyframe, Recording
 from dyngs.view.source import open_source
@@ -73,38 +73,44 @@ def until(is_so: Callable[[], bool], page: Page | None = None, seconds: float = 
         page.driven.wait_for_timeout(50) if page is not None else time.sleep(0.05)
 
 
-def opened(viewer: Viewer, browser: Browser) -> tuple[Page, Browsing]:
+def opened(viewer: Viewer, browser: Browser) -> tuple[Page, BrowserConnection]:
     """A page whose image is complete."""
-    known = viewer.browsing
+    known = viewer.connections
     # viser draws fewer pixels where the browser is slow
     page = browser.open(f"{viewer.link}?fixedDpr=1", *SIZE)
-    until(lambda: len(viewer.browsing) > len(known), page)
-    (browsing,) = [one for one in viewer.browsing if one not in known]
-    settle(page, browsing)
-    return page, browsing
+    until(lambda: len(viewer.connections) > len(known), page)
+    (connection,) = [one for one in viewer.connections if one not in known]
+    settle(page, connection)
+    return page, connection
 
 
-def settle(page: Page, browsing: Browsing) -> None:
+def settle(page: Page, connection: BrowserConnection) -> None:
     """Wait until the controls are in their place, nothing is left to be drawn, and the page has
     shown it."""
-    until(lambda: browsing.session.eye is not None and browsing.session.eye.size[0] < SIZE[0], page)
-    until(lambda: browsing.num_sent > 0 and browsing.session.due() is None, page)
+    until(
+        lambda: (
+            connection.session.browser_camera is not None
+            and connection.session.browser_camera.size[0] < SIZE[0]
+        ),
+        page,
+    )
+    until(lambda: connection.num_sent > 0 and connection.session.due() is None, page)
     page.driven.wait_for_timeout(600)
     for close in page.driven.locator(".mantine-Notification-closeButton").all():
         close.click()  # viser says, before the image, that there is no GPU
-    until(lambda: browsing.session.due() is None, page)
+    until(lambda: connection.session.due() is None, page)
     # no longer dimmed, as before it is connected
     until(lambda: bool((page.screenshot()[-5, 300] >= 254).all()), page)
 
 
-def rendered(run: Path, browsing: Browsing, folder: Path) -> np.ndarray:
+def rendered(run: Path, connection: BrowserConnection, folder: Path) -> np.ndarray:
     """What ``dyngs render`` draws along the path that the page would save."""
-    session = browsing.session
-    assert session.eye is not None
-    recording = Recording((Keyframe(session.eye.camera(), session.time),))
+    session = connection.session
+    assert session.browser_camera is not None
+    recording = Recording((Keyframe(session.browser_camera.camera(), session.time),))
     folder.mkdir()
     path = folder / "path.json"
-    path.write_text(recording.document(session.eye.size, 30.0, session.opened))
+    path.write_text(recording.document(session.browser_camera.size, 30.0, session.opened))
     assert main(["render", str(run), "--path", str(path), "--out", str(folder / "out")]) == 0
     return np.asarray(Image.open(folder / "out" / "frame_0000.png").convert("RGB"))
 
@@ -117,17 +123,17 @@ def likeness(one: np.ndarray, other: np.ndarray) -> float:
 def test_the_page_shows_what_render_draws_at_every_time(
     viewer: Viewer, browser: Browser, run: Path, tmp_path: Path
 ) -> None:
-    page, browsing = opened(viewer, browser)
+    page, connection = opened(viewer, browser)
     first = page.screenshot()
-    truth = rendered(run, browsing, tmp_path / "first")
+    truth = rendered(run, connection, tmp_path / "first")
     assert likeness(first[SEEN], truth[SEEN]) > 0.95
     slider = page.driven.get_by_role("slider").first
     slider.focus()
     page.press("End")
-    until(lambda: browsing.session.time == 1.0, page)
-    settle(page, browsing)
+    until(lambda: connection.session.time == 1.0, page)
+    settle(page, connection)
     last = page.screenshot()
-    later = rendered(run, browsing, tmp_path / "last")
+    later = rendered(run, connection, tmp_path / "last")
     assert likeness(last[SEEN], later[SEEN]) > 0.95
     assert likeness(last[SEEN], first[SEEN]) < likeness(last[SEEN], later[SEEN])
     assert np.abs(later[SEEN].astype(int) - truth[SEEN]).mean() > 0.1  # something has moved
@@ -142,25 +148,28 @@ def test_two_browsers_have_cameras_of_their_own_and_one_may_go(
 ) -> None:
     (one, first), (two, second) = opened(viewer, browser), opened(viewer, browser)
     threads = threading.active_count()
-    before = second.session.eye
+    before = second.session.browser_camera
     one.drag((300, 300), (380, 330))
-    until(lambda: first.session.eye is not None and first.session.eye != before, one)
+    until(
+        lambda: first.session.browser_camera is not None and first.session.browser_camera != before,
+        one,
+    )
     assert before is not None
-    assert second.session.eye is not None
-    assert second.session.eye.position == pytest.approx(before.position)
+    assert second.session.browser_camera is not None
+    assert second.session.browser_camera.position == pytest.approx(before.position)
     for page in (one, two):
         page.click("text=Play")
     sent = second.num_sent
     until(lambda: second.num_sent > sent + 3, two)
     one.close()  # while it gets images
-    until(lambda: len(viewer.browsing) == 1, two)
+    until(lambda: len(viewer.connections) == 1, two)
     sent = second.num_sent
     until(lambda: second.num_sent > sent + 3, two)
     assert viewer.drawer.sessions == (second.session,)
     assert first.session.closed
     assert two.errors == []
     two.close()
-    until(lambda: not viewer.browsing)
+    until(lambda: not viewer.connections)
     assert viewer.drawer.sessions == ()
     assert threading.active_count() <= threads + 2  # viser's pool may have grown
 
@@ -205,11 +214,11 @@ def test_texts_of_strangers_are_shown_and_never_run(browser: Browser, tmp_path: 
         source = open_source(folder)
         with Viewer(source, source.load(source.names[0]), ServerOptions()) as viewer:
             page = browser.open(viewer.link, *SIZE)
-            until(lambda viewer=viewer: any(one.num_sent for one in viewer.browsing), page)
-            (browsing,) = viewer.browsing
+            until(lambda viewer=viewer: any(one.num_sent for one in viewer.connections), page)
+            (connection,) = viewer.connections
             if folder == run:
-                browsing.session.change(comparing=True)
-                browsing.notify(SCRIPT, FRAME)
+                connection.session.change(comparing=True)
+                connection.notify(SCRIPT, FRAME)
             else:
                 page.click("text=Help")
             until(
@@ -300,7 +309,7 @@ def test_the_server_asks_the_gate() -> None:
     from websockets.sync.client import connect
 
     port = free_port("127.0.0.1", None)
-    with enforce_access(AccessPolicy("secret")), quiet():
+    with enforce_access(AccessPolicy("secret")), silence_viser():
         server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
     version = f"viser-v{viser.__version__}"
     try:
@@ -317,7 +326,7 @@ def test_the_server_asks_the_gate() -> None:
         with connect(socket_at, additional_headers=cookie, subprotocols=[version]) as opened_socket:  # type: ignore[list-item]
             assert opened_socket.recv(timeout=5)
     finally:
-        with quiet():
+        with silence_viser():
             server.stop()
     assert link_to("::1", 80) == "http://[::1]:80/"
     assert link_to("box", 80, "secret") == "http://box:80/?token=secret"

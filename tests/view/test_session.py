@@ -22,13 +22,13 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.similarity import UNMOVED, Similarity
 from dyngs.runs.opened import OpenedScene
 from dyngs.view import session
-from dyngs.view.layers import Shot, draw
+from dyngs.view.layers import ViewRequest, draw
 from dyngs.view.session import (
     REFINE_DELAY,
-    RenderScheduler,
     BrowserCamera,
     Keyframe,
     Recording,
+    RenderScheduler,
     SentImage,
     Session,
     Timeline,
@@ -47,7 +47,7 @@ def opened(scene: GaussianScene | None = None) -> OpenedScene:
     return opened_at(scene or moving_scene(Sliding()))
 
 
-def eye(x: float = 0.0, size: tuple[int, int] = (400, 300)) -> BrowserCamera:
+def browser_camera(x: float = 0.0, size: tuple[int, int] = (400, 300)) -> BrowserCamera:
     wxyz, position = pose_of(camera())
     return BrowserCamera(tuple(wxyz), (x, *position[1:].tolist()), 0.7, size)
 
@@ -70,13 +70,13 @@ class Looked:
 def test_small_while_moving_then_whole_and_then_nothing_until_something_changes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    shots: list[Shot] = []
+    shots: list[ViewRequest] = []
     monkeypatch.setattr(
-        session, "draw", lambda opened, shot: shots.append(shot) or draw(opened, shot)
+        session, "draw", lambda opened, request: shots.append(request) or draw(opened, request)
     )
     looked = Looked()
     assert looked.session.due() is None  # there is no camera
-    looked.session.move(eye(size=(1200, 900)))
+    looked.session.move(browser_camera(size=(1200, 900)))
     looked.after(0)
     first = looked.sent[0]
     assert not first.is_refined
@@ -90,7 +90,7 @@ def test_small_while_moving_then_whole_and_then_nothing_until_something_changes(
     assert looked.sent[-1].is_refined
     assert looked.sent[-1].image.shape == (900, 1200, 3)
     assert looked.session.due() is None
-    looked.session.move(eye(size=(1200, 900)))  # the same
+    looked.session.move(browser_camera(size=(1200, 900)))  # the same
     assert looked.session.due() is None
     looked.session.change(layer="alpha")
     assert looked.session.due() == 0.0
@@ -98,7 +98,7 @@ def test_small_while_moving_then_whole_and_then_nothing_until_something_changes(
 
 def test_a_playing_scene_is_drawn_on_and_on_and_a_still_one_is_not() -> None:
     looked = Looked()
-    looked.session.move(eye())
+    looked.session.move(browser_camera())
     looked.after(1)
     looked.after(1)
     assert looked.session.due() is None
@@ -116,7 +116,7 @@ def test_a_playing_scene_is_drawn_on_and_on_and_a_still_one_is_not() -> None:
     looked.after(1)
     assert looked.session.due() is None
     still = Looked(still_scene())
-    still.session.move(eye())
+    still.session.move(browser_camera())
     still.session.change_timeline(playing=True)
     still.after(1)
     still.after(1)
@@ -125,7 +125,7 @@ def test_a_playing_scene_is_drawn_on_and_on_and_a_still_one_is_not() -> None:
 
 def test_a_scene_without_a_loop_stops_at_its_end_and_plays_again_from_its_start() -> None:
     looked = Looked()
-    looked.session.move(eye())
+    looked.session.move(browser_camera())
     looked.session.change_timeline(playing=True, loops=False)
     looked.after(looked.session.opened.seconds + 1)
     looked.after(1)
@@ -137,12 +137,12 @@ def test_a_scene_without_a_loop_stops_at_its_end_and_plays_again_from_its_start(
 
 
 def test_a_preview_shows_the_recorded_cameras_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    shots: list[Shot] = []
+    shots: list[ViewRequest] = []
     monkeypatch.setattr(
-        session, "draw", lambda opened, shot: shots.append(shot) or draw(opened, shot)
+        session, "draw", lambda opened, request: shots.append(request) or draw(opened, request)
     )
     looked = Looked()
-    looked.session.move(eye())
+    looked.session.move(browser_camera())
     keys = (Keyframe(at_depth(4), 0.2, 2.0), Keyframe(at_depth(8), 0.6, 1.0))
     looked.session.preview(Recording(keys))
     looked.clock.now += 1.0
@@ -153,21 +153,21 @@ def test_a_preview_shows_the_recorded_cameras_once(monkeypatch: pytest.MonkeyPat
     looked.after(1)
     assert looked.session.due() is None
     assert shots[-1].time == 0.0
-    assert looked.session.eye is not None
-    own = looked.session.eye.camera((400, 300))
+    assert looked.session.browser_camera is not None
+    own = looked.session.browser_camera.camera((400, 300))
     assert torch.equal(shots[-1].camera.cam_from_world, own.cam_from_world)
 
 
 def test_jobs_and_who_has_gone() -> None:
     looked = Looked()
     done = list[int]()
-    looked.session.move(eye())
+    looked.session.move(browser_camera())
     for number in (1, 2):
-        looked.session.ask(lambda number=number: done.append(number))
+        looked.session.submit_job(lambda number=number: done.append(number))
     looked.after(1)
     assert done == [1, 2]
     count = len(looked.sent)
-    looked.session.ask(lambda: pytest.fail("asked"))
+    looked.session.submit_job(lambda: pytest.fail("asked"))
     looked.session.closed = True
     assert looked.session.due() is None
     looked.session.draw_next()
@@ -176,13 +176,13 @@ def test_jobs_and_who_has_gone() -> None:
 
 def test_the_scene_in_training_is_drawn_again_as_large_as_it_was() -> None:
     looked = Looked()
-    looked.session.move(eye())
+    looked.session.move(browser_camera())
     looked.after(1)
     looked.after(1)
     whole = looked.sent[-1].image.shape
-    looked.session.take(opened(), refreshes=False)
+    looked.session.update_scene(opened(), refreshes=False)
     assert looked.session.due() is None
-    looked.session.take(replace(opened(), name="later"), refreshes=True)
+    looked.session.update_scene(replace(opened(), name="later"), refreshes=True)
     looked.after(1)
     assert looked.sent[-1].is_refined
     assert looked.sent[-1].image.shape == whole
@@ -281,8 +281,8 @@ def test_a_fault_of_one_is_told_once_and_the_others_go_on() -> None:
         one.on_error = lambda message, one=one: told.append((one, message))
         drawer.add(one)
     for _ in range(20):
-        bad.ask(lambda: fail(DyngsError("no such file")))
-        worse.ask(lambda: fail(ZeroDivisionError("by nothing")))
+        bad.submit_job(lambda: fail(DyngsError("no such file")))
+        worse.submit_job(lambda: fail(ZeroDivisionError("by nothing")))
         drawer.draw_one()
     assert set(told) == {(bad, "no such file"), (worse, "ZeroDivisionError: by nothing")}
     assert len(told) == 2

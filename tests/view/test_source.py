@@ -17,7 +17,7 @@ from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
 from dyngs.view.controls import motion_files
 from dyngs.view.session import RenderScheduler, Session
-from dyngs.view.source import first_of, open_source
+from dyngs.view.source import load_first, open_source
 from dyngs.view.training import BetweenStepRenderer, opened_training
 
 
@@ -31,7 +31,7 @@ def test_a_folder_of_runs_is_a_picker(tmp_path: Path) -> None:
     assert not source.load("b/run").scene.is_static
     assert source.load("b/run").name == "b/run"
     next((tmp_path / "a/deep/run/checkpoints").iterdir()).write_bytes(b"damaged")
-    first = first_of(source)
+    first = load_first(source)
     assert first.name == "b/run"
     assert "left out" in first.notes[0]
     assert open_source(tmp_path / "b" / "run").names == ("run",)
@@ -41,7 +41,7 @@ def test_where_nothing_is_to_be_seen_one_line_says_so(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="no runs there"):
         open_source(tmp_path)
     with pytest.raises(DyngsError, match="no such file"):
-        first_of(open_source(tmp_path / "nothing"))
+        load_first(open_source(tmp_path / "nothing"))
 
 
 def test_motion_files_are_found_by_suffix(tmp_path: Path) -> None:
@@ -82,10 +82,10 @@ class Onlooker:
                     self.drawer.add(session)
                 for session in self.drawer.sessions:
                     session.change(divide=event.step / 1000)
-                    if session.eye is None:
+                    if session.browser_camera is None:
                         other, _ = looking_at_balls()
-                        assert other.eye is not None
-                        session.move(other.eye)
+                        assert other.browser_camera is not None
+                        session.move(other.browser_camera)
                 self.drawn.after_step(trainer.model.scene)
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dyngs.core.errors import DyngsError, format_one_line
 from dyngs.data.times import evenly_spaced
-from dyngs.export.edit.frame import Point, number, point
+from dyngs.export.edit.frame import Point, parse_number, parse_point
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.similarity import Similarity
 
@@ -25,7 +25,7 @@ class Box:
     low: np.ndarray
     high: np.ndarray
 
-    def holds(self, points: np.ndarray) -> np.ndarray:
+    def contains(self, points: np.ndarray) -> np.ndarray:
         return np.all((points >= self.low) & (points <= self.high), axis=1)
 
 
@@ -36,7 +36,7 @@ class Sphere:
     centre: Point
     radius: float
 
-    def holds(self, points: np.ndarray) -> np.ndarray:
+    def contains(self, points: np.ndarray) -> np.ndarray:
         return np.linalg.norm(points - np.array(self.centre), axis=1) <= self.radius
 
 
@@ -53,9 +53,9 @@ def parse_region(words: Sequence[str]) -> Region:
     if len(parts) != 2:
         shown = format_one_line(repr(text), 60)
         raise DyngsError(f"--crop: {shown}: give two corners x,y,z x,y,z, or a centre and a radius")
-    first = point(parts[0], "--crop")
+    first = parse_point(parts[0], "--crop")
     if "," in parts[1]:
-        corners = np.array([first, point(parts[1], "--crop")])
+        corners = np.array([first, parse_point(parts[1], "--crop")])
         low = corners.min(0)
         high = corners.max(0)
         if not (low < high).all():
@@ -63,7 +63,7 @@ def parse_region(words: Sequence[str]) -> Region:
                 "--crop: the box is flat; give two opposite corners that differ in x, y and z"
             )
         return Box(low, high)
-    radius = number(parts[1], "--crop")
+    radius = parse_number(parts[1], "--crop")
     if not radius > 0:
         raise DyngsError(f"--crop: a radius of {radius:g}? Give a positive one")
     return Sphere(first, radius)
@@ -79,5 +79,5 @@ def gaussians_in_region(region: Region, scene: GaussianScene, world: Similarity)
     moments = [times[i] for i in evenly_spaced(len(times), _TIMES)] or [None]
     found = np.zeros(len(scene), bool)
     for time in moments:
-        found |= region.holds(world.points(scene.at(time).means.cpu().numpy()))
+        found |= region.contains(world.points(scene.at(time).means.cpu().numpy()))
     return torch.from_numpy(found)

@@ -52,7 +52,7 @@ class Frame:
         return replace(found, shift=(x, y, z))
 
 
-def point(text: str, option: str) -> Point:
+def parse_point(text: str, option: str) -> Point:
     """Return the point "x,y,z". Raises DyngsError: it is no such thing."""
     try:
         x, y, z = (float(word) for word in text.split(","))
@@ -66,23 +66,25 @@ def point(text: str, option: str) -> Point:
     return x, y, z
 
 
-def number(text: str, option: str) -> float:
+def parse_number(text: str, option: str) -> float:
     """Return a finite number, after which "m" may stand. Raises DyngsError: it is no such thing."""
     try:
         found = float(text.removesuffix("m"))
     except ValueError:
         found = math.nan
     if not math.isfinite(found):
-        raise DyngsError(f"{option}: {format_one_line(repr(text), 60)} is no number; write it as 1.25")
+        raise DyngsError(
+            f"{option}: {format_one_line(repr(text), 60)} is no number; write it as 1.25"
+        )
     return found
 
 
-def direction(text: str) -> Point | str:
+def parse_direction(text: str) -> Point | str:
     """Return what ``--up`` names: an axis such as "-y", a direction "x,y,z", or "auto". Raises
     DyngsError."""
     if text == "auto":
         return text
-    found = AXES[text] if text in AXES else point(text, "--up")
+    found = AXES[text] if text in AXES else parse_point(text, "--up")
     if not math.hypot(*found) > 0:
         raise DyngsError(f"--up: {text} has no direction; give x,y,z, an axis such as -y, or auto")
     return found
@@ -93,10 +95,10 @@ def parse_scale(text: str) -> float:
     scene and what their distance is to be. Raises DyngsError."""
     words = text.split()
     if len(words) == 3:
-        now = math.dist(point(words[0], "--scale"), point(words[1], "--scale"))
-        factor = number(words[2], "--scale") / now if now > 0 else math.nan
+        now = math.dist(parse_point(words[0], "--scale"), parse_point(words[1], "--scale"))
+        factor = parse_number(words[2], "--scale") / now if now > 0 else math.nan
     else:
-        factor = number(text, "--scale")
+        factor = parse_number(text, "--scale")
     low, high = _FACTORS
     if not low <= factor <= high:
         what = "a factor, or two points and their distance: 'x,y,z x,y,z LENGTH'"
@@ -106,7 +108,7 @@ def parse_scale(text: str) -> float:
     return factor
 
 
-def fitted(points: np.ndarray, wanted: np.ndarray) -> Similarity:
+def fit_similarity(points: np.ndarray, wanted: np.ndarray) -> Similarity:
     """Return the similarity that brings points nearest to where they are wanted, least squares
     (Umeyama 1991).
 
@@ -161,7 +163,7 @@ def control_point_frame(path: Path) -> GeoFrame:
     it."""
     points, world = np.split(_control_points(path), 2, axis=1)
     try:
-        found = fitted(points, world)
+        found = fit_similarity(points, world)
     except DyngsError as error:
         raise DyngsError(f"{path}: {error}") from None
     _, line = _residuals(found, points, world, "control points")
@@ -228,7 +230,7 @@ def gps_frame(opened: OpenedScene) -> GeoFrame:
     origin = positions.mean(axis=0)
     world = east_north_up(positions, origin)
     try:
-        similarity = fitted(centres, world)
+        similarity = fit_similarity(centres, world)
     except DyngsError:
         raise DyngsError(
             f"{root}: the photos stand on one line, which leaves open what is up; {_INSTEAD}"

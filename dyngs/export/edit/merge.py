@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, counted
-from dyngs.export.splat_files import splats_at, up_of
+from dyngs.core.errors import DyngsError, format_count
+from dyngs.export.splat_files import find_up_direction, splats_at
 from dyngs.gaussians.rendering import splat_options
 from dyngs.io.formats.formats import format_to_read, read_splats
 from dyngs.io.formats.similarity import Similarity, axis_of, joined, turn_between
@@ -17,7 +17,7 @@ from dyngs.io.formats.splat_file import SplatFile, with_degree
 from dyngs.runs.opened import open_scene
 
 
-def merged(
+def merge_scenes(
     splat: SplatFile, up: Sequence[float] | None, files: Sequence[Path], tell: Callable[[str], None]
 ) -> SplatFile:
     """Return the contents with those of more files or runs, whose up is brought to ``up`` (3,)
@@ -41,7 +41,7 @@ def merged(
             tell(
                 f"{file}: was trained for another low-pass filter ({other.mode.value}); it is drawn as the rest is"
             )
-        tell(f"{file}: {counted(len(gaussians), 'Gaussian')} added")
+        tell(f"{file}: {format_count(len(gaussians), 'Gaussian')} added")
         parts.append(gaussians.detach())
     degree = max(part.sh_degree for part in parts)
     return replace(splat, gaussians=joined([with_degree(part, degree) for part in parts]))
@@ -58,5 +58,5 @@ def _still(file: Path) -> tuple[SplatFile, Sequence[float] | None]:
         raise DyngsError(
             f"{file}: moves, and --merge adds still scenes; `dyngs export --time T` makes one of it"
         )
-    found = up_of(opened)
+    found = find_up_direction(opened)
     return splats_at(opened, opened.scene, 0.0), None if found is None else found[0]

@@ -1,4 +1,4 @@
-// Reading what a page holds: a header, and lists of numbers in one deflated block of bytes. See numbers.py.
+// Reading what a page holds: a header, and lists of numbers in one deflated block of bytes. See scene_data.py.
 
 const PLACES = ["header", "numbers"]; // of a page, by the ids of their elements
 

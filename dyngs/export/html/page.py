@@ -15,9 +15,14 @@ import numpy as np
 
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
-from dyngs.core.errors import counted
+from dyngs.core.errors import format_count
 from dyngs.data.geometry import look_at_point
-from dyngs.export.choose_path import frontal_cameras, orbit_cameras_around, points_at, select_view
+from dyngs.export.choose_path import (
+    framing_points,
+    frontal_cameras,
+    orbit_cameras_around,
+    select_view,
+)
 from dyngs.export.html.scene_data import PackedArrays, add_levels, add_scene, block_files
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.rendering import RenderOptions
@@ -30,7 +35,7 @@ from dyngs.runs.folder import collect_inputs
 from dyngs.runs.opened import OpenedScene
 
 
-def filled(page: str, pieces: Mapping[str, str]) -> str:
+def fill_template(page: str, pieces: Mapping[str, str]) -> str:
     """Return ``page`` with each ``{{name}}`` replaced by the piece of that name; pieces are not
     looked into."""
     first, *rest = page.split("{{")
@@ -92,7 +97,7 @@ def write_page(
     return WrittenPage(path, len(text.encode()), header, _notes(opened, header))
 
 
-def write_folder(
+def write_page_folder(
     opened: OpenedScene,
     folder: Path,
     *,
@@ -111,7 +116,7 @@ def write_folder(
     require_new_folder(folder)
     lists = PackedArrays(chunked=True)
     if most is not None or opened.renderable.has_levels:
-        levelled = LevelScene.of(opened.renderable, most)
+        levelled = LevelScene.from_scene(opened.renderable, most)
         colour = levelled.scene.colour
         header = add_levels(levelled.levels, colour, lists) | _drawn(levelled.options)
         header["levels"]["most"] = most
@@ -150,7 +155,9 @@ def _notes(opened: OpenedScene, header: dict[str, Any]) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _header(opened: OpenedScene, time: float, views: Sequence[Cameras], lists: PackedArrays) -> dict[str, Any]:
+def _header(
+    opened: OpenedScene, time: float, views: Sequence[Cameras], lists: PackedArrays
+) -> dict[str, Any]:
     views, target = _beginning(opened, views)
     found = opened.renderable.page_data()
     if found is not None:
@@ -164,7 +171,9 @@ def _header(opened: OpenedScene, time: float, views: Sequence[Cameras], lists: P
     return told | _shown(opened, time, views, target)
 
 
-def _beginning(opened: OpenedScene, views: Sequence[Cameras]) -> tuple[Sequence[Cameras], list[float]]:
+def _beginning(
+    opened: OpenedScene, views: Sequence[Cameras]
+) -> tuple[Sequence[Cameras], list[float]]:
     """Return the cameras to begin with and to go through, each a batch of one, and the point to
     look at: ``views`` if there are any, else those of the capture, else around the scene."""
     cameras = opened.cameras
@@ -175,7 +184,7 @@ def _beginning(opened: OpenedScene, views: Sequence[Cameras]) -> tuple[Sequence[
         rows = np.linspace(0, len(others) - 1, min(len(others), MOST_VIEWS)).round().astype(int)
         chosen = (select_view(capture), *(others[i] for i in rows))
         return training_cameras(chosen, opened.config.data), look_at_point(cameras).tolist()
-    target = np.median(points_at(opened.renderable).cpu().numpy(), axis=0)
+    target = np.median(framing_points(opened.renderable).cpu().numpy(), axis=0)
     if not views:
         ring = orbit_cameras_around(opened, _RING)
         views = [ring.select(i) for i in range(_RING)]
@@ -218,7 +227,9 @@ def _view(camera: Cameras) -> dict[str, Any]:
     }
 
 
-def _assembled(opened: OpenedScene, header: dict[str, Any], lists: PackedArrays, title: str | None) -> str:
+def _assembled(
+    opened: OpenedScene, header: dict[str, Any], lists: PackedArrays, title: str | None
+) -> str:
     """Return the text of the page. All that stems from a run is escaped; scripts are allowed by
     their hash alone."""
     if title is None:
@@ -239,8 +250,10 @@ def _assembled(opened: OpenedScene, header: dict[str, Any], lists: PackedArrays,
         "fetched": " connect-src 'self';" if fetches else "",  # nothing, but for its parts
     }
     size = len(page) + sum(len(x) for x in fixed.values())
-    about = counted(header["count"], "triangle" if "texture" in header else "Gaussian")
-    return filled(page, fixed | {"about": about + ("" if fetches else f", {size / 1e6:.1f} MB")})
+    about = format_count(header["count"], "triangle" if "texture" in header else "Gaussian")
+    return fill_template(
+        page, fixed | {"about": about + ("" if fetches else f", {size / 1e6:.1f} MB")}
+    )
 
 
 SCRIPTS = (
@@ -261,7 +274,10 @@ SHADERS += ("harmonics.glsl", "triangles.vert.glsl", "triangles.frag.glsl")
 def element_script() -> str:
     """Return the script: it needs nothing else, leaves no other name behind, and is ASCII, as pages
     may be of any."""
-    texts = {"STYLE": read_asset("scene.css"), "SHADERS": {name: read_asset(name) for name in SHADERS}}
+    texts = {
+        "STYLE": read_asset("scene.css"),
+        "SHADERS": {name: read_asset(name) for name in SHADERS},
+    }
     constants = [f"const {name} = {script_safe(value)};" for name, value in texts.items()]
     parts = "\n".join([*constants, *map(read_asset, SCRIPTS)])
     script = f'// <dyngs-scene src="PAGE">: a scene of dyngs (Apache-2.0).\n(() => {{\n"use strict";\n{parts}}})();\n'

@@ -15,6 +15,7 @@ from dyngs.core.tensor_checks import (
     require_times,
     require_positive,
     require_tensor,
+    require_times,
 )
 from dyngs.data.capture import Capture, Split
 from dyngs.gaussians import Gaussians, TopologyEdit
@@ -68,10 +69,10 @@ class HumanScene(GaussianScene, Posable):
             "learned.weights", torch.zeros_like(tensors["anchors.weights"])
         )  # exported files hold the corrected weights only
         require_avatar(gaussians, tensors)
-        anchors = Anchors(**part_of(tensors, "anchors"))
-        clip = MotionClip(**part_of(tensors, "clip"))
+        anchors = Anchors(**select_prefix(tensors, "anchors"))
+        clip = MotionClip(**select_prefix(tensors, "clip"))
         skeleton = Skeleton(tensors["joints"], tuple(tensors["parents"].tolist()))
-        learned = part_of(tensors, "learned")
+        learned = select_prefix(tensors, "learned")
         shapes = None
         if "shapes.directions" in tensors:
             shapes = PoseBlendShapes(

@@ -187,7 +187,9 @@ def read_obj(path: Path, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Triangles ``f v/vt v/vt v/vt`` of the file may come in any order. Raises DyngsError: the file
     cannot be read, or belongs to another body.
     """
-    with wrap_read_errors(path, "give the .obj made for this body, with triangles 'f v/vt v/vt v/vt'"):
+    with wrap_read_errors(
+        path, "give the .obj made for this body, with triangles 'f v/vt v/vt v/vt'"
+    ):
         uv = []
         triangles: dict[tuple[int, ...], dict[int, int]] = {}
         for line in read_limited(path).decode("latin-1").splitlines():

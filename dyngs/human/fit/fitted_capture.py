@@ -216,7 +216,9 @@ def read_known_shape(path: Path, body: BodyTemplate) -> BodyFrames:
     ``path`` is a capture or folder that ``dyngs data fit`` wrote, or the run of an avatar trained
     on one. Raises DyngsError: none of these, or the shape of another template.
     """
-    with wrap_read_errors(path, "give a capture that `dyngs data fit` wrote, or a run trained on it"):
+    with wrap_read_errors(
+        path, "give a capture that `dyngs data fit` wrote, or a run trained on it"
+    ):
         folder = path
         if (path / RESOLVED_NAME).is_file():
             data = load_resolved(path).data

@@ -84,7 +84,9 @@ class CameraCorrections:
         """
         pose, lens = self.rows(view)
         own = torch.zeros(6, device="cpu") if pose is None else self.poses[pose]
-        return corrected(cameras, own, None if lens is None else self.lenses[lens], self.size)
+        return apply_correction(
+            cameras, own, None if lens is None else self.lenses[lens], self.size
+        )
 
     def correct_view(self, view: View) -> View:
         """Return ``view`` with its camera as ``applied_to`` has it, in float64."""
@@ -103,7 +105,7 @@ class CameraCorrections:
         flat -= self._common @ (self._common.T @ flat)
 
 
-def corrected(cameras: Cameras, pose: Tensor, lens: Tensor | None, size: float) -> Cameras:
+def apply_correction(cameras: Cameras, pose: Tensor, lens: Tensor | None, size: float) -> Cameras:
     """Return the camera ``cameras`` (V = 1) with the corrections ``pose`` (6,) and ``lens`` (3,);
     differentiable."""
     pose = pose.to(cameras.cam_from_world)
@@ -121,7 +123,7 @@ def corrected(cameras: Cameras, pose: Tensor, lens: Tensor | None, size: float) 
     return Cameras(motion @ cameras.cam_from_world, intrinsics, cameras.width, cameras.height)
 
 
-def watched(cameras: Cameras) -> Cameras:
+def with_camera_gradients(cameras: Cameras) -> Cameras:
     """Return ``cameras`` as leaf tensors that collect gradients."""
     pose, intrinsics = (
         x.detach().clone().requires_grad_() for x in (cameras.cam_from_world, cameras.intrinsics)
@@ -129,7 +131,7 @@ def watched(cameras: Cameras) -> Cameras:
     return Cameras(pose, intrinsics, cameras.width, cameras.height)
 
 
-def slopes(
+def correction_gradients(
     cameras: Cameras, by_pose: Tensor, by_intrinsics: Tensor, size: float
 ) -> tuple[Tensor, Tensor]:
     """Return the gradients (6,) and (3,) by a further small correction of the pose and of the
@@ -199,7 +201,7 @@ class CameraRefinement(Correction):
         }
 
     def before_render(self, image: Image) -> Image:
-        return replace(image, cameras=watched(image.cameras))
+        return replace(image, cameras=with_camera_gradients(image.cameras))
 
     @torch.no_grad()
     def after_backward(self, index: int, step: int, image: Image) -> Count:
@@ -216,7 +218,7 @@ class CameraRefinement(Correction):
         if rate == 0 or by_pose is None or by_intrinsics is None:
             return 0
         left_out = torch.zeros((), dtype=torch.int64, device="cpu")
-        gradients = slopes(cameras, by_pose, by_intrinsics, self.corrections.size)
+        gradients = correction_gradients(cameras, by_pose, by_intrinsics, self.corrections.size)
         rates = (rate, LENS_RATE * rate if step >= LENS_STARTS * self._steps else 0.0)
         rows = self.corrections.rows(self._views[index])
         for (name, x), row, gradient, lr in zip(
@@ -288,7 +290,7 @@ def fit_camera_to_image(
     best = correction.clone()
     least = float("inf")
     for update in range(1, FIT_UPDATES + 1):
-        camera = watched(corrected(image.cameras, correction[0], None, size))
+        camera = with_camera_gradients(apply_correction(image.cameras, correction[0], None, size))
         with torch.enable_grad():
             drawn = scene.render(camera, image.time, options=options, background=background)
             loss = l1_ssim_loss(drawn.rgb[0], truth, FIT_SSIM_WEIGHT, counts)
@@ -298,6 +300,6 @@ def fit_camera_to_image(
             best = correction.clone()
             least = float(loss.detach())
         rate = FIRST_FIT_RATE * (LAST_FIT_RATE / FIRST_FIT_RATE) ** (update / FIT_UPDATES)
-        slope = slopes(camera, by_pose, by_intrinsics, size)[0][None]
+        slope = correction_gradients(camera, by_pose, by_intrinsics, size)[0][None]
         adam_step_(correction, slope, first, second, lr=rate, step=update)
-    return replace(image, cameras=corrected(image.cameras, best[0], None, size))
+    return replace(image, cameras=apply_correction(image.cameras, best[0], None, size))

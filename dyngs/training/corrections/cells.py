@@ -24,7 +24,7 @@ def cell_camera(cameras: Cameras) -> Cameras:
     return cameras.resized(max(1, round(fraction * width)), max(1, round(fraction * height)))
 
 
-def points_of(camera: Cameras, which: Tensor, depth: Tensor) -> Tensor:
+def unproject_pixels(camera: Cameras, which: Tensor, depth: Tensor) -> Tensor:
     """Return (P, 3) the points of the world that pixels ``which`` (P,), row by row, show at
     ``depth`` (P,)."""
     pose = camera.cam_from_world[0]
@@ -49,7 +49,7 @@ def project_to_pixels(camera: Cameras, world: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(inside, y * camera.width + x, -1), z
 
 
-def distances(cameras: Sequence[Cameras]) -> Tensor:
+def camera_distances(cameras: Sequence[Cameras]) -> Tensor:
     """Return (V, V) the distances of cameras from each other."""
     centres = torch.cat([camera.centers for camera in cameras]).cpu()
     return torch.cdist(centres, centres, compute_mode="donot_use_mm_for_euclid_dist")

@@ -31,10 +31,15 @@ from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.network import SATURATED, apply_affine_colour
 from dyngs.gaussians.optimizer import AdamState
-from dyngs.models.model import Correction, LossInput, Loss, RenderedView
+from dyngs.models.model import Correction, Loss, LossInput, RenderedView
 from dyngs.models.renderable import Rendering
 from dyngs.ops.adam import Count
-from dyngs.training.corrections.cells import cell_camera, distances, project_to_pixels, points_of
+from dyngs.training.corrections.cells import (
+    camera_distances,
+    cell_camera,
+    project_to_pixels,
+    unproject_pixels,
+)
 
 WARM_UP = 0.25
 """Fraction of the run in which images are taken as they are: before, the rendering shows too little
@@ -176,7 +181,7 @@ def estimate_log_gains(
         draw: renders the scene from cameras at a time, with expected depth.
     """
     cells = [_cells_of(images, index, draw) for index in which]
-    distance = distances([x.camera for x in cells])
+    distance = camera_distances([x.camera for x in cells])
     places = [
         _places(cells, i, distance[i].argsort(stable=True)[:COMPARED])
         for i in evenly_spaced(len(cells), DRAWN_FROM)
@@ -213,7 +218,7 @@ def _places(cells: Sequence[_Cells], index: int, compared: Tensor) -> _Places:
     """Return what the views ``compared`` show of the known cells of one view."""
     own = cells[index]
     which = own.known.nonzero()[:, 0]
-    world = points_of(own.camera, which, own.depth[which])
+    world = unproject_pixels(own.camera, which, own.depth[which])
     colours = []
     shown = []
     for other in (cells[i] for i in compared.tolist()):

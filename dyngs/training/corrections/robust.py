@@ -25,7 +25,13 @@ from dyngs.core.camera import Cameras
 from dyngs.core.tensor_checks import require_indices, require_tensor
 from dyngs.data.loader import ImageLoader
 from dyngs.models.model import Correction, RenderedView
-from dyngs.training.corrections.cells import CELLS, cell_camera, distances, project_to_pixels, points_of
+from dyngs.training.corrections.cells import (
+    CELLS,
+    camera_distances,
+    cell_camera,
+    project_to_pixels,
+    unproject_pixels,
+)
 
 # An image is looked at each so many times that it is trained on; in between its mask stays
 EVERY = 4
@@ -57,9 +63,9 @@ class RobustMasks(Correction):
         images: ImageLoader,
         cameras: list[Cameras],
         steps: int,
-        corrected: Callable[[int, Cameras], Cameras] | None = None,
+        correct_cameras: Callable[[int, Cameras], Cameras] | None = None,
     ) -> None:
-        self._others = NeighbourViews(images, cameras, corrected)
+        self._others = NeighbourViews(images, cameras, correct_cameras)
         self._begins = WARM_UP * steps
         self._visits = torch.zeros(len(images), dtype=torch.int64, device="cpu")
         self._left_out = torch.zeros(len(images), CELLS, CELLS, dtype=torch.uint8, device="cpu")
@@ -171,14 +177,14 @@ class NeighbourViews:
         self,
         images: ImageLoader,
         cameras: Sequence[Cameras],
-        corrected: Callable[[int, Cameras], Cameras] | None = None,
+        correct_cameras: Callable[[int, Cameras], Cameras] | None = None,
     ) -> None:
         self._images = images
         self._cameras = [cell_camera(camera.to(device="cpu")) for camera in cameras]
-        self._corrected = corrected
+        self._corrected = correct_cameras
         ahead = torch.cat([camera.cam_from_world for camera in self._cameras])[:, 2, :3]
         same_side = (ahead[:, None] * ahead).sum(-1) > 0
-        distance = torch.where(same_side, distances(self._cameras), torch.inf)
+        distance = torch.where(same_side, camera_distances(self._cameras), torch.inf)
         self._distance = distance.fill_diagonal_(torch.inf)
         self._cells: dict[int, Tensor] = {}
 
@@ -197,7 +203,7 @@ class NeighbourViews:
             drawn: (5, h, w) rendered colour, depth and alpha of the cells.
         """
         shown = drawn[:, which]
-        world = points_of(self._camera(index), which.flatten().nonzero()[:, 0], shown[3])
+        world = unproject_pixels(self._camera(index), which.flatten().nonzero()[:, 0], shown[3])
         order = self._distance[index].argsort(stable=True)[:NEAREST]
         found = [shown.new_full((shown.shape[1],), torch.nan)]
         for other in order[self._distance[index][order].isfinite()].tolist():

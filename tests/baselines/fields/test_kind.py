@@ -17,7 +17,7 @@ from dyngs.cli import main
 from dyngs.evaluate.report import evaluate_run
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.runs.opened import open_run
-from dyngs.view.layers import Shot, draw
+from dyngs.view.layers import ViewRequest, draw
 from dyngs.view.views import initial_viewpoint
 
 STEPS = ["train.steps=30", "train.save_every=15"]
@@ -50,9 +50,9 @@ def test_it_is_evaluated_drawn_and_viewed(run: Path, tmp_path: Path) -> None:
     opened = open_run(run)
     for layer in ("colour", "depth"):
         shot = (
-            Shot(initial_viewpoint(opened).start)
+            ViewRequest(initial_viewpoint(opened).start)
             if layer == "colour"
-            else Shot(initial_viewpoint(opened).start, layer="depth")
+            else ViewRequest(initial_viewpoint(opened).start, layer="depth")
         )
         assert draw(opened, shot).std() > 0
 

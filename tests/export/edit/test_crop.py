@@ -18,10 +18,10 @@ def test_boxes_and_spheres() -> None:
     box = parse_region(["1,-1,0", "-0.5,1,1"])
     x, y, z = POINTS.T
     np.testing.assert_array_equal(
-        box.holds(POINTS), (abs(y) <= 1) & (z >= 0) & (z <= 1) & (x >= -0.5) & (x <= 1)
+        box.contains(POINTS), (abs(y) <= 1) & (z >= 0) & (z <= 1) & (x >= -0.5) & (x <= 1)
     )
     ball = parse_region(["1,0,0 1.2m"])  # also as one word
-    np.testing.assert_array_equal(ball.holds(POINTS), (x - 1) ** 2 + y**2 + z**2 <= 1.44)
+    np.testing.assert_array_equal(ball.contains(POINTS), (x - 1) ** 2 + y**2 + z**2 <= 1.44)
     assert isinstance(box, Box)
     assert isinstance(ball, Sphere)
 

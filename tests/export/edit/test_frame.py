@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.export.edit.frame import direction, control_point_frame, number, point, parse_scale
+from dyngs.export.edit.frame import (
+    control_point_frame,
+    parse_direction,
+    parse_number,
+    parse_point,
+    parse_scale,
+)
 from dyngs.io.formats.similarity import Similarity
 
 SCENE = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0.5, 0.5, 1]])
@@ -26,11 +32,14 @@ def table(path: Path, world: np.ndarray, scene: np.ndarray = SCENE, start: str =
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (lambda: point("1,2", "--origin"), "--origin: '1,2' is no point; write three numbers"),
-        (lambda: point("1,2,nan", "--origin"), "'1,2,nan' is no point"),
-        (lambda: number("x", "--max-loss"), "--max-loss: 'x' is no number"),
-        (lambda: direction("0,0,0"), "has no direction"),
-        (lambda: direction("up"), "'up' is no point"),
+        (
+            lambda: parse_point("1,2", "--origin"),
+            "--origin: '1,2' is no point; write three numbers",
+        ),
+        (lambda: parse_point("1,2,nan", "--origin"), "'1,2,nan' is no point"),
+        (lambda: parse_number("x", "--max-loss"), "--max-loss: 'x' is no number"),
+        (lambda: parse_direction("0,0,0"), "has no direction"),
+        (lambda: parse_direction("up"), "'up' is no point"),
         (lambda: parse_scale("0,0,0 1,0,0"), "is no number"),
         (lambda: parse_scale("nan"), "'nan' is no number"),
         (lambda: parse_scale("0"), "is no factor"),

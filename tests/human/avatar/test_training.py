@@ -195,7 +195,7 @@ def test_what_is_hardly_seen_is_filled_after_the_last_step_and_nothing_else_chan
         trainer = build_trainer(tiny(capture, steps=4, fill_unseen=fill))
         reports = [trainer.step() for _ in range(step)]
         found = {name: x.clone() for name, x in trainer.checkpoint().tensors.items()}
-        return found, reports[-1].finding or ""
+        return found, reports[-1].message or ""
 
     assert same(after(3, True)[0], after(3, False)[0])
     (filled, line), (plain, silence) = after(4, True), after(4, False)
@@ -254,5 +254,5 @@ def test_poses_that_views_gain_nothing_from_stay_for_good(
     assert lines[9].startswith("body poses not refitted")
     resumed = build_trainer(tiny(capture, steps=240))
     resumed.restore(trainer.checkpoint())
-    assert all(resumed.step().finding is None for _ in range(4)), "it is not tried again"
+    assert all(resumed.step().message is None for _ in range(4)), "it is not tried again"
     assert torch.equal(human(resumed).clip.poses, given)

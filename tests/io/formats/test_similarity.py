@@ -12,7 +12,7 @@ from splat_scenes import AROUND, cloud, seen
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.export.edit.frame import fitted
+from dyngs.export.edit.frame import fit_similarity
 from dyngs.gaussians.filters import apply_filter
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.io.formats.similarity import (
@@ -78,11 +78,11 @@ def test_one_after_another_and_back() -> None:
 
 def test_control_points_give_the_similarity() -> None:
     for count in (3, 4):
-        found = fitted(CORNERS[:count], ODD.points(CORNERS[:count]))
+        found = fit_similarity(CORNERS[:count], ODD.points(CORNERS[:count]))
         np.testing.assert_allclose(found.points(CORNERS), ODD.points(CORNERS), atol=1e-12)
     far = Similarity(ODD.turn, 0.02, (691000.0, 5334000.0, 520.0))
     np.testing.assert_allclose(
-        fitted(CORNERS, far.points(CORNERS)).points(CORNERS), far.points(CORNERS), atol=1e-6
+        fit_similarity(CORNERS, far.points(CORNERS)).points(CORNERS), far.points(CORNERS), atol=1e-6
     )
 
 
@@ -97,7 +97,7 @@ def test_control_points_give_the_similarity() -> None:
 )
 def test_points_that_leave_it_open(points: np.ndarray, wanted: np.ndarray, said: str) -> None:
     with pytest.raises(DyngsError, match=said):
-        fitted(points, wanted)
+        fit_similarity(points, wanted)
 
 
 def test_points_near_the_origin_keep_their_coordinates() -> None:

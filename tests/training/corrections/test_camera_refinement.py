@@ -25,11 +25,11 @@ from dyngs.training.corrections.camera_refinement import (
     STARTS,
     CameraCorrections,
     CameraRefinement,
+    apply_correction,
     common_motion_basis,
-    corrected,
+    correction_gradients,
     fit_camera_to_image,
-    slopes,
-    watched,
+    with_camera_gradients,
 )
 from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
@@ -80,11 +80,13 @@ def test_slopes_are_the_gradients_of_a_correction(seed: int) -> None:
         of_lens = torch.stack([k[0, 0], k[1, 1], k[0, 2], k[1, 2]])
         return (camera.cam_from_world[0, :3] * weights).sum() + (of_lens * by_lens).sum()
 
-    leaf = watched(camera)
+    leaf = with_camera_gradients(camera)
     by_pose, by_intrinsics = torch.autograd.grad(loss(leaf), [leaf.cam_from_world, leaf.intrinsics])
     pose, lens = (torch.zeros(n, dtype=torch.float64, requires_grad=True) for n in (6, 3))
-    truth = torch.autograd.grad(loss(corrected(camera, pose, lens, SIZE)), [pose, lens])
-    for ours, theirs in zip(slopes(camera, by_pose, by_intrinsics, SIZE), truth, strict=True):
+    truth = torch.autograd.grad(loss(apply_correction(camera, pose, lens, SIZE)), [pose, lens])
+    for ours, theirs in zip(
+        correction_gradients(camera, by_pose, by_intrinsics, SIZE), truth, strict=True
+    ):
         torch.testing.assert_close(ours, theirs)
 
 
@@ -96,7 +98,7 @@ def test_a_correction_means_the_same_at_every_scale() -> None:
     )
     pose = torch.tensor([0.01, -0.02, 0.03, 0.1, 0.2, -0.1])
     lens = torch.tensor([0.05, 0.01, -0.02])
-    large, little = (corrected(camera_of(v), pose, lens, SIZE) for v in (view, small))
+    large, little = (apply_correction(camera_of(v), pose, lens, SIZE) for v in (view, small))
     torch.testing.assert_close(large.cam_from_world, little.cam_from_world)
     torch.testing.assert_close(0.5 * large.intrinsics[0, :2], little.intrinsics[0, :2])
 
@@ -182,7 +184,9 @@ def test_disturbed_cameras_are_found() -> None:
     errors = []
     for step in range(1, steps + 1):
         index = step % len(views)
-        camera = watched(refinement.corrections.correct_cameras(views[index], camera_of(views[index])))
+        camera = with_camera_gradients(
+            refinement.corrections.correct_cameras(views[index], camera_of(views[index]))
+        )
         error = (points_seen(camera, points.double()) - truth[index]).norm(dim=-1).mean()
         error.backward()
         refinement.after_backward(index, step, image_of(camera))
@@ -239,7 +243,7 @@ def shown(scene: StaticScene, image: Image) -> Tensor:
 @pytest.mark.parametrize("left_only", [False, True])
 def test_the_pose_of_a_render_is_found_again(left_only: bool) -> None:
     scene, right = scene_and_image()
-    wrong = replace(right, cameras=corrected(right.cameras, WRONG, None, 3.0))
+    wrong = replace(right, cameras=apply_correction(right.cameras, WRONG, None, 3.0))
     weights = torch.zeros(40, 48) if left_only else None
     if weights is not None:
         weights[:, :24] = 1

@@ -81,7 +81,7 @@ class KeypointNerf(FieldNetwork):
     def render(
         self, person: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
     ) -> FieldPicture:
-        rays, _ = rays_of(camera)
+        rays, _ = camera_rays(camera)
         shifts = sample_offsets(len(rays), generator=generator).to(rays.origins)
         pieces = split_rays(torch.arange(len(rays), device=shifts.device))
         found = [self._along(person, rays[some], shifts[some]) for some in pieces]

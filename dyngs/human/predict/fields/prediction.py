@@ -62,7 +62,7 @@ from dyngs.models.renderable import (
     Renderable,
     Rendering,
     TimeStep,
-    composited,
+    composite_background,
     fixed_cameras,
 )
 from dyngs.models.views import evaluation_background
@@ -184,7 +184,9 @@ class PredictedModel(Model[PredictedField]):
             "`ngp` or `human` on the capture"
         )
 
-    def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+    def draw(
+        self, image: Image, step: int, background: Tensor, *, depth: bool = False
+    ) -> RenderOutput:
         raise self._untrained()
 
     def update(self, step: int) -> UpdateResult:

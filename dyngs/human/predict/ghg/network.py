@@ -55,7 +55,9 @@ from dyngs.models.prediction import (
     ResidualBlock,
     initialize_weights,
     image_loss,
+    initialize_weights,
     load_weights,
+    optimizer_step,
     random_index,
     updated,
     upsample,
@@ -508,7 +510,7 @@ class PersonPredictor(Predictor[AtlasNetwork]):
             scene = self._scene(maps)
             time_steps = [scene.time_step(image.time) for image in images]
             loss = _images_error(scene, time_steps, images, self.background, self.config)[0]
-            if not updated(optimizer, self.network, loss, rate * (1.0 - step / steps)):
+            if not optimizer_step(optimizer, self.network, loss, rate * (1.0 - step / steps)):
                 break
             on_progress("adapting to the images", step + 1, steps)
         return steps
