@@ -308,7 +308,7 @@ class PoseRefit:
             or not self.applies_to(scene)
         ):
             return None
-        scene.changed()
+        scene.clear_caches()
         if elapsed[-1] > 0:
             return self.refit_frame(scene, elapsed[-1] - 1), ""
         gain_db, shift = self.measure_gain(scene)

@@ -9,10 +9,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, State, StateTensor, part_of, add_prefix, with_role
+from dyngs.core.state import Role, State, StateTensor, add_prefix, select_prefix, with_role
 from dyngs.core.tensor_checks import (
     require_indices,
-    require_times,
     require_positive,
     require_tensor,
     require_times,

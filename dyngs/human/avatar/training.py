@@ -42,7 +42,7 @@ from dyngs.human.avatar.posing import (
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.keys import HumanModel
 from dyngs.models.kind import StartContext
-from dyngs.models.model import LossInput, Loss
+from dyngs.models.model import Loss, LossInput
 from dyngs.models.views import background_colour
 from dyngs.ops.adam import Count
 from dyngs.ops.device import copy_async

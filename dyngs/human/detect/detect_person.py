@@ -21,7 +21,7 @@ from dyngs.capture.masks import at_size, outlined
 from dyngs.capture.sfm.photos import digest_of
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ProgressCallback, ignore_progress
-from dyngs.core.errors import DyngsError, counted, show
+from dyngs.core.errors import DyngsError, format_count, log_info
 from dyngs.data.capture import Capture, View, by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.read import is_capture, read_capture
@@ -109,11 +109,11 @@ def capture_warnings(
     if count < len(images):
         num_missing = len(images) - count
         messages.append(
-            f"no person detected in {num_missing} of {counted(len(images), 'image')}; skipping them"
+            f"no person detected in {num_missing} of {format_count(len(images), 'image')}; skipping them"
         )
     if num_cut_off > 0.1 * count:
         messages.append(
-            f"feet are cut off or hidden in {num_cut_off} of {counted(count, 'image')}; legs are "
+            f"feet are cut off or hidden in {num_cut_off} of {format_count(count, 'image')}; legs are "
             "not reliable there"
         )
     if height < 120:
@@ -121,7 +121,9 @@ def capture_warnings(
             f"the person is only {height:.0f} px high; move closer or record larger images"
         )
     if num_blurred > 0.1 * count:
-        messages.append(f"{counted(num_blurred, 'image')} blurred; use more light or slower motion")
+        messages.append(
+            f"{format_count(num_blurred, 'image')} blurred; use more light or slower motion"
+        )
     if is_single_camera and not _turns(detections):
         messages.append(
             "the person never turns around; sides that the camera does not see are guessed"
@@ -167,7 +169,7 @@ def detect_person(
     detector: Detector,
     folder: Path,
     on_progress: ProgressCallback,
-    log: Callable[[str], None] = show,
+    log: Callable[[str], None] = log_info,
 ) -> FitInputs:
     """Detect the person in all views; write masks and key points to ``folder`` and return their
     paths.
@@ -196,8 +198,8 @@ def detect_person(
         else:
             log(
                 f"{prefix}{detector.name} detected the person in {len(heights)} of "
-                f"{counted(len(person), 'image')}, {np.median(heights):.0f} px high; swapped left and "
-                f"right in {counted(num_swapped, 'image')}"
+                f"{format_count(len(person), 'image')}, {np.median(heights):.0f} px high; swapped left and "
+                f"right in {format_count(num_swapped, 'image')}"
             )
             for warning in capture_warnings(images, person, is_single_camera=len(cameras) == 1):
                 log(f"warning: {prefix}{warning}")
@@ -220,7 +222,7 @@ def detect_person(
     if not points:
         raise DyngsError(
             f"{capture.root}: {detector.name} detects nobody in "
-            f"{counted(sum(map(len, cameras)), 'image')}; check the images, or pass masks of "
+            f"{format_count(sum(map(len, cameras)), 'image')}; check the images, or pass masks of "
             "another program to `dyngs data fit` (docs/person.md)"
         )
     _write_keypoints(folder / "keypoints.json", points)
@@ -251,7 +253,7 @@ def write_detected_person(
     out: Path,
     detector: Detector,
     on_progress: ProgressCallback = ignore_progress,
-    log: Callable[[str], None] = show,
+    log: Callable[[str], None] = log_info,
 ) -> FittedCapture:
     """Detect a person, fit the body, and write the fitted capture to the new folder ``out``.
 
@@ -272,7 +274,7 @@ def write_detected_person(
 def ensure_detected_person(
     data: DataConfig,
     *,
-    log: Callable[[str], None] = show,
+    log: Callable[[str], None] = log_info,
     on_progress: ProgressCallback = ignore_progress,
 ) -> DataConfig:
     """Return options for the fitted capture of the person in a clip; the result is cached per

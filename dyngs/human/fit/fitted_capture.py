@@ -25,7 +25,7 @@ from dyngs.capture.sfm.photos import digest_of
 from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.core.conventions import ProgressCallback, ignore_progress
-from dyngs.core.errors import DyngsError, counted, wrap_read_errors, show
+from dyngs.core.errors import DyngsError, format_count, log_info, wrap_read_errors
 from dyngs.data.body_frames import frame_number, numbered, read_body_file
 from dyngs.data.capture import BodyFrames, Capture, Split, View
 from dyngs.data.geometry import opengl_from_cam
@@ -175,7 +175,7 @@ def write_fitted_capture(
     worst = int(np.nanargmin(chosen.per_frame))
     label = "" if body.name == "anny" else f"{_template_label(model, body)}, "
     lines = [
-        f"{label}{counted(len(fit.motion.clip), 'frame')}; "
+        f"{label}{format_count(len(fit.motion.clip), 'frame')}; "
         f"silhouette IoU on {_evaluation_views(fit.num_held_out)}: {candidates}",
         f"chosen: {chosen.name}; worst frame {fit.motion.frames[worst]} (IoU "
         f"{chosen.per_frame[worst]:.3f}); see {out / 'fit_overlays.png'}",
@@ -185,7 +185,7 @@ def write_fitted_capture(
 
 
 def _evaluation_views(num_held_out: int) -> str:
-    return counted(num_held_out, "held-out view") if num_held_out else "the fitted views"
+    return format_count(num_held_out, "held-out view") if num_held_out else "the fitted views"
 
 
 def read_run_template(path: Path) -> HumanModel:
@@ -269,7 +269,7 @@ def _at_most(options: DataConfig, longest_side: int) -> DataConfig:
 
 
 def read_person_capture(
-    options: DataConfig, inputs: FitInputs, work: Path, log: Callable[[str], None] = show
+    options: DataConfig, inputs: FitInputs, work: Path, log: Callable[[str], None] = log_info
 ) -> Capture:
     """Read a capture with silhouettes from a capture, a video, or a folder of images of one fixed
     camera.
@@ -523,7 +523,7 @@ def ensure_fitted_body(
     model: HumanModel | None = None,
     *,
     only_if_needed: bool = False,
-    log: Callable[[str], None] = show,
+    log: Callable[[str], None] = log_info,
     on_progress: ProgressCallback = ignore_progress,
 ) -> DataConfig:
     """Return options for the capture with a fitted body; the fit is cached per capture.

@@ -231,7 +231,7 @@ def test_wrong_poses_are_fitted_to_the_images_and_resuming_changes_no_byte(
     monkeypatch.setattr(pose_fit, "REFIT_STARTS", (10 / 240,))
     config = tiny(turned(capture, tmp_path / "turned"), steps=240)
     trainer = build_trainer(config)
-    lines = [trainer.step().finding or "" for _ in range(16)]
+    lines = [trainer.step().message or "" for _ in range(16)]
     assert "refitting body poses" in lines[9]
     assert "".join(lines[:9] + lines[10:]) == ""
     straight = {name: x.clone() for name, x in trainer.checkpoint().tensors.items()}
@@ -250,7 +250,7 @@ def test_poses_that_views_gain_nothing_from_stay_for_good(
     monkeypatch.setattr(pose_fit, "REFIT_STARTS", (10 / 240, 14 / 240))
     trainer = build_trainer(tiny(capture, steps=240))
     given = human(trainer).clip.poses.clone()
-    lines = [trainer.step().finding or "" for _ in range(12)]
+    lines = [trainer.step().message or "" for _ in range(12)]
     assert lines[9].startswith("body poses not refitted")
     resumed = build_trainer(tiny(capture, steps=240))
     resumed.restore(trainer.checkpoint())

@@ -31,7 +31,7 @@ from dyngs.human.predict.fields.network import (
     PointFeatures,
     SourceFeatures,
     blend_colours,
-    initialize_weights,
+    initialize_network,
     mean_and_variance,
     relative_directions,
     sample_maps,
@@ -79,7 +79,7 @@ class EgHumanNerf(FieldNetwork):
         self.blend = Perceptron(3 * colours + PARAMS.geometry + 5, width, width // 2, 1)
         self.sharpness = nn.Parameter(torch.tensor(math.log(PARAMS.sharpness), device="cpu"))
         self.refine = Refinement()
-        initialize_weights(self, generator)
+        initialize_network(self, generator)
         with torch.no_grad():  # start with the body surface and unchanged colours
             for layer in (self.guide.layers[-1], self.surface.layers[-1], self.refine.last):
                 layer.weight.mul_(0.1)  # pyright: ignore[reportCallIssue, reportAttributeAccessIssue]
@@ -96,7 +96,7 @@ class EgHumanNerf(FieldNetwork):
     def render(
         self, person: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
     ) -> FieldPicture:
-        rays, z = rays_of(camera)
+        rays, z = camera_rays(camera)
         boundaries, _ = person.extra
         near, far, body_depth = (
             (x.flatten() / z).clamp(max=_FAR)[:, None] for x in boundaries.interval(camera)

@@ -28,14 +28,14 @@ from dyngs.human.predict.fields.network import (
     Perceptron,
     SourceFeatures,
     blend_colours,
-    initialize_weights,
+    initialize_network,
     mean_and_variance,
     relative_directions,
     sample_offsets,
     split_rays,
 )
 from dyngs.human.predict.people import NUM_KEY_POINTS, PosedBody, Sources
-from dyngs.models.volume import select_samples, rays_of, reached_samples, thin_samples
+from dyngs.models.volume import camera_rays, reached_samples, select_samples, thin_samples
 from dyngs.ops.rays import MarchSteps, Rays, Samples, Space, composite, march
 
 
@@ -73,7 +73,7 @@ class KeypointNerf(FieldNetwork):
         self.per_image = Perceptron(CODE + PARAMS.features + FINE, width, width, PARAMS.pooled)
         self.geometry = Perceptron(2 * PARAMS.pooled + HINTS, width, width, 1 + PARAMS.geometry)
         self.blend = Perceptron(3 * colours + 4, width, width // 2, 1)
-        initialize_weights(self, generator)
+        initialize_network(self, generator)
 
     def prepare(self, features: SourceFeatures, body: PosedBody) -> tuple[Space, Tensor]:
         return visual_hull(features, body.key_points)
@@ -114,8 +114,12 @@ class KeypointNerf(FieldNetwork):
             geometry = self._geometry(person, points, code[:, which])
         densities = density(geometry)
         colours = self._colours(features, geometry, points, rays.directions[samples.rays.long()])
-        composited = composite(densities, colours, samples)
-        return composited.colour, composited.transmittance, composited.depth
+        composite_background = composite(densities, colours, samples)
+        return (
+            composite_background.colour,
+            composite_background.transmittance,
+            composite_background.depth,
+        )
 
     def _geometry(self, person: EncodedPerson, points: Tensor, code: Tensor) -> Tensor:
         """Return raw density and geometry features (M, 1 + PARAMS.geometry) of points (M, 3).

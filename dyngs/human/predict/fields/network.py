@@ -107,7 +107,7 @@ def sample_maps(maps: Tensor, grid: Tensor, mode: str = "bilinear") -> Tensor:
     return sampled[:, :, 0].mT
 
 
-def initialize_weights(network: nn.Module, generator: torch.Generator) -> None:
+def initialize_network(network: nn.Module, generator: torch.Generator) -> None:
     """Initialise all weights from ``generator`` on the CPU; biases are 0."""
     initialize_weights(network, generator)
     for layer in network.modules():

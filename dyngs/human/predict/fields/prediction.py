@@ -16,7 +16,7 @@ from dyngs.config import Config, DataConfig
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import ProgressCallback
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import Role, State, move_fields_to, add_prefix, with_role
+from dyngs.core.state import Role, State, add_prefix, move_fields_to, with_role
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.data.loader import Image
 from dyngs.data.read import captures_in
@@ -47,7 +47,7 @@ from dyngs.human.predict.people import (
 )
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
-from dyngs.models.model import Drawn, Model, UpdateResult
+from dyngs.models.model import Model, RenderOutput, UpdateResult
 from dyngs.models.prediction import (
     Example,
     Learner,
@@ -131,7 +131,7 @@ class PredictedField(Renderable):
         rgb = torch.stack([x.colour for x in renders])
         transmittance = torch.stack([x.transmittance for x in renders])
         depth = self.scale * torch.stack([x.depth for x in renders])
-        return composited(rgb, transmittance, depth, options, background_colour)
+        return composite_background(rgb, transmittance, depth, options, background_colour)
 
 
 def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedField:

@@ -53,13 +53,11 @@ from dyngs.models.prediction import (
     Learner,
     Predictor,
     ResidualBlock,
-    initialize_weights,
     image_loss,
     initialize_weights,
     load_weights,
     optimizer_step,
     random_index,
-    updated,
     upsample,
 )
 from dyngs.models.renderable import Renderable
