@@ -96,7 +96,7 @@ def train(
     Poses of photos and videos are found first, and a body is fitted to a person where that is
     needed.
 
-    Example::
+    Example:
 
         import dyngs
 

@@ -27,7 +27,8 @@ examples:
   dyngs compare scans/dance --models static,dynamic,mine.yaml --steps 7000 data.longest_side=400
   dyngs compare scans/bench --models static,mip --max-mb 2 --out study
 
-Each model is a preset or a YAML file. An interrupted command continues when it is given again. Details: docs/cli.md.
+Each model is a preset or a YAML file. An interrupted command continues when it is given again.
+Guide: `dyngs docs compare`.
 """
 _TRADEOFF = """\
 examples:
@@ -35,7 +36,8 @@ examples:
   dyngs tradeoff runs/dance --vary prune=0.5,0.8 --vary storage --finetune 2000
   dyngs tradeoff runs/dance --require 'psnr>=30,fps>=20,mb<=5' --minimize mb
 
-An interrupted or repeated command continues and measures only what is missing. Details: docs/tradeoff.md.
+An interrupted or repeated command continues and measures only what is missing.
+Guide: `dyngs docs compare`.
 """
 _FRONT = "* Pareto front of PSNR, speed and size"
 _CONTINUES = "what is finished is kept; the same command continues"

@@ -106,7 +106,7 @@ _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
 def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Config:
     """Return the configuration of a preset with overrides laid over it.
 
-    Example::
+    Example:
 
         import dyngs
 

@@ -133,7 +133,7 @@ def load_split_images(
 @dataclass(frozen=True, kw_only=True)
 class EvalReport:
     """The report that ``dyngs eval`` prints and writes; the fields are the keys of the file, see
-    docs/formats.md."""
+    docs/reference/runs.md."""
 
     split: str
     num_views: int

@@ -1,5 +1,7 @@
-"""Camera paths for rendering: their scene times, JSON files (docs/camera_paths.md) of dyngs and of
-other programs, and the interpolation of keyframes."""
+"""Camera paths for rendering: scene times, JSON files of dyngs and of other programs, keyframes.
+
+The file format is described in docs/reference/camera-paths.md.
+"""
 
 from __future__ import annotations
 
@@ -84,7 +86,7 @@ def camera_path_file(path: str) -> Path | None:
     if not path.endswith(".json"):
         names = ", ".join(AUTOMATIC_PATHS)
         raise DyngsError(
-            f"no camera path {path!r}; use {names}, or a .json file (docs/camera_paths.md)"
+            f"no camera path {path!r}; use {names}, or a .json file (`dyngs docs camera-paths`)"
         )
     return Path(path)
 
@@ -112,7 +114,7 @@ def parse_times(text: str) -> tuple[float, ...]:
 def read_path(
     file: Path, world_offset: np.ndarray | None = None, size: tuple[int, int] | None = None
 ) -> CameraPath:
-    """Read a camera path from a JSON file (docs/camera_paths.md); cameras are float32 on the CPU.
+    """Read a camera path from a JSON file, see docs/reference/camera-paths.md.
 
     The file is in the coordinates of the capture, the returned cameras are in the world rebased by
     ``world_offset`` (3,), ``Capture.world_offset``. ``size``: of the images, for files without one.
@@ -163,7 +165,7 @@ def _as_document(found: Any, file: Path) -> tuple[dict[str, Any], tuple[str, ...
     if isinstance(found, list):
         return {"frames": [_frame_of_3dgs(x, f"{file}: [{i}]") for i, x in enumerate(found)]}, ()
     if not isinstance(found, dict):
-        raise DyngsError(f"{file}: a camera path is a JSON object; see docs/camera_paths.md")
+        raise DyngsError(f"{file}: a camera path is a JSON object; see `dyngs docs camera-paths`")
     kind = str(found.get("camera_type", found.get("camera_model")))
     panoramic = ("fisheye", "equirectangular", "spherical", "omni", "vr180")
     if any(name in kind.lower() for name in panoramic):

@@ -45,7 +45,7 @@ Gaussians with radius 0 are not drawn; their colours are ignored but must be fin
 class RenderOptions(DrawOptions):
     """Render options of Gaussians, in addition to those of ``DrawOptions``.
 
-    Example::
+    Example:
 
         import dyngs
 
@@ -116,7 +116,7 @@ def render(
     Differentiable in the Gaussians, the poses and intrinsics of the cameras, the background, the
     probe and the shader.
 
-    Example::
+    Example:
 
         import torch
 
@@ -189,7 +189,7 @@ def contributions(
 ) -> Tensor:
     """Return the sums (V, N) over pixels of each Gaussian's blending weight, in pixels.
 
-    Example::
+    Example:
 
         import torch
 

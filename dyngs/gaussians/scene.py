@@ -49,7 +49,7 @@ class GaussianTimeStep(TimeStep):
 class GaussianScene(Renderable):
     """N Gaussians at any time.
 
-    Example::
+    Example:
 
         import dyngs
 

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from dyngs.core.section import Positive, SceneModel
 
-NO_BODY = "has no body parameters, which model.kind=human needs; see docs/human.md"
+NO_BODY = "has no body parameters, which model.kind=human needs; see `dyngs docs people`"
 
 
 class _OnTemplate(SceneModel):

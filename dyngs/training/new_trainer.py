@@ -40,7 +40,7 @@ MANY_ALIKE = 0.05
 their silhouettes."""
 # fraction of train.alpha_weight before other moving things, until their motion is followed
 EARLY_OPACITY = 0.2
-# fraction of the run; measured as the others, see docs/benchmarks.md#backgrounds
+# fraction of the run; measured as the others, see docs/benchmarks/index.md
 FULL_OPACITY_FROM = 0.6
 ALIKE_IMAGES = 12  # number of images in which colours are compared with the background
 

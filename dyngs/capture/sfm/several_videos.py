@@ -407,7 +407,7 @@ def _posed(
         raise DyngsError(
             f"no poses could be found for {len(images)} cameras: neighbours must show much of the same, from "
             "directions that differ by 30 degrees or less, with texture in what stands; add cameras between them, "
-            "or give the poses in cameras.json (docs/formats.md)"
+            "or give the poses in cameras.json (`dyngs docs captures`)"
         )
     line = (
         f"{len(names)} of {len(images)} cameras have a pose, {model.num_points3D():,} points, mean error "

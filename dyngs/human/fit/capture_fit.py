@@ -896,7 +896,7 @@ def fit_capture(
     """
     if not capture.has_alpha:
         raise DyngsError(
-            f"{capture.root}: the images have no silhouettes; add masks of the person (docs/human.md)"
+            f"{capture.root}: the images have no silhouettes; add masks of the person (`dyngs docs people`)"
         )
     capture = capture.replace(splits=numbered(capture.splits))
     views = capture.splits["train"]
