@@ -344,12 +344,12 @@ class HumanTraining(SceneTraining[HumanScene]):
             message = f"filled {low_fraction:.0%} of the surface that few views show"
         return replace(scene, seen=confidence), EditResult(None, changes, message=message)
 
-    def follow(self, edit: TopologyEdit | None = None) -> None:
+    def apply_edit(self, edit: TopologyEdit | None = None) -> None:
         """Discard cached neighbours after the set of Gaussians changed."""
         self._neighbours = self._mirror_images = None
 
     def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
-        self.follow()
+        self.apply_edit()
         if "refines_from" in tensors:  # the run may have been extended
             self._has_refined = True
             self.refines_from = min(self.refines_from, int(tensors["refines_from"]))

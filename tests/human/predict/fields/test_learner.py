@@ -87,7 +87,7 @@ def test_a_prediction_is_a_run(
     assert "predicted fields cannot be trained" in error_line(
         capsys, "train", "--resume", str(made.run_dir)
     )
-    assert "is not trained" in error_line(
+    assert "cannot be trained" in error_line(
         capsys, "train", f"data.root={read_captured_person(folder)}", "model.kind=predicted_field"
     )
 
@@ -134,7 +134,7 @@ def test_a_body_is_fitted_where_none_is_given(
     written."""
     asked: list[Path] = []
     monkeypatch.setattr(
-        "dyngs.human.predict.fields.prediction.with_fitted_body",
+        "dyngs.human.predict.fields.prediction.ensure_fitted_body",
         lambda data, **_: (asked.append(data.root), data)[1],
     )
     person = Path(shutil.copytree(read_captured_person(folder), tmp_path / "bare"))
