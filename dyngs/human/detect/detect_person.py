@@ -16,19 +16,19 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from dyngs.capture.fixed_camera import is_plain_clip, read_fixed_camera
-from dyngs.capture.masks import at_size, outlined
+from dyngs.capture.fixed_camera import is_image_sequence, read_fixed_camera
+from dyngs.capture.masks import resize_mask, outlined
 from dyngs.capture.sfm.photos import digest_of
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info
-from dyngs.data.capture import Capture, View, by_camera
+from dyngs.data.capture import Capture, View, group_by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.read import is_capture, read_capture
 from dyngs.human.detect.detector import MIN_CONFIDENCE, Detection, Detector, MediaPipe
 from dyngs.human.fit.capture_fit import viterbi_path
 from dyngs.human.fit.fitted_capture import FitInputs, FittedCapture, write_fitted_capture
-from dyngs.io.outputs import make_once, note_source, require_new_folder
+from dyngs.io.outputs import make_once, record_source, require_new_folder
 from dyngs.io.write import cache_folder, temporary_folder_beside, write_image, write_text
 
 SWAP_COST = 0.04
@@ -179,7 +179,7 @@ def detect_person(
     Raises DyngsError: nobody is detected.
     """
     points: dict[str, np.ndarray] = {}
-    cameras = [*by_camera(capture.splits).values()]
+    cameras = [*group_by_camera(capture.splits).values()]
     for index, views in enumerate(cameras, 1):
         # Detectors read image files, which are deleted afterwards.
         size = target_size(views[0].width, views[0].height, 1.0, DETECTOR_SIDE_PX)
@@ -218,7 +218,7 @@ def detect_person(
             )
             masks = outlines
         for view, mask in zip(views, masks, strict=True):
-            write_image(folder / "masks" / f"{view.name}.png", at_size(mask, view))
+            write_image(folder / "masks" / f"{view.name}.png", resize_mask(mask, view))
     if not points:
         raise DyngsError(
             f"{capture.root}: {detector.name} detects nobody in "
@@ -261,7 +261,7 @@ def write_detected_person(
     cameras. Raises DyngsError: see ``detect_person`` and ``write_fitted_capture``.
     """
     require_new_folder(out)
-    clip = options.format == "auto" and not is_capture(options.root) and is_plain_clip(options.root)
+    clip = options.format == "auto" and not is_capture(options.root) and is_image_sequence(options.root)
     folder = temporary_folder_beside(out.with_name(f"{out.name}.found"))
     try:
         capture = read_fixed_camera(options) if clip else read_capture(options)
@@ -292,5 +292,5 @@ def ensure_detected_person(
         log(write_detected_person(data, folder, detector, on_progress, log).summary)
 
     make_once(folder, detect, log, f"person:  using the cached result in {folder}")
-    note_source(folder, data.root)
+    record_source(folder, data.root)
     return data.model_copy(update={"root": folder, "frames": None})

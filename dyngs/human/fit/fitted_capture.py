@@ -16,11 +16,11 @@ import torch
 
 from dyngs.capture.fixed_camera import (
     FORMAT,
-    is_plain_clip,
+    is_image_sequence,
     read_fixed_camera,
     silhouettes_of,
 )
-from dyngs.capture.masks import with_background_masks
+from dyngs.capture.masks import add_background_masks
 from dyngs.capture.sfm.photos import digest_of
 from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
@@ -28,8 +28,8 @@ from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info, wrap_read_errors
 from dyngs.data.body_frames import frame_number, numbered, read_body_file
 from dyngs.data.capture import BodyFrames, Capture, Split, View
-from dyngs.data.geometry import opengl_from_cam
-from dyngs.data.images.images import straight_uint8
+from dyngs.data.geometry import to_opengl_pose
+from dyngs.data.images.images import to_straight_uint8
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import is_capture, read_capture
 from dyngs.data.times import evenly_spaced
@@ -49,7 +49,7 @@ from dyngs.human.fit.capture_fit import (
 from dyngs.human.fit.keypoints import read_joints, read_keypoints
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion
-from dyngs.io.outputs import make_once, new_folder
+from dyngs.io.outputs import make_once, atomic_folder
 from dyngs.io.write import atomic_file, cache_folder, write_image, write_text
 
 _BODY = "body_train.npz"
@@ -109,7 +109,7 @@ def write_fitted_capture(
     body = load_template(model)
     _require_texels(model, body)
     person = None if inputs.person is None else read_known_shape(inputs.person, body)
-    with new_folder(out) as folder:
+    with atomic_folder(out) as folder:
         masks = folder / ".masks"
         capture = read_person_capture(options, inputs, masks)
         capture = capture.replace(splits=numbered(capture.splits))
@@ -279,7 +279,7 @@ def read_person_capture(
     cannot be made.
     """
     source = options.root
-    if options.format == "auto" and not is_capture(source) and is_plain_clip(source):
+    if options.format == "auto" and not is_capture(source) and is_image_sequence(source):
         capture = read_fixed_camera(options, inputs.masks)
         for line in capture.warnings:
             log(line)
@@ -299,7 +299,7 @@ def read_person_capture(
             raise DyngsError(
                 f"{source}: no silhouettes, and a moving camera; add masks of the person"
             )
-        capture = with_background_masks(capture, work, inputs.background, log)
+        capture = add_background_masks(capture, work, inputs.background, log)
     if capture.format != FORMAT and inputs.masks is None:
         return capture
     # Estimated masks may be empty: skip frames with less than a fifth of the usual area.
@@ -426,8 +426,8 @@ def write_split(
         parts = [photo.rgb_premultiplied]
         if photo.alpha is not None:
             parts.append(photo.alpha[..., None])
-        write_image(out / f"images/{stem}", straight_uint8(torch.cat(parts, dim=-1)).numpy())
-        pose = opengl_from_cam(view.cam_from_world).copy()
+        write_image(out / f"images/{stem}", to_straight_uint8(torch.cat(parts, dim=-1)).numpy())
+        pose = to_opengl_pose(view.cam_from_world).copy()
         pose[:3, 3] = capture.world_scale * pose[:3, 3] + capture.world_offset
         fl_x, _, cx, _, fl_y, cy = image.cameras.intrinsics[0, :2].double().flatten().tolist()
         frame: dict[str, object] = {
@@ -445,7 +445,7 @@ def write_split(
         if view.time is not None:
             frame["time"] = view.time
         if view.silhouette is not None and image.alpha is not None:
-            write_image(out / f"masks/{stem}", straight_uint8(image.alpha[..., None]).numpy())
+            write_image(out / f"masks/{stem}", to_straight_uint8(image.alpha[..., None]).numpy())
             frame["silhouette_path"] = f"masks/{stem}"
         frames.append(frame)
     write_text(out / f"transforms_{split}.json", json.dumps({"frames": frames}, indent=1) + "\n")

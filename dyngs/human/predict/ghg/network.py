@@ -29,7 +29,7 @@ from dyngs.core.state import move_fields_to
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.read import captures_in, read_capture
+from dyngs.data.read import list_captures, read_capture
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import RestPose
 from dyngs.gaussians.scene import GaussianTimeStep, render_options
@@ -599,7 +599,7 @@ def learner(config: Config, generator: torch.Generator) -> AtlasLearner:
     model: Any = config.model
     body = load_template(human_options(model))
     network = new_network(model, generator).to(device)
-    people = [read_atlas_person(data, model, body) for data in captures_in(config.data)]
+    people = [read_atlas_person(data, model, body) for data in list_captures(config.data)]
     source_choices = [_choices(person, model.source_views, generator) for person in people]
     mean = mean_colours(people, model.resolution).to(device)
     return AtlasLearner(config, network, people, source_choices, mean, device)

@@ -34,7 +34,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.state import move_fields_to
 from dyngs.data.capture import Capture, all_views
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.read import captures_in, read_capture
+from dyngs.data.read import list_captures, read_capture
 from dyngs.data.times import distinct_times
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import FilterUpdate
@@ -444,7 +444,7 @@ def _offset_image(pair: RectifiedPair, offsets: Tensor) -> Tensor:
 def learner(config: Config, generator: torch.Generator) -> GpsLearner:
     """Return the network in training, before the first step."""
     device = select_device(config.run.device)
-    return GpsLearner(config, GpsNetwork(generator).to(device), captures_in(config.data), device)
+    return GpsLearner(config, GpsNetwork(generator).to(device), list_captures(config.data), device)
 
 
 def predictor(
