@@ -1,5 +1,5 @@
-"""A video, or a folder of its frames, of a person before one fixed camera, as a capture with a
-guessed camera."""
+"""A video, or a folder of its frames, of a person filmed by one fixed camera with estimated
+intrinsics."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from dyngs.data.capture import Capture, Silhouette, VideoFrame, View
 from dyngs.data.geometry import OPENGL_FROM_OPENCV, pinhole_matrix
 from dyngs.data.images.images import SUFFIXES, list_files, read_header
 from dyngs.data.images.video import colour_messages, decode_frames, locate_cached_frames
-from dyngs.data.readers.transforms import find_masks, mask_of
+from dyngs.data.readers.transforms import find_mask, find_masks
 from dyngs.data.times import evenly_spaced, natural_order, parse_frames
-from dyngs.io.containment import check_size, inside, restrict_paths_to
+from dyngs.io.containment import check_inside, check_size, restrict_paths_to
 from dyngs.io.outputs import VIDEO_SUFFIXES
 
 FORMAT = "fixed_camera"
-"""``Capture.format`` of what is read here."""
+"""``Capture.format`` of these captures."""
 MOST_FRAMES = 60  # frames that are taken where ``data.frames`` names none
 FOCAL = 1.2
-"""Guessed focal length, as a fraction of the longest side of the images: between a phone's and a
-film camera's."""
+"""Default focal length in longest sides of the image: between that of a phone and a film
+camera."""
 
 
 def is_image_sequence(source: Path) -> bool:
-    """Whether a path is a video, or a folder that holds images directly or in ``images``."""
+    """Whether a path is a video, or a folder with images directly or in ``images``."""
     with wrap_read_errors(source):
         if source.is_file():
             return source.suffix.lower() in VIDEO_SUFFIXES
@@ -34,17 +34,17 @@ def is_image_sequence(source: Path) -> bool:
 
 
 def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture:
-    """Read a clip of one fixed camera; ``options.root`` is a video, or a folder of images in the
-    order of names.
+    """Read a clip of one fixed camera; ``options.root`` is a video or a folder of images in order
+    of names.
 
-    The camera is a pinhole in the middle of the image, with the focal length of the EXIF tags, else
-    ``FOCAL`` times the longest side. The world is y up if the camera is level, the camera stands at
-    its origin. Without ``data.frames``, ``MOST_FRAMES`` are taken, evenly spread. Raises
-    DyngsError: no clip, images of different sizes, or no mask for an image.
+    The camera is a pinhole with the principal point in the centre and the focal length from EXIF,
+    else ``FOCAL`` times the longest side. It is at the world origin; the world is y up if the
+    camera is level. Without ``data.frames``, ``MOST_FRAMES`` are used, evenly spaced. Raises
+    DyngsError for a missing clip, images of different sizes, or an image without a mask.
 
     Args:
-        masks: folder of masks (white = the person), named as the images, or ``frame_000012.png``
-            for frame 12 of a video; None: alpha, if the images have it.
+        masks: folder of masks (white = the person) named after the images, or ``frame_000012.png``
+            for frame 12 of a video; None: alpha of the images, if any.
     """
     source = options.root
     with (
@@ -67,7 +67,8 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
     )
     if other is not None:
         raise DyngsError(
-            f"{paths[other]}: has another size than {paths[numbers[0]].name}; give the frames of one camera"
+            f"{paths[other]}: its size differs from {paths[numbers[0]].name}; give frames of one "
+            "camera"
         )
     focal = first.focal_px or FOCAL * max(width, height)
     intrinsics = pinhole_matrix(focal, focal, width / 2, height / 2)
@@ -89,26 +90,24 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
     )
     has_alpha = masks is not None or first.alpha is not None
     note = f"{len(numbers)} of {len(paths)} frames, focal length {focal:.0f} px "
-    note += "by the EXIF tags" if first.focal_px else "guessed"
+    note += "from EXIF" if first.focal_px else "guessed"
     return Capture(
         source, FORMAT, {"train": views}, has_alpha=has_alpha, fps=fps, warnings=(note, *notes)
     )
 
 
 def _frames_of(source: Path) -> tuple[Sequence[Path], float | None, list[str]]:
-    """Return the image files of a clip, in order, and of a video its frame rate and a line on
+    """Return the image files of a clip in order, the frame rate of a video, and messages on
     colours."""
     if source.is_file():
         planned = locate_cached_frames(source)
         if not planned.paths:
-            raise DyngsError(f"{source}: the video holds no image; copy it again")
+            raise DyngsError(f"{source}: the video contains no frame; copy it again")
         return planned.paths, planned.info.fps or None, colour_messages([planned.info])
     images = _images_of(source)
     if not images:
-        raise DyngsError(
-            f"{source}: holds no images; give a folder of the frames of a clip, or a video"
-        )
-    return [inside(path) for path in images], None, []
+        raise DyngsError(f"{source}: no images found; give a video or a folder of its frames")
+    return [check_inside(path) for path in images], None, []
 
 
 def _images_of(folder: Path) -> list[Path]:
@@ -128,22 +127,23 @@ def _chosen(options: DataConfig, count: int) -> list[int]:
 
 
 def silhouettes_of(masks: Path, names: Sequence[str]) -> list[Silhouette]:
-    """Return the masks (white = the person) in a folder of the named images.
+    """Return the masks (white = the person) of the named images.
 
-    Raises DyngsError: no folder, or an image without a mask.
+    Raises DyngsError if the folder or a mask is missing.
     """
     if not masks.is_dir():
         raise DyngsError(f"no such folder of masks: {masks}")
     with restrict_paths_to(masks), wrap_read_errors(masks):
         found = find_masks(masks)
-        own = [mask_of(name, found) for name in names]
+        own = [find_mask(name, found) for name in names]
         for path in own:
             if path is not None:
-                inside(path)
+                check_inside(path)
     missing = [name for name, path in zip(names, own, strict=True) if path is None]
     if missing:
         raise DyngsError(
-            f"{masks}: no mask for {len(missing)} of {len(names)} images, first {missing[0]}; a mask is named as its "
-            "image (a.jpg.png, a.jpg or a.png for a.jpg), white where the person is"
+            f"{masks}: no mask for {len(missing)} of {len(names)} images, first {missing[0]}; "
+            "name a mask after its image (a.jpg.png, a.jpg or a.png for a.jpg), white where the "
+            "person is"
         )
     return [Silhouette(path, "white") for path in own if path is not None]

@@ -1,10 +1,9 @@
-"""The initial points of a scene: those of the capture, else of silhouettes, depth maps or
-triangulation, else none.
+"""Initial points of a scene: from the capture, silhouettes, depth maps, triangulation or plane
+sweeps.
 
-In static captures, dense points are added where there are few.
-
-Triangulated by pycolmap on the CPU from the images of one time step, or of one moving camera over
-the full clip: there, what moves violates the poses.
+Points are triangulated by pycolmap on the CPU, from the images of one time step, or of one moving
+camera over the whole clip, where moving points violate the poses. Static captures with few points
+get dense points in addition.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from dyngs.capture.plane_sweep import sweep_dense_points, points_from_depth_maps
+from dyngs.capture.plane_sweep import points_from_depth_maps, sweep_dense_points
 from dyngs.capture.sfm.colmap import (
     ColmapError,
     feature_options,
@@ -29,7 +28,7 @@ from dyngs.capture.sfm.colmap import (
 )
 from dyngs.config import DataConfig, PointsInit
 from dyngs.data.capture import Capture, PointCloud, View
-from dyngs.data.geometry import projected
+from dyngs.data.geometry import project_points
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.scene_space import cube_half_side, cube_mismatch_reason, sample_points_in_frusta
 from dyngs.data.times import evenly_spaced
@@ -39,12 +38,11 @@ if TYPE_CHECKING:
     import pycolmap
 
 MIN_IMAGES = 3
-"""Images that must see a point; two agree by accident too often."""
+"""Images that must see a point: two agree by accident too often."""
 MIN_POINTS = 30
-"""With fewer points random ones are the better start."""
+"""With fewer points, random ones are better."""
 MIN_CLIP_POINTS = 1000
-"""Likewise over a clip: they lack all that moves. With 509 a static run on the scene of orbits
-ended 1.7 dB lower."""
+"""The same for clips, whose points lack everything that moves."""
 LONGEST_SIDE = 1000
 MAX_FEATURES = 2048
 """SIFT features per image."""
@@ -53,8 +51,7 @@ CLIP_IMAGES = 50  # images of a clip, evenly spaced in time, that points are tri
 TIME_STEPS = (1, 2, 4, 8)
 OVERLAPPING = 4  # and with so many others that share most of what they see
 MAX_TURN = 45.0
-"""Degrees between the optical axes beyond which images are not matched for their overlap: SIFT does
-not."""
+"""Degrees between optical axes above which SIFT does not match."""
 MAX_ERROR, PRECISION = 0.002, 1.0
 """Mean reprojection error of a track over a clip: in longer sides of the image, and in px, which
 SIFT needs."""
@@ -63,10 +60,10 @@ _PROBES = 4000  # random points by which the overlap of images is judged
 
 
 def views_at_one_time(views: Sequence[View], limit: int) -> list[View]:
-    """Return at most ``limit`` views of one time step, evenly spaced; of those with most views, the
-    middle.
+    """Return at most ``limit`` views of one time step, evenly spaced: the middle one of those with
+    most views.
 
-    Without times all views show the same time step.
+    Without times all views belong to one time step.
     """
     shown = Counter(view.time for view in views)
     most = max(shown.values(), default=0)
@@ -76,21 +73,20 @@ def views_at_one_time(views: Sequence[View], limit: int) -> list[View]:
 
 
 def triangulate_from_views(views: Sequence[View], options: DataConfig) -> PointCloud | None:
-    """Return points that several views of a time step see, in order of their coordinates; None for
-    hardly any.
+    """Triangulate points from views of one time step, sorted by coordinates; None for too few.
 
-    SIFT features in images of at most ``LONGEST_SIDE`` px, matched between all pairs, triangulated
-    by the views' poses. One thread, so that the same images give the same points.
+    SIFT features in images of at most ``LONGEST_SIDE`` px are matched between all pairs and
+    triangulated with the given poses, in one thread for reproducible results.
     """
     return _points_of(views, options, None)
 
 
 def triangulate_clip(views: Sequence[View], options: DataConfig) -> PointCloud | None:
-    """Return points of what stands, from one moving camera; None where there are hardly any.
+    """Triangulate static points from one moving camera; None for too few.
 
-    As ``triangulated_points``, of at most ``CLIP_IMAGES`` images and matched between the pairs of
-    ``clip_pairs``; tracks over three images or more that do not agree with the poses, as those of
-    what moves, are left out.
+    As ``triangulate_from_views``, with at most ``CLIP_IMAGES`` images and the pairs of
+    ``clip_pairs``. Tracks of three or more images that do not fit the poses, such as those of
+    moving objects, are removed.
     """
     in_order = sorted(views, key=lambda view: (view.time or 0.0, view.name))
     chosen = [in_order[i] for i in evenly_spaced(len(in_order), CLIP_IMAGES)]
@@ -98,16 +94,16 @@ def triangulate_clip(views: Sequence[View], options: DataConfig) -> PointCloud |
 
 
 def clip_pairs(views: Sequence[View]) -> list[tuple[int, int]]:
-    """Return the pairs (i, j), i < j, of views in order of time that are matched; a bounded number
-    for each view.
+    """Return the pairs (i, j), i < j, of views in order of time to be matched, a limited number
+    per view.
 
-    Those near each other in time (``TIME_STEPS``), and of the others the ``OVERLAPPING`` whose
-    images show most of the same space, judged by random points in what the cameras see.
+    These are neighbours in time (``TIME_STEPS``), and the ``OVERLAPPING`` other views that see
+    most of the same space, judged by random points in the view frusta.
     """
     count = len(views)
     pairs = {(i, i + step) for step in TIME_STEPS for i in range(count - step)}
     points, _ = sample_points_in_frusta(views, np.random.default_rng(0).random((_PROBES, 4)))
-    seen = np.stack([projected(points, view)[1] for view in views]).astype(float)
+    seen = np.stack([project_points(points, view)[1] for view in views]).astype(float)
     axes = np.stack([view.cam_from_world[2, :3] for view in views])
     overlap = np.where(axes @ axes.T > np.cos(np.radians(MAX_TURN)), seen @ seen.T, 0.0)
     for i, row in enumerate(overlap):
@@ -136,7 +132,7 @@ def _points_of(
 def _triangulated(
     folder: Path, images: Sequence[Image], pairs: Sequence[tuple[int, int]] | None
 ) -> PointCloud | None:
-    """Return the points of tracks over enough images, matched between all pairs or these."""
+    """Return the points of tracks over enough images, matched between all or the given pairs."""
     import pycolmap
 
     files = folder / "images"
@@ -213,25 +209,20 @@ AROUND_ORIGIN = ("blender", "body_json")
 def create_initial_points(
     capture: Capture, options: DataConfig, init: PointsInit
 ) -> tuple[Capture, list[str]]:
-    """Return the capture with the points that a scene begins with, None for random ones, and lines
-    on the choice.
+    """Return the capture with initial points (None for random ones), and messages on their source.
 
-    Without points they are taken from depth maps that agree with the poses, else triangulated: from
-    the images of a time step that several cameras show, else from those of a moving camera over the
-    full clip. Not where it is published custom to begin with random points: in the cube around the
-    origin of Blender scenes that are still or show each time step from one side, if they lie there.
-    Those of still ones are drawn in the silhouettes, if there are any. To fewer than half of
-    ``init.dense`` in still captures points of plane sweeps are added, which also replace random
-    ones where nothing could be triangulated; those in silhouettes do well without (`still` lost 0.1
-    dB by them).
+    If the capture has none, they come from depth maps that agree with the poses, else from
+    triangulation: of one time step seen by several cameras, or of a moving camera over the whole
+    clip. Blender scenes in the cube around the origin start from random points, as is common:
+    static ones in the silhouettes, if there are any, and dynamic ones seen from one side at a
+    time. Static captures with fewer than half of ``init.dense`` points get points of plane sweeps
+    in addition, which also replace random points where triangulation failed.
     """
     lines: list[str] = []
     if capture.points is not None:
         if capture.points_file is not None:
             count = f"{len(capture.points.xyz):,} points"
-            lines.append(
-                f"{capture.points_file.name}: {count}, which the first Gaussians are made from"
-            )
+            lines.append(f"{capture.points_file.name}: {count} used as initial points")
         return _with_dense_points(capture, options, init.dense, lines)
     views = capture.splits["train"]
     is_by_custom = capture.format in AROUND_ORIGIN
@@ -240,13 +231,13 @@ def create_initial_points(
     is_in_cube = is_by_custom and why is None
     if why is not None:
         lines.append(
-            f"the scene does not lie around the origin, where Blender scenes do by custom: {why}"
+            f"the scene is not centred at the origin, as Blender scenes usually are: {why}"
         )
     if is_in_cube and views[0].time is None:
         points = sample_points_in_silhouettes(views, options, init.num_random, half_side)
         if points is not None:
             lines.append(
-                f"{len(points.xyz):,} first points were drawn at random in the silhouettes of the images"
+                f"{len(points.xyz):,} initial points sampled at random inside the silhouettes"
             )
         return capture.replace(points=points), lines
     if init.triangulate == 0:
@@ -256,7 +247,7 @@ def create_initial_points(
     if views[0].time is None and views[0].depth_path is not None:
         points = points_from_depth_maps(views, options, init.num_random)
     if points is not None:
-        lines.append(f"{len(points.xyz):,} first points are from the depth maps")
+        lines.append(f"{len(points.xyz):,} initial points from the depth maps")
     elif (
         views[0].time is None
         or len({view.cam_from_world.tobytes() for view in moment}) >= MIN_IMAGES
@@ -265,7 +256,7 @@ def create_initial_points(
     elif not is_in_cube:
         points = triangulate_clip(views, options)
         if points is not None:
-            lines.append(f"{len(points.xyz):,} points were triangulated over the full clip")
+            lines.append(f"{len(points.xyz):,} initial points triangulated from the whole clip")
     return _with_dense_points(capture.replace(points=points), options, init.dense, lines)
 
 
@@ -278,12 +269,14 @@ def _with_dense_points(
     if views[0].time is not None or 2 * num_known >= count:
         return capture, lines
     if points is None:
-        candidates, _ = sample_points_in_frusta(views, np.random.default_rng(0).random((_PROBES, 4)))
+        candidates, _ = sample_points_in_frusta(
+            views, np.random.default_rng(0).random((_PROBES, 4))
+        )
         points = sweep_dense_points(views, options, candidates, count, fill=True)
         if points is not None:
             lines = [
                 *lines,
-                f"{len(points.xyz):,} first points are from depth maps by plane sweep (init.dense)",
+                f"{len(points.xyz):,} initial points from plane-sweep depth maps (init.dense)",
             ]
         return capture.replace(points=points), lines
     dense = sweep_dense_points(views, options, points.xyz, count)
@@ -293,31 +286,30 @@ def _with_dense_points(
         np.concatenate([points.xyz, dense.xyz]), np.concatenate([points.rgb, dense.rgb])
     )
     added = (
-        f"{len(dense.xyz):,} points of depth maps were added to {len(points.xyz):,} (init.dense)"
+        f"{len(dense.xyz):,} dense points added to {len(points.xyz):,} initial points (init.dense)"
     )
     return capture.replace(points=both), [*lines, added]
 
 
 SILHOUETTES = 40
-"""Images, evenly spaced, whose silhouettes are looked at."""
+"""Silhouettes that are used, evenly spaced."""
 INSIDE = 0.5  # alpha from which a pixel belongs to the silhouette
 # fraction of the silhouettes that may lack a point: of a pixel, or wrong themselves
 MISTAKEN = 0.05
 ENOUGH, DRAWS = 1000, 10
-"""Points until which further ones are drawn, and how often at most. On lego 2,000 did as well as
-5,000 or 20,000, whose runs ended with a quarter, and four fifths, more Gaussians."""
+"""Points until which further ones are drawn, and the largest number of draws; more points did not
+help."""
 MOST = 0.5  # fraction of the points inside above which the silhouettes say nothing
 
 
 def sample_points_in_silhouettes(
     views: Sequence[View], options: DataConfig, num_random: int, half_side: float
 ) -> PointCloud | None:
-    """Return random points of the cube around the origin that lie in the silhouettes, in the
-    images' median colours.
+    """Sample random points of the cube around the origin inside the silhouettes, with median image
+    colours.
 
-    ``num_random`` are drawn, and as many again where few of them lie inside; ``half_side`` is half
-    the side of the cube. None where images have no silhouettes, where those hold no points, or
-    most.
+    ``num_random`` are drawn, repeatedly if few of them are inside; ``half_side`` is half the side
+    of the cube. None if there are no silhouettes, or if they contain no or most points.
     """
     shown = [
         (views[i], _small_image(views[i], options)) for i in evenly_spaced(len(views), SILHOUETTES)
@@ -343,7 +335,7 @@ def sample_points_in_silhouettes(
 
 
 LOOK_SIDE = 240
-"""Longest side of the images that points are looked at in, px."""
+"""Longest side of the images in which points are tested, in px."""
 
 
 def _small_image(view: View, options: DataConfig) -> np.ndarray:
@@ -358,11 +350,10 @@ def _small_image(view: View, options: DataConfig) -> np.ndarray:
 
 
 def _colours_at(xyz: np.ndarray, shown: Sequence[tuple[View, np.ndarray]]) -> np.ndarray:
-    """Return (V, P, 4) colours and alpha of the images at the points, NaN where they lie
-    outside."""
+    """Return (V, P, 4) colours and alpha of the images at the points, NaN outside the images."""
     found = np.full((len(shown), len(xyz), 4), np.nan)
     for i, (view, image) in enumerate(shown):
-        positions, inside = projected(xyz, view)
+        positions, inside = project_points(xyz, view)
         size = np.array(image.shape[1::-1])
         column, row = np.minimum((positions[inside] * size).astype(int), size - 1).T
         found[i, inside] = image[row, column]

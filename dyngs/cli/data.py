@@ -63,8 +63,8 @@ def _add_inspect(verbs: args.Commands) -> None:
         verbs,
         "inspect",
         run_inspect,
-        "report what a capture or a video holds and what is suspicious about it",
-        "Report views, sizes, intrinsics, times, points, masks, and everything suspicious. Of videos without poses: "
+        "report the contents of a capture or a video and its problems",
+        "Report views, sizes, intrinsics, times, points, masks, and all problems. Of videos without poses: "
         "size, rate, length, sound, sharpness, motion, and what to run next.",
     )
     path = "capture (folder or .zip), video, or folder of videos"

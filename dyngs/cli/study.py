@@ -126,7 +126,7 @@ def amount(text: str) -> float:
 def run_compare(arguments: argparse.Namespace) -> int:
     """Train, compare, print the table and write the report; the folder is locked against other
     commands."""
-    from dyngs.io.outputs import writing
+    from dyngs.io.outputs import lock_folder
     from dyngs.runs.folder import collect_inputs
     from dyngs.study.compare import ModelComparison
     from dyngs.study.report import Report, build_table, can_plot, page_views, plot_curves
@@ -152,7 +152,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
     configs, unfit = comparison.configs(arguments.models.split(","))
     for config in configs.values():
         collect_inputs(config).require_output(out)
-    with writing(out), redirect_messages(arguments.json):
+    with lock_folder(out), redirect_messages(arguments.json):
         comparison.require_same(configs, unfit)
         try:
             results, left_out, curves = comparison.run(configs, arguments.ray)
@@ -193,14 +193,14 @@ def _print_report(report: Report, stem: Path, *, is_json: bool) -> None:
 def run_tradeoff(arguments: argparse.Namespace) -> int:
     """Measure, print and write the tables, and choose a run; the folder is locked against other
     commands."""
-    from dyngs.io.outputs import writing
+    from dyngs.io.outputs import lock_folder
 
     if not arguments.run_dir.is_dir():
         raise DyngsError(
             f"{arguments.run_dir}: not a run folder; give one that `dyngs train` wrote"
         )
     out: Path = arguments.out or arguments.run_dir / "tradeoff"
-    with writing(out):
+    with lock_folder(out):
         return _tradeoff(arguments, out)
 
 

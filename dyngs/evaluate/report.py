@@ -124,7 +124,7 @@ def load_split_images(
     images = ImageLoader(views, run.config.data)
     found = load_camera_corrections(run_dir, run, capture.splits["train"])
     if found is not None:
-        images.corrected = lambda index, cameras: found.correct_cameras(
+        images.camera_correction = lambda index, cameras: found.correct_cameras(
             images.views[index], cameras
         )
     return images

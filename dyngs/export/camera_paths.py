@@ -16,8 +16,15 @@ import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, format_one_line
-from dyngs.data.geometry import from_opengl_pose, validate_pose, invert_rigid, pinhole_matrix
-from dyngs.io.fields import entry, as_float_array, is_number, parse_numbers, read_json, require_at_most
+from dyngs.data.geometry import from_opengl_pose, invert_rigid, pinhole_matrix, validate_pose
+from dyngs.io.fields import (
+    as_float_array,
+    is_number,
+    parse_numbers,
+    read_json,
+    require_at_most,
+    require_key,
+)
 
 _MAX_FRAMES = 100_000
 """A longer path is taken for a typing mistake."""
@@ -186,7 +193,7 @@ def _of_nerfstudio(found: dict[str, Any], file: Path) -> dict[str, Any]:
     frames = []
     for i, view in enumerate(views if isinstance(views, list) else []):
         where = f"{file}: camera_path[{i}]"
-        pose = entry(where, view, "camera_to_world")
+        pose = require_key(where, view, "camera_to_world")
         half = math.radians(_number(view, "fov", where, 0.01, 179)) / 2
         frame = {"transform_matrix": pose, "fl_x": 0.5 * height / math.tan(half)}
         frames.append(frame | {"time": view["render_time"]} if "render_time" in view else frame)
@@ -198,10 +205,12 @@ def _frame_of_3dgs(view: object, where: str) -> dict[str, Any]:
     """Return a frame of a cameras.json, which holds places and rotations of cameras in the
     world."""
     pose = np.eye(4)
-    pose[:3, :3] = parse_numbers(f"{where}: 'rotation'", entry(where, view, "rotation"), (3, 3))
-    pose[:3, 3] = parse_numbers(f"{where}: 'position'", entry(where, view, "position"), (3,))
+    pose[:3, :3] = parse_numbers(
+        f"{where}: 'rotation'", require_key(where, view, "rotation"), (3, 3)
+    )
+    pose[:3, 3] = parse_numbers(f"{where}: 'position'", require_key(where, view, "position"), (3,))
     names = {"w": "width", "h": "height", "fl_x": "fx", "fl_y": "fy"}
-    others = {key: entry(where, view, name) for key, name in names.items()}
+    others = {key: require_key(where, view, name) for key, name in names.items()}
     return {"cam_from_world": invert_rigid(pose), **others}
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from dyngs.config import DefaultStrategy, McmcStrategy, PointsInit, RandomInit
 from dyngs.data.capture import View
-from dyngs.data.geometry import pinhole_matrix, count_visible_views
+from dyngs.data.geometry import count_visible_views, pinhole_matrix
 from dyngs.gaussians.initialization import (
     InitialValues,
     SceneGeometry,
@@ -108,7 +108,7 @@ def test_random_points_fill_their_cube(
 @pytest.mark.parametrize(
     ("offset", "by_convention"), [((7.0, -3.0, 11.0), True), ((0.0, 0.0, 0.0), False)]
 )
-def test_other_random_points_lie_where_cameras_look(
+def test_random_points_lie_in_frusta(
     offset: tuple[float, float, float], by_convention: bool
 ) -> None:
     """Wherever the scene lies: all in three images or more, most of them near what all cameras look

@@ -261,7 +261,11 @@ def write_detected_person(
     cameras. Raises DyngsError: see ``detect_person`` and ``write_fitted_capture``.
     """
     require_new_folder(out)
-    clip = options.format == "auto" and not is_capture(options.root) and is_image_sequence(options.root)
+    clip = (
+        options.format == "auto"
+        and not is_capture(options.root)
+        and is_image_sequence(options.root)
+    )
     folder = temporary_folder_beside(out.with_name(f"{out.name}.found"))
     try:
         capture = read_fixed_camera(options) if clip else read_capture(options)

@@ -21,7 +21,7 @@ from dyngs.config import DataConfig
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import ProgressCallback, RasterizeMode, ignore_progress
 from dyngs.core.errors import DyngsError
-from dyngs.data.body_frames import frame_number, numbered
+from dyngs.data.body_frames import assign_frame_numbers, frame_number
 from dyngs.data.capture import Capture, Split, View
 from dyngs.data.images.images import area_downscale
 from dyngs.data.images.maps import silhouette_box
@@ -898,7 +898,7 @@ def fit_capture(
         raise DyngsError(
             f"{capture.root}: the images have no silhouettes; add masks of the person (`dyngs docs people`)"
         )
-    capture = capture.replace(splits=numbered(capture.splits))
+    capture = capture.replace(splits=assign_frame_numbers(capture.splits))
     views = capture.splits["train"]
     if capture.body is None:
         motion = _clip_without_poses(views, body.joints)

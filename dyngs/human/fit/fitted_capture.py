@@ -26,7 +26,7 @@ from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info, wrap_read_errors
-from dyngs.data.body_frames import frame_number, numbered, read_body_file
+from dyngs.data.body_frames import assign_frame_numbers, frame_number, read_body_file
 from dyngs.data.capture import BodyFrames, Capture, Split, View
 from dyngs.data.geometry import to_opengl_pose
 from dyngs.data.images.images import to_straight_uint8

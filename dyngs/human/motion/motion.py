@@ -23,7 +23,7 @@ from dyngs.data.body_frames import merge_root_rotation, rows_of
 from dyngs.data.capture import BodyFrames, View
 from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.human.body.skinning import axis_angle_to_matrix
-from dyngs.io.containment import LIMITS_VARIABLE, allowed
+from dyngs.io.containment import LIMITS_VARIABLE, scaled_limit
 
 UpAxis = Literal["auto", "y", "z"]
 MAX_JOINT_POSES = 5_000_000
@@ -69,7 +69,7 @@ class Motion:
 def require_frame_count(path: Path, frames: float, joints: int) -> None:
     """Raise DyngsError if a motion exceeds ``MAX_JOINT_POSES``, before it is allocated."""
     count = max(joints, len(JOINT_NAMES))
-    most = allowed(MAX_JOINT_POSES)
+    most = scaled_limit(MAX_JOINT_POSES)
     if not frames * count <= most:
         raise DyngsError(
             f"{path}: {frames:.0f} frames of {count} joints exceed the limit of {most:,} joint poses; "

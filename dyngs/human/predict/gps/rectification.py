@@ -256,7 +256,7 @@ def _at_size(image: Image, person_px: int) -> Image:
             f"{image.name}: no silhouette of a person; add alpha or a mask of the person, see docs/human.md"
         )
     rows = (image.alpha > MIN_ALPHA).any(1).nonzero()
-    return image.shrunk(max(1, int(rows.max() - rows.min() + 1) // person_px))
+    return image.downscaled(max(1, int(rows.max() - rows.min() + 1) // person_px))
 
 
 def _box(image: Image, rotation: Tensor) -> Tensor:
@@ -352,7 +352,7 @@ def crop_image(image: Image, top: int, left: int, height: int, width: int) -> Im
     def part(x: Tensor) -> Tensor:
         return x[top : top + height, left : left + width].contiguous()
 
-    names = ("alpha", "mask", "depth", "moves", "labels", "flow")
+    names = ("alpha", "mask", "depth", "motion_mask", "labels", "flow")
     maps = {name: part(x) for name in names if (x := getattr(image, name)) is not None}
     return replace(
         image,
