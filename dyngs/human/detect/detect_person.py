@@ -17,7 +17,7 @@ import numpy as np
 from scipy import ndimage
 
 from dyngs.capture.fixed_camera import is_image_sequence, read_fixed_camera
-from dyngs.capture.masks import resize_mask, outlined
+from dyngs.capture.masks import outlined, resize_mask
 from dyngs.capture.sfm.photos import digest_of
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ProgressCallback, ignore_progress

@@ -49,7 +49,7 @@ from dyngs.human.fit.capture_fit import (
 from dyngs.human.fit.keypoints import read_joints, read_keypoints
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion
-from dyngs.io.outputs import make_once, atomic_folder
+from dyngs.io.outputs import atomic_folder, make_once
 from dyngs.io.write import atomic_file, cache_folder, write_image, write_text
 
 _BODY = "body_train.npz"
@@ -112,7 +112,7 @@ def write_fitted_capture(
     with atomic_folder(out) as folder:
         masks = folder / ".masks"
         capture = read_person_capture(options, inputs, masks)
-        capture = capture.replace(splits=numbered(capture.splits))
+        capture = capture.replace(splits=assign_frame_numbers(capture.splits))
         views = capture.splits["train"]
         # The fit starts from the shape of a known person, or from that of the capture.
         known_body = person
