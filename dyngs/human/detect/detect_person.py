@@ -17,8 +17,8 @@ import numpy as np
 from scipy import ndimage
 
 from dyngs.capture.fixed_camera import is_image_sequence, read_fixed_camera
-from dyngs.capture.masks import outlined, resize_mask
-from dyngs.capture.sfm.photos import digest_of
+from dyngs.capture.masks import refine_outlines, resize_mask
+from dyngs.capture.sfm.photos import digest_files
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info
@@ -209,7 +209,7 @@ def detect_person(
                 masks[row] = detection.mask > 127
                 scale = views[row].width / size[0]
                 points[views[row].name] = detection.keypoints * np.array([scale, scale, 1.0])
-        outlines = outlined(images, masks) if heights else None
+        outlines = refine_outlines(images, masks) if heights else None
         if outlines is not None:
             iou = (outlines & masks).sum() / max(int((outlines | masks).sum()), 1)
             log(
@@ -288,7 +288,7 @@ def ensure_detected_person(
     """
     name = re.sub(r"[^A-Za-z0-9-]", "_", data.root.stem)[:40]
     frames_hash = hashlib.sha256(repr(data.frames).encode()).hexdigest()[:8]
-    folder = cache_folder("people") / f"{name}.{digest_of(data.root)}{frames_hash}"
+    folder = cache_folder("people") / f"{name}.{digest_files(data.root)}{frames_hash}"
 
     def detect() -> None:
         detector = MediaPipe()

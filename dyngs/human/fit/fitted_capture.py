@@ -21,7 +21,7 @@ from dyngs.capture.fixed_camera import (
     silhouettes_of,
 )
 from dyngs.capture.masks import add_background_masks
-from dyngs.capture.sfm.photos import digest_of
+from dyngs.capture.sfm.photos import digest_files
 from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.core.conventions import ProgressCallback, ignore_progress
@@ -592,4 +592,4 @@ def _digest(data: DataConfig) -> str:
     )
     options = data.model_dump(mode="json", include=set(names.split()))
     options_hash = hashlib.sha256(repr(sorted(options.items())).encode()).hexdigest()[:8]
-    return f"{digest_of(root, files)}{options_hash}"
+    return f"{digest_files(root, files)}{options_hash}"

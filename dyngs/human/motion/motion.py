@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import move_fields_to
-from dyngs.data.body_frames import merge_root_rotation, rows_of
+from dyngs.data.body_frames import match_frames, merge_root_rotation
 from dyngs.data.capture import BodyFrames, View
 from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.human.body.skinning import axis_angle_to_matrix
@@ -258,7 +258,7 @@ def captured_motion(
     frame number. Raises DyngsError: a view without body parameters.
     """
     centred = merge_root_rotation(body_frames, joints[0].double().cpu().numpy())
-    rows = rows_of(where, centred, views)
+    rows = match_frames(where, centred, views)
     last = max(len(centred.frames) - 1, 1)
     times = {
         row: row / last if view.time is None else view.time
