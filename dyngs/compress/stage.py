@@ -164,12 +164,12 @@ def pruning(trainer: GaussianTrainer) -> TrainingEdit:
     options = trainer.config.prune
     edit = removal(trainer, scores_of(trainer, options) if options.fraction > 0 else None)
     message = f"pruned: {len(scene):,} -> "
-    if edit.kept is None:
+    if edit.keep is None:
         return replace(
             edit, message=f"{message}{counted(len(scene), 'Gaussian')}{_let_through(edit)}"
         )
-    gain = quality_of(trainer, scene.select(edit.kept)) - quality_of(trainer, scene)
-    left = counted(int(edit.kept.sum()), "Gaussian")
+    gain = quality_of(trainer, scene.select(edit.keep)) - quality_of(trainer, scene)
+    left = counted(int(edit.keep.sum()), "Gaussian")
     cost = f"{gain:+.2f} dB before it is trained again"
     return replace(edit, message=f"{message}{left}, {cost}{_let_through(edit)}")
 
@@ -194,7 +194,7 @@ def removal(trainer: GaussianTrainer, scores: Tensor | None) -> TrainingEdit:
     moves = capability(trainer.config.model, Moves) is not None and not whole.is_static
     if options.mask_times > 1 and moves:
         masks = _masks(trainer, whole, kept)
-    return TrainingEdit(kept=kept, masks=masks, stops_densification=True)
+    return TrainingEdit(keep=kept, masks=masks, stops_densification=True)
 
 
 @torch.no_grad()

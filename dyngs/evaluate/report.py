@@ -208,7 +208,8 @@ class EvalReport:
             return ()
         worse, other = ("black", "white") if difference > 0 else ("white", "black")
         return (
-            f"PSNR on {worse} is {abs(difference):.1f} dB lower than on {other}: opacity is wrong in places "
+            f"PSNR on {worse} is {abs(difference):.1f} dB lower than on {other}: opacity is wrong "
+            "in places "
             f"(train.alpha_weight); `dyngs render RUN --out DIR --background {worse}` shows where",
         )
 
@@ -240,7 +241,8 @@ def evaluate_run(
     inputs_of(run_dir).require_output(report_path(run_dir, split))
     if refine_poses and split == "train":
         raise DyngsError(
-            f"{run_dir}: --refine is for images that were not trained on; name them with --split test, val or pose"
+            f"{run_dir}: --refine is for images that were not trained on; name them with --split "
+            "test, val or pose"
         )
     run = load_run(run_dir, data_root)
     capture = capture or read_capture_of(run.config.data, run.info)
@@ -368,7 +370,8 @@ def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
     notes = []
     if 0 < run.step < run.config.total_steps:
         notes.append(
-            f"the run is not finished: it stands at step {run.step:,} of {run.config.total_steps:,}, and its schedules "
+            f"the run is not finished: it stands at step {run.step:,} of "
+            f"{run.config.total_steps:,}, and its schedules "
             "where they were then"
         )
     if run.config.data.background == "random":

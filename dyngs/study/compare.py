@@ -201,7 +201,8 @@ class ModelComparison:
             side = load_resolved(folder).data.longest_side
             if side != config.data.longest_side:
                 raise DyngsError(
-                    f"too few steps fit into {self.limit}, so its images were shrunk to {side} px, unlike those "
+                    f"too few steps fit into {self.limit}, so its images were shrunk to {side} px, "
+                    "unlike those "
                     f"of the others; give more minutes, or data.longest_side={side} for all"
                 )
         is_limited = self.max_mb is not None and has_file(folder)

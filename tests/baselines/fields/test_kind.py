@@ -104,10 +104,10 @@ def test_what_does_not_go_is_refused(
 @pytest.mark.parametrize(
     ("keys", "said"),
     [
-        (["train.robust=always"], "has no effect with model.kind=ngp"),
-        (["train.exposure=always"], "has no effect with model.kind=ngp"),
-        (["camera.refine=always"], "has no effect with model.kind=ngp"),
-        (["budget.max_gaussians=10"], "has no effect with model.kind=ngp"),
+        (["train.robust=always"], "not supported by model.kind=ngp"),
+        (["train.exposure=always"], "not supported by model.kind=ngp"),
+        (["camera.refine=always"], "not supported by model.kind=ngp"),
+        (["budget.max_gaussians=10"], "not supported by model.kind=ngp"),
         (["model.time=true"], "the images have no times"),
         (["model.sizes=huge"], "one of tiny, cpu, published"),
     ],
