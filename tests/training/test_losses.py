@@ -34,7 +34,7 @@ def test_a_term_that_is_not_finite_is_named(
 ) -> None:
     terms = {"image": torch.tensor(0.5), "alpha": torch.tensor(0.1)} | {name: torch.tensor(value)}
     with pytest.raises(
-        DyngsError, match=rf"^step 3, view 'r_7': the loss term '{name}' is {value}; {advice}"
+        DyngsError, match=rf"^step 3, view 'r_7': loss term '{name}' is {value}; {advice}"
     ):
         StepCheck(terms, {}, CPU).loss(3, image, MOVES_BY)
 
