@@ -51,8 +51,7 @@ def with_times(path: CameraPath, times: Sequence[float]) -> CameraPath:
     with a note."""
     if len(times) != len(path):
         raise DyngsError(
-            f"the camera path has {len(path)} cameras, but there are {len(times)} times; give as "
-            "many"
+            f"the camera path has {len(path)} cameras, but there are {len(times)} times; give as many"
         )
     inside, notes = clamp_times(times)
     return replace(path, times=inside, notes=(*path.notes, *notes))
@@ -103,8 +102,7 @@ def parse_times(text: str) -> tuple[float, ...]:
         start, stop, count = 0.0, 0.0, 0
     if not (math.isfinite(start) and math.isfinite(stop) and 1 <= count <= _MAX_FRAMES):
         raise DyngsError(
-            f"{printable(repr(text), 60)} is no range of times; write START:STOP:COUNT, for "
-            "instance 0:1:60 for 60 "
+            f"{printable(repr(text), 60)} is no range of times; write START:STOP:COUNT, for instance 0:1:60 for 60 "
             "evenly spaced times"
         )
     return tuple(np.linspace(start, stop, count).tolist())
@@ -171,8 +169,7 @@ def _as_document(found: Any, file: Path) -> tuple[dict[str, Any], tuple[str, ...
         raise DyngsError(f"{file}: cameras of a path are pinholes, not {printable(kind, 40)}")
     if "camera_path" in found:
         return _of_nerfstudio(found, file), (
-            "nerfstudio's path is taken to be in the coordinates of the capture; its viewer may "
-            "have turned, shifted "
+            "nerfstudio's path is taken to be in the coordinates of the capture; its viewer may have turned, shifted "
             "and scaled them (dataparser_transforms.json)",
         )
     is_bent = any(found.get(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
@@ -312,8 +309,7 @@ def _with_seconds(
         period = num_frames / fps if num_frames else span + way_back
     if at[0] < 0 or (np.diff(at) <= 0).any() or (period is not None and period <= span):
         raise DyngsError(
-            f"{file}: each keyframe must be 'at' a later second than the one before, and before a "
-            "loop ends"
+            f"{file}: each keyframe must be 'at' a later second than the one before, and before a loop ends"
         )
     if num_frames is None:
         num_frames = round(at[-1] * fps) + 1 if period is None else max(1, round(period * fps))

@@ -69,8 +69,7 @@ def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
     ):
         file = opened.config.data.root
         raise DyngsError(
-            f"{file}: a {file.suffix.lower()} holds one time and no views; leave out --path along, "
-            "--time, --times "
+            f"{file}: a {file.suffix.lower()} holds one time and no views; leave out --path along, --time, --times "
             "and --view"
         )
     if options.path is None:
@@ -117,8 +116,7 @@ def select_view(capture: Capture, name: str | None = None, split: str | None = N
     if name.isascii() and name.isdigit() and len(name) < 10 and int(name) < len(first):
         return first[int(name)]
     raise DyngsError(
-        f"{capture.root}: no view {name!r}; the split {order[0]} has {len(first)} views: "
-        f"{first[0].name} (0) to "
+        f"{capture.root}: no view {name!r}; the split {order[0]} has {len(first)} views: {first[0].name} (0) to "
         f"{first[-1].name} ({len(first) - 1})"
     )
 

@@ -62,8 +62,7 @@ def orbit_path(
         azimuths = swing + middle
         degrees = round(math.degrees(width))
         notes = (
-            f"the capture was filmed from an arc of {degrees} degrees: the orbit swings along it "
-            "and back",
+            f"the capture was filmed from an arc of {degrees} degrees: the orbit swings along it and back",
         )
     if fraction_in_front(poses, center) < 0.5:
         notes = (

@@ -236,8 +236,7 @@ def write_run_sequence(
     others = sorted(file.name for file in folder.glob(f"[!.]*{suffix}") if file.name not in names)
     if others:
         raise DyngsError(
-            f"{folder}: holds other {suffix} files ({others[0]}), which players would take for "
-            "frames; give an empty "
+            f"{folder}: holds other {suffix} files ({others[0]}), which players would take for frames; give an empty "
             "folder"
         )
     return [
@@ -449,8 +448,7 @@ def write_rigid_bodies(
     field = None if scene is None else find_body_field(scene.field)
     if scene is None or field is None:
         raise DyngsError(
-            "--bodies: no body that turns was found in this run; leave it out, or give --times "
-            "A:B:N"
+            "--bodies: no body that turns was found in this run; leave it out, or give --times A:B:N"
         )
     scene = scene.without_masks()  # the rows of the labels
     splat = splats_at(opened, scene, time, how)
@@ -493,8 +491,7 @@ def write_rigid_bodies(
     with atomic_file(path) as temporary:
         document.write(temporary)
     notes = (
-        f"bodies: {len(channels) // 2}, which turn for {opened.seconds:.1f} s in the colours of "
-        f"time {time:g}",
+        f"bodies: {len(channels) // 2}, which turn for {opened.seconds:.1f} s in the colours of time {time:g}",
         f"all else and shadows stand as at time {time:g}; a sequence has their motion",
         *offset_notes(splat, "the file states it"),
     )

@@ -78,6 +78,5 @@ def video_writer(
                 container.mux(stream.encode(None))
         except (FFmpegError, OSError, ValueError) as error:
             raise DyngsError(
-                f"cannot write the video {path} ({error}); use the suffix .mp4, and a PyAV that "
-                "has libx264"
+                f"cannot write the video {path} ({error}); use the suffix .mp4, and a PyAV that has libx264"
             ) from error

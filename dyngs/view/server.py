@@ -110,8 +110,7 @@ def free_port(host: str, port: int | None) -> int:
         except OSError as error:
             problem = error
     raise DyngsError(
-        f"--host {host}, --port {port or '8080 to 8129'}: cannot listen there ({problem}); choose "
-        "another, or leave "
+        f"--host {host}, --port {port or '8080 to 8129'}: cannot listen there ({problem}); choose another, or leave "
         "--port out to get a free one"
     )
 

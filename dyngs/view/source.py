@@ -79,8 +79,7 @@ def open_to_view(
     opened = replace(opened, name=name, stated_up=up or opened.stated_up)
     if opened.missing is not None:
         opened = opened.noted(
-            f"without the capture, so no cameras and no truth: {opened.missing}; if it was moved, "
-            "add data.root=FOLDER"
+            f"without the capture, so no cameras and no truth: {opened.missing}; if it was moved, add data.root=FOLDER"
         )
     return opened
 

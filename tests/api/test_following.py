@@ -150,5 +150,7 @@ def test_what_needs_one_process_says_so(still: Path, tmp_path: Path) -> None:
         DyngsError, match=r"batch_size=2: train[.]robust=always needs one image per step"
     ):
         train(_still(still, tmp_path / "run", robust="always"), processes=two)
-    with pytest.raises(DyngsError, match="batch_size=5: must be a multiple of the number of processes, 2"):
+    with pytest.raises(
+        DyngsError, match="batch_size=5: must be a multiple of the number of processes, 2"
+    ):
         train(_still(still, tmp_path / "run", batch_size=5), processes=two)

@@ -70,7 +70,7 @@ def test_lines_of_a_plot_join_the_run_with_a_setting() -> None:
     """Pruning is faster and smaller; fewer harmonics are neither, but a line leads there, too."""
     pytest.importorskip("matplotlib")
     rows = [
-        row("as it is", 30, 10, 5),
+        row("original", 30, 10, 5),
         row("prune=0.5", 29, 20, 2),
         row("prune=0.7", 28, 30, 1),
         row("sh_degree=0", 28, 5, 9),

@@ -146,7 +146,7 @@ def test_a_damaged_point_says_what_to_do(found: Found, tmp_path: Path) -> None:
     bad += [json.dumps(good | {"ms": value}) for value in (0, float("nan"), float("inf"))]
     for text in (*bad, "", "[]", "{}", "[" * 5000):
         path.write_text(text)
-        with pytest.raises(DyngsError, match=r"x\.json: .* no result of a study: remove it"):
+        with pytest.raises(DyngsError, match=r"x\.json: .* not a result of a study; remove it"):
             read_measurement(path)
 
 
@@ -174,7 +174,7 @@ def test_names_tell_variants_apart_and_merging_keeps_changes(a: Variant, b: Vari
 
 
 def test_the_setting_of_a_variant() -> None:
-    assert (Variant().setting, Variant().name) == ("", "as it is")
+    assert (Variant().setting, Variant().name) == ("", "original")
     assert Variant(prune=0.5, finetune=9).setting == "prune + finetune"
     assert Variant(prune=0.5, sh_degree=0).setting == "several"
 
@@ -194,7 +194,7 @@ def test_single_changes_differ_from_the_run() -> None:
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("prun", "no such setting; there are prune, mask_times, sh_degree"),
+        ("prun", "unknown setting; use prune, mask_times, sh_degree"),
         ("prune=1.5", "--vary prune=1.5: Input should be less than 1"),
         ("prune=", "valid number"),
         ("prune=nan", "finite number"),
@@ -303,11 +303,11 @@ def test_conditions() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("psnr>30", "is no condition; write for instance psnr>=30"),
-        ("psnr>=30,,mb<=5", "is no condition"),
-        ("speed>=3", "no such metric; there are psnr, ssim, lpips, fps"),
-        ("psnr>=nan", "is no condition"),
-        ("psnr>=__import__('os')", "is no condition"),
+        ("psnr>30", ": not a condition; example: psnr>=30"),
+        ("psnr>=30,,mb<=5", "not a condition"),
+        ("speed>=3", "unknown metric; use psnr, ssim, lpips, fps"),
+        ("psnr>=nan", "not a condition"),
+        ("psnr>=__import__('os')", "not a condition"),
     ],
 )
 def test_what_is_no_condition_is_refused(text: str, message: str) -> None:
@@ -327,8 +327,8 @@ def test_the_best_of_what_qualifies() -> None:
     [
         (
             "psnr>=30,fps>=20,mb<=5",
-            r"psnr>=30, fps>=20, mb<=5; with the others met the best psnr is 27 \(prune=0.8\); "
-            r"with the others met the best fps is 18 \(prune=0.5\)",
+            r"psnr>=30, fps>=20, mb<=5; best psnr with the other conditions: 27 \(prune=0.8\); "
+            r"best fps with the other conditions: 18 \(prune=0.5\)",
         ),
         ("psnr>=50,fps>=90", "has psnr>=50, fps>=90$"),
         ("lpips<=0.5", "has lpips<=0.5$"),

@@ -61,8 +61,7 @@ def parse_point(text: str, option: str) -> Point:
     if not all(map(math.isfinite, (x, y, z))):
         shown = printable(repr(text), 60)
         raise DyngsError(
-            f"{option}: {shown} is no point; write three numbers x,y,z without spaces, such as "
-            "0,-1.5,2"
+            f"{option}: {shown} is no point; write three numbers x,y,z without spaces, such as 0,-1.5,2"
         )
     return x, y, z
 
@@ -102,8 +101,7 @@ def parse_scale(text: str) -> float:
     if not low <= factor <= high:
         what = "a factor, or two points and their distance: 'x,y,z x,y,z LENGTH'"
         raise DyngsError(
-            f"--scale: {printable(repr(text), 60)} is no factor from {low:g} to {high:g}; give "
-            f"{what}"
+            f"--scale: {printable(repr(text), 60)} is no factor from {low:g} to {high:g}; give {what}"
         )
     return factor
 
@@ -194,8 +192,7 @@ def _control_points(path: Path) -> np.ndarray:
             row = []
         if len(row) != 6 or not np.isfinite(row).all():
             raise DyngsError(
-                f"{path}: {printable(repr(line), 60)} is not six numbers x,y,z,X,Y,Z (scene, then "
-                "world)"
+                f"{path}: {printable(repr(line), 60)} is not six numbers x,y,z,X,Y,Z (scene, then world)"
             )
         rows.append(row)
     return np.array(rows, np.float64).reshape(-1, 6)
@@ -242,8 +239,7 @@ def gps_frame(opened: Opened) -> GeoFrame:
     tilt = math.degrees(error / spread[1])
     if tilt > MOST_TILT:
         raise DyngsError(
-            f"{root}: the photos stand too near to one line for positions that are off by "
-            f"{error:.2g} m: up would be "
+            f"{root}: the photos stand too near to one line for positions that are off by {error:.2g} m: up would be "
             f"uncertain by {tilt:.0f} degrees; {_INSTEAD}"
         )
     latitude, longitude, altitude = origin.tolist()
@@ -251,8 +247,7 @@ def gps_frame(opened: Opened) -> GeoFrame:
     notes = (
         line,
         f"x is east, y north, z up, in metres; the origin is at {place} (WGS84)",
-        f"positions are off by {error:.2g} m: up and north are good to about {tilt:.2g} degrees, "
-        "the scale to "
+        f"positions are off by {error:.2g} m: up and north are good to about {tilt:.2g} degrees, the scale to "
         f"{100 * error / float(np.linalg.norm(spread)):.2g} %",
     )
     return GeoFrame(similarity, notes)

@@ -39,8 +39,7 @@ def merge_scenes(
             gaussians = Similarity(turn_between(tuple(direction), tuple(up))).gaussians(gaussians)
         if splat_options(other) != splat_options(splat):
             tell(
-                f"{file}: was trained for another low-pass filter ({other.mode.value}); it is "
-                "drawn as the rest is"
+                f"{file}: was trained for another low-pass filter ({other.mode.value}); it is drawn as the rest is"
             )
         tell(f"{file}: {counted(len(gaussians), 'Gaussian')} added")
         parts.append(gaussians.detach())

@@ -63,8 +63,7 @@ def body_mesh(body: BodyTemplate) -> tuple[Tensor, Tensor, Tensor]:
     """
     if body.uv is None or body.uv_faces is None:
         raise DyngsError(
-            f"the body template '{body.name}' has no texture coordinates; train with "
-            "model.uv=FILE.obj for a mesh"
+            f"the body template '{body.name}' has no texture coordinates; train with model.uv=FILE.obj for a mesh"
         )
     pairs = body.faces.flatten() * len(body.uv) + body.uv_faces.flatten()
     corners, inverse = torch.unique(pairs, return_inverse=True)
@@ -279,11 +278,9 @@ def write_mesh(run: LoadedRun, path: Path, played: AnimationInfo | None = None) 
     moved = "that of the template" if surface.margin is None else "moved to the Gaussians"
     unseen = 100 * float((baked.alpha < SEEN).float().mean())
     notes = [
-        f"texture of {len(image)} x {len(image)}; {unseen:.1f} % of the body is not seen in the "
-        "Gaussians and has "
+        f"texture of {len(image)} x {len(image)}; {unseen:.1f} % of the body is not seen in the Gaussians and has "
         "colours from around it or from its mirror side",
-        f"the surface is {moved}: silhouettes agree at {surface.agreement:.3f} (intersection over "
-        "union), those of the "
+        f"the surface is {moved}: silhouettes agree at {surface.agreement:.3f} (intersection over union), those of the "
         f"template as it is at {surface.plain:.3f}",
     ]
     if scene.shapes is not None:
@@ -373,8 +370,7 @@ def write_rigged_splats(
         colours = frontal_colours(scene, anchor_normals(scene.anchors, body, vertices))
         gaussians = gaussians.replace(sh=((colours - 0.5) / SH_C0)[:, None])
         notes = (
-            "the colours of the run are a network; the file has those seen from straight above the "
-            "skin",
+            "the colours of the run are a network; the file has those seen from straight above the skin",
         )
     if scene.shapes is not None:
         notes = (*notes, "offsets that depend on the pose are left out: skinning weights hold none")
