@@ -171,7 +171,9 @@ class ModelComparison:
             name: StudyScene(name, name, self.run_dir(name), partial(self._train, config))
             for name, config in configs.items()
         }
-        missing = [x for x in study_scenes.values() if not measurer.measurement_path(x.slug).is_file()]
+        missing = [
+            x for x in study_scenes.values() if not measurer.measurement_path(x.slug).is_file()
+        ]
         left_out = dict[str, str]()
         for study_scene, result in run_tasks(measurer.measure, missing, ray_cores):
             if isinstance(result, DyngsError):

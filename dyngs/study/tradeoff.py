@@ -227,9 +227,7 @@ class Tradeoff:
         """
         load_resolved(self.run_dir)  # raises if this is not a run
         inputs_of(self.run_dir).require_output(self.out)
-        own = current_settings(
-            self.run_dir
-        )
+        own = current_settings(self.run_dir)
         run = load_run(self.run_dir)
         split_views(read_capture_of(run.config.data, run.info), self.split)
         newest = checkpoint_paths(self.run_dir)[-1]
@@ -252,7 +250,9 @@ class Tradeoff:
     def _measure(
         self, variants: Sequence[Variant], ray_cores: int | None
     ) -> dict[Variant, Measurement]:
-        measurer = SceneMeasurer(self.out, self.split, self.threads, self.device, rounds=self.rounds)
+        measurer = SceneMeasurer(
+            self.out, self.split, self.threads, self.device, rounds=self.rounds
+        )
         study_scenes = [
             StudyScene(v.name, v.slug, self.run_dir, partial(self.folder, v)) for v in variants
         ]

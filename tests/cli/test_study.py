@@ -115,9 +115,9 @@ def test_the_same_command_trains_nothing(
     assert "dynamic" in values["left_out"]
     before = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
     said = error_line(capsys, *words, "init.half_extent=2", "--split", "train")
-    assert "split is test there and train here" in said
+    assert "split: test there, train here" in said
     assert (
-        "overrides is init.num_random=100 there and init.num_random=100, init.half_extent=2 here"
+        "overrides: init.num_random=100 there, init.num_random=100, init.half_extent=2 here"
         in said
     )
     assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
