@@ -175,7 +175,7 @@ class GaussianScene(Renderable):
         """Return the scene with only the Gaussians at ``index`` (long or bool)."""
         return self.apply_edit(TopologyEdit.select(index))
 
-    def part(self, which: Literal["moving", "still"]) -> GaussianScene:
+    def part(self, which: Literal["moving", "static"]) -> GaussianScene:
         """Return only the Gaussians that move, or only those that do not."""
         moves = torch.zeros(len(self), dtype=torch.bool, device=self.gaussians.means.device)
         if not self.is_static:

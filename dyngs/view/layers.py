@@ -18,7 +18,7 @@ from dyngs.runs.opened import Opened
 from dyngs.view.views import views_of
 
 Layer = Literal["colour", "depth", "alpha", "error"]
-Part = Literal["all", "moving", "still"]
+Part = Literal["all", "moving", "static"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 PARTS: tuple[Part, ...] = get_args(Part)
 

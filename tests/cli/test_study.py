@@ -117,8 +117,7 @@ def test_the_same_command_trains_nothing(
     said = error_line(capsys, *words, "init.half_extent=2", "--split", "train")
     assert "split: test there, train here" in said
     assert (
-        "overrides: init.num_random=100 there, init.num_random=100, init.half_extent=2 here"
-        in said
+        "overrides: init.num_random=100 there, init.num_random=100, init.half_extent=2 here" in said
     )
     assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
 

@@ -130,7 +130,7 @@ def test_masks_reach_every_metric() -> None:
 @pytest.mark.parametrize(
     ("truth", "mask", "message"),
     [
-        (torch.full((14, 20, 3), math.nan), None, "view 'a': psnr is not finite, the image holds"),
+        (torch.full((14, 20, 3), math.nan), None, "view 'a': psnr is not finite .the image contains"),
         (
             torch.zeros(14, 20, 3),
             torch.zeros(14, 20),
@@ -255,7 +255,7 @@ def test_held_out_frames_are_scored_in_the_poses_of_the_file(run: Path) -> None:
 def test_refined_poses_stand_beside_those_as_given(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
+    monkeypatch.setattr(pose_fit, "MAX_WINDOWS", 1)
     stored = {}
     for name, more in (("given", []), ("refined", ["--refine"]), ("again", ["--refine"])):
         assert main(["eval", str(run), "--split", "pose", *more]) == 0

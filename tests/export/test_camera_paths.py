@@ -190,9 +190,9 @@ SPINE = keyed([key(0), key(1)])
         (transforms(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE"),
         ("frames", "must be a JSON object"),
         (keyed([key(0, time=0.1), key(1)]), r"keyframes\[1\]: 'time' is missing"),
-        (keyed([key(0, at=2), key(1, at=2)]), "a later second"),
+        (keyed([key(0, at=2), key(1, at=2)]), "'at' of keyframes must increase"),
         (SPINE | {"seconds": 1e6}, "asks for 10,000,000 frames"),
-        (keyed([key(0, at=0), key(1, at=2)], seconds=2, loop=True), "before a loop ends"),
+        (keyed([key(0, at=0), key(1, at=2)], seconds=2, loop=True), "below the length of a loop"),
     ],
 )
 def test_what_cannot_be_read_is_refused(document: Any, problem: str, tmp_path: Path) -> None:

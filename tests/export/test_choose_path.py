@@ -190,4 +190,4 @@ def test_who_was_filmed_from_one_side_is_seen_from_all(tmp_path: Path) -> None:
     )
     path = choose_path(open_run(folder), PathOptions("orbit", 4))
     assert np.diff(directions(path.cameras.centers)) == pytest.approx(90, abs=1)
-    assert any("goes all around" in note for note in path.notes)
+    assert any("is a full circle" in note for note in path.notes)

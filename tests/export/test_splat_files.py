@@ -86,7 +86,7 @@ def test_one_moment(moving: Opened, time: float, tmp_path: Path) -> None:
 
 
 def test_parts_together_are_the_whole(moving: Opened, tmp_path: Path) -> None:
-    parts: dict[Part, tuple[int, ...]] = {"moving": MOVING_ROWS, "still": STILL_ROWS}
+    parts: dict[Part, tuple[int, ...]] = {"moving": MOVING_ROWS, "static": STILL_ROWS}
     for part, rows in parts.items():
         path = write_run_splats(moving, tmp_path / f"{part}.ply", 0.7, part).path
         torch.testing.assert_close(x_of(path), moved_x(rows, 0.7))
@@ -94,7 +94,7 @@ def test_parts_together_are_the_whole(moving: Opened, tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="nothing moves in this run"):
         scene_part(still_scene(), "moving")
     with pytest.raises(DyngsError, match="no static part"):
-        scene_part(moving_scene(Sliding(), ALL), "still")
+        scene_part(moving_scene(Sliding(), ALL), "static")
 
 
 @pytest.mark.parametrize(("part", "rows"), [("all", ALL), ("moving", MOVING_ROWS)])

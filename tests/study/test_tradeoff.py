@@ -98,7 +98,7 @@ def test_on_a_gpu_quality_is_the_same(
     briefly = replace(study, settings={"prune": (0.5,)}, finetune=0, combine=0)
     expected = replace(briefly, out=tmp_path / "here").run()
     for module in ("training.new_trainer", "study.measure", "study.tradeoff"):
-        monkeypatch.setattr(f"dyngs.{module}.device_for", lambda _: GPU)
+        monkeypatch.setattr(f"dyngs.{module}.select_device", lambda _: GPU)
     there = replace(briefly, out=tmp_path / "there")
     with pretend_gpu():
         measured = there.run()
@@ -133,7 +133,7 @@ def test_masks_that_a_run_has_stay(found: Found, study: Tradeoff, tmp_path: Path
 
 
 def test_a_stored_run_cannot_be_varied(found: Found, study: Tradeoff) -> None:
-    with pytest.raises(DyngsError, match=r"only scene\.dyngs is there; give the run that it"):
+    with pytest.raises(DyngsError, match=r"contains only scene\.dyngs; use the run that it"):
         current_settings(study.folder(Variant(storage=2.0)))
 
 
@@ -330,8 +330,8 @@ def test_the_best_of_what_qualifies() -> None:
             r"psnr>=30, fps>=20, mb<=5; best psnr with the other conditions: 27 \(prune=0.8\); "
             r"best fps with the other conditions: 18 \(prune=0.5\)",
         ),
-        ("psnr>=50,fps>=90", "has psnr>=50, fps>=90$"),
-        ("lpips<=0.5", "has lpips<=0.5$"),
+        ("psnr>=50,fps>=90", "meets psnr>=50, fps>=90$"),
+        ("lpips<=0.5", "meets lpips<=0.5$"),
     ],
 )
 def test_what_is_missed_is_named(asked: str, message: str) -> None:

@@ -46,7 +46,7 @@ class Frame:
         if up is not None:
             similarity = similarity.after(Similarity(turn_between(tuple(up), tuple(wanted))))
         if self.origin is None:
-            return found
+            return similarity
         x, y, z = (-similarity.points(np.array(self.origin))).tolist()
         return replace(similarity, shift=(x, y, z))
 

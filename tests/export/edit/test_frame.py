@@ -83,7 +83,7 @@ def test_coordinates_too_large_for_float32_get_an_offset(tmp_path: Path) -> None
         ("0 0 0 1 1 1\n1 1 1 2 2 2\n2 2 2 3 3 3\n", "lie on one line in the scene"),
         ("0 0 0 1 1 1\n1 1 2\n", "'1 1 2': expected six numbers"),
         ("a b\n0 0 0 1 1 nan\n", "'0 0 0 1 1 nan': expected six numbers"),
-        ("0 0 0 0 0 0\n1 0 0 1e12 0 0\n0 1 0 0 1e12 0\n", "the scale would be beyond"),
+        ("0 0 0 0 0 0\n1 0 0 1e12 0 0\n0 1 0 0 1e12 0\n", "the scale is implausible"),
     ],
 )
 def test_control_points_that_are_none(text: str, said: str, tmp_path: Path) -> None:
