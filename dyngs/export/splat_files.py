@@ -281,7 +281,7 @@ def scene_part(scene: GaussianScene, part: Part) -> GaussianScene:
     found = scene.part(part)
     if not len(found):
         what = "the whole scene moves" if part == "static" else "nothing moves in this run"
-        raise DyngsError(f"{what}: no {'static' if part == 'still' else 'dynamic'} part")
+        raise DyngsError(f"{what}: no {'static' if part == 'static' else 'dynamic'} part")
     return found
 
 

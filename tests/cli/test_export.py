@@ -166,7 +166,7 @@ def test_a_page_has_the_full_name_of_its_run(run: Path, tmp_path: Path) -> None:
         ("--format html --sh-degree 3", "--sh-degree does not go with"),
         ("--format html --max-change 3", "--max-change does not go with --format html"),
         ("--format html --out page.pdf", "give --out page.html"),
-        ("--format html --motion walk.bvh", "needs the run of a person"),
+        ("--format html --motion walk.bvh", "needs a run of a person"),
         ("--format html --folder --max-gaussians-drawn 9", "for still scenes"),
         ("--format html --folder --out page.html", "writes a folder; give --out page"),
         ("--format html --max-gaussians-drawn 9", "goes with --folder"),
@@ -267,9 +267,7 @@ def test_wrong_options_end_in_one_line(
 def test_a_scene_without_a_person(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = write_moving_run(tmp_path / "run")
     assert main(["export", str(run), "--joints", "--out", "x.ply"]) == 2
-    assert re.search(
-        r"needs the run of a person \(model\.kind=human\), this one is", capsys.readouterr().err
-    )
+    assert re.search(r"needs a run of a person \(model\.kind=human\), not", capsys.readouterr().err)
 
 
 @pytest.fixture(scope="module")

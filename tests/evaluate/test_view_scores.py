@@ -130,7 +130,11 @@ def test_masks_reach_every_metric() -> None:
 @pytest.mark.parametrize(
     ("truth", "mask", "message"),
     [
-        (torch.full((14, 20, 3), math.nan), None, "view 'a': psnr is not finite .the image contains"),
+        (
+            torch.full((14, 20, 3), math.nan),
+            None,
+            "view 'a': psnr is not finite .the image contains",
+        ),
         (
             torch.zeros(14, 20, 3),
             torch.zeros(14, 20),

@@ -38,7 +38,7 @@ def test_a_folder_of_runs_is_a_picker(tmp_path: Path) -> None:
 
 
 def test_where_nothing_is_to_be_seen_one_line_says_so(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match="no runs there"):
+    with pytest.raises(DyngsError, match="no runs found"):
         open_source(tmp_path)
     with pytest.raises(DyngsError, match="no such file"):
         load_first(open_source(tmp_path / "nothing"))
