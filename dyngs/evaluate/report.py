@@ -205,7 +205,8 @@ class EvalReport:
             return ()
         worse, other = ("black", "white") if difference > 0 else ("white", "black")
         return (
-            f"PSNR on {worse} is {abs(difference):.1f} dB lower than on {other}: some opacities are "
+            f"PSNR on {worse} is {abs(difference):.1f} dB lower than on {other}: some opacities "
+            "are "
             "wrong; raise train.alpha_weight. To see them, run "
             f"`dyngs render RUN --out DIR --background {worse}`",
         )

@@ -50,7 +50,8 @@ def with_times(path: CameraPath, times: Sequence[float]) -> CameraPath:
     """Return the path with other scene times, one per camera, clamped to [0, 1]."""
     if len(times) != len(path):
         raise DyngsError(
-            f"the camera path has {len(path)} cameras but {len(times)} times; give one time per camera"
+            f"the camera path has {len(path)} cameras but {len(times)} times; give one time per "
+            "camera"
         )
     inside, notes = clamp_times(times)
     return replace(path, times=inside, notes=(*path.notes, *notes))
@@ -100,7 +101,8 @@ def parse_times(text: str) -> tuple[float, ...]:
         start, stop, count = 0.0, 0.0, 0
     if not (math.isfinite(start) and math.isfinite(stop) and 1 <= count <= _MAX_FRAMES):
         raise DyngsError(
-            f"{printable(repr(text), 60)}: not a range of times; use START:STOP:COUNT, such as 0:1:60"
+            f"{printable(repr(text), 60)}: not a range of times; use START:STOP:COUNT, such as "
+            "0:1:60"
         )
     return tuple(np.linspace(start, stop, count).tolist())
 
@@ -172,7 +174,8 @@ def _as_document(found: Any, file: Path) -> tuple[dict[str, Any], tuple[str, ...
         raise DyngsError(f"{file}: cameras must be pinholes, not {printable(kind, 40)}")
     if "camera_path" in found:
         return _convert_nerfstudio(found, file), (
-            "the nerfstudio path is read in coordinates of the capture; nerfstudio may have used others "
+            "the nerfstudio path is read in coordinates of the capture; nerfstudio may have used "
+            "others "
             "(dataparser_transforms.json)",
         )
     is_distorted = any(found.get(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))

@@ -68,7 +68,8 @@ def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
     ):
         file = opened.config.data.root
         raise DyngsError(
-            f"{file}: a {file.suffix.lower()} has no times and no views; remove --path along, --time, "
+            f"{file}: a {file.suffix.lower()} has no times and no views; remove --path along, "
+            "--time, "
             "--times and --view"
         )
     if options.path is None:

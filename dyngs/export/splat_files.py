@@ -504,7 +504,8 @@ def write_rigid_bodies(
     with atomic_file(path) as temporary:
         document.write(temporary)
     notes = (
-        f"{len(channels) // 2} bodies, animated for {opened.seconds:.1f} s, with the colours of time {time:g}",
+        f"bodies: {len(channels) // 2}, animated for {opened.seconds:.1f} s, with the colours of "
+        f"time {time:g}",
         f"other motion and shadows are frozen at time {time:g}; export a sequence to keep them",
         *offset_notes(splat, "the file states it"),
     )

@@ -110,7 +110,8 @@ class ModelComparison:
             name = re.sub(r"[^\w.-]", "_", file.stem).lstrip(".-") or "model"
             if name in configs or name in left_out:
                 raise DyngsError(
-                    f"--models: {printable(word, 60)}: two models are named {name}; rename one preset"
+                    f"--models: {printable(word, 60)}: two models are named {name}; rename one "
+                    "preset"
                 )
             words = [*self.overrides, *fixed, f"run.dir={self.run_dir(name)}"]
             try:
@@ -205,8 +206,10 @@ class ModelComparison:
             side = load_resolved(folder).data.longest_side
             if side != config.data.longest_side:
                 raise DyngsError(
-                    f"too few steps fit into {self.limit}, so its images were resized to {side} px, unlike "
-                    f"those of the other models; use more minutes, or data.longest_side={side} for all"
+                    f"too few steps fit into {self.limit}, so its images were resized to {side} "
+                    "px, unlike "
+                    f"those of the other models; use more minutes, or data.longest_side={side} for "
+                    "all"
                 )
         is_limited = self.max_mb is not None and has_file(folder)
         return folder / EXPORT_FOLDER if is_limited else folder

@@ -285,7 +285,7 @@ def pose_person(opened: Opened, angles: Mapping[str, Sequence[float]]) -> Opened
 
     rest = opened.at_rest()
     person = as_human_scene(rest.renderable)
-    clip = None if person is None else person.played
+    clip = None if person is None else person.replacement_clip
     if person is None or clip is None:
         return rest
     turns = torch.zeros_like(clip.poses)

@@ -110,7 +110,8 @@ def free_port(host: str, port: int | None) -> int:
         except OSError as error:
             problem = error
     raise DyngsError(
-        f"--host {host} --port {port or '8080 to 8129'}: cannot listen ({problem}); use another port, or "
+        f"--host {host} --port {port or '8080 to 8129'}: cannot listen ({problem}); use another "
+        "port, or "
         "omit --port to find a free one"
     )
 

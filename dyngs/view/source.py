@@ -78,7 +78,8 @@ def open_to_view(
     opened = replace(opened, name=name, stated_up=up or opened.stated_up)
     if opened.missing is not None:
         opened = opened.noted(
-            f"capture not found, no cameras and true images: {opened.missing}; if it was moved, add "
+            f"capture not found, no cameras and true images: {opened.missing}; if it was moved, "
+            "add "
             "data.root=FOLDER"
         )
     return opened

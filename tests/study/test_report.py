@@ -80,7 +80,7 @@ def test_lines_of_a_plot_join_the_run_with_a_setting() -> None:
         front, *lines = axes.lines
         assert len(front.get_xdata()) == 3
         found = {line.get_label(): len(line.get_xdata()) for line in lines}
-        assert found == {"the run itself": 1, "prune": 3, "sh_degree": 2}
+        assert found == {"original run": 1, "prune": 3, "sh_degree": 2}
     text = figure_to_svg(figure)
     assert "<image" not in text
     assert 'href="http' not in text

@@ -86,7 +86,7 @@ def test_finished_points_are_not_measured_again(found: Found, study: Tradeoff) -
 
 
 def test_points_of_something_else_do_not_mix(found: Found, study: Tradeoff, tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match=r"another study .split is test there and train here"):
+    with pytest.raises(DyngsError, match=r"another study .split: test there, train here"):
         replace(study, split="train").run()
     with pytest.raises(DyngsError, match="no views"):
         replace(study, out=tmp_path, split="val").run()
@@ -105,7 +105,7 @@ def test_on_a_gpu_quality_is_the_same(
     untimed = [replace(x, ms=None, gain=1.0) for x in measured.values()]
     assert untimed == [replace(x, ms=None, gain=1.0) for x in expected.values()]
     monkeypatch.undo()
-    with pytest.raises(DyngsError, match=r"another study .device is"):
+    with pytest.raises(DyngsError, match=r"another study .device:"):
         there.run()
 
 

@@ -33,7 +33,7 @@ def test_a_folder_of_runs_is_a_picker(tmp_path: Path) -> None:
     next((tmp_path / "a/deep/run/checkpoints").iterdir()).write_bytes(b"damaged")
     first = load_first(source)
     assert first.name == "b/run"
-    assert "left out" in first.notes[0]
+    assert "skipped" in first.notes[0]
     assert open_source(tmp_path / "b" / "run").names == ("run",)
 
 

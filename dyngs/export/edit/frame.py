@@ -99,7 +99,8 @@ def parse_scale(text: str) -> float:
     if not low <= factor <= high:
         what = "a factor, or two points and their distance: 'x,y,z x,y,z LENGTH'"
         raise DyngsError(
-            f"--scale: {printable(repr(text), 60)} is not a factor from {low:g} to {high:g}; use {what}"
+            f"--scale: {printable(repr(text), 60)} is not a factor from {low:g} to {high:g}; use "
+            f"{what}"
         )
     return factor
 
@@ -180,7 +181,7 @@ def _control_points(path: Path) -> np.ndarray:
     A first line of names, and lines starting with #, are ignored.
     """
     if not path.exists():
-        raise DyngsError(f"{path}: file not found; it must contain rows x,y,z,X,Y,Z")
+        raise DyngsError(f"{path}: no such file; it must contain rows x,y,z,X,Y,Z")
     text = re.sub("[,;]", " ", read_limited(path, _MOST_BYTES).decode("utf-8", "replace"))
     lines = [line for line in text.splitlines() if line.strip() and line.lstrip()[0] != "#"]
     if lines and lines[0].lstrip()[0].isalpha():
@@ -193,7 +194,8 @@ def _control_points(path: Path) -> np.ndarray:
             row = []
         if len(row) != 6 or not np.isfinite(row).all():
             raise DyngsError(
-                f"{path}: {printable(repr(line), 60)}: expected six numbers x,y,z,X,Y,Z (scene, world)"
+                f"{path}: {printable(repr(line), 60)}: expected six numbers x,y,z,X,Y,Z (scene, "
+                "world)"
             )
         rows.append(row)
     return np.array(rows, np.float64).reshape(-1, 6)
@@ -240,7 +242,8 @@ def gps_frame(opened: Opened) -> GeoFrame:
     tilt = math.degrees(error / spread[1])
     if tilt > MOST_TILT:
         raise DyngsError(
-            f"{root}: positions are too close to one line for errors of {error:.2g} m: up is uncertain by "
+            f"{root}: positions are too close to one line for errors of {error:.2g} m: up is "
+            "uncertain by "
             f"{tilt:.0f} degrees; {_INSTEAD}"
         )
     latitude, longitude, altitude = origin.tolist()
@@ -248,7 +251,8 @@ def gps_frame(opened: Opened) -> GeoFrame:
     notes = (
         line,
         f"x is east, y north, z up, in metres; the origin is at {place} (WGS84)",
-        f"position error {error:.2g} m; accuracy of up and north about {tilt:.2g} degrees, of scale "
+        f"position error {error:.2g} m; accuracy of up and north about {tilt:.2g} degrees, of "
+        "scale "
         f"{100 * error / float(np.linalg.norm(spread)):.2g} %",
     )
     return GeoFrame(similarity, notes)

@@ -45,7 +45,8 @@ def merge_scenes(
             gaussians = Similarity(turn_between(tuple(direction), tuple(up))).gaussians(gaussians)
         if splat_options(other) != splat_options(splat):
             log(
-                f"{file}: its low-pass filter ({other.mode.value}) is replaced by that of the first scene"
+                f"{file}: its low-pass filter ({other.mode.value}) is replaced by that of the "
+                "first scene"
             )
         log(f"{file}: {counted(len(gaussians), 'Gaussian')} added")
         parts.append(gaussians.detach())

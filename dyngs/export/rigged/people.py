@@ -290,7 +290,8 @@ def write_mesh(run: LoadedRun, path: Path, played: AnimationInfo | None = None) 
     moved = "of the template" if surface.margin is None else "fitted to the Gaussians"
     unseen = 100 * float((baked.alpha < SEEN).float().mean())
     notes = [
-        f"texture {len(image)} x {len(image)}; {unseen:.1f} % of the body is unseen and filled from its "
+        f"texture {len(image)} x {len(image)}; {unseen:.1f} % of the body is unseen and filled "
+        "from its "
         "surroundings or its mirror side",
         f"surface {moved}: silhouette IoU {surface.agreement:.3f} (template: {surface.plain:.3f})",
     ]

@@ -72,7 +72,7 @@ def test_coordinates_too_large_for_float32_get_an_offset(tmp_path: Path) -> None
     found = control_point_frame(table(tmp_path / "a.csv", world))
     np.testing.assert_allclose(found.similarity.points(SCENE) + found.offset, world, atol=1e-6)
     assert np.abs(found.similarity.points(SCENE)).max() < 100
-    assert "to be added to positions: 691002 5334018 507" in found.lines[1]
+    assert "to add to positions: 691002 5334018 507" in found.lines[1]
 
 
 @pytest.mark.parametrize(
