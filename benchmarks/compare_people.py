@@ -28,7 +28,7 @@ from dyngs.api.train import train
 from dyngs.cli.output import numbers_table, print_messages, print_tables
 from dyngs.config import DataConfig
 from dyngs.config.io import load_config, packaged_preset
-from dyngs.core.conventions import report_nothing
+from dyngs.core.conventions import ignore_progress
 from dyngs.core.errors import DyngsError, counted, show
 from dyngs.core.metrics import psnr, ssim
 from dyngs.data.capture import View
@@ -118,7 +118,7 @@ def compare_people(bench: PeopleBench, out: Path) -> Table:
                 own = {key: getattr(given, key) for key in changed}
                 data = config.data.model_copy(update={"root": person.root, "test_every": 0} | own)
                 kind = require_network(config, Path(name))
-                make = partial(kind.networks()[1], config, checkpoint, data, show, report_nothing)
+                make = partial(kind.networks()[1], config, checkpoint, data, show, ignore_progress)
                 views = make().views
                 methods: dict[str, Method] = {name: partial(_predicted, make, False)}
                 if config.model.kind == "human_predictor":
@@ -202,7 +202,7 @@ def _predicted(
     predictor = make()
     began = time.process_time()
     if adapts:
-        predictor.adapt(sources, None, report_nothing)
+        predictor.adapt(sources, None, ignore_progress)
     start = time.process_time()
     scene = predictor.predict(sources)
     return scene, time.process_time() - start, start - began

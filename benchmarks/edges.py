@@ -28,7 +28,7 @@ from dyngs.core.state import Role
 from dyngs.data.capture import Split, View
 from dyngs.data.loader import ImageLoader
 from dyngs.models.renderable import Renderable
-from dyngs.runs.opened import Opened, open_run
+from dyngs.runs.opened import OpenedScene, open_run
 
 NEAR = 2  # px from an edge
 SPLITS: tuple[Split, ...] = ("test", "val")
@@ -51,7 +51,7 @@ def num_values(scene: Renderable) -> int:
 
 
 @torch.no_grad()
-def errors(opened: Opened, split: Split) -> list[float]:
+def errors(opened: OpenedScene, split: Split) -> list[float]:
     """Return means over views: PSNR and SSIM of whole images, and PSNR near edges, NaN without
     any."""
     options = opened.config.data.model_copy(update={"downscale": 1.0, "longest_side": None})

@@ -172,7 +172,7 @@ class TrueMotion(DeformationField):
 class OracleTraining(StaticTraining):
     """Training of colours and Gaussians while the motion is given."""
 
-    moves_by = ("true motion", "optim")
+    deformation_name = ("true motion", "optim")
 
     def __init__(self, steps: int) -> None:
         super().__init__(FilterUpdate())

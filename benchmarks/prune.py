@@ -22,7 +22,7 @@ from statistics import median
 
 import torch
 
-from dyngs.api.prune import file_of, prune_run, prune_within
+from dyngs.api.prune import file_of, prune_run, prune_to_loss
 from dyngs.api.scene_file import write_scene_file
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
@@ -76,7 +76,7 @@ def promises(given: argparse.Namespace) -> None:
         if not checkpoint_paths(out):
             overrides = (*given.overrides, f"run.threads={given.threads}")
             began = time.perf_counter()
-            promise = prune_within(given.run_dir, out, most, overrides)
+            promise = prune_to_loss(given.run_dir, out, most, overrides)
             print(f"\n{promise}\n{time.perf_counter() - began:.0f} s\n", flush=True)
         before, after = compare_runs([given.run_dir, file_of(out)], given.threads)
         print(line(f"{most:g} dB allowed", file_of(out), after, before, given.threads), end="")

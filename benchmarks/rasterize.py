@@ -22,8 +22,8 @@ from torch import Tensor
 
 from dyngs.cli.output import numbers_table, print_tables
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import counted, reading
-from dyngs.core.state import fields_moved_to
+from dyngs.core.errors import counted, wrap_read_errors
+from dyngs.core.state import move_fields_to
 from dyngs.io.numpy_files import read_arrays
 from dyngs.ops.native import active_isa, kernel_threads
 from dyngs.ops.projection import Projection, ProjectionOptions, project
@@ -52,7 +52,7 @@ class Workload:
 
     def to(self, device: torch.device) -> Workload:
         """Return the same workload on ``device``."""
-        return fields_moved_to(self, device)
+        return move_fields_to(self, device)
 
 
 def garden_workload(path: Path) -> Workload:
@@ -60,7 +60,7 @@ def garden_workload(path: Path) -> Workload:
     shapes, first camera."""
     keys = ("means3d", "colors", "viewmats", "Ks", "width", "height")
     data = read_arrays(path, lambda names: [key for key in keys if key in names])
-    with reading(path, "give a workload of gsplat's benchmark"):
+    with wrap_read_errors(path, "give a workload of gsplat's benchmark"):
         near = (np.abs(data["means3d"]) <= 2).all(axis=1)
         means = torch.from_numpy(data["means3d"][near]).float()
         colors = torch.from_numpy(data["colors"][near]).float()[None] / 255

@@ -47,7 +47,7 @@ import torch
 from dyngs.cli import main as dyngs
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.runs.checkpoint import checkpoint_paths, has_only_scene_file, load_run
-from dyngs.runs.folder import ASKED_NAME, EXPORT_FOLDER
+from dyngs.runs.folder import REQUESTED_NAME, EXPORT_FOLDER
 
 OPERATIONS = (
     "os.rename",
@@ -170,17 +170,17 @@ def forked(
     os.close(opened)
     errors = Path(name)
     start = time.perf_counter()
-    reading, writing = os.pipe()
+    wrap_read_errors, writing = os.pipe()
     pid = os.fork()
     if pid == 0:
         _be_child(words, out, (errors, writing), prepare)
     os.close(writing)
     try:
-        meet(pid, reading)
+        meet(pid, wrap_read_errors)
         status = _waited(pid)
-        counted = os.read(reading, 64) if select.select([reading], [], [], 0)[0] else b""
+        counted = os.read(wrap_read_errors, 64) if select.select([wrap_read_errors], [], [], 0)[0] else b""
     finally:
-        os.close(reading)
+        os.close(wrap_read_errors)
     said = errors.read_text(errors="replace")
     errors.unlink()
     number = counted.rpartition(b"#")[2]
@@ -318,7 +318,7 @@ def told(file: Path) -> object:
         return [{key: value for key, value in line.items() if key != "seconds"} for line in lines]
     if file.name == "timing.json":
         return list(json.loads(file.read_text())["seconds_train"])
-    if file.name in (RESOLVED_NAME, ASKED_NAME):
+    if file.name in (RESOLVED_NAME, REQUESTED_NAME):
         return [
             line for line in file.read_text().splitlines() if not line.strip().startswith("dir:")
         ]

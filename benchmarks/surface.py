@@ -23,14 +23,14 @@ from scipy.spatial import cKDTree
 from dyngs.data.geometry import inverse_rigid
 from dyngs.data.synthetic.captures import nearest_things, sampled_rays
 from dyngs.export.surface_file import write_surface
-from dyngs.runs.opened import Opened, open_run
+from dyngs.runs.opened import OpenedScene, open_run
 
 SIDE = 200  # Rays along an image
 POINTS = 300_000  # Of a mesh
 NEAR = 0.01  # Of the scene's size
 
 
-def true_points(opened: Opened) -> np.ndarray:
+def true_points(opened: OpenedScene) -> np.ndarray:
     """Return (P, 3) points of the true surface that training views see."""
     scene = polyhedra()
     found = []

@@ -117,7 +117,7 @@ def safetensors_changed(data: bytes, rng: Random) -> bytes:
 
 def dyngs_changed(data: bytes, rng: Random) -> bytes:
     """Return a ``scene.dyngs`` after one mutation, mostly with the right checksum."""
-    from dyngs.runs.stored_file import MAGIC, MAX_HEADER, compressed, decompressed
+    from dyngs.runs.stored_file import MAGIC, MAX_HEADER, compress_lzma, decompress_lzma
 
     if rng.random() < 0.1:
         return bytes_changed(data, rng)
@@ -127,8 +127,8 @@ def dyngs_changed(data: bytes, rng: Random) -> bytes:
     blocks = data[end:-32]
     if rng.random() < 0.6:
         try:
-            tree = tree_changed(json.loads(decompressed(header, MAX_HEADER, exact=False)), rng)
-            header = compressed(json_bytes(tree), room=MAX_HEADER)
+            tree = tree_changed(json.loads(decompress_lzma(header, MAX_HEADER, exact=False)), rng)
+            header = compress_lzma(json_bytes(tree), room=MAX_HEADER)
         except Exception:  # changed before so that it cannot be read
             header = bytes_changed(header, rng)
     elif rng.random() < 0.2:

@@ -16,7 +16,7 @@ from tiny_fields import stirred_field
 
 from dyngs.config import Config, DataConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, save_config
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
 from dyngs.deform.keys import DynamicModel
@@ -442,7 +442,7 @@ def _moving(kind: str) -> tuple[Config, dict[str, torch.Tensor]]:
         data=DataConfig.model_validate({"root": "capture"}),
         model=DynamicModel(deform=tiny_options(kind)),
     )
-    state = tensors_of(field_state(stirred_field(kind, num_moving=2)))
+    state = strip_roles(field_state(stirred_field(kind, num_moving=2)))
     tensors = _gaussians() | {f"model.field.{name}": x.contiguous() for name, x in state.items()}
     tensors["model.rows"] = torch.tensor([1, 3])
     return config, tensors | {"model.times": torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)}

@@ -14,7 +14,7 @@ from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
 from torch import Tensor
 
 from dyngs.config import NetworkColour, SceneModel
-from dyngs.core.state import prefixed, tensors_of
+from dyngs.core.state import add_prefix, strip_roles
 from dyngs.deform.fields import WindowedField, field_state
 from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians.colour.training import NetworkTraining
@@ -24,7 +24,7 @@ from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.stored_file import (
     Coding,
-    stored_tensor,
+    encode_tensor,
     with_header,
 )
 
@@ -135,7 +135,7 @@ def stored_as_they_are(tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -
         ValueError: the format cannot say that.
     """
     kept = {name: x for name, x in tensors.items() if x.dtype != torch.bfloat16}
-    stored = [stored_tensor(name, x, Coding("exact")) for name, x in sorted(kept.items())]
+    stored = [encode_tensor(name, x, Coding("exact")) for name, x in sorted(kept.items())]
     return with_header(dict(info), [entry for entry, _ in stored], [block for _, block in stored])
 
 
@@ -170,13 +170,13 @@ def contents(kind: str) -> tuple[Tensors, SceneModel]:
         colours = NetworkTraining(
             options, 10, box, torch.Generator().manual_seed(0), uses_time=True
         )
-        state |= tensors_of(prefixed("colour", colours.network.state() | colours.state()))
+        state |= strip_roles(add_prefix("colour", colours.network.state() | colours.state()))
     elif kind != "static":
         name = "control_nodes" if kind in ("masked", "windowed") else kind
         model = DynamicModel(deform=tiny_options(name))
         field = stirred_field(name, len(_ROWS))
         field = WindowedField(field, len(_ROWS)) if kind == "windowed" else field
-        state |= tensors_of(prefixed("field", field_state(field)))
+        state |= strip_roles(add_prefix("field", field_state(field)))
         state |= {
             "rows": torch.tensor(_ROWS),
             "times": torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64),
@@ -185,7 +185,7 @@ def contents(kind: str) -> tuple[Tensors, SceneModel]:
         masks = VisibilityMasks.pack(
             (0.0, 0.5, 1.0), torch.arange(9)[None] % 3 == torch.arange(3)[:, None]
         )
-        state |= tensors_of(prefixed("masks", masks.state()))
+        state |= strip_roles(add_prefix("masks", masks.state()))
     tensors = {f"gaussians.{name}": x for name, x in gaussians.tensors().items()}
     return {
         name: x.contiguous()

@@ -13,7 +13,7 @@ from torch import Tensor
 from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.camera import Cameras
-from dyngs.core.state import Role, tensors_of
+from dyngs.core.state import Role, strip_roles
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, select_rows
@@ -171,7 +171,7 @@ def write_moving_run(
     tensors = {f"gaussians.{name}": x.contiguous() for name, x in gaussians.tensors().items()}
     if moves:
         tensors |= {
-            f"model.field.{name}": x for name, x in tensors_of(field_state(sliding_nodes())).items()
+            f"model.field.{name}": x for name, x in strip_roles(field_state(sliding_nodes())).items()
         }
         tensors["model.rows"] = torch.tensor(MOVING_ROWS)
         tensors["model.times"] = torch.tensor(TRAIN_TIMES, dtype=torch.float64)

@@ -8,7 +8,7 @@ from tiny_fields import ALL_KINDS as FIELDS
 from tiny_fields import cloud, stirred_field, tiny_options
 
 from dyngs.core.camera import Cameras
-from dyngs.core.state import State, part_of, tensors_of
+from dyngs.core.state import State, part_of, strip_roles
 from dyngs.deform.fields import OPEN, WindowedField
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
@@ -62,7 +62,7 @@ def scene_of_kind(kind: str) -> GaussianScene:
 
 def restored(kind: str, state: State) -> GaussianScene:
     """The scene of what is stored, but for its colours."""
-    tensors = {name: x.clone() for name, x in tensors_of(state).items()}
+    tensors = {name: x.clone() for name, x in strip_roles(state).items()}
     gaussians = Gaussians.stored(part_of(tensors, "gaussians"))
     own = part_of(tensors, "model")
     if kind == "static":

@@ -27,7 +27,7 @@ from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.runs.opened import opened_scene
+from dyngs.runs.opened import wrap_scene
 
 Failure = Literal["cut", "404", "503", "silent", "damaged"]
 
@@ -41,7 +41,7 @@ def write(
 ) -> WrittenPage:
     scene = replace(scene, options=options or scene.options, background=torch.ones(3))
     return write_page(
-        replace(opened_scene(scene), stated_up="-y"), path, title=title, views=(view,)
+        replace(wrap_scene(scene), stated_up="-y"), path, title=title, views=(view,)
     )
 
 
@@ -137,7 +137,7 @@ def levels_of_a_cloud(folder: Path, most: int | None = None) -> tuple[LevelScene
     )
     view = large(camera(), 6)
     written = write_page_folder(
-        replace(opened_scene(still), stated_up="-y"), folder, most=most, views=(view,)
+        replace(wrap_scene(still), stated_up="-y"), folder, most=most, views=(view,)
     )
     assert written.num_bytes == sum(file.stat().st_size for file in folder.iterdir())
     blocks = [*(f"0-{i}.bin" for i in range(4)), "1-0.bin"]

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.gaussians.optimizer import AdamState
 from dyngs.ops.adam import Count
 
@@ -76,21 +76,21 @@ def test_mapped_changes_both_moments_of_what_is_named() -> None:
 def test_a_restored_one_goes_on_as_if_never_stopped() -> None:
     adam, tensors = stepped(2)
     copies = {name: x.detach().clone().requires_grad_() for name, x in tensors.items()}
-    other = AdamState.from_state(tensors_of(adam.state()), tensors)
+    other = AdamState.from_state(strip_roles(adam.state()), tensors)
     for one, own in ((adam, tensors), (other, copies)):
         for name, x in own.items():
             x.grad = random(x.shape, 99)
             one.step_(name, x, lr=0.1, step=3)
     assert all(torch.equal(x, copies[name]) for name, x in tensors.items())
-    for name, x in tensors_of(adam.state()).items():
-        assert torch.equal(x, tensors_of(other.state())[name])
-        assert torch.equal(x, tensors_of(other.to("cpu").state())[name])
+    for name, x in strip_roles(adam.state()).items():
+        assert torch.equal(x, strip_roles(other.state())[name])
+        assert torch.equal(x, strip_roles(other.to("cpu").state())[name])
 
 
 @pytest.mark.parametrize("part", ["exp_avg", "exp_avg_sq"])
 def test_moments_that_do_not_fit_are_refused(part: str) -> None:
     adam, tensors = stepped(1)
-    state = tensors_of(adam.state())
+    state = strip_roles(adam.state())
     name = f"{part}.weight"
     with pytest.raises(KeyError, match=name):
         AdamState.from_state({k: x for k, x in state.items() if k != name}, tensors)

@@ -23,7 +23,7 @@ import dyngs
 from dyngs.cli import doctor, main
 from dyngs.cli.train import parse_config
 from dyngs.config.io import load_config, save_config
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 
 VERBS = (
     "demo",
@@ -127,7 +127,7 @@ def test_module_and_command_are_the_same() -> None:
 
 
 def fail_in_a_reader() -> None:
-    with reading("cameras.json"):
+    with wrap_read_errors("cameras.json"):
         raise KeyError("fl_x")
 
 

@@ -18,12 +18,12 @@ import dyngs
 from dyngs.cli.output import print_messages, print_notes
 from dyngs.core.errors import (
     DyngsError,
-    as_word,
+    quote_path,
     counted,
-    printable,
-    reading,
+    format_one_line,
+    wrap_read_errors,
     reason,
-    require_regular,
+    require_regular_file,
     show,
     warn,
 )
@@ -55,7 +55,7 @@ from dyngs.runs.stored_file import read_scene
 def test_every_error_becomes_one_line_that_names_the_file(error: Exception) -> None:
     with (
         pytest.raises(DyngsError, match=r"^a/cameras\.json: .*; export it again$") as caught,
-        reading("a/cameras.json", "export it again"),
+        wrap_read_errors("a/cameras.json", "export it again"),
     ):
         raise error
     line = str(caught.value)
@@ -65,16 +65,16 @@ def test_every_error_becomes_one_line_that_names_the_file(error: Exception) -> N
 
 
 def test_a_line_of_ours_and_interrupts_pass() -> None:
-    with pytest.raises(DyngsError, match=r"^ours$"), reading("a.json"):
+    with pytest.raises(DyngsError, match=r"^ours$"), wrap_read_errors("a.json"):
         raise DyngsError("ours")
-    with pytest.raises(KeyboardInterrupt), reading("a.json"):
+    with pytest.raises(KeyboardInterrupt), wrap_read_errors("a.json"):
         raise KeyboardInterrupt
 
 
 def test_errors_of_the_system_are_said_in_its_words(tmp_path: Path) -> None:
     path = tmp_path / "none.bin"
     line = re.escape(f"{path}: cannot be read (No such file or directory); copy or export it again")
-    with pytest.raises(DyngsError, match=line), reading(path):
+    with pytest.raises(DyngsError, match=line), wrap_read_errors(path):
         path.read_bytes()
 
 
@@ -84,8 +84,8 @@ def test_reason_of_an_error_without_words_is_its_type() -> None:
 
 
 def test_printable_keeps_letters_and_escapes_what_a_terminal_obeys() -> None:
-    assert printable("Größe \x1b[2J\u202e\udce9\nnext") == "Größe \\x1b[2J\\u202e\\udce9 next"
-    assert printable("abcdefgh", 6) == "abc..."
+    assert format_one_line("Größe \x1b[2J\u202e\udce9\nnext") == "Größe \\x1b[2J\\u202e\\udce9 next"
+    assert format_one_line("abcdefgh", 6) == "abc..."
 
 
 def test_no_message_can_steer_a_terminal() -> None:
@@ -118,10 +118,10 @@ def test_what_may_never_end_is_not_read(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to("/dev/zero")
     for name in ("pipe", "link"):
         with pytest.raises(DyngsError, match=rf"{name}: is no file but a pipe"):
-            require_regular(tmp_path / name)
+            require_regular_file(tmp_path / name)
     (tmp_path / "file").touch()
     for name in ("file", "", "not there", "a\0b"):
-        require_regular(tmp_path / name)
+        require_regular_file(tmp_path / name)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names here")
@@ -170,7 +170,7 @@ def test_names_in_commands_can_be_copied(
     """What shows on the terminal, also within an error, is the name again for a shell."""
     stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding, errors="backslashreplace")
     monkeypatch.setattr(sys, "stdout", stream)
-    print(DyngsError(f"run `{as_word(name)}`"), end="")
+    print(DyngsError(f"run `{quote_path(name)}`"), end="")
     stream.flush()
     shown = stream.buffer.getvalue().decode(encoding)
     monkeypatch.undo()

@@ -19,7 +19,7 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.config.io import load_config, packaged_presets
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import (
@@ -150,7 +150,7 @@ def test_the_coarse_phase_is_static_training(capture: Path, tmp_path: Path) -> N
     )
     for _ in range(8):
         assert static.step().loss == dynamic.step().loss
-    mine, others = (tensors_of(trainer.model.state()) for trainer in (static, dynamic))
+    mine, others = (strip_roles(trainer.model.state()) for trainer in (static, dynamic))
     moments = [name for name in mine if name.startswith("exp_avg")]
     assert moments
     assert all(torch.equal(mine[name], others[name]) for name in moments)

@@ -14,11 +14,11 @@ from torch import Tensor
 from dyngs.core.state import (
     Role,
     StateTensor,
-    fields_moved_to,
-    moved_to,
+    move_fields_to,
+    move_to_device,
     part_of,
-    prefixed,
-    tensors_of,
+    add_prefix,
+    strip_roles,
     with_role,
 )
 
@@ -36,9 +36,9 @@ def test_a_prefix_is_put_before_and_taken_away(
     tensors = {name: torch.tensor([x]) for name, x in values.items()}
     state = with_role(tensors, role)
     assert all(x.role is role for x in state.values())
-    assert tensors_of(state) == tensors
-    assert part_of(tensors_of(prefixed(prefix, state)), prefix) == tensors
-    assert tensors_of(prefixed(prefix, state)) == {
+    assert strip_roles(state) == tensors
+    assert part_of(strip_roles(add_prefix(prefix, state)), prefix) == tensors
+    assert strip_roles(add_prefix(prefix, state)) == {
         f"{prefix}.{name}": x for name, x in tensors.items()
     }
 
@@ -77,7 +77,7 @@ def test_what_is_moved_keeps_its_shape() -> None:
         "e": "cpu",
     }
     value["a"][0].cache["old"] = x
-    moved: Any = moved_to(value, "meta")
+    moved: Any = move_to_device(value, "meta")
     plain, own = moved["a"]
     assert devices([plain.x, own.times, own.x, moved["b"].tensor]) == [
         "meta",
@@ -90,8 +90,8 @@ def test_what_is_moved_keeps_its_shape() -> None:
     assert devices([value["a"][0].x, value["b"].tensor]) == ["cpu", "cpu"], (
         "what was given stays as it is"
     )
-    assert moved_to(Role.SHARED, "meta") is Role.SHARED
-    assert moved_to(Plain, "meta") is Plain
+    assert move_to_device(Role.SHARED, "meta") is Role.SHARED
+    assert move_to_device(Plain, "meta") is Plain
 
 
 @dataclass(frozen=True)
@@ -104,10 +104,10 @@ class Mixed:
 
 def test_all_tensors_are_moved_and_only_real_ones_converted() -> None:
     given = Mixed(torch.zeros(2), torch.zeros(2).long(), None, "x")
-    moved = fields_moved_to(given, "meta")
+    moved = move_fields_to(given, "meta")
     assert (moved.real.device.type, moved.whole.device.type) == ("meta", "meta")
     assert (moved.none, moved.name) == (None, "x")
-    exact = fields_moved_to(given, None, torch.float64)
+    exact = move_fields_to(given, None, torch.float64)
     assert (exact.real.dtype, exact.whole.dtype, exact.real.device.type) == (
         torch.float64,
         torch.int64,

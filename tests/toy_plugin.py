@@ -26,4 +26,4 @@ def installed() -> Iterator[None]:
 
 def forget() -> None:
     kinds.installed_kind.cache_clear()
-    kinds.foreign_kinds.cache_clear()
+    kinds.plugin_kinds.cache_clear()

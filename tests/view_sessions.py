@@ -14,21 +14,21 @@ import torch
 from moving_scene import Sliding, camera, moving_scene
 
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.runs.opened import Opened, opened_scene
+from dyngs.runs.opened import OpenedScene, wrap_scene
 from dyngs.view.session import BrowserCamera, SentImage, Session
 from dyngs.view.views import Viewpoint, pose_of
 
 
-def opened_at(scene: GaussianScene, name: str = "balls") -> Opened:
+def opened_at(scene: GaussianScene, name: str = "balls") -> OpenedScene:
     """A scene on white, looked at from 4 away."""
     opened = replace(
-        opened_scene(replace(scene, background=torch.ones(3)), Path(name)), stated_up="-y"
+        wrap_scene(replace(scene, background=torch.ones(3)), Path(name)), stated_up="-y"
     )
     opened.once("viewpoint", lambda: Viewpoint(camera(), np.zeros(3), 4.0, np.array([0.0, -1, 0])))
     return opened
 
 
-def balls() -> Opened:
+def balls() -> OpenedScene:
     """Five balls of which two move."""
     return opened_at(moving_scene(Sliding()))
 

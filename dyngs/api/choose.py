@@ -35,7 +35,7 @@ from dyngs.deform.keys import FreeField
 from dyngs.deform.static_errors import changed_fraction, group_fixed_cameras
 from dyngs.gaussians.colour.network import apply_affine_colour, fit_affine_colour
 from dyngs.io.write import write_text
-from dyngs.models.kind import HasGaussians, Moves, capability, kind_of
+from dyngs.models.kind import HasGaussians, HasMotion, capability, kind_of
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour, evaluation_background
@@ -144,7 +144,7 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
     if problem is not None:
         raise DyngsError(f"{config.data.root}: {problem}")
     model: Any = config.model
-    if capability(model, Moves) is None or not model.choose:
+    if capability(model, HasMotion) is None or not model.choose:
         return _with_settings(config, capture)
     moves = _motion_of_fixed_cameras(capture, config)
     if moves is False:
@@ -226,7 +226,7 @@ def _motion(config: Config, capture: Capture) -> Choice | None:
     small = _with(small, "init", num_random=min(config.init.num_random, MOTION.gaussians))
     made_of = capability(config.model, HasGaussians)
     assert made_of is not None
-    small = small.model_copy(update={"model": made_of.adding(config.model, MOTION_RANDOM)})
+    small = small.model_copy(update={"model": made_of.with_added_gaussians(config.model, MOTION_RANDOM)})
     step = _work_of_step(config, views[0])
     # a step with motion costs two without
     work = len(folds) * 1.4 * MOTION.steps * _work_of_step(small, views[0])
@@ -261,11 +261,11 @@ def _with_settings(
     colours.
     """
     kind = kind_of(config.model)
-    is_static = capability(config.model, Moves) is None
+    is_static = capability(config.model, HasMotion) is None
     found: list[tuple[str, str, Callable[[Section], Section], Score]] = []
     for section, key, score in (
-        ("camera", "refine", after_pose_fit),
-        ("train", "exposure", after_colour_fit),
+        ("camera", "refine", psnr_after_pose_fit),
+        ("train", "exposure", psnr_after_colour_fit),
         ("train", "robust", explained),
     ):
         if getattr(getattr(config, section), key) == "auto":
@@ -468,7 +468,7 @@ def explained_pixels(one: Tensor, other: Tensor, truth: Tensor, mask: Tensor | N
     return weight * (error <= known.sort().values[rank - 1])
 
 
-def after_pose_fit(pair: Pair, index: int) -> list[float]:
+def psnr_after_pose_fit(pair: Pair, index: int) -> list[float]:
     """Return the PSNR of the right half of the view from the pose in which its left half fits each
     model best.
 
@@ -491,7 +491,7 @@ def after_pose_fit(pair: Pair, index: int) -> list[float]:
     return scores
 
 
-def after_colour_fit(pair: Pair, index: int) -> list[float]:
+def psnr_after_colour_fit(pair: Pair, index: int) -> list[float]:
     """Return the mean PSNR of the view as it is, and with each half recoloured by a fit on the
     other half.
 

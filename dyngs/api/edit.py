@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.compress.clean import at_end, cleaned_file, cleaned_run
+from dyngs.compress.clean import restore_final_trainer, clean_file, clean_run
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, counted, show
@@ -58,12 +58,12 @@ from dyngs.runs.checkpoint import (
 from dyngs.runs.folder import (
     LOG_NAME,
     RunFrame,
-    inputs_of,
+    collect_inputs,
     require_empty,
     write_config,
     write_frame,
 )
-from dyngs.runs.opened import Opened, open_scene, opened_file
+from dyngs.runs.opened import OpenedScene, open_scene, scene_from_file
 
 Tell = Callable[[str], None]
 
@@ -121,7 +121,7 @@ class EditSource:
     ``rows``: (N,) indices of the Gaussians that are left, of a run; None: all.
     """
 
-    opened: Opened
+    opened: OpenedScene
     splat: SplatFile | None = None
     usual: str | None = None
     rows: torch.Tensor | None = None
@@ -139,7 +139,7 @@ class EditSource:
         before = torch.arange(len(scene), device="cpu") if self.rows is None else self.rows
         return replace(
             self,
-            opened=self.opened.showing(scene.select(rows.to(scene.device))),
+            opened=self.opened.with_scene(scene.select(rows.to(scene.device))),
             rows=before[rows.cpu()],
         )
 
@@ -170,7 +170,7 @@ def edit_scene(
             f"give a name in {all_suffixes()} or {FOURDGS_SUFFIX}, or without a suffix for a run"
         )
         raise DyngsError(f"{out}: edits end in a file of Gaussians or a run; {wanted}")
-    inputs_of(source, *edits.merge, *reads).require_output(out)
+    collect_inputs(source, *edits.merge, *reads).require_output(out)
     found = _opened(source, data_root)
     for note in found.opened.notes:
         tell(note)
@@ -178,9 +178,9 @@ def edit_scene(
         edits = replace(edits, geo=gps_frame(found.opened))
     if edits.max_loss is not None:
         if found.splat is None:
-            found = found.kept(cleaned_run(source, edits.max_loss, edits.threads, data_root, tell))
+            found = found.kept(clean_run(source, edits.max_loss, edits.threads, data_root, tell))
         else:
-            found = found.kept(cleaned_file(found.opened.scene.gaussians, tell))
+            found = found.kept(clean_file(found.opened.scene.gaussians, tell))
     found = _cropped(found, source, edits, tell)
     if not out.suffix:
         return EditedFile(_written_run(found, source, out, edits, data_root, tell))
@@ -188,7 +188,7 @@ def edit_scene(
 
 
 def write_part(
-    opened: Opened, rows: torch.Tensor, out: Path, time: float | None = None
+    opened: OpenedScene, rows: torch.Tensor, out: Path, time: float | None = None
 ) -> EditedFile:
     """Write the Gaussians ``rows`` (N,) of a scene, at ``time`` if it moves, upright for viewers of
     the format.
@@ -205,7 +205,7 @@ def _opened(source: Path, data_root: Path | None) -> EditSource:
     own = format_to_read(source)
     if own is not None and data_root is None:
         splat = read_splats(source, nonfinite="skip")
-        opened = opened_file(splat, source)
+        opened = scene_from_file(splat, source)
         info = replace(opened.info, world_offset=splat.file_offset)
         return EditSource(replace(opened, info=info), splat, own.up)
     return EditSource(open_scene(source, data_root=data_root))
@@ -326,7 +326,7 @@ def _part(config: Config, run_dir: Path, rows: Tensor) -> Checkpoint:
         kernel_threads(config.run.threads or num_cores()),
         deterministic(select_device(config.run.device), True),
     ):
-        trainer = at_end(config, run_dir)
+        trainer = restore_final_trainer(config, run_dir)
         kept = torch.zeros(trainer.num_gaussians, dtype=torch.bool, device=trainer.device)
         kept[rows.to(trainer.device)] = True
         trainer.model.keep(kept, trainer.done)

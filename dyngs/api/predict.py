@@ -10,13 +10,13 @@ from pathlib import Path
 
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
-from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, show
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.outputs import new_folder
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import Predicts, capability
-from dyngs.models.prediction import Predictor, named_views
+from dyngs.models.kind import PredictsScenes, capability
+from dyngs.models.prediction import Predictor, find_views
 from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
 from dyngs.runs.folder import require_empty, write_config
@@ -44,7 +44,7 @@ def predict(
     *,
     steps: int | None = None,
     say: Callable[[str], None] = show,
-    report: ReportProgress = report_nothing,
+    report: ProgressCallback = ignore_progress,
 ) -> Prediction:
     """Write the person of ``capture`` as a run folder ``out`` for all commands; ``dyngs train
     --resume`` refines it.
@@ -103,9 +103,9 @@ def network_config(run_dir: Path) -> Config:
     return config
 
 
-def require_network(config: Config, run_dir: Path) -> Predicts:
+def require_network(config: Config, run_dir: Path) -> PredictsScenes:
     """Return the kind of a network. Raises DyngsError: it is another kind."""
-    network = capability(config.model, Predicts)
+    network = capability(config.model, PredictsScenes)
     if network is None:
         raise DyngsError(
             f"{run_dir}: a run of model.kind={config.model.kind}; a prediction needs the run of a network "
@@ -133,7 +133,7 @@ def write_run(
 
 def _chosen(predictor: Predictor, views: int | tuple[str, ...]) -> list[int]:
     if isinstance(views, tuple):
-        return named_views(predictor.name, predictor.views, views)
+        return find_views(predictor.name, predictor.views, views)
     if not 1 <= views <= len(predictor.views):
         raise DyngsError(
             f"{predictor.name}: cannot choose {views} of its {len(predictor.views)} training views"

@@ -11,13 +11,13 @@ from pathlib import Path
 
 from dyngs.api.scene_file import write_scene_file
 from dyngs.api.train import train
-from dyngs.compress.search import Promise, Search, unseen_images
+from dyngs.compress.search import PruneResult, Search, validation_images
 from dyngs.config import Config, PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, show
 from dyngs.data.read import require_folder
 from dyngs.io.outputs import new_folder
-from dyngs.models.checkpoint import Checkpoint, read_capture_of, settings_of
+from dyngs.models.checkpoint import Checkpoint, read_run_capture, checkpoint_settings
 from dyngs.models.kind import HasGaussians, capability
 from dyngs.ops.device import deterministic, keep_freed_memory, select_device
 from dyngs.ops.native import kernel_threads, num_cores
@@ -54,12 +54,12 @@ def prune_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
     require_empty(out)
     start = latest_checkpoint(run_dir)
     config = _config_from(run_dir, start, out, overrides)
-    if not config.prune.is_wanted:
+    if not config.prune.is_enabled:
         raise DyngsError("nothing to do: give a share to --prune, or key times to --masks")
     require_folder(config.data.root)
     with new_folder(out, require_empty) as started:
         _copy_start(run_dir, started)
-        save_checkpoint(started, replace(start, settings=settings_of(config)), 0.0)
+        save_checkpoint(started, replace(start, settings=checkpoint_settings(config)), 0.0)
         write_config(config, started)
     train(config, resume_from=out)
     write_scene_file(out, file_of(out))
@@ -71,13 +71,13 @@ def file_of(folder: Path) -> Path:
     return folder / EXPORT_FOLDER
 
 
-def prune_within(
+def prune_to_loss(
     run_dir: Path,
     out: Path,
     max_loss: float,
     overrides: Sequence[str],
     tell: Callable[[str], None] = show,
-) -> Promise:
+) -> PruneResult:
     """Take as much from the run in ``run_dir`` as ``max_loss`` allows, and write the rest to
     ``out``: a run and a file.
 
@@ -99,7 +99,7 @@ def prune_within(
     start = latest_checkpoint(run_dir)
     begun = time.perf_counter()
     config = _config_from(run_dir, start, out, [f"prune.steps={SEARCH_STEPS}", *overrides])
-    if config.prune.is_wanted:
+    if config.prune.is_enabled:
         raise DyngsError(
             "prune.fraction and prune.mask_times are chosen with --prune R, which removes just that share"
         )
@@ -110,13 +110,13 @@ def prune_within(
     keep_freed_memory()
     bytewise = deterministic(select_device(config.run.device), config.run.deterministic)
     with kernel_threads(config.run.threads or num_cores()), bytewise:
-        trainer = build_trainer(config, read_capture_of(config.data, start.info), restored=True)
+        trainer = build_trainer(config, read_run_capture(config.data, start.info), restored=True)
         trainer.restore(start)
-        chosen, data, promise = Search(trainer, start, tell, unseen_images(trainer)).run(max_loss)
+        chosen, data, promise = Search(trainer, start, tell, validation_images(trainer)).run(max_loss)
     with new_folder(out, require_empty) as started:
         _copy_start(run_dir, started)
         seconds = seconds_at(run_dir, start.info.step) + time.perf_counter() - begun
-        smaller = replace(chosen.checkpoint, settings=settings_of(chosen.config))
+        smaller = replace(chosen.checkpoint, settings=checkpoint_settings(chosen.config))
         save_checkpoint(started, smaller, seconds)
         write_config(chosen.config, started)
         write_scene(started / EXPORT_FOLDER / SCENE_FILE, data)

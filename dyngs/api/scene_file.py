@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from dyngs.compress.measure import Precision, storage_plan
+from dyngs.compress.measure import Precision, plan_storage
 from dyngs.config.io import load_resolved
-from dyngs.models.checkpoint import restored_model
+from dyngs.models.checkpoint import restore_model
 from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
-from dyngs.runs.folder import folder_of_export, inputs_of, read_frame, write_config, write_frame
+from dyngs.runs.folder import open_export_folder, collect_inputs, read_frame, write_config, write_frame
 from dyngs.runs.stored_file import drawable, encoded, write_scene
 
 
@@ -39,11 +39,11 @@ def write_scene_file(
     then.
     """
     config = load_resolved(run_dir, data_root=data_root)
-    inputs_of(run_dir).require_output(out)
-    with folder_of_export(out, run_dir, config) as folder:
+    collect_inputs(run_dir).require_output(out)
+    with open_export_folder(out, run_dir, config) as folder:
         checkpoint = latest_checkpoint(run_dir)
-        scene = restored_model(checkpoint, config.model)
-        precision, coarseness = storage_plan(config, checkpoint, scene, max_change)
+        scene = restore_model(checkpoint, config.model)
+        precision, coarseness = plan_storage(config, checkpoint, scene, max_change)
         data = encoded(checkpoint.info, scene, precision.steps, coarseness)
         write_scene(folder / SCENE_FILE, data)
         if out.resolve() != run_dir.resolve():

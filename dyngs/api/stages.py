@@ -11,15 +11,15 @@ from dyngs.api.first_scene import first_of
 from dyngs.capture.sfm.unposed import with_poses
 from dyngs.config import AutoColour, FixedStrategy, SceneInit, ShColour
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
-from dyngs.core.conventions import ReportProgress
+from dyngs.core.conventions import ProgressCallback
 from dyngs.core.errors import DyngsError, counted, show
 from dyngs.data.read import capture_folder, read_capture, require_folder, require_images
-from dyngs.models.checkpoint import Checkpoint, read_capture_of
-from dyngs.models.kind import HasBody, Moves, Predicts, capability, kind_of
+from dyngs.models.checkpoint import Checkpoint, read_run_capture
+from dyngs.models.kind import HasBody, HasMotion, PredictsScenes, capability, kind_of
 from dyngs.models.views import training_times
 from dyngs.runs.capture_record import require_same_capture
 from dyngs.runs.checkpoint import SCENE_FILE
-from dyngs.runs.folder import ASKED_NAME, EXPORT_FOLDER
+from dyngs.runs.folder import REQUESTED_NAME, EXPORT_FOLDER
 from dyngs.training.limits import apply_gaussian_cap, gaussian_limit
 from dyngs.training.plan import (
     Limits,
@@ -62,7 +62,7 @@ def share_views(processes: Processes) -> Stage:
     return stage
 
 
-def find_poses(report: ReportProgress) -> Stage:
+def find_poses(report: ProgressCallback) -> Stage:
     """Return the stage that unpacks a capture, estimates its poses, and fits a body to a person,
     where that is needed; what is found is kept for other runs."""
 
@@ -71,7 +71,7 @@ def find_poses(report: ReportProgress) -> Stage:
         data = config.data
         model = config.model
         kind = kind_of(model)
-        if isinstance(kind, Predicts):
+        if isinstance(kind, PredictsScenes):
             return plan, None  # its folder holds a capture per person
         root = data.root
         folder = capture_folder(root)
@@ -79,7 +79,7 @@ def find_poses(report: ReportProgress) -> Stage:
         if isinstance(kind, HasBody):
             data = kind.find_body(data, model, show, report)
         else:
-            data = with_poses(data, needs_times=isinstance(kind, Moves), report=report)
+            data = with_poses(data, needs_times=isinstance(kind, HasMotion), report=report)
         if data.root == folder:  # the archive outlives the cache
             data = data.model_copy(update={"root": root})
         message = None if folder == root else f"{root} is unpacked in {folder}"
@@ -114,9 +114,9 @@ def read_same_capture(folder: Path, resumed: Checkpoint) -> Stage:
 
     def stage(plan: RunPlan) -> tuple[RunPlan, None]:
         data = plan.resolved.data
-        if capability(plan.resolved.model, Predicts) is not None:
+        if capability(plan.resolved.model, PredictsScenes) is not None:
             return plan, None
-        capture = read_capture_of(data, resumed.info)
+        capture = read_run_capture(data, resumed.info)
         require_same_capture(folder, data, capture)
         return replace(plan, capture=capture), None
 
@@ -126,7 +126,7 @@ def read_same_capture(folder: Path, resumed: Checkpoint) -> Stage:
 def run_pilots(plan: RunPlan) -> tuple[RunPlan, None]:
     """Read the capture, find initial points, and resolve ``auto`` settings by pilot runs."""
     config = plan.resolved
-    if capability(config.model, Predicts) is not None:
+    if capability(config.model, PredictsScenes) is not None:
         return plan, None
     config, choices, capture = choose(config, require_images(read_capture(config.data)))
     return replace(plan, resolved=config, capture=capture, choices=tuple(choices)), None
@@ -181,7 +181,7 @@ def extend_run(folder: Path, resumed: Checkpoint | None) -> Stage:
             # otherwise a run that is stopped now would take it for its own
             (folder / EXPORT_FOLDER / SCENE_FILE).unlink(missing_ok=True)
         save_config(longer, folder / RESOLVED_NAME)
-        (folder / ASKED_NAME).unlink(missing_ok=True)  # what was requested now is what is there
+        (folder / REQUESTED_NAME).unlink(missing_ok=True)  # what was requested now is what is there
         config = extend_config(with_steps(config, stored.train.steps), done, steps)
         return replace(plan, requested=longer, resolved=config), describe_extension(
             stored, longer, done

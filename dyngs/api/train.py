@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dyngs.api.budget.count import CountLimit
-from dyngs.api.budget.size import has_file, write_within
+from dyngs.api.budget.size import has_file, write_limited_file
 from dyngs.api.budget.time import TimeLimit, fit_minutes
 from dyngs.api.choose import write_choices
 from dyngs.api.following import Leader
@@ -29,18 +29,18 @@ from dyngs.compress.clean import remove_floaters
 from dyngs.compress.stage import prune_stage
 from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME
-from dyngs.core.conventions import ReportProgress, report_nothing
-from dyngs.core.errors import DyngsError, as_word, counted, show, warn
+from dyngs.core.conventions import ProgressCallback, ignore_progress
+from dyngs.core.errors import DyngsError, quote_path, counted, show, warn
 from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.outputs import writing
-from dyngs.models.kind import Predicts, capability
+from dyngs.models.kind import PredictsScenes, capability
 from dyngs.ops.device import deterministic, keep_freed_memory, select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import write_record
 from dyngs.runs.checkpoint import (
     Checkpoint,
-    last_good,
+    describe_last_checkpoint,
     latest_checkpoint,
     remove_old_checkpoints,
     save_checkpoint,
@@ -48,16 +48,16 @@ from dyngs.runs.checkpoint import (
 )
 from dyngs.runs.folder import (
     LOG_NAME,
-    asked_for,
+    load_requested_config,
     begin,
-    default_folder,
-    inputs_of,
-    is_done,
-    note_asked,
-    note_root,
+    default_run_dir,
+    collect_inputs,
+    is_finished,
+    write_requested_config,
+    update_data_root,
     require_startable,
-    tidy,
-    was_only_begun,
+    remove_partial_files,
+    is_stopped_before_checkpoint,
     write_config,
 )
 from dyngs.training.clock import SaveTimer, Stopwatch
@@ -89,7 +89,7 @@ def train(
     resume_from: Path | None = None,
     listeners: Sequence[Listener] = (),
     processes: Processes | None = None,
-    progress: Callable[[], AbstractContextManager[ReportProgress]] | None = None,
+    progress: Callable[[], AbstractContextManager[ProgressCallback]] | None = None,
 ) -> Path:
     """Train and return the run folder.
 
@@ -121,33 +121,33 @@ def train(
         KeyboardInterrupt: after Ctrl-C or SIGTERM, once a checkpoint is saved; the message says how
             to go on.
     """
-    folder = resume_from or config.run.dir or default_folder(config.run.name)
+    folder = resume_from or config.run.dir or default_run_dir(config.run.name)
     processes = processes or Processes()
     plan = planned(RunPlan(config, config), [share_views(processes)])
     validate_limits(plan.resolved)
     device = select_device(config.run.device)
     if resume_from is None:
         if not (folder / RESOLVED_NAME).is_file():
-            inputs_of(config).require_output(folder)
-        with progress() if progress else nullcontext(report_nothing) as report:
+            collect_inputs(config).require_output(folder)
+        with progress() if progress else nullcontext(ignore_progress) as report:
             plan = planned(plan, [find_poses(report), continue_scene])
     elif not folder.is_dir():
         latest_checkpoint(folder)  # raises, and says what is there
     keep_freed_memory()
     bytewise = deterministic(device, config.run.deterministic)
     with writing(folder) as alone, kernel_threads(_num_threads(config, processes)), bytewise:
-        tidy(folder, sole_writer=alone)
+        remove_partial_files(folder, sole_writer=alone)
         resumed = None
         if resume_from is None:
             plan = replace(plan, requested=plan.resolved)
-            if is_done(folder, plan.resolved) and not _is_export_pending(plan.resolved, folder):
+            if is_finished(folder, plan.resolved) and not _is_export_pending(plan.resolved, folder):
                 show(_about_finished(plan.resolved, folder))
                 return folder
             require_startable(folder, plan.resolved)
         else:
-            note_root(folder, config.data)
+            update_data_root(folder, config.data)
             resumed = _newest(folder)
-            plan = replace(plan, requested=asked_for(folder))
+            plan = replace(plan, requested=load_requested_config(folder))
             plan = planned(plan, [extend_run(folder, resumed)])
         if resumed is not None:
             total = plan.resolved.total_steps
@@ -178,7 +178,7 @@ def _built(
     """Return the trainer of a plan, before its first step or where it was ``resumed``."""
     config = plan.resolved
     trainer: Any
-    if capability(config.model, Predicts):
+    if capability(config.model, PredictsScenes):
         trainer = network_trainer(config)
     else:
         trainer = build_trainer(
@@ -195,9 +195,9 @@ def _built(
 
 
 def _about_finished(config: Config, folder: Path) -> str:
-    run = as_word(folder)
+    run = quote_path(folder)
     longer = f"`dyngs train --resume {run} train.steps=N` trains longer"
-    if config.prune.is_wanted:
+    if config.prune.is_enabled:
         longer = "give another run.dir to train again"
     return f"{folder}: run already finished ({counted(config.total_steps, 'step')}); {longer}"
 
@@ -245,7 +245,7 @@ class _Run:
             trainer,
             config.total_steps,
             stopwatch,
-            lambda: last_good(self.folder),
+            lambda: describe_last_checkpoint(self.folder),
             stages=[prune_stage] if isinstance(trainer, Trainer) else [],
             limits=editors,
             before_step=self._leader.before_step,
@@ -254,7 +254,7 @@ class _Run:
         self._save_timer = SaveTimer(config.train.save_minutes, stopwatch.seconds)
         if resumed is None:
             begin(self.folder, config)
-            note_asked(self.folder, plan.requested)
+            write_requested_config(self.folder, plan.requested)
             write_record(self.folder, config.data, plan.capture)
             write_choices(self.folder, plan.choices)
 
@@ -287,11 +287,11 @@ class _Run:
                 if loop.trainer.done > self._saved:
                     self._save()
                 raise KeyboardInterrupt(
-                    f"stopped after step {loop.trainer.done}; go on with: dyngs train --resume {as_word(self.folder)}"
+                    f"stopped after step {loop.trainer.done}; go on with: dyngs train --resume {quote_path(self.folder)}"
                 )
             for line in self._reached():
                 loop.emit(Message(line))
-        note_asked(self.folder, self._plan.requested)
+        write_requested_config(self.folder, self._plan.requested)
 
     def _save_and_evaluate(self, event: Event) -> None:
         match event:
@@ -344,10 +344,10 @@ class _Run:
             cost = self._time.cost_of_all(self.loop)
             if cost is not None:
                 steps = self._time.most_steps
-                resume = f"dyngs train --resume {as_word(self.folder)} train.steps={steps}"
+                resume = f"dyngs train --resume {quote_path(self.folder)} train.steps={steps}"
                 yield f"{cost}; this run goes on to that with `{resume}`"
         if isinstance(trainer, Trainer) and self._plan.limits.megabytes is not None:
-            yield str(write_within(trainer, self.folder, self._plan.limits.megabytes))
+            yield str(write_limited_file(trainer, self.folder, self._plan.limits.megabytes))
 
 
 def _show_memory(trainer: Trainer[Any], processes: int) -> None:
@@ -365,7 +365,7 @@ def _is_export_pending(config: Config, folder: Path) -> bool:
 
 def _newest(folder: Path) -> Checkpoint | None:
     """Return the newest valid checkpoint; None for a run that was stopped before its first."""
-    if was_only_begun(folder):
+    if is_stopped_before_checkpoint(folder):
         return None
     checkpoint = latest_checkpoint(folder)
     remove_old_checkpoints(folder)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from dyngs.config import DataConfig
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.capture import Capture, Silhouette, VideoFrame, View
 from dyngs.data.geometry import OPENGL_FROM_OPENCV, pinhole_matrix
 from dyngs.data.images.images import SUFFIXES, files_in, read_header
@@ -27,7 +27,7 @@ film camera's."""
 
 def is_plain_clip(source: Path) -> bool:
     """Whether a path is a video, or a folder that holds images directly or in ``images``."""
-    with reading(source):
+    with wrap_read_errors(source):
         if source.is_file():
             return source.suffix.lower() in VIDEO_SUFFIXES
         return source.is_dir() and bool(_images_of(source))
@@ -49,12 +49,12 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
     source = options.root
     with (
         staying_within(source if source.is_dir() else source.parent, options.follow_links),
-        reading(source),
+        wrap_read_errors(source),
     ):
         paths, fps, notes = _frames_of(source)
     numbers = _chosen(options, len(paths))
     videos = {paths[i]: VideoFrame(source, i) for i in numbers} if source.is_file() else {}
-    with reading(source):
+    with wrap_read_errors(source):
         decode_frames(source, videos)
         headers = [read_header(paths[i]) for i in numbers]
     silhouettes = None if masks is None else silhouettes_of(masks, [paths[i].name for i in numbers])
@@ -134,7 +134,7 @@ def silhouettes_of(masks: Path, names: Sequence[str]) -> list[Silhouette]:
     """
     if not masks.is_dir():
         raise DyngsError(f"no such folder of masks: {masks}")
-    with staying_within(masks), reading(masks):
+    with staying_within(masks), wrap_read_errors(masks):
         found = find_masks(masks)
         own = [mask_of(name, found) for name in names]
         for path in own:

@@ -16,7 +16,7 @@ import numpy as np
 from dyngs.capture.sfm.frame_choice import STANDS, displaced_by, measured, shrunk
 from dyngs.capture.sfm.several_videos import VIDEOS_FILE, CameraVideo, open_video, read_given
 from dyngs.config import DataConfig
-from dyngs.core.errors import DyngsError, as_word, counted, printable, reading
+from dyngs.core.errors import DyngsError, quote_path, counted, format_one_line, wrap_read_errors
 from dyngs.data.body_frames import about_pelvis
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry import (
@@ -270,7 +270,7 @@ def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectRep
     )
     try:
         capture = read_capture(options, decode_videos=deep)
-        with reading(options.root, "`dyngs --debug` shows where"):
+        with wrap_read_errors(options.root, "`dyngs --debug` shows where"):
             report = report_on(capture, deep)
     except DyngsError as error:
         return InspectReport(options.root, None, (), (str(error), *links))
@@ -290,7 +290,7 @@ def format_report(report: InspectReport) -> str:
         lines.append("nothing suspicious")
     else:
         lines.append(f"suspicious ({len(report.problems)}):")
-        lines += [f"  - {printable(problem)}" for problem in report.problems]
+        lines += [f"  - {format_one_line(problem)}" for problem in report.problems]
     return "\n".join(lines)
 
 
@@ -464,7 +464,7 @@ def video_report(path: Path) -> str:
         facts, stands = video_facts(video)
         moving += [] if stands else [video.name]
         lines += [f"video {video.path}", *_aligned(facts)]
-    where = as_word(videos[0].path if len(videos) == 1 else path)
+    where = quote_path(videos[0].path if len(videos) == 1 else path)
     if len(videos) == 1 and moving:
         lines.append(
             f"next: dyngs train static data.root={where}     # nothing but the camera moves"

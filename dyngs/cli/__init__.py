@@ -42,7 +42,7 @@ from dyngs.cli import (
 )
 from dyngs.cli.arguments import follows_links, require_outputs_apart
 from dyngs.cli.output import print_messages
-from dyngs.core.errors import DyngsError, NoCaptureError, printable, quoted, require_name
+from dyngs.core.errors import DyngsError, NoCaptureError, format_one_line, quote_word, validate_file_name
 from dyngs.io.containment import following_links_of_runs
 
 EXIT_ERROR = 2
@@ -119,7 +119,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if "--debug" in flags:
             traceback.print_exception(error)
         with suppress(OSError):  # stderr may lie on a full disk
-            print(f"dyngs: error: {printable(message)}", file=sys.stderr)
+            print(f"dyngs: error: {format_one_line(message)}", file=sys.stderr)
         _abandon_if_broken(sys.stderr)
         return EXIT_ERROR
 
@@ -158,7 +158,7 @@ def _show_any_name() -> None:
 
 def _dispatch(arguments: list[str]) -> int:
     for word in arguments:
-        require_name(word)
+        validate_file_name(word)
     if not arguments:
         print(_NEXT)
         return 0
@@ -180,7 +180,7 @@ def _dispatch(arguments: list[str]) -> int:
         )
         if not getattr(parsed, "takes_root", False) or names_root:
             raise
-        again = " ".join(map(quoted, ["dyngs", *arguments, "data.root=FOLDER"]))
+        again = " ".join(map(quote_word, ["dyngs", *arguments, "data.root=FOLDER"]))
         raise DyngsError(f"{error}; if it was moved: `{again}`") from error
 
 
@@ -210,7 +210,7 @@ class _Parser(argparse.ArgumentParser):
         return parsed, rest
 
     def error(self, message: str) -> NoReturn:
-        raise DyngsError(f"{printable(message, 400)} (see `{self.prog} --help`)")
+        raise DyngsError(f"{format_one_line(message, 400)} (see `{self.prog} --help`)")
 
 
 def make_parser(only: str = "") -> argparse.ArgumentParser:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import torch
 
     from dyngs.config import DataConfig
-    from dyngs.runs.opened import Opened
+    from dyngs.runs.opened import OpenedScene
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 AXES = ("x", "y", "z", "-x", "-y", "-z")
@@ -162,12 +162,12 @@ def require_motion_for_feet(arguments: argparse.Namespace) -> None:
         )
 
 
-def in_motion(arguments: argparse.Namespace, opened: Opened) -> Opened:
+def play_motion(arguments: argparse.Namespace, opened: OpenedScene) -> OpenedScene:
     """Return the person in ``--motion``, or all as it is without; print what was found of its
     feet."""
     if arguments.motion is None:
         return opened
-    moved = opened.in_motion(arguments.motion, keep_feet=arguments.keep_feet)
+    moved = opened.play_motion(arguments.motion, keep_feet=arguments.keep_feet)
     print_notes(moved.notes[len(opened.notes) :])
     return replace(moved, notes=opened.notes)
 
@@ -240,7 +240,7 @@ def require_outputs_apart(parser: argparse.ArgumentParser, arguments: argparse.N
     existing = [Path(out) for out in outputs if os.path.lexists(out)]
     if not existing:
         return
-    from dyngs.runs.folder import inputs_of
+    from dyngs.runs.folder import collect_inputs
 
     named = (value if equals else key for key, equals, value in words if key != "run.dir")
     read = [
@@ -248,7 +248,7 @@ def require_outputs_apart(parser: argparse.ArgumentParser, arguments: argparse.N
         *_values(parser, arguments, input_word),
         *named,
     ]
-    inputs = inputs_of(*(Path(one) for one in read if os.path.lexists(one)))
+    inputs = collect_inputs(*(Path(one) for one in read if os.path.lexists(one)))
     for out in existing:
         inputs.require_output(out)
 
@@ -278,7 +278,7 @@ def computing_device(choice: str) -> torch.device:
     return device
 
 
-def add_most_drawn(parser: argparse.ArgumentParser, about: str) -> None:
+def add_max_gaussians_drawn(parser: argparse.ArgumentParser, about: str) -> None:
     kind = whole("a number of Gaussians", 1, 10**9 - 1)
     parser.add_argument("--max-gaussians-drawn", type=kind, metavar="N", help=about)
 

@@ -6,7 +6,7 @@ import argparse
 
 from dyngs.cli.arguments import Commands, add_command, input_path, output_path
 from dyngs.cli.output import print_notes, print_written
-from dyngs.cli.splats import add_axes, print_redrawn
+from dyngs.cli.splats import add_axes, print_image_difference
 from dyngs.core.errors import counted
 
 _EPILOG = """\
@@ -56,6 +56,6 @@ def run(arguments: argparse.Namespace) -> int:
     )
     print_notes((*splat.notes, f"{counted(len(splat.gaussians), 'Gaussian')}; {said}"))
     written = write_splats(arguments.target, rotated, sh_degree=arguments.sh_degree)
-    print_redrawn(written.notes, [compare_file_with_source(splat, written)])
+    print_image_difference(written.notes, [compare_file_with_source(splat, written)])
     print_written(written.path)
     return 0

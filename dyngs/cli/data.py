@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from dyngs.cli import arguments as args
 from dyngs.cli.output import ProgressBar, print_lines, print_notes
-from dyngs.core.errors import DyngsError, as_word, counted
+from dyngs.core.errors import DyngsError, quote_path, counted
 
 if TYPE_CHECKING:
     from dyngs.human.fit.fitted_capture import KnownAvatar
@@ -267,8 +267,8 @@ def run_sfm(arguments: argparse.Namespace) -> int:
             said = poses_of_videos(images, out, options, report)
         else:
             said = estimate_poses(images, out, options, report).summary()
-    print_lines(f"{said}\nnext: dyngs data inspect {as_word(out)} --image cameras.png")
-    print(f"      dyngs train {'dynamic' if several else 'static'} data.root={as_word(out)}")
+    print_lines(f"{said}\nnext: dyngs data inspect {quote_path(out)} --image cameras.png")
+    print(f"      dyngs train {'dynamic' if several else 'static'} data.root={quote_path(out)}")
     return 0
 
 
@@ -288,8 +288,8 @@ def run_fit(arguments: argparse.Namespace) -> int:
         inputs = FitInputs(**passed, avatar=_avatar_in(arguments.person), template=template)
         result = write_fitted_capture(options, arguments.out, report, inputs)
     files = {"model.body": result.model.body, "model.uv": result.model.uv}
-    keys = "".join(f" {key}={as_word(path)}" for key, path in files.items() if path is not None)
-    print_lines(f"{result.summary}\nnext: dyngs train human data.root={as_word(result.root)}{keys}")
+    keys = "".join(f" {key}={quote_path(path)}" for key, path in files.items() if path is not None)
+    print_lines(f"{result.summary}\nnext: dyngs train human data.root={quote_path(result.root)}{keys}")
     return 0
 
 
@@ -302,7 +302,7 @@ def run_people(arguments: argparse.Namespace) -> int:
     detector = MediaPipe(arguments.mediapipe)
     with ProgressBar() as report:
         result = write_detected_person(options, arguments.out, detector, report)
-    print_lines(f"{result.summary}\nnext: dyngs train human data.root={as_word(result.root)}")
+    print_lines(f"{result.summary}\nnext: dyngs train human data.root={quote_path(result.root)}")
     return 0
 
 
@@ -385,5 +385,5 @@ def run_synth(arguments: argparse.Namespace) -> int:
         else:
             usual = "fixed" if "num_cameras" in given else None
             synthetic.write_dynamic_capture(scene, out, options(**{"style": usual} | given))
-    print(f"written: {out}\nnext:    dyngs train {preset} data.root={as_word(out)}")
+    print(f"written: {out}\nnext:    dyngs train {preset} data.root={quote_path(out)}")
     return 0

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli.arguments import Commands, add_command, add_threads, output_path, whole
 from dyngs.cli.output import numbers_table, print_tables
-from dyngs.core.errors import as_word, counted, show
+from dyngs.core.errors import quote_path, counted, show
 
 if TYPE_CHECKING:
     from dyngs.config import Config
@@ -96,8 +96,8 @@ def run_demo(
     print(f"orbit video           {video}")
     print(f"for other viewers     {ply}")
     print(f"run folder            {run_dir}")
-    print(f"to look around        dyngs view {as_word(run_dir)}    (pip install 'dyngs[view]')")
-    print(f"one page to share     dyngs export {as_word(run_dir)} --out scene.html")
+    print(f"to look around        dyngs view {quote_path(run_dir)}    (pip install 'dyngs[view]')")
+    print(f"one page to share     dyngs export {quote_path(run_dir)} --out scene.html")
 
 
 def demo_config(capture: Path, run_dir: Path, steps: int = 3000, threads: int = 0) -> Config:

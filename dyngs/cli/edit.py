@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import print_written
-from dyngs.core.errors import DyngsError, as_word, show
+from dyngs.core.errors import DyngsError, quote_path, show
 
 if TYPE_CHECKING:
     from dyngs.api.edit import Edits
@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Edit, and print what was done and how the file differs from the scene."""
     with heavy_imports():
         from dyngs.api.edit import edit_scene
-        from dyngs.cli.splats import print_redrawn
+        from dyngs.cli.splats import print_image_difference
 
     source = args.run_of_scene_file(arguments.source)
     reads = [] if arguments.geo in (None, _EXIF) else [arguments.geo]
@@ -96,10 +96,10 @@ def run(arguments: argparse.Namespace) -> int:
     if written.redrawn is None:
         print(f"written: {written.path}")
     else:
-        print_redrawn(written.notes, [written.redrawn])
+        print_image_difference(written.notes, [written.redrawn])
         print_written(written.path)
     if written.redrawn is None or written.path.suffix.lower() == ".ply":
-        print(f"next:    dyngs view {as_word(written.path)}")
+        print(f"next:    dyngs view {quote_path(written.path)}")
     return 0
 
 

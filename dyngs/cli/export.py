@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import print_notes, print_written
-from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_redrawn
-from dyngs.core.errors import DyngsError, as_word, counted
+from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_image_difference
+from dyngs.core.errors import DyngsError, quote_path, counted
 
 if TYPE_CHECKING:
     from dyngs.data.capture import Split, View
     from dyngs.export.splat_files import Part
-    from dyngs.runs.opened import Opened
+    from dyngs.runs.opened import OpenedScene
 
 _OTHER_SUFFIXES = {
     f".{MOVING}": MOVING,
@@ -123,7 +123,7 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument("--segments", type=kind, metavar="N", help=about)
     about = "--format html, sog: a folder for a web server, of which a page or PlayCanvas fetches what is seen"
     parser.add_argument("--folder", action="store_true", help=about)
-    args.add_most_drawn(
+    args.add_max_gaussians_drawn(
         parser, "--folder: so many Gaussians of an image are drawn at most, as on phones"
     )
     about = "a person at rest, with joints and skinning weights: .ply, .glb"
@@ -233,7 +233,7 @@ def _target(arguments: argparse.Namespace, name: str) -> Path:
     return out
 
 
-def _open(arguments: argparse.Namespace) -> Opened:
+def _open(arguments: argparse.Namespace) -> OpenedScene:
     from dyngs.runs.opened import open_scene
 
     return open_scene(arguments.run_dir, data_root=args.data_root(arguments))
@@ -243,11 +243,11 @@ def _is_sequence(arguments: argparse.Namespace) -> bool:
     return arguments.times is not None or (arguments.motion is not None and arguments.time is None)
 
 
-def _moved(arguments: argparse.Namespace, opened: Opened) -> Opened:
+def _moved(arguments: argparse.Namespace, opened: OpenedScene) -> OpenedScene:
     if getattr(opened.renderable, "sides", None) is not None:
         line = "of the sides that it was found from dyngs draws the one nearest to the camera, a file all: less sharply"
         print_notes((line,))
-    return args.in_motion(arguments, opened)
+    return args.play_motion(arguments, opened)
 
 
 def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
@@ -268,7 +268,7 @@ def _part(arguments: argparse.Namespace) -> Part:
 
 
 def _export_splats(
-    arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...] | None, kind: str
+    arguments: argparse.Namespace, opened: OpenedScene, times: tuple[float, ...] | None, kind: str
 ) -> list[Path]:
     """Write a sequence if several times of a moving scene are requested, else one file; return the
     paths."""
@@ -331,7 +331,7 @@ def _export_splats(
         )
         for i in _shown(len(written))
     ]
-    print_redrawn(written[0].notes, found)
+    print_image_difference(written[0].notes, found)
     return [one.path for one in written]
 
 
@@ -341,7 +341,7 @@ def _shown(count: int) -> list[int]:
 
 
 def _export_moving(
-    arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...]
+    arguments: argparse.Namespace, opened: OpenedScene, times: tuple[float, ...]
 ) -> list[Path]:
     """Write all times as one file of moving Gaussians."""
     from dyngs.export.images import compare_file_with_run
@@ -364,12 +364,12 @@ def _export_moving(
         compare_file_with_run(opened, scene, times[i], splats[i], read_4dgs_frame(path, i))
         for i in _shown(len(times))
     ]
-    print_redrawn(notes, found)
+    print_image_difference(notes, found)
     return [path]
 
 
 def _export_tracks(
-    arguments: argparse.Namespace, opened: Opened, times: tuple[float, ...] | None
+    arguments: argparse.Namespace, opened: OpenedScene, times: tuple[float, ...] | None
 ) -> list[Path]:
     from dyngs.export.splat_files import tracks_of, write_tracks
 
@@ -418,12 +418,12 @@ def _export_dyngs(arguments: argparse.Namespace) -> None:
 
 def _export_avatar(arguments: argparse.Namespace) -> None:
     from dyngs.human.avatar.avatar_file import write_avatar
-    from dyngs.runs.folder import inputs_of
+    from dyngs.runs.folder import collect_inputs
     from dyngs.runs.opened import open_run
 
     path = _target(arguments, "avatar.safetensors")
-    run = open_run(arguments.run_dir).in_own_frame()
-    inputs_of(run).require_output(path)
+    run = open_run(arguments.run_dir).in_edit_frame()
+    collect_inputs(run).require_output(path)
     print_written(write_avatar(run.renderable, run.config.model, run.info, path))
 
 
@@ -454,7 +454,7 @@ def _export_bodies(arguments: argparse.Namespace) -> None:
     found = compare_file_with_run(
         opened, opened.scene, time, written.splat, read_splats(written.path)
     )
-    print_redrawn(written.notes, [found])
+    print_image_difference(written.notes, [found])
     print_written(written.path)
 
 
@@ -471,7 +471,7 @@ def _export_rigged(arguments: argparse.Namespace) -> None:
         raise DyngsError(
             "--motion does not go with --joints in a .ply, which has the rest pose; give --out FILE.glb"
         )
-    opened = _moved(arguments, _open(arguments)).in_own_frame()
+    opened = _moved(arguments, _open(arguments)).in_edit_frame()
     played = None if motion is None else AnimationInfo(motion.stem, opened.fps or FRAME_RATE)
     print_notes((write_rigged_splats if arguments.joints else write_mesh)(opened, out, played))
     print_written(out)
@@ -531,7 +531,7 @@ def _export_page(arguments: argparse.Namespace) -> None:
         out = arguments.out or arguments.run_dir / "scene"
         if out.suffix.lower() == ".html":
             raise DyngsError(f"{out}: --folder writes a folder; give --out {out.with_suffix('')}")
-        where = f"for any web server, such as `python -m http.server -d {as_word(out)}`"
+        where = f"for any web server, such as `python -m http.server -d {quote_path(out)}`"
     else:
         out = _target(arguments, "scene.html")
         where = "it plays in any browser with WebGL 2, offline"
@@ -578,7 +578,7 @@ def _export_cameras(arguments: argparse.Namespace) -> None:
     print_notes((line,))
     written = write_cameras(path, capture, splits, run.world)
     count = counted(len(all_views(capture.splits)), "camera")
-    root = as_word(path.parent)
+    root = quote_path(path.parent)
     print(
         f"written: {written} ({count}); `data.root={root} data.follow_links=true` trains with them"
     )

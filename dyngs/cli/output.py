@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, nullcontext, redirect_stdout
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from dyngs.core.errors import LOGGER, escaped, show, warn
+from dyngs.core.errors import LOGGER, escape_control_characters, show, warn
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -44,10 +44,10 @@ def print_messages(*, quiet: bool = False) -> None:
 
 def print_lines(text: str) -> None:
     """Print lines that may quote names of others, without anything that a terminal would obey."""
-    print("\n".join(map(escaped, text.split("\n"))), flush=True)
+    print("\n".join(map(escape_control_characters, text.split("\n"))), flush=True)
 
 
-def results_alone(is_json: bool) -> AbstractContextManager[object]:
+def redirect_messages(is_json: bool) -> AbstractContextManager[object]:
     """Return a block in which all that is printed goes to stderr, where stdout is for JSON."""
     return redirect_stdout(sys.stderr) if is_json else nullcontext()
 
@@ -85,7 +85,7 @@ def numbers_table(title: str, head: Sequence[str], cells: Sequence[Sequence[str]
     for name in head[1:]:
         table.add_column(name, justify="right")
     for row in cells:
-        table.add_row(*(escape(escaped(cell)) for cell in row))
+        table.add_row(*(escape(escape_control_characters(cell)) for cell in row))
     return table
 
 

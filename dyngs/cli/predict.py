@@ -6,7 +6,7 @@ import argparse
 
 from dyngs.cli.arguments import Commands, add_command, input_path, output_path
 from dyngs.cli.output import ProgressBar, print_lines
-from dyngs.core.errors import as_word, counted
+from dyngs.core.errors import quote_path, counted
 
 _EPILOG = """\
 examples:
@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
         f", after {made.seconds_steps:.2f} s of training on these images" if made.steps else ""
     )
     what = counted(made.num_gaussians, "Gaussian") if made.num_gaussians else "a field"
-    word = as_word(out)
+    word = quote_path(out)
     # fields are not trained
     refine = f"\n           dyngs train --resume {word}   refines it" if made.num_gaussians else ""
     print_lines(

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
-from dyngs.cli.output import numbers_table, print_tables, results_alone
-from dyngs.core.errors import DyngsError, as_word
+from dyngs.cli.output import numbers_table, print_tables, redirect_messages
+from dyngs.core.errors import DyngsError, quote_path
 
 if TYPE_CHECKING:
-    from dyngs.compress.search import Promise
+    from dyngs.compress.search import PruneResult
     from dyngs.evaluate.report import RunMetrics
 
 MAX_LOSS = 0.2
@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
         *args.run_device(arguments),
         *arguments.overrides,
     ]
-    with results_alone(arguments.json):
+    with redirect_messages(arguments.json):
         folder, promise = _pruned(arguments, overrides)
     pruned = load_run(folder)
     device = args.computing_device(pruned.config.run.device)
@@ -102,16 +102,16 @@ def run(arguments: argparse.Namespace) -> int:
         )
     print(
         f"written: {folder}, and the file in {file_of(folder)}\n"
-        f"next:    dyngs eval {as_word(folder)}\n         dyngs render {as_word(file_of(folder))} "
-        f"--out {as_word(folder / 'images')}"
+        f"next:    dyngs eval {quote_path(folder)}\n         dyngs render {quote_path(file_of(folder))} "
+        f"--out {quote_path(folder / 'images')}"
     )
     return 0
 
 
-def _pruned(arguments: argparse.Namespace, overrides: list[str]) -> tuple[Path, Promise | None]:
+def _pruned(arguments: argparse.Namespace, overrides: list[str]) -> tuple[Path, PruneResult | None]:
     """Prune as requested; return the new folder, and what is promised of it where the fraction was
     searched for."""
-    from dyngs.api.prune import prune_run, prune_within
+    from dyngs.api.prune import prune_run, prune_to_loss
 
     chosen = any(text.startswith(("prune.fraction=", "prune.mask_times=")) for text in overrides)
     if chosen and arguments.max_loss is not None:
@@ -121,7 +121,7 @@ def _pruned(arguments: argparse.Namespace, overrides: list[str]) -> tuple[Path, 
     if chosen:
         return prune_run(arguments.run_dir, arguments.out, overrides), None
     most = MAX_LOSS if arguments.max_loss is None else arguments.max_loss
-    promise = prune_within(arguments.run_dir, arguments.out, most, overrides)
+    promise = prune_to_loss(arguments.run_dir, arguments.out, most, overrides)
     print(promise)
     return arguments.out, promise
 
@@ -134,7 +134,7 @@ def _decibels(text: str) -> float:
 
 
 def cost_cells(
-    before: RunMetrics, after: RunMetrics, promise: Promise | None = None
+    before: RunMetrics, after: RunMetrics, promise: PruneResult | None = None
 ) -> list[list[str]]:
     """Return the rows of a table that compares a run with the file of a pruned one."""
     ratio = before.num_gaussians / after.num_gaussians

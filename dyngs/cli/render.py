@@ -14,7 +14,7 @@ from dyngs.core.errors import DyngsError, counted
 
 if TYPE_CHECKING:
     from dyngs.export.choose_path import PathOptions
-    from dyngs.runs.opened import Opened
+    from dyngs.runs.opened import OpenedScene
 
 _EPILOG = """\
 examples:
@@ -74,7 +74,7 @@ def add_parser(commands: args.Commands) -> None:
     background = "background of all images (default: that of training)"
     parser.add_argument("--background", choices=("white", "black"), help=background)
     args.add_up(parser, " of the path")
-    args.add_most_drawn(
+    args.add_max_gaussians_drawn(
         parser, "of a still scene: draw far parts coarser, and N Gaussians of each image at most"
     )
     args.add_threads(parser)
@@ -172,32 +172,32 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
         )
 
 
-def _opened(arguments: argparse.Namespace) -> Opened:
+def _opened(arguments: argparse.Namespace) -> OpenedScene:
     """Return what is rendered, in the motion and before the background that are requested."""
     from dyngs.runs.opened import open_scene
 
     opened = open_scene(arguments.source, nonfinite="skip", data_root=args.data_root(arguments))
     if arguments.motion is not None:
-        opened = args.in_motion(arguments, opened)
+        opened = args.play_motion(arguments, opened)
     elif arguments.pose == "rest":
         opened = opened.at_rest()
     elif arguments.split is not None:
-        opened = opened.of_split(arguments.split)
+        opened = opened.for_split(arguments.split)
     opened = _before(arguments, opened)
     return opened if arguments.up is None else replace(opened, stated_up=arguments.up)
 
 
-def _before(arguments: argparse.Namespace, opened: Opened) -> Opened:
+def _before(arguments: argparse.Namespace, opened: OpenedScene) -> OpenedScene:
     """Return the scene before the background that is requested, if one is."""
     return opened if arguments.background is None else opened.on_background(arguments.background)
 
 
-def _coarser(arguments: argparse.Namespace, opened: Opened) -> Opened:
+def _coarser(arguments: argparse.Namespace, opened: OpenedScene) -> OpenedScene:
     """Return the scene with levels of detail, if they are asked for."""
     from dyngs.gaussians.levels import LevelScene
 
     most: int | None = arguments.max_gaussians_drawn
-    return opened if most is None else opened.showing(LevelScene.of(opened.renderable, most))
+    return opened if most is None else opened.with_scene(LevelScene.of(opened.renderable, most))
 
 
 def _path_options(arguments: argparse.Namespace) -> PathOptions:

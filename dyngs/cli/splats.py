@@ -29,7 +29,7 @@ def add_axes(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sh-degree", type=int, choices=range(5), metavar="N", help=about)
 
 
-def print_redrawn(notes: tuple[str, ...], found: Sequence[float]) -> None:
+def print_image_difference(notes: tuple[str, ...], found: Sequence[float]) -> None:
     """Print what the format could not hold, and the worst PSNR, dB, of files drawn again and the
     scene."""
     worst = min(found)

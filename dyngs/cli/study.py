@@ -14,7 +14,7 @@ from dyngs.cli.output import (
     print_lines,
     print_notes,
     print_tables,
-    results_alone,
+    redirect_messages,
 )
 from dyngs.core.errors import DyngsError, counted
 
@@ -125,7 +125,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
     """Train, compare, print the table and write the report; the folder is locked against other
     commands."""
     from dyngs.io.outputs import writing
-    from dyngs.runs.folder import inputs_of
+    from dyngs.runs.folder import collect_inputs
     from dyngs.study.compare import ModelComparison
     from dyngs.study.report import Report, build_table, can_plot, page_views, plot_curves
     from dyngs.study.tradeoff import build_rows
@@ -149,8 +149,8 @@ def run_compare(arguments: argparse.Namespace) -> int:
     )
     configs, unfit = comparison.configs(arguments.models.split(","))
     for config in configs.values():
-        inputs_of(config).require_output(out)
-    with writing(out), results_alone(arguments.json):
+        collect_inputs(config).require_output(out)
+    with writing(out), redirect_messages(arguments.json):
         comparison.require_same(configs, unfit)
         try:
             results, left_out, curves = comparison.run(configs, arguments.ray)
@@ -222,7 +222,7 @@ def _tradeoff(arguments: argparse.Namespace, out: Path) -> int:
         arguments.device,
         arguments.ray,
     )
-    with results_alone(arguments.json):
+    with redirect_messages(arguments.json):
         try:
             found = study.run()
         except KeyboardInterrupt:

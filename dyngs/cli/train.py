@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.output import ProgressBar, print_lines
 from dyngs.cli.view import add_serving_arguments
-from dyngs.core.errors import DyngsError, as_word, counted
+from dyngs.core.errors import DyngsError, quote_path, counted
 
 if TYPE_CHECKING:
     from dyngs.config import Config
@@ -97,15 +97,15 @@ def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> i
         )
     for line in _about_motion(folder, config):
         print(line)
-    word = as_word(folder)
+    word = quote_path(folder)
     print(f"trained: {folder}")
-    from dyngs.models.kind import Predicts, capability
+    from dyngs.models.kind import PredictsScenes, capability
 
-    if capability(config.model, Predicts) is not None:
+    if capability(config.model, PredictsScenes) is not None:
         print(f"next:    dyngs predict {word} CAPTURE --out RUN")
     else:
         print(
-            f"next:    dyngs eval {word}\n         dyngs render {word} --out {as_word(folder / 'images')}"
+            f"next:    dyngs eval {word}\n         dyngs render {word} --out {quote_path(folder / 'images')}"
         )
     return 0
 
@@ -123,14 +123,14 @@ def _view(arguments: argparse.Namespace, config: Config) -> TrainingView:
 
 def _about_motion(folder: Path, config: Config) -> list[str]:
     """Return lines about the moving part of a dynamic model."""
-    from dyngs.models.kind import Moves, capability
+    from dyngs.models.kind import HasMotion, capability
     from dyngs.runs.checkpoint import load_run
 
-    if capability(config.model, Moves) is None:
+    if capability(config.model, HasMotion) is None:
         return []
     run = load_run(folder)
     scene = run.scene
-    if capability(run.config.model, Moves) is None:
+    if capability(run.config.model, HasMotion) is None:
         return ["motion:  none, so this is a static model, like those of configs/static.yaml"]
     if scene.is_static:
         return ["motion:  nothing moves, so this became a static model"]
@@ -153,7 +153,7 @@ def parse_config(words: Sequence[str], resume: Path | None, begun: Path | None =
     paths = [word for word in overrides if "=" not in word and Path(word).exists()]
     if paths:
         raise DyngsError(
-            f"{paths[0]!r}: a capture, photos or a video are given as data.root={as_word(paths[0])}"
+            f"{paths[0]!r}: a capture, photos or a video are given as data.root={quote_path(paths[0])}"
         )
     if resume is None:
         if not words:

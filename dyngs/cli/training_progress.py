@@ -8,7 +8,7 @@ import time
 from contextlib import suppress
 from typing import IO, Any
 
-from dyngs.core.errors import escaped
+from dyngs.core.errors import escape_control_characters
 from dyngs.models.schedule import image_divisor
 from dyngs.training.clock import TimeForecast
 from dyngs.training.events import Evaluated, Event, Message, Started, StepDone, TotalChanged
@@ -94,7 +94,7 @@ class TrainingProgress:
 
     def say(self, line: str) -> None:
         """Show ``line`` above the progress bar."""
-        line = escaped(line)
+        line = escape_control_characters(line)
         with suppress(OSError):
             if self._bar is not None:
                 self._bar.console.print(line, markup=False, highlight=False)

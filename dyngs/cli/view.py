@@ -33,7 +33,7 @@ def add_parser(commands: args.Commands) -> None:
     add_serving_arguments(parser)
     about = "motion file for a person, or a folder of them"
     parser.add_argument("--motion", type=args.input_path, metavar="PATH", help=about)
-    args.add_most_drawn(
+    args.add_max_gaussians_drawn(
         parser, "of a large still scene: so many are drawn at most while anything moves"
     )
     args.add_up(parser)

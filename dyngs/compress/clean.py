@@ -10,15 +10,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.compress.search import evenly_held_out, unseen_images
-from dyngs.compress.stage import importance, quality_of, scoring_views
+from dyngs.compress.search import held_out_indices, validation_images
+from dyngs.compress.stage import measure_importance, quality_of, scoring_views
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, counted
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import depths_and_contributions
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.models.checkpoint import read_capture_of
+from dyngs.models.checkpoint import read_run_capture
 from dyngs.models.kind import HasGaussians, capability, kind_of
 from dyngs.ops.device import deterministic, select_device
 from dyngs.ops.native import kernel_threads, num_cores
@@ -96,7 +96,7 @@ _TRIALS = 6  # of a bisection
 Tell = Callable[[str], None]
 
 
-def by_shape(gaussians: Gaussians, opacities: Tensor) -> dict[str, Tensor]:
+def classify_shapes(gaussians: Gaussians, opacities: Tensor) -> dict[str, Tensor]:
     """Return (N,) bool by kind: what scales, opacities (N,) and distances alone say of
     Gaussians."""
     ordered = gaussians.scales.sort(dim=1, descending=True).values
@@ -124,10 +124,10 @@ def lone(means: Tensor) -> Tensor:
     return (distance > LONE * distance.median()).to(means.device)
 
 
-def cleaned_file(gaussians: Gaussians, tell: Tell) -> Tensor:
+def clean_file(gaussians: Gaussians, tell: Tell) -> Tensor:
     """Return (N,) bool which Gaussians stay of a scene without cameras: all but what is faint, a
     needle or alone."""
-    found = by_shape(gaussians, gaussians.opacities)
+    found = classify_shapes(gaussians, gaussians.opacities)
     gone = torch.zeros_like(found["faint"])
     for kind in ("faint", "needles", "lone"):
         tell(f"clean: {kind}: {counted(int((found[kind] & ~gone).sum()), 'Gaussian')}")
@@ -143,7 +143,7 @@ def cleaned_file(gaussians: Gaussians, tell: Tell) -> Tensor:
     return ~gone
 
 
-def cleaned_run(
+def clean_run(
     run_dir: Path, max_loss: float, threads: int, data_root: Path | None, tell: Tell
 ) -> Tensor:
     """Return (N,) bool which Gaussians of a run stay; what goes, and what it costs, is told.
@@ -161,9 +161,9 @@ def cleaned_run(
         deterministic(select_device(config.run.device), True),
         torch.no_grad(),
     ):
-        trainer = at_end(config, run_dir)
-        unseen = unseen_images(trainer)
-        held = () if unseen else evenly_held_out(len(trainer.images))
+        trainer = restore_final_trainer(config, run_dir)
+        unseen = validation_images(trainer)
+        held = () if unseen else held_out_indices(len(trainer.images))
         if not unseen and not held:
             raise DyngsError(
                 f"{run_dir}: --clean needs two views or more, of which one judges what it costs"
@@ -181,7 +181,7 @@ def cleaned_run(
             return loss, max(loss, trained_before - quality_of(trainer, left))
 
         kept = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
-        for kind, rows in suspects_of(trainer, held).items():
+        for kind, rows in find_removal_candidates(trainer, held).items():
             kept = taken(kept, kind, rows, lambda left: losses(left)[1] <= max_loss, tell)
         loss, worst = losses(kept)
         views = counted(len(images), "validation view" if unseen else "training view")
@@ -216,12 +216,12 @@ def taken(
     return left
 
 
-def at_end(config: Config, run_dir: Path) -> GaussianTrainer:
+def restore_final_trainer(config: Config, run_dir: Path) -> GaussianTrainer:
     """Return the trainer of a run where it ended; without checkpoints with nothing but its
     scene."""
     run = load_run(run_dir, config.data.root)
     trainer: GaussianTrainer = build_trainer(
-        config, read_capture_of(config.data, run.info), restored=True
+        config, read_run_capture(config.data, run.info), restored=True
     )
     if has_only_scene_file(run_dir):
         scene = run.scene.to(trainer.device)
@@ -232,7 +232,7 @@ def at_end(config: Config, run_dir: Path) -> GaussianTrainer:
     return trainer
 
 
-def suspects_of(trainer: GaussianTrainer, held: Sequence[int]) -> dict[str, Tensor]:
+def find_removal_candidates(trainer: GaussianTrainer, held: Sequence[int]) -> dict[str, Tensor]:
     """Return the rows (K,) that may go, by kind, the most harmless first; of each first those that
     contribute least to all training views not ``held``."""
     scene: GaussianScene = trainer.model.scene.without_masks()
@@ -240,12 +240,12 @@ def suspects_of(trainer: GaussianTrainer, held: Sequence[int]) -> dict[str, Tens
     if scene.is_static:
         cameras = trainer.images.cameras()
         views = replace(views, cameras=[cameras[i] for i in range(len(cameras)) if i not in held])
-    found = importance(views, slopes=False)
+    found = measure_importance(views, slopes=False)
     contribution = found.contribution
     kinds = {"never seen": contribution <= 0}
     if scene.is_static and len(trainer.images) >= FEWEST_VIEWS:
         kinds["floaters"] = floaters(trainer)
-    shapes = by_shape(scene.at(None), found.opacities.amax(0))
+    shapes = classify_shapes(scene.at(None), found.opacities.amax(0))
     kinds |= {kind: shapes[kind] for kind in ("lone", "faint", "veils", "needles")}
     order = torch.sort(contribution, stable=True).indices
     return {kind: order[is_one[order]] for kind, is_one in kinds.items()}

@@ -20,7 +20,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import contributions
 from dyngs.gaussians.scene import GaussianScene, render_options, restore_scene
-from dyngs.models.checkpoint import Checkpoint, read_capture_of, restored_model
+from dyngs.models.checkpoint import Checkpoint, read_run_capture, restore_model
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.runs.stored_file import (
@@ -28,14 +28,14 @@ from dyngs.runs.stored_file import (
     LIMIT,
     MAX_COARSENESS,
     TRIANGLES,
-    coding_of,
+    choose_coding,
     completed,
     decoded,
     drawable,
     encoded,
     group_of,
     restored,
-    step_below,
+    round_step_down,
 )
 
 GREY_LEVELS = 255.0
@@ -69,7 +69,7 @@ class Precision:
     allowed: float | None = None  # what it was to be at most; None likewise
 
 
-def coarseness_of(visibility: Tensor) -> Tensor:
+def compute_coarseness(visibility: Tensor) -> Tensor:
     """Return (N,) uint8 octaves by which each Gaussian may be stored more coarsely than the most
     visible ones.
 
@@ -85,7 +85,7 @@ def coarseness_of(visibility: Tensor) -> Tensor:
     return octaves.round().clamp_max(MAX_COARSENESS).to(torch.uint8)
 
 
-def assumed_precision(gaussians: Gaussians) -> Precision:
+def default_precision(gaussians: Gaussians) -> Precision:
     """Return steps where no image can be drawn: fine ones; those of positions follow the size of
     the Gaussians."""
     log_scales = gaussians.log_scales.detach().double()
@@ -96,7 +96,7 @@ def assumed_precision(gaussians: Gaussians) -> Precision:
     )
 
 
-def measured_precision(
+def measure_precision(
     exact: Mapping[str, Tensor], wanted: Sequence[Tensor], draw: Draw, max_change: float
 ) -> Precision:
     """Return the largest steps found that change the images by at most ``max_change``, grey levels
@@ -147,7 +147,7 @@ def rounded(
     coarseness = exact[COARSENESS].numpy() if COARSENESS in exact else None
     found = dict(exact)
     for name in exact if names is None else names:
-        coding = coding_of(name, exact[name], steps, by_coarseness=coarseness is not None)
+        coding = choose_coding(name, exact[name], steps, by_coarseness=coarseness is not None)
         found[name] = restored(exact[name], coding, coarseness)
     return found
 
@@ -176,7 +176,7 @@ def _scaled(
     found = math.inf
     factor = 1.0
     for trial in range(2 * TRIALS):
-        tried = {name: step and step_below(factor * step) for name, step in steps.items()}
+        tried = {name: step and round_step_down(factor * step) for name, step in steps.items()}
         found = change(tried)
         if found <= allowed and (best is None or found > best[1]):
             best = (tried, found)
@@ -204,7 +204,7 @@ def _largest_step(
     step = first = min(max(FIRST_STEP * math.sqrt(mean_square), finest), coarsest)
     best = None
     for _ in range(TRIALS):
-        step = step_below(min(max(step, finest), coarsest))
+        step = round_step_down(min(max(step, finest), coarsest))
         found = change(step)
         if math.isnan(found):
             return finest, False
@@ -216,8 +216,8 @@ def _largest_step(
             max(math.sqrt(0.9 * allowed / max(found, 1e-300)), 1 / WIDEST_JUMP), WIDEST_JUMP
         )
     if best is None:
-        return finest, change(step_below(finest)) <= allowed
-    return step_below(first) if best >= coarsest / 2 else best, True
+        return finest, change(round_step_down(finest)) <= allowed
+    return round_step_down(first) if best >= coarsest / 2 else best, True
 
 
 def _usual_size(values: Tensor) -> tuple[float, float]:
@@ -246,7 +246,7 @@ Shot = tuple[Cameras, float | None]
 """Camera and time of one training image."""
 
 
-def storage_plan(
+def plan_storage(
     config: Config, checkpoint: Checkpoint, scene: Renderable, max_change: float | None
 ) -> tuple[Precision, Tensor | None]:
     """Return how exactly ``scene`` must be stored, and the coarseness (N,) uint8 of its Gaussians,
@@ -257,13 +257,13 @@ def storage_plan(
     the scene's own errors.
     """
     try:
-        capture = read_capture_of(config.data, checkpoint.info)
+        capture = read_run_capture(config.data, checkpoint.info)
     except DyngsError:
-        assumed = isinstance(scene, GaussianScene) and assumed_precision(scene.gaussians)
+        assumed = isinstance(scene, GaussianScene) and default_precision(scene.gaussians)
         return assumed or _ASSUMED, None
     coarseness = None
     if isinstance(scene, GaussianScene):
-        coarseness = coarseness_of(_visibility(scene, _shots(config, capture, scene, LOOKED_AT)))
+        coarseness = compute_coarseness(_visibility(scene, _shots(config, capture, scene, LOOKED_AT)))
     _, background = evaluation_background(config.data.background, capture.has_alpha)
     shots = _shots(config, capture, scene, COMPARED)
     info = checkpoint.info
@@ -279,7 +279,7 @@ def storage_plan(
         ]
 
     def redrawn(tensors: Mapping[str, Tensor]) -> list[Tensor]:
-        return images(restored_model(replace(checkpoint, tensors=dict(tensors)), config.model))
+        return images(restore_model(replace(checkpoint, tensors=dict(tensors)), config.model))
 
     wanted = images(scene)
     if max_change is None:
@@ -291,10 +291,10 @@ def storage_plan(
         max_change = GREY_LEVELS * math.sqrt((10 ** (LOSS_DB / 10) - 1) * fmean(errors))
     exact = drawable(scene) | ({} if coarseness is None else {COARSENESS: coarseness})
     most = max(max_change, SMALLEST_CHANGE)
-    return measured_precision(exact, wanted, redrawn, most), coarseness
+    return measure_precision(exact, wanted, redrawn, most), coarseness
 
 
-def coarsest_file(
+def find_coarsest_file(
     config: Config, checkpoint: Checkpoint, quality: Callable[[GaussianScene], float], least: float
 ) -> tuple[bytes, float] | None:
     """Return the bytes of a file with the coarsest steps tried at which ``quality`` is at least
@@ -304,12 +304,12 @@ def coarsest_file(
     before they count. ``quality``: of a scene, the higher the better.
     """
     scene = restore_scene(checkpoint, config.model)
-    precision, coarseness = storage_plan(config, checkpoint, scene, None)
+    precision, coarseness = plan_storage(config, checkpoint, scene, None)
     best = None
 
     def is_too_coarse(factor: float) -> bool:
         nonlocal best
-        steps = {name: step and step_below(factor * step) for name, step in precision.steps.items()}
+        steps = {name: step and round_step_down(factor * step) for name, step in precision.steps.items()}
         data = encoded(checkpoint.info, scene, steps, coarseness)
         found = quality(restore_scene(decoded(data), config.model))
         if found >= least:

@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.compress.measure import coarsest_file
+from dyngs.compress.measure import find_coarsest_file
 from dyngs.compress.stage import PROBED_VIEWS, probe_images, quality_of, removal, scores_of
 from dyngs.config import AutoColour, Config
 from dyngs.core.errors import DyngsError, counted
@@ -133,7 +133,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Promise:
+class PruneResult:
     """Scores of the candidate that a search chooses."""
 
     asked: float  # largest loss on the views held out, dB
@@ -155,14 +155,14 @@ class Promise:
         return f"taken away: {self.choice}; {kept}; {self.trials} trials"
 
 
-def evenly_held_out(count: int) -> tuple[int, ...]:
+def held_out_indices(count: int) -> tuple[int, ...]:
     """Return the indices of those of ``count`` training views that are held out, evenly spread;
     none of one view."""
     chosen = min(max(1, round(HELD_OUT_FRACTION * count)), MOST_HELD_OUT) if count > 1 else 0
     return tuple((2 * i + 1) * count // (2 * chosen) for i in range(chosen))
 
 
-def unseen_images(trainer: GaussianTrainer) -> list[Image]:
+def validation_images(trainer: GaussianTrainer) -> list[Image]:
     """Return at most ``MOST_HELD_OUT`` images of the split `val`, which no training sees; of people
     none.
 
@@ -194,7 +194,7 @@ class Search:
         unseen: Sequence[Image] = (),
     ) -> None:
         self.trainer, self.start, self.tell = trainer, start, tell
-        self.held_out = () if unseen else evenly_held_out(len(trainer.images))
+        self.held_out = () if unseen else held_out_indices(len(trainer.images))
         self.trials = 0
         self._config = trainer.config
         trainer.hold_out(self.held_out)
@@ -252,7 +252,7 @@ class Search:
             accepted += [] if found is None else [found]
         return accepted
 
-    def run(self, max_loss: float) -> tuple[Candidate, bytes, Promise]:
+    def run(self, max_loss: float) -> tuple[Candidate, bytes, PruneResult]:
         """Return the smallest accepted candidate whose file keeps the promise, and that file,
         rounded as far as it may.
 
@@ -260,12 +260,12 @@ class Search:
         """
         for candidate in reversed(self.accepted(max_loss)):
             least = candidate.psnr - max(max_loss - candidate.worst, SMALLEST_FILE_LOSS)
-            file = coarsest_file(candidate.config, candidate.checkpoint, self._quality, least)
+            file = find_coarsest_file(candidate.config, candidate.checkpoint, self._quality, least)
             if file is not None:
                 before = candidate.psnr + candidate.loss
                 choice = candidate.choice
                 data, after = file
-                promise = Promise(max_loss, before, after, choice, self.views, self.trials)
+                promise = PruneResult(max_loss, before, after, choice, self.views, self.trials)
                 return candidate, data, promise
             self.tell(f"without {candidate.choice}: the file loses more than {max_loss:g} dB")
         raise DyngsError(

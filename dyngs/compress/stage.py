@@ -31,7 +31,7 @@ from dyngs.deform.scene import field_scene_of
 from dyngs.gaussians.rendering import RenderOptions, contributions, sensitivities
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.models.kind import Moves, capability
+from dyngs.models.kind import HasMotion, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
 from dyngs.ops.device import copy_async
@@ -97,7 +97,7 @@ def _neighbours(x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def importance(views: ScoringViews, *, slopes: bool) -> Importance:
+def measure_importance(views: ScoringViews, *, slopes: bool) -> Importance:
     """Return the contribution of each Gaussian to the images of ``views``; ``slopes`` cost the
     larger half."""
     scene = views.scene
@@ -154,11 +154,11 @@ def prune_stage(loop: Loop) -> TrainingEdit | None:
     config = trainer.config
     if trainer.done != config.train.steps or trainer.done >= loop.total:
         return None
-    return pruning(trainer)
+    return build_pruning_edit(trainer)
 
 
 @torch.no_grad()
-def pruning(trainer: GaussianTrainer) -> TrainingEdit:
+def build_pruning_edit(trainer: GaussianTrainer) -> TrainingEdit:
     """Return the edit that prunes and masks the Gaussians of ``trainer`` by its config."""
     scene = trainer.model.scene.without_masks()
     options = trainer.config.prune
@@ -191,7 +191,7 @@ def removal(trainer: GaussianTrainer, scores: Tensor | None) -> TrainingEdit:
     whole = trainer.model.scene.without_masks()
     kept = None if scores is None else highest(scores, options.fraction)
     masks = None
-    moves = capability(trainer.config.model, Moves) is not None and not whole.is_static
+    moves = capability(trainer.config.model, HasMotion) is not None and not whole.is_static
     if options.mask_times > 1 and moves:
         masks = _masks(trainer, whole, kept)
     return TrainingEdit(keep=kept, masks=masks, stops_densification=True)
@@ -203,7 +203,7 @@ def scores_of(trainer: GaussianTrainer, options: PruneConfig | None = None) -> T
     of docs/prune.md."""
     score = (options or PruneConfig()).score
     scene = trainer.model.scene.without_masks()
-    found = importance(scoring_views(trainer, scene), slopes=score == "sensitivity")
+    found = measure_importance(scoring_views(trainer, scene), slopes=score == "sensitivity")
     match score:
         case "variation":
             return found.variation
@@ -273,15 +273,15 @@ def _masks(trainer: GaussianTrainer, scene: GaussianScene, kept: Tensor | None) 
     last = len(scene.times) - 1
     count = min(options.mask_times, len(scene.times))
     times = [scene.times[round(k * last / (count - 1))] for k in range(count)]
-    fractions = importance(scoring_views(trainer, scene, times), slopes=False).fractions
+    fractions = measure_importance(scoring_views(trainer, scene, times), slopes=False).fractions
     seen = fractions > MASKED_BELOW
     moved = field_scene_of(scene)
     if moved is not None and moved.field is not None and moved.field.can_fade:
-        seen |= there_after(scene, times, trainer.model.options.alpha_min).to(seen.device)
+        seen |= visible_between_times(scene, times, trainer.model.options.alpha_min).to(seen.device)
     return VisibilityMasks.pack(tuple(times), seen if kept is None else seen[:, kept])
 
 
-def there_after(scene: GaussianScene, times: Sequence[float], alpha_min: float) -> Tensor:
+def visible_between_times(scene: GaussianScene, times: Sequence[float], alpha_min: float) -> Tensor:
     """Return (K, N) bool: which Gaussians are more opaque than ``alpha_min`` between one of K key
     times and the next.
 

@@ -24,17 +24,17 @@ from dyngs.config.kinds import is_kind, package_of
 from dyngs.config.schema import (
     allowed_values,
     as_written,
-    choices_of,
+    list_choices,
     default_kind,
     has_kinds,
-    is_kind_of,
+    allows_kind,
     is_section,
-    kinds_of,
+    list_kinds,
     section_class,
     section_classes,
 )
 from dyngs.config.yaml_reader import Leaf, read_file, read_override
-from dyngs.core.errors import DyngsError, printable, reading, require_name
+from dyngs.core.errors import DyngsError, format_one_line, wrap_read_errors, validate_file_name
 from dyngs.io.containment import follows_links_of_runs
 from dyngs.io.outputs import command_for
 from dyngs.io.write import write_text
@@ -188,7 +188,7 @@ def load_resolved(
     return config.model_copy(update={"data": data})
 
 
-def without_removed_keys(model: dict[str, object]) -> dict[str, object]:
+def drop_removed_model_keys(model: dict[str, object]) -> dict[str, object]:
     """Return the section ``model`` of an earlier version without the keys of
     ``REMOVED_MODEL_KEYS``."""
     removed = REMOVED_MODEL_KEYS.get(str(model.get("kind")), {})
@@ -328,8 +328,8 @@ class _Layers:
                 )
             section = inner
         if isinstance(value, str):
-            with reading(f"{leaf.origin}: {printable('.'.join(keys), 100)}"):
-                require_name(value)
+            with wrap_read_errors(f"{leaf.origin}: {format_one_line('.'.join(keys), 100)}"):
+                validate_file_name(value)
             value = os.path.expanduser(value) if value.startswith("~/") else value
         section[keys[-1]] = value
         self.origins[keys] = leaf.origin
@@ -422,10 +422,10 @@ def _section(
                 f"{where}{'.'.join(keys)} is a section, not a value; give one of its keys"
             )
         kind = inner.get("kind") or default_kind(info)
-        if has_kinds(info) and not is_kind_of(info, kind):
+        if has_kinds(info) and not allows_kind(info, kind):
             where = layers.origin_of((*keys, "kind"))
-            allowed = f"one of {', '.join(kinds_of(info))}"
-            raise DyngsError(where + _not_allowed((*keys, "kind"), allowed, kind, kinds_of(info)))
+            allowed = f"one of {', '.join(list_kinds(info))}"
+            raise DyngsError(where + _not_allowed((*keys, "kind"), allowed, kind, list_kinds(info)))
         values[name] = _section(section_class(info, kind), inner, keys, layers)
     try:
         return section.model_validate(values)
@@ -440,14 +440,14 @@ def _section(
         raise DyngsError(f"{where}{name} is missing ({info.description}); give {example}")
     if problem["type"] == "value_error":
         raise DyngsError(f"{where}{'.'.join(keys)} {problem.get('ctx', {}).get('error')}")
-    choices = choices_of(info.annotation)
+    choices = list_choices(info.annotation)
     raise DyngsError(where + _not_allowed(keys, allowed_values(info), values[keys[-1]], choices))
 
 
 def _not_allowed(keys: tuple[str, ...], allowed: str, value: object, choices: list[str]) -> str:
     close = get_close_matches(value[:100], choices, n=1) if isinstance(value, str) else []
     hint = f"; did you mean {close[0]!r}?" if close else ""
-    return f"{'.'.join(keys)} must be {allowed}, not {printable(as_written(value), 60)}{hint}"
+    return f"{'.'.join(keys)} must be {allowed}, not {format_one_line(as_written(value), 60)}{hint}"
 
 
 def _about_unknown(section: type[BaseModel], keys: tuple[str, ...], layers: _Layers) -> str:
@@ -472,7 +472,7 @@ def _about_unknown(section: type[BaseModel], keys: tuple[str, ...], layers: _Lay
     close = get_close_matches(written, same or known, n=1)
     found = [x for x in close if get_close_matches(last, [x.rpartition(".")[2]])] or same
     hint = f"; did you mean {' or '.join(map(repr, found))}?" if found else ""
-    return f"{where}unknown key {printable(repr(name), 60)}{hint}"
+    return f"{where}unknown key {format_one_line(repr(name), 60)}{hint}"
 
 
 def _note_requested(

@@ -42,12 +42,12 @@ class InstalledKind(Protocol):
 
 def kind_names() -> list[str]:
     """Return the names of all installed kinds, ours first."""
-    return [*OWN, *(name for name in sorted(foreign_kinds()) if name not in OWN)]
+    return [*OWN, *(name for name in sorted(plugin_kinds()) if name not in OWN)]
 
 
 def is_kind(name: object) -> bool:
     """Return whether a kind with this name is installed."""
-    return name in OWN or name in foreign_kinds()
+    return name in OWN or name in plugin_kinds()
 
 
 @cache
@@ -56,7 +56,7 @@ def installed_kind(name: str) -> InstalledKind:
     there is none."""
     if name in OWN:
         return cast("InstalledKind", EntryPoint(name, OWN[name], GROUP).load())
-    entry = foreign_kinds()[name]
+    entry = plugin_kinds()[name]
     try:
         return cast("InstalledKind", entry.load())
     except Exception as error:
@@ -72,10 +72,10 @@ def section_of_kind(name: str) -> type[ModelSection]:
 
 def package_of(name: str) -> str | None:
     """Return the name of the package that a kind is from; None: it is ours, or not installed."""
-    entry = None if name in OWN else foreign_kinds().get(name)
+    entry = None if name in OWN else plugin_kinds().get(name)
     return entry.dist.name if entry is not None and entry.dist is not None else None
 
 
 @cache
-def foreign_kinds() -> dict[str, EntryPoint]:
+def plugin_kinds() -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=GROUP)}

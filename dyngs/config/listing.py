@@ -14,7 +14,7 @@ from pydantic import BaseModel
 
 from dyngs.config import Config
 from dyngs.config.io import find_preset, load_config, load_resolved
-from dyngs.config.schema import allowed_values, default_text, kinds_of, section_classes
+from dyngs.config.schema import allowed_values, default_text, list_kinds, section_classes
 from dyngs.config.yaml_reader import read_file, read_override
 
 WIDTH = 118
@@ -59,7 +59,7 @@ def _section(section: BaseModel, values: dict[str, Any], depth: int) -> Iterator
         about = info.description or ""
         if is_section:
             yield "" if depth == 0 else f"{space}#"
-            about = f"{about}; kind is one of {', '.join(kinds_of(info))}" if kinds_of(info) else ""
+            about = f"{about}; kind is one of {', '.join(list_kinds(info))}" if list_kinds(info) else ""
         elif name != "kind":
             about += f" ({allowed_values(info)})"
         yield from (f"{space}# {line}" for line in textwrap.wrap(about, WIDTH - 2 - len(space)))

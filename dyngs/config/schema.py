@@ -84,13 +84,13 @@ def _kind_key(name: str, info: FieldInfo, variants: list[type[BaseModel]]) -> Co
     """Return the key ``kind`` of the section ``name``; its description says what each kind is."""
     kinds = [variant.model_fields["kind"] for variant in variants]
     meanings = "; ".join(
-        f"{', '.join(choices_of(kind.annotation))}: {kind.description}" for kind in kinds
+        f"{', '.join(list_choices(kind.annotation))}: {kind.description}" for kind in kinds
     )
     description = f"{info.description}. {meanings}"
     return ConfigKey(
         f"{name}.kind",
         (),
-        f"one of {', '.join(kinds_of(info))}",
+        f"one of {', '.join(list_kinds(info))}",
         str(default_kind(info)),
         description,
     )
@@ -120,7 +120,7 @@ def allowed_values(info: FieldInfo, plural: bool = False) -> str:
     )
     one = {bool: "true or false", int: "an integer", float: "a number", str: "text", Path: "a path"}
     many = {bool: "true or false", int: "integers", float: "numbers", str: "texts", Path: "paths"}
-    choices = choices_of(plain)
+    choices = list_choices(plain)
     if choices:
         text = choices[0] if len(choices) == 1 else f"one of {', '.join(choices)}"
     elif len(get_args(plain)) > 1 and get_origin(plain) in (Union, UnionType):
@@ -143,7 +143,7 @@ def allowed_values(info: FieldInfo, plural: bool = False) -> str:
     return text + (" " + " and ".join(bounds) if bounds else "") + (" or null" if optional else "")
 
 
-def choices_of(annotation: Any) -> list[str]:
+def list_choices(annotation: Any) -> list[str]:
     """Return the values of a ``Literal`` or an enum as text; none for other types."""
     if get_origin(annotation) is Literal:
         return [str(a) for a in get_args(annotation)]
@@ -195,17 +195,17 @@ def section_classes(info: FieldInfo) -> list[type[BaseModel]]:
     return [o for o in options if isinstance(o, type) and issubclass(o, BaseModel)]
 
 
-def kinds_of(info: FieldInfo) -> list[str]:
+def list_kinds(info: FieldInfo) -> list[str]:
     """Return the kinds that a section may have; empty where there is only one class."""
     if _is_any_kind(info):
         return kind_names()
     variants = section_classes(info) if has_kinds(info) else []
-    return [kind for v in variants for kind in choices_of(v.model_fields["kind"].annotation)]
+    return [kind for v in variants for kind in list_choices(v.model_fields["kind"].annotation)]
 
 
-def is_kind_of(info: FieldInfo, kind: object) -> bool:
+def allows_kind(info: FieldInfo, kind: object) -> bool:
     """Return whether a section may be of this kind."""
-    return is_kind(kind) if _is_any_kind(info) else kind in kinds_of(info)
+    return is_kind(kind) if _is_any_kind(info) else kind in list_kinds(info)
 
 
 def default_kind(info: FieldInfo) -> str | None:
@@ -217,10 +217,10 @@ def default_kind(info: FieldInfo) -> str | None:
 def section_class(info: FieldInfo, kind: object) -> type[BaseModel]:
     """Return the class of a section of this ``kind``; the default one where there is no such
     kind."""
-    kind = kind if is_kind_of(info, kind) else default_kind(info)
+    kind = kind if allows_kind(info, kind) else default_kind(info)
     if _is_any_kind(info):
         return section_of_kind(str(kind))
     variants = section_classes(info)
     if len(variants) == 1:
         return variants[0]
-    return next(v for v in variants if kind in choices_of(v.model_fields["kind"].annotation))
+    return next(v for v in variants if kind in list_choices(v.model_fields["kind"].annotation))

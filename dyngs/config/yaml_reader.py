@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from dyngs.core.errors import DyngsError, printable, reading, reason
+from dyngs.core.errors import DyngsError, format_one_line, wrap_read_errors, reason
 from dyngs.io.fields import read_limited
 
 MAX_BYTES = 2**18
@@ -38,7 +38,7 @@ class Leaf:
 
 def read_file(path: Path) -> list[Leaf]:
     """Read the values of a file in its order; an empty section is a leaf of value None."""
-    with reading(path, "give a YAML preset in UTF-8"):
+    with wrap_read_errors(path, "give a YAML preset in UTF-8"):
         text = read_limited(path, MAX_BYTES).decode("utf-8-sig")
     root = _root(text, str(path))
     if root is None:
@@ -53,9 +53,9 @@ def read_override(text: str) -> list[Leaf]:
     section."""
     key, equals, written = (part.strip() for part in text.partition("="))
     keys = tuple(key.split("."))
-    origin = printable(text, _SHOWN)
+    origin = format_one_line(text, _SHOWN)
     if not equals or not all(re.fullmatch(r"\w+", k) for k in keys):
-        shown = printable(repr(text), _SHOWN)
+        shown = format_one_line(repr(text), _SHOWN)
         raise DyngsError(
             f"{shown} is not an override; write section.key=value, for instance train.steps=2000"
         )
@@ -92,7 +92,7 @@ def _root(text: str, origin: str) -> yaml.Node | None:
         if "'\\t'" in problem:
             problem = "a tab where YAML wants spaces; indent with spaces"
         raise DyngsError(
-            f"{origin}{line}: not valid YAML: {printable(problem, 2 * _SHOWN)}"
+            f"{origin}{line}: not valid YAML: {format_one_line(problem, 2 * _SHOWN)}"
         ) from error
 
 
@@ -105,7 +105,7 @@ def _leaves(
         if not isinstance(key_node, yaml.ScalarNode):
             raise DyngsError(f"{where}: keys must be plain words")
         key = key_node.value
-        shown = printable(".".join((*above, key)), _SHOWN)
+        shown = format_one_line(".".join((*above, key)), _SHOWN)
         if "." in key:
             raise DyngsError(f"{where}: {shown!r} must be nested in YAML: {key.split('.')[0]}: ...")
         if key in seen:

@@ -29,12 +29,12 @@ SH_C0 = 0.28209479177387814
 
 MAX_SH_DEGREE = 4
 
-ReportProgress = Callable[[str, int, int], None]
+ProgressCallback = Callable[[str, int, int], None]
 """Function that is told how far long work has come: what is being done, how many parts of it are
 done, of how many."""
 
 
-def report_nothing(what: str, done: int, total: int) -> None:
+def ignore_progress(what: str, done: int, total: int) -> None:
     """Tell nobody: the default of functions that report their progress."""
 
 
@@ -52,7 +52,7 @@ def num_sh_terms(degree: int) -> int:
     return (degree + 1) ** 2
 
 
-def srgb_encoded(linear: np.ndarray) -> np.ndarray:
+def encode_srgb(linear: np.ndarray) -> np.ndarray:
     """Return the sRGB signal of linear light in [0, 1]."""
     return np.where(
         linear <= 0.0031308,
@@ -61,6 +61,6 @@ def srgb_encoded(linear: np.ndarray) -> np.ndarray:
     )
 
 
-def srgb_decoded(signal: np.ndarray) -> np.ndarray:
+def decode_srgb(signal: np.ndarray) -> np.ndarray:
     """Return the linear light of an sRGB signal in [0, 1]."""
     return np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)

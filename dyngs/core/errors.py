@@ -35,7 +35,7 @@ class DyngsError(Exception):
     def __str__(self) -> str:
         """The message on one line without anything that a terminal would obey, whatever names and
         values it quotes."""
-        return printable(super().__str__())
+        return format_one_line(super().__str__())
 
 
 class NoCaptureError(DyngsError):
@@ -43,7 +43,7 @@ class NoCaptureError(DyngsError):
 
 
 @contextmanager
-def reading(
+def wrap_read_errors(
     path: str | os.PathLike[str], advice: str = "copy or export it again"
 ) -> Generator[None]:
     """A block in which whatever goes wrong is a DyngsError that names ``path``, with the first
@@ -69,7 +69,7 @@ def reading(
         ) from cause
 
 
-def require_name(text: str) -> None:
+def validate_file_name(text: str) -> None:
     """Nothing, if ``text`` may name a file: no NUL, nothing that is no character. Raises
     DyngsError."""
     try:
@@ -78,11 +78,11 @@ def require_name(text: str) -> None:
     except UnicodeEncodeError:
         pass
     raise DyngsError(
-        f"{printable(text, _MAX_REASON)!r} holds a character that no name or path may hold; remove it"
+        f"{format_one_line(text, _MAX_REASON)!r} holds a character that no name or path may hold; remove it"
     )
 
 
-def require_regular(path: str | os.PathLike[str]) -> None:
+def require_regular_file(path: str | os.PathLike[str]) -> None:
     """Nothing, if ``path`` is a file, a folder or not there: what reads a pipe or a device may
     never end."""
     try:
@@ -103,20 +103,20 @@ def reason(error: BaseException) -> str:
         text = f"{error.strerror}{where}"
     else:
         text = f"{type(error).__name__}: {error}" if str(error).strip() else type(error).__name__
-    return printable(text[: 4 * _MAX_REASON], _MAX_REASON)
+    return format_one_line(text[: 4 * _MAX_REASON], _MAX_REASON)
 
 
-def as_word(path: str | os.PathLike[str]) -> str:
+def quote_path(path: str | os.PathLike[str]) -> str:
     """Return a path as a word of a command that can be copied to a shell, whatever characters it
     holds."""
     text = os.fspath(path)
-    return quoted(f"./{text}" if text.startswith("-") else text)
+    return quote_word(f"./{text}" if text.startswith("-") else text)
 
 
-def quoted(text: str) -> str:
+def quote_word(text: str) -> str:
     """Return ``text`` as a word for a shell, with escapes ($'...') where stdout cannot show it."""
     encoding = getattr(sys.stdout, "encoding", None) or "ascii"
-    if printable(text) == text and text == text.encode(encoding, "replace").decode(
+    if format_one_line(text) == text and text == text.encode(encoding, "replace").decode(
         encoding, "replace"
     ):
         return shlex.quote(text)
@@ -133,24 +133,24 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'s' * (number != 1)}"
 
 
-def printable(text: str, length: int | None = None) -> str:
+def format_one_line(text: str, length: int | None = None) -> str:
     """``text`` on one line, what a terminal would obey or cannot show as escapes, with ``...``
     beyond ``length``."""
-    shown = escaped(" ".join(text.split()))
+    shown = escape_control_characters(" ".join(text.split()))
     return shown if length is None or len(shown) <= length else f"{shown[: length - 3]}..."
 
 
 def show(text: str) -> None:
     """Log lines as information, without anything that a terminal would obey."""
-    LOGGER.info("\n".join(map(escaped, text.split("\n"))))
+    LOGGER.info("\n".join(map(escape_control_characters, text.split("\n"))))
 
 
 def warn(text: str) -> None:
     """Log a warning of one line."""
-    LOGGER.warning(printable(text))
+    LOGGER.warning(format_one_line(text))
 
 
-def escaped(line: str) -> str:
+def escape_control_characters(line: str) -> str:
     """Return a line with escapes for all that a terminal would obey or cannot show."""
     return "".join(
         c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line

@@ -17,7 +17,7 @@ CutOff = Annotated[float, Field(ge=1e-6, le=0.5)]
 """Opacity or transmittance below which the rasterizer stops."""
 
 
-def as_number(value: object) -> object:
+def parse_digits(value: object) -> object:
     """Return the number that a text of digits is, for choices between numbers."""
     return int(value) if isinstance(value, str) and value.isdecimal() else value
 
@@ -43,12 +43,12 @@ class ModelSection(Section):
         """Name of the kind."""
 
     @property
-    def added_for_motion(self) -> int:
+    def num_added_for_motion(self) -> int:
         """Number of Gaussians that are added when motion begins."""
         return 0
 
     @property
-    def moving_bytes(self) -> int:
+    def bytes_per_moving_gaussian(self) -> int:
         """Bytes of memory of a Gaussian in training next to its own values, where it moves."""
         return 0
 
@@ -57,7 +57,7 @@ class ModelSection(Section):
         the power of the number with which that goes."""
         return "strategy.max_gaussians", count, 1.0
 
-    def moves_after(self, steps: int) -> int | None:
+    def motion_start_step(self, steps: int) -> int | None:
         """Return the last step without motion in a run of ``steps``; None: nothing moves."""
         return None
 

@@ -42,12 +42,12 @@ def with_role(tensors: Mapping[str, Tensor], role: Role) -> State:
     return {name: StateTensor(x, role) for name, x in tensors.items()}
 
 
-def prefixed(prefix: str, state: Mapping[str, StateTensor]) -> State:
+def add_prefix(prefix: str, state: Mapping[str, StateTensor]) -> State:
     """Return the state with ``prefix.`` before every name."""
     return {f"{prefix}.{name}": x for name, x in state.items()}
 
 
-def tensors_of(state: Mapping[str, StateTensor]) -> dict[str, Tensor]:
+def strip_roles(state: Mapping[str, StateTensor]) -> dict[str, Tensor]:
     """Return name to tensor, without the roles."""
     return {name: x.tensor for name, x in state.items()}
 
@@ -58,22 +58,22 @@ def part_of(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(start): x for name, x in tensors.items() if name.startswith(start)}
 
 
-def moved_to(value: T, device: torch.device | str) -> T:
+def move_to_device(value: T, device: torch.device | str) -> T:
     """Return a copy of ``value`` with its tensors on ``device``: by its own ``to`` if it has one,
     else by its parts."""
     own: Any = value
     if hasattr(value, "to"):
         return own.to(device=device)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return fields_moved_to(value, device)
+        return move_fields_to(value, device)
     if isinstance(value, tuple):
-        return cast(T, tuple(moved_to(x, device) for x in own))
+        return cast(T, tuple(move_to_device(x, device) for x in own))
     if isinstance(value, dict):
-        return cast(T, {name: moved_to(x, device) for name, x in own.items()})
+        return cast(T, {name: move_to_device(x, device) for name, x in own.items()})
     return value
 
 
-def fields_moved_to(
+def move_fields_to(
     value: T, device: torch.device | str | None = None, dtype: torch.dtype | None = None
 ) -> T:
     """Return a copy of the dataclass ``value`` with its fields on ``device``, as ``moved_to`` has
@@ -88,7 +88,7 @@ def fields_moved_to(
     def moved(x: Any) -> Any:
         if isinstance(x, Tensor):
             return x.to(device, dtype if x.is_floating_point() else None)
-        return x if device is None else moved_to(x, device)
+        return x if device is None else move_to_device(x, device)
 
     own: Any = value
     fields = {f.name: moved(getattr(value, f.name)) for f in dataclasses.fields(own) if f.init}

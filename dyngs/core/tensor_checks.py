@@ -49,7 +49,7 @@ def require_ascending(name: str, x: Tensor) -> Tensor:
     return x
 
 
-def require_moments(name: str, x: Tensor) -> Tensor:
+def require_times(name: str, x: Tensor) -> Tensor:
     """Return ``x`` (N,) if it holds distinct times from 0 to 1, ascending; else raise
     ValueError."""
     require_ascending(name, require_tensor(name, x, (None,), None))

@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.capture import (
     BODY_KINDS,
     BodyFrames,
@@ -192,7 +192,7 @@ def ensure_fitted_body(capture: Capture, folder: Path) -> Capture:
         )
     with (
         staying_within(folder, False),
-        reading(folder, "give a folder that `dyngs data fit` wrote"),
+        wrap_read_errors(folder, "give a folder that `dyngs data fit` wrote"),
     ):
         train = read_body_file(folder / "body_train.npz")
         body: dict[Split, BodyFrames] = {"train": train, "val": train, "test": train}

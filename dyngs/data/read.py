@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.config import DataConfig
-from dyngs.core.errors import DyngsError, NoCaptureError, reading
+from dyngs.core.errors import DyngsError, NoCaptureError, wrap_read_errors
 from dyngs.data import times
 from dyngs.data.body_frames import ensure_fitted_body
 from dyngs.data.capture import (
@@ -186,12 +186,12 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
     require_folder(options.root)
     root = capture_folder(options.root)
     options = options.model_copy(update={"root": root})
-    with reading(root, "choose another folder or change its permissions"):
+    with wrap_read_errors(root, "choose another folder or change its permissions"):
         found = [format for format in FORMATS if format.recognise(root)]
     chosen = _chosen_format(options, found)
     with (
         staying_within(root, options.follow_links),
-        reading(
+        wrap_read_errors(
             root,
             "one of its files is not as it should be (`dyngs --debug` shows where); export it again",
         ),
@@ -238,7 +238,7 @@ def capture_folder(root: Path) -> Path:
 
 
 def _is_recognised(folder: Path) -> bool:
-    with reading(folder, "choose another folder or change its permissions"):
+    with wrap_read_errors(folder, "choose another folder or change its permissions"):
         return any(format.recognise(folder) for format in FORMATS)
 
 

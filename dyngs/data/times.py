@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, printable, reading
+from dyngs.core.errors import DyngsError, format_one_line, wrap_read_errors
 from dyngs.data.capture import Splits, View, all_views, each_view
 from dyngs.data.geometry import inverse_rigid
 from dyngs.io.fields import is_number, read_json_object
@@ -60,7 +60,7 @@ def read_seconds(root: Path) -> dict[str, float]:
     path = root / SECONDS_FILE
     if not path.is_file():
         return {}
-    with reading(
+    with wrap_read_errors(
         path, "it needs an object 'seconds' of image names and seconds; see docs/formats.md"
     ):
         seconds: Any = read_json_object(path)["seconds"]
@@ -222,7 +222,7 @@ def parse_frames(text: str, key: str = "data.frames") -> slice:
     parts = [int(part) if part.strip() else None for part in text.split(":")] if is_slice else []
     if not is_slice or parts[2:] == [0]:
         raise DyngsError(
-            f"{key}={printable(repr(text), 60)}: write start:stop or start:stop:step in whole numbers, such as "
+            f"{key}={format_one_line(repr(text), 60)}: write start:stop or start:stop:step in whole numbers, such as "
             "0:100:2, and a step that is not 0"
         )
     return slice(*parts)

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, State, StateTensor, moved_to, part_of, prefixed
+from dyngs.core.state import Role, State, StateTensor, move_to_device, part_of, add_prefix
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.deform.field import (
     MAX_KEY_TIMES,
@@ -194,7 +194,7 @@ class ControlNodes(DeformationField):
         buffers = {
             name: StateTensor(x, own.get(name, Role.SHARED)) for name, x in self.buffers.items()
         }
-        return super().state() | prefixed("buffers", buffers)
+        return super().state() | add_prefix("buffers", buffers)
 
     @property
     def num_values(self) -> int:
@@ -212,7 +212,7 @@ class ControlNodes(DeformationField):
 
     def to(self, device: torch.device | str) -> ControlNodes:
         field = super().to(device)
-        field.buffers = moved_to(self.buffers, device)
+        field.buffers = move_to_device(self.buffers, device)
         return field
 
     @property

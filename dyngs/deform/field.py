@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dyngs.core.initialisation import glorot
-from dyngs.core.state import State, moved_to, part_of, prefixed
+from dyngs.core.state import State, move_to_device, part_of, add_prefix
 from dyngs.deform.keys import FieldSection
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import Parameters
@@ -134,7 +134,7 @@ class DeformationField:
 
     def state(self) -> State:
         """Return the state that ``restored`` needs, without the setup."""
-        return prefixed("learned", self.parameters.state())
+        return add_prefix("learned", self.parameters.state())
 
     def with_state(self: F, tensors: Mapping[str, Tensor]) -> F:
         """Return the field of a state that ``state`` returned, with the options and the setup of
@@ -147,7 +147,7 @@ class DeformationField:
 
     def to(self: F, device: torch.device | str) -> F:
         field = self.with_parameters(self.parameters.to(device))
-        field.setup = moved_to(self.setup, device)
+        field.setup = move_to_device(self.setup, device)
         return field
 
     def with_parameters(self: F, parameters: Parameters) -> F:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, State, part_of, prefixed, with_role
+from dyngs.core.state import Role, State, part_of, add_prefix, with_role
 from dyngs.core.tensor_checks import require_positive, require_tensor
 from dyngs.deform.bodies.field import BodyField
 from dyngs.deform.control_nodes import ControlNodes
@@ -67,7 +67,7 @@ class WindowedField(OuterField):
         )
 
     def state(self) -> State:
-        return self.inner_field.state() | prefixed("windows", self.parameters.state())
+        return self.inner_field.state() | add_prefix("windows", self.parameters.state())
 
     @staticmethod
     def from_state(inner_field: DeformationField, tensors: Mapping[str, Tensor]) -> WindowedField:

@@ -177,16 +177,16 @@ class DynamicModel(SceneModel):
     )
 
     @property
-    def added_for_motion(self) -> int:
+    def num_added_for_motion(self) -> int:
         if not isinstance(self.deform, FreeField):
             return self.num_random_moving
         return 2 * self.num_random_moving + COPIES_OF_MOVING
 
-    def moves_after(self, steps: int) -> int:
+    def motion_start_step(self, steps: int) -> int:
         shortest = min(MIN_STATIC_STEPS, steps // 3)
         return min(max(1, round(self.motion_from * steps), shortest), steps)
 
     @property
-    def moving_bytes(self) -> int:
+    def bytes_per_moving_gaussian(self) -> int:
         # features from space-time grids, or neurons of a network, of each Gaussian
         return 200 if isinstance(self.deform, (ControlNodesField, FreeField)) else 2000

@@ -8,7 +8,7 @@ from dyngs.core.section import SceneModel
 from dyngs.deform.keys import (
     DynamicModel,
 )
-from dyngs.models.kind import ExtendsTo, LimitsSize, Moves
+from dyngs.models.kind import HasSchedules, HasSizeLimit, HasMotion
 
 if TYPE_CHECKING:
     from dyngs.data.capture import Capture
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from dyngs.models.schedule import Length
 
 
-class DynamicKind(LimitsSize, Moves, ExtendsTo):
+class DynamicKind(HasSizeLimit, HasMotion, HasSchedules):
     """See the module."""
 
     def refusal(self, capture: Capture) -> str | None:
@@ -32,14 +32,14 @@ class DynamicKind(LimitsSize, Moves, ExtendsTo):
 
         return start, restore
 
-    def extended(self, section: DynamicModel, length: Length) -> DynamicModel:
-        from dyngs.deform.schedule import extended
+    def extend_schedules(self, section: DynamicModel, length: Length) -> DynamicModel:
+        from dyngs.deform.schedule import extend_schedules
 
-        return extended(section, length)
+        return extend_schedules(section, length)
 
-    def adding(self, section: SceneModel, most: int) -> SceneModel:
+    def with_added_gaussians(self, section: SceneModel, most: int) -> SceneModel:
         assert isinstance(section, DynamicModel)
-        count = min(section.added_for_motion, most)
+        count = min(section.num_added_for_motion, most)
         return section.model_copy(update={"num_random_moving": count})
 
     def num_shared(self, section: DynamicModel, num_times: int, num_moving: int = 0) -> int:

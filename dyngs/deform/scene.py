@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, State, StateTensor, part_of, prefixed
+from dyngs.core.state import Role, State, StateTensor, part_of, add_prefix
 from dyngs.core.tensor_checks import require_ascending, require_indices
 from dyngs.deform.field import DeformationField, Offsets, apply_offsets
 from dyngs.deform.fields import field_state, restore_field
@@ -17,7 +17,7 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import apply_filter, filter_state, restore_filter
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, restore_times, times_state
 from dyngs.gaussians.visibility import VisibilityMasks, intersect_sorted
-from dyngs.models.renderable import Renderable, clamped_time
+from dyngs.models.renderable import Renderable, clamp_time
 
 _NONE = torch.zeros(0, dtype=torch.long, device="cpu")
 
@@ -80,7 +80,7 @@ class DynamicScene(GaussianScene):
 
         What does not move is not computed anew.
         """
-        now = clamped_time(time)
+        now = clamp_time(time)
         if self.field is None or self.is_static:
             return GaussianTimeStep(apply_filter(self.gaussians, self.filter_std), now)
         part = self._drawn_around(now)
@@ -126,9 +126,9 @@ class DynamicScene(GaussianScene):
     def _model_state(self) -> State:
         state = filter_state(self.filter_std) | times_state(self.training_times)
         if self.field is not None:
-            state |= prefixed("field", field_state(self.field))
+            state |= add_prefix("field", field_state(self.field))
             state["rows"] = StateTensor(self.moving, Role.SHARED)
-        return state if self.masks is None else state | prefixed("masks", self.masks.state())
+        return state if self.masks is None else state | add_prefix("masks", self.masks.state())
 
     def _drawn_around(self, time: float) -> _DrawnPart:
         """Return the Gaussians drawn around ``time``; without gradients, those of the last mask

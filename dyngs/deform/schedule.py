@@ -42,7 +42,7 @@ def deform_schedule(model: DynamicModel, rates: RateSchedule) -> DeformSchedule:
     nothing.
     """
     steps = rates.steps
-    coarse_end = model.moves_after(steps)
+    coarse_end = model.motion_start_step(steps)
     window_grows_from = max(coarse_end, round(model.time_window_grows_from * steps))
     window_full_at = max(window_grows_from, round(model.time_window_full_at * steps))
     decay_from = window_full_at if model.time_window < 1 else coarse_end
@@ -57,7 +57,7 @@ def deform_schedule(model: DynamicModel, rates: RateSchedule) -> DeformSchedule:
     )
 
 
-def extended(model: DynamicModel, length: Length) -> DynamicModel:
+def extend_schedules(model: DynamicModel, length: Length) -> DynamicModel:
     """Return the section for a run of another length; phases that have begun keep their step.
 
     Raises DyngsError: its motion began too early for that length.
@@ -70,7 +70,7 @@ def extended(model: DynamicModel, length: Length) -> DynamicModel:
             "time_window_full_at": length.kept(old.window_full_at),
         }
     changed = model.model_copy(update=fractions)
-    motion_start = changed.moves_after(length.steps)
+    motion_start = changed.motion_start_step(length.steps)
     if old.coarse_end <= length.done < motion_start:
         raise DyngsError(
             f"train.steps={length.steps}: motion began after step {old.coarse_end:,}, but a run of "

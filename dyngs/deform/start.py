@@ -32,7 +32,7 @@ from dyngs.gaussians.rendering import Shader
 from dyngs.gaussians.scene import restore_appearance
 from dyngs.gaussians.schedule import rate_schedule
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import RunStart
+from dyngs.models.kind import StartContext
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background, training_cameras, training_times
 
@@ -43,7 +43,7 @@ STEPS_PER_SHOT = 50
 SECONDS_PER_SHOT = 3.0  # Of train.minutes for each, where that is given, likewise
 
 
-def start(run: RunStart) -> GaussianModel:
+def start(run: StartContext) -> GaussianModel:
     """Return the model of a moving scene before its first step. Raises DyngsError: there are no
     times to move in."""
     model = run.config.model
@@ -69,7 +69,7 @@ def restore(model: DynamicModel, checkpoint: Checkpoint) -> DynamicScene:
     return restore_appearance(scene, model, checkpoint)
 
 
-def _training_views(run: RunStart, model: DynamicModel, colours: ColourTraining) -> TrainingViews:
+def _training_views(run: StartContext, model: DynamicModel, colours: ColourTraining) -> TrainingViews:
     config = run.config
     capture = run.capture
     images = run.images

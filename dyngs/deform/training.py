@@ -117,7 +117,7 @@ class TrainingViews:
 class DynamicTraining(SceneTraining[DynamicScene]):
     """See ``SceneTraining``."""
 
-    moves_by = ("field", "model.deform")
+    deformation_name = ("field", "model.deform")
 
     def __init__(
         self,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.core.metrics import Lpips, LpipsNet, load_lpips, psnr
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.loader import Image, ImageLoader
@@ -38,8 +38,8 @@ from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.human.avatar.pose_fit import IMAGE_COMPARISON, SILHOUETTE_COMPARISON, fit_poses_to_images
 from dyngs.human.avatar.scene import as_human_scene
 from dyngs.io.write import write_text
-from dyngs.models.checkpoint import OTHER_CONFIG, read_capture_of
-from dyngs.models.kind import Moves, capability
+from dyngs.models.checkpoint import CONFIG_ADVICE, read_run_capture
+from dyngs.models.kind import HasMotion, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.ops.device import CPU, select_device
@@ -52,7 +52,7 @@ from dyngs.runs.checkpoint import (
     latest_checkpoint,
     load_run,
 )
-from dyngs.runs.folder import inputs_of
+from dyngs.runs.folder import collect_inputs
 from dyngs.runs.opened import scene_of_split, split_views
 from dyngs.training.corrections.camera_refinement import (
     CameraCorrections,
@@ -70,7 +70,7 @@ def load_camera_corrections(
         return None
     checkpoint = latest_checkpoint(run_dir)
     refinement = CameraRefinement(trained_on, run.info.extent, run.config.train.steps)
-    with reading(checkpoint.name, OTHER_CONFIG):
+    with wrap_read_errors(checkpoint.name, CONFIG_ADVICE):
         refinement.load_state(checkpoint.part("cameras"))
     return refinement.corrections
 
@@ -239,14 +239,14 @@ def evaluate_run(
         capture: capture of the run, if already read.
     """
     render_device = select_device(device)
-    inputs_of(run_dir).require_output(report_path(run_dir, split))
+    collect_inputs(run_dir).require_output(report_path(run_dir, split))
     if refine_poses and split == "train":
         raise DyngsError(
             f"{run_dir}: --refine needs images that were not trained on; use --split test, val or "
             "pose"
         )
     run = load_run(run_dir, data_root)
-    capture = capture or read_capture_of(run.config.data, run.info)
+    capture = capture or read_run_capture(run.config.data, run.info)
     views = split_views(capture, split)
     background, colour = evaluation_background(run.config.data.background, capture.has_alpha)
     scene = scene_of_split(run, capture, split).to(render_device)
@@ -374,7 +374,7 @@ def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
         notes.append(f"unfinished run: step {run.step:,} of {run.config.total_steps:,}")
     if run.config.data.background == "random":
         notes.append("trained with random backgrounds, evaluated on black")
-    if capability(run.config.model, Moves) is not None and run.renderable.is_static:
+    if capability(run.config.model, HasMotion) is not None and run.renderable.is_static:
         notes.append("dynamic model without motion: rendered as a static scene")
     if len({(s.width, s.height) for s in scores}) > 1:
         notes.append("views differ in size; width and height are those of the first view")
@@ -408,7 +408,7 @@ def compare_runs(
     """
     runs = [load_run(folder, data_root) for folder in folders]
     data = runs[0].config.data
-    capture = read_capture_of(data, runs[0].info)
+    capture = read_run_capture(data, runs[0].info)
     background = evaluation_background(data.background, capture.has_alpha)[1].to(device)
     psnrs: dict[str, list[float]] = {}
     seconds = np.zeros(0)

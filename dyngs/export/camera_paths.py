@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError, printable
+from dyngs.core.errors import DyngsError, format_one_line
 from dyngs.data.geometry import cam_from_opengl, checked_pose, inverse_rigid, pinhole_matrix
 from dyngs.io.fields import entry, float_array, is_number, numbers_of, read_json, require_at_most
 
@@ -101,7 +101,7 @@ def parse_times(text: str) -> tuple[float, ...]:
         start, stop, count = 0.0, 0.0, 0
     if not (math.isfinite(start) and math.isfinite(stop) and 1 <= count <= _MAX_FRAMES):
         raise DyngsError(
-            f"{printable(repr(text), 60)}: not a range of times; use START:STOP:COUNT, such as "
+            f"{format_one_line(repr(text), 60)}: not a range of times; use START:STOP:COUNT, such as "
             "0:1:60"
         )
     return tuple(np.linspace(start, stop, count).tolist())
@@ -171,7 +171,7 @@ def _as_document(found: Any, file: Path) -> tuple[dict[str, Any], tuple[str, ...
     kind = str(found.get("camera_type", found.get("camera_model")))
     panoramic = ("fisheye", "equirectangular", "spherical", "omni", "vr180")
     if any(name in kind.lower() for name in panoramic):
-        raise DyngsError(f"{file}: cameras must be pinholes, not {printable(kind, 40)}")
+        raise DyngsError(f"{file}: cameras must be pinholes, not {format_one_line(kind, 40)}")
     if "camera_path" in found:
         return _convert_nerfstudio(found, file), (
             "the nerfstudio path is read in coordinates of the capture; nerfstudio may have used "
@@ -254,7 +254,7 @@ def _number(
     """Return the number at ``key``. Raises DyngsError unless it is in [low, high]."""
     value = keys.get(key, default)
     if not is_number(value) or not low <= value <= high:
-        problem = "is missing" if value is None else f"is {printable(repr(value), 60)}"
+        problem = "is missing" if value is None else f"is {format_one_line(repr(value), 60)}"
         raise DyngsError(f"{where}: '{key}' {problem}; must be a number from {low:g} to {high:g}")
     return float(value)
 

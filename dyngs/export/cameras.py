@@ -12,7 +12,7 @@ from dyngs.data.geometry import opengl_from_cam
 from dyngs.io.formats.ply import double_ply
 from dyngs.io.formats.similarity import Similarity
 from dyngs.io.write import atomic_file, write_text
-from dyngs.runs.folder import inputs_of
+from dyngs.runs.folder import collect_inputs
 
 NAME, POINTS_NAME = "transforms.json", "points.ply"
 _OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -37,7 +37,7 @@ def write_cameras(
         ``path``.
     """
     for out in (path, path.with_name(POINTS_NAME)):
-        inputs_of(capture).require_output(out)
+        collect_inputs(capture).require_output(out)
     if world is None:
         x, y, z = capture.world_offset.tolist()
         world = Similarity(scale=capture.world_scale, shift=(x, y, z))

@@ -27,7 +27,7 @@ from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.io.formats.similarity import AXES
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import training_cameras
-from dyngs.runs.opened import Opened, cameras_for_paths, split_views
+from dyngs.runs.opened import OpenedScene, cameras_for_paths, split_views
 
 DEFAULT_FRAMES = 120
 DEFAULT_SIZE = (960, 720)  # Image size in pixels for scenes without a capture
@@ -53,7 +53,7 @@ class PathOptions:
     split: str | None = None  # split of that view; None uses test, else val, else train
 
 
-def choose_path(opened: Opened, options: PathOptions) -> CameraPath:
+def choose_path(opened: OpenedScene, options: PathOptions) -> CameraPath:
     """Return the cameras and times to render, with notes about chosen defaults.
 
     Raises:
@@ -127,7 +127,7 @@ def select_view(capture: Capture, name: str | None = None, split: str | None = N
 
 
 def orbit_cameras_around(
-    opened: Opened, count: int, size: tuple[int, int] = DEFAULT_SIZE
+    opened: OpenedScene, count: int, size: tuple[int, int] = DEFAULT_SIZE
 ) -> Cameras:
     """Return ``count`` cameras on a circle around a scene, which see a person in all of their
     motion.
@@ -150,7 +150,7 @@ def framing_points(scene: Renderable, time: float | None = None) -> Tensor:
     return scene.at(time).means if isinstance(scene, GaussianScene) else scene.bounds
 
 
-def frontal_cameras(opened: Opened, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
+def frontal_cameras(opened: OpenedScene, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
     """Return three neighbouring cameras on a circle around a scene. The second one faces a
     person."""
     ring = orbit_cameras_around(opened, _RING, size)
@@ -162,7 +162,7 @@ def frontal_cameras(opened: Opened, size: tuple[int, int] = DEFAULT_SIZE) -> Cam
     return pick_cameras(ring, [(front + i) % _RING for i in (-1, 0, 1)])
 
 
-def _fixed_camera(opened: Opened, options: PathOptions) -> CameraPath:
+def _fixed_camera(opened: OpenedScene, options: PathOptions) -> CameraPath:
     times = opened.renderable.times
     if opened.captured is None:
         camera = frontal_cameras(opened, options.size or DEFAULT_SIZE).select(1)
@@ -174,7 +174,7 @@ def _fixed_camera(opened: Opened, options: PathOptions) -> CameraPath:
     return with_times(CameraPath(pick_cameras(camera, [0] * len(times))), times)
 
 
-def _automatic_path(opened: Opened, name: str, options: PathOptions) -> CameraPath:
+def _automatic_path(opened: OpenedScene, name: str, options: PathOptions) -> CameraPath:
     """Return the orbit, spiral or along path, placed by the training cameras or the scene."""
     scene = opened.renderable
     frames = options.num_frames or (DEFAULT_FRAMES if opened.fps is None else len(scene.times))

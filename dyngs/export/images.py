@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import ReportProgress, report_nothing, srgb_encoded
+from dyngs.core.conventions import ProgressCallback, ignore_progress, encode_srgb
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import ImageLoader
@@ -29,8 +29,8 @@ from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.write import to_uint8, write_image
 from dyngs.models.renderable import DrawOptions, Renderable, TimeStep
 from dyngs.ops.device import CPU
-from dyngs.runs.folder import inputs_of
-from dyngs.runs.opened import Opened, split_views
+from dyngs.runs.folder import collect_inputs
+from dyngs.runs.opened import OpenedScene, split_views
 
 
 @dataclass(frozen=True)
@@ -94,11 +94,11 @@ def render_path(
 
 
 def write_path_images(
-    opened: Opened,
+    opened: OpenedScene,
     path: CameraPath,
     out_dir: Path | None,
     output: OutputOptions = OutputOptions(),
-    on_progress: ReportProgress = report_nothing,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> list[Path]:
     """Render a scene along a path to ``frame_0000.png`` etc. and to a video. Return the paths.
 
@@ -128,11 +128,11 @@ def write_path_images(
 
 
 def write_split_images(
-    opened: Opened,
+    opened: OpenedScene,
     split: str,
     out_dir: Path,
     output: OutputOptions = OutputOptions(),
-    on_progress: ReportProgress = report_nothing,
+    on_progress: ProgressCallback = ignore_progress,
     device: torch.device = CPU,
 ) -> list[Path]:
     """Render a split of a run to ``NAME.png`` per view and ``sheet.png`` (truth, render, error).
@@ -148,7 +148,7 @@ def write_split_images(
     """
     views = split_views(opened.capture, split)
     loader = ImageLoader(views, opened.config.data)
-    scene = opened.of_split(split).renderable.to(device)
+    scene = opened.for_split(split).renderable.to(device)
     options = _with_depth(scene, output)
     shown = np.linspace(0, len(loader) - 1, min(len(loader), 12)).round().astype(int)
     rows: list[tuple[str, np.ndarray, np.ndarray]] = []
@@ -168,7 +168,7 @@ def write_split_images(
                 rows.append((label, (truth * counts).numpy(), (rendered * counts).numpy()))
 
     sheet = out_dir / "sheet.png"
-    inputs_of(opened).require_output(sheet)
+    collect_inputs(opened).require_output(sheet)
     written = _write_images(opened, frames(), out_dir, output)
     write_image(sheet, contact_sheet(rows))
     return [*written, sheet]
@@ -205,7 +205,7 @@ def file_stems(names: Sequence[str]) -> list[str]:
 
 
 def _write_images(
-    opened: Opened,
+    opened: OpenedScene,
     frames: Iterable[tuple[str, DrawnImage]],
     out_dir: Path | None,
     output: OutputOptions,
@@ -218,7 +218,7 @@ def _write_images(
         one_range: depth colours of all frames use the range of the first frame.
     """
     limits = None
-    inputs = inputs_of(opened)
+    inputs = collect_inputs(opened)
     for out in (out_dir, output.video):
         if out is not None:
             inputs.require_output(out)
@@ -330,11 +330,11 @@ def color_map(values: np.ndarray, name: str) -> np.ndarray:
     source = oiio.ImageBuf(np.ascontiguousarray(clipped, dtype=np.float32))
     colored = oiio.ImageBufAlgo.color_map(source, 0, name)
     linear = np.asarray(colored.get_pixels(oiio.FLOAT))[..., :3]  # colour tables are linear
-    return to_uint8(srgb_encoded(np.clip(linear, 0.0, 1.0)))
+    return to_uint8(encode_srgb(np.clip(linear, 0.0, 1.0)))
 
 
 def compare_file_with_run(
-    opened: Opened, scene: GaussianScene, time: float, meant: SplatFile, read: SplatFile
+    opened: OpenedScene, scene: GaussianScene, time: float, meant: SplatFile, read: SplatFile
 ) -> float:
     """Return the PSNR in dB between renderings of a file and of its scene; 100 if equal.
 

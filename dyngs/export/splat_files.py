@@ -55,8 +55,8 @@ from dyngs.io.gltf import GlbDocument
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import atomic_file
 from dyngs.ops.quaternions import align_quat_signs, rotation_matrices, unit_quats
-from dyngs.runs.folder import inputs_of
-from dyngs.runs.opened import Opened
+from dyngs.runs.folder import collect_inputs
+from dyngs.runs.opened import OpenedScene
 
 PER_LEAF = MERGED**7  # Gaussians of a leaf at level 0
 PER_FILE = MERGED**9  # Most Gaussians of a file
@@ -152,7 +152,7 @@ DEFAULT_WRITE_OPTIONS = WriteOptions()
 
 
 def choose_write_options(
-    opened: Opened,
+    opened: OpenedScene,
     target: str,
     up: str | None = None,
     from_up: str | None = None,
@@ -189,7 +189,7 @@ def choose_write_options(
     return how, f"up is {wanted} in the file ({turned}; source: {who})"
 
 
-def find_up_direction(opened: Opened) -> tuple[tuple[float, ...], str] | None:
+def find_up_direction(opened: OpenedScene) -> tuple[tuple[float, ...], str] | None:
     """Return the up direction (3,) in the axes of ``splats_at``, and its source. None if unknown.
 
     A direction within 30 degrees of an axis is snapped to the axis.
@@ -205,7 +205,7 @@ def find_up_direction(opened: Opened) -> tuple[tuple[float, ...], str] | None:
 
 
 def write_run_splats(
-    opened: Opened,
+    opened: OpenedScene,
     path: Path,
     time: float = 0.0,
     part: Part = "all",
@@ -219,13 +219,13 @@ def write_run_splats(
     Raises:
         DyngsError: an empty part, or an unknown suffix.
     """
-    inputs_of(opened).require_output(path)
+    collect_inputs(opened).require_output(path)
     splat = splats_at(opened, scene_part(opened.scene, part), time, how)
     return write_splats(path, splat, sh_degree=how.sh_degree)
 
 
 def write_run_sequence(
-    opened: Opened,
+    opened: OpenedScene,
     folder: Path,
     times: Sequence[float],
     part: Part = "all",
@@ -241,7 +241,7 @@ def write_run_sequence(
     """
     digits = max(4, len(str(len(times) - 1)))
     names = [f"frame_{i:0{digits}d}{suffix}" for i in range(len(times))]
-    inputs = inputs_of(opened)
+    inputs = collect_inputs(opened)
     for path in (folder, *(folder / name for name in names)):
         inputs.require_output(path)
     others = sorted(file.name for file in folder.glob(f"[!.]*{suffix}") if file.name not in names)
@@ -256,7 +256,7 @@ def write_run_sequence(
 
 
 def write_run_levels(
-    opened: Opened,
+    opened: OpenedScene,
     folder: Path,
     time: float = 0.0,
     part: Part = "all",
@@ -268,7 +268,7 @@ def write_run_levels(
     Raises:
         DyngsError: an empty part, or a folder that is not empty.
     """
-    inputs_of(opened).require_output(folder)
+    collect_inputs(opened).require_output(folder)
     splat = splats_at(opened, scene_part(opened.scene, part), time, how)
     whole, notes = fitted(folder, format_named("sog"), splat, how.sh_degree)
     return write_sog_levels(folder, whole), notes
@@ -286,7 +286,7 @@ def scene_part(scene: GaussianScene, part: Part) -> GaussianScene:
 
 
 def splats_at(
-    opened: Opened, scene: GaussianScene, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
+    opened: OpenedScene, scene: GaussianScene, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
 ) -> SplatFile:
     """Return the content of a file of Gaussians for a scene at one time, in the requested axes.
 
@@ -373,7 +373,7 @@ FOURDGS_FPS = 30.0
 
 
 def write_4dgs(
-    opened: Opened,
+    opened: OpenedScene,
     path: Path,
     times: Sequence[float],
     part: Part = "all",
@@ -387,7 +387,7 @@ def write_4dgs(
     Raises:
         DyngsError: a missing package, an empty part, or the file cannot be written.
     """
-    inputs_of(opened).require_output(path)
+    collect_inputs(opened).require_output(path)
     model, delta, files = _fourdgs(path)
     scene = scene_part(opened.scene, part)
     splats = tuple(splats_at(opened, scene, time, how) for time in times)
@@ -450,7 +450,7 @@ def _fourdgs(path: Path) -> tuple[Any, Any, Any]:
 
 @torch.no_grad()
 def write_rigid_bodies(
-    opened: Opened, path: Path, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
+    opened: OpenedScene, path: Path, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
 ) -> Written:
     """Write a run at a time in [0, 1] as .glb: an animated node per rigid body, and one for the
     rest.
@@ -458,7 +458,7 @@ def write_rigid_bodies(
     Raises:
         DyngsError: no rigid body in this run, or the file cannot be written.
     """
-    inputs_of(opened).require_output(path)
+    collect_inputs(opened).require_output(path)
     scene = field_scene_of(opened.scene)
     field = None if scene is None else find_body_field(scene.field)
     if scene is None or field is None:

@@ -20,14 +20,14 @@ from dyngs.io.formats.similarity import Similarity, far_offset
 from dyngs.io.write import atomic_file
 from dyngs.models.renderable import Surface, SurfaceOptions
 from dyngs.models.views import training_cameras
-from dyngs.runs.folder import inputs_of
-from dyngs.runs.opened import Opened
+from dyngs.runs.folder import collect_inputs
+from dyngs.runs.opened import OpenedScene
 
 SUFFIXES = ".ply", ".glb", ".obj"
 
 
 def surface_write_options(
-    opened: Opened, suffix: str, up: str | None, from_up: str | None
+    opened: OpenedScene, suffix: str, up: str | None, from_up: str | None
 ) -> tuple[WriteOptions, str]:
     """Return the rotation of an exported mesh, and a note about it, see ``choose_write_options``.
 
@@ -38,7 +38,7 @@ def surface_write_options(
 
 
 def write_surface(
-    opened: Opened,
+    opened: OpenedScene,
     out: Path,
     *,
     time: float = 0.0,
@@ -59,7 +59,7 @@ def write_surface(
             raise DyngsError(f"--{name}: not supported for the mesh of this scene; use {known}")
     if suffix not in SUFFIXES:
         raise DyngsError(f"{out}: a mesh file must end in {', '.join(SUFFIXES)}")
-    inputs_of(opened).require_output(out)
+    collect_inputs(opened).require_output(out)
     surface = scene.own_surface(time, options) or _fused_surface(opened, time, options.cells)
     vertices = Similarity(how.turn).points(opened.world.points(surface.vertices))
     colours = np.round(255 * surface.colours.clip(0, 1)).astype(np.uint8)
@@ -89,7 +89,7 @@ def _mesh_bytes(suffix: str, vertices: np.ndarray, faces: np.ndarray, colours: n
     return scene.export(file_type="glb")
 
 
-def _fused_surface(opened: Opened, time: float, cells: int | None) -> Surface:
+def _fused_surface(opened: OpenedScene, time: float, cells: int | None) -> Surface:
     """Return the surface of Gaussians fused from training views, bounded to the captured volume."""
     scene = opened.scene
     views = opened.capture.splits["train"]

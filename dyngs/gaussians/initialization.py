@@ -44,7 +44,7 @@ from dyngs.gaussians.schedule import (
     grad_threshold,
     growth_per_change,
 )
-from dyngs.models.kind import RunStart
+from dyngs.models.kind import StartContext
 from dyngs.models.views import training_cameras
 
 START_OPACITY = 0.1
@@ -217,7 +217,7 @@ class InitialGaussians:
     frozen: Tensor | None = None
 
 
-def load_or_create_gaussians(run: RunStart) -> Gaussians:
+def load_or_create_gaussians(run: StartContext) -> Gaussians:
     """Return the Gaussians of the scene to go on from, at the points of the capture, or at
     random."""
     if run.first is not None:
@@ -229,7 +229,7 @@ def load_or_create_gaussians(run: RunStart) -> Gaussians:
 
 
 def build_colour_training(
-    run: RunStart, gaussians: Gaussians, *, uses_time: bool
+    run: StartContext, gaussians: Gaussians, *, uses_time: bool
 ) -> ColourTraining:
     """Return how colours are trained."""
     colour = run.config.colour
@@ -246,7 +246,7 @@ def build_colour_training(
             assert_never(colour)
 
 
-def build_densifier(run: RunStart) -> Densifier:
+def build_densifier(run: StartContext) -> Densifier:
     """Return the strategy of the run."""
     strategy = run.config.strategy
     steps = run.config.train.steps
@@ -271,7 +271,7 @@ def build_densifier(run: RunStart) -> Densifier:
             assert_never(strategy)
 
 
-def build_filter_update(run: RunStart) -> FilterUpdate:
+def build_filter_update(run: StartContext) -> FilterUpdate:
     """Return when the 3D filter of the model is computed anew."""
     config = run.config
     cameras = (

@@ -25,7 +25,7 @@ from dyngs.core.state import State
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import require_gaussians
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.models.renderable import Renderable, Rendering, TimeStep, joined_renderings, single_views
+from dyngs.models.renderable import Renderable, Rendering, TimeStep, concatenate_renderings, single_views
 from dyngs.ops.quaternions import quats_from_matrices, rotation_matrices
 
 MERGED = 4  # Gaussians in one of the next level, and blocks below one
@@ -314,7 +314,7 @@ class LevelScene(Renderable):
                 self.levels.seen_by(one, self.most).to(device=self.device)
             )
             images.append(seen.render(one, options=options, background=behind))
-        return joined_renderings([Rendering(x.rgb, x.transmittance, x.depth) for x in images])
+        return concatenate_renderings([Rendering(x.rgb, x.transmittance, x.depth) for x in images])
 
     def state(self) -> State:
         return self.scene.state()

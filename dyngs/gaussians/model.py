@@ -13,7 +13,7 @@ from torch import Tensor
 from dyngs.config import AutoColour, DefaultStrategy, SceneInit, SceneModel
 from dyngs.core.conventions import SH_C0, RasterizeMode
 from dyngs.core.gaussians import morton_order
-from dyngs.core.state import Role, State, prefixed, with_role
+from dyngs.core.state import Role, State, add_prefix, with_role
 from dyngs.data.loader import Image
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import restore_colour_network
@@ -29,8 +29,8 @@ from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, render_options
 from dyngs.gaussians.schedule import active_sh_degree, learning_rates, means_rate, rate_schedule
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import RunStart
-from dyngs.models.model import Drawn, Loss, Model, Updated
+from dyngs.models.kind import StartContext
+from dyngs.models.model import Drawn, Loss, Model, UpdateResult
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.adam import Count
@@ -48,7 +48,7 @@ class SceneTraining(Generic[S]):
         colour_loss: how colours are compared with true ones; None: by L1 and D-SSIM.
     """
 
-    moves_by: tuple[str, str] = ("", "")
+    deformation_name: tuple[str, str] = ("", "")
     colour_loss: Loss | None = None
 
     def trains_on(self, time: float | None, step: int) -> bool:
@@ -119,7 +119,7 @@ class GaussianModel(Model[GaussianScene]):
 
     def __init__(
         self,
-        run: RunStart,
+        run: StartContext,
         scene: GaussianScene,
         training: SceneTraining[Any],
         densifier: Densifier,
@@ -151,8 +151,8 @@ class GaussianModel(Model[GaussianScene]):
         return self._scene
 
     @property
-    def moves_by(self) -> tuple[str, str]:  # type: ignore[override]
-        return self.training.moves_by
+    def deformation_name(self) -> tuple[str, str]:  # type: ignore[override]
+        return self.training.deformation_name
 
     @property
     def rasterize_mode(self) -> RasterizeMode:
@@ -215,8 +215,8 @@ class GaussianModel(Model[GaussianScene]):
     def trains_on(self, time: float | None, step: int) -> bool:
         return self.training.trains_on(time, step)
 
-    def holds_out(self, index: int, step: int) -> bool:
-        return self.colours.holds_out(index, step)
+    def is_held_out(self, index: int, step: int) -> bool:
+        return self.colours.is_held_out(index, step)
 
     def window(self, step: int) -> tuple[float, float]:
         return self.training.window(step)
@@ -224,7 +224,7 @@ class GaussianModel(Model[GaussianScene]):
     def extend(self, seen: tuple[float, float], step: int) -> None:
         self.training.extend(self._scene, seen, step)
 
-    def update(self, step: int) -> Updated:
+    def update(self, step: int) -> UpdateResult:
         before = self._optimizer.parameters
         generator = self._generator
         lr_means = means_rate(self._rates, self._course.progress(step), self._run.extent)
@@ -256,7 +256,7 @@ class GaussianModel(Model[GaussianScene]):
         )
         self._scene.changed()
         text = "; ".join(text for text in findings if text) or None
-        return Updated(bad, text, self._optimizer.parameters is not before)
+        return UpdateResult(bad, text, self._optimizer.parameters is not before)
 
     def _perturb(self, lr_means: float) -> None:
         """Let the strategy shake the Gaussians, but for those that stay as they are."""
@@ -306,9 +306,9 @@ class GaussianModel(Model[GaussianScene]):
         self._scene = replace(self._scene, options=options)
 
     def state(self) -> State:
-        state = self._scene.state() | prefixed("model", self.training.state())
-        state |= prefixed("model.colour", self.colours.state()) | self._optimizer.state()
-        return state | prefixed("strategy", with_role(self.densifier.state(), Role.TRAINING))
+        state = self._scene.state() | add_prefix("model", self.training.state())
+        state |= add_prefix("model.colour", self.colours.state()) | self._optimizer.state()
+        return state | add_prefix("strategy", with_role(self.densifier.state(), Role.TRAINING))
 
     def restore(self, checkpoint: Checkpoint) -> None:
         gaussians = Gaussians.stored(checkpoint.part("gaussians"))
@@ -393,7 +393,7 @@ class GaussianModel(Model[GaussianScene]):
         return render_options(model, self._run.extent, self._run.capture.world_scale)
 
 
-def training_options(run: RunStart) -> RenderOptions:
+def training_options(run: StartContext) -> RenderOptions:
     """Return how the training images of a run are drawn."""
     strategy = run.config.strategy
     absgrad = isinstance(strategy, DefaultStrategy) and strategy.absgrad

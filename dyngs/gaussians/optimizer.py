@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dyngs.config import OptimConfig
-from dyngs.core.state import Role, State, StateTensor, moved_to, prefixed, with_role
+from dyngs.core.state import Role, State, StateTensor, move_to_device, add_prefix, with_role
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.ops.adam import AdamUpdate, Count, adam_steps_, seen_rows
@@ -112,7 +112,7 @@ class AdamState:
 
     def state(self) -> State:
         first, second = (
-            prefixed(part, with_role(getattr(self, part), Role.TRAINING)) for part in MOMENTS
+            add_prefix(part, with_role(getattr(self, part), Role.TRAINING)) for part in MOMENTS
         )
         return first | second
 
@@ -231,7 +231,7 @@ class Parameters:
         return found
 
     def to(self, device: torch.device | str) -> Parameters:
-        found = Parameters(moved_to(self.values(), device), self.rates, self.decay, self._roles)
+        found = Parameters(move_to_device(self.values(), device), self.rates, self.decay, self._roles)
         found._adam = self._adam.to(device)
         return found
 

@@ -19,14 +19,14 @@ from dyngs.config import SceneModel
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.core.section import ModelSection
-from dyngs.core.state import Role, State, prefixed, with_role
-from dyngs.core.tensor_checks import require_moments
+from dyngs.core.state import Role, State, add_prefix, with_role
+from dyngs.core.tensor_checks import require_times
 from dyngs.data.scene_space import TYPICAL_EXTENT
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import ColourNetwork, RestPose, restore_colour_network
 from dyngs.gaussians.rendering import GaussianRendering, RenderOptions, Shader, render
 from dyngs.gaussians.visibility import VisibilityMasks
-from dyngs.models.checkpoint import Checkpoint, restored_model
+from dyngs.models.checkpoint import Checkpoint, restore_model
 from dyngs.models.renderable import Renderable, TimeStep, near_plane
 from dyngs.models.views import background_colour
 
@@ -198,12 +198,12 @@ class GaussianScene(Renderable):
         self._derived.clear()
 
     def state(self) -> State:
-        return prefixed(
+        return add_prefix(
             "gaussians", with_role(self.gaussians.detach().tensors(), Role.PER_GAUSSIAN)
-        ) | prefixed(
+        ) | add_prefix(
             "model",
             self._model_state()
-            | ({} if self.colour is None else prefixed("colour", self.colour.state())),
+            | ({} if self.colour is None else add_prefix("colour", self.colour.state())),
         )
 
     @abstractmethod
@@ -222,7 +222,7 @@ def require_gaussians(scene: Renderable, what: str) -> GaussianScene:
 
 def restore_scene(checkpoint: Checkpoint, model: ModelSection) -> GaussianScene:
     """Return the scene of a checkpoint of ``model``; see ``restored_model``."""
-    return require_gaussians(restored_model(checkpoint, model), checkpoint.name)
+    return require_gaussians(restore_model(checkpoint, model), checkpoint.name)
 
 
 def _number(time: float | TimeStep | None) -> float | None:
@@ -268,4 +268,4 @@ def times_state(times: tuple[float, ...]) -> State:
 def restore_times(tensors: Mapping[str, Tensor]) -> tuple[float, ...]:
     """Return the training times of a state. Raises ValueError for times that do not ascend within
     [0, 1]."""
-    return tuple(require_moments("times", tensors["times"]).tolist()) if "times" in tensors else ()
+    return tuple(require_times("times", tensors["times"]).tolist()) if "times" in tensors else ()

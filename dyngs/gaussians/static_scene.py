@@ -17,7 +17,7 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import apply_filter, filter_state, restore_filter
 from dyngs.gaussians.rendering import GaussianRendering, RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, restore_times, times_state
-from dyngs.models.renderable import TimeStep, clamped_time, joined_renderings, single_views
+from dyngs.models.renderable import TimeStep, clamp_time, concatenate_renderings, single_views
 
 _UNSEEN = -30.0  # Logit of an opacity that is never drawn
 
@@ -107,7 +107,7 @@ class StaticScene(GaussianScene):
 
     def time_step(self, time: float | None) -> GaussianTimeStep:
         """Return the Gaussians, fused with their 3D filter if there is one."""
-        return GaussianTimeStep(apply_filter(self.gaussians, self.filter_std), clamped_time(time))
+        return GaussianTimeStep(apply_filter(self.gaussians, self.filter_std), clamp_time(time))
 
     def render(
         self,
@@ -133,7 +133,7 @@ class StaticScene(GaussianScene):
             found.append(
                 super().render(camera, own, options=options, background=behind, probe=signal)
             )
-        return joined_renderings(found)
+        return concatenate_renderings(found)
 
     def apply_edit(self, edit: TopologyEdit) -> StaticScene:
         std = None if self.filter_std is None else edit.apply(self.filter_std)

@@ -28,7 +28,7 @@ from dyngs.gaussians.rendering import contributions
 from dyngs.gaussians.scene import restore_appearance
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import RunStart
+from dyngs.models.kind import StartContext
 from dyngs.models.schedule import scaled
 from dyngs.models.views import training_cameras
 
@@ -66,7 +66,7 @@ class SmallGaussianPruning:
         return EditResult(TopologyEdit.select(kept), message=text)
 
 
-def build_small_pruning(run: RunStart) -> SmallGaussianPruning:
+def build_small_pruning(run: StartContext) -> SmallGaussianPruning:
     """Return when and by which views Gaussians of a run are removed: when no more are added."""
     config = run.config
     strategy = run.config.strategy
@@ -126,13 +126,13 @@ class StaticTraining(SceneTraining[StaticScene]):
         return StaticScene.from_state(gaussians, tensors)
 
 
-def _still(run: RunStart) -> FrozenMask | None:
+def _still(run: StartContext) -> FrozenMask | None:
     init = run.config.init
     rows = None if run.first is None else run.first.frozen
     return FrozenMask(rows, init.trains == "colour") if isinstance(init, SceneInit) else None
 
 
-def start(run: RunStart) -> GaussianModel:
+def start(run: StartContext) -> GaussianModel:
     """Return the model of a static scene before its first step."""
     gaussians = load_or_create_gaussians(run)
     colours = build_colour_training(run, gaussians, uses_time=False)

@@ -55,7 +55,7 @@ class HumanModel(_OnTemplate):
     )
 
     @property
-    def moving_bytes(self) -> int:
+    def bytes_per_moving_gaussian(self) -> int:
         """Bytes of its anchor, weights of joints, their gradients, and the Gaussian in a pose, where
         the body fit is refined."""
         return 2600

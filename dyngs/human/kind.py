@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from dyngs.core.conventions import ReportProgress
+from dyngs.core.conventions import ProgressCallback
 from dyngs.human.keys import NO_BODY, HumanModel
-from dyngs.models.kind import HasBody, HasGaussians, InMotion
+from dyngs.models.kind import HasBody, HasGaussians, PlayedMotion
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,7 +34,7 @@ class HumanKind(HasGaussians, HasBody):
         data: DataConfig,
         section: HumanModel,
         say: Callable[[str], None],
-        report: ReportProgress,
+        report: ProgressCallback,
     ) -> DataConfig:
         """Return the options of a capture with a body: found, and fitted to the silhouettes."""
         from dyngs.capture.sfm.unposed import is_unposed
@@ -48,7 +48,7 @@ class HumanKind(HasGaussians, HasBody):
             data, section, only_if_needed=not section.fit, say=say, report=report
         )
 
-    def in_motion(
+    def play_motion(
         self,
         section: HumanModel,
         scene: Posable,
@@ -56,7 +56,7 @@ class HumanKind(HasGaussians, HasBody):
         path: Path,
         *,
         keep_feet: bool,
-    ) -> InMotion:
+    ) -> PlayedMotion:
         from dyngs.human.avatar.play_motion import play_motion
 
         return play_motion(section, scene, info, path, keep_feet=keep_feet)

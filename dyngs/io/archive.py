@@ -11,7 +11,7 @@ import stat
 import zipfile
 from pathlib import Path, PurePosixPath
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.io.fields import require_at_most
 from dyngs.io.write import cache_folder, temporary_folder_beside
 
@@ -46,7 +46,7 @@ def unpacked(path: Path) -> Path:
     Raises DyngsError: a damaged or encrypted archive; too many files or bytes; a name that leads
     out of the folder, a link; no room on the disk. Nothing is left in the cache then.
     """
-    with reading(path, _ADVICE), zipfile.ZipFile(path) as archive:
+    with wrap_read_errors(path, _ADVICE), zipfile.ZipFile(path) as archive:
         members = _checked_members(path, archive)
         status = path.stat()
         content = [(name, info.file_size, info.CRC) for name, info in members.items()]

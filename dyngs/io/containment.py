@@ -16,7 +16,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-from dyngs.core.errors import DyngsError, require_regular
+from dyngs.core.errors import DyngsError, require_regular_file
 
 LIMITS_VARIABLE = "DYNGS_LIMITS"
 """Environment variable that multiplies all limits: 4 allows four times as much of everything."""
@@ -66,7 +66,7 @@ def inside(path: Path) -> Path:
             f"{path}: leads to {real}, which lies outside the capture {boundary[0]}; "
             "copy the file into the capture, or, if you trust it to name files of yours, set data.follow_links=true"
         )
-    require_regular(path)
+    require_regular_file(path)
     return path
 
 

@@ -11,7 +11,7 @@ from typing import Any, TextIO, TypeGuard
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, reading, require_regular
+from dyngs.core.errors import DyngsError, wrap_read_errors, require_regular_file
 from dyngs.io.containment import inside, require_at_most
 
 MOST_TEXT_BYTES = 1 << 26
@@ -25,7 +25,7 @@ def read_limited(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
         DyngsError: it is larger, a pipe or a device.
         OSError: it cannot be read.
     """
-    require_regular(path)
+    require_regular_file(path)
     require_at_most(path, path.stat().st_size, most, "bytes")
     return path.read_bytes()
 
@@ -44,7 +44,7 @@ def read_json_object(path: Path, what: str = "it must be a JSON object") -> dict
 
 def read_json(path: Path) -> Any:
     """Read the JSON in ``path``, UTF-8, 16 or 32. Raises DyngsError."""
-    with reading(path, "it must be a JSON file; copy or export it again"):
+    with wrap_read_errors(path, "it must be a JSON file; copy or export it again"):
         try:
             return json.loads(read_limited(inside(path)))
         except json.JSONDecodeError as error:

@@ -18,7 +18,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, reading, require_regular
+from dyngs.core.errors import DyngsError, wrap_read_errors, require_regular_file
 from dyngs.io.fields import require_at_most
 
 _TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
@@ -50,7 +50,7 @@ class GltfFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         text, self._attached = _chunks(path)
-        with reading(path):
+        with wrap_read_errors(path):
             self.json: dict[str, Any] = json.loads(text)
             if not self.json["asset"]["version"].startswith("2."):
                 raise ValueError("its version is not 2")
@@ -73,7 +73,7 @@ class GltfFile:
 
         Raises DyngsError: the accessor has another type than ``kind``, or lies outside its buffer.
         """
-        with reading(self.path, f"accessor {index} is broken; export it again"):
+        with wrap_read_errors(self.path, f"accessor {index} is broken; export it again"):
             accessor = self.json["accessors"][index]
             if accessor["type"] != kind:
                 raise self.error(
@@ -130,8 +130,8 @@ class GltfFile:
 
 def _chunks(path: Path) -> tuple[bytes, bytes]:
     """Return the JSON chunk and the binary chunk of a file."""
-    require_regular(path)
-    with reading(path):
+    require_regular_file(path)
+    with wrap_read_errors(path):
         content = path.read_bytes()
     if content[:4] != b"glTF":  # a .gltf
         return content.removeprefix(b"\xef\xbb\xbf"), b""

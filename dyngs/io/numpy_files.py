@@ -12,7 +12,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.io.containment import check_size, inside
 from dyngs.io.fields import entry, require_at_most
 
@@ -34,7 +34,7 @@ def read_arrays(
     if path.exists() and not path.is_file():
         raise DyngsError(f"{path}: is no file; name a .npz")
     advice = "it is not a .npz, or a damaged one: copy it again"
-    with reading(path, advice), path.open("rb") as file, zipfile.ZipFile(file) as archive:
+    with wrap_read_errors(path, advice), path.open("rb") as file, zipfile.ZipFile(file) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         picked = {name: members[name] for name in choose(members)}
         total = sum(info.file_size for info in picked.values())
@@ -43,7 +43,7 @@ def read_arrays(
         total = 0
         for name, info in picked.items():
             with (
-                reading(f"{path}: '{name:.40}'", "it must be an array of numbers; export it again"),
+                wrap_read_errors(f"{path}: '{name:.40}'", "it must be an array of numbers; export it again"),
                 archive.open(info) as stream,
             ):
                 found[name] = _array(stream, total, path)
@@ -55,7 +55,7 @@ def read_npy(path: Path) -> np.ndarray:
     """Read the float64 array of a ``.npy`` file; archives and Python objects are refused."""
     # NumPy reads the header as Python text; a damaged one raises nearly anything.
     with (
-        reading(path, "it must be a NumPy array of numbers; copy it again"),
+        wrap_read_errors(path, "it must be a NumPy array of numbers; copy it again"),
         inside(path).open("rb") as file,
     ):
         return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
@@ -143,7 +143,7 @@ def _hdf5(path: Path, key: str, rows: int | EllipsisType | None) -> Any:
     if not inside(path).is_file():
         raise DyngsError(f"{path}: no such file; restore it")
     advice = f"'{key}' must be a data set in an HDF5 file; copy the file again"
-    with reading(path, advice), h5py.File(path, "r") as file:
+    with wrap_read_errors(path, advice), h5py.File(path, "r") as file:
         found: Any = file.get(key)
         # A link inside the file may lead to another file.
         is_own = isinstance(file.get(key, getlink=True), h5py.HardLink)

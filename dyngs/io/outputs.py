@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dyngs.core.errors import DyngsError, as_word, require_regular, warn
+from dyngs.core.errors import DyngsError, quote_path, require_regular_file, warn
 from dyngs.io.containment import leaving_links
 from dyngs.io.fields import read_limited
 from dyngs.io.write import remove_quietly, require_replaceable, temporary_folder_beside, write_text
@@ -41,7 +41,7 @@ def command_for(path: Path, *, captures: bool = True) -> str | None:
 
     Only names are looked at, those directly in a folder and in ``images`` below it.
     """
-    where = as_word(path)
+    where = quote_path(path)
     static = f"`dyngs train static data.root={where}`"
     dynamic = f"`dyngs train dynamic data.root={where}`"
     either = f"make a scene of it with {static}, or {dynamic} if things move"
@@ -266,7 +266,7 @@ def _locked(path: Path) -> tuple[int, bool]:
     folder = path.parent
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
     while True:
-        require_regular(path)
+        require_regular_file(path)
         try:
             file = os.open(path, flags, 0o666)
         except OSError as error:

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.io.fields import require_at_most
 from dyngs.io.numpy_files import array_header, require_text
 
@@ -105,7 +105,7 @@ def read_pickled_array(path: Path) -> object:
 def _unpickled(path: Path, is_array: bool) -> object:
     if not path.is_file():
         raise DyngsError(f"{path}: no such file; restore it")
-    with reading(path, "it must be a pickle; copy it again, or export it as arrays"):
+    with wrap_read_errors(path, "it must be a pickle; copy it again, or export it as arrays"):
         content = path.read_bytes()
         file = io.BytesIO(content)
         if is_array and array_header(file)[2].kind != "O":

@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError, reason, require_regular
+from dyngs.core.errors import DyngsError, reason, require_regular_file
 from dyngs.io.write import atomic_file, remove_quietly, temporary_folder_beside
 
 
@@ -68,7 +68,7 @@ def read_tensors(
     path: Path, kind: FileKind, advice: str
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Read header and tensors of a file. Raises DyngsError."""
-    require_regular(path)
+    require_regular_file(path)
     try:
         with safe_open(path, framework="pt") as file:
             header = json.loads((file.metadata() or {}).get(kind.key, "null"))

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, printable
+from dyngs.core.errors import DyngsError, format_one_line
 
 CACHE_VARIABLE = "DYNGS_CACHE_DIR"
 _NAME = re.compile(
@@ -247,7 +247,7 @@ def image_error(source: Any) -> str:
     """Return the last error of OpenImageIO, or of one of its readers and writers, as one short
     line, "" if there is none."""
     text = any_text(source.geterror).strip()
-    return printable(text.splitlines()[0], 100) if text else ""
+    return format_one_line(text.splitlines()[0], 100) if text else ""
 
 
 def any_text(ask: Callable[[], str]) -> str:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dyngs.config import Config, DataConfig
 from dyngs.core.conventions import RasterizeMode
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.core.section import ModelSection
 from dyngs.core.state import part_of
 from dyngs.data.capture import Capture
@@ -21,7 +21,7 @@ from dyngs.data.scene_space import change_coordinates
 from dyngs.models.kind import kind_of
 from dyngs.models.renderable import Renderable
 
-OTHER_CONFIG = "was its config changed? Otherwise train anew"
+CONFIG_ADVICE = "was its config changed? Otherwise train anew"
 """Advice where a checkpoint and its run do not fit together."""
 
 _MAX_STEP = 2**53
@@ -40,7 +40,7 @@ _SETTINGS = (
 """Keys of the configuration that decide what a checkpoint holds."""
 
 
-def settings_of(config: Config) -> dict[str, Any]:
+def checkpoint_settings(config: Config) -> dict[str, Any]:
     """Return the settings that decide what a checkpoint holds, by dotted key; None where a section
     has no such key."""
     found = {}
@@ -64,7 +64,7 @@ class CheckpointInfo:
     world_scale: float = 1.0  # as ``Capture.world_scale``
 
 
-def info_of(header: Mapping[str, Any]) -> CheckpointInfo:
+def parse_info(header: Mapping[str, Any]) -> CheckpointInfo:
     """Return the metadata in the header of a file. Raises KeyError, ValueError, TypeError or
     OverflowError."""
     step, (x, y, z) = header["step"], (float(value) for value in header["world_offset"])
@@ -86,7 +86,7 @@ def info_of(header: Mapping[str, Any]) -> CheckpointInfo:
     return CheckpointInfo(step, extent, (x, y, z), background, mode, scale)
 
 
-def read_capture_of(data: DataConfig, info: CheckpointInfo) -> Capture:
+def read_run_capture(data: DataConfig, info: CheckpointInfo) -> Capture:
     """Return the capture of a run in the scene coordinates that the run was trained in.
 
     Those of ``read_capture`` may differ: the capture has changed since, or another version of dyngs
@@ -113,7 +113,7 @@ class Checkpoint:
     def require_settings(self, config: Config) -> None:
         """Raise where ``config`` has another value of a setting that decided what the checkpoint
         holds."""
-        for name, now in settings_of(config).items():
+        for name, now in checkpoint_settings(config).items():
             before = self.settings.get(name, now)
             if before != now:
                 raise DyngsError(
@@ -126,15 +126,15 @@ class Checkpoint:
         return part_of(self.tensors, prefix)
 
 
-def restored_model(checkpoint: Checkpoint, model: ModelSection) -> Renderable:
+def restore_model(checkpoint: Checkpoint, model: ModelSection) -> Renderable:
     """Return the scene of a checkpoint of ``model``.
 
     Raises:
         DyngsError: a tensor is missing, or is not as the model or the other tensors have it; names
             the file.
     """
-    with reading(checkpoint.name, OTHER_CONFIG):
+    with wrap_read_errors(checkpoint.name, CONFIG_ADVICE):
         try:
             return kind_of(model).restore(model, checkpoint)
         except KeyError as missing:
-            raise DyngsError(f"{checkpoint.name} lacks {missing}; {OTHER_CONFIG}") from None
+            raise DyngsError(f"{checkpoint.name} lacks {missing}; {CONFIG_ADVICE}") from None

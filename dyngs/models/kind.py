@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 
 from dyngs.config.kinds import installed_kind
-from dyngs.core.conventions import ReportProgress
+from dyngs.core.conventions import ProgressCallback
 from dyngs.core.errors import DyngsError
 from dyngs.core.section import ModelSection, SceneModel
 
@@ -38,14 +38,14 @@ if TYPE_CHECKING:
     Restore = Callable[[Any, Checkpoint], Renderable]
     MakeLearner = Callable[[Config, torch.Generator], Learner[Any]]
     MakePredictor = Callable[
-        [Config, Checkpoint, DataConfig, Callable[[str], None], ReportProgress], Predictor
+        [Config, Checkpoint, DataConfig, Callable[[str], None], ProgressCallback], Predictor
     ]
 
 C = TypeVar("C", bound="ModelKind")
 
 
 @dataclass(frozen=True)
-class RunStart:
+class StartContext:
     """What a model begins with."""
 
     config: Config
@@ -88,7 +88,7 @@ class ModelKind(ABC):
         """Import the model; return the function that returns it before the first step, and the one
         that returns the scene of a checkpoint (KeyError or ValueError: its tensors do not fit)."""
 
-    def start(self, run: RunStart) -> Model[Any]:
+    def start(self, run: StartContext) -> Model[Any]:
         """Return the model before the first step."""
         return self.functions()[0](run)
 
@@ -98,7 +98,7 @@ class ModelKind(ABC):
         return self.functions()[1](section, checkpoint)
 
 
-class Predicts(ModelKind):
+class PredictsScenes(ModelKind):
     """A network that predicts scenes from a few images, and is trained on several captures."""
 
     uses: ClassVar[frozenset[str]] = frozenset()
@@ -138,12 +138,12 @@ class HasGaussians(ModelKind):
     speeds_up_short_runs: ClassVar[bool] = False
     """Learning rates are higher in shorter runs, see ``optim.rate_factor``."""
 
-    def adding(self, section: SceneModel, most: int) -> SceneModel:
+    def with_added_gaussians(self, section: SceneModel, most: int) -> SceneModel:
         """Return the section with at most ``most`` Gaussians added beside the strategy."""
         return section
 
 
-class LimitsSize(HasGaussians):
+class HasSizeLimit(HasGaussians):
     """The size of its file follows from the number of its Gaussians."""
 
     def num_shared(self, section: Any, num_times: int, num_moving: int = 0) -> int:
@@ -151,15 +151,15 @@ class LimitsSize(HasGaussians):
         return 0
 
 
-class Moves(ModelKind):
+class HasMotion(ModelKind):
     """Moves over the times of the capture, after a while as a static model."""
 
 
-class ExtendsTo(ModelKind):
+class HasSchedules(ModelKind):
     """A kind whose section has schedules that depend on the length of the run."""
 
     @abstractmethod
-    def extended(self, section: Any, length: Length) -> ModelSection:
+    def extend_schedules(self, section: Any, length: Length) -> ModelSection:
         """Return the section for a run that goes on to another length. Raises DyngsError: it
         cannot."""
 
@@ -173,15 +173,15 @@ class HasBody(ModelKind):
         data: DataConfig,
         section: Any,
         say: Callable[[str], None],
-        report: ReportProgress,
+        report: ProgressCallback,
     ) -> DataConfig:
         """Return the options of a capture with body parameters: found, and fitted to the
         silhouettes."""
 
     @abstractmethod
-    def in_motion(
+    def play_motion(
         self, section: Any, scene: Posable, info: CheckpointInfo, path: Path, *, keep_feet: bool
-    ) -> InMotion:
+    ) -> PlayedMotion:
         """Return a person in the motion of a file (AMASS, SMPL-X, BVH, glTF or VRM animation).
 
         A file with ``scale`` is a fit to this person in the world of the capture; any other motion
@@ -197,7 +197,7 @@ class HasBody(ModelKind):
 
 
 @dataclass(frozen=True)
-class InMotion:
+class PlayedMotion:
     """A person who plays the motion of a file."""
 
     scene: Posable

@@ -42,13 +42,13 @@ class Drawn:
 
 
 @dataclass(frozen=True)
-class Updated:
+class UpdateResult:
     """What an update has done."""
 
     bad: Count = 0  # number of rows left out because their gradient was not finite
     finding: str | None = None  # lines about what was found out, or None
     # there are other rows now: several processes must have come to the same
-    is_rearranged: bool = False
+    topology_changed: bool = False
 
 
 class Model(ABC, Generic[S_co]):
@@ -59,7 +59,7 @@ class Model(ABC, Generic[S_co]):
             for messages.
     """
 
-    moves_by: tuple[str, str] = ("", "")
+    deformation_name: tuple[str, str] = ("", "")
 
     @property
     @abstractmethod
@@ -71,7 +71,7 @@ class Model(ABC, Generic[S_co]):
         """Return how ``image`` is drawn in ``step`` before ``background`` (3,), differentiable."""
 
     @abstractmethod
-    def update(self, step: int) -> Updated:
+    def update(self, step: int) -> UpdateResult:
         """Change what is learned by the gradients that are there, and drop them."""
 
     @property
@@ -108,7 +108,7 @@ class Model(ABC, Generic[S_co]):
         may."""
         return True
 
-    def holds_out(self, index: int, step: int) -> bool:
+    def is_held_out(self, index: int, step: int) -> bool:
         """Return whether training view ``index`` must not be trained on in ``step``."""
         return False
 
@@ -136,7 +136,7 @@ class Model(ABC, Generic[S_co]):
 
 
 @dataclass(frozen=True)
-class Look:
+class LossInput:
     """A training image next to its rendering, for terms of the loss."""
 
     index: int  # of the view
@@ -157,7 +157,7 @@ class Loss:
         """Return whether ``image`` must be drawn with its depth."""
         return False
 
-    def __call__(self, look: Look) -> Mapping[str, Tensor]:
+    def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
         """Return differentiable scalars, weighted, by name."""
         raise NotImplementedError
 

@@ -12,12 +12,12 @@ import torch
 from torch import Tensor, nn
 
 from dyngs.config import Config, DataConfig, TrainConfig
-from dyngs.core.conventions import ReportProgress
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.conventions import ProgressCallback
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
-from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
+from dyngs.models.checkpoint import CONFIG_ADVICE, Checkpoint
 from dyngs.models.model import Model
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour, evaluation_background
@@ -67,12 +67,12 @@ class Encoder(nn.Module):
         return self.levels(images)[1:]
 
 
-def upsampled(features: Tensor) -> Tensor:
+def upsample(features: Tensor) -> Tensor:
     """Return features (B, C, H, W) at twice the resolution, bilinear."""
     return nn.functional.interpolate(features, scale_factor=2, mode="bilinear", align_corners=False)
 
 
-def begin_weights(network: nn.Module, generator: torch.Generator) -> None:
+def initialize_weights(network: nn.Module, generator: torch.Generator) -> None:
     """Draw the weights of all convolutions (He et al. 2015) from ``generator``, on the CPU; biases
     are 0."""
     for layer in network.modules():
@@ -118,7 +118,7 @@ class Predictor(ABC, Generic[N]):
     def chosen(self, count: int) -> list[int]:
         """Return the indices of ``count`` of the views that suit a prediction."""
 
-    def adapt(self, views: Sequence[int], steps: int | None, report: ReportProgress) -> int:
+    def adapt(self, views: Sequence[int], steps: int | None, report: ProgressCallback) -> int:
         """Train the network for ``steps`` on these images alone, None: as many as usual; return how
         many these were."""
         if steps:
@@ -137,7 +137,7 @@ class Predictor(ABC, Generic[N]):
     def run_config(self, views: Sequence[int]) -> Config:
         """Return the configuration of the run that the scene becomes, which training can refine."""
 
-    def data_of_moment(self, time: float | None, times: Collection[float]) -> DataConfig:
+    def data_at_time(self, time: float | None, times: Collection[float]) -> DataConfig:
         """Return the options of the time step of the capture, at ``times``, that is nearest to
         ``time``; None: as given."""
         moments = sorted(set(times))
@@ -189,7 +189,7 @@ class Learner(ABC, Generic[N]):
         chosen = config.data.background
         self.background = chosen if chosen == "random" else evaluation_background(chosen, True)[0]
 
-    def drawn_background(self, generator: torch.Generator) -> Tensor:
+    def sample_background(self, generator: torch.Generator) -> Tensor:
         """Return the colour (3,) behind an example."""
         return copy_async(background_colour(self.background, generator), self.device)
 
@@ -213,7 +213,7 @@ def random_index(count: int, generator: torch.Generator) -> int:
     return int(torch.randint(count, (1,), generator=generator, device="cpu"))
 
 
-def kept_open(
+def keep_captures_open(
     open_person: Callable[[DataConfig], P], people: Sequence[DataConfig]
 ) -> Callable[[int], P]:
     """Return a function that opens the captures of people, of which the last ones stay open.
@@ -232,7 +232,7 @@ def load_weights(network: nn.Module, checkpoint: Checkpoint, part: str = "model.
     own = network.state_dict()
     if {k: x.shape for k, x in weights.items()} != {k: x.shape for k, x in own.items()}:
         raise DyngsError(f"{checkpoint.name} is not of this network; was its config changed?")
-    with reading(checkpoint.name, OTHER_CONFIG):
+    with wrap_read_errors(checkpoint.name, CONFIG_ADVICE):
         for name, x in weights.items():
             require_tensor(name, x, tuple(x.shape), own[name].dtype)
         network.load_state_dict(weights)
@@ -290,7 +290,7 @@ def load_optimizer(
         }
 
 
-def named_views(capture: str, views: Sequence[View], names: Sequence[str]) -> list[int]:
+def find_views(capture: str, views: Sequence[View], names: Sequence[str]) -> list[int]:
     """Return the indices of the views with these names, or with images of these file names.
 
     Raises DyngsError: an unknown name, or the same view twice.

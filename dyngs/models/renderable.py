@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import Role, State, fields_moved_to
+from dyngs.core.state import Role, State, move_fields_to
 from dyngs.data.capture import Capture, Split
 from dyngs.ops.registration import check_choice, check_finite, check_number
 
@@ -126,10 +126,10 @@ class Rendering:
     ) -> T:
         """Return the same images on another device or in another precision; integers stay
         integers."""
-        return fields_moved_to(self, device, dtype)
+        return move_fields_to(self, device, dtype)
 
 
-def joined_renderings(found: Sequence[Images]) -> Images:
+def concatenate_renderings(found: Sequence[Images]) -> Images:
     """Return the images of renderings of the same size, of any number of views each, as one
     rendering."""
     first = found[0]
@@ -205,7 +205,7 @@ class Renderable(ABC):
 
     def time_step(self, time: float | None) -> TimeStep:
         """Return what drawing at ``time`` needs, clamped to [0, 1]; None is the first."""
-        return TimeStep(clamped_time(time))
+        return TimeStep(clamp_time(time))
 
     @abstractmethod
     def state(self) -> State:
@@ -221,7 +221,7 @@ class Renderable(ABC):
         see."""
         return None
 
-    def page_lists(self) -> tuple[dict[str, Any], dict[str, tuple[Tensor, Literal[8, 16]]]] | None:
+    def page_data(self) -> tuple[dict[str, Any], dict[str, tuple[Tensor, Literal[8, 16]]]] | None:
         """Return what a page draws of a scene that is not made of Gaussians: its header, and rows
         (R, D) by name with the bits of each number; None: there is no page of it."""
         return None
@@ -234,7 +234,7 @@ class Renderable(ABC):
 
     def to(self: R, device: torch.device | str) -> R:
         """Return it with its tensors on ``device``."""
-        return fields_moved_to(self, device)
+        return move_fields_to(self, device)
 
 
 def single_views(
@@ -349,7 +349,7 @@ def _numbers(x: Tensor) -> NDArray[Any]:
     return x.detach().cpu().numpy()
 
 
-def clamped_time(time: float | None) -> float:
+def clamp_time(time: float | None) -> float:
     """Return ``time`` within [0, 1]; None is 0. Raises DyngsError for NaN."""
     if time is not None and math.isnan(time):
         raise DyngsError("the time to draw is not a number; give one from 0 to 1")
@@ -360,7 +360,7 @@ class Posable(Renderable):
     """A person, whose body can play other motions than that of training."""
 
     @abstractmethod
-    def up_of_body(self) -> Tensor:
+    def body_up_direction(self) -> Tensor:
         """Return the direction (3,) that is up for the body at rest."""
 
     @abstractmethod
@@ -372,5 +372,5 @@ class Posable(Renderable):
         """Return it moved by a similarity: rotation (3, 3), then scale, then shift (3,)."""
 
     @abstractmethod
-    def as_filmed(self: P, capture: Capture, split: Split) -> P:
+    def for_split(self: P, capture: Capture, split: Split) -> P:
         """Return it as the views of a split of its capture show it."""

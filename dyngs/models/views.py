@@ -19,7 +19,7 @@ OPAQUE = 0.99  # Alpha from which a pixel shows no background
 ALIKE = 0.1  # Largest difference of a channel up to which a colour counts as that of the background
 
 
-def share_alike(images: Iterable[Image], background: Tensor) -> float | None:
+def background_coloured_fraction(images: Iterable[Image], background: Tensor) -> float | None:
     """Return the fraction of the opaque pixels whose channels all differ from ``background`` (3,)
     by ``ALIKE`` or less.
 
@@ -54,7 +54,7 @@ def background_colour(name: str, generator: torch.Generator | None = None) -> Te
     return torch.full((3,), _BACKGROUNDS["black" if name == "random" else name], device="cpu")
 
 
-def resolved_background(config: Config, capture: Capture) -> str:
+def resolve_background(config: Config, capture: Capture) -> str:
     """Return "white", "black" or "random"; "auto" is white where images have alpha, as in 3DGS,
     else black."""
     if config.data.background == "auto":

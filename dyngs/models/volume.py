@@ -56,7 +56,7 @@ def reached_samples(densities: Tensor, samples: Samples) -> tuple[Samples, Tenso
 
 
 @torch.no_grad()
-def thinned_samples(densities: Tensor, samples: Samples, shifts: Tensor) -> tuple[Samples, Tensor]:
+def thin_samples(densities: Tensor, samples: Samples, shifts: Tensor) -> tuple[Samples, Tensor]:
     """As ``reached_samples``; of light ones each fourth is taken, four times as long around the
     same middle.
 
@@ -72,13 +72,13 @@ def thinned_samples(densities: Tensor, samples: Samples, shifts: Tensor) -> tupl
     light = weights < LIGHT
     chosen = through & (~light | (place % EVERY == 0))
     more = light.to(densities) * ((EVERY - 1) / 2) * (samples.ends - samples.starts)
-    return kept_samples(
+    return select_samples(
         replace(samples, starts=samples.starts - more, ends=samples.ends + more), chosen
     )
 
 
 @torch.no_grad()
-def kept_samples(samples: Samples, chosen: Tensor) -> tuple[Samples, Tensor]:
+def select_samples(samples: Samples, chosen: Tensor) -> tuple[Samples, Tensor]:
     """Return the samples (K) that are ``chosen`` (M,) bool, and their indices (K,) among all."""
     counts = torch.zeros(samples.num_rays, dtype=torch.int64, device=chosen.device)
     counts.index_add_(0, samples.rays.long(), chosen.long())

@@ -18,13 +18,13 @@ import torch
 
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
-from dyngs.core.errors import DyngsError, as_word, reading
+from dyngs.core.errors import DyngsError, quote_path, wrap_read_errors
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.io.fields import read_limited
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.io.write import write_text
-from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, info_of, restored_model
-from dyngs.models.kind import Predicts, capability
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, parse_info, restore_model
+from dyngs.models.kind import PredictsScenes, capability
 from dyngs.models.renderable import Renderable
 from dyngs.runs.stored_file import read_scene
 
@@ -55,7 +55,7 @@ class LoadedRun:
 def checkpoint_paths(run_dir: Path) -> list[Path]:
     """Return the run's checkpoints, oldest first."""
     found = (run_dir / "checkpoints").glob("step_*.safetensors")
-    return sorted((f for f in found if re.fullmatch(r"step_[0-9]+", f.stem)), key=step_of)
+    return sorted((f for f in found if re.fullmatch(r"step_[0-9]+", f.stem)), key=checkpoint_step)
 
 
 def remove_old_checkpoints(run_dir: Path) -> None:
@@ -64,7 +64,7 @@ def remove_old_checkpoints(run_dir: Path) -> None:
         old.unlink(missing_ok=True)
 
 
-def step_of(path: Path) -> int:
+def checkpoint_step(path: Path) -> int:
     """Return the number of steps done, from the name of a checkpoint."""
     return int(path.stem.removeprefix("step_"))
 
@@ -82,7 +82,7 @@ def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float)
             field = name.removeprefix("gaussians.").removeprefix("model.")
             step = checkpoint.info.step
             raise DyngsError(
-                f"{run_dir}: {field} is not finite after step {step}; not saved. {last_good(run_dir)}"
+                f"{run_dir}: {field} is not finite after step {step}; not saved. {describe_last_checkpoint(run_dir)}"
             )
     path = run_dir / "checkpoints" / f"step_{checkpoint.info.step:07d}.safetensors"
     # Its time first: a checkpoint whose time is lost by a kill between the two would go on as if it
@@ -98,8 +98,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
     """Return the checkpoint in ``path``. Raises DyngsError, which names an older one if there
     is."""
     header, tensors = read_tensors(path, _KIND, _instead_of(path))
-    with reading(path, _instead_of(path).removeprefix("; ")):
-        return Checkpoint(info_of(header), tensors, path, dict(header.get("settings", {})))
+    with wrap_read_errors(path, _instead_of(path).removeprefix("; ")):
+        return Checkpoint(parse_info(header), tensors, path, dict(header.get("settings", {})))
 
 
 def latest_checkpoint(run_dir: Path) -> Checkpoint:
@@ -122,9 +122,9 @@ def load_run(run_dir: Path, data_root: Path | None = None) -> LoadedRun:
     """Return the model of a run folder at its newest checkpoint, or of its .dyngs file if it has
     none."""
     config = load_resolved(run_dir, data_root=data_root)
-    if capability(config.model, Predicts) is not None:
+    if capability(config.model, PredictsScenes) is not None:
         raise DyngsError(
-            f"{run_dir}: a network, not a scene; `dyngs predict {as_word(run_dir)} CAPTURE --out RUN` makes one"
+            f"{run_dir}: a network, not a scene; `dyngs predict {quote_path(run_dir)} CAPTURE --out RUN` makes one"
         )
     checkpoint = (
         replace(read_scene(run_dir / SCENE_FILE), path=run_dir / SCENE_FILE)
@@ -132,7 +132,7 @@ def load_run(run_dir: Path, data_root: Path | None = None) -> LoadedRun:
         else latest_checkpoint(run_dir)
     )
     checkpoint.require_settings(config)
-    scene = restored_model(checkpoint, config.model)
+    scene = restore_model(checkpoint, config.model)
     step = checkpoint.info.step
     return LoadedRun(config, scene, step, seconds_at(run_dir, step), checkpoint.info)
 
@@ -143,7 +143,7 @@ def has_only_scene_file(run_dir: Path) -> bool:
     return (run_dir / SCENE_FILE).is_file() and not checkpoint_paths(run_dir)
 
 
-def last_good(run_dir: Path) -> str:
+def describe_last_checkpoint(run_dir: Path) -> str:
     """Return a sentence that names the newest checkpoint, or says that there is none."""
     paths = checkpoint_paths(run_dir)
     return f"The last good checkpoint is {paths[-1]}" if paths else "There is no checkpoint yet"
@@ -174,7 +174,7 @@ def _write_seconds(run_dir: Path, step: int, seconds: float) -> None:
 
 def _instead_of(path: Path) -> str:
     """Return the end of a message on what to do about a damaged checkpoint."""
-    older = [p for p in checkpoint_paths(path.parent.parent) if step_of(p) < step_of(path)]
+    older = [p for p in checkpoint_paths(path.parent.parent) if checkpoint_step(p) < checkpoint_step(path)]
     if older:
         return f"; delete it to go on from the previous one, {older[-1].name}"
     return "; there is no older one, train anew"

@@ -20,14 +20,14 @@ from pydantic import BaseModel
 
 from dyngs.config import Config, DataConfig, RunConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
-from dyngs.core.errors import DyngsError, as_word
+from dyngs.core.errors import DyngsError, quote_path
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.io.fields import read_limited
 from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity, similarity_of
 from dyngs.io.outputs import LOCK_NAME, Inputs, new_folder, writing
 from dyngs.io.write import remove_leftovers, remove_quietly, temporary_folder_beside, write_text
-from dyngs.models.kind import Predicts, capability
+from dyngs.models.kind import PredictsScenes, capability
 from dyngs.runs.capture_record import RECORD_NAME, require_same_capture
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
@@ -35,7 +35,7 @@ from dyngs.runs.checkpoint import (
     LoadedRun,
     checkpoint_paths,
     has_only_scene_file,
-    step_of,
+    checkpoint_step,
 )
 
 BODY_FOLDER = "body"
@@ -61,7 +61,7 @@ def write_config(config: Config, folder: Path) -> None:
     save_config(config, folder / RESOLVED_NAME)
 
 
-def with_body_of(config: Config, stored: Config) -> Config:
+def share_body_path(config: Config, stored: Config) -> Config:
     """Return ``config`` with the path of the fit of ``stored``, where both have the same."""
     return (
         _with_body(config, stored.data.body)
@@ -110,14 +110,14 @@ EXPORT_FOLDER = "export"
 """In a run folder: the run as one .dyngs file of at most ``budget.max_mb``."""
 CHOICES_NAME = "choices.json"
 """In a run folder: what small runs before it said."""
-ASKED_NAME = "asked.yaml"
+REQUESTED_NAME = "asked.yaml"
 """In a run folder: the configuration as it was asked for, where training has chosen something else
 (config.yaml)."""
-_BEGUN = (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME, CHOICES_NAME, RECORD_NAME, BODY_FOLDER)
+_BEGUN = (RESOLVED_NAME, REQUESTED_NAME, LOG_NAME, TIMING_NAME, CHOICES_NAME, RECORD_NAME, BODY_FOLDER)
 """Files that a run stopped before its first checkpoint may have written."""
 
 
-def default_folder(name: str) -> Path:
+def default_run_dir(name: str) -> Path:
     """Return the run folder of a run that has only a name."""
     parts = Path(name).parts
     if not parts or ".." in parts or Path(name).is_absolute():
@@ -146,7 +146,7 @@ def require_empty(folder: Path) -> None:
 
 
 @contextmanager
-def folder_of_export(out: Path, run_dir: Path, config: Config) -> Iterator[Path]:
+def open_export_folder(out: Path, run_dir: Path, config: Config) -> Iterator[Path]:
     """Yield the folder to write the stored scene and configuration of a run to: ``out``, or one
     that becomes it."""
     if not out.exists():
@@ -181,10 +181,10 @@ def require_startable(folder: Path, config: Config) -> None:
     begun = _config_of_begun(folder)
     paths = checkpoint_paths(folder)
     found = _found(folder)
-    go_on = f"`dyngs train --resume {as_word(folder)}`, or give another run.dir"
+    go_on = f"`dyngs train --resume {quote_path(folder)}`, or give another run.dir"
     if paths:
         raise DyngsError(
-            f"{folder} already holds a run, stopped after step {step_of(paths[-1]):,}; go on with {go_on}"
+            f"{folder} already holds a run, stopped after step {checkpoint_step(paths[-1]):,}; go on with {go_on}"
         )
     if begun is not None:
         if not (_is_same_run(begun, config) or _is_as_asked(folder, config)):
@@ -198,32 +198,32 @@ def require_startable(folder: Path, config: Config) -> None:
         )
 
 
-def is_done(folder: Path, config: Config) -> bool:
+def is_finished(folder: Path, config: Config) -> bool:
     """Return whether ``folder`` holds the finished run of just this configuration, as it was asked
     for."""
     paths = checkpoint_paths(folder)
     if not paths or not _is_as_asked(folder, config):
         return False
-    return step_of(paths[-1]) >= load_resolved(folder).total_steps
+    return checkpoint_step(paths[-1]) >= load_resolved(folder).total_steps
 
 
-def note_asked(folder: Path, asked: Config) -> None:
+def write_requested_config(folder: Path, asked: Config) -> None:
     """Write the configuration that was requested next to that of the run, if the two differ."""
-    path = folder / ASKED_NAME
+    path = folder / REQUESTED_NAME
     stored = load_resolved(folder)
     if _is_same_run(stored, asked):
         path.unlink(missing_ok=True)
     else:
-        save_config(with_body_of(asked, stored), path)
+        save_config(share_body_path(asked, stored), path)
 
 
-def note_root(folder: Path, data: DataConfig) -> None:
+def update_data_root(folder: Path, data: DataConfig) -> None:
     """Write into the configuration of a run where its capture lies by now; it must be the same
     capture."""
-    for path in (folder / RESOLVED_NAME, folder / ASKED_NAME):
+    for path in (folder / RESOLVED_NAME, folder / REQUESTED_NAME):
         stored = load_resolved(path) if path.is_file() else None
         if stored is not None and stored.data.root != data.root:
-            is_network = capability(stored.model, Predicts) is not None
+            is_network = capability(stored.model, PredictsScenes) is not None
             capture = None if is_network else read_capture(data)
             require_same_capture(folder, data, capture)
             save_config(
@@ -234,20 +234,20 @@ def note_root(folder: Path, data: DataConfig) -> None:
             )
 
 
-def asked_for(folder: Path) -> Config:
+def load_requested_config(folder: Path) -> Config:
     """Return the configuration of a run as it was asked for."""
-    path = folder / ASKED_NAME
+    path = folder / REQUESTED_NAME
     return load_resolved(path if path.is_file() else folder)
 
 
 def _is_as_asked(folder: Path, config: Config) -> bool:
     try:
-        return _is_same_run(asked_for(folder), config)
+        return _is_same_run(load_requested_config(folder), config)
     except DyngsError:  # a file of that name, but not of a run
         return False
 
 
-def was_only_begun(folder: Path) -> bool:
+def is_stopped_before_checkpoint(folder: Path) -> bool:
     """Return whether a run began in ``folder`` and was stopped before its first checkpoint."""
     return _config_of_begun(folder) is not None
 
@@ -259,7 +259,7 @@ def begin(folder: Path, config: Config) -> None:
         write_config(config, folder)
 
 
-def tidy(folder: Path, *, sole_writer: bool) -> None:
+def remove_partial_files(folder: Path, *, sole_writer: bool) -> None:
     """Remove what killed processes left half written in a run folder; its owner calls this before
     it writes.
 
@@ -302,7 +302,7 @@ def _config_of_begun(folder: Path) -> Config | None:
 def _is_same_run(one: Config, other: Config) -> bool:
     """Return whether two runs have the same bytes, whatever they are called, wherever they are, by
     how many threads."""
-    return _what_counts(one) == _what_counts(with_body_of(other, one))
+    return _what_counts(one) == _what_counts(share_body_path(other, one))
 
 
 def _what_counts(config: Config) -> Config:
@@ -313,7 +313,7 @@ def _what_counts(config: Config) -> Config:
 Read = Path | BaseModel | LoadedRun | Capture | None
 
 
-def inputs_of(*read: Read) -> Inputs:
+def collect_inputs(*read: Read) -> Inputs:
     """Return what is read of files, folders, runs, configurations and captures, with all that these
     name.
 
@@ -349,7 +349,7 @@ def _named_by(one: Read) -> Iterator[Path]:
 
 def _files_of_run(run_dir: Path) -> Iterator[Path]:
     yield from (
-        run_dir / name for name in (RESOLVED_NAME, ASKED_NAME, LOG_NAME, TIMING_NAME, RECORD_NAME)
+        run_dir / name for name in (RESOLVED_NAME, REQUESTED_NAME, LOG_NAME, TIMING_NAME, RECORD_NAME)
     )
     yield from checkpoint_paths(run_dir)
     yield from (run_dir / BODY_FOLDER).glob("*")

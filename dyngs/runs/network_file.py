@@ -12,13 +12,13 @@ from pathlib import Path
 import torch
 
 from dyngs.config import Config
-from dyngs.config.io import without_removed_keys
-from dyngs.core.errors import DyngsError, reading
+from dyngs.config.io import drop_removed_model_keys
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import Predicts, capability
-from dyngs.runs.checkpoint import info_of
-from dyngs.runs.folder import inputs_of
+from dyngs.models.kind import PredictsScenes, capability
+from dyngs.runs.checkpoint import parse_info
+from dyngs.runs.folder import collect_inputs
 
 SUFFIX = ".safetensors"
 PUBLISHED = "dyngs_people_weights"
@@ -37,7 +37,7 @@ def write_network(run_dir: Path, config: Config, checkpoint: Checkpoint, path: P
     """
     if path.suffix.lower() != SUFFIX:
         raise DyngsError(f"{path}: a network is written as {SUFFIX}")
-    inputs_of(run_dir).require_output(path)
+    collect_inputs(run_dir).require_output(path)
     if getattr(config.model, "body", None) is not None:
         raise DyngsError(
             f"{run_dir}: a file of a network holds no template, and model.body names one; give the run"
@@ -66,14 +66,14 @@ def read_network(path: Path) -> tuple[Config, Checkpoint]:
     Raises DyngsError: the file is missing, damaged, altered or something else.
     """
     header, tensors = read_tensors(path, _KIND, _ADVICE)
-    with reading(path, _ADVICE.removeprefix("; ")):
-        info = info_of(header)
+    with wrap_read_errors(path, _ADVICE.removeprefix("; ")):
+        info = parse_info(header)
         model = header["model"]
         if not isinstance(model, dict) or model.get("body") is not None:
             raise ValueError("its section model is not that of a network")
-        model = without_removed_keys(model)
+        model = drop_removed_model_keys(model)
         config = Config.model_validate({"data": {"root": path.parent}, "model": model})
-        if capability(config.model, Predicts) is None:
+        if capability(config.model, PredictsScenes) is None:
             raise ValueError(f"it is of model.kind={config.model.kind}")
     return config, Checkpoint(
         info, {n: x.float() if x.is_floating_point() else x for n, x in tensors.items()}, path

@@ -25,7 +25,7 @@ from dyngs.io.formats.formats import all_suffixes, format_to_read, read_splats
 from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity
 from dyngs.io.formats.splat_file import Nonfinite, SplatFile
 from dyngs.io.outputs import command_for
-from dyngs.models.checkpoint import CheckpointInfo, read_capture_of
+from dyngs.models.checkpoint import CheckpointInfo, read_run_capture
 from dyngs.models.kind import HasBody, capability
 from dyngs.models.renderable import Posable, Renderable
 from dyngs.models.static_section import StaticModel
@@ -75,7 +75,7 @@ AVATAR_SUFFIX = ".safetensors"
 
 
 @dataclass(frozen=True)
-class Opened(LoadedRun, Cache):
+class OpenedScene(LoadedRun, Cache):
     """A scene, and what is known about it.
 
     Attributes:
@@ -182,7 +182,7 @@ class Opened(LoadedRun, Cache):
                 self.stated_up
             ), "the file" if self.edited is None else "the edit"
         if self.person is not None:
-            return self.person.up_of_body().double().cpu().numpy(), "the body at rest"
+            return self.person.body_up_direction().double().cpu().numpy(), "the body at rest"
         cameras = self.cameras
         return None if cameras is None else (up_direction(cameras), "the mean camera")
 
@@ -197,27 +197,27 @@ class Opened(LoadedRun, Cache):
         known = found.seconds if isinstance(found, Capture) else None
         return max(known or frames / FRAME_RATE, SHORTEST)
 
-    def showing(self, scene: Renderable) -> Opened:
+    def with_scene(self, scene: Renderable) -> OpenedScene:
         """Return the same with another scene."""
         return replace(self, renderable=scene)
 
-    def to(self, device: torch.device | str) -> Opened:
+    def to(self, device: torch.device | str) -> OpenedScene:
         """Return the same with its scene on ``device``, which then draws it."""
-        return self.showing(self.renderable.to(device))
+        return self.with_scene(self.renderable.to(device))
 
-    def on_background(self, name: str) -> Opened:
+    def on_background(self, name: str) -> OpenedScene:
         """Return the same before a "white" or "black" background."""
-        return self.showing(self.renderable.on_background(background_colour(name)))
+        return self.with_scene(self.renderable.on_background(background_colour(name)))
 
-    def noted(self, *notes: str) -> Opened:
+    def noted(self, *notes: str) -> OpenedScene:
         """Return the same with more notes."""
         return replace(self, notes=(*self.notes, *notes))
 
-    def of_split(self, split: str) -> Opened:
+    def for_split(self, split: str) -> OpenedScene:
         """Return the same as the views of ``split`` show it, see ``scene_of_split``."""
-        return self.showing(scene_of_split(self, self.capture, split))
+        return self.with_scene(scene_of_split(self, self.capture, split))
 
-    def in_motion(self, path: Path, *, keep_feet: bool = False) -> Opened:
+    def play_motion(self, path: Path, *, keep_feet: bool = False) -> OpenedScene:
         """Return the same with its person in the motion of a file, see ``HasBody.in_motion``.
 
         Raises:
@@ -228,17 +228,17 @@ class Opened(LoadedRun, Cache):
         body = capability(self.config.model, HasBody)
         if body is None:
             raise self._no_person(wanted)
-        found = body.in_motion(self.config.model, person, self.info, path, keep_feet=keep_feet)
+        found = body.play_motion(self.config.model, person, self.info, path, keep_feet=keep_feet)
         notes = (*self.notes, *found.notes)
         return replace(self, renderable=found.scene, fps=found.fps, as_captured=False, notes=notes)
 
-    def at_rest(self) -> Opened:
+    def at_rest(self) -> OpenedScene:
         """Return the same with its person in the rest pose of the template, upright on the floor.
         Raises DyngsError."""
         person = self.require_person("--pose rest")
         return replace(self, renderable=person.at_rest(), as_captured=False)
 
-    def in_own_frame(self) -> Opened:
+    def in_edit_frame(self) -> OpenedScene:
         """Return the same with its person moved into the frame of the edit, for files that hold
         nothing but them."""
         how = self.frame
@@ -268,7 +268,7 @@ def open_scene(
     nonfinite: Nonfinite = "error",
     data_root: Path | None = None,
     with_capture: bool = True,
-) -> Opened:
+) -> OpenedScene:
     """Open a run folder, a ``scene.dyngs`` with the ``config.yaml`` of its run, an avatar, or a
     file of Gaussians.
 
@@ -298,50 +298,50 @@ def open_scene(
             f"or a file of Gaussians ({all_suffixes()}, .ckpt, .pt)"
         )
     splat = read_splats(path, nonfinite=nonfinite)
-    opened = opened_file(splat, path)
+    opened = scene_from_file(splat, path)
     if splat.edited != UNMOVED:  # then its own frame is the one that people mean
         return opened
     info = replace(opened.info, world_offset=splat.world_offset)
     return replace(opened, info=info, turned=splat.turned)
 
 
-def open_run(folder: Path, data_root: Path | None = None, *, with_capture: bool = True) -> Opened:
+def open_run(folder: Path, data_root: Path | None = None, *, with_capture: bool = True) -> OpenedScene:
     """Open a run folder at its newest checkpoint, see ``load_run``."""
     run = load_run(folder, data_root)
     edited = read_frame(folder)
     captured = None
     if with_capture:
         try:
-            captured = Captured(run.config.data, read_capture_of(run.config.data, run.info))
+            captured = Captured(run.config.data, read_run_capture(run.config.data, run.info))
         except DyngsError as error:
             captured = Captured(run.config.data, error)
-    opened = Opened(**vars(run), name=folder.absolute().name, captured=captured, path=folder)
+    opened = OpenedScene(**vars(run), name=folder.absolute().name, captured=captured, path=folder)
     if edited is None:
         return opened
     return replace(opened, edited=edited, stated_up=edited.up, scaled=edited.similarity.scale != 1)
 
 
-def _open_avatar(path: Path) -> Opened:
+def _open_avatar(path: Path) -> OpenedScene:
     kind = installed_kind("human")
     assert isinstance(kind, HasBody)
     model, person, info = kind.read_person(path)
     config = Config(data=DataConfig(root=path), model=model)
-    return Opened(config, person, info.step, 0.0, info, name=path.name, path=path)
+    return OpenedScene(config, person, info.step, 0.0, info, name=path.name, path=path)
 
 
-def opened_file(splat: SplatFile, path: Path) -> Opened:
+def scene_from_file(splat: SplatFile, path: Path) -> OpenedScene:
     """Return the scene that a file holds, in its own frame."""
     scene = StaticScene(gaussians=splat.gaussians, options=file_render_options(splat))
     scaled = splat.edited.scale != 1
-    opened = opened_scene(scene, path)
+    opened = wrap_scene(scene, path)
     return replace(opened, stated_up=splat.up, notes=splat.notes, path=path, scaled=scaled)
 
 
-def opened_scene(scene: GaussianScene, file: Path = Path("scene")) -> Opened:
+def wrap_scene(scene: GaussianScene, file: Path = Path("scene")) -> OpenedScene:
     """Return a scene of which nothing else is known, as if it had been read from ``file``."""
     config = Config(data=DataConfig(root=file), model=StaticModel())
     info = CheckpointInfo(0, 0.0, (0.0, 0.0, 0.0), "black", scene.options.mode.value)
-    return Opened(config, scene, 0, 0.0, info, name=file.name)
+    return OpenedScene(config, scene, 0, 0.0, info, name=file.name)
 
 
 def cameras_for_paths(views: Sequence[View], data: DataConfig) -> Cameras:
@@ -374,4 +374,4 @@ def scene_of_split(run: LoadedRun, capture: Capture, split: str) -> Renderable:
     if not isinstance(run.renderable, Posable):
         return run.renderable
     split_views(capture, split)
-    return run.renderable.as_filmed(capture, cast(Split, split))
+    return run.renderable.for_split(capture, cast(Split, split))

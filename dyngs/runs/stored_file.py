@@ -28,13 +28,13 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError, printable, require_regular
+from dyngs.core.errors import DyngsError, format_one_line, require_regular_file
 from dyngs.core.gaussians import storage_order
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.io.write import atomic_file
-from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, info_of
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, parse_info
 from dyngs.models.renderable import Renderable
 from dyngs.ops.quaternions import quat_product
 
@@ -46,7 +46,7 @@ SPARSE_ROUNDING = 0.35
 """Added before rounding down instead of 0.5: a bias to zero, which costs least to store."""
 
 
-def step_below(step: float) -> float:
+def round_step_down(step: float) -> float:
     """Return the largest allowed step that does not exceed ``step``, or the smallest one."""
     fraction, exponent = math.frexp(min(max(step, SMALLEST_STEP), LARGEST_STEP))
     return math.ldexp(math.floor(8 * fraction) / 8, exponent)
@@ -124,7 +124,7 @@ _AXIS_TURNS = {
 columns are the axes in this order, up to signs."""
 
 
-def sorted_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def sort_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the same N Gaussians with their shortest axis first and their longest last.
 
     ``quats``: (N, 4) wxyz; zero is the identity. ``log_scales``: (N, 3).
@@ -201,7 +201,7 @@ def drawable(scene: Renderable) -> dict[str, Tensor]:
     Not those of Gaussians whose axes a field changes one by one. Raises DyngsError: a value is not
     finite, or there are neither Gaussians nor triangles.
     """
-    kept = tensors_of(scene.drawing_state())
+    kept = strip_roles(scene.drawing_state())
     for name, x in kept.items():
         if x.is_floating_point() and not bool(torch.isfinite(x).all()):
             raise DyngsError(f"{name.partition('.')[2]} is not finite; it cannot be stored")
@@ -213,7 +213,7 @@ def drawable(scene: Renderable) -> dict[str, Tensor]:
     sorts = torch.ones(len(sh), dtype=torch.bool, device=sh.device)
     sorts[scene.offset_rows] = False
     names = ("gaussians.quats", "gaussians.log_scales")
-    found = sorted_axes(*(kept[name][sorts].numpy() for name in names))
+    found = sort_axes(*(kept[name][sorts].numpy() for name in names))
     for name, values in zip(names, found, strict=True):
         kept[name] = kept[name].clone()
         kept[name][sorts] = torch.from_numpy(values).to(kept[name])
@@ -236,7 +236,7 @@ def completed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return full
 
 
-def stored_edit(scene: GaussianScene, means: np.ndarray) -> TopologyEdit:
+def storage_edit(scene: GaussianScene, means: np.ndarray) -> TopologyEdit:
     """Return the edit that puts Gaussians next to their neighbours in space, first those that a
     field moves.
 
@@ -255,7 +255,7 @@ def group_of(name: str, x: Tensor) -> str | None:
     return name.rstrip("0123456789")
 
 
-def coding_of(
+def choose_coding(
     name: str, x: Tensor, steps: Mapping[str, float], *, by_coarseness: bool = False
 ) -> Coding:
     """Return the coding of a tensor.
@@ -273,14 +273,14 @@ def coding_of(
         return Coding("half" if fits else "exact")
     kind = _KINDS.get(name, "grid")
     low, high = _LIMITS.get(kind, (SMALLEST_STEP, LARGEST_STEP))
-    step = step_below(min(max(steps[group], low), high))
+    step = round_step_down(min(max(steps[group], low), high))
     # with more than an eighth of the values out of the integer range, all are stored as they are
     if kind in ("grid", "sparse") and int((x.abs() >= LIMIT * step).sum()) > x.numel() / 8:
         return Coding("exact")
     return Coding(kind, step, by_coarseness and name.startswith("gaussians.sh_"))
 
 
-def to_whole(
+def quantize_tensor(
     x: Tensor, coding: Coding, coarseness: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ``x`` as integers, and the values that no whole number reaches.
@@ -308,7 +308,7 @@ def to_whole(
     return numbers.astype(np.int64), far
 
 
-def from_whole(
+def dequantize_tensor(
     numbers: np.ndarray,
     far: np.ndarray,
     coding: Coding,
@@ -338,8 +338,8 @@ def from_whole(
 
 def restored(x: Tensor, coding: Coding, coarseness: np.ndarray | None = None) -> Tensor:
     """Return ``x`` as it is read back."""
-    whole = to_whole(x, coding, coarseness)
-    return from_whole(*whole, coding, _name_of(x), coarseness)
+    whole = quantize_tensor(x, coding, coarseness)
+    return dequantize_tensor(*whole, coding, _name_of(x), coarseness)
 
 
 def _name_of(x: Tensor) -> str:
@@ -363,16 +363,16 @@ def packed(whole: np.ndarray) -> tuple[Packing, bytes]:
         axes = [-1, *(axis for axis in range(min(whole.ndim, 2)) if whole.shape[axis] > 1)]
         orders = (True, False) if whole.ndim > 1 else (True,)
         ways = [(axis, by_rows) for axis in axes for by_rows in orders]
-        best = min(ways, key=lambda way: len(compressed(_laid_out(sample, *way)[1], quick=True)))
+        best = min(ways, key=lambda way: len(compress_lzma(_laid_out(sample, *way)[1], quick=True)))
     packing, plain = _laid_out(whole, *best)
-    return packing, compressed(plain)
+    return packing, compress_lzma(plain)
 
 
 def unpacked(packing: Packing, data: bytes, shape: tuple[int, ...]) -> np.ndarray:
     """Return int64 numbers of ``shape``. Raises DyngsError if the bytes do not hold that many
     numbers."""
     count = math.prod(shape)
-    plain = np.frombuffer(decompressed(data, packing.planes * count), dtype=np.uint8)
+    plain = np.frombuffer(decompress_lzma(data, packing.planes * count), dtype=np.uint8)
     wide = np.zeros((count, 8), np.uint8)
     wide[:, : packing.planes] = plain.reshape(packing.planes, count).T
     stored = wide.view("<u8")[:, 0].astype(np.uint64)
@@ -385,7 +385,7 @@ def unpacked(packing: Packing, data: bytes, shape: tuple[int, ...]) -> np.ndarra
     return np.cumsum(whole, axis=packing.axis) if 0 <= packing.axis < len(shape) else whole
 
 
-def compressed(plain: bytes, *, room: int | None = None, quick: bool = False) -> bytes:
+def compress_lzma(plain: bytes, *, room: int | None = None, quick: bool = False) -> bytes:
     """Return ``plain`` as LZMA2 without headers.
 
     ``room``: the size that it will be read with, where that is not its own.
@@ -394,7 +394,7 @@ def compressed(plain: bytes, *, room: int | None = None, quick: bool = False) ->
     return lzma.compress(plain, format=lzma.FORMAT_RAW, filters=filters)
 
 
-def decompressed(data: bytes, size: int, *, exact: bool = True) -> bytes:
+def decompress_lzma(data: bytes, size: int, *, exact: bool = True) -> bytes:
     """Return the ``size`` bytes that ``data`` holds (at most so many, if not ``exact``); never
     takes memory for more.
 
@@ -474,7 +474,7 @@ def read_scene(path: Path) -> Checkpoint:
     Raises DyngsError: a file that is missing, truncated, altered, or of another version; one line
     that names it.
     """
-    require_regular(path)
+    require_regular_file(path)
     try:
         return decoded(path.read_bytes())
     except OSError as error:
@@ -500,8 +500,8 @@ def encoded(
     rows = None
     if isinstance(scene, GaussianScene):
         means = kept["gaussians.means"]
-        near = restored(means, coding_of("gaussians.means", means, steps))
-        edit = stored_edit(scene, near.numpy())
+        near = restored(means, choose_coding("gaussians.means", means, steps))
+        edit = storage_edit(scene, near.numpy())
         kept = drawable(scene.apply_edit(edit))
         if coarseness is not None:
             kept[COARSENESS] = edit.apply(coarseness)
@@ -509,19 +509,19 @@ def encoded(
     entries = []
     blocks = []
     for name in sorted(kept):
-        coding = coding_of(name, kept[name], steps, by_coarseness=rows is not None)
-        entry, block = stored_tensor(name, kept[name], coding, rows)
+        coding = choose_coding(name, kept[name], steps, by_coarseness=rows is not None)
+        entry, block = encode_tensor(name, kept[name], coding, rows)
         entries.append(entry)
         blocks.append(block)
     return with_header(asdict(info), entries, blocks)
 
 
-def stored_tensor(
+def encode_tensor(
     name: str, x: Tensor, coding: Coding, rows: np.ndarray | None = None
 ) -> tuple[_Entry, bytes]:
     """Return the entry of a tensor in the header, and its bytes; ``rows`` (N,) is its
     coarseness."""
-    numbers, far = to_whole(x, coding, rows)
+    numbers, far = quantize_tensor(x, coding, rows)
     packing, block = packed(numbers)
     own = {"name": name, "dtype": _name_of(x), "shape": tuple(x.shape)}
     own |= {"size": len(block), "far": len(far)}
@@ -532,7 +532,7 @@ def stored_tensor(
 def with_header(info: dict[str, Any], entries: list[_Entry], blocks: list[bytes]) -> bytes:
     """Return the bytes of a file of stored tensors; ``info`` are the fields of ``CheckpointInfo``."""
     header = _Header(info=info, tensors=tuple(entries)).model_dump_json()
-    packed_header = compressed(header.encode(), room=MAX_HEADER)
+    packed_header = compress_lzma(header.encode(), room=MAX_HEADER)
     size = len(packed_header).to_bytes(4, "little")
     body = b"".join([MAGIC, size, packed_header, *blocks])
     num_values = sum(math.prod(entry.shape) for entry in entries)
@@ -556,7 +556,7 @@ def decoded(data: bytes) -> Checkpoint:
     start = len(MAGIC) + 4
     end = start + int.from_bytes(body[len(MAGIC) : start], "little")
     try:
-        header = _Header.model_validate_json(decompressed(body[start:end], MAX_HEADER, exact=False))
+        header = _Header.model_validate_json(decompress_lzma(body[start:end], MAX_HEADER, exact=False))
         num_values = sum(math.prod(entry.shape) for entry in header.tensors)
         if num_values > FREE_VALUES + VALUES_PER_BYTE * len(body):
             raise DyngsError(f"it claims {num_values} values, more than a file of its size holds")
@@ -567,9 +567,9 @@ def decoded(data: bytes) -> Checkpoint:
             tensors[entry.name] = _tensor(entry, block, tensors.get(COARSENESS))
         if any(body[end:]) or end > len(body):
             raise DyngsError("it holds something else than its header says")
-        return Checkpoint(info_of(header.info), completed(tensors))
+        return Checkpoint(parse_info(header.info), completed(tensors))
     except KeyError as missing:
-        raise DyngsError(f"it lacks {printable(str(missing), 60)}") from None
+        raise DyngsError(f"it lacks {format_one_line(str(missing), 60)}") from None
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
@@ -586,4 +586,4 @@ def _tensor(entry: _Entry, block: bytes, coarseness: Tensor | None) -> Tensor:
     far = np.frombuffer(block[entry.size :], dtype="<i8").astype(np.int64).reshape(entry.far, 2)
     coding = Coding(entry.kind, entry.step, entry.by_coarseness)
     rows = None if coarseness is None else coarseness.clamp(0, MAX_COARSENESS).numpy()
-    return from_whole(numbers, far, coding, entry.dtype, rows)
+    return dequantize_tensor(numbers, far, coding, entry.dtype, rows)

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from dyngs.models.kind import LimitsSize
+from dyngs.models.kind import HasSizeLimit
 from dyngs.models.static_section import StaticModel
 
 if TYPE_CHECKING:
     from dyngs.models.kind import Restore, Start
 
 
-class StaticKind(LimitsSize):
+class StaticKind(HasSizeLimit):
     """See the module."""
 
-    uses = LimitsSize.uses | {"init.scene"}
+    uses = HasSizeLimit.uses | {"init.scene"}
     speeds_up_short_runs = True
 
     def functions(self) -> tuple[Start, Restore]:

@@ -21,13 +21,13 @@ from pydantic import TypeAdapter
 from dyngs.api.budget.size import has_file
 from dyngs.config import Config
 from dyngs.config.io import find_preset, load_config, load_resolved
-from dyngs.core.errors import DyngsError, printable, show
+from dyngs.core.errors import DyngsError, format_one_line, show
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.view_scores import SceneRenderer
-from dyngs.models.kind import Predicts, capability, kind_of
+from dyngs.models.kind import PredictsScenes, capability, kind_of
 from dyngs.models.views import evaluation_background
 from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.folder import EXPORT_FOLDER
@@ -96,7 +96,7 @@ class ModelComparison:
         keys = {word.partition("=")[0] for word in [*fixed, "run.dir", "budget.", "train.minutes"]}
         for word in self.overrides:
             if word.startswith(tuple(keys)):
-                raise DyngsError(f"{printable(word, 80)}: set by `dyngs compare`; use its options")
+                raise DyngsError(f"{format_one_line(word, 80)}: set by `dyngs compare`; use its options")
         of_data = [word for word in self.overrides if word.startswith("data.")]
         data = load_config(None, [*of_data, fixed[0]]).data
         capture = read_capture(data)
@@ -110,7 +110,7 @@ class ModelComparison:
             name = re.sub(r"[^\w.-]", "_", file.stem).lstrip(".-") or "model"
             if name in configs or name in left_out:
                 raise DyngsError(
-                    f"--models: {printable(word, 60)}: two models are named {name}; rename one "
+                    f"--models: {format_one_line(word, 60)}: two models are named {name}; rename one "
                     "preset"
                 )
             words = [*self.overrides, *fixed, f"run.dir={self.run_dir(name)}"]
@@ -118,7 +118,7 @@ class ModelComparison:
                 config = load_config(file, words)
                 validate_limits(config)
                 problem = kind_of(config.model).refusal(capture)
-                if capability(config.model, Predicts) is not None:
+                if capability(config.model, PredictsScenes) is not None:
                     problem = "predicts people and needs several captures"
             except DyngsError as error:
                 problem = str(error)

@@ -18,7 +18,7 @@ from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.report import load_split_images
 from dyngs.evaluate.view_scores import Regions, SceneRenderer, score_views, time_renders
 from dyngs.io.write import write_image
-from dyngs.models.checkpoint import read_capture_of
+from dyngs.models.checkpoint import read_run_capture
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import evaluation_background
 from dyngs.ops.device import select_device
@@ -162,7 +162,7 @@ class SceneMeasurer:
         ``run_dir``."""
         run = load_run(run_dir)
         device = select_device(self.device)
-        capture = read_capture_of(run.config.data, run.info)
+        capture = read_run_capture(run.config.data, run.info)
         views = split_views(capture, self.split)
         loader = load_split_images(capture, views, run_dir, run)
         loader.device = device

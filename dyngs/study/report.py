@@ -17,7 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dyngs.core.errors import escaped, printable
+from dyngs.core.errors import escape_control_characters, format_one_line
 from dyngs.export.html.page import fill_template, script_safe, source_hash
 from dyngs.io.write import write_text
 from dyngs.study.measure import TRUTH, Measurement
@@ -186,7 +186,7 @@ def csv_text(rows: Sequence[Mapping[str, object]]) -> str:
 def _escape_formula(value: object) -> object:
     if not isinstance(value, str):
         return value
-    return escaped(f"'{value}" if value.lstrip()[:1] in ("=", "+", "-", "@") else value)
+    return escape_control_characters(f"'{value}" if value.lstrip()[:1] in ("=", "+", "-", "@") else value)
 
 
 def html_table(head: Sequence[str], cells: Cells) -> str:
@@ -204,7 +204,7 @@ def markdown_table(head: Sequence[str], cells: Cells) -> str:
 
 def markdown_text(text: str) -> str:
     """Return ``text`` as one line of Markdown without HTML, links or table columns."""
-    return re.sub(r"([\\`*<>\[\]|&])", r"\\\1", printable(text))
+    return re.sub(r"([\\`*<>\[\]|&])", r"\\\1", format_one_line(text))
 
 
 # Plots

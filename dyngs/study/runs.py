@@ -13,7 +13,7 @@ from pydantic import ConfigDict, TypeAdapter
 from dyngs.api.train import train
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
-from dyngs.core.errors import DyngsError, printable, reading
+from dyngs.core.errors import DyngsError, format_one_line, wrap_read_errors
 from dyngs.io.child import home_of_dyngs
 from dyngs.io.containment import following_links_of_runs, follows_links_of_runs
 from dyngs.io.fields import read_limited
@@ -92,7 +92,7 @@ def run_tasks(
 
 def read_stored(path: Path, kind: TypeAdapter[T]) -> T:
     """Return a stored result. Raises DyngsError if the file is damaged."""
-    with reading(path, "not a result of a study; remove it to measure again"):
+    with wrap_read_errors(path, "not a result of a study; remove it to measure again"):
         return kind.validate_json(read_limited(path))
 
 
@@ -117,7 +117,7 @@ def require_same_study(
         write_stored(path, facts)
         return
     here = json.loads(json.dumps(facts))
-    with reading(path, "damaged description of a study; use another --out"):
+    with wrap_read_errors(path, "damaged description of a study; use another --out"):
         known = json.loads(read_limited(path))
         differing = [
             f"{key}: {_describe_value(known.get(key))} there, {_describe_value(here[key])} here"
@@ -132,4 +132,4 @@ def require_same_study(
 
 def _describe_value(value: object) -> str:
     text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-    return printable(text, 80) or "none"
+    return format_one_line(text, 80) or "none"

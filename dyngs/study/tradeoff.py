@@ -21,15 +21,15 @@ from pydantic.dataclasses import dataclass
 
 from dyngs.api.prune import prune_run
 from dyngs.api.scene_file import write_scene_file
-from dyngs.compress.stage import pruning
+from dyngs.compress.stage import build_pruning_edit
 from dyngs.config import BudgetConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.core.conventions import num_sh_terms
-from dyngs.core.errors import DyngsError, printable, show
+from dyngs.core.errors import DyngsError, format_one_line, show
 from dyngs.core.section import CutOff
-from dyngs.core.state import tensors_of
-from dyngs.models.checkpoint import read_capture_of, restored_model, settings_of
-from dyngs.models.kind import HasGaussians, Moves, capability
+from dyngs.core.state import strip_roles
+from dyngs.models.checkpoint import read_run_capture, restore_model, checkpoint_settings
+from dyngs.models.kind import HasGaussians, HasMotion, capability
 from dyngs.ops.device import select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.checkpoint import (
@@ -41,7 +41,7 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
-from dyngs.runs.folder import inputs_of, write_config
+from dyngs.runs.folder import collect_inputs, write_config
 from dyngs.runs.opened import split_views
 from dyngs.study.measure import SCORES, Measurement, SceneMeasurer, StudyScene
 from dyngs.study.runs import STORED_CONFIG, require_same_study, run_tasks, train_to_end
@@ -131,7 +131,7 @@ def parse_variations(words: Sequence[str]) -> dict[str, tuple[Value, ...]]:
     variations: dict[str, tuple[Value, ...]] = {}
     for word in words:
         name, equals, listed = word.partition("=")
-        shown = f"--vary {printable(word, 60)}"
+        shown = f"--vary {format_one_line(word, 60)}"
         if name not in SETTINGS:
             raise DyngsError(f"{shown}: unknown setting; use {', '.join(SETTINGS)}")
         variations[name] = SETTINGS[name]
@@ -165,7 +165,7 @@ def current_settings(run_dir: Path) -> dict[str, Value | None]:
         "storage": None,
         "alpha_min": scene.options.alpha_min,
     }
-    if capability(config.model, Moves) is not None and not scene.is_static:
+    if capability(config.model, HasMotion) is not None and not scene.is_static:
         own["mask_times"] = config.prune.mask_times
     return own
 
@@ -226,10 +226,10 @@ class Tradeoff:
             DyngsError: invalid run or split, or the folder contains measurements of another run.
         """
         load_resolved(self.run_dir)  # raises if this is not a run
-        inputs_of(self.run_dir).require_output(self.out)
+        collect_inputs(self.run_dir).require_output(self.out)
         own = current_settings(self.run_dir)
         run = load_run(self.run_dir)
-        split_views(read_capture_of(run.config.data, run.info), self.split)
+        split_views(read_run_capture(run.config.data, run.info), self.split)
         newest = checkpoint_paths(self.run_dir)[-1]
         source = {
             "run": str(self.run_dir.absolute()),
@@ -307,14 +307,14 @@ class Tradeoff:
             steps = f"train.steps={start.info.step}"
             config = load_resolved(source, [steps, *self._pruning_overrides(wanted)])
             with kernel_threads(self.threads or num_cores()):
-                capture = read_capture_of(config.data, start.info)
+                capture = read_run_capture(config.data, start.info)
                 trainer = build_trainer(config, capture, restored=True)
                 trainer.restore(start)
-                trainer.apply(pruning(trainer))
+                trainer.apply(build_pruning_edit(trainer))
                 checkpoint = trainer.checkpoint()
         # Omit optimizer, sampler and random state.
-        tensors = tensors_of(restored_model(checkpoint, config.model).state())
-        checkpoint = replace(checkpoint, tensors=tensors, settings=settings_of(config))
+        tensors = strip_roles(restore_model(checkpoint, config.model).state())
+        checkpoint = replace(checkpoint, tensors=tensors, settings=checkpoint_settings(config))
         save_checkpoint(folder, checkpoint, seconds_at(source, checkpoint.info.step))
         write_config(config, folder)  # marks the folder as complete
 
@@ -476,7 +476,7 @@ def parse_requirements(text: str) -> list[Requirement]:
             bound = math.nan
         if match is None or not math.isfinite(bound):
             raise DyngsError(
-                f"--require {printable(part.strip(), 60)!r}: not a condition; example: "
+                f"--require {format_one_line(part.strip(), 60)!r}: not a condition; example: "
                 "psnr>=30,fps>=20,mb<=5"
             )
         requirements.append(replace(parse_goal(match[1], smallest=match[2] == "<="), bound=bound))
@@ -486,7 +486,7 @@ def parse_requirements(text: str) -> list[Requirement]:
 def parse_goal(name: str, *, smallest: bool) -> Requirement:
     """Return the goal of ``--minimize`` or ``--maximize``."""
     if name not in METRICS:
-        raise DyngsError(f"{printable(name, 60)}: unknown metric; use {', '.join(METRICS)}")
+        raise DyngsError(f"{format_one_line(name, 60)}: unknown metric; use {', '.join(METRICS)}")
     return Requirement(name, smallest)
 
 

@@ -72,7 +72,7 @@ def step_cost(config: Config, step: int, pixels: float, num_gaussians: float) ->
     """Return the relative cost of ``step`` for an image of ``pixels`` pixels at full size."""
     drawn = pixels / image_divisor(config.train, max(step, 1)) ** 2
     cost = FIXED + PER_MEGAPIXEL * 1e-6 * drawn + PER_GAUSSIAN * num_gaussians
-    begins = config.model.moves_after(config.train.steps)
+    begins = config.model.motion_start_step(config.train.steps)
     return cost if begins is None or step <= begins else MOTION * cost
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dyngs.config import Config
 from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
-from dyngs.models.kind import HasGaussians, LimitsSize, capability, kind_of
+from dyngs.models.kind import HasGaussians, HasSizeLimit, capability, kind_of
 
 # Fraction of the limit reserved for the random Gaussians that are added when motion begins
 RANDOM_FRACTION = 0.1
@@ -35,7 +35,7 @@ def validate_limits(config: Config) -> None:
                     "per step; use "
                     f"{key}=never, or train.batch_size=1"
                 )
-    if config.train.minutes is not None and config.prune.is_wanted:
+    if config.train.minutes is not None and config.prune.is_enabled:
         raise DyngsError(
             "train.minutes: cannot be combined with prune.*, whose duration is unknown; train "
             "first, then run "
@@ -73,11 +73,11 @@ def apply_gaussian_cap(config: Config, cap: int | None) -> Config:
     changes = {}
     if cap is None:
         return config
-    added = config.model.added_for_motion
+    added = config.model.num_added_for_motion
     made_of = capability(config.model, HasGaussians)
     if made_of is not None and added:
         added = min(added, int(RANDOM_FRACTION * cap))
-        changes["model"] = made_of.adding(config.model, added)
+        changes["model"] = made_of.with_added_gaussians(config.model, added)
     cap -= added
     return config.model_copy(update=changes | {"strategy": config.strategy.limited(cap)})
 
@@ -86,7 +86,7 @@ def gaussian_limit(config: Config, num_times: int) -> int | None:
     """Return the largest allowed number of Gaussians at the end of a run, or None."""
     limits = [config.budget.max_gaussians] if config.budget.max_gaussians is not None else []
     megabytes = config.budget.max_mb
-    if megabytes is not None and capability(config.model, LimitsSize) is not None:
+    if megabytes is not None and capability(config.model, HasSizeLimit) is not None:
         limits.append(max_gaussians_in_file(config, num_times, megabytes))
     return min(limits, default=None)
 
@@ -99,12 +99,12 @@ def max_gaussians_in_file(config: Config, num_times: int, megabytes: float) -> i
         DyngsError: fewer than ``FEWEST`` fit. The message contains the size that would suffice.
     """
     each = SHAPE_BYTES + HARMONIC_BYTES * 3 * (num_sh_terms(config.stored_sh_degree) - 1)
-    kind = capability(config.model, LimitsSize)
+    kind = capability(config.model, HasSizeLimit)
     assert kind is not None
-    static_bytes, moving_bytes = (
+    static_bytes, bytes_per_moving_gaussian = (
         FIELD_BYTES * kind.num_shared(config.model, num_times, moving) for moving in (0, 1)
     )
-    each += moving_bytes - static_bytes  # all Gaussians may move
+    each += bytes_per_moving_gaussian - static_bytes  # all Gaussians may move
     count = int((1e6 * megabytes - static_bytes) / each)
     if count < FEWEST:
         field = f" (deformation field: {1e-6 * static_bytes:.2g} MB)" if static_bytes else ""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image
-from dyngs.models.model import Look, Loss
+from dyngs.models.model import LossInput, Loss
 from dyngs.ops.device import AsyncReadback, copy_async
 from dyngs.ops.loss import l1_ssim_loss
 
@@ -21,7 +21,7 @@ class ImageLoss(Loss):
     def __init__(self, ssim_weight: float) -> None:
         self._ssim_weight = ssim_weight
 
-    def __call__(self, look: Look) -> Mapping[str, Tensor]:
+    def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
         return {
             "image": l1_ssim_loss(look.rendered, look.truth, self._ssim_weight, look.image.mask)
         }
@@ -40,7 +40,7 @@ class SilhouetteLoss(Loss):
         self.early = early
         self._full_from = full_from
 
-    def __call__(self, look: Look) -> Mapping[str, Tensor]:
+    def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
         if self.weight == 0 or look.image.alpha is None:
             return {}
         error = (look.drawn.rendering.alpha[0] - look.image.alpha).abs()
@@ -53,14 +53,14 @@ class SilhouetteLoss(Loss):
 class PenaltyLoss(Loss):
     """Regularizers of the rendered Gaussians."""
 
-    def __call__(self, look: Look) -> Mapping[str, Tensor]:
+    def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
         return look.drawn.penalties
 
 
 class RegularizerLoss(Loss):
     """Regularizers of the model parameters."""
 
-    def __call__(self, look: Look) -> Mapping[str, Tensor]:
+    def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
         return look.model.regularizers()
 
 
@@ -77,7 +77,7 @@ class StepCheck:
         numbers += [x.sum().double().reshape(1) for x in self._moved.values()]
         self._read = AsyncReadback(torch.cat(numbers))
 
-    def loss(self, step: int, image: Image, moves_by: tuple[str, str]) -> float:
+    def loss(self, step: int, image: Image, deformation_name: tuple[str, str]) -> float:
         """Return the sum of the terms. Blocks until they are computed.
 
         Raises:
@@ -90,7 +90,7 @@ class StepCheck:
         for (name, x), total in zip(self._moved.items(), sums, strict=True):
             # The sum of finite numbers may overflow.
             if not math.isfinite(total) and not bool(x.isfinite().all()):
-                what, section = moves_by
+                what, section = deformation_name
                 raise DyngsError(
                     f"{where}: the {what} produced non-finite {name} at time {image.time or 0:g}; "
                     f"lower the learning rates in {section}"

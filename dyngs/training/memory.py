@@ -121,7 +121,7 @@ def stored_values(config: Config) -> int:
 
 def gaussian_bytes(config: Config) -> int:
     """Return the bytes of training memory per Gaussian, including motion if the model has any."""
-    return 4 * COPIES * stored_values(config) + config.model.moving_bytes
+    return 4 * COPIES * stored_values(config) + config.model.bytes_per_moving_gaussian
 
 
 def expected_gaussians(config: Config, now: int, longest_side: int = 400) -> int:
@@ -146,7 +146,7 @@ def expected_gaussians(config: Config, now: int, longest_side: int = 400) -> int
         factor = factor if factor < 1 else min(factor, 4.0) ** 0.5
         grown = 250_000 * min(longest_side / 400, 1.0) ** 0.5 * factor
     most = max(now, round(min(grown, strategy.growth_limit)))
-    return most + config.model.added_for_motion
+    return most + config.model.num_added_for_motion
 
 
 def resident_memory() -> int:

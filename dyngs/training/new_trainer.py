@@ -17,11 +17,11 @@ from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.initialization import InitialGaussians, scene_geometry
 from dyngs.gaussians.model import GaussianModel
-from dyngs.models.kind import Moves, RunStart, kind_of
+from dyngs.models.kind import HasMotion, StartContext, kind_of
 from dyngs.models.views import (
     background_colour,
-    resolved_background,
-    share_alike,
+    resolve_background,
+    background_coloured_fraction,
     training_cameras,
     training_times,
 )
@@ -76,11 +76,11 @@ def build_trainer(
     priors = PriorLosses()
     kind = kind_of(config.model)
     if "train.priors" in kind.uses:
-        moves = isinstance(kind, Moves) and len(set(training_times(capture))) > 1
+        moves = isinstance(kind, HasMotion) and len(set(training_times(capture))) > 1
         priors = load_priors(config, capture, images.views, moves=moves)
     if not priors.masks:
         images = images.without_motion_masks()
-    background = resolved_background(config, capture)
+    background = resolve_background(config, capture)
     extent = scene_geometry(capture).extent
     messages = [priors.message] if priors.message else []
     published = capture.has_alpha and config.train.alpha_weight == 0 and background != "random"
@@ -93,7 +93,7 @@ def build_trainer(
     early = _early_alpha_fraction(config, capture, images, background)
 
     def parts(config: Config) -> TrainerParts:
-        start = RunStart(
+        start = StartContext(
             config, uncapped or config, capture, images, background, extent, generator, first
         )
         model = kind.start(start)
@@ -105,7 +105,7 @@ def build_trainer(
             correct_cameras = refinement.corrections.correct_cameras
             images.corrected = lambda index, cameras: correct_cameras(views[index], cameras)
         robust = None
-        may_mask = "train.robust" in kind.uses and not isinstance(kind, Moves)
+        may_mask = "train.robust" in kind.uses and not isinstance(kind, HasMotion)
         if config.train.robust == "always" and may_mask:
             cameras = training_cameras(views, config.data)
             robust = RobustMasks(images, cameras, steps, images.corrected)
@@ -179,5 +179,5 @@ def _early_alpha_fraction(
     ):
         return 1.0
     shown = (images[i] for i in evenly_spaced(len(images), ALIKE_IMAGES))
-    alike = share_alike(shown, background_colour(background))
+    alike = background_coloured_fraction(shown, background_colour(background))
     return 1.0 if alike is None or alike >= MANY_ALIKE else EARLY_OPACITY

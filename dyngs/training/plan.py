@@ -10,7 +10,7 @@ from dyngs.config import Config, TrainConfig
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.capture import Capture
 from dyngs.gaussians.initialization import InitialGaussians
-from dyngs.models.kind import ExtendsTo, capability
+from dyngs.models.kind import HasSchedules, capability
 from dyngs.models.schedule import PUBLISHED_STEPS, Length, scaled
 from dyngs.training.corrections.exposure import WARM_UP
 
@@ -81,9 +81,9 @@ def extend_config(config: Config, done: int, steps: int) -> Config:
         )
     _require_exposures_stay(config, length)
     changed: dict[str, object] = {"train": _train(config.train, length)}
-    extends = capability(config.model, ExtendsTo)
+    extends = capability(config.model, HasSchedules)
     if extends is not None:
-        changed["model"] = extends.extended(config.model, length)
+        changed["model"] = extends.extend_schedules(config.model, length)
     return config.model_copy(update=changed)
 
 

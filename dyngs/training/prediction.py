@@ -11,9 +11,9 @@ from torch import Tensor
 
 from dyngs.config import Config
 from dyngs.core.conventions import RasterizeMode
-from dyngs.core.errors import DyngsError, reading
-from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, settings_of
-from dyngs.models.kind import Predicts, capability
+from dyngs.core.errors import DyngsError, wrap_read_errors
+from dyngs.models.checkpoint import CONFIG_ADVICE, Checkpoint, CheckpointInfo, checkpoint_settings
+from dyngs.models.kind import PredictsScenes, capability
 from dyngs.models.prediction import Learner, load_optimizer, optimizer_state, updated
 from dyngs.training.events import StepReport
 from dyngs.training.trainer import TrainingEdit, ViewSampler
@@ -78,11 +78,11 @@ class NetworkTrainer:
         mode = getattr(self.config.model, "rasterize_mode", RasterizeMode.CLASSIC).value
         info = CheckpointInfo(self.done, 1.0, (0.0, 0.0, 0.0), self.learner.background, mode)
         stored = {name: x.detach().cpu() for name, x in tensors.items()}
-        return Checkpoint(info, stored, settings=settings_of(self.config))
+        return Checkpoint(info, stored, settings=checkpoint_settings(self.config))
 
     def restore(self, checkpoint: Checkpoint) -> None:
         self.learner.load(checkpoint)
-        with reading(checkpoint.name, OTHER_CONFIG):
+        with wrap_read_errors(checkpoint.name, CONFIG_ADVICE):
             self.sampler.load_state(checkpoint.part("sampler"))
             self.generator.set_state(checkpoint.tensors["rng"])
             load_optimizer(self.optimizer, self.learner.network, checkpoint.part("optimizer"))
@@ -91,7 +91,7 @@ class NetworkTrainer:
 
 def network_trainer(config: Config) -> NetworkTrainer:
     """Return the trainer of a network of any kind, before its first step."""
-    network = capability(config.model, Predicts)
+    network = capability(config.model, PredictsScenes)
     assert network is not None
     generator = torch.Generator().manual_seed(config.run.seed)
     learner = network.networks()[0](config, generator)

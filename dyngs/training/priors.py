@@ -18,7 +18,7 @@ from dyngs.data.tracks import ImageTracks, read_tracks
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.models.model import Look, Loss
+from dyngs.models.model import LossInput, Loss
 from dyngs.models.views import training_cameras
 
 SOFT_PX = 0.5  # Constant of the Charbonnier loss, px: smaller errors are penalised quadratically
@@ -143,7 +143,7 @@ class PriorLosses(Loss):
     def needs_depth(self, image: Image) -> bool:
         return self.depth and image.depth is not None
 
-    def __call__(self, look: Look) -> dict[str, Tensor]:
+    def __call__(self, look: LossInput) -> dict[str, Tensor]:
         found: dict[str, Tensor | None] = {}
         image = look.image
         rendering = look.drawn.rendering
@@ -155,7 +155,7 @@ class PriorLosses(Loss):
             found |= self._motion(scene, look)
         return {name: x for name, x in found.items() if x is not None}
 
-    def _motion(self, scene: GaussianScene, look: Look) -> dict[str, Tensor | None]:
+    def _motion(self, scene: GaussianScene, look: LossInput) -> dict[str, Tensor | None]:
         image = look.image
         here = image.cameras
         first, last = look.model.window(look.step)

@@ -15,13 +15,13 @@ from torch import Tensor
 
 from dyngs.config import Config
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError, reading
-from dyngs.core.state import Role, prefixed, tensors_of, with_role
+from dyngs.core.errors import DyngsError, wrap_read_errors
+from dyngs.core.state import Role, add_prefix, strip_roles, with_role
 from dyngs.core.tensor_checks import require_indices
 from dyngs.data.capture import Capture
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint, CheckpointInfo, settings_of
-from dyngs.models.model import Correction, Look, Loss, Model, RenderedView
+from dyngs.models.checkpoint import CONFIG_ADVICE, Checkpoint, CheckpointInfo, checkpoint_settings
+from dyngs.models.model import Correction, LossInput, Loss, Model, RenderedView
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour
@@ -171,8 +171,8 @@ class Trainer(Generic[M]):
         updated = self.model.update(step)
         self.bad_gradients = self.bad_gradients + updated.bad
         self.done = step
-        if updated.is_rearranged:
-            self.processes.require_same(tensors_of(self.model.scene.state()), f"after step {step}")
+        if updated.topology_changed:
+            self.processes.require_same(strip_roles(self.model.scene.state()), f"after step {step}")
         messages = [*self.pending_messages, updated.finding or ""]
         self.pending_messages.clear()
         message = "\n".join(line for line in messages if line)
@@ -215,7 +215,7 @@ class Trainer(Generic[M]):
         image = view.image
         rendered = view.rendered
         truth = image.composite(background)
-        look = Look(index, step, image, drawn, rendered, truth, self.model, self.generator)
+        look = LossInput(index, step, image, drawn, rendered, truth, self.model, self.generator)
         terms: dict[str, Tensor] = {}
         for loss in self.losses:
             terms |= loss(look)
@@ -223,7 +223,7 @@ class Trainer(Generic[M]):
         with torch.autograd.set_multithreading_enabled(False):
             # Run GPU nodes in this thread, too, to avoid switching threads.
             reduce(add, terms.values()).backward()
-        value = check.loss(step, image, self.model.moves_by)
+        value = check.loss(step, image, self.model.deformation_name)
         drawn.after_backward()
         for correction in self.corrections:
             bad = correction.after_backward(index, step, image)
@@ -280,21 +280,21 @@ class Trainer(Generic[M]):
     def checkpoint(self) -> Checkpoint:
         state = self.model.state()
         for name, part in self._image_parts().items():
-            state |= prefixed(name, with_role(part.state(), Role.TRAINING))
+            state |= add_prefix(name, with_role(part.state(), Role.TRAINING))
         state |= with_role({"rng": self.generator.get_state()}, Role.TRAINING)
-        tensors = {name: x.cpu() for name, x in tensors_of(state).items()}
-        return Checkpoint(self.info, tensors, settings=settings_of(self.config))
+        tensors = {name: x.cpu() for name, x in strip_roles(state).items()}
+        return Checkpoint(self.info, tensors, settings=checkpoint_settings(self.config))
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Restore the state of ``checkpoint``."""
-        with reading(checkpoint.name, OTHER_CONFIG):
+        with wrap_read_errors(checkpoint.name, CONFIG_ADVICE):
             try:
                 self.model.restore(checkpoint)
                 for name, part in self._image_parts().items():
                     part.load_state(checkpoint.part(name))
                 self.generator.set_state(checkpoint.tensors["rng"])
             except KeyError as missing:
-                raise DyngsError(f"{checkpoint.name} lacks {missing}; {OTHER_CONFIG}") from None
+                raise DyngsError(f"{checkpoint.name} lacks {missing}; {CONFIG_ADVICE}") from None
         self.done = checkpoint.info.step
         self.place(self.device)
 
@@ -353,7 +353,7 @@ class Trainer(Generic[M]):
         def is_eligible(index: int) -> bool:
             return (
                 may_train(index)
-                and not self.model.holds_out(index, step)
+                and not self.model.is_held_out(index, step)
                 and index not in self.held_out
             )
 

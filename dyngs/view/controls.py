@@ -21,7 +21,7 @@ from dyngs.human.avatar.scene import as_human_scene
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.motion import compose_rotations
 from dyngs.io.write import to_uint8
-from dyngs.runs.opened import Opened
+from dyngs.runs.opened import OpenedScene
 from dyngs.view.edit import EditControls, can_be_edited
 from dyngs.view.layers import LAYERS, PARTS, draw
 from dyngs.view.session import Keyframe, Recording
@@ -66,7 +66,7 @@ class Controls:
         connection.status = gui.add_markdown("")
         self.show(connection.loaded)
 
-    def show(self, opened: Opened) -> None:
+    def show(self, opened: OpenedScene) -> None:
         """Create the controls for a scene."""
         for handle in self._folders:
             handle.remove()
@@ -117,10 +117,10 @@ class Controls:
         self._connection.session.change(**changes)
         self._frusta.hide_covering_frusta()
 
-    def _add_edits(self, opened: Opened) -> None:
+    def _add_edits(self, opened: OpenedScene) -> None:
         self._edits = EditControls(self._connection, opened)
 
-    def _add_display(self, gui: viser.GuiApi, opened: Opened) -> None:
+    def _add_display(self, gui: viser.GuiApi, opened: OpenedScene) -> None:
         session = self._connection.session
         scene = opened.renderable if isinstance(opened.renderable, GaussianScene) else None
         layers = [name for name in LAYERS if name != "error" or len(views_of(opened))]
@@ -166,7 +166,7 @@ class Controls:
         speed.on_update(lambda _: session.change_timeline(speed=float(speed.value)))
         self._connection.time_slider = slider
 
-    def _add_capture(self, gui: viser.GuiApi, opened: Opened) -> None:
+    def _add_capture(self, gui: viser.GuiApi, opened: OpenedScene) -> None:
         session = self._connection.session
         hint = "camera frusta with images; click one to go there"
         cameras = gui.add_checkbox("Cameras", False, hint=hint)
@@ -208,7 +208,7 @@ class Controls:
             elif choice == BY_SLIDERS:
                 opened = pose_person(opened, angles)
             elif choice != AS_CAPTURED:
-                opened = opened.in_motion(self._motions[choice], keep_feet=bool(feet.value))
+                opened = opened.play_motion(self._motions[choice], keep_feet=bool(feet.value))
             connection.session.show(opened)
 
         def play(_: Any) -> None:
@@ -270,7 +270,7 @@ class Controls:
         gui.add_button("Save path", hint=hint).on_click(save)
 
 
-def _add_help(gui: viser.GuiApi, opened: Opened) -> None:
+def _add_help(gui: viser.GuiApi, opened: OpenedScene) -> None:
     from dyngs.view.server import escape_markdown
 
     gui.add_markdown(HELP)
@@ -278,7 +278,7 @@ def _add_help(gui: viser.GuiApi, opened: Opened) -> None:
         gui.add_markdown(f"*{escape_markdown(note)}*")
 
 
-def pose_person(opened: Opened, angles: Mapping[str, Sequence[float]]) -> Opened:
+def pose_person(opened: OpenedScene, angles: Mapping[str, Sequence[float]]) -> OpenedScene:
     """Return a person in rest pose with joints rotated by ``angles``: degrees about x, y, z, by
     joint."""
     from scipy.spatial.transform import Rotation
@@ -293,7 +293,7 @@ def pose_person(opened: Opened, angles: Mapping[str, Sequence[float]]) -> Opened
         turned = Rotation.from_euler("xyz", degrees, degrees=True)
         turns[0, JOINT_NAMES.index(name)] = turns.new_tensor(turned.as_rotvec())
     poses = compose_rotations(clip.poses, turns)
-    return rest.showing(person.with_motion(replace(clip, poses=poses)))
+    return rest.with_scene(person.with_motion(replace(clip, poses=poses)))
 
 
 def motion_files(path: Path | None) -> dict[str, Path]:
@@ -325,7 +325,7 @@ class CameraFrusta:
         self._handles: list[tuple[Any, np.ndarray, float]] = []
         connection.on_move = self.hide_covering_frusta
 
-    def show(self, opened: Opened) -> None:
+    def show(self, opened: OpenedScene) -> None:
         """Add the frusta one by one in the render thread, one per static camera."""
         self.remove()
         handles = self._handles
@@ -360,7 +360,7 @@ class CameraFrusta:
             is_near = float(np.linalg.norm(position - browser_camera.position)) < 1.5 * size
             handle.visible = not (is_elsewhere or is_near)
 
-    def _add(self, opened: Opened, index: int, size: float, handles: list[Any]) -> None:
+    def _add(self, opened: OpenedScene, index: int, size: float, handles: list[Any]) -> None:
         if handles is not self._handles:
             return  # removed meanwhile
         shown = views_of(opened)

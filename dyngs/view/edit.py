@@ -23,7 +23,7 @@ from dyngs.data.geometry import look_at, perpendicular, with_poses
 from dyngs.export.edit.crop import Box, gaussians_in_region
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.similarity import UNMOVED, Similarity
-from dyngs.runs.opened import Opened
+from dyngs.runs.opened import OpenedScene
 from dyngs.view.layers import ViewRequest, depth_of
 from dyngs.view.views import camera_at, initial_viewpoint
 
@@ -37,14 +37,14 @@ _CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 _EDGES = np.array([(a, b) for a, b in combinations(_CORNERS, 2) if np.abs(a - b).sum() == 1])
 
 
-def world_of(opened: Opened) -> Similarity:
+def world_of(opened: OpenedScene) -> Similarity:
     """Return the transform from a scene to the coordinates of ``dyngs edit``; identity for a
     file."""
     return UNMOVED if opened.captured is None else opened.world
 
 
 def pick_point(
-    opened: Opened, origin: np.ndarray, direction: np.ndarray, pixel: float, request: ViewRequest
+    opened: OpenedScene, origin: np.ndarray, direction: np.ndarray, pixel: float, request: ViewRequest
 ) -> np.ndarray | None:
     """Return the point (3,) where a ray hits the scene, or None.
 
@@ -76,7 +76,7 @@ class EditState:
         steps: (K,) indices into ``whole`` that remained after each deletion.
     """
 
-    whole: Opened
+    whole: OpenedScene
     centre: np.ndarray
     size: np.ndarray
     points: list[np.ndarray] = field(default_factory=list)
@@ -92,12 +92,12 @@ class EditState:
         return self.steps[-1] if self.steps else torch.arange(len(self.whole.scene), device="cpu")
 
     @property
-    def left(self) -> Opened:
+    def left(self) -> OpenedScene:
         """The remaining scene."""
         if not self.steps:
             return self.whole
         scene: GaussianScene = self.whole.scene
-        return self.whole.showing(scene.select(self.rows.to(scene.device)))
+        return self.whole.with_scene(scene.select(self.rows.to(scene.device)))
 
     def pick(self, point: np.ndarray) -> None:
         """Add a picked point (3,). A third point starts a new pair."""
@@ -151,7 +151,7 @@ class EditState:
         return ",".join(f"{x:.{digits}g}" for x in point)
 
 
-def can_be_edited(opened: Opened) -> bool:
+def can_be_edited(opened: OpenedScene) -> bool:
     """Return whether a scene can be edited: Gaussians from a file or run, no person, not in
     training."""
     is_file = opened.path is not None and opened.path.exists()
@@ -162,7 +162,7 @@ def can_be_edited(opened: Opened) -> bool:
 class EditControls:
     """Edit controls and markers of one browser for one scene."""
 
-    def __init__(self, connection: BrowserConnection, opened: Opened) -> None:
+    def __init__(self, connection: BrowserConnection, opened: OpenedScene) -> None:
         begin = initial_viewpoint(opened)
         world = world_of(opened)
         extent = begin.extent * world.scale

@@ -14,7 +14,7 @@ from dyngs.export.images import color_map, depth_to_rgb
 from dyngs.gaussians.levels import LevelScene
 from dyngs.io.write import to_uint8
 from dyngs.models.renderable import Rendering, TimeStep
-from dyngs.runs.opened import Opened
+from dyngs.runs.opened import OpenedScene
 from dyngs.view.views import views_of
 
 Layer = Literal["colour", "depth", "alpha", "error"]
@@ -45,7 +45,7 @@ class ViewRequest:
     is_moving: bool = False
 
 
-def draw(opened: Opened, request: ViewRequest) -> np.ndarray:
+def draw(opened: OpenedScene, request: ViewRequest) -> np.ndarray:
     """Return the image (H, W, 3) uint8 of a request."""
     if request.view is None:
         return _layer(opened, request)
@@ -70,7 +70,7 @@ def draw(opened: Opened, request: ViewRequest) -> np.ndarray:
     return composed
 
 
-def truth_in_window(opened: Opened, view: int, size: tuple[int, int]) -> np.ndarray | None:
+def truth_in_window(opened: OpenedScene, view: int, size: tuple[int, int]) -> np.ndarray | None:
     """Return the true image of a view, fitted into a window of ``size`` px: (H, W, 4) uint8.
 
     Pixels outside the image are transparent.
@@ -86,7 +86,7 @@ def truth_in_window(opened: Opened, view: int, size: tuple[int, int]) -> np.ndar
 
 
 @torch.no_grad()
-def _layer(opened: Opened, request: ViewRequest) -> np.ndarray:
+def _layer(opened: OpenedScene, request: ViewRequest) -> np.ndarray:
     """Return one layer (H, W, 3) uint8; colours for the layer "error"."""
     match request.layer:
         case "depth":
@@ -98,7 +98,7 @@ def _layer(opened: Opened, request: ViewRequest) -> np.ndarray:
     return to_uint8(pixels.clamp(0, 1).cpu().numpy())
 
 
-def with_levels(opened: Opened, most: int) -> Opened:
+def with_levels(opened: OpenedScene, most: int) -> OpenedScene:
     """Return a static scene with levels of detail: at most ``most`` Gaussians are rendered while it
     moves."""
     opened = opened.noted(f"at most {most:,} Gaussians are rendered while the view moves")
@@ -106,7 +106,7 @@ def with_levels(opened: Opened, most: int) -> Opened:
     return opened
 
 
-def _rendering(opened: Opened, request: ViewRequest, **options: Any) -> Rendering:
+def _rendering(opened: OpenedScene, request: ViewRequest, **options: Any) -> Rendering:
     """Return a rendering on the CPU. The last deformed scene is cached."""
     part = request.part
     scene = opened.renderable
@@ -123,7 +123,7 @@ def _rendering(opened: Opened, request: ViewRequest, **options: Any) -> Renderin
 
 
 @torch.no_grad()
-def depth_of(opened: Opened, request: ViewRequest) -> tuple[np.ndarray, np.ndarray]:
+def depth_of(opened: OpenedScene, request: ViewRequest) -> tuple[np.ndarray, np.ndarray]:
     """Return expected depth (H, W) along the optical axis in world units, and alpha (H, W)."""
     rendering = _rendering(opened, request, depth="expected")
     depth = np.zeros(0) if rendering.depth is None else rendering.depth[0].numpy()

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
-from dyngs.core.errors import DyngsError, printable
-from dyngs.runs.opened import Opened
+from dyngs.core.errors import DyngsError, format_one_line
+from dyngs.runs.opened import OpenedScene
 from dyngs.view.session import BrowserCamera, RenderScheduler, SentImage, Session
 from dyngs.view.source import SceneSource
 from dyngs.view.views import fitting_fov, initial_viewpoint, orbit_center, pose_of, views_of
@@ -172,7 +172,7 @@ class ServerOptions:
 class BrowserConnection:
     """A connected browser with its session; ``opened`` is shown first."""
 
-    def __init__(self, client: viser.ClientHandle, opened: Opened, target: float) -> None:
+    def __init__(self, client: viser.ClientHandle, opened: OpenedScene, target: float) -> None:
         self.client = client
         self.loaded = opened
         self.session = Session(opened, self.send, target)
@@ -243,7 +243,7 @@ def escape_markdown(text: str) -> str:
 
     viser would execute scripts in HTML.
     """
-    return _PUNCTUATION.sub(r"\\\1", _IN_LINKS.sub("\u200b", printable(text)))
+    return _PUNCTUATION.sub(r"\\\1", _IN_LINKS.sub("\u200b", format_one_line(text)))
 
 
 class Viewer:
@@ -257,7 +257,7 @@ class Viewer:
     """
 
     def __init__(
-        self, source: SceneSource, first: Opened, serving: ServerOptions = ServerOptions()
+        self, source: SceneSource, first: OpenedScene, serving: ServerOptions = ServerOptions()
     ) -> None:
         require_viser()
         import viser

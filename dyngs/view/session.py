@@ -23,7 +23,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.geometry import checked_pose
 from dyngs.export.camera_paths import Keyframes, interpolate_keyframes, resize_cameras
-from dyngs.runs.opened import Opened
+from dyngs.runs.opened import OpenedScene
 from dyngs.view.layers import Layer, Part, ViewRequest, draw
 from dyngs.view.views import camera_at, nearest_view, views_of
 
@@ -138,7 +138,7 @@ class Recording:
         time = 0.0 if frame.times is None else float(frame.times[0])
         return Cameras(pose, matrix, *size), time
 
-    def document(self, size: tuple[int, int], fps: float, opened: Opened) -> str:
+    def document(self, size: tuple[int, int], fps: float, opened: OpenedScene) -> str:
         """Return the path as JSON for ``dyngs render --path`` (docs/camera_paths.md), in capture
         coordinates.
 
@@ -182,7 +182,7 @@ class Session:
 
     def __init__(
         self,
-        opened: Opened,
+        opened: OpenedScene,
         send: Callable[[SentImage], None],
         target: float = 1 / 14,
         clock: Callable[[], float] = time.monotonic,
@@ -226,7 +226,7 @@ class Session:
         self.on_play(self.timeline.playing)
         self._note_change()
 
-    def show(self, opened: Opened) -> None:
+    def show(self, opened: OpenedScene) -> None:
         """Show another scene at the same time."""
         self.opened = opened
         self.change_timeline(seconds=opened.seconds)
@@ -236,7 +236,7 @@ class Session:
         self._preview = recording, self._clock()
         self._note_change()
 
-    def update_scene(self, opened: Opened, *, refreshes: bool) -> None:
+    def update_scene(self, opened: OpenedScene, *, refreshes: bool) -> None:
         """Replace the scene by a newer state. ``refreshes`` requests a new image."""
         self.opened = opened
         self._is_stale |= refreshes

@@ -14,7 +14,7 @@ from dyngs.io.formats.formats import format_to_read
 from dyngs.io.outputs import command_for
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
-from dyngs.runs.opened import Opened, open_scene
+from dyngs.runs.opened import OpenedScene, open_scene
 from dyngs.view.layers import with_levels
 
 
@@ -23,7 +23,7 @@ class SceneSource:
     """Names of scenes, at least one, and the function that loads a scene by name."""
 
     names: tuple[str, ...]
-    load: Callable[[str], Opened]
+    load: Callable[[str], OpenedScene]
 
 
 def open_source(
@@ -54,7 +54,7 @@ def open_source(
         instead = f"{known}; then " if known else ""
         raise DyngsError(f"{path}: no runs found; {instead}give a run, a file, or a folder of runs")
 
-    def load(name: str) -> Opened:
+    def load(name: str) -> OpenedScene:
         opened = open_to_view(runs[name], name, up, data_root).to(device)
         return opened if most is None else with_levels(opened, most)
 
@@ -63,7 +63,7 @@ def open_source(
 
 def open_to_view(
     path: Path, name: str, up: str | None = None, data_root: Path | None = None
-) -> Opened:
+) -> OpenedScene:
     """Open a run or a file for viewing. A missing capture is reported in a note.
 
     Args:
@@ -85,7 +85,7 @@ def open_to_view(
     return opened
 
 
-def load_first(source: SceneSource) -> Opened:
+def load_first(source: SceneSource) -> OpenedScene:
     """Return the first scene that can be loaded, with notes about those that cannot. Raises
     DyngsError."""
     failed: list[DyngsError] = []

@@ -14,10 +14,10 @@ from torch import Tensor
 from dyngs.config import Config
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.models.kind import Predicts, capability
+from dyngs.models.kind import PredictsScenes, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
-from dyngs.runs.opened import Captured, Opened
+from dyngs.runs.opened import Captured, OpenedScene
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
 from dyngs.view.server import ServerOptions, Viewer, free_port, require_viser
@@ -60,7 +60,7 @@ class BetweenStepRenderer:
         with torch.no_grad():
             for session in sessions:
                 shell = _shell(scene, session.opened.background)
-                session.update_scene(session.opened.showing(shell), refreshes=refreshes)
+                session.update_scene(session.opened.with_scene(shell), refreshes=refreshes)
             while self._drawer.draw_one():
                 if self._clock() - start > REFRESH_SECONDS * self._fraction:
                     break
@@ -80,7 +80,7 @@ class TrainingView:
     """
 
     def __init__(self, config: Config, serving: ServerOptions, log: Callable[[str], None]) -> None:
-        if capability(config.model, Predicts) is not None:
+        if capability(config.model, PredictsScenes) is not None:
             raise DyngsError(
                 "--view: a network has no scene to show; create one with `dyngs predict`"
             )
@@ -114,7 +114,7 @@ class TrainingView:
             event.loop.stopwatch.exclude(time.perf_counter() - start)
 
 
-def opened_training(trainer: Trainer[Any]) -> Opened:
+def opened_training(trainer: Trainer[Any]) -> OpenedScene:
     """Return the scene of a trainer with its training views."""
     config = trainer.config
     views = trainer.images.views
@@ -123,7 +123,7 @@ def opened_training(trainer: Trainer[Any]) -> Opened:
     captured.once("views", lambda: shown)
     with torch.no_grad():
         scene = _shell(trainer.model.scene, background_colour(trainer.background))
-    return Opened(
+    return OpenedScene(
         config,
         scene,
         trainer.done,

@@ -17,7 +17,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.export.choose_path import framing_points, orbit_cameras_around
 from dyngs.human.avatar.scene import as_human_scene
 from dyngs.models.views import training_cameras
-from dyngs.runs.opened import Opened, scene_of_split
+from dyngs.runs.opened import OpenedScene, scene_of_split
 
 MAX_FOV = math.radians(160)
 
@@ -52,7 +52,7 @@ class Viewpoint:
     up: np.ndarray
 
 
-def views_of(opened: Opened) -> CapturedViews:
+def views_of(opened: OpenedScene) -> CapturedViews:
     """Return the views of the capture of a scene, without images if a person is in other poses."""
     if opened.captured is None:
         return CapturedViews()
@@ -60,7 +60,7 @@ def views_of(opened: Opened) -> CapturedViews:
     return found if opened.as_captured else replace(found, images=None)
 
 
-def _views_of_capture(opened: Opened) -> CapturedViews:
+def _views_of_capture(opened: OpenedScene) -> CapturedViews:
     """Return the views of all splits that show the same motion as the scene."""
     if opened.missing is not None:
         return CapturedViews()
@@ -85,13 +85,13 @@ def captured_views(
     )
 
 
-def initial_viewpoint(opened: Opened) -> Viewpoint:
+def initial_viewpoint(opened: OpenedScene) -> Viewpoint:
     """Return the initial viewpoint: the first camera of the capture, or a view of the whole
     scene."""
     return (opened.captured or opened).once("viewpoint", lambda: _viewpoint(opened))
 
 
-def _viewpoint(opened: Opened) -> Viewpoint:
+def _viewpoint(opened: OpenedScene) -> Viewpoint:
     shown = views_of(opened)
     cameras = opened.cameras
     person = as_human_scene(opened.renderable)
@@ -109,13 +109,13 @@ def _viewpoint(opened: Opened) -> Viewpoint:
     return Viewpoint(start, center, float(np.median(apart)), up)
 
 
-def has_timeline(opened: Opened) -> bool:
+def has_timeline(opened: OpenedScene) -> bool:
     """Return whether the scene has, or may get, several times."""
     may_move = opened.in_training and len(opened.renderable.times) > 1
     return may_move or not opened.renderable.is_static or opened.person is not None
 
 
-def nearest_view(opened: Opened, camera: Cameras, time: float) -> int:
+def nearest_view(opened: OpenedScene, camera: Cameras, time: float) -> int:
     """Return the index of the view nearest to a camera in position, direction and time.
 
     An angle of one radian counts as half the size of the scene, and as a quarter of the clip.

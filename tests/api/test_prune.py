@@ -11,9 +11,9 @@ from moving_scene import write_moving_run
 from pretend_gpu import GPU, pretend_gpu
 from tiny_fields import busy_config, write_tiny_capture
 
-from dyngs.api.prune import file_of, prune_run, prune_within
+from dyngs.api.prune import file_of, prune_run, prune_to_loss
 from dyngs.api.train import train
-from dyngs.compress.search import evenly_held_out
+from dyngs.compress.search import held_out_indices
 from dyngs.compress.stage import quality_of
 from dyngs.config import PruneConfig
 from dyngs.config.io import load_resolved
@@ -67,7 +67,7 @@ def test_a_pruned_run_can_be_pruned(run_dir: Path, tmp_path: Path) -> None:
     once = prune_run(run_dir, tmp_path / "once", ASKED)
     twice = prune_run(once, tmp_path / "twice", ("prune.fraction=0.5", "prune.steps=2"))
     thrice = tmp_path / "thrice"
-    prune_within(twice, thrice, 50.0, BRIEFLY, silent)
+    prune_to_loss(twice, thrice, 50.0, BRIEFLY, silent)
     sizes = [len(load_run(folder).scene) for folder in (run_dir, once, twice, thrice)]
     assert sizes[0] > sizes[1] > sizes[2] > sizes[3]
     assert load_run(twice).step == 32
@@ -80,11 +80,11 @@ def test_on_a_gpu_it_is_the_same(
 ) -> None:
     """The search, of few candidates, its file, and the comparison with the run before."""
     briefly = ("prune.steps=1", "run.threads=1")
-    expected = prune_within(run_dir, tmp_path / "here", 3.0, briefly, silent)
+    expected = prune_to_loss(run_dir, tmp_path / "here", 3.0, briefly, silent)
     here = compare_runs([run_dir, file_of(tmp_path / "here")], 1)
     monkeypatch.setattr("dyngs.training.new_trainer.select_device", lambda _: GPU)
     with pretend_gpu():
-        found = prune_within(run_dir, tmp_path / "there", 3.0, briefly, silent)
+        found = prune_to_loss(run_dir, tmp_path / "there", 3.0, briefly, silent)
         there = compare_runs([run_dir, file_of(tmp_path / "there")], 1, GPU)
     assert found == expected
     files = [file_of(tmp_path / name) / SCENE_FILE for name in ("there", "here")]
@@ -97,7 +97,7 @@ def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
     told: list[str] = []
     folder = tmp_path / "a"
     first, again = (
-        prune_within(run_dir, tmp_path / name, 1.0, BRIEFLY, told.append) for name in ("a", "b")
+        prune_to_loss(run_dir, tmp_path / name, 1.0, BRIEFLY, told.append) for name in ("a", "b")
     )
     assert first == again
     assert told[: len(told) // 2] == told[len(told) // 2 :]
@@ -107,7 +107,7 @@ def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
     config = load_resolved(folder)
     trainer = build_trainer(config, restored=True)
     trainer.restore(latest_checkpoint(folder))
-    shown = [trainer.images[i] for i in evenly_held_out(len(trainer.images))]
+    shown = [trainer.images[i] for i in held_out_indices(len(trainer.images))]
     assert quality_of(trainer, load_run(file_of(folder)).scene, shown) == pytest.approx(
         first.after, abs=1e-4
     )
@@ -146,6 +146,6 @@ def test_what_cannot_be_done_is_refused(tmp_path: Path) -> None:
         (tmp_path / "new", ["model.alpha_min=0.1"], "losses are counted from RUN as it is"),
     ):
         with pytest.raises(DyngsError, match=message):
-            prune_within(run_dir, out, 0.2, overrides)
+            prune_to_loss(run_dir, out, 0.2, overrides)
     assert not (tmp_path / "new").exists()
     assert (taken / "file").read_text() == "mine"

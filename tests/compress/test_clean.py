@@ -12,7 +12,7 @@ from scaled_files import FACTORS, scaled
 from splat_scenes import cloud
 
 from dyngs.api.train import train
-from dyngs.compress.clean import by_shape, cleaned_file, cleaned_run, lone
+from dyngs.compress.clean import classify_shapes, clean_file, clean_run, lone
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
@@ -52,7 +52,7 @@ def spoiled() -> Gaussians:
 
 
 def test_shapes() -> None:
-    found = by_shape(spoiled(), spoiled().opacities)
+    found = classify_shapes(spoiled(), spoiled().opacities)
     rows = {kind: torch.nonzero(x)[:, 0].tolist() for kind, x in found.items()}
     assert rows == {"needles": [200], "veils": [201], "faint": [202], "lone": [203]}
     assert not lone(torch.zeros(4, 3)).any()
@@ -60,25 +60,25 @@ def test_shapes() -> None:
 
 def test_files_without_cameras() -> None:
     told: list[str] = []
-    kept = cleaned_file(spoiled(), told.append)
+    kept = clean_file(spoiled(), told.append)
     assert torch.nonzero(~kept)[:, 0].tolist() == [200, 202, 203]
     assert "3 of 204 Gaussians go; without the cameras of a run" in told[-1]
     with pytest.raises(DyngsError, match="nothing would be left"):
-        cleaned_file(spoiled().select(torch.tensor([200, 202])), told.append)
+        clean_file(spoiled().select(torch.tensor([200, 202])), told.append)
 
 
 @pytest.mark.parametrize("factor", FACTORS)
 def test_the_same_goes_in_any_unit(factor: float) -> None:
-    wanted = cleaned_file(spoiled(), lambda _: None)
-    assert torch.equal(cleaned_file(scaled(spoiled(), factor), lambda _: None), wanted)
+    wanted = clean_file(spoiled(), lambda _: None)
+    assert torch.equal(clean_file(scaled(spoiled(), factor), lambda _: None), wanted)
 
 
 @pytest.mark.parametrize("allowed", [0.0, 0.2, 50.0])
 def test_no_more_is_lost_than_allowed(allowed: float, run_dir: Path) -> None:
     told: list[str] = []
     again: list[str] = []
-    kept = cleaned_run(run_dir, allowed, 1, None, told.append)
-    assert torch.equal(kept, cleaned_run(run_dir, allowed, 1, None, again.append))
+    kept = clean_run(run_dir, allowed, 1, None, told.append)
+    assert torch.equal(kept, clean_run(run_dir, allowed, 1, None, again.append))
     assert told == again, "deterministic"
     change = float(told[-1].split("(")[1].split(")")[0])
     assert -allowed - 5e-4 <= change

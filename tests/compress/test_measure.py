@@ -10,8 +10,8 @@ from moving_scene import write_moving_run
 
 from dyngs.compress.measure import (
     Precision,
-    coarsest_file,
-    storage_plan,
+    find_coarsest_file,
+    plan_storage,
 )
 from dyngs.config import SceneModel
 from dyngs.config.io import load_resolved
@@ -25,7 +25,7 @@ def plan_of(
 ) -> tuple[Precision, torch.Tensor | None]:
     run = load_run(run_dir)
     assert isinstance(run.config.model, SceneModel)
-    return storage_plan(run.config, latest_checkpoint(run_dir), run.scene, max_change)
+    return plan_storage(run.config, latest_checkpoint(run_dir), run.scene, max_change)
 
 
 @pytest.mark.parametrize("moves", [True, False])
@@ -66,13 +66,13 @@ def test_the_coarsest_that_is_good_enough(tmp_path: Path) -> None:
         does not matter."""
         return -float((scene.at(0.5).means.sum(0) - exact.sum(0)).square().sum())
 
-    every = coarsest_file(config, checkpoint, lambda scene: 1.0, 0.0)
+    every = find_coarsest_file(config, checkpoint, lambda scene: 1.0, 0.0)
     assert every is not None
-    some = coarsest_file(config, checkpoint, quality, -1e-3)
+    some = find_coarsest_file(config, checkpoint, quality, -1e-3)
     assert some is not None
     data, reached = some
     assert reached >= -1e-3
     stored = restore_scene(type(checkpoint)(checkpoint.info, decoded(data).tensors), config.model)
     assert quality(stored) == reached
     assert len(every[0]) <= len(data)
-    assert coarsest_file(config, checkpoint, lambda scene: -1.0, 0.0) is None
+    assert find_coarsest_file(config, checkpoint, lambda scene: -1.0, 0.0) is None

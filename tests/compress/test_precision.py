@@ -13,8 +13,8 @@ from torch import Tensor
 from dyngs.compress.measure import (
     Draw,
     Precision,
-    coarseness_of,
-    measured_precision,
+    compute_coarseness,
+    measure_precision,
 )
 from dyngs.core.state import part_of
 from dyngs.gaussians import Gaussians
@@ -22,7 +22,7 @@ from dyngs.gaussians.rendering import render
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.runs.stored_file import (
     MAX_COARSENESS,
-    coding_of,
+    choose_coding,
     completed,
     drawable,
     restored,
@@ -42,7 +42,7 @@ def scene_of(stored: Mapping[str, Tensor]) -> StaticScene:
 
 def measured(stored: Mapping[str, Tensor], draw: Draw, max_change: float) -> Precision:
     """How exactly a static scene must be stored."""
-    return measured_precision(drawable(scene_of(stored)), draw(stored), draw, max_change)
+    return measure_precision(drawable(scene_of(stored)), draw(stored), draw, max_change)
 
 
 def draw(state: Mapping[str, Tensor]) -> list[Tensor]:
@@ -57,7 +57,7 @@ def draw(state: Mapping[str, Tensor]) -> list[Tensor]:
 def test_the_change_is_what_is_allowed_or_less(max_change: float) -> None:
     precision = measured(tensors(), draw, max_change)
     exact = drawable(scene_of(tensors()))
-    rounded = {name: restored(x, coding_of(name, x, precision.steps)) for name, x in exact.items()}
+    rounded = {name: restored(x, choose_coding(name, x, precision.steps)) for name, x in exact.items()}
     before = draw(tensors())[0].clamp(0, 1)
     after = draw(completed(rounded))[0].clamp(0, 1)
     change = 255 * float((before - after).double().square().mean().sqrt())
@@ -67,16 +67,16 @@ def test_the_change_is_what_is_allowed_or_less(max_change: float) -> None:
 
 def test_coarseness_is_half_an_octave_per_octave() -> None:
     visibility = torch.tensor([1.0] * 8 + [2.0**-4, 0.0])
-    assert coarseness_of(visibility).tolist() == [0] * 8 + [2, MAX_COARSENESS]
-    assert coarseness_of(torch.zeros(0)).shape == (0,)
-    assert coarseness_of(torch.zeros(3)).tolist() == [MAX_COARSENESS] * 3
+    assert compute_coarseness(visibility).tolist() == [0] * 8 + [2, MAX_COARSENESS]
+    assert compute_coarseness(torch.zeros(0)).shape == (0,)
+    assert compute_coarseness(torch.zeros(3)).tolist() == [MAX_COARSENESS] * 3
 
 
 def change_after(
     stored: dict[str, Tensor], exact: dict[str, Tensor], steps: Mapping[str, float]
 ) -> float:
     """Grey levels by which rounding with ``steps`` changes the image."""
-    rounded = {name: restored(x, coding_of(name, x, steps)) for name, x in exact.items()}
+    rounded = {name: restored(x, choose_coding(name, x, steps)) for name, x in exact.items()}
     before = draw(stored)[0].clamp(0, 1)
     after = draw(completed(rounded))[0].clamp(0, 1)
     return 255 * float((before - after).double().square().mean().sqrt())
@@ -115,4 +115,4 @@ def test_what_no_step_is_fine_enough_for_is_stored_as_it_is() -> None:
     assert precision.change is not None
     assert precision.change <= 0.01
     means = drawable(scene_of(far))["gaussians.means"]
-    assert coding_of("gaussians.means", means, precision.steps).kind == "exact"
+    assert choose_coding("gaussians.means", means, precision.steps).kind == "exact"

@@ -11,7 +11,7 @@ from dyngs.compress.search import (
     Candidate,
     PruneChoice,
     Search,
-    evenly_held_out,
+    held_out_indices,
 )
 from dyngs.config import PruneConfig
 from dyngs.training.new_trainer import build_trainer
@@ -30,13 +30,13 @@ def trainer(moving: Path) -> Trainer:
 
 
 def test_views_held_out_are_spread_and_few() -> None:
-    assert evenly_held_out(1) == ()
-    assert evenly_held_out(2) == (1,)
-    assert evenly_held_out(16) == (4, 12)
-    assert len(evenly_held_out(100)) == 12
-    assert len(evenly_held_out(10_000)) == 32
-    assert 0 not in evenly_held_out(100)
-    assert 99 not in evenly_held_out(100)
+    assert held_out_indices(1) == ()
+    assert held_out_indices(2) == (1,)
+    assert held_out_indices(16) == (4, 12)
+    assert len(held_out_indices(100)) == 12
+    assert len(held_out_indices(10_000)) == 32
+    assert 0 not in held_out_indices(100)
+    assert 99 not in held_out_indices(100)
 
 
 @pytest.mark.parametrize("allowed", [0.0, 0.05, 0.31, 0.69, 9.0])

@@ -14,8 +14,8 @@ from torch import Tensor
 from dyngs.api.train import train
 from dyngs.compress.stage import (
     Importance,
-    pruning,
-    there_after,
+    build_pruning_edit,
+    visible_between_times,
 )
 from dyngs.config import (
     Config,
@@ -116,7 +116,7 @@ def test_mcmc_stands_still_in_the_stage(still: Path, tmp_path: Path) -> None:
     strategy = McmcStrategy(start=1, stop=30_000, every=3, max_gaussians=90)
     trainer = trained(still_config(still, tmp_path, strategy=strategy))
     before = len(trainer.model.scene.gaussians)
-    trainer.apply(pruning(trainer))
+    trainer.apply(build_pruning_edit(trainer))
     assert isinstance(trainer.model.densifier, Densifier)
     for _ in range(4):
         trainer.step()
@@ -128,7 +128,7 @@ def test_every_score_keeps_as_many(score: str, moving: Path, tmp_path: Path) -> 
     stage = STAGE.model_copy(update={"score": score})
     trainer = trained(moving_config(moving, tmp_path, "control_nodes", stage))
     before = trainer.model.scene.gaussians.detach()
-    trainer.apply(pruning(trainer))
+    trainer.apply(build_pruning_edit(trainer))
     after = trainer.model.scene.gaussians
     assert len(after) == len(before) - len(before) // 2
     assert _all_rows_of(after.means, before.means)
@@ -143,7 +143,7 @@ def _all_rows_of(some: Tensor, everything: Tensor) -> bool:
 def test_masks_are_trained_with(moving: Path, tmp_path: Path) -> None:
     """What no key time sees is not drawn, and receives no gradient."""
     trainer = trained(moving_config(moving, tmp_path, "control_nodes"))
-    trainer.apply(pruning(trainer))
+    trainer.apply(build_pruning_edit(trainer))
     scene = trainer.model.scene
     assert scene.masks is not None
     image = trainer.images[3]
@@ -187,7 +187,7 @@ def test_what_is_there_for_a_while_is_masked_only_while_it_is_not() -> None:
         gaussians=cloud(5), training_times=times, field=field, moving=torch.arange(4)
     )
     keys = (times[0], times[5], times[9])
-    masks = VisibilityMasks.pack(keys, there_after(scene, keys, 1 / 255))
+    masks = VisibilityMasks.pack(keys, visible_between_times(scene, keys, 1 / 255))
     assert masks.seen.sum(0).tolist() == [1, 1, 1, 1, 3]
     for time in times:
         drawn = set(masks.active(masks.interval(time)).tolist())

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import cloud, tiny_setup
 from torch import Tensor
 
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.keys import ControlNodesField
 from dyngs.gaussians import TopologyEdit
@@ -123,7 +123,7 @@ def test_after_any_changes_of_the_set_nodes_are_where_gaussians_are(
         assert followed.max() < len(positions)
         if nodes == 12:
             assert torch.equal(positions[followed[:, 0]], means)
-        assert all(len(x) == len(positions) for x in tensors_of(field.parameters.state()).values())
+        assert all(len(x) == len(positions) for x in strip_roles(field.parameters.state()).values())
 
 
 def test_new_nodes_start_with_the_motion_found_there() -> None:
@@ -151,16 +151,16 @@ def test_nodes_that_nothing_follows_are_dropped_with_their_moments() -> None:
         x.grad = torch.ones_like(x)
     field.parameters.step(1, 0.0)
     stays = [x.tolist() for x in field.buffers["positions"]].index([-1.0, 0.0, 0.0])
-    old = {name: x[stays].clone() for name, x in tensors_of(field.parameters.state()).items()}
+    old = {name: x[stays].clone() for name, x in strip_roles(field.parameters.state()).items()}
     field = changed(field, torch.tensor([0]), torch.tensor([False]))
     field.offsets(means[:1], 0.5)
     assert field.buffers["positions"].tolist() == [[-1.0, 0.0, 0.0]]
     assert all(
-        torch.equal(x, old[name][None]) for name, x in tensors_of(field.parameters.state()).items()
+        torch.equal(x, old[name][None]) for name, x in strip_roles(field.parameters.state()).items()
     )
     field = changed(field, torch.tensor([0, 0]), torch.tensor([False, True]))
     field.offsets(means[[0, 2]], 0.5)
-    state = tensors_of(field.parameters.state())
+    state = strip_roles(field.parameters.state())
     assert state["exp_avg.means"][0].any()
     assert not state["exp_avg.means"][1].any()
 

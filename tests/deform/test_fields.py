@@ -14,7 +14,7 @@ from tiny_fields import (
     tiny_setup,
 )
 
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.deform.fields import field_state, restore_field
 
 
@@ -27,7 +27,7 @@ def test_a_restored_field_moves_everything_alike(kind: str) -> None:
     for time in TIMES:
         field.offsets(means, time).means.square().sum().backward()
     field.parameters.step(1, 0.0)
-    state = {name: x.clone() for name, x in tensors_of(field_state(field)).items()}
+    state = {name: x.clone() for name, x in strip_roles(field_state(field)).items()}
     again = restore_field(tiny_options(kind), state, 9)
     same = again.setup
     assert torch.equal(same.center, setup.center)
@@ -47,7 +47,7 @@ def test_a_restored_field_moves_everything_alike(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
 def test_what_is_missing_is_named(kind: str) -> None:
-    state = tensors_of(field_state(tiny_field(kind)))
+    state = strip_roles(field_state(tiny_field(kind)))
     for name in ("box", "numbers", next(name for name in state if name.startswith("learned."))):
         with pytest.raises(KeyError, match=name.removeprefix("learned.")):
             restore_field(tiny_options(kind), {k: x for k, x in state.items() if k != name}, 9)

@@ -9,7 +9,7 @@ import torch
 from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
 from torch import Tensor
 
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.deform.field import DeformationField, apply_offsets
 from dyngs.deform.fields import field_state
 from dyngs.deform.keys import DynamicModel
@@ -84,7 +84,7 @@ def test_from_a_checkpoint(kind: str, rows: Tensor | None) -> None:
     gaussians = cloud()
     num_moving = 9 if rows is None else len(rows)
     field = stirred_field(kind, num_moving)
-    state = {f"field.{name}": x for name, x in tensors_of(field_state(field)).items()}
+    state = {f"field.{name}": x for name, x in strip_roles(field_state(field)).items()}
     state |= {
         "times": torch.tensor([0.0, 0.25, 1.0], dtype=torch.float64),
         "filter_std": torch.ones(9),

@@ -11,7 +11,7 @@ import torch
 from tiny_fields import TIMES, cloud, stirred_field, tiny_options
 from torch import Tensor
 
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.deform.field import apply_offsets
 from dyngs.deform.fields import EDGE, OPEN, WindowedField, field_state, restore_field
 
@@ -70,7 +70,7 @@ def test_windows_close_where_nothing_is_to_be_seen_and_open_no_further_than_they
 
 
 def stored(field: WindowedField) -> dict[str, Tensor]:
-    return {name: x.clone() for name, x in tensors_of(field_state(field)).items()}
+    return {name: x.clone() for name, x in strip_roles(field_state(field)).items()}
 
 
 def test_a_stored_field_is_the_same_field() -> None:

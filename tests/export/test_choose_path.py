@@ -26,25 +26,25 @@ from dyngs.human.keys import HumanModel
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.io.formats.formats import write_splats
 from dyngs.io.formats.splat_file import SplatFile
-from dyngs.runs.opened import Opened, cameras_for_paths, open_run, open_scene, opened_scene
+from dyngs.runs.opened import OpenedScene, cameras_for_paths, open_run, open_scene, wrap_scene
 
 MODEL = HumanModel(resolution=24, sh_degree=0, fit=False)
 TRAIN = TrainConfig(steps=1)
 
 
 @pytest.fixture(scope="module")
-def moving_run(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+def moving_run(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
     return open_run(write_moving_run(tmp_path_factory.mktemp("moving")))
 
 
 @pytest.fixture(scope="module")
-def still_run(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+def still_run(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
     return open_run(write_moving_run(tmp_path_factory.mktemp("still"), moves=False))
 
 
 @pytest.mark.parametrize("name", ["orbit", "spiral"])
 def test_time_runs_along_a_path_unless_told_otherwise(
-    name: str, moving_run: Opened, still_run: Opened
+    name: str, moving_run: OpenedScene, still_run: OpenedScene
 ) -> None:
     path = choose_path(moving_run, PathOptions(name, 5))
     assert path.times == (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -60,7 +60,7 @@ def test_time_runs_along_a_path_unless_told_otherwise(
     assert (still.times, still.notes) == (None, ())
 
 
-def test_times_of_a_file_are_overridden(moving_run: Opened, tmp_path: Path) -> None:
+def test_times_of_a_file_are_overridden(moving_run: OpenedScene, tmp_path: Path) -> None:
     cameras = cameras_for_paths(moving_run.capture.splits["train"], moving_run.config.data)
     file = tmp_path / "path.json"
     frames = [
@@ -79,7 +79,7 @@ def test_times_of_a_file_are_overridden(moving_run: Opened, tmp_path: Path) -> N
         choose_path(moving_run, PathOptions(str(file), times=(0.0, 0.5, 1.0)))
 
 
-def test_a_camera_that_stands_still(moving_run: Opened) -> None:
+def test_a_camera_that_stands_still(moving_run: OpenedScene) -> None:
     capture = moving_run.capture
     wanted = ImageLoader(capture.splits["test"], DataConfig(root=capture.root))[1]
     path = choose_path(moving_run, PathOptions(None, times=(0.0, 0.5, 1.0), view="1"))
@@ -96,7 +96,7 @@ def test_a_camera_that_stands_still(moving_run: Opened) -> None:
     assert (len(small), small.width, small.height) == (1, 8, 4)
 
 
-def test_views_are_found_by_name_image_and_number(moving_run: Opened) -> None:
+def test_views_are_found_by_name_image_and_number(moving_run: OpenedScene) -> None:
     capture = moving_run.capture
     test = capture.splits["test"]
     train = capture.splits["train"]
@@ -156,7 +156,7 @@ def test_an_orbit_shows_the_same_frames_in_any_unit(factor: float, tmp_path: Pat
 
 
 def test_a_single_gaussian_is_in_view_whole() -> None:
-    one = opened_scene(StaticScene(gaussians=some_gaussians(1)))
+    one = wrap_scene(StaticScene(gaussians=some_gaussians(1)))
     size = math.exp(-3)
     distance = float(
         (orbit_cameras_around(one, 1).centers[0] - one.scene.gaussians.means[0]).norm()

@@ -32,7 +32,7 @@ from dyngs.export.images import (
 from dyngs.export.video import video_writer
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.runs.opened import Opened, open_run, opened_scene
+from dyngs.runs.opened import OpenedScene, open_run, wrap_scene
 
 BALLS = StaticScene(gaussians=two_balls())
 LABEL, GAP = 22, 6  # px, of contact sheets
@@ -49,7 +49,7 @@ def write_balls(
     cameras: Cameras, out: Path | None, output: OutputOptions | None = None
 ) -> list[Path]:
     path = CameraPath(cameras)
-    return write_path_images(opened_scene(BALLS), path, out, output or OutputOptions())
+    return write_path_images(wrap_scene(BALLS), path, out, output or OutputOptions())
 
 
 def standing(*times: float) -> CameraPath:
@@ -61,7 +61,7 @@ def names(folder: Path) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+def run(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
     return open_run(write_moving_run(tmp_path_factory.mktemp("moving"), standing=True))
 
 
@@ -129,7 +129,7 @@ def test_depth_colours_share_one_range_along_a_path(tmp_path: Path) -> None:
     assert b[9, 10, 2] > b[9, 10, 0]
 
 
-def test_split_of_a_run(run: Opened, tmp_path: Path) -> None:
+def test_split_of_a_run(run: OpenedScene, tmp_path: Path) -> None:
     output = OutputOptions(depth=True, alpha=True, video=tmp_path / "test.mp4")
     written = write_split_images(run, "test", tmp_path / "out", output)
     stems = ["r_000", "r_001", "r_002"]

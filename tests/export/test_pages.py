@@ -48,7 +48,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.runs.opened import Opened, open_run, opened_scene
+from dyngs.runs.opened import OpenedScene, open_run, wrap_scene
 
 
 @pytest.fixture(scope="module")
@@ -111,8 +111,8 @@ def test_triangles(texture: int, degree: int, browser: Browser, tmp_path: Path) 
     page.close()
 
 
-def opened_triangles(scene: TriangleScene) -> Opened:
-    return replace(opened_scene(scene_of_kind("static")), renderable=scene, stated_up="-y")
+def opened_triangles(scene: TriangleScene) -> OpenedScene:
+    return replace(wrap_scene(scene_of_kind("static")), renderable=scene, stated_up="-y")
 
 
 @needs_browser
@@ -195,13 +195,13 @@ def test_levels_are_drawn_as_by_dyngs(most: int | None, browser: Browser, tmp_pa
 
 
 def test_only_a_new_folder_is_written_and_no_moving_scene(tmp_path: Path) -> None:
-    still = opened_scene(still_scene())
+    still = wrap_scene(still_scene())
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine").touch()
     with pytest.raises(DyngsError, match="exists already"):
         write_page_folder(still, tmp_path / "full")
     with pytest.raises(DyngsError, match="for still scenes"):
-        write_page_folder(opened_scene(sliding_scene()), tmp_path / "new", most=9)
+        write_page_folder(wrap_scene(sliding_scene()), tmp_path / "new", most=9)
     assert [path.name for path in tmp_path.rglob("*")] == ["full", "mine"]
 
 
@@ -218,11 +218,11 @@ def test_a_page_names_no_host_and_allows_none(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def moving_run(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+def moving_run(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
     return open_run(write_moving_run(tmp_path_factory.mktemp("moving")))
 
 
-def test_a_page_begins_at_a_camera_of_the_capture(moving_run: Opened, tmp_path: Path) -> None:
+def test_a_page_begins_at_a_camera_of_the_capture(moving_run: OpenedScene, tmp_path: Path) -> None:
     written = write_page(moving_run, tmp_path / "a.html", time=0.25)
     header = written.header
     assert written.notes == ()
@@ -242,7 +242,7 @@ def test_a_page_begins_at_a_camera_of_the_capture(moving_run: Opened, tmp_path: 
 def test_a_page_begins_with_the_same_view_in_any_unit(factor: float, tmp_path: Path) -> None:
     headers = []
     for unit in (1.0, factor):
-        opened = opened_scene(StaticScene(gaussians=scaled(still_scene().gaussians, unit)))
+        opened = wrap_scene(StaticScene(gaussians=scaled(still_scene().gaussians, unit)))
         headers.append(write_page(opened, tmp_path / "a.html").header)
     wanted, found = headers
     np.testing.assert_allclose(np.array(found["target"]) / factor, wanted["target"], atol=1e-5)
@@ -273,7 +273,7 @@ def test_a_long_clip_is_fetched_as_it_is_played(
     monkeypatch.setattr(scene_data, "CHUNK_BYTES", 60)
     scene = replace(scene, background=torch.ones(3))
     written = write_page_folder(
-        replace(opened_scene(scene), stated_up="-y"), tmp_path / "clip", views=(view,)
+        replace(wrap_scene(scene), stated_up="-y"), tmp_path / "clip", views=(view,)
     )
     curves = written.header["curves"]
     count = -(-(curves["points"] - 3) // curves["chunk"])

@@ -55,19 +55,19 @@ from dyngs.io.formats.formats import read_splats, upright, write_splats
 from dyngs.io.formats.similarity import AXES, Similarity, turn_between
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.gltf import GltfFile
-from dyngs.runs.opened import Captured, Opened, open_run, opened_scene
+from dyngs.runs.opened import Captured, OpenedScene, open_run, wrap_scene
 
 ALL = (0, 1, 2, 3, 4)
 STILL_ROWS = (0, 2, 4)
 
 
 @pytest.fixture(scope="module")
-def moving(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+def moving(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
     return open_run(write_moving_run(tmp_path_factory.mktemp("moving"), offset=(100.0, 0.0, -5.0)))
 
 
 @pytest.fixture(scope="module")
-def near(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+def near(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
     return open_run(write_moving_run(tmp_path_factory.mktemp("near")))
 
 
@@ -76,7 +76,7 @@ def x_of(path: Path) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("time", [0.0, 0.3, 1.0])
-def test_one_moment(moving: Opened, time: float, tmp_path: Path) -> None:
+def test_one_moment(moving: OpenedScene, time: float, tmp_path: Path) -> None:
     splat = read_splats(write_run_splats(moving, tmp_path / "a.ply", time).path)
     torch.testing.assert_close(splat.gaussians.means[:, 0], moved_x(ALL, time))
     assert torch.equal(splat.gaussians.means[:, 1:], row_of_balls().means[:, 1:])
@@ -85,7 +85,7 @@ def test_one_moment(moving: Opened, time: float, tmp_path: Path) -> None:
     assert splat.eps2d == moving.config.model.eps2d
 
 
-def test_parts_together_are_the_whole(moving: Opened, tmp_path: Path) -> None:
+def test_parts_together_are_the_whole(moving: OpenedScene, tmp_path: Path) -> None:
     parts: dict[Part, tuple[int, ...]] = {"moving": MOVING_ROWS, "static": STILL_ROWS}
     for part, rows in parts.items():
         path = write_run_splats(moving, tmp_path / f"{part}.ply", 0.7, part).path
@@ -98,7 +98,7 @@ def test_parts_together_are_the_whole(moving: Opened, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("part", "rows"), [("all", ALL), ("moving", MOVING_ROWS)])
-def test_a_sequence(moving: Opened, part: Part, rows: tuple[int, ...], tmp_path: Path) -> None:
+def test_a_sequence(moving: OpenedScene, part: Part, rows: tuple[int, ...], tmp_path: Path) -> None:
     times = (0.0, 0.25, 1.0)
     files = write_run_sequence(moving, tmp_path / "new" / "seq", times, part)
     paths = [one.path for one in files]
@@ -110,7 +110,7 @@ def test_a_sequence(moving: Opened, part: Part, rows: tuple[int, ...], tmp_path:
 
 
 def test_a_sequence_of_the_same_length_is_replaced_and_others_are_refused(
-    moving: Opened, tmp_path: Path
+    moving: OpenedScene, tmp_path: Path
 ) -> None:
     folder = tmp_path / "seq"
     write_run_sequence(moving, folder, (0.0, 0.5))
@@ -125,7 +125,7 @@ def test_a_sequence_of_the_same_length_is_replaced_and_others_are_refused(
         write_run_sequence(moving, folder / "notes.txt", (0.0, 0.5))
 
 
-def test_up_is_what_the_cameras_or_the_user_say(near: Opened) -> None:
+def test_up_is_what_the_cameras_or_the_user_say(near: OpenedScene) -> None:
     found = find_up_direction(near)
     assert found is not None
     name = next(name for name, axis in AXES.items() if axis == found[0])
@@ -150,7 +150,7 @@ def test_edits_of_every_kind_of_scene_are_exact(kind: str) -> None:
     between."""
     scene = replace(scene_of_kind(kind), colour=None)
     edit = Similarity((0.6, 0.0, 0.8, 0.0), 2.5, (3.0, -1.0, 0.5))
-    splat = splats_at(opened_scene(scene), scene, 0.3, WriteOptions(edit=edit, up="y"))
+    splat = splats_at(wrap_scene(scene), scene, 0.3, WriteOptions(edit=edit, up="y"))
     seen = onlooker()
     before = scene.render(seen, 0.3, background=torch.zeros(3)).rgb
     options = replace(scene.options, near=scene.options.near * edit.scale)
@@ -160,7 +160,7 @@ def test_edits_of_every_kind_of_scene_are_exact(kind: str) -> None:
     assert (splat.edited, splat.up) == (edit, "y")
 
 
-def test_a_file_drawn_again_is_compared_with_its_run(near: Opened, tmp_path: Path) -> None:
+def test_a_file_drawn_again_is_compared_with_its_run(near: OpenedScene, tmp_path: Path) -> None:
     for how in (WriteOptions(), WriteOptions(turn_between(AXES["z"], AXES["-y"]), "-y")):
         written = write_run_splats(near, tmp_path / "a.ply", 0.7, how=how)
         read = read_splats(written.path)
@@ -217,7 +217,7 @@ def test_a_file_of_tracks_holds_arrays_without_pickle(tmp_path: Path) -> None:
     assert path.read_bytes() == first
 
 
-def test_moving_files(tmp_path: Path, near: Opened, capsys: pytest.CaptureFixture[str]) -> None:
+def test_moving_files(tmp_path: Path, near: OpenedScene, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("fourdgs")
     times = [i / 9 for i in range(10)]  # more than one group of key frame and deltas
     splats, _ = write_4dgs(near, tmp_path / "a.4dgs", times)
@@ -236,7 +236,7 @@ def test_moving_files(tmp_path: Path, near: Opened, capsys: pytest.CaptureFixtur
 
 
 @pytest.fixture(scope="module")
-def rolling(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+def rolling(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
     """Of five balls the second and the fourth are one body, which turns by 0.9 times half a turn
     and moves aside."""
     opened = open_run(write_moving_run(tmp_path_factory.mktemp("rolling")))
@@ -248,12 +248,12 @@ def rolling(tmp_path_factory: pytest.TempPathFactory) -> Opened:
     rest = BodyRestPose(torch.tensor([[0.1, 0.2, 0.0]]), torch.ones(1), labels)
     field = BodyField(sliding_nodes(), rest, {"places": places[None], "quats": quats[None]})
     assert isinstance(opened.scene, DynamicScene)
-    return opened.showing(replace(opened.scene, field=WindowedField(field, len(MOVING_ROWS))))
+    return opened.with_scene(replace(opened.scene, field=WindowedField(field, len(MOVING_ROWS))))
 
 
 @pytest.mark.parametrize("how", [WriteOptions(), WriteOptions((0.5, 0.5, 0.5, 0.5), "y")])
 def test_the_animation_of_bodies_shows_the_scene_at_all_times(
-    tmp_path: Path, rolling: Opened, how: WriteOptions
+    tmp_path: Path, rolling: OpenedScene, how: WriteOptions
 ) -> None:
     written = write_rigid_bodies(rolling, tmp_path / "a.glb", 0.25, how)
     found = read_splats(written.path).gaussians

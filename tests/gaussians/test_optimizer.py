@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dyngs.config import OptimConfig
-from dyngs.core.state import part_of, tensors_of
+from dyngs.core.state import part_of, strip_roles
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import GaussianOptimizer
 
@@ -25,7 +25,7 @@ def _stored(optimizer: GaussianOptimizer) -> dict[str, torch.Tensor]:
     tensors = {
         f"gaussians.{name}": x.detach() for name, x in optimizer.parameters.tensors().items()
     }
-    return {name: x.clone() for name, x in (tensors | tensors_of(optimizer.state())).items()}
+    return {name: x.clone() for name, x in (tensors | strip_roles(optimizer.state())).items()}
 
 
 def _restored(tensors: dict[str, torch.Tensor]) -> GaussianOptimizer:

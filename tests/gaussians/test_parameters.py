@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, tensors_of
+from dyngs.core.state import Role, strip_roles
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.optimizer import Parameters
 
@@ -58,11 +58,11 @@ def test_an_edit_moves_rows_and_starts_new_ones_without_moments() -> None:
     learned = Parameters(start_values(), RATES, roles=roles)
     give_gradients(learned, 1)
     learned.step(1, 0.0)
-    before = {name: x.clone() for name, x in tensors_of(learned.state()).items()}
+    before = {name: x.clone() for name, x in strip_roles(learned.state()).items()}
     index = torch.tensor([3, 0, 0, 2, 3])
     is_new = torch.tensor([False, False, True, False, True])
     edited = learned.apply_edit(Role.PER_MOVING, TopologyEdit(index, is_new))
-    after = tensors_of(edited.state())
+    after = strip_roles(edited.state())
     assert torch.equal(after["weight"], before["weight"][index])
     assert edited["weight"].requires_grad
     assert edited["weight"].is_leaf
@@ -75,7 +75,7 @@ def test_an_edit_moves_rows_and_starts_new_ones_without_moments() -> None:
     )
     edited["weight"].grad = torch.ones(5, 5)
     edited.step(2, 0.5)
-    assert all(torch.equal(x, before[name]) for name, x in tensors_of(learned.state()).items())
+    assert all(torch.equal(x, before[name]) for name, x in strip_roles(learned.state()).items())
 
 
 def test_rows_rearranged_take_their_moments_along() -> None:
@@ -83,11 +83,11 @@ def test_rows_rearranged_take_their_moments_along() -> None:
     learned = Parameters(start_values(), RATES)
     give_gradients(learned, 1)
     learned.step(1, 0.0)
-    before = {name: x.clone() for name, x in tensors_of(learned.state()).items()}
+    before = {name: x.clone() for name, x in strip_roles(learned.state()).items()}
     values = torch.randn(3, 5, generator=torch.Generator().manual_seed(2))
     source = torch.tensor([2, 99, 0])
     is_new = torch.tensor([False, True, False])
-    found = tensors_of(learned.reorder({"weight": values}, source, is_new).state())
+    found = strip_roles(learned.reorder({"weight": values}, source, is_new).state())
     assert torch.equal(found["weight"], values)
     for name in ("exp_avg.weight", "exp_avg_sq.weight"):
         assert torch.equal(
@@ -101,14 +101,14 @@ def test_a_restored_one_goes_on_as_if_never_stopped() -> None:
     for step in (1, 2, 3):
         give_gradients(first, step)
         first.step(step, step / 6)
-    state = tensors_of(first.state())
+    state = strip_roles(first.state())
     second = second.with_state(state)
     for learned in (first, second):
         for step in (4, 5):
             give_gradients(learned, step)
             learned.step(step, step / 6)
-    for name, x in tensors_of(first.state()).items():
-        assert torch.equal(tensors_of(second.state())[name], x), name
+    for name, x in strip_roles(first.state()).items():
+        assert torch.equal(strip_roles(second.state())[name], x), name
     for name in ("bias", "exp_avg.bias"):
         with pytest.raises(KeyError, match=name):
             second.with_state({n: x for n, x in state.items() if n != name})

@@ -15,7 +15,7 @@ from tiny_fields import busy_config, write_tiny_capture
 from torch import Tensor
 
 from dyngs.config import FixedStrategy
-from dyngs.core.state import Role, part_of, tensors_of
+from dyngs.core.state import Role, part_of, strip_roles
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import restore_colour_network
 from dyngs.gaussians.scene import GaussianScene, restore_scene
@@ -67,7 +67,7 @@ def test_what_is_stored_gives_the_same_images(kind: str, drawing: bool) -> None:
     state = scene.drawing_state() if drawing else scene.state()
     found = replace(
         restored(kind, state),
-        colour=restore_colour_network(part_of(tensors_of(state), "model.colour")),
+        colour=restore_colour_network(part_of(strip_roles(state), "model.colour")),
     )
     assert type(found) is type(scene)
     assert found.times == scene.times

@@ -11,7 +11,7 @@ import torch
 from motion_files import random_motion
 from synthetic_bodies import model, write_npz
 
-from dyngs.core.state import moved_to
+from dyngs.core.state import move_to_device
 from dyngs.human.avatar.observations import nearest_neighbours
 from dyngs.human.avatar.posing import (
     Skeleton,
@@ -63,7 +63,7 @@ def test_the_parts_of_an_avatar_move_to_a_device(tmp_path: Path) -> None:
     shapes = pose_blend_shapes(body)
     assert shapes is not None
     skeleton = Skeleton(body.joints, body.parents)
-    moved = moved_to((body, anchors, shapes, skeleton), "meta")
+    moved = move_to_device((body, anchors, shapes, skeleton), "meta")
     for x in (moved[0].weights, moved[1].points, moved[2].faces, moved[3].joints):
         assert x.device.type == "meta"
     clip = motion_clip(random_motion(2)).to(device="meta")

@@ -18,8 +18,8 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.human.predict.ghg.network import PersonPredictor, new_network
-from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, restored_model
-from dyngs.models.kind import HasGaussians, Predicts, capability, kind_of
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, restore_model
+from dyngs.models.kind import HasGaussians, PredictsScenes, capability, kind_of
 from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable
 from dyngs.training.new_trainer import build_trainer
@@ -99,7 +99,7 @@ def test_every_kind_is_here() -> None:
     for name in kind_names():
         kind = kind_of(section_of_kind(name)())
         assert kind.name == name
-        assert isinstance(kind, Predicts) == (name in NETWORKS)
+        assert isinstance(kind, PredictsScenes) == (name in NETWORKS)
 
 
 def test_it_is_trained_stored_and_restored(config: Config) -> None:
@@ -120,7 +120,7 @@ def test_it_is_trained_stored_and_restored(config: Config) -> None:
 
 
 def test_its_scene_is_restored_and_drawn(config: Config, trainer: Trainer) -> None:
-    scene = restored_model(trainer.checkpoint(), config.model)
+    scene = restore_model(trainer.checkpoint(), config.model)
     own = trainer.model.scene
     assert isinstance(scene, Renderable)
     assert scene.state().keys() == own.state().keys()
@@ -176,7 +176,7 @@ def test_only_what_is_made_of_gaussians_passes_for_that(config: Config, trainer:
 @pytest.mark.parametrize("name", sorted(NETWORKS))
 def test_a_network_is_no_scene_but_predicts_one(name: str) -> None:
     with pytest.raises(DyngsError, match="a network, not a scene"):
-        restored_model(
+        restore_model(
             Checkpoint(CheckpointInfo(1, 1.0, (0.0, 0.0, 0.0), "white", "classic"), {}),
             section_of_kind(name)(),
         )

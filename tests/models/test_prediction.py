@@ -15,7 +15,7 @@ from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.models.prediction import (
     load_optimizer,
     load_weights,
-    named_views,
+    find_views,
     optimizer_state,
     updated,
 )
@@ -24,13 +24,13 @@ from dyngs.models.prediction import (
 def test_views_by_name() -> None:
     """In the order given; of the view, or of its file."""
     views = [View(f"a/{i}", Path(f"a/{i}.png"), np.eye(4), np.eye(3), 8, 8) for i in range(6)]
-    assert named_views("ann", views, ["5.png", "a/2"]) == [5, 2]
+    assert find_views("ann", views, ["5.png", "a/2"]) == [5, 2]
     with pytest.raises(
         DyngsError, match="ann: no training view is named 'nobody'; the first is 'a/0'"
     ):
-        named_views("ann", views, ["nobody"])
+        find_views("ann", views, ["nobody"])
     with pytest.raises(DyngsError, match="named twice"):
-        named_views("ann", views, ["5.png", "a/5"])
+        find_views("ann", views, ["5.png", "a/5"])
 
 
 def stored(network: nn.Module) -> Checkpoint:

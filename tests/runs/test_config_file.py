@@ -16,7 +16,7 @@ from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
 from dyngs.evaluate.report import evaluate_run
 from dyngs.runs.checkpoint import latest_checkpoint
-from dyngs.runs.folder import is_same_body, with_body_of
+from dyngs.runs.folder import is_same_body, share_body_path
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -85,7 +85,7 @@ def test_bodies_are_the_same_by_their_contents(person: Path, tmp_path: Path) -> 
     (two / "body_pose.npz").unlink()
     assert not is_same_body(one, two)
     first, second = (config_of(person, fit, tmp_path / "run") for fit in (one, other))
-    assert with_body_of(second, first) == second
+    assert share_body_path(second, first) == second
 
 
 def test_another_fit_is_another_run(person: Path, tmp_path: Path) -> None:

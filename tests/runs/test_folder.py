@@ -27,7 +27,7 @@ from dyngs.runs.checkpoint import (
     KEEP_CHECKPOINTS,
     checkpoint_paths,
 )
-from dyngs.runs.folder import tidy
+from dyngs.runs.folder import remove_partial_files
 from dyngs.runs.opened import open_run
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -175,7 +175,7 @@ def test_nothing_is_removed_through_a_link(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "checkpoints").symlink_to(outside)
     before = _contents(outside)
-    tidy(tmp_path / "run", sole_writer=True)
+    remove_partial_files(tmp_path / "run", sole_writer=True)
     assert _contents(outside) == before
 
 

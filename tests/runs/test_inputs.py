@@ -23,7 +23,7 @@ from dyngs.export.html.page import write_page
 from dyngs.export.images import OutputOptions, write_path_images, write_split_images
 from dyngs.export.splat_files import write_4dgs, write_run_sequence, write_run_splats
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.runs.folder import inputs_of
+from dyngs.runs.folder import collect_inputs
 from dyngs.runs.opened import open_run
 
 PACKAGE = Path(dyngs.__file__).parent
@@ -118,11 +118,11 @@ def test_what_a_run_reads(tmp_path: Path) -> None:
     for path in own:
         for named in (run, run / "checkpoints" / ".." / ".." / "run"):
             with pytest.raises(DyngsError, match="which is read"):
-                inputs_of(named).require_output(path)
+                collect_inputs(named).require_output(path)
     for name in ("splats.ply", "metrics.json", "scene.dyngs"):
         (run / name).write_text("an export")
-        inputs_of(run).require_output(run / name)
+        collect_inputs(run).require_output(run / name)
     checkpoint_paths(run)[0].rename(run / "kept")
     for named in (run, run / "scene.dyngs"):
         with pytest.raises(DyngsError, match="which is read"):
-            inputs_of(named).require_output(run / "scene.dyngs")
+            collect_inputs(named).require_output(run / "scene.dyngs")

@@ -16,7 +16,7 @@ from two_balls import two_balls
 from dyngs.core.errors import DyngsError
 from dyngs.io.formats.formats import write_splats
 from dyngs.io.formats.splat_file import SplatFile
-from dyngs.runs.opened import FRAME_RATE, SHORTEST, Opened, open_scene
+from dyngs.runs.opened import FRAME_RATE, SHORTEST, OpenedScene, open_scene
 
 
 @pytest.fixture(scope="module")
@@ -69,11 +69,11 @@ def test_another_background_is_drawn(folder: Path) -> None:
 
 
 def test_only_people_play_motions(folder: Path) -> None:
-    run: Opened = open_scene(folder)
+    run: OpenedScene = open_scene(folder)
     with pytest.raises(
         DyngsError, match=r"--motion walk.npz needs the run of a person \(model.kind=human\)"
     ):
-        run.in_motion(Path("walk.npz"))
+        run.play_motion(Path("walk.npz"))
     with pytest.raises(DyngsError, match="--pose rest needs the run of a person"):
         run.at_rest()
 

@@ -22,9 +22,9 @@ from dyngs.runs.stored_file import (
     COARSENESS,
     MAGIC,
     MAX_HEADER,
-    compressed,
+    compress_lzma,
     decoded,
-    decompressed,
+    decompress_lzma,
     encoded,
     packed,
     read_scene,
@@ -82,9 +82,9 @@ def with_header(data: bytes, old: bytes, new: bytes) -> bytes:
     """The file with ``old`` replaced in its header, and a checksum that fits."""
     start = len(MAGIC) + 4
     end = start + int.from_bytes(data[len(MAGIC) : start], "little")
-    header = decompressed(data[start:end], MAX_HEADER, exact=False)
+    header = decompress_lzma(data[start:end], MAX_HEADER, exact=False)
     assert old in header
-    changed = compressed(header.replace(old, new, 1), room=MAX_HEADER)
+    changed = compress_lzma(header.replace(old, new, 1), room=MAX_HEADER)
     body = MAGIC + len(changed).to_bytes(4, "little") + changed + data[end:-32]
     return body + hashlib.sha256(body).digest()
 
@@ -197,4 +197,4 @@ def test_numbers_come_back(whole: np.ndarray) -> None:
 @pytest.mark.parametrize("size", [0, 9, 11])
 def test_another_length_is_an_error(size: int) -> None:
     with pytest.raises(DyngsError, match="not as long as it says"):
-        decompressed(compressed(b"0123456789"), size)
+        decompress_lzma(compress_lzma(b"0123456789"), size)

@@ -28,21 +28,21 @@ from dyngs.runs.stored_file import (
     MAX_COARSENESS,
     ROTATION_STEP,
     Coding,
-    coding_of,
+    choose_coding,
     completed,
     drawable,
-    from_whole,
+    dequantize_tensor,
     group_of,
     opacities_from_grid,
     opacities_to_grid,
     packed,
     rotations_from_grid,
     rotations_to_grid,
-    sorted_axes,
-    step_below,
-    stored_edit,
+    sort_axes,
+    round_step_down,
+    storage_edit,
     to_grid,
-    to_whole,
+    quantize_tensor,
     unpacked,
 )
 
@@ -51,10 +51,10 @@ def read_again(
     x: torch.Tensor, coding: Coding, coarseness: np.ndarray | None = None
 ) -> torch.Tensor:
     """``x`` as a file gives it back: through bytes, laid out as ``packed`` chose."""
-    numbers, far = to_whole(x, coding, coarseness)
+    numbers, far = quantize_tensor(x, coding, coarseness)
     packing, data = packed(numbers)
     back = unpacked(packing, data, numbers.shape)
-    return from_whole(back, far, coding, str(x.dtype).removeprefix("torch."), coarseness)
+    return dequantize_tensor(back, far, coding, str(x.dtype).removeprefix("torch."), coarseness)
 
 
 NUMBERS = st.floats(-3, 3, width=32) | st.floats(width=32, allow_nan=False, allow_infinity=False)
@@ -89,7 +89,7 @@ def test_any_tensor_comes_back_within_its_bound(
     """Half a step (0.65 of one where zero is preferred), 11 bits where there is no step; exact
     where out of reach."""
     group = group_of(name, x)
-    coding = coding_of(name, x, {} if group is None else {group: step}, by_coarseness=by_coarseness)
+    coding = choose_coding(name, x, {} if group is None else {group: step}, by_coarseness=by_coarseness)
     rows = np.arange(len(x)) % (MAX_COARSENESS + 1) if coding.by_coarseness else None
     error = (read_again(x, coding, rows).double() - x.double()).abs()
     if coding.kind == "exact":
@@ -100,7 +100,7 @@ def test_any_tensor_comes_back_within_its_bound(
     else:
         steps = torch.as_tensor(coding.steps(rows, x.ndim)).double()
         fraction = 0.65 if coding.kind == "sparse" else 0.5
-        assert step_below(coding.step) == coding.step
+        assert round_step_down(coding.step) == coding.step
         assert bool((error <= fraction * steps * (1 + 1e-12)).all())
         assert bool((error[(x.double().abs() >= LIMIT * steps)] == 0).all())
 
@@ -119,7 +119,7 @@ def moving(kind: str) -> tuple[DynamicScene, DynamicModel]:
 
 def stored(scene: GaussianScene) -> dict[str, torch.Tensor]:
     """What a file holds of a scene, in its order."""
-    return drawable(scene.apply_edit(stored_edit(scene, scene.gaussians.means.numpy())))
+    return drawable(scene.apply_edit(storage_edit(scene, scene.gaussians.means.numpy())))
 
 
 def read(tensors: dict[str, torch.Tensor], model: DynamicModel) -> DynamicScene:
@@ -151,7 +151,7 @@ def test_what_is_not_finite_is_refused() -> None:
 
 
 FLOATS = st.floats(-(2.0**100), 2.0**100, width=32)
-STEPS = st.floats(1e-20, 1e10).map(step_below)
+STEPS = st.floats(1e-20, 1e10).map(round_step_down)
 QUATS = nps.arrays(
     np.float32, st.tuples(st.integers(0, 8), st.just(4)), elements=st.floats(-10, 10, width=32)
 )
@@ -165,9 +165,9 @@ def covariances(quats: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
 
 @given(st.floats(1e-25, 1e15))
 def test_steps_are_the_next_smaller_ones(step: float) -> None:
-    found = step_below(step)
+    found = round_step_down(step)
     assert found <= step < found * 1.25 + 1e-300
-    assert step_below(found) == found
+    assert round_step_down(found) == found
     assert math.frexp(found)[0] * 8 in (4, 5, 6, 7)
 
 
@@ -194,7 +194,7 @@ def test_opacities_are_finite_near_and_stable(logits: np.ndarray, step: float) -
     assert np.array_equal(whole, opacities_to_grid(back, step))
 
 
-@given(QUATS, st.floats(1e-5, ROTATION_STEP).map(step_below))
+@given(QUATS, st.floats(1e-5, ROTATION_STEP).map(round_step_down))
 @settings(deadline=None, max_examples=40)
 def test_rotations_are_stable_and_turn_axes_into_axes(quats: np.ndarray, step: float) -> None:
     whole = rotations_to_grid(quats, step)
@@ -215,7 +215,7 @@ def test_rotations_are_stable_and_turn_axes_into_axes(quats: np.ndarray, step: f
 def test_sorting_axes_keeps_the_gaussian(order: tuple[int, int, int]) -> None:
     quats = np.random.default_rng(2).normal(size=(1, 4))
     log_scales = np.array([[-2.0, -1.0, 0.5]])[:, order]
-    turned, ordered = sorted_axes(quats, log_scales)
+    turned, ordered = sort_axes(quats, log_scales)
     assert ordered.tolist() == [[-2.0, -1.0, 0.5]]
     np.testing.assert_allclose(
         covariances(turned, ordered), covariances(quats, log_scales), atol=1e-12

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from dyngs.core.camera import Cameras
-from dyngs.core.state import part_of, tensors_of
+from dyngs.core.state import part_of, strip_roles
 from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate, filter_std, fuse_filter
@@ -43,7 +43,7 @@ def test_without_filter_parameters_pass_through() -> None:
     assert moment.penalties == {}
     assert training.optimize(scene, 1) == 0
     assert training.after_step(scene, 1, True) is scene
-    assert part_of(tensors_of(scene.state()), "model") == {}
+    assert part_of(strip_roles(scene.state()), "model") == {}
     assert training.state() == {}
 
 
@@ -129,7 +129,7 @@ def test_the_filter_is_kept_until_it_is_due() -> None:
 def test_state_goes_round() -> None:
     training = StaticTraining(FilterUpdate([_camera()]))
     first = training.first_scene(_gaussians(2.0))
-    stored = part_of(tensors_of(first.state()), "model")
+    stored = part_of(strip_roles(first.state()), "model")
     second = training.restore(_gaussians(4.0), stored)
     drawn = (
         training.time_step(scene, _image(), 1).gaussians.log_scales for scene in (first, second)

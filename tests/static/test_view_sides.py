@@ -11,7 +11,7 @@ import torch
 from camera_rings import ring_of
 from splat_scenes import cloud
 
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.static_scene import StaticScene, ViewSides
@@ -57,7 +57,7 @@ def test_images_teach_their_own_side_alone() -> None:
 def test_sides_follow_their_gaussians_and_are_stored() -> None:
     kept = torch.arange(0, 100, 3)
     scene = two_sides().apply_edit(TopologyEdit.select(kept))
-    tensors = {name.removeprefix("model."): x for name, x in tensors_of(scene.state()).items()}
+    tensors = {name.removeprefix("model."): x for name, x in strip_roles(scene.state()).items()}
     again = StaticScene.from_state(scene.gaussians, tensors)
     assert again.sides is not None
     assert torch.equal(again.sides.of, (kept >= 40).long())
@@ -78,7 +78,7 @@ def test_sides_follow_their_gaussians_and_are_stored() -> None:
 )
 def test_sides_that_do_not_fit_are_refused(name: str, value: torch.Tensor) -> None:
     tensors = {
-        name.removeprefix("model."): x for name, x in tensors_of(two_sides().state()).items()
+        name.removeprefix("model."): x for name, x in strip_roles(two_sides().state()).items()
     }
     with pytest.raises(ValueError, match=name):
         ViewSides.from_state(tensors | {f"sides.{name}": value}, 100)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from browser import Browser, needs_browser
 
-from dyngs.core.errors import escaped
+from dyngs.core.errors import escape_control_characters
 from dyngs.io.write import write_image
 from dyngs.study.report import (
     Report,
@@ -52,7 +52,7 @@ def test_csv_holds_no_formulas(text: str) -> None:
     (row,) = csv.reader(
         io.StringIO(csv_text([{"name": text, "dB": -1.5}]).partition("\n")[2], newline="")
     )
-    assert row == [f"'{escaped(text)}", "-1.5"]
+    assert row == [f"'{escape_control_characters(text)}", "-1.5"]
 
 
 def test_markdown_shows_names_as_they_are() -> None:

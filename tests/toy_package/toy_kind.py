@@ -13,13 +13,13 @@ from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.core.section import ModelSection
-from dyngs.core.state import Role, State, StateTensor, prefixed
+from dyngs.core.state import Role, State, StateTensor, add_prefix
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image
 from dyngs.gaussians.optimizer import AdamState
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import ModelKind, RunStart
-from dyngs.models.model import Drawn, Model, Updated
+from dyngs.models.kind import ModelKind, StartContext
+from dyngs.models.model import Drawn, Model, UpdateResult
 from dyngs.models.renderable import DrawOptions, Renderable, Rendering, TimeStep
 from dyngs.models.views import background_colour
 
@@ -111,7 +111,7 @@ class ToyScene(Renderable):
 class Toy(Model[ToyScene]):
     """A grid in training."""
 
-    def __init__(self, run: RunStart, model: ToyModel) -> None:
+    def __init__(self, run: StartContext, model: ToyModel) -> None:
         noise = 0.1 * torch.randn(1, 4, CELLS, CELLS, CELLS, generator=run.generator)
         self._grid = (noise - torch.tensor([0.0, 0, 0, 2]).view(1, 4, 1, 1, 1)).requires_grad_()
         self._lr = model.lr
@@ -135,11 +135,11 @@ class Toy(Model[ToyScene]):
     def regularizers(self) -> dict[str, Tensor]:
         return {"empty": 1e-4 * torch.nn.functional.softplus(self._grid[:, 3]).mean()}
 
-    def update(self, step: int) -> Updated:
-        return Updated(self._adam.step_("grid", self._grid, lr=self._lr, step=step))
+    def update(self, step: int) -> UpdateResult:
+        return UpdateResult(self._adam.step_("grid", self._grid, lr=self._lr, step=step))
 
     def state(self) -> State:
-        return self.scene.state() | prefixed("adam", self._adam.state())
+        return self.scene.state() | add_prefix("adam", self._adam.state())
 
     def restore(self, checkpoint: Checkpoint) -> None:
         self._grid = stored_grid(checkpoint).clone().requires_grad_()
@@ -153,7 +153,7 @@ def stored_grid(checkpoint: Checkpoint) -> Tensor:
     return require_tensor("grid", checkpoint.tensors["model.grid"], (1, 4, CELLS, CELLS, CELLS))
 
 
-def start(run: RunStart) -> Toy:
+def start(run: StartContext) -> Toy:
     model = run.config.model
     assert isinstance(model, ToyModel)
     return Toy(run, model)

@@ -11,7 +11,7 @@ from scenes import random_scene
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image
-from dyngs.models.model import Drawn, Look
+from dyngs.models.model import Drawn, LossInput
 from dyngs.models.renderable import Rendering
 from dyngs.training.losses import SilhouetteLoss, StepCheck
 
@@ -60,7 +60,7 @@ def test_the_error_of_alpha_counts_where_the_mask_does_and_fully_late_in_the_run
 
     def at(step: int, image: Image) -> float:
         black = torch.zeros(2, 2, 3)
-        look = Look(0, step, image, nothing, black, black, None, torch.Generator())
+        look = LossInput(0, step, image, nothing, black, black, None, torch.Generator())
         return float(loss(look).get("alpha", 0.0))
 
     opaque = replace(image, alpha=alpha)

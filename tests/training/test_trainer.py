@@ -86,7 +86,7 @@ class _LiftedScene(GaussianScene):
 class _Lifted(SceneTraining[_LiftedScene]):
     """How it is trained; what it has done is part of its state."""
 
-    moves_by = ("field", "model.deform")
+    deformation_name = ("field", "model.deform")
 
     def __init__(self) -> None:
         self.steps: list[int] = []

@@ -15,14 +15,14 @@ from scene_kinds import scene_of_kind
 from view_sessions import Page, looking_at_balls, opened_at
 
 from dyngs.human.body.joints import SMPLX_ROWS
-from dyngs.runs.opened import Opened, open_run
+from dyngs.runs.opened import OpenedScene, open_run
 from dyngs.view.controls import BODY_JOINTS, BY_SLIDERS, Controls, pose_person
 from dyngs.view.layers import draw
 from dyngs.view.source import SceneSource
 from dyngs.view.views import views_of
 
 
-def page_of(opened: Opened | None = None, motions: dict[str, Path] | None = None) -> Page:
+def page_of(opened: OpenedScene | None = None, motions: dict[str, Path] | None = None) -> Page:
     session, _ = looking_at_balls()
     session.opened = opened or session.opened
     page: Any = Page(session)
@@ -30,7 +30,7 @@ def page_of(opened: Opened | None = None, motions: dict[str, Path] | None = None
     return page
 
 
-def person() -> Opened:
+def person() -> OpenedScene:
     return opened_at(scene_of_kind("human"), "person")
 
 
@@ -61,11 +61,11 @@ def test_every_body_has_the_joints_with_sliders() -> None:
 def test_feet_are_kept_in_motions_of_files(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[Path, bool]] = []
 
-    def in_motion(opened: Opened, path: Path, *, keep_feet: bool) -> Opened:
+    def play_motion(opened: OpenedScene, path: Path, *, keep_feet: bool) -> OpenedScene:
         asked.append((path, keep_feet))
         return opened
 
-    monkeypatch.setattr(Opened, "in_motion", in_motion)
+    monkeypatch.setattr(OpenedScene, "play_motion", play_motion)
     page = page_of(person(), {"walk.npz": Path("walk.npz")})
     page.set("Motion", "walk.npz")
     page.set("Keep feet", True)

@@ -17,7 +17,7 @@ from dyngs.export.splat_files import write_run_splats
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import read_splats
-from dyngs.runs.opened import Opened, open_run, open_scene, opened_scene
+from dyngs.runs.opened import OpenedScene, open_run, open_scene, wrap_scene
 from dyngs.view.edit import EditState, can_be_edited, pick_point
 from dyngs.view.layers import ViewRequest
 
@@ -25,20 +25,20 @@ SHOT = ViewRequest(camera())
 
 
 def editing(
-    opened: Opened, centre: tuple[float, float, float] = (0.5, 0.0, 0.0), size: float = 1.2
+    opened: OpenedScene, centre: tuple[float, float, float] = (0.5, 0.0, 0.0), size: float = 1.2
 ) -> EditState:
     return EditState(opened, np.array(centre), np.full(3, size))
 
 
 @pytest.fixture
-def wall() -> Opened:
+def wall() -> OpenedScene:
     """An opaque wall at z = 2 of small Gaussians, with nothing at x < 0."""
     y, x = torch.meshgrid(torch.linspace(-1, 1, 81), torch.linspace(0, 2, 81), indexing="ij")
     means = torch.stack([x.flatten(), y.flatten(), torch.full((81 * 81,), 2.0)], dim=1)
     n = len(means)
     scales = torch.log(torch.tensor([0.03, 0.03, 1e-3])).repeat(n, 1)
     quats = torch.tensor([1.0, 0, 0, 0]).repeat(n, 1)
-    return opened_scene(
+    return wrap_scene(
         StaticScene(
             gaussians=Gaussians(means, quats, scales, torch.full((n,), 6.0), means[:, None])
         )
@@ -49,7 +49,7 @@ def wall() -> Opened:
     ("aim", "error"), [((0.3, 0.2, 2.0), 0.003), ((0.8, 0.1, 2.0), 0.03), ((1.5, -0.6, 2.0), 0.03)]
 )
 def test_a_ray_meets_the_wall_where_geometry_says(
-    wall: Opened, aim: tuple[float, float, float], error: float
+    wall: OpenedScene, aim: tuple[float, float, float], error: float
 ) -> None:
     """From the side to the size of its Gaussians, 0.03, of which the nearer ones cover the
     others."""

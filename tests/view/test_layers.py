@@ -27,7 +27,7 @@ from dyngs.export.images import render_frame
 from dyngs.gaussians import levels
 from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.runs.opened import Opened, open_run, open_scene
+from dyngs.runs.opened import OpenedScene, open_run, open_scene
 from dyngs.view.controls import CameraFrusta
 from dyngs.view.layers import (
     LAYERS,
@@ -50,7 +50,7 @@ from dyngs.view.views import (
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+def run(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
     return open_run(write_moving_run(tmp_path_factory.mktemp("run")))
 
 
@@ -62,7 +62,7 @@ def test_colours_are_those_of_dyngs_render() -> None:
 
 
 @pytest.mark.parametrize("layer", LAYERS)
-def test_a_gpu_draws_every_layer_alike(run: Opened, layer: str) -> None:
+def test_a_gpu_draws_every_layer_alike(run: OpenedScene, layer: str) -> None:
     view = 0 if layer in ("colour", "error") else None
     shots = [ViewRequest(camera(), 0.5, layer, part, view, 0.5) for part in PARTS]  # type: ignore[arg-type]
     expected = [draw(run, request) for request in shots]
@@ -88,7 +88,7 @@ def test_many_gaussians_are_drawn_in_levels_while_anything_moves(
     assert not np.array_equal(coarse, draw(whole, request))
     assert np.array_equal(draw(whole, moving), draw(whole, request))
     assert np.array_equal(draw(opened, request), draw(whole, request))
-    edited = opened.showing(opened.scene.select(torch.arange(1000)))
+    edited = opened.with_scene(opened.scene.select(torch.arange(1000)))
     assert np.array_equal(draw(edited, moving), draw(edited, request))
     with pytest.raises(DyngsError, match="for still scenes"):
         with_levels(balls(), 300)
@@ -104,7 +104,7 @@ def test_the_moment_of_a_time_is_computed_once() -> None:
     assert asked.calls == 2
 
 
-def test_the_line_divides_render_and_truth(run: Opened) -> None:
+def test_the_line_divides_render_and_truth(run: OpenedScene) -> None:
     def shown(divide: float) -> np.ndarray:
         return draw(run, ViewRequest(camera(64, 64), 0.0, view=2, divide=divide))
 

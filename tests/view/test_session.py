@@ -20,7 +20,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.export.camera_paths import read_path
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.similarity import UNMOVED, Similarity
-from dyngs.runs.opened import Opened
+from dyngs.runs.opened import OpenedScene
 from dyngs.view import session
 from dyngs.view.layers import ViewRequest, draw
 from dyngs.view.session import (
@@ -43,7 +43,7 @@ class Clock:
         return self.now
 
 
-def opened(scene: GaussianScene | None = None) -> Opened:
+def opened(scene: GaussianScene | None = None) -> OpenedScene:
     return opened_at(scene or moving_scene(Sliding()))
 
 

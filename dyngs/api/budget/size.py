@@ -11,16 +11,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.compress.measure import storage_plan
+from dyngs.compress.measure import plan_storage
 from dyngs.compress.stage import highest, probe_images, quality_of, scores_of
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.core.errors import DyngsError, counted
-from dyngs.models.checkpoint import restored_model
+from dyngs.models.checkpoint import restore_model
 from dyngs.models.kind import HasGaussians, capability
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.folder import EXPORT_FOLDER, write_config
-from dyngs.runs.stored_file import decoded, encoded, step_below, write_scene
+from dyngs.runs.stored_file import decoded, encoded, round_step_down, write_scene
 from dyngs.training.trainer import Trainer
 
 KEPT = 0.7
@@ -65,7 +65,7 @@ def has_file(run_dir: Path) -> bool:
 
 
 @torch.no_grad()
-def write_within(trainer: Trainer[Any], run_dir: Path, megabytes: float) -> SizeReport:
+def write_limited_file(trainer: Trainer[Any], run_dir: Path, megabytes: float) -> SizeReport:
     """Write ``scene.dyngs``, of at most so many 1e6 bytes, into a folder of ``run_dir``, and return
     a report.
 
@@ -78,20 +78,20 @@ def write_within(trainer: Trainer[Any], run_dir: Path, megabytes: float) -> Size
     scene: Any = trainer.model.scene.to(CPU)
     images = probe_images(trainer)  # files are made on the CPU
     before = quality_of(trainer, scene, images)
-    precision, coarseness = storage_plan(config, full, scene, None)
+    precision, coarseness = plan_storage(config, full, scene, None)
 
     def stored(kept: Any, octaves: Tensor | None) -> tuple[float, float, bytes, int] | None:
         """Return PSNR, the factor on the steps, the file and the number kept; None: none fits."""
 
         def encode(factor: float) -> bytes:
-            steps = {name: step_below(factor * step) for name, step in precision.steps.items()}
+            steps = {name: round_step_down(factor * step) for name, step in precision.steps.items()}
             return encoded(full.info, kept, steps, octaves)
 
         found = _fitted(encode, int(1e6 * megabytes))
         if found is None:
             return None
         data, factor = found
-        read = restored_model(decoded(data), config.model)
+        read = restore_model(decoded(data), config.model)
         return quality_of(trainer, read, images), factor, data, len(kept)
 
     chosen = stored(scene, coarseness)

@@ -161,5 +161,5 @@ class TimeLimit:
 def events_before(config: Config, done: int) -> list[bool]:
     """Return which of the events that happen once in a run have happened after ``done`` steps."""
     steps = config.train.steps
-    once = (config.model.moves_after(steps), config.colour.measured_after(steps))
+    once = (config.model.motion_start_step(steps), config.colour.measurement_step(steps))
     return [done >= step for step in once if step is not None]

@@ -25,7 +25,7 @@ from dyngs.baselines.fields.scene import (
 )
 from dyngs.baselines.fields.training import FieldTraining
 from dyngs.core.initialisation import glorot
-from dyngs.models.kind import RunStart
+from dyngs.models.kind import StartContext
 from dyngs.ops.perceptron import Layer, perceptron
 from dyngs.ops.rays import Rays, Samples, Space, composite
 
@@ -223,7 +223,7 @@ def build_samples(rays: Rays, space: Space, distances: Tensor) -> Samples:
 class NerfTraining(FieldTraining):
     """Training of NeRF: a fixed number of rays, a rate that falls exponentially."""
 
-    def __init__(self, run: RunStart) -> None:
+    def __init__(self, run: StartContext) -> None:
         super().__init__(run, NerfField, 1, 0)
         self._sizes = SIZES[self._model.sizes]
 

@@ -31,13 +31,13 @@ from dyngs.baselines.fields.scene import (
 from dyngs.baselines.fields.training import FieldTraining
 from dyngs.core.errors import DyngsError
 from dyngs.core.initialisation import glorot
-from dyngs.core.state import Role, State, prefixed, with_role
+from dyngs.core.state import Role, State, add_prefix, with_role
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import RunStart
-from dyngs.models.model import Updated
-from dyngs.models.volume import reached_samples, thinned_samples
+from dyngs.models.kind import StartContext
+from dyngs.models.model import UpdateResult
+from dyngs.models.volume import reached_samples, thin_samples
 from dyngs.ops.device import copy_async
 from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.hash_grid import HashLevels, hash_features, select_features
@@ -176,7 +176,7 @@ class NgpField(Field):
             if shifts is None:
                 samples, which = reached_samples(densities, marched)
             else:
-                samples, which = thinned_samples(densities, marched, shifts[:, 1])
+                samples, which = thin_samples(densities, marched, shifts[:, 1])
         features = select_features(features, which, samples.coords, table, self.levels)
         geometry = self._geometry(features, time)
         basis = harmonics_basis(rays.directions, DIRECTION_DEGREE)
@@ -299,7 +299,7 @@ class NgpTraining(FieldTraining):
 
     betas = (0.9, 0.99)
 
-    def __init__(self, run: RunStart) -> None:
+    def __init__(self, run: StartContext) -> None:
         model: Any = run.config.model
         sizes = SIZES[model.sizes]
         camera = run.images[0].cameras
@@ -350,7 +350,7 @@ class NgpTraining(FieldTraining):
         fallen = sum(step > fraction * self._run.config.train.steps for fraction in DROPS)
         return (self._model.lr or RATE) * rising * DROP**fallen
 
-    def update(self, step: int) -> Updated:
+    def update(self, step: int) -> UpdateResult:
         for name, x in self._field.parameters.items():
             if name != "table" and x.grad is not None:
                 x.grad.add_(x.detach(), alpha=WEIGHT_DECAY)
@@ -414,7 +414,7 @@ class NgpTraining(FieldTraining):
 
     def state(self) -> State:
         own = {"values": self._opacities, "rays": torch.tensor([self._rays], device="cpu")}
-        return super().state() | prefixed("occupancy", with_role(own, Role.TRAINING))
+        return super().state() | add_prefix("occupancy", with_role(own, Role.TRAINING))
 
     def restore(self, checkpoint: Checkpoint) -> None:
         before = self._field.space

@@ -17,8 +17,8 @@ from torch import Tensor
 from dyngs.baselines.fields.kind import FieldModel
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import Role, State, prefixed, with_role
-from dyngs.core.tensor_checks import require_moments, require_tensor
+from dyngs.core.state import Role, State, add_prefix, with_role
+from dyngs.core.tensor_checks import require_times, require_tensor
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import focus_point, fraction_in_front, inverse_rigid
 from dyngs.data.scene_space import extent_of
@@ -229,7 +229,7 @@ class FieldScene(Renderable):
         own = {"space": torch.tensor(numbers, dtype=torch.float64, device="cpu")}
         if self.training_times:
             own["times"] = torch.tensor(self.training_times, dtype=torch.float64, device="cpu")
-        return prefixed("field", with_role(own, Role.SHARED) | self.field.state())
+        return add_prefix("field", with_role(own, Role.SHARED) | self.field.state())
 
     def render(
         self,
@@ -277,7 +277,7 @@ def restore_scene(
         raise ValueError(f"'space' is no space: {numbers}")
     space = Space((x, y, z), half, int(cascades), int(cells))
     field = field_class.from_state(model, space, stored)
-    times = require_moments("times", stored["times"]).tolist() if "times" in stored else ()
+    times = require_times("times", stored["times"]).tolist() if "times" in stored else ()
     behind = evaluation_background(checkpoint.info.background, False)[1]
     return FieldScene(field, tuple(times), DrawOptions(near=NEAR * half), behind)
 

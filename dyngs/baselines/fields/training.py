@@ -12,12 +12,12 @@ from torch import Tensor
 
 from dyngs.baselines.fields.scene import NEAR, Field, FieldScene, restore_scene, space_of
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import State, prefixed
+from dyngs.core.state import State, add_prefix
 from dyngs.data.loader import Image
 from dyngs.gaussians.optimizer import AdamState
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import RunStart
-from dyngs.models.model import Drawn, Look, Loss, Model, Updated
+from dyngs.models.kind import StartContext
+from dyngs.models.model import Drawn, LossInput, Loss, Model, UpdateResult
 from dyngs.models.renderable import DrawOptions, Rendering
 from dyngs.models.views import evaluation_background, training_times
 from dyngs.models.volume import rays_of
@@ -31,7 +31,7 @@ class ColourLoss(Loss):
     def __init__(self, function: Callable[[Tensor, Tensor], Tensor]) -> None:
         self._function = function
 
-    def __call__(self, look: Look) -> Mapping[str, Tensor]:
+    def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
         return {"image": masked_mean(self._function(look.rendered, look.truth), look.image.mask)}
 
 
@@ -55,7 +55,7 @@ class FieldTraining(Model[FieldScene]):
     betas = (0.9, 0.999)  # How slowly Adam forgets
 
     def __init__(
-        self, run: RunStart, field_class: type[Field], cells: int | None, pixels: int
+        self, run: StartContext, field_class: type[Field], cells: int | None, pixels: int
     ) -> None:
         self._run = run
         model: Any = run.config.model
@@ -139,17 +139,17 @@ class FieldTraining(Model[FieldScene]):
     def count(self, num_rays: int, num_samples: int) -> None:
         """Note how many samples the rays of an image needed."""
 
-    def update(self, step: int) -> Updated:
+    def update(self, step: int) -> UpdateResult:
         rate = self.rate(step)
         updates = []
         for name, x in self._scene.field.parameters.items():
             # rows of a hash grid that no sample touched stay as they are
             rows = seen_rows(x.grad) if name == "table" and x.grad is not None else None
             updates.append(self._adam.update(name, x, rate, rows))
-        return Updated(self._adam.steps_(updates, step=step, betas=self.betas))
+        return UpdateResult(self._adam.steps_(updates, step=step, betas=self.betas))
 
     def state(self) -> State:
-        return self._scene.state() | prefixed("adam", self._adam.state())
+        return self._scene.state() | add_prefix("adam", self._adam.state())
 
     def restore(self, checkpoint: Checkpoint) -> None:
         self._learn(restore_scene(type(self._scene.field), self._model, checkpoint))

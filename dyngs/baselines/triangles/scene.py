@@ -20,7 +20,7 @@ from dyngs.baselines.triangles.kind import BgTriangleModel
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0, num_sh_terms
 from dyngs.core.gaussians import storage_order
-from dyngs.core.state import Role, State, prefixed, with_role
+from dyngs.core.state import Role, State, add_prefix, with_role
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.renderable import (
@@ -32,7 +32,7 @@ from dyngs.models.renderable import (
     TimeStep,
     composited,
     fixed_cameras,
-    joined_renderings,
+    concatenate_renderings,
     single_views,
 )
 from dyngs.models.views import evaluation_background
@@ -196,7 +196,7 @@ class TriangleScene(Renderable):
         flat = (faces + first).flatten(0, 1)
         return Surface(vertices.flatten(0, 1).numpy(), flat.numpy(), colours.clamp(0, 1).numpy())
 
-    def page_lists(self) -> tuple[dict[str, Any], dict[str, tuple[Tensor, Literal[8, 16]]]]:
+    def page_data(self) -> tuple[dict[str, Any], dict[str, tuple[Tensor, Literal[8, 16]]]]:
         patches = self.patches
         middles = patches.points.detach()[:, CORNERS].mean(1).float().numpy()
         order = torch.from_numpy(storage_order(middles, np.zeros(0, dtype=np.int64)))
@@ -232,7 +232,7 @@ class TriangleScene(Renderable):
 
     def state(self) -> State:
         unit = {"unit": torch.tensor([self.unit], dtype=torch.float64, device="cpu")}
-        return prefixed("triangles", self.patches.state() | with_role(unit, Role.SHARED))
+        return add_prefix("triangles", self.patches.state() | with_role(unit, Role.SHARED))
 
     def render(
         self,
@@ -246,7 +246,7 @@ class TriangleScene(Renderable):
         behind = self.background if background is None else background
         cameras = fixed_cameras(cameras, behind, self.patches.points)
         views = single_views(cameras, behind)
-        return joined_renderings([self.drawn(x, options, colour)[0] for x, colour in views])
+        return concatenate_renderings([self.drawn(x, options, colour)[0] for x, colour in views])
 
     def drawn(
         self, camera: Cameras, options: TriangleOptions, background: Tensor | None = None

@@ -28,7 +28,7 @@ from dyngs.config.kinds import section_of_kind
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0, num_sh_terms
 from dyngs.core.errors import DyngsError, counted
-from dyngs.core.state import Role, State, prefixed, with_role
+from dyngs.core.state import Role, State, add_prefix, with_role
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
@@ -51,8 +51,8 @@ from dyngs.gaussians.surface import (
     simplify_mesh,
 )
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import RunStart
-from dyngs.models.model import Drawn, Model, Updated
+from dyngs.models.kind import StartContext
+from dyngs.models.model import Drawn, Model, UpdateResult
 from dyngs.models.schedule import scaled
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.loss import l1_ssim_loss
@@ -68,7 +68,7 @@ VIEWS = 64  # Whose depths are fused
 SURFACE_CELLS = 128  # Along the scene, at most; no more than pixels along an image
 
 
-def _at_points(run: RunStart, model: BgTriangleModel) -> tuple[Patches, float]:
+def _at_points(run: StartContext, model: BgTriangleModel) -> tuple[Patches, float]:
     """Return triangles turned at random, and half the side of the scene."""
     values = InitialValues(max_gaussians=min(NUM_FIRST, model.max_triangles))
     first = initial_gaussians(
@@ -92,7 +92,7 @@ def _at_points(run: RunStart, model: BgTriangleModel) -> tuple[Patches, float]:
     return _flat(corners, colours[:, None].repeat(1, 3, 1), model), unit
 
 
-def _on_surface(run: RunStart, model: BgTriangleModel) -> tuple[Patches, float]:
+def _on_surface(run: StartContext, model: BgTriangleModel) -> tuple[Patches, float]:
     """Return triangles on the surface of Gaussians, and half the side of the scene.
 
     Triangles cannot move through each other: what lies behind one gets no gradient, so that
@@ -127,7 +127,7 @@ def _on_surface(run: RunStart, model: BgTriangleModel) -> tuple[Patches, float]:
     return _flat(corners, colours[faces], model), unit
 
 
-def _trained_gaussians(run: RunStart, steps: int) -> GaussianModel:
+def _trained_gaussians(run: StartContext, steps: int) -> GaussianModel:
     config = run.config
     changed = {
         "model": section_of_kind("static").model_validate({"sh_degree": 0}),
@@ -352,7 +352,7 @@ class TriangleTraining(Model[TriangleScene]):
         DyngsError: the points are no scene, or ``budget.max_mb`` has no room.
     """
 
-    def __init__(self, run: RunStart) -> None:
+    def __init__(self, run: StartContext) -> None:
         config = run.config
         self._run = run
         self._steps = config.train.steps
@@ -409,7 +409,7 @@ class TriangleTraining(Model[TriangleScene]):
     def tallies(self, step: int) -> Sequence[Tensor]:
         return [] if self.is_textured else list(self._now.tensors().values())
 
-    def update(self, step: int) -> Updated:
+    def update(self, step: int) -> UpdateResult:
         patches = self._scene.patches
         grad = patches.points.grad
         if not self.is_textured and grad is not None:
@@ -422,19 +422,19 @@ class TriangleTraining(Model[TriangleScene]):
         if step == self._steps:
             return self._finished(bad)
         if self.is_textured:
-            return Updated(bad)
+            return UpdateResult(bad)
         if self._first_texture <= step:
             if self._tallies.views >= LEAST_EVERY:
                 self._change(0, 1)  # what is useless goes, and nothing is split
             self._texture()
             count = len(self._scene)
-            return Updated(bad, f"textures are learned from now on, on {count:,} triangles", True)
+            return UpdateResult(bad, f"textures are learned from now on, on {count:,} triangles", True)
         interval = max(LEAST_EVERY, scaled(EVERY, self._steps))
         last = min(scaled(UNTIL, self._steps), self._first_texture)
         if step % interval or step > last:
-            return Updated(bad)
+            return UpdateResult(bad)
         self._change(self._model.max_triangles, 1 + (last - step) // interval)
-        return Updated(bad, is_rearranged=True)
+        return UpdateResult(bad, topology_changed=True)
 
     @property
     def _first_texture(self) -> int:
@@ -457,18 +457,18 @@ class TriangleTraining(Model[TriangleScene]):
             self._adam.exp_avg[name] = before.exp_avg[name]
             self._adam.exp_avg_sq[name] = before.exp_avg_sq[name]
 
-    def _finished(self, bad: Tensor | int) -> Updated:
+    def _finished(self, bad: Tensor | int) -> UpdateResult:
         """Remove what no training view shows."""
         images = self._run.images
         shown = max_pixels(self._scene, (images[i].cameras for i in range(len(images))))
         count = len(shown)
         stays = shown >= LEAST_SHOWN
         if bool(stays.all()) or not bool(stays.any()):
-            return Updated(bad)
+            return UpdateResult(bad)
         none = {name: x.detach()[:0] for name, x in self._scene.patches.tensors.items()}
         self._exchange(stays.nonzero()[:, 0], none)
         gone = f"{count - len(self._scene):,} of {counted(count, 'triangle')} are removed"
-        return Updated(
+        return UpdateResult(
             bad, f"{gone}: no training view shows more than {LEAST_SHOWN:g} px of them", True
         )
 
@@ -491,7 +491,7 @@ class TriangleTraining(Model[TriangleScene]):
         self._adam = AdamState(first, second)
 
     def state(self) -> State:
-        kept = prefixed("adam", self._adam.state()) | prefixed("tallies", self._tallies.state())
+        kept = add_prefix("adam", self._adam.state()) | add_prefix("tallies", self._tallies.state())
         return self._scene.state() | kept
 
     def restore(self, checkpoint: Checkpoint) -> None:

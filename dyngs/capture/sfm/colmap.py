@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from dyngs.capture.sfm.photos import Photo
-from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError
 from dyngs.io.write import write_text
 
@@ -65,7 +65,7 @@ class SfmTask:
     names: Sequence[str]
     photos: Sequence[Photo]
     options: SfmOptions
-    report: ReportProgress = report_nothing
+    report: ProgressCallback = ignore_progress
     is_video: bool = False
     masks: Path | None = None
 

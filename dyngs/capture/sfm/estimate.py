@@ -26,7 +26,7 @@ from dyngs.capture.sfm.colmap import (
 )
 from dyngs.capture.sfm.frame_choice import STILL, chosen_frames, measured
 from dyngs.capture.sfm.photos import Photo, copied, gather_photos, lay_out
-from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, counted
 from dyngs.data.images.images import read_header
 from dyngs.data.images.video import (
@@ -168,7 +168,7 @@ def estimate_poses(
     source: Path,
     out: Path,
     options: SfmOptions = SfmOptions(),
-    report: ReportProgress = report_nothing,
+    report: ProgressCallback = ignore_progress,
 ) -> SfmResult:
     """Estimate poses of the images in ``source`` and write a COLMAP capture (``out/images``,
     ``out/sparse/0``).
@@ -194,7 +194,7 @@ def estimate_poses(
 
 
 def _posed_in(
-    capture: Path, source: Path, out: Path, options: SfmOptions, report: ReportProgress
+    capture: Path, source: Path, out: Path, options: SfmOptions, report: ProgressCallback
 ) -> SfmResult:
     blurred: list[str] = []
     if source.is_file():
@@ -234,7 +234,7 @@ def _posed_in(
 
 
 def _laid_out(
-    capture: Path, photos: list[Photo], is_video: bool, options: SfmOptions, report: ReportProgress
+    capture: Path, photos: list[Photo], is_video: bool, options: SfmOptions, report: ProgressCallback
 ) -> SfmTask:
     folder = capture / "images"
     work = capture / "colmap"
@@ -305,7 +305,7 @@ def _advice(unregistered: Sequence[str], blurred: Sequence[str], is_video: bool)
 
 
 def _frames_of(
-    video: Path, capture: Path, options: SfmOptions, report: ReportProgress
+    video: Path, capture: Path, options: SfmOptions, report: ProgressCallback
 ) -> tuple[list[Photo], list[str], list[str]]:
     """Frames of a video, chosen by ``frame_choice``; their seconds are written, too.
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, counted, reading
+from dyngs.core.errors import DyngsError, counted, wrap_read_errors
 from dyngs.data.images.images import (
     END_MARKERS,
     SUFFIXES,
@@ -66,7 +66,7 @@ def digest_of(source: Path, files: Sequence[Path] | None = None) -> str:
     """
     digest = hashlib.sha256()
     for path in files or ([source] if source.is_file() else photos_below(source)):
-        with reading(path):
+        with wrap_read_errors(path):
             status = path.stat()
             digest.update(os.fsencode(path.relative_to(source.parent)))
             digest.update(f"{status.st_size} {status.st_mtime_ns}".encode())
@@ -179,7 +179,7 @@ def _checked(photo: Path) -> ImageHeader | None:
 
 def _is_heif(photo: Path) -> bool:
     """Whether the content of a photo is HEIC; JPEG may be named ``.heic``."""
-    with reading(photo), inside(photo).open("rb") as file:
+    with wrap_read_errors(photo), inside(photo).open("rb") as file:
         begin = file.read(8)
     is_jpeg = begin.startswith(b"\xff\xd8")
     return begin[4:] == b"ftyp" or (photo.suffix.lower() in HEIF_SUFFIXES and not is_jpeg)
@@ -227,7 +227,7 @@ def _convert_heif(photo: Path, target: Path) -> str:
 
     heif: Any = pillow_heif
     with (
-        reading(photo, "the image is damaged; copy or convert it again"),
+        wrap_read_errors(photo, "the image is damaged; copy or convert it again"),
         heif.HeifImageFile(str(photo)) as image,
     ):
         check_size(photo, *image.size)

@@ -30,8 +30,8 @@ from dyngs.capture.sfm.colmap import (
     quiet_colmap,
 )
 from dyngs.capture.sfm.frame_choice import STANDS, displaced_by, shrunk
-from dyngs.core.conventions import ReportProgress, report_nothing
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.conventions import ProgressCallback, ignore_progress
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.images.video import (
     VideoInfo,
     colour_notes,
@@ -89,7 +89,7 @@ def poses_of_videos(
     source: Path,
     out: Path,
     options: SfmOptions = SfmOptions(),
-    report: ReportProgress = report_nothing,
+    report: ProgressCallback = ignore_progress,
 ) -> str:
     """Make a capture of a folder of videos of fixed cameras that ran at once; return a description
     of the result.
@@ -162,7 +162,7 @@ def read_given(
     starts = fields.get("starts")
     test = fields.get("test")
     wrong = f"it may hold 'starts', and 'test', a list of some of the cameras {first_few(names)}"
-    with reading(path, wrong):
+    with wrap_read_errors(path, wrong):
         if fields.keys() - {"starts", "test"} or not set(test or ()) < set(names):
             raise ValueError("an unknown key or camera, or no camera left to train on")
     if starts is None:
@@ -310,7 +310,7 @@ def _samples(path: Path) -> np.ndarray | None:
     blocks: list[np.ndarray] = []
     lead = 0.0
     with (
-        reading(path, "it must be a video; copy or convert it again"),
+        wrap_read_errors(path, "it must be a video; copy or convert it again"),
         opened_video(path) as container,
     ):
         if not container.streams.audio:
@@ -348,7 +348,7 @@ LESS_ERROR = 0.7
 
 
 def _static_images(
-    source: Path, videos: Sequence[CameraVideo], report: ReportProgress
+    source: Path, videos: Sequence[CameraVideo], report: ProgressCallback
 ) -> tuple[dict[str, np.ndarray], str]:
     """Return the median image (H, W, 3) uint8 of each camera, without moving things, and a message
     that no camera moves."""
@@ -376,7 +376,7 @@ def _static_images(
 
 
 def _posed(
-    work: Path, images: Mapping[str, np.ndarray], options: SfmOptions, report: ReportProgress
+    work: Path, images: Mapping[str, np.ndarray], options: SfmOptions, report: ProgressCallback
 ) -> tuple[pycolmap.Reconstruction, str]:
     """Return the model of an image ``CAMERA.png`` for each camera, and a line on it.
 
@@ -559,7 +559,7 @@ def _write_images(
     root: Path,
     videos: Sequence[CameraVideo],
     frames: Sequence[dict[int, float]],
-    report: ReportProgress,
+    report: ProgressCallback,
 ) -> dict[str, float]:
     """Write the frames as ``root/images/CAMERA/frame_NNNNN.png``; return name to second."""
     total = sum(map(len, frames))

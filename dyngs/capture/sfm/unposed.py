@@ -12,8 +12,8 @@ from dyngs.capture.sfm.estimate import estimate_poses
 from dyngs.capture.sfm.photos import digest_of, photos_below
 from dyngs.capture.sfm.several_videos import VIDEOS_FILE, poses_of_videos
 from dyngs.config import DataConfig
-from dyngs.core.conventions import ReportProgress, report_nothing
-from dyngs.core.errors import DyngsError, as_word, counted, reading, show
+from dyngs.core.conventions import ProgressCallback, ignore_progress
+from dyngs.core.errors import DyngsError, quote_path, counted, wrap_read_errors, show
 from dyngs.data.images.video import VIDEO_SUFFIXES, videos_in
 from dyngs.data.read import is_capture
 from dyngs.io.outputs import command_for, make_once, note_source
@@ -27,7 +27,7 @@ def with_poses(
     *,
     needs_times: bool = False,
     say: Callable[[str], None] = show,
-    report: ReportProgress = report_nothing,
+    report: ProgressCallback = ignore_progress,
 ) -> DataConfig:
     """Return the options with a capture that has poses as their folder: the same one, unless it has
     none.
@@ -48,7 +48,7 @@ def with_poses(
     if videos and not needs_times:
         raise DyngsError(
             f"{source}: holds {len(videos)} videos, which a static scene cannot be made of; give `dyngs train dynamic "
-            f"data.root={as_word(source)}`, or one video of a camera that moves"
+            f"data.root={quote_path(source)}`, or one video of a camera that moves"
         )
     if source.is_dir() and not videos and needs_times and data.times == "files":
         raise DyngsError(
@@ -93,7 +93,7 @@ def is_unposed(data: DataConfig) -> bool:
         return True
     videos = videos_in(root)
     if len(videos) == 1:
-        raise DyngsError(f"{root}: holds one video; give that: data.root={as_word(videos[0])}")
+        raise DyngsError(f"{root}: holds one video; give that: data.root={quote_path(videos[0])}")
     photos = [] if videos or command_for(root, captures=False) is not None else photos_below(root)
     if photos:
         raise DyngsError(
@@ -122,5 +122,5 @@ def is_videos(source: Path) -> bool:
 
 
 def _holds_photos(folder: Path) -> bool:
-    with reading(folder, "choose another folder or change its permissions"):
+    with wrap_read_errors(folder, "choose another folder or change its permissions"):
         return len(photos_below(folder)) >= FEWEST_PHOTOS

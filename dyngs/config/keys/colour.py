@@ -24,7 +24,7 @@ class ColourSection(Section):
         """Return the degree of the harmonics that training begins with, of ``model.sh_degree``."""
         return sh_degree
 
-    def measured_after(self, steps: int) -> int | None:
+    def measurement_step(self, steps: int) -> int | None:
         """Return the step after which it is measured whose harmonics pay; None where it never
         is."""
         return None
@@ -68,5 +68,5 @@ class AutoColour(ColourSection):
     )
     tolerance: float = Field(default=0.05, ge=0, description="PSNR that may be lost by it, dB")
 
-    def measured_after(self, steps: int) -> int:
+    def measurement_step(self, steps: int) -> int:
         return max(1, round(MEASURED_AT * steps))

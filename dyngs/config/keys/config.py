@@ -69,7 +69,7 @@ class PruneConfig(Section):
     steps: int = Field(default=2000, ge=1, description="steps of fine-tuning after pruning")
 
     @property
-    def is_wanted(self) -> bool:
+    def is_enabled(self) -> bool:
         return self.fraction > 0 or self.mask_times > 1
 
 
@@ -133,7 +133,7 @@ class Config(Section):
 
     @property
     def total_steps(self) -> int:
-        return self.train.steps + (self.prune.steps if self.prune.is_wanted else 0)
+        return self.train.steps + (self.prune.steps if self.prune.is_enabled else 0)
 
     @property
     def stored_sh_degree(self) -> int:

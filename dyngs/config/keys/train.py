@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, field_validator
 
-from dyngs.core.section import Fraction, Section, as_number
+from dyngs.core.section import Fraction, Section, parse_digits
 
 
 class TrainConfig(Section):
@@ -28,7 +28,7 @@ class TrainConfig(Section):
         description="views per step, whose gradients are averaged; processes that torchrun starts share them "
         "(docs/several_processes.md), and 1 means one for each process there",
     )
-    initial_downscale: Annotated[Literal[1, 2, 4, 8, 16], BeforeValidator(as_number)] = Field(
+    initial_downscale: Annotated[Literal[1, 2, 4, 8, 16], BeforeValidator(parse_digits)] = Field(
         default=1,
         description="sides of the training images are divided by this at first; 1: full resolution",
     )

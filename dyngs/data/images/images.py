@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.core.conventions import srgb_encoded
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.conventions import encode_srgb
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.io.containment import check_size, inside, max_decoded_mb
 from dyngs.io.fields import first_few
 from dyngs.io.write import any_text, image_error
@@ -237,7 +237,7 @@ def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool
 
 
 def _reading(path: Path) -> AbstractContextManager[None]:
-    return reading(path, "the image is damaged or of an unknown kind; copy or convert it again")
+    return wrap_read_errors(path, "the image is damaged or of an unknown kind; copy or convert it again")
 
 
 def read_raw(path: Path) -> tuple[np.ndarray, bool]:
@@ -457,7 +457,7 @@ def _straight_srgb(pixels: np.ndarray, header: ImageHeader) -> np.ndarray:
         pixels[..., :3] = np.where(alpha > 0, pixels[..., :3] / np.maximum(alpha, 1e-6), 0)
     pixels = np.clip(pixels, 0, 1)
     if header.is_float:
-        pixels[..., :3] = srgb_encoded(pixels[..., :3])
+        pixels[..., :3] = encode_srgb(pixels[..., :3])
     return np.round(pixels * 255).astype(np.uint8)
 
 

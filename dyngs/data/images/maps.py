@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.capture import Silhouette, View
 from dyngs.data.images.images import read_image, read_raw
 from dyngs.data.images.lens import LensMap, undistorted_points
@@ -79,7 +79,7 @@ def _read_flo(path: Path) -> np.ndarray:
     if not inside(path).is_file():
         raise DyngsError(f"{path}: no such flow field; restore it or remove it from the capture")
     with (
-        reading(path, "it must be a .flo file of Middlebury; export it again"),
+        wrap_read_errors(path, "it must be a .flo file of Middlebury; export it again"),
         path.open("rb") as file,
     ):
         magic, width, height = struct.unpack("<fii", file.read(12))

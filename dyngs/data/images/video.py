@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from dyngs.core.conventions import srgb_decoded, srgb_encoded
-from dyngs.core.errors import DyngsError, counted, reading, reason
+from dyngs.core.conventions import decode_srgb, encode_srgb
+from dyngs.core.errors import DyngsError, counted, wrap_read_errors, reason
 from dyngs.data.capture import VideoFrame
 from dyngs.data.images.images import files_in, rotated_upright
 from dyngs.io.containment import allowed, check_size, inside, require_at_most
@@ -120,7 +120,7 @@ def _linear_table(transfer: int, white: int) -> np.ndarray:
     elif transfer == _PQ:
         linear = _pq_linear(signal) * 10_000 / _REFERENCE_WHITE
     else:
-        linear = srgb_decoded(signal)
+        linear = decode_srgb(signal)
     return linear.astype(np.float32)
 
 
@@ -143,7 +143,7 @@ def _pq_linear(signal: np.ndarray) -> np.ndarray:
 @lru_cache
 def _srgb_table() -> np.ndarray:
     """Return the 8-bit sRGB level of linear light in 65,536 steps."""
-    return np.round(255 * srgb_encoded(np.arange(_LEVELS + 1) / _LEVELS)).astype(np.uint8)
+    return np.round(255 * encode_srgb(np.arange(_LEVELS + 1) / _LEVELS)).astype(np.uint8)
 
 
 MAX_FRAMES = 1_000_000  # limit on the frames of one video: ten hours
@@ -180,7 +180,7 @@ def videos_in(folder: Path) -> list[Path]:
 
     Raises DyngsError: two with the same name but for the suffix.
     """
-    with reading(folder, "choose another folder or change its permissions"):
+    with wrap_read_errors(folder, "choose another folder or change its permissions"):
         videos = files_in(folder, VIDEO_SUFFIXES)
     names: dict[str, Path] = {}
     for path in videos:
@@ -338,7 +338,7 @@ def opened_video(path: Path) -> Iterator[InputContainer]:
 
 
 def _reading(path: Path) -> AbstractContextManager[None]:
-    return reading(path, "it must be a video; copy or convert it again")
+    return wrap_read_errors(path, "it must be a video; copy or convert it again")
 
 
 def _broken(path: Path, index: int, why: str) -> DyngsError:
@@ -435,7 +435,7 @@ def planned_frames(video: Path) -> VideoFrames:
     They lie in ``CACHE/frames/NAME.DIGEST/frame_000000.png`` and so on; ``video.json`` next to them
     holds the ``VideoInfo`` and marks the folder as ours.
     """
-    with reading(inside(video), "check the path and its permissions"):
+    with wrap_read_errors(inside(video), "check the path and its permissions"):
         status = video.stat()
         digest = _digest(video, status.st_size, status.st_mtime_ns)
     label = re.sub(r"[^A-Za-z0-9-]", "_", video.stem)[:40]

@@ -14,7 +14,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.capture import Capture, CaptureFormat, Lens, PointCloud, Splits, View
 from dyngs.data.geometry import (
     ROTATION_TOLERANCE,
@@ -128,7 +128,7 @@ def _text_entries(path: Path, entry_of: Callable[[str], Entry]) -> list[Entry]:
     entries: list[Entry] = []
     announced = 0
     may_skip = False
-    with reading(path), open_text(path) as file:
+    with wrap_read_errors(path), open_text(path) as file:
         for number, raw in enumerate(file, start=1):
             line = raw.strip(" \t\r\n")
             if line.startswith("#"):
@@ -153,7 +153,7 @@ def _text_entries(path: Path, entry_of: Callable[[str], Entry]) -> list[Entry]:
 
 
 def _binary_entries(path: Path, next_entry: Callable[[_Binary], Entry]) -> list[Entry]:
-    with reading(path):
+    with wrap_read_errors(path):
         file = _Binary(path.read_bytes())
         entries = [next_entry(file) for _ in range(file.unpack("<Q")[0])]
         if file.at != len(file.data):
@@ -370,7 +370,7 @@ def _splits(folder: Path, names: list[str], views: list[View]) -> tuple[Splits, 
     path = folder / TEST_LIST
     if not path.is_file():
         return {"train": tuple(views)}, []
-    with reading(path, "it must list names of images, a line each; repair or remove it"):
+    with wrap_read_errors(path, "it must list names of images, a line each; repair or remove it"):
         text = read_text(path)
     listed = {folded(line.strip()) for line in text.splitlines() if line.strip()}
     unknown = sorted(listed - set(map(folded, names)))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.capture import Capture, CaptureFormat, PointCloud, Splits
 from dyngs.data.geometry import OPENGL_FROM_OPENCV
 from dyngs.data.images.images import SUFFIXES, files_in
@@ -86,7 +86,7 @@ def _metadata(path: Path, names: list[str]) -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
     for name in names:
         where = f"{path}, '{name}'"
-        with reading(where, "give its warp_id and camera_id"):
+        with wrap_read_errors(where, "give its warp_id and camera_id"):
             found[name] = entry(path, fields, name) if fields else {}
             number = found[name].get("warp_id", found[name].get("time_id", 0))
             if number < 0 or number % 1 != 0:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.body_frames import body_frames, number_in_name, of_one_clip
 from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette, Splits, View
 from dyngs.data.geometry import checked_pose
@@ -55,7 +55,7 @@ def read_neuman(root: Path) -> Capture:
     if (root / ALIGNED).is_file():
         path = root / ALIGNED
         found = read_npz(path, ("global_orient", "body_pose", "betas", "transl", "scale"))
-        with reading(path, "it must hold a row for each posed image"):
+        with wrap_read_errors(path, "it must hold a row for each posed image"):
             parts = [found[key].reshape(len(names), -1) for key in ("global_orient", "body_pose")]
             poses = np.concatenate(parts, axis=1)
         body = body_frames(path, numbers, poses, found["transl"], found["betas"], found["scale"])
@@ -78,7 +78,7 @@ def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
     from scipy.spatial.transform import Rotation  # late: other captures need none of scipy
 
     path = next((root / name for name in FITS if (root / name).is_file()), root / FITS[0])
-    with reading(path, "it must hold the body parameters of one person"):
+    with wrap_read_errors(path, "it must hold the body parameters of one person"):
         fits: Any = read_pickle(inside(path))
         (fit,) = fits.values()
         poses = fit["pose"]
@@ -109,7 +109,7 @@ def _splits(root: Path, people: dict[str, View]) -> tuple[Splits, list[str]]:
         path = root / f"{split}_split.txt"
         if not path.is_file():
             continue
-        with reading(path, "it lists names of images, one a line"):
+        with wrap_read_errors(path, "it lists names of images, one a line"):
             listed = list(dict.fromkeys(read_limited(inside(path)).decode().split()))
         unposed += [name for name in listed if name not in people]
         splits[split] = tuple(people[name] for name in listed if name in people)

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, counted, reading
+from dyngs.core.errors import DyngsError, counted, wrap_read_errors
 from dyngs.data.capture import Capture, CaptureFormat, PointCloud
 from dyngs.data.geometry import OPENGL_FROM_OPENCV, opengl_from_cam
 from dyngs.data.images.images import SUFFIXES, files_in, read_header
@@ -113,7 +113,7 @@ def read_metashape(root: Path) -> Capture:
     """
     path = _only(_exports(root, ".xml", b"<chunk"))
     cameras: list[tuple[str, _Fields]] = []
-    with reading(path, _ADVICE):
+    with wrap_read_errors(path, _ADVICE):
         content = path.read_bytes()
         if b"<!ENTITY" in content:
             raise DyngsError(
@@ -211,7 +211,7 @@ def read_realitycapture(root: Path) -> Capture:
     path = _only(_exports(root, ".csv", _REALITYCAPTURE_MARK))
     photos = _photos_of(root)
     cameras: list[tuple[str, _Fields]] = []
-    with reading(path, _ADVICE), path.open(encoding="utf-8-sig", newline="") as file:
+    with wrap_read_errors(path, _ADVICE), path.open(encoding="utf-8-sig", newline="") as file:
         titles = next(line for line in file if line.startswith("#name")).strip().split(",")
         for row in csv.DictReader(file, [_RENAMED.get(title, title) for title in titles]):
             name = row.pop("#name")
@@ -278,7 +278,7 @@ def read_odm(root: Path) -> Capture:
     path = next(root / name for name in _ODM_FILES if (root / name).is_file())
     points = None
     warnings: list[str] = []
-    with reading(path, _ADVICE):
+    with wrap_read_errors(path, _ADVICE):
         content = json.loads(inside(path).read_text(encoding="utf-8-sig"))
         if path.suffix == ".json":
             model = max(content, key=lambda model: len(model["shots"]))

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.body_frames import read_body_file, rows_of
 from dyngs.data.capture import (
     BodyFrames,
@@ -417,7 +417,7 @@ def read_points(path: Path) -> PointCloud:
         raise DyngsError(f"{path}: no such point file; restore it or remove {KEY}")
     # From an open file: given a path, trimesh would look for textures next to it.
     with (
-        reading(path, "it must be a .ply file of points; export it again"),
+        wrap_read_errors(path, "it must be a .ply file of points; export it again"),
         path.open("rb") as file,
     ):
         loaded: Any = trimesh.load(file, file_type="ply", process=False, skip_materials=True)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.body_frames import body_frames, number_in_name, of_one_clip, rows_of
 from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette, Splits
 from dyngs.data.geometry import checked_pose, opengl_from_cam
@@ -45,7 +45,7 @@ def read_zju_mocap(root: Path) -> Capture:
     shots: list[Any]
     if (root / ANNOTATIONS).is_file():
         path = root / ANNOTATIONS
-        with reading(path):
+        with wrap_read_errors(path):
             shots = _annotated_shots(path)
         numbers = sorted({shot.own["frame"] for shot in shots})
         found = next((x for x in (root / "new_params", root / "params") if x.is_dir()), root)
@@ -54,10 +54,10 @@ def read_zju_mocap(root: Path) -> Capture:
         kind, folders = "nonzero", ("mask_cihp", "mask", "masks")
     else:
         path = root / CAMERAS
-        with reading(path):
+        with wrap_read_errors(path):
             shots = _single_shots(path)
         found = root / MESHES
-        with reading(found):
+        with wrap_read_errors(found):
             by_name = _by_name(found)
             infos = [(f"{found}, {name}", own) for name, own in by_name.items()]
             body = _body(found, [number_in_name(found, name) for name in by_name], infos)

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dyngs.core.conventions import srgb_encoded
+from dyngs.core.conventions import encode_srgb
 from dyngs.core.errors import DyngsError
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.io.outputs import new_folder
@@ -242,7 +242,7 @@ def trace(
         if len(here):
             rays = hit[here]
             rgb[here] = _shade(scene, primitive, points[here], directions[rays], lamps[rays])
-    return hit, srgb_encoded(np.clip(rgb, 0.0, 1.0))
+    return hit, encode_srgb(np.clip(rgb, 0.0, 1.0))
 
 
 def _shade(

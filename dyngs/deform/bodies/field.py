@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, State, StateTensor, fields_moved_to, part_of, prefixed
+from dyngs.core.state import Role, State, StateTensor, move_fields_to, part_of, add_prefix
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.deform.field import DeformationField, Offsets, OuterField, select_rows
 from dyngs.gaussians import Gaussians, TopologyEdit
@@ -168,7 +168,7 @@ class BodyField(OuterField):
     def state(self) -> State:
         rest = {name: StateTensor(x, Role.SHARED) for name, x in vars(self.rest).items()}
         rest["labels"] = StateTensor(self.rest.labels, Role.PER_MOVING)
-        return self.inner_field.state() | prefixed("bodies", rest | super().state())
+        return self.inner_field.state() | add_prefix("bodies", rest | super().state())
 
     @staticmethod
     def from_state(inner_field: DeformationField, tensors: Mapping[str, Tensor]) -> BodyField:
@@ -195,7 +195,7 @@ class BodyField(OuterField):
 
     def to(self, device: torch.device | str) -> BodyField:
         field = super().to(device)
-        field.rest = fields_moved_to(self.rest, device)
+        field.rest = move_fields_to(self.rest, device)
         return field
 
 

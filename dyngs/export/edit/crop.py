@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError, printable
+from dyngs.core.errors import DyngsError, format_one_line
 from dyngs.data.times import evenly_spaced
 from dyngs.export.edit.frame import Point, parse_number, parse_point
 from dyngs.gaussians.scene import GaussianScene
@@ -52,7 +52,7 @@ def parse_region(words: Sequence[str]) -> Region:
     text = " ".join(words)
     parts = text.split()
     if len(parts) != 2:
-        shown = printable(repr(text), 60)
+        shown = format_one_line(repr(text), 60)
         raise DyngsError(f"--crop: {shown}: use two corners x,y,z x,y,z, or x,y,z and a radius")
     first = parse_point(parts[0], "--crop")
     if "," in parts[1]:

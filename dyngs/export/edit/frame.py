@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, printable
+from dyngs.core.errors import DyngsError, format_one_line
 from dyngs.data.capture import all_views
 from dyngs.data.scene_space import MAX_DISTANCE
 from dyngs.io.fields import read_limited
 from dyngs.io.formats.similarity import AXES, Similarity, similarity_of_matrix, turn_between
-from dyngs.runs.opened import Opened
+from dyngs.runs.opened import OpenedScene
 
 _FACTORS = (1e-9, 1e9)  # Smallest and largest allowed scale
 _MOST_BYTES = 1 << 20  # Largest file of control points
@@ -58,7 +58,7 @@ def parse_point(text: str, option: str) -> Point:
     except ValueError:
         x = y = z = math.nan
     if not all(map(math.isfinite, (x, y, z))):
-        shown = printable(repr(text), 60)
+        shown = format_one_line(repr(text), 60)
         raise DyngsError(
             f"{option}: {shown} is not a point; use three numbers without spaces, such as 0,-1.5,2"
         )
@@ -72,7 +72,7 @@ def parse_number(text: str, option: str) -> float:
     except ValueError:
         found = math.nan
     if not math.isfinite(found):
-        raise DyngsError(f"{option}: {printable(repr(text), 60)} is not a number")
+        raise DyngsError(f"{option}: {format_one_line(repr(text), 60)} is not a number")
     return found
 
 
@@ -99,7 +99,7 @@ def parse_scale(text: str) -> float:
     if not low <= factor <= high:
         what = "a factor, or two points and their distance: 'x,y,z x,y,z LENGTH'"
         raise DyngsError(
-            f"--scale: {printable(repr(text), 60)} is not a factor from {low:g} to {high:g}; use "
+            f"--scale: {format_one_line(repr(text), 60)} is not a factor from {low:g} to {high:g}; use "
             f"{what}"
         )
     return factor
@@ -194,7 +194,7 @@ def _control_points(path: Path) -> np.ndarray:
             row = []
         if len(row) != 6 or not np.isfinite(row).all():
             raise DyngsError(
-                f"{path}: {printable(repr(line), 60)}: expected six numbers x,y,z,X,Y,Z (scene, "
+                f"{path}: {format_one_line(repr(line), 60)}: expected six numbers x,y,z,X,Y,Z (scene, "
                 "world)"
             )
         rows.append(row)
@@ -209,7 +209,7 @@ _RADIUS, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS84 semi-major axis in 
 _INSTEAD = "use control points (--geo FILE), or --up and --scale"
 
 
-def gps_frame(opened: Opened) -> GeoFrame:
+def gps_frame(opened: OpenedScene) -> GeoFrame:
     """Return the frame with x east, y north, z up, in metres, fitted to GPS positions of photos.
 
     Raises:

@@ -31,8 +31,8 @@ from dyngs.io.formats.similarity import AXES
 from dyngs.io.outputs import new_folder, require_new_folder
 from dyngs.io.write import write_text
 from dyngs.models.views import training_cameras
-from dyngs.runs.folder import inputs_of
-from dyngs.runs.opened import Opened
+from dyngs.runs.folder import collect_inputs
+from dyngs.runs.opened import OpenedScene
 
 
 def fill_template(page: str, pieces: Mapping[str, str]) -> str:
@@ -75,7 +75,7 @@ class WrittenPage:
 
 
 def write_page(
-    opened: Opened,
+    opened: OpenedScene,
     path: Path,
     *,
     title: str | None = None,
@@ -90,7 +90,7 @@ def write_page(
         views: cameras offered on the page, each a batch of one, the first one initially. Empty uses
             those of the capture, or an orbit.
     """
-    inputs_of(opened).require_output(path)
+    collect_inputs(opened).require_output(path)
     lists = PackedArrays()
     header = _header(opened, time, views, lists)
     text = _assemble_page(opened, header, lists, title)
@@ -99,7 +99,7 @@ def write_page(
 
 
 def write_page_folder(
-    opened: Opened,
+    opened: OpenedScene,
     folder: Path,
     *,
     most: int | None = None,
@@ -141,7 +141,7 @@ def write_page_folder(
     return WrittenPage(folder / PAGE, size, header, _notes(opened, header))
 
 
-def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
+def _notes(opened: OpenedScene, header: dict[str, Any]) -> tuple[str, ...]:
     notes: list[str] = []
     if opened.missing is not None:
         notes.append(
@@ -162,10 +162,10 @@ def _notes(opened: Opened, header: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _header(
-    opened: Opened, time: float, views: Sequence[Cameras], lists: PackedArrays
+    opened: OpenedScene, time: float, views: Sequence[Cameras], lists: PackedArrays
 ) -> dict[str, Any]:
     views, target = _initial_views(opened, views)
-    found = opened.renderable.page_lists()
+    found = opened.renderable.page_data()
     if found is not None:
         header, own = found
         for name, (rows, bits) in own.items():
@@ -180,7 +180,7 @@ def _header(
 
 
 def _initial_views(
-    opened: Opened, views: Sequence[Cameras]
+    opened: OpenedScene, views: Sequence[Cameras]
 ) -> tuple[Sequence[Cameras], list[float]]:
     """Return the cameras of the page, each a batch of one, and the orbit target.
 
@@ -205,7 +205,7 @@ def _initial_views(
 
 
 def _view_header(
-    opened: Opened, time: float, views: Sequence[Cameras], target: list[float]
+    opened: OpenedScene, time: float, views: Sequence[Cameras], target: list[float]
 ) -> dict[str, Any]:
     upward = np.array(AXES["z"]) if opened.up is None else opened.up[0]
     return {
@@ -238,7 +238,7 @@ def _view(camera: Cameras) -> dict[str, Any]:
 
 
 def _assemble_page(
-    opened: Opened, header: dict[str, Any], lists: PackedArrays, title: str | None
+    opened: OpenedScene, header: dict[str, Any], lists: PackedArrays, title: str | None
 ) -> str:
     """Return the text of the page. Texts of a run are escaped, and scripts are allowed by hash
     only."""

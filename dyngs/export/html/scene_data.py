@@ -121,8 +121,8 @@ def add_scene(scene: GaussianScene, lists: PackedArrays, tolerance: float) -> di
         header |= _add_person(person, order, lists, tolerance)
     elif moved is not None:
         header |= _add_motion(moved, order, lists, tolerance)
-    with_harmonics = scene.colour is None
-    header |= _add_gaussians(gaussians.select(order).detach(), lists, with_harmonics=with_harmonics)
+    bake_harmonics = scene.colour is None
+    header |= _add_gaussians(gaussians.select(order).detach(), lists, bake_harmonics=bake_harmonics)
     return header if scene.colour is None else header | _add_network(scene.colour, lists)
 
 
@@ -133,7 +133,7 @@ def add_levels(levels: Levels, colour: ColourNetwork | None, lists: PackedArrays
     The page fetches the blocks itself, see ``block_numbers``.
     """
     lists.exact("blocks", np.concatenate(levels.blocks).astype(np.float32))
-    coarsest = block_numbers(levels, (len(levels.levels) - 1, 0), with_harmonics=colour is None)
+    coarsest = block_numbers(levels, (len(levels.levels) - 1, 0), bake_harmonics=colour is None)
     sizes = [len(level) for level in levels.levels]
     known = {"sizes": sizes, "block": BLOCK, "merged": MERGED, "pixels": PIXELS}
     degree = levels.levels[0].sh_degree if colour is None else 0
@@ -142,7 +142,7 @@ def add_levels(levels: Levels, colour: ColourNetwork | None, lists: PackedArrays
     return header if colour is None else header | _add_network(colour, lists)
 
 
-def block_numbers(levels: Levels, block: Block, *, with_harmonics: bool) -> PackedArrays:
+def block_numbers(levels: Levels, block: Block, *, bake_harmonics: bool) -> PackedArrays:
     """Return the arrays of a block with ``BLOCK`` rows. Missing rows are padded with transparent
     Gaussians."""
     gaussians = levels.of_block(block)
@@ -150,20 +150,20 @@ def block_numbers(levels: Levels, block: Block, *, with_harmonics: bool) -> Pack
     padded = gaussians.select(rows)
     padded.logit_opacities[len(gaussians) :] = -MOST_LOGIT
     lists = PackedArrays()
-    _add_gaussians(padded, lists, with_harmonics=with_harmonics)
+    _add_gaussians(padded, lists, bake_harmonics=bake_harmonics)
     return lists
 
 
-def block_files(levels: Levels, *, with_harmonics: bool) -> Iterator[tuple[str, bytes]]:
+def block_files(levels: Levels, *, bake_harmonics: bool) -> Iterator[tuple[str, bytes]]:
     """Yield names and contents of the files of all blocks, as requested by ``levels.js``."""
     for level, balls in enumerate(levels.blocks):
         for place in range(len(balls)):
-            numbers = block_numbers(levels, (level, place), with_harmonics=with_harmonics)
+            numbers = block_numbers(levels, (level, place), bake_harmonics=bake_harmonics)
             yield f"{level}-{place}.bin", numbers.deflated()
 
 
 def _add_gaussians(
-    gaussians: Gaussians, lists: PackedArrays, *, with_harmonics: bool
+    gaussians: Gaussians, lists: PackedArrays, *, bake_harmonics: bool
 ) -> dict[str, Any]:
     unit = torch.nn.functional.normalize(gaussians.quats, dim=1)
     logits = gaussians.logit_opacities.clamp(-MOST_LOGIT, MOST_LOGIT)
@@ -172,7 +172,7 @@ def _add_gaussians(
     lists.quantised("log_scales", _numpy(gaussians.log_scales), 8)
     lists.quantised("logit_opacities", _numpy(logits[:, None]), 8)
     lists.quantised("base", _numpy(gaussians.sh[:, 0]), 8)
-    degree = gaussians.sh_degree if with_harmonics else 0
+    degree = gaussians.sh_degree if bake_harmonics else 0
     if degree:
         lists.quantised("rest", _numpy(gaussians.sh[:, 1:].flatten(1)), 8)
     return {"degree": degree}

@@ -50,7 +50,7 @@ from dyngs.io.write import atomic_file
 from dyngs.models.kind import HasBody, capability
 from dyngs.ops.quaternions import align_quat_signs
 from dyngs.runs.checkpoint import LoadedRun
-from dyngs.runs.folder import inputs_of
+from dyngs.runs.folder import collect_inputs
 
 _MOST_ROWS = 4000  # Most anchors used to fit the shape; each gives three equations
 
@@ -269,7 +269,7 @@ def write_mesh(run: LoadedRun, path: Path, played: AnimationInfo | None = None) 
         DyngsError: not the run of a person, or a missing template or UV map.
     """
     scene, body = person_and_template(run, "--format mesh")
-    inputs_of(run).require_output(path)
+    collect_inputs(run).require_output(path)
     with torch.no_grad():
         vertices = rest_vertices(scene, body)
         normals = anchor_normals(scene.anchors, body, vertices)
@@ -377,7 +377,7 @@ def write_rigged_splats(
         DyngsError: not the run of a person, or a missing template.
     """
     scene, body = person_and_template(run, "--joints")
-    inputs_of(run).require_output(path)
+    collect_inputs(run).require_output(path)
     vertices = rest_vertices(scene, body)
     rig = build_rig(scene, vertices)
     gaussians = scene.gaussians

@@ -200,7 +200,7 @@ class ColourTraining:
             return {}
         return {"opacity entropy": self.entropy_weight * opacity_entropy(gaussians.logit_opacities)}
 
-    def holds_out(self, index: int, step: int) -> bool:
+    def is_held_out(self, index: int, step: int) -> bool:
         """Return whether training view ``index`` must not be trained on in ``step``."""
         return False
 
@@ -284,18 +284,18 @@ class AutoTraining(ColourTraining):
     def __init__(self, options: AutoColour, steps: int, num_views: int) -> None:
         super().__init__(options)
         self.tolerance = options.tolerance
-        self.measured_after = options.measured_after(steps)
+        self.measurement_step = options.measurement_step(steps)
         self.held_out = tuple(range(_HELD_OUT, num_views, HELD_OUT_EVERY))
         self._frozen: Tensor | None = None
 
-    def holds_out(self, index: int, step: int) -> bool:
+    def is_held_out(self, index: int, step: int) -> bool:
         """Return true for every eighth view, until the harmonics are measured on them."""
-        return step <= self.measured_after and index in self.held_out
+        return step <= self.measurement_step and index in self.held_out
 
     def measure_harmonics(
         self, step: int, looks: Callable[[], MeasurementViews]
     ) -> ViewDependence | None:
-        if step != self.measured_after or not self.held_out:
+        if step != self.measurement_step or not self.held_out:
             return None
         views = looks()
         seen = [i for i in views.indices if i not in self.held_out]

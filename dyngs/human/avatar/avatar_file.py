@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from dyngs.core.conventions import RasterizeMode
-from dyngs.core.errors import DyngsError, printable
+from dyngs.core.errors import DyngsError, format_one_line
 from dyngs.core.section import ModelSection
 from dyngs.core.state import part_of
 from dyngs.core.tensor_checks import require_tensor
@@ -25,7 +25,7 @@ from dyngs.human.avatar.scene import HumanScene, as_human_scene
 from dyngs.human.body.body_reader import template_path
 from dyngs.human.keys import HumanModel
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
-from dyngs.models.checkpoint import CheckpointInfo, info_of
+from dyngs.models.checkpoint import CheckpointInfo, parse_info
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
 
@@ -105,7 +105,7 @@ def read_avatar(path: Path) -> tuple[HumanModel, HumanScene, CheckpointInfo]:
     header, tensors = read_tensors(path, _KIND, _ADVICE)
     try:
         scene = _scene(tensors)
-        info = info_of(header)
+        info = parse_info(header)
         model = HumanModel(
             body=_template_beside(path, **header["template"]),
             near=header["near"],
@@ -117,7 +117,7 @@ def read_avatar(path: Path) -> tuple[HumanModel, HumanScene, CheckpointInfo]:
         why = (
             f"{error.args[0]} is missing"
             if isinstance(error, KeyError)
-            else printable(str(error), 120)
+            else format_one_line(str(error), 120)
         )
         raise DyngsError(f"{path}: not a valid avatar ({why}){_ADVICE}") from None
     options = render_options(model, info.extent, info.world_scale)

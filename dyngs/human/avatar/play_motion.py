@@ -13,13 +13,13 @@ from dyngs.human.motion.motion import motion_clip
 from dyngs.human.motion.placement import place_like, reduce_foot_sliding, sole_points, up_direction
 from dyngs.human.motion.retarget import read_motion
 from dyngs.models.checkpoint import CheckpointInfo
-from dyngs.models.kind import InMotion
+from dyngs.models.kind import PlayedMotion
 from dyngs.models.renderable import Renderable
 
 
 def play_motion(
     section: HumanModel, person: Renderable, info: CheckpointInfo, path: Path, *, keep_feet: bool
-) -> InMotion:
+) -> PlayedMotion:
     """See ``dyngs.models.kind.HasBody``."""
     if not isinstance(person, HumanScene):
         raise DyngsError(f"{path}: only a person plays a motion")
@@ -44,4 +44,4 @@ def play_motion(
         clip, note = reduce_foot_sliding(clip, soles, up_direction(scene.clip), motion.fps)
         playing = scene.with_motion(clip)
         notes = (*notes, note)
-    return InMotion(playing.to(person.gaussians.means.device), motion.fps, notes)
+    return PlayedMotion(playing.to(person.gaussians.means.device), motion.fps, notes)

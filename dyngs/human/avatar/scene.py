@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, State, StateTensor, part_of, prefixed, with_role
+from dyngs.core.state import Role, State, StateTensor, part_of, add_prefix, with_role
 from dyngs.core.tensor_checks import (
     require_indices,
-    require_moments,
+    require_times,
     require_positive,
     require_tensor,
 )
@@ -43,7 +43,7 @@ from dyngs.human.avatar.posing import (
 from dyngs.human.body.joints import SMPLX_ROWS
 from dyngs.human.body.skinning import check_tree
 from dyngs.human.motion.motion import MotionClip, captured_motion, has_same_parameters
-from dyngs.models.renderable import Posable, Renderable, clamped_time
+from dyngs.models.renderable import Posable, Renderable, clamp_time
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,7 +166,7 @@ class HumanScene(GaussianScene, Posable):
 
         Who keeps one pose is posed once, but for gradients.
         """
-        now = clamped_time(time)
+        now = clamp_time(time)
         kept = self._derived.get("posed")
         if kept is not None and not torch.is_grad_enabled():
             return replace(kept, time=now)
@@ -230,7 +230,7 @@ class HumanScene(GaussianScene, Posable):
         """
         return replace(self, replacement_clip=clip)
 
-    def up_of_body(self) -> Tensor:
+    def body_up_direction(self) -> Tensor:
         from dyngs.human.motion.placement import up_direction  # late: scipy
 
         return up_direction(self.clip)
@@ -253,7 +253,7 @@ class HumanScene(GaussianScene, Posable):
         replacement_clip = None if self.replacement_clip is None else there(self.replacement_clip)
         return replace(self, clip=there(self.clip), replacement_clip=replacement_clip)
 
-    def as_filmed(self, capture: Capture, split: Split) -> HumanScene:
+    def for_split(self, capture: Capture, split: Split) -> HumanScene:
         """Return the person as the views of a split show them.
 
         The split pose, and splits with body parameters of their own, have the poses of their files.
@@ -286,8 +286,8 @@ class HumanScene(GaussianScene, Posable):
         it."""
         clip = self.clip
         skeleton = self.skeleton
-        state = prefixed("learned", self.learned.state())
-        state |= prefixed("anchors", with_role(self.anchors.tensors(), Role.PER_GAUSSIAN))
+        state = add_prefix("learned", self.learned.state())
+        state |= add_prefix("anchors", with_role(self.anchors.tensors(), Role.PER_GAUSSIAN))
         if self.seen is not None:
             state["seen"] = StateTensor(self.seen, Role.PER_GAUSSIAN)
         given = {
@@ -344,7 +344,7 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
             f"'parents' is {parents.dtype} {tuple(parents.shape)}, not whole numbers ({j},)"
         )
     check_tree(tuple(parents.tolist()))
-    require_moments("clip.times", state["clip.times"])
+    require_times("clip.times", state["clip.times"])
     shapes = {
         "joints": (j, 3),
         "clip.poses": (f, j, 3),

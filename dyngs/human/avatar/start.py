@@ -31,13 +31,13 @@ from dyngs.human.body.body_reader import load_template, rest_shape
 from dyngs.human.keys import NO_BODY, HumanModel
 from dyngs.human.motion.motion import CapturedMotion, captured_motion
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import RunStart
+from dyngs.models.kind import StartContext
 from dyngs.models.views import evaluation_background, training_cameras
 
 MAX_COLOUR_VIEWS = 50  # number of images from which a person's first colours are taken
 
 
-def start(run: RunStart) -> GaussianModel:
+def start(run: StartContext) -> GaussianModel:
     """Return the model of a person before the first step.
 
     Raises DyngsError: a capture without body parameters, or a template that cannot be read.

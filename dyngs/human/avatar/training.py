@@ -41,8 +41,8 @@ from dyngs.human.avatar.posing import (
 )
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.keys import HumanModel
-from dyngs.models.kind import RunStart
-from dyngs.models.model import Look, Loss
+from dyngs.models.kind import StartContext
+from dyngs.models.model import LossInput, Loss
 from dyngs.models.views import background_colour
 from dyngs.ops.adam import Count
 from dyngs.ops.device import copy_async
@@ -93,7 +93,7 @@ class OutlineLoss(Loss):
             "show behind the person"
         )
 
-    def __call__(self, look: Look) -> Mapping[str, Tensor]:
+    def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
         rendered = look.rendered
         truth = look.truth
         plate = self._plates.get(self._photos.views[look.index].camera_id)
@@ -110,7 +110,7 @@ class OutlineLoss(Loss):
         return {"image": l1_ssim_loss(rendered, truth, self._ssim_weight, look.image.mask)}
 
 
-def make_outline_loss(run: RunStart) -> OutlineLoss | None:
+def make_outline_loss(run: StartContext) -> OutlineLoss | None:
     """Return how colours are compared near outlines; None where masks come with the images, or no
     camera stands."""
     views = run.images.views
@@ -222,7 +222,7 @@ class HumanTraining(SceneTraining[HumanScene]):
     poses are fitted again.
     """
 
-    moves_by = ("pose", "model")
+    deformation_name = ("pose", "model")
 
     def __init__(
         self,

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.core.state import fields_moved_to
+from dyngs.core.state import move_fields_to
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.body.skinning import (
     apply_transforms,
@@ -76,7 +76,7 @@ class BodyTemplate:
     ) -> BodyTemplate:
         """Return the template on ``device``, its floating-point tensors in ``dtype``; None leaves
         either as it is."""
-        return fields_moved_to(self, device, dtype)
+        return move_fields_to(self, device, dtype)
 
 
 def apply_shape(body: BodyTemplate, betas: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.capture import BodyFrames
 from dyngs.human.body.body import BodyTemplate, apply_shape, bone_shape_directions
 from dyngs.human.keys import HumanModel
@@ -42,7 +42,7 @@ def read_body(path: Path, uv: Path | None = None) -> BodyTemplate:
     suffix = path.suffix.lower()
     if suffix not in (".npz", ".pkl"):
         raise DyngsError(f"{path}: a body file must end in .npz or .pkl")
-    with reading(path, "give a body file of SMPL, SMPL-H or SMPL-X"):
+    with wrap_read_errors(path, "give a body file of SMPL, SMPL-H or SMPL-X"):
 
         def wanted(names: Collection[str]) -> list[str]:
             keys = (*_TEMPLATE, *_TEMPLATE_SHAPES) if "weights_idx" in names else _SMPL
@@ -184,7 +184,7 @@ def read_obj(path: Path, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Those of the file may come in any order, as ``f v/vt v/vt v/vt``. Raises DyngsError: the file
     cannot be read, or belongs to another body.
     """
-    with reading(path, "give the .obj made for this body, with triangles 'f v/vt v/vt v/vt'"):
+    with wrap_read_errors(path, "give the .obj made for this body, with triangles 'f v/vt v/vt v/vt'"):
         uv = []
         triangles: dict[tuple[int, ...], dict[int, int]] = {}
         for line in read_limited(path).decode("latin-1").splitlines():

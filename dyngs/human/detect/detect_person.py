@@ -20,7 +20,7 @@ from dyngs.capture.fixed_camera import is_plain_clip, read_fixed_camera
 from dyngs.capture.masks import at_size, outlined
 from dyngs.capture.sfm.photos import digest_of
 from dyngs.config import DataConfig
-from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, counted, show
 from dyngs.data.capture import Capture, View, by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
@@ -155,7 +155,7 @@ def detect_person(
     capture: Capture,
     detector: Detector,
     folder: Path,
-    report: ReportProgress,
+    report: ProgressCallback,
     say: Callable[[str], None] = show,
 ) -> FitInputs:
     """Find a person in all views, write masks and key points to ``folder``, and return where they
@@ -233,7 +233,7 @@ def write_detected_person(
     options: DataConfig,
     out: Path,
     detector: Detector,
-    report: ReportProgress = report_nothing,
+    report: ProgressCallback = ignore_progress,
     say: Callable[[str], None] = show,
 ) -> FittedCapture:
     """Find a person and fit the body to them: write the capture of ``write_fitted_capture`` to the
@@ -254,7 +254,7 @@ def write_detected_person(
 
 
 def ensure_detected_person(
-    data: DataConfig, *, say: Callable[[str], None] = show, report: ReportProgress = report_nothing
+    data: DataConfig, *, say: Callable[[str], None] = show, report: ProgressCallback = ignore_progress
 ) -> DataConfig:
     """Return the options with the capture of the person that is found in a clip; the same clip is
     looked at once.

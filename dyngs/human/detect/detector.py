@@ -16,7 +16,7 @@ from typing import Protocol
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, as_word
+from dyngs.core.errors import DyngsError, quote_path
 from dyngs.human.detect import mediapipe_worker
 from dyngs.io.numpy_files import read_arrays
 
@@ -143,7 +143,7 @@ class MediaPipe:
         if done.returncode == mediapipe_worker.NO_MEDIAPIPE:
             raise DyngsError(
                 f"{self._python}: {_last_line(done.stderr)}; give the interpreter of an environment made by "
-                f"`{as_word(self._python)} -m pip install {MEDIAPIPE_PACKAGE}`"
+                f"`{quote_path(self._python)} -m pip install {MEDIAPIPE_PACKAGE}`"
             )
         if done.returncode:
             raise DyngsError(

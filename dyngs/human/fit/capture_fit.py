@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dyngs.config import DataConfig
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import RasterizeMode, ReportProgress, report_nothing
+from dyngs.core.conventions import RasterizeMode, ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import frame_number, numbered
 from dyngs.data.capture import Capture, Split, View
@@ -487,7 +487,7 @@ class BodyFit:
         learned: Sequence[str],
         steps: int,
         observed: Observations,
-        report: ReportProgress = report_nothing,
+        report: ProgressCallback = ignore_progress,
         schedule_start: float = 0.0,
     ) -> Parameters:
         """Return the fit ``start`` after ``steps`` of Adam on what is named.
@@ -604,7 +604,7 @@ def estimate_initial_poses(
     times: Tensor,
     body: BodyDiscs,
     observed: Observations,
-    report: ReportProgress = report_nothing,
+    report: ProgressCallback = ignore_progress,
 ) -> MotionClip:
     """Return poses of a person in F frames, found in the silhouettes of ``observed`` (per row)
     alone.
@@ -874,7 +874,7 @@ def fit_capture(
     capture: Capture,
     options: DataConfig,
     body: BodyTemplate,
-    report: ReportProgress,
+    report: ProgressCallback,
     keypoints: Keypoints | None = None,
     effort: FitEffort = FitEffort(),
     *,
@@ -945,7 +945,7 @@ def _from_given(
     fitting: BodyFit,
     seen: FitViews,
     shape: Sequence[str],
-    report: ReportProgress,
+    report: ProgressCallback,
     effort: FitEffort,
 ) -> tuple[CandidateFit, ...]:
     """Return candidates from given poses, from simple to complex."""
@@ -979,7 +979,7 @@ def _from_silhouettes(
     fitting: BodyFit,
     seen: FitViews,
     shape: Sequence[str],
-    report: ReportProgress,
+    report: ProgressCallback,
     effort: FitEffort,
 ) -> tuple[CandidateFit, ...]:
     """Return candidates from poses that were found frame by frame.
@@ -1125,7 +1125,7 @@ def place_new_poses(
     options: DataConfig,
     body: BodyTemplate,
     found: CaptureFit,
-    report: ReportProgress,
+    report: ProgressCallback,
     effort: FitEffort = FitEffort(),
 ) -> PlacedClip | None:
     """Return the clip of ``pose`` moved to its silhouettes, if it looks better there; None without

@@ -24,8 +24,8 @@ from dyngs.capture.masks import with_background_masks
 from dyngs.capture.sfm.photos import digest_of
 from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
-from dyngs.core.conventions import ReportProgress, report_nothing
-from dyngs.core.errors import DyngsError, counted, reading, show
+from dyngs.core.conventions import ProgressCallback, ignore_progress
+from dyngs.core.errors import DyngsError, counted, wrap_read_errors, show
 from dyngs.data.body_frames import frame_number, numbered, read_body_file
 from dyngs.data.capture import BodyFrames, Capture, Split, View
 from dyngs.data.geometry import opengl_from_cam
@@ -92,7 +92,7 @@ class FittedCapture:
 def write_fitted_capture(
     options: DataConfig,
     out: Path,
-    report: ReportProgress,
+    report: ProgressCallback,
     given: FitInputs = FitInputs(),
     *,
     with_images: bool = True,
@@ -218,7 +218,7 @@ def read_known_shape(path: Path, body: BodyTemplate) -> BodyFrames:
     ``path`` is a capture or a folder that ``dyngs data fit`` wrote, or the run of an avatar trained
     on one. Raises DyngsError: none of these, or a shape of another template.
     """
-    with reading(path, "give a capture that `dyngs data fit` wrote, or a run trained on it"):
+    with wrap_read_errors(path, "give a capture that `dyngs data fit` wrote, or a run trained on it"):
         folder = path
         if (path / RESOLVED_NAME).is_file():
             data = load_resolved(path).data
@@ -522,7 +522,7 @@ def ensure_fitted_body(
     *,
     only_if_needed: bool = False,
     say: Callable[[str], None] = show,
-    report: ReportProgress = report_nothing,
+    report: ProgressCallback = ignore_progress,
 ) -> DataConfig:
     """Return the options with a fit of a template to the capture; the same capture is fitted once.
 
@@ -581,7 +581,7 @@ def _digest(data: DataConfig) -> str:
     Files beyond 100 MB, such as videos, say nothing about bodies and cameras.
     """
     root = data.root.resolve()
-    with reading(root):
+    with wrap_read_errors(root):
         found = [path for path in root.rglob("*") if path.is_file()]
         files = sorted(path for path in found if path.stat().st_size < 100_000_000)
     names = (

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.body_frames import frame_number
 from dyngs.data.capture import Capture, View
 from dyngs.data.images.lens import undistorted_points
@@ -86,10 +86,10 @@ def read_keypoints(path: Path, views: Sequence[View]) -> Keypoints:
     """
     named = _by_name(views)
     found: Keypoints = {}
-    with reading(path):
+    with wrap_read_errors(path):
         files = sorted(path.rglob("*.json")) if path.is_dir() else [path]
     for file in files:
-        with reading(file, "give a folder of OpenPose files or a COCO file"):
+        with wrap_read_errors(file, "give a folder of OpenPose files or a COCO file"):
             name = file.relative_to(path).as_posix().removesuffix(".json")
             name = name.removesuffix("_keypoints")
             if path.is_dir() and _view_of(named, name) is None:
@@ -147,7 +147,7 @@ def read_joints(path: Path, capture: Capture) -> Joints3D:
     views = capture.splits["train"]
     scale = capture.world_scale
     found: Joints3D = {}
-    with reading(path):
+    with wrap_read_errors(path):
         if path.is_dir():
             named = _by_name(views)
             for file in sorted(path.glob("*.npz")):

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.capture import ShapeSpace
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.joints import SMPLX_ROWS
@@ -56,7 +56,7 @@ def read_amass(
     without ``scale`` and ``up_axis``, shape parameters are set to zero and the lowest vertex to y =
     0. Raises DyngsError: names the file and what is missing or wrong.
     """
-    with reading(path, "give an AMASS file of a motion"):
+    with wrap_read_errors(path, "give an AMASS file of a motion"):
         keys = ("poses", *_PARTS, *_NAMED, "trans", "betas", *_ALIASES, "scale", "up_axis", *_RATES)
         # Others, which may hold objects, are not read.
         arrays = read_arrays(path, lambda names: [key for key in keys if key in names])

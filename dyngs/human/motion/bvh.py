@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.human.motion.motion import SkeletonMotion, require_frame_count, require_frame_rate
 from dyngs.io.fields import read_limited, require_at_most
 
@@ -28,7 +28,7 @@ def read_bvh(path: Path) -> SkeletonMotion:
     degrees, in the order of its channels. Raises DyngsError: names the file and what is wrong with
     it.
     """
-    with reading(path):
+    with wrap_read_errors(path):
         text = read_limited(path, 1 << 28).decode("utf-8-sig", errors="replace")
         header = re.search(
             r"^[ \t]*MOTION\s+Frames[ \t]*:[ \t]*(\d{1,9})\s+Frame[ \t]+Time[ \t]*:[ \t]*(\S{1,40})",

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dyngs.core.errors import reading
+from dyngs.core.errors import wrap_read_errors
 from dyngs.human.motion.motion import SkeletonMotion, require_frame_count, sample_times
 from dyngs.io.fields import require_at_most
 from dyngs.io.gltf import MOST_JOINTS, GltfFile
@@ -46,7 +46,7 @@ def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> Skeleto
     animation, anything broken or not supported (sparse accessors, meshopt compression, mirrored
     nodes); names the file.
     """
-    with reading(path):
+    with wrap_read_errors(path):
         file = GltfFile(path)
         vrm = _vrm_animation(file)
         bind = None

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import fields_moved_to
+from dyngs.core.state import move_fields_to
 from dyngs.data.body_frames import about_pelvis, rows_of
 from dyngs.data.capture import BodyFrames, View
 from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
@@ -47,7 +47,7 @@ class Motion:
 
     def to(self, *, device: torch.device | str) -> Motion:
         """Return the motion with its tensors on ``device``."""
-        return fields_moved_to(self, device)
+        return move_fields_to(self, device)
 
     def for_joints(self, count: int) -> Motion:
         """Return the motion for a body of 55 (SMPL-X), 52 (SMPL-H) or 24 (SMPL) joints, see
@@ -187,7 +187,7 @@ class MotionClip:
 
     def to(self, *, device: torch.device | str) -> MotionClip:
         """Return the clip with its poses, translations and scales on ``device``."""
-        return replace(fields_moved_to(self, device), times=self.times)
+        return replace(move_fields_to(self, device), times=self.times)
 
     def select(self, rows: Tensor) -> MotionClip:
         """Return the frames at ``rows`` (long, on the CPU, ascending)."""

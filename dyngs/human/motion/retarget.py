@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from dyngs.core.errors import DyngsError, reading
+from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.joints import JOINT_NAMES, JOINT_PARENTS, SMPLX_ROWS
@@ -309,7 +309,7 @@ def read_motion(
     if fps is not None:
         require_frame_rate(path, fps)
     body = default_template() if body is None else body
-    with reading(path):
+    with wrap_read_errors(path):
         if suffix == ".npz":
             motion = read_amass(path, body, up, fps)
         elif suffix == ".bvh":

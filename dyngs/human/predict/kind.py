@@ -12,14 +12,14 @@ from dyngs.human.predict.keys import (
     KeypointNerfModel,
     PredictedFieldModel,
 )
-from dyngs.models.kind import ModelKind, Predicts
+from dyngs.models.kind import ModelKind, PredictsScenes
 
 if TYPE_CHECKING:
     from dyngs.data.capture import Capture
     from dyngs.models.kind import MakeLearner, MakePredictor, Restore, Start
 
 
-class HumanPredictorKind(Predicts):
+class HumanPredictorKind(PredictsScenes):
     """See the module."""
 
     def num_views(self, section: HumanPredictorModel) -> int:
@@ -34,7 +34,7 @@ class HumanPredictorKind(Predicts):
 HUMAN_PREDICTOR = HumanPredictorKind(HumanPredictorModel)
 
 
-class GpsKind(Predicts):
+class GpsKind(PredictsScenes):
     """See the module."""
 
     def num_views(self, section: GpsModel) -> int:
@@ -49,7 +49,7 @@ class GpsKind(Predicts):
 GPS = GpsKind(GpsModel)
 
 
-class FieldPredictorKind(Predicts):
+class FieldPredictorKind(PredictsScenes):
     """See the module."""
 
     def num_views(self, section: FieldPredictorModel) -> int:

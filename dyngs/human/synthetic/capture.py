@@ -20,7 +20,7 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dyngs.core.conventions import ReportProgress, report_nothing
+from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError
 from dyngs.data.images.maps import MILLIMETRE
 from dyngs.data.read import PEOPLE_FILE
@@ -709,7 +709,7 @@ class PeopleOptions:
 
 
 def write_people(
-    out: Path, options: PeopleOptions = PeopleOptions(), report: ReportProgress = report_nothing
+    out: Path, options: PeopleOptions = PeopleOptions(), report: ProgressCallback = ignore_progress
 ) -> Path:
     """Write people as ``out/SHARD/PERSON``, captures of ``write_human_capture`` with depth maps.
 

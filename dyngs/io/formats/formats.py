@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from dyngs.core.conventions import RasterizeMode
-from dyngs.core.errors import DyngsError, reading, require_regular
+from dyngs.core.errors import DyngsError, wrap_read_errors, require_regular_file
 from dyngs.io.formats import ply
 from dyngs.io.formats.antimatter import read_antimatter, write_antimatter
 from dyngs.io.formats.checkpoint import read_checkpoint
@@ -127,8 +127,8 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
     own = format_to_read(path) or format_of(path)
     if not path.exists():
         raise DyngsError(f"{path}: no such file")
-    require_regular(path)
-    with reading(path):
+    require_regular_file(path)
+    with wrap_read_errors(path):
         splat = own.read(path)
         if splat.up is None:
             splat = replace(splat, up=own.up)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.core.conventions import SH_C0, num_sh_terms, srgb_decoded
+from dyngs.core.conventions import SH_C0, num_sh_terms, decode_srgb
 from dyngs.core.gaussians import Gaussians
 from dyngs.io.fields import require_at_most
 from dyngs.io.formats.similarity import joined, similarity_of_matrix
@@ -80,7 +80,7 @@ def add_gaussians(document: GlbDocument, gaussians: Gaussians) -> dict[str, Any]
     """Add the numbers of Gaussians to a document, harmonics up to degree 3; return their
     primitive."""
     sh = gaussians.sh.numpy()
-    linear = srgb_decoded((sh[:, 0] * SH_C0 + 0.5).clip(0, 1))
+    linear = decode_srgb((sh[:, 0] * SH_C0 + 0.5).clip(0, 1))
     arrays = {
         "POSITION": gaussians.means.numpy(),
         "COLOR_0": np.concatenate([linear, gaussians.opacities.numpy()[:, None]], axis=1),

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
@@ -237,7 +237,7 @@ class CameraRefinement(Correction):
 
     def state(self) -> dict[str, Tensor]:
         updates = {f"updates.{name}": x for name, x in self._updates.items()}
-        return self._values() | updates | tensors_of(self._adam.state())
+        return self._values() | updates | strip_roles(self._adam.state())
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         for name, x in self._values().items():

@@ -25,13 +25,13 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from dyngs.core.camera import Cameras
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.network import SATURATED, apply_affine_colour
 from dyngs.gaussians.optimizer import AdamState
-from dyngs.models.model import Correction, Look, Loss, RenderedView
+from dyngs.models.model import Correction, LossInput, Loss, RenderedView
 from dyngs.models.renderable import Rendering
 from dyngs.ops.adam import Count
 from dyngs.training.corrections.cells import (
@@ -102,7 +102,7 @@ class ViewExposures(Loss, Correction):
         white = view.image.composite(view.background) >= SATURATED
         return replace(view, rendered=torch.where(white, shown.clamp_max(1.0), shown))
 
-    def __call__(self, look: Look) -> dict[str, Tensor]:
+    def __call__(self, look: LossInput) -> dict[str, Tensor]:
         return self.penalties(look.index)
 
     def penalties(self, index: int) -> dict[str, Tensor]:
@@ -125,7 +125,7 @@ class ViewExposures(Loss, Correction):
         return bad
 
     def state(self) -> dict[str, Tensor]:
-        moments = tensors_of(self._adam.state())
+        moments = strip_roles(self._adam.state())
         return {"values": self._values.detach(), "visits": self._visits} | moments
 
     def load_state(self, state: dict[str, Tensor]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from dyngs.api.budget.size import write_within
+from dyngs.api.budget.size import write_limited_file
 from dyngs.api.train import train
 from dyngs.compress.stage import quality_of
 from dyngs.config import (
@@ -67,12 +67,12 @@ def trainer(still: Path, tmp_path_factory: pytest.TempPathFactory) -> Trainer:
 
 def test_a_file_is_never_larger_and_shows_what_is_said(trainer: Trainer, tmp_path: Path) -> None:
     before = trainer.checkpoint().tensors
-    usual = write_within(trainer, tmp_path / "usual", 5.0)
+    usual = write_limited_file(trainer, tmp_path / "usual", 5.0)
     assert (usual.coarser, usual.num_kept) == (1, 500)
     assert usual.after > usual.before - 0.1, "0.025 dB were meant to be lost"
     for fraction in (0.8, 0.4, 0.15):
         asked = fraction * usual.megabytes
-        report = write_within(trainer, tmp_path / str(fraction), asked)
+        report = write_limited_file(trainer, tmp_path / str(fraction), asked)
         file = tmp_path / str(fraction) / EXPORT_FOLDER / SCENE_FILE
         assert file.stat().st_size == round(1e6 * report.megabytes) <= 1e6 * asked
         assert report.coarser > 1 or report.num_kept < 500
@@ -89,7 +89,7 @@ def test_a_file_is_never_larger_and_shows_what_is_said(trainer: Trainer, tmp_pat
 
 def test_what_cannot_fit_is_said(trainer: Trainer, tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match=r"budget.max_mb=0.0001: what is trained does not fit"):
-        write_within(trainer, tmp_path, 0.0001)
+        write_limited_file(trainer, tmp_path, 0.0001)
     assert not (tmp_path / EXPORT_FOLDER).exists()
 
 

@@ -12,7 +12,7 @@ from dyngs.api.budget.time import fitting_steps
 from dyngs.api.train import train
 from dyngs.config import Config
 from dyngs.config.io import load_config, load_resolved, packaged_preset
-from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, seconds_at, step_of
+from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, seconds_at, checkpoint_step
 from dyngs.training.clock import TimeForecast
 from dyngs.training.events import Event, Message
 from dyngs.training.trainer import Trainer
@@ -73,7 +73,7 @@ def test_a_run_ends_in_time_and_says_what_all_steps_would_cost(
     checkpoint_paths(run)[-1].unlink()
     if checkpoint_paths(run):
         train(load_resolved(run), resume_from=run)
-        assert step_of(checkpoint_paths(run)[-1]) <= done
+        assert checkpoint_step(checkpoint_paths(run)[-1]) <= done
 
 
 def test_a_run_that_gets_slow_ends_in_time(

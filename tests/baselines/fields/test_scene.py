@@ -12,7 +12,7 @@ from small_fields import NERF, NGP, config_of
 from dyngs.baselines.fields.kind import NgpModel
 from dyngs.baselines.fields.ngp import NgpField
 from dyngs.baselines.fields.scene import FieldScene
-from dyngs.models.checkpoint import restored_model
+from dyngs.models.checkpoint import restore_model
 from dyngs.models.renderable import DrawOptions
 from dyngs.ops.rays import Space
 from dyngs.training.new_trainer import build_trainer
@@ -51,7 +51,7 @@ def test_with_time_it_moves(moving: Path, keys: list[str]) -> None:
     for _ in range(20):
         trainer.step()
     checkpoint = trainer.checkpoint()
-    scene = restored_model(checkpoint, trainer.config.model)
+    scene = restore_model(checkpoint, trainer.config.model)
     assert len(scene.times) > 1
     assert not scene.is_static
     image = trainer.images[0]

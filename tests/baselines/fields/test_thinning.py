@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from dyngs.models.volume import EVERY, LIGHT, reached_samples, thinned_samples
+from dyngs.models.volume import EVERY, LIGHT, reached_samples, thin_samples
 from dyngs.ops.rays import Samples, composite
 
 
@@ -28,7 +28,7 @@ def samples_of(
 def test_what_shows_is_kept_and_the_rest_is_thinned() -> None:
     generator = torch.Generator().manual_seed(0)
     densities, samples = samples_of(40, 40, generator)
-    found, which = thinned_samples(
+    found, which = thin_samples(
         densities, samples, torch.rand(40, generator=generator, dtype=torch.float64)
     )
     weights = composite(
@@ -58,7 +58,7 @@ def test_rays_see_the_same_on_average_with_the_same_gradients() -> None:
 
     full, full_grad = seen(*reached_samples(densities, samples))
     parts = [
-        seen(*thinned_samples(densities, samples, torch.full((2,), (k + 0.5) / EVERY).double()))
+        seen(*thin_samples(densities, samples, torch.full((2,), (k + 0.5) / EVERY).double()))
         for k in range(4)
     ]
     mean, mean_grad = (sum(x) / EVERY for x in zip(*parts, strict=True))

@@ -9,7 +9,7 @@ import torch
 from small_triangles import bent
 
 from dyngs.baselines.triangles.scene import Patches, evaluate_patches, subdivide
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.ops.patches import lattice, patch_values
 
 
@@ -53,6 +53,6 @@ def test_a_texture_begins_with_the_colours_that_were_there() -> None:
     ],
 )
 def test_what_does_not_fit_is_refused(name: str, value: torch.Tensor) -> None:
-    stored = tensors_of(bent(4).with_texture(3).state())
+    stored = strip_roles(bent(4).with_texture(3).state())
     with pytest.raises(ValueError, match=r"'\w+'"):
         Patches.from_state(stored | {name: value})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dyngs.data.images.video import BT2020, ColourTags, srgb_encoded, to_srgb
+from dyngs.data.images.video import BT2020, ColourTags, encode_srgb, to_srgb
 
 PQ, HLG, DISPLAY_P3, BT709 = 16, 18, 12, 1
 
@@ -37,7 +37,7 @@ def grey_level(signal: float, transfer: int) -> int:
     ],
 )
 def test_signals_of_the_standards(transfer: int, signal: float, light: float) -> None:
-    expected = 255 * float(srgb_encoded(np.array(min(light, 1.0))))
+    expected = 255 * float(encode_srgb(np.array(min(light, 1.0))))
     assert grey_level(signal, transfer) == pytest.approx(expected, abs=1.5)
 
 
@@ -55,5 +55,5 @@ def test_sdr_in_its_own_primaries_is_left_alone() -> None:
     ],
 )
 def test_red_in_wider_primaries(primaries: int, red: tuple[float, float, float]) -> None:
-    pixel = np.round(65535 * srgb_encoded(np.array([[red]]))).astype(np.uint16)
+    pixel = np.round(65535 * encode_srgb(np.array([[red]]))).astype(np.uint16)
     assert np.abs(to_srgb(pixel, ColourTags(primaries)).astype(int) - (255, 0, 0)).max() <= 3

@@ -15,7 +15,7 @@ from PIL import Image, ImageOps
 from tiny_captures import random_pixels, write_image
 
 from dyngs.capture.sfm.photos import gather_photos, lay_out
-from dyngs.core.conventions import srgb_encoded
+from dyngs.core.conventions import encode_srgb
 from dyngs.core.errors import DyngsError
 from dyngs.data.images.images import (
     area_downscale,
@@ -144,7 +144,7 @@ def test_alpha_of_tiff_is_as_the_file_says(
     assert output.write_image(np.ascontiguousarray(stored, np.float32))
     output.close()
     image = read_image(tmp_path / "a.tif").numpy().astype(float)
-    shown = 255 * (srgb_encoded(colour) if kind == "float" else colour)
+    shown = 255 * (encode_srgb(colour) if kind == "float" else colour)
     assert np.abs(image[..., :3] - shown).max() <= (2.5 if kind == "uint8" else 0.6)
     assert np.abs(image[..., 3:] - 255 * alpha).max() <= 0.6
 

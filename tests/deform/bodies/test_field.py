@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import TIMES, cloud, stirred_field, tiny_options
 from torch import Tensor
 
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.deform.bodies.field import BodyField, BodyRestPose
 from dyngs.deform.field import apply_offsets
 from dyngs.deform.fields import field_state, restore_field
@@ -106,7 +106,7 @@ def test_gradients_reach_the_motion_and_the_gaussians() -> None:
 
 
 def stored(field: BodyField) -> dict[str, Tensor]:
-    return {name: x.clone() for name, x in tensors_of(field_state(field)).items()}
+    return {name: x.clone() for name, x in strip_roles(field_state(field)).items()}
 
 
 def test_a_stored_field_is_the_same_field() -> None:

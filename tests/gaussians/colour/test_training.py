@@ -22,7 +22,7 @@ from dyngs.config import (
     RunConfig,
     TrainConfig,
 )
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import restore_colour_network
@@ -52,7 +52,7 @@ def colours(seed: int = 0, **options: object) -> NetworkTraining:
 def stored(learner: NetworkTraining) -> dict[str, Tensor]:
     """What a checkpoint has of colours: of the scene, and of its training."""
     return {
-        name: x.clone() for name, x in tensors_of(learner.network.state() | learner.state()).items()
+        name: x.clone() for name, x in strip_roles(learner.network.state() | learner.state()).items()
     }
 
 
@@ -96,12 +96,12 @@ def test_the_frozen_follow_the_set_and_go_round() -> None:
     colours.follow(TopologyEdit(torch.tensor([1, 2, 2]), torch.tensor([False, False, True])))
     assert colours.frozen_harmonics() is not None
     other = AutoTraining(AutoColour(), 100, 20)
-    other.restore(tensors_of(colours.state()), 3)
+    other.restore(strip_roles(colours.state()), 3)
     frozen = other.frozen_harmonics()
     assert frozen is not None
     assert frozen.tolist() == [False, True, True]
     with pytest.raises(ValueError, match="frozen"):
-        other.restore(tensors_of(colours.state()), 4)
+        other.restore(strip_roles(colours.state()), 4)
     colours.freeze(torch.ones(3, dtype=torch.bool))
     assert colours.frozen_harmonics() is None, (
         "where no harmonics are stored none need to be kept at zero"

@@ -77,7 +77,7 @@ def motion(tmp_path: Path) -> Path:
 def test_the_file_plays_as_the_run(run_dir: Path, file: Path, motion: Path) -> None:
     run = open_run(run_dir)
     read = open_scene(file)
-    for one, other in ((run.in_motion(motion), read.in_motion(motion)), (run.at_rest(), read)):
+    for one, other in ((run.play_motion(motion), read.play_motion(motion)), (run.at_rest(), read)):
         for time in (0.0, 0.7, 1.0):
             wanted = one.scene.at(time).tensors()
             found = other.scene.at(time).tensors()
@@ -107,9 +107,9 @@ def test_blend_shapes_go_along_and_the_template_is_looked_for_beside_the_file(
     run = open_run(trained(capture, tmp_path / "run", body=body))
     file = written(run, tmp_path / "elsewhere" / "ann.safetensors")
     with pytest.raises(DyngsError, match=r"elsewhere/bodies\.npz: cannot be read"):
-        open_scene(file).in_motion(motion)
+        open_scene(file).play_motion(motion)
     (tmp_path / "elsewhere" / "bodies.npz").write_bytes(body.read_bytes())
-    one, other = (x.in_motion(motion).scene for x in (run, open_scene(file)))
+    one, other = (x.play_motion(motion).scene for x in (run, open_scene(file)))
     assert isinstance(other, HumanScene)
     assert other.shapes is not None
     torch.testing.assert_close(other.at(0.4).means, one.at(0.4).means, rtol=0, atol=1e-5)

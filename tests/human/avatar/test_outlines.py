@@ -18,8 +18,8 @@ from dyngs.data.loader import ImageLoader
 from dyngs.human.avatar.training import OutlineLoss, make_outline_loss
 from dyngs.human.keys import HumanModel
 from dyngs.io.write import write_image
-from dyngs.models.kind import RunStart
-from dyngs.models.model import Drawn, Look
+from dyngs.models.kind import StartContext
+from dyngs.models.model import Drawn, LossInput
 from dyngs.models.renderable import Rendering
 
 SIDE = 40
@@ -58,11 +58,11 @@ def views(folder: Path, grown: int, light: float = 0.0) -> list[View]:
     return found
 
 
-def run(seen: list[View], background: str = "white", **train: Any) -> RunStart:
+def run(seen: list[View], background: str = "white", **train: Any) -> StartContext:
     config = Config(data=DataConfig(root=Path()), model=HumanModel(), train=TrainConfig(**train))
     capture = Capture(Path(), "body_json", {"train": tuple(seen)}, has_alpha=True)
     images = ImageLoader(seen)
-    return RunStart(config, config, capture, images, background, 1.0, GENERATOR)
+    return StartContext(config, config, capture, images, background, 1.0, GENERATOR)
 
 
 def loss_of(loss: OutlineLoss, seen: list[View], frame: int, alpha: Tensor, rgb: Tensor) -> Tensor:
@@ -70,7 +70,7 @@ def loss_of(loss: OutlineLoss, seen: list[View], frame: int, alpha: Tensor, rgb:
     image = ImageLoader(seen)[frame]
     rendered = alpha[..., None] * rgb + 1 - alpha[..., None]
     drawn = Drawn(Rendering(rendered[None], 1 - alpha[None], None), {}, {}, lambda: None)
-    look = Look(
+    look = LossInput(
         frame, 1, image, drawn, rendered, image.composite(torch.ones(3)), cast(Any, None), GENERATOR
     )
     return loss(look)["image"]

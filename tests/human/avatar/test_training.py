@@ -157,7 +157,7 @@ def test_motions_rest_and_splits_are_played(capture: Path, tmp_path: Path) -> No
     save_checkpoint(tmp_path, trainer.checkpoint(), 0.0)
     save_config(trainer.config, tmp_path / RESOLVED_NAME)
     run = open_run(tmp_path)
-    own = run.in_motion(capture / "body_train.npz")
+    own = run.play_motion(capture / "body_train.npz")
     assert len(own.scene.times) == 3
     first = run.scene.at(0.0)
     again = own.scene.at(0.0)
@@ -181,7 +181,7 @@ def test_a_fit_far_from_the_origin_is_played_exactly(capture: Path, tmp_path: Pa
     for name, shift in (("near", np.zeros(3)), ("far", np.array(offset))):
         write_npz(tmp_path / f"{name}.npz", fit | {"trans": fit["trans"] + shift})
     played = (
-        run.in_motion(tmp_path / f"{name}.npz").scene
+        run.play_motion(tmp_path / f"{name}.npz").scene
         for run, name in ((near, "near"), (far, "far"))
     )
     there, here = (scene.at(0.5).means for scene in played)

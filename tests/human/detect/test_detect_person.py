@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from dyngs.capture.fixed_camera import read_fixed_camera
 from dyngs.config import DataConfig
-from dyngs.core.conventions import report_nothing
+from dyngs.core.conventions import ignore_progress
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, all_views
 from dyngs.data.images.images import read_image
@@ -95,7 +95,7 @@ def test_masks_and_key_points_of_all_views(
     monkeypatch.setattr(module, "DETECTOR_SIDE_PX", side)
     said: list[str] = []
     found = detect_person(
-        capture_of(clip), Rough(), tmp_path / "found", report_nothing, said.append
+        capture_of(clip), Rough(), tmp_path / "found", ignore_progress, said.append
     )
     assert found.masks is not None
     assert found.keypoints is not None
@@ -116,7 +116,7 @@ def test_masks_and_key_points_of_all_views(
 def test_nobody_is_an_error(clip: Path, tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="Rough finds nobody in 10 images"):
         detect_person(
-            capture_of(clip), Rough(nobody=True), tmp_path / "found", report_nothing, [].append
+            capture_of(clip), Rough(nobody=True), tmp_path / "found", ignore_progress, [].append
         )
 
 
@@ -130,7 +130,7 @@ def test_a_camera_in_which_nobody_is_found_is_left_out(clip: Path, tmp_path: Pat
     detector.detect = lambda images: next(answers)(images)  # type: ignore[method-assign]
     said: list[str] = []
     both = capture.replace(splits={"train": (*first, *others)})
-    found = detect_person(both, detector, tmp_path / "found", report_nothing, said.append)
+    found = detect_person(both, detector, tmp_path / "found", ignore_progress, said.append)
     assert "warning: camera 1: Rough finds nobody, its images are left out" in said
     assert found.masks is not None
     assert not any(read_image(found.masks / f"{view.name}.png").any() for view in others)

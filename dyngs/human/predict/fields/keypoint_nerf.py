@@ -36,7 +36,7 @@ from dyngs.human.predict.fields.network import (
     split_rays,
 )
 from dyngs.human.predict.people import NUM_KEY_POINTS, PosedBody, Sources
-from dyngs.models.volume import kept_samples, rays_of, reached_samples, thinned_samples
+from dyngs.models.volume import select_samples, rays_of, reached_samples, thin_samples
 from dyngs.ops.rays import MarchSteps, Rays, Samples, Space, composite, march
 
 
@@ -101,12 +101,12 @@ class KeypointNerf(FieldNetwork):
         learns = torch.is_grad_enabled()
         with torch.no_grad():  # which samples are worth it takes their densities alone
             shown = seen.alpha(places(samples, space)) > PARAMS.visible
-            samples = kept_samples(samples, shown.all(0))[0]
+            samples = select_samples(samples, shown.all(0))[0]
             points = places(samples, space)
             code = spatial_code(points, known.body.key_points, seen.sources)
             geometry = self._geometry(known, points, code)
             if learns:
-                samples, which = thinned_samples(density(geometry), samples, shifts)
+                samples, which = thin_samples(density(geometry), samples, shifts)
             else:
                 samples, which = reached_samples(density(geometry), samples)
             points = points[which]

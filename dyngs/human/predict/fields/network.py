@@ -17,7 +17,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.initialisation import glorot
 from dyngs.data.loader import Image
 from dyngs.human.predict.people import PosedBody, Sources
-from dyngs.models.prediction import Encoder, begin_weights, upsampled
+from dyngs.models.prediction import Encoder, initialize_weights, upsample
 from dyngs.ops.perceptron import Layer, perceptron
 
 FINE = 8
@@ -53,7 +53,7 @@ class ImageEncoder(nn.Module):
 
     def forward(self, rgba: Tensor) -> tuple[Tensor, Tensor]:
         half, quarter, eighth = self.levels(rgba)
-        return self.fuse(torch.cat([quarter, upsampled(eighth)], 1)), self.fine(half)
+        return self.fuse(torch.cat([quarter, upsample(eighth)], 1)), self.fine(half)
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def at_pixels(maps: Tensor, grid: Tensor, mode: str = "bilinear") -> Tensor:
 
 def begin(network: nn.Module, generator: torch.Generator) -> None:
     """Draw all weights from ``generator``, on the CPU; biases are 0."""
-    begin_weights(network, generator)
+    initialize_weights(network, generator)
     for layer in network.modules():
         if isinstance(layer, nn.Linear):
             with torch.no_grad():

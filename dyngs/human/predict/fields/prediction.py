@@ -14,9 +14,9 @@ from torch import Tensor
 
 from dyngs.config import Config, DataConfig
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import ReportProgress
+from dyngs.core.conventions import ProgressCallback
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import Role, State, fields_moved_to, prefixed, with_role
+from dyngs.core.state import Role, State, move_fields_to, add_prefix, with_role
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.data.loader import Image
 from dyngs.data.read import captures_in
@@ -46,14 +46,14 @@ from dyngs.human.predict.people import (
     window,
 )
 from dyngs.models.checkpoint import Checkpoint
-from dyngs.models.kind import RunStart
-from dyngs.models.model import Drawn, Model, Updated
+from dyngs.models.kind import StartContext
+from dyngs.models.model import Drawn, Model, UpdateResult
 from dyngs.models.prediction import (
     Example,
     Learner,
     Predictor,
     image_loss,
-    kept_open,
+    keep_captures_open,
     load_weights,
     random_index,
 )
@@ -110,7 +110,7 @@ class PredictedField(Renderable):
         tensors |= {f"sources.{name}": x for name, x in vars(self.sources).items()}
         tensors |= {f"body.{name}": x for name, x in vars(self.body).items()}
         tensors["numbers"] = torch.tensor([self.scale], dtype=torch.float64, device="cpu")
-        return prefixed("field", with_role(tensors, Role.SHARED))
+        return add_prefix("field", with_role(tensors, Role.SHARED))
 
     def render(
         self,
@@ -164,7 +164,7 @@ def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedFiel
 class PredictedModel(Model[PredictedField]):
     """What was predicted, in the place of a model in training; to train it is refused."""
 
-    def __init__(self, run: RunStart) -> None:
+    def __init__(self, run: StartContext) -> None:
         assert isinstance(run.config.model, PredictedFieldModel)
         self._run_dir = run.config.run.dir
         self._section = run.config.model
@@ -188,8 +188,8 @@ class PredictedModel(Model[PredictedField]):
     def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
         raise self._untrained()
 
-    def update(self, step: int) -> Updated:
-        return Updated(0)
+    def update(self, step: int) -> UpdateResult:
+        return UpdateResult(0)
 
     @property
     def leaves(self) -> Sequence[Tensor]:
@@ -238,7 +238,7 @@ class FieldPredictor(Predictor[FieldNetwork]):
 
     def run_config(self, views: Sequence[int]) -> Config:
         times = distinct_times(self.views).values()
-        data = self.data_of_moment(self.views[views[0]].time, times)
+        data = self.data_at_time(self.views[views[0]].time, times)
         model = PredictedFieldModel.model_validate({"network": self.config.model.kind})
         return self.config.model_copy(update={"data": data, "model": model})
 
@@ -258,18 +258,18 @@ class FieldLearner(Learner[FieldNetwork]):
     ) -> None:
         super().__init__(config, network, [person.root.name for person in people], device)
         self._template = template_of(self.section)
-        self._opened = kept_open(self._open, people)
+        self._opened = keep_captures_open(self._open, people)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
         known = self._opened(person)
         sources, target = self._views(known, generator)
         body, scale = known.body_in(known.views[target])
-        body = fields_moved_to(body, self.device)
-        given = fields_moved_to(
+        body = move_fields_to(body, self.device)
+        given = move_fields_to(
             crop_source_images([known.images[i] for i in sources], scale), self.device
         )
         image = _part(known.images[target], generator).to(self.device)
-        background = self.drawn_background(generator)
+        background = self.sample_background(generator)
         seen = self.network.look(given, body)
         picture = self.network.picture(seen, metric(image.cameras, scale), generator)
         rendered = picture.colour + picture.transmittance[..., None] * background
@@ -328,7 +328,7 @@ def predictor(
     checkpoint: Checkpoint,
     data: DataConfig,
     say: Callable[[str], None],
-    report: ReportProgress,
+    report: ProgressCallback,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
     body is fitted.

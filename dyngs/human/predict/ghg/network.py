@@ -21,9 +21,9 @@ from torch import Tensor, nn
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import SH_C0, ReportProgress, report_nothing
-from dyngs.core.errors import DyngsError, reading
-from dyngs.core.state import fields_moved_to
+from dyngs.core.conventions import SH_C0, ProgressCallback, ignore_progress
+from dyngs.core.errors import DyngsError, wrap_read_errors
+from dyngs.core.state import move_fields_to
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
@@ -44,19 +44,19 @@ from dyngs.human.fit.fitted_capture import ensure_fitted_body
 from dyngs.human.keys import HumanModel, HumanPredictorModel
 from dyngs.human.predict.gps.rectification import spread
 from dyngs.human.predict.people import Person, captured_person, depths
-from dyngs.models.checkpoint import OTHER_CONFIG, Checkpoint
+from dyngs.models.checkpoint import CONFIG_ADVICE, Checkpoint
 from dyngs.models.prediction import (
     Encoder,
     Example,
     Learner,
     Predictor,
     ResidualBlock,
-    begin_weights,
+    initialize_weights,
     image_loss,
     load_weights,
     random_index,
     updated,
-    upsampled,
+    upsample,
 )
 from dyngs.models.renderable import Renderable
 from dyngs.ops.device import CPU, select_device
@@ -375,7 +375,7 @@ class AtlasNetwork(Encoder):
                 nn.Conv2d(WIDTHS[0] + channels, WIDTHS[0], 3, padding=1), nn.SiLU()
             )
             self.heads = nn.Conv2d(WIDTHS[0], scaffolds * sum(HEADS.values()), 1)
-        begin_weights(self, generator)
+        initialize_weights(self, generator)
         nn.init.zeros_(self.heads.weight)
 
     def forward(self, maps: Tensor) -> Tensor:
@@ -384,8 +384,8 @@ class AtlasNetwork(Encoder):
         levels = self.levels(maps[None])
         features = levels.pop()
         for layer in self.up:
-            features = layer(torch.cat([upsampled(features), levels.pop()], dim=1))
-        features = self.last(torch.cat([upsampled(features), maps[None]], dim=1))
+            features = layer(torch.cat([upsample(features), levels.pop()], dim=1))
+        features = self.last(torch.cat([upsample(features), maps[None]], dim=1))
         return self.heads(features)[0].unflatten(0, (self.scaffolds, -1))
 
 
@@ -509,7 +509,7 @@ class PersonPredictor(Predictor[AtlasNetwork]):
         self,
         views: Sequence[int],
         steps: int | None = None,
-        report: ReportProgress = report_nothing,
+        report: ProgressCallback = ignore_progress,
     ) -> int:
         """Train the network until its prediction shows the images better that it is predicted
         from."""
@@ -563,18 +563,18 @@ class AtlasLearner(Learner[AtlasNetwork]):
         self.people = people
         self.source_choices = source_choices
         self.mean = mean
-        self._moved = [fields_moved_to(x, device) for x in people]
+        self._moved = [move_fields_to(x, device) for x in people]
         self._maps = cache(self._observed)
 
     def _observed(self, person: int, choice: int) -> TexelMaps:
         maps = self.people[person].observe(self.source_choices[person][choice])
-        return fields_moved_to(maps, self.device)
+        return move_fields_to(maps, self.device)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
         filmed = self.people[person].person
         choice = random_index(len(self.source_choices[person]), generator)
         targets = self._targets(filmed, self.source_choices[person][choice], generator)
-        background = self.drawn_background(generator)
+        background = self.sample_background(generator)
         maps = self._maps(person, choice)
         scene = predict_avatar(self._moved[person], maps, self.mean, self.network)
         row = filmed.motion.rows[-1 if targets[0].frame is None else targets[0].frame]
@@ -623,7 +623,7 @@ def predictor(
     checkpoint: Checkpoint,
     data: DataConfig,
     say: Callable[[str], None],
-    report: ReportProgress,
+    report: ProgressCallback,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
     body is fitted.
@@ -653,7 +653,7 @@ def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int)
     """Return the mean colours (3, S, S) of a checkpoint, whose weights ``network`` takes; S is the
     ``resolution``."""
     load_weights(network, checkpoint)
-    with reading(checkpoint.name, OTHER_CONFIG):
+    with wrap_read_errors(checkpoint.name, CONFIG_ADVICE):
         mean = checkpoint.tensors["model.mean"]
         return require_tensor("mean", mean, (3, resolution, resolution))
 

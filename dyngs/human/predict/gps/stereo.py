@@ -30,9 +30,9 @@ from torch.nn.functional import (
 
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_config, packaged_preset
-from dyngs.core.conventions import SH_C0, ReportProgress
+from dyngs.core.conventions import SH_C0, ProgressCallback
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import fields_moved_to
+from dyngs.core.state import move_fields_to
 from dyngs.data.capture import Capture, all_views
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import captures_in, read_capture
@@ -60,12 +60,12 @@ from dyngs.models.prediction import (
     Learner,
     Predictor,
     ResidualBlock,
-    begin_weights,
+    initialize_weights,
     image_loss,
-    kept_open,
+    keep_captures_open,
     load_weights,
     random_index,
-    upsampled,
+    upsample,
 )
 from dyngs.models.renderable import Renderable
 from dyngs.ops.device import CPU, select_device
@@ -112,10 +112,10 @@ class StereoNetwork(nn.Module):
         (D), ``inside`` (2, 1, H, W) is 1 where the person is.
         """
         fine = self.enter(torch.cat([levels[0], 5 * swept], dim=1))
-        middle = self.down[0](torch.cat([fine, upsampled(levels[1])], dim=1))
-        coarse = self.deep(self.down[1](torch.cat([middle, upsampled(levels[2])], dim=1)))
-        middle = self.up[0](torch.cat([middle, upsampled(coarse)], dim=1))
-        fine = self.up[1](torch.cat([fine, upsampled(middle)], dim=1))
+        middle = self.down[0](torch.cat([fine, upsample(levels[1])], dim=1))
+        coarse = self.deep(self.down[1](torch.cat([middle, upsample(levels[2])], dim=1)))
+        middle = self.up[0](torch.cat([middle, upsample(coarse)], dim=1))
+        fine = self.up[1](torch.cat([fine, upsample(middle)], dim=1))
         change = self.change(fine)
         colours, beside = swept.split(NUM_OFFSETS, dim=1)
         shares = (change[:, 1:] - _COLOUR * colours - _BESIDE * beside).softmax(dim=1)
@@ -231,7 +231,7 @@ class GpsNetwork(nn.Module):
             )
             self.last = nn.Sequential(nn.Conv2d(half + 20, _LAST, 3, padding=1), nn.SiLU())
             self.heads = nn.Conv2d(_LAST, 4 * sum(HEADS.values()), 1)
-        begin_weights(self, generator)
+        initialize_weights(self, generator)
         for layer in (self.heads, self.stereo.change, self.stereo.weights):
             nn.init.zeros_(layer.weight)
 
@@ -251,9 +251,9 @@ class GpsNetwork(nn.Module):
             return offsets, None
         depth = pixel_unshuffle(torch.cat([offsets[-1] / _RANGE * inside, inside], dim=1), 2)
         halves, quarters, eighths = self.depth_encoder(depth)
-        features = self.up[0](torch.cat([fused, quarters, upsampled(eighths)], dim=1))
-        features = self.up[1](torch.cat([upsampled(features), levels[0], halves], dim=1))
-        features = self.last(torch.cat([upsampled(features), images, depth[:, :4]], dim=1))
+        features = self.up[0](torch.cat([fused, quarters, upsample(eighths)], dim=1))
+        features = self.up[1](torch.cat([upsample(features), levels[0], halves], dim=1))
+        features = self.last(torch.cat([upsample(features), images, depth[:, :4]], dim=1))
         return offsets, pixel_shuffle(self.heads(features), 2)
 
 
@@ -359,7 +359,7 @@ class GpsPredictor(Predictor[GpsNetwork]):
         )
         shown = all_views({k: x for k, x in self._capture.splits.items() if k != "pose"})
         times = distinct_times(shown).values()
-        data = self.data_of_moment(self.views[views[0]].time, times)
+        data = self.data_at_time(self.views[views[0]].time, times)
         return preset.model_copy(update={"data": data, "model": model})
 
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
@@ -377,16 +377,16 @@ class GpsLearner(Learner[GpsNetwork]):
         device: torch.device = CPU,
     ) -> None:
         super().__init__(config, network, [person.root.name for person in people], device)
-        self._opened = kept_open(_lessons, people)
+        self._opened = keep_captures_open(_lessons, people)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
         images, pairs = self._opened(person)
         pair, between = pairs[random_index(len(pairs), generator)]
         target = between[random_index(len(between), generator)]
-        background = self.drawn_background(generator)
+        background = self.sample_background(generator)
         left, right = (images[i] for i in pair)
         windows = rectify_views(left, right, self.section.person_px)
-        windows = fields_moved_to(windows, self.device)
+        windows = move_fields_to(windows, self.device)
         only_depth = step <= round(DEPTH_FRACTION * self.config.train.steps)
         offsets, raw = self.network(windows, with_gaussians=not only_depth)
         depth_loss = offset_loss(windows, offsets, DECAY)
@@ -448,7 +448,7 @@ def predictor(
     checkpoint: Checkpoint,
     data: DataConfig,
     say: Callable[[str], None],
-    report: ReportProgress,
+    report: ProgressCallback,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the capture of ``data``."""
     network = GpsNetwork(torch.Generator())

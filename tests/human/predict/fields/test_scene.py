@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import tensors_of
+from dyngs.core.state import strip_roles
 from dyngs.human.predict.fields.keypoint_nerf import KeypointNerf
 from dyngs.human.predict.fields.prediction import (
     NETWORKS,
@@ -19,7 +19,7 @@ from dyngs.human.predict.fields.prediction import (
 )
 from dyngs.human.predict.keys import PredictedFieldModel
 from dyngs.human.predict.people import Person, crop_source_images
-from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, restored_model
+from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, restore_model
 from dyngs.models.renderable import DrawOptions
 
 KINDS = sorted(NETWORKS)
@@ -38,7 +38,7 @@ def kind_of(scene: PredictedField) -> Literal["keypoint_nerf", "eg_human_nerf"]:
 
 
 def checkpoint_of(scene: PredictedField, **changes: torch.Tensor) -> Checkpoint:
-    tensors = tensors_of(scene.state()) | {f"field.{name}": x for name, x in changes.items()}
+    tensors = strip_roles(scene.state()) | {f"field.{name}": x for name, x in changes.items()}
     return Checkpoint(
         CheckpointInfo(0, 1.0, (0.0, 0.0, 0.0), "white", "classic"), tensors, Path("it")
     )
@@ -46,7 +46,7 @@ def checkpoint_of(scene: PredictedField, **changes: torch.Tensor) -> Checkpoint:
 
 def test_it_is_stored_and_drawn_the_same(scene: PredictedField, person: Person) -> None:
     model = PredictedFieldModel.model_validate({"network": kind_of(scene)})
-    found = restored_model(checkpoint_of(scene), model)
+    found = restore_model(checkpoint_of(scene), model)
     camera = person.images[1].cameras
     options = DrawOptions(depth="expected")
     one, other = (x.render(camera, 0.3, options=options) for x in (scene, found))
@@ -83,7 +83,7 @@ def test_what_does_not_fit_is_refused(scene: PredictedField, name: str) -> None:
     broken = own + 10**9 if name == "body.faces" else own[..., :-1]
     for changed in (broken, own * float("nan") if own.is_floating_point() else broken):
         with pytest.raises(DyngsError, match=r"it[: ]"):
-            restored_model(
+            restore_model(
                 checkpoint_of(scene, **{name: changed}), PredictedFieldModel(network=kind_of(scene))
             )
     del whole.tensors[f"field.{name}"]

@@ -18,7 +18,7 @@ from tiny_stereo import stereo_config, stereo_people
 from dyngs.api.predict import predict
 from dyngs.api.train import train
 from dyngs.config import DataConfig
-from dyngs.core.conventions import report_nothing
+from dyngs.core.conventions import ignore_progress
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
 from dyngs.data.geometry import look_at
@@ -162,7 +162,7 @@ def test_one_moment_of_several_is_what_its_run_is_trained_on(
         load_checkpoint(checkpoint_paths(run)[-1]),
         data,
         [].append,
-        report_nothing,
+        ignore_progress,
     )
     later = [i for i, view in enumerate(found.views) if view.frame == 1][:2]
     assert found.run_config(later).data.frames == "1:2"
