@@ -23,13 +23,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.api.predict import require_network, trained_network
+from dyngs.api.predict import read_trained_network, require_network
 from dyngs.api.train import train
 from dyngs.cli.output import numbers_table, print_messages, print_tables
 from dyngs.config import DataConfig
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.conventions import ignore_progress
-from dyngs.core.errors import DyngsError, counted, show
+from dyngs.core.errors import DyngsError, format_count, log_info
 from dyngs.core.metrics import psnr, ssim
 from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
@@ -106,7 +106,7 @@ def compare_people(bench: PeopleBench, out: Path) -> Table:
         raise DyngsError(
             f"two networks are named {twice}; the table needs one name each: rename a run"
         )
-    loaded = [(network.stem, *trained_network(network)) for network in bench.networks]
+    loaded = [(network.stem, *read_trained_network(network)) for network in bench.networks]
     words = [f"data.root={bench.people}", *(f"data.{word}" for word in bench.data)]
     given = load_config(packaged_preset("static"), words).data
     changed = {word.partition("=")[0] for word in bench.data}
@@ -118,7 +118,9 @@ def compare_people(bench: PeopleBench, out: Path) -> Table:
                 own = {key: getattr(given, key) for key in changed}
                 data = config.data.model_copy(update={"root": person.root, "test_every": 0} | own)
                 kind = require_network(config, Path(name))
-                make = partial(kind.networks()[1], config, checkpoint, data, show, ignore_progress)
+                make = partial(
+                    kind.networks()[1], config, checkpoint, data, log_info, ignore_progress
+                )
                 views = make().views
                 methods: dict[str, Method] = {name: partial(_predicted, make, False)}
                 if config.model.kind == "human_predictor":
@@ -139,7 +141,7 @@ def compare_people(bench: PeopleBench, out: Path) -> Table:
                                     label, made, images, count, person.root.name, pictures
                                 )
                     except DyngsError as error:
-                        show(f"{label} left out: {error}")
+                        log_info(f"{label} left out: {error}")
         if not found:
             raise DyngsError(f"{bench.people}: nothing could be predicted")
         table = _table(found, bench.counts)
@@ -256,7 +258,7 @@ def _scores(
 def _table(found: Sequence[Score], counts: Sequence[int]) -> Table:
     """Return the table: means over people and views, medians of times."""
     last = ("scene, CPU s", "trained, CPU s", "ms a picture", "MB")
-    head = ["method", *(counted(n, "view") for n in counts), *last]
+    head = ["method", *(format_count(n, "view") for n in counts), *last]
     cells = []
     for name in dict.fromkeys(score.method for score in found):
         own = [score for score in found if score.method == name]

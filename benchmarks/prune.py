@@ -22,7 +22,7 @@ from statistics import median
 
 import torch
 
-from dyngs.api.prune import file_of, prune_run, prune_to_loss
+from dyngs.api.prune import export_folder, prune_run, prune_to_loss
 from dyngs.api.scene_file import write_scene_file
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
@@ -35,7 +35,7 @@ from dyngs.evaluate.report import (
 )
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
-from dyngs.runs.stored_file import drawable, read_scene
+from dyngs.runs.stored_file import read_scene, tensors_to_store
 
 ONCE = "prune.steps=1"
 NO_MASKS, NO_PRUNING = "prune.mask_times=0", "prune.fraction=0"
@@ -78,9 +78,11 @@ def promises(given: argparse.Namespace) -> None:
             began = time.perf_counter()
             promise = prune_to_loss(given.run_dir, out, most, overrides)
             print(f"\n{promise}\n{time.perf_counter() - began:.0f} s\n", flush=True)
-        before, after = compare_runs([given.run_dir, file_of(out)], given.threads)
-        print(line(f"{most:g} dB allowed", file_of(out), after, before, given.threads), end="")
-        print(stored(file_of(out), given.threads), flush=True)
+        before, after = compare_runs([given.run_dir, export_folder(out)], given.threads)
+        print(
+            line(f"{most:g} dB allowed", export_folder(out), after, before, given.threads), end=""
+        )
+        print(stored(export_folder(out), given.threads), flush=True)
     print(line("trained", given.run_dir, before, before, given.threads))
 
 
@@ -90,7 +92,7 @@ def where(given: argparse.Namespace) -> None:
     run = load_run(given.run_dir)
     folder = given.folder / "stored"
     file = read_scene(write_scene_file(given.run_dir, folder).path)
-    exact = {name: x.numel() * x.itemsize for name, x in drawable(run.scene).items()}
+    exact = {name: x.numel() * x.itemsize for name, x in tensors_to_store(run.scene).items()}
     print("| tensor | float | stored |\n|---|---|---|")
     for name, size in sorted(file.sizes.items(), key=lambda item: -item[1]):
         print(f"| {name} | {exact.get(name, 0)} | {size} |")
@@ -151,7 +153,7 @@ def main() -> None:
             prune_run(given.run_dir, out, (*common, *given.overrides, *asked))
         before, after = compare_runs([given.run_dir, out], given.threads)
         print(line(name, out, after, before, given.threads), end="", flush=True)
-        print(stored(file_of(out), given.threads), flush=True)
+        print(stored(export_folder(out), given.threads), flush=True)
     print(line("trained", given.run_dir, before, before, given.threads))
 
 

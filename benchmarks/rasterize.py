@@ -22,7 +22,7 @@ from torch import Tensor
 
 from dyngs.cli.output import numbers_table, print_tables
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import counted, wrap_read_errors
+from dyngs.core.errors import format_count, wrap_read_errors
 from dyngs.core.state import move_fields_to
 from dyngs.io.numpy_files import read_arrays
 from dyngs.ops.native import active_isa, kernel_threads
@@ -197,13 +197,13 @@ def report_cells(report: dict[str, Any]) -> tuple[str, list[str], list[list[str]
     is_cpu = report["device"] == "cpu"
     where = f"instruction set {report['isa']}" if is_cpu else report["device"]
     title = (
-        f"{counted(report['num_gaussians'], 'Gaussian')}, {report['num_visible']:,} visible at "
+        f"{format_count(report['num_gaussians'], 'Gaussian')}, {report['num_visible']:,} visible at "
         f"{report['width']}x{report['height']}, {report['entries']:,} tile entries, "
         f"{report['pairs'] / 1e6:.1f} M blended pairs; {where}"
     )
     head = [
         "median (best) ms",
-        *(counted(run["threads"], "thread") if is_cpu else "cuda" for run in runs),
+        *(format_count(run["threads"], "thread") if is_cpu else "cuda" for run in runs),
     ]
     cells = [
         [name, *(f"{run['milliseconds'][name]:.2f} ({run['fastest'][name]:.2f})" for run in runs)]

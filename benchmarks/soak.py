@@ -47,7 +47,7 @@ import torch
 from dyngs.cli import main as dyngs
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.runs.checkpoint import checkpoint_paths, has_only_scene_file, load_run
-from dyngs.runs.folder import REQUESTED_NAME, EXPORT_FOLDER
+from dyngs.runs.folder import EXPORT_FOLDER, REQUESTED_NAME
 
 OPERATIONS = (
     "os.rename",
@@ -178,7 +178,11 @@ def forked(
     try:
         meet(pid, wrap_read_errors)
         status = _waited(pid)
-        counted = os.read(wrap_read_errors, 64) if select.select([wrap_read_errors], [], [], 0)[0] else b""
+        counted = (
+            os.read(wrap_read_errors, 64)
+            if select.select([wrap_read_errors], [], [], 0)[0]
+            else b""
+        )
     finally:
         os.close(wrap_read_errors)
     said = errors.read_text(errors="replace")

@@ -29,7 +29,7 @@ from dyngs.io.formats.splat_file import SplatFile, with_degree
 from dyngs.io.tensor_file import write_tensors
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
-from dyngs.runs.stored_file import encoded
+from dyngs.runs.stored_file import encode_scene
 
 _INFO = CheckpointInfo(7, 1.0, (1.0, 0.0, 0.0), "white", "classic")
 
@@ -262,7 +262,7 @@ def write_scene_file_still(root: Path) -> None:
         Config(data=DataConfig.model_validate({"root": "capture"}), model=model),
         root / RESOLVED_NAME,
     )
-    (root / "scene.dyngs").write_bytes(encoded(_scene_info(), _scene(_gaussians(), model), {}))
+    (root / "scene.dyngs").write_bytes(encode_scene(_scene_info(), _scene(_gaussians(), model), {}))
 
 
 def write_scene_file_moving(root: Path) -> None:
@@ -273,7 +273,9 @@ def write_scene_file_moving(root: Path) -> None:
         f"gaussians.{name}": 0.01
         for name in ("means", "quats", "log_scales", "logit_opacities", "sh_base")
     }
-    (root / "scene.dyngs").write_bytes(encoded(_scene_info(), _scene(tensors, config.model), steps))
+    (root / "scene.dyngs").write_bytes(
+        encode_scene(_scene_info(), _scene(tensors, config.model), steps)
+    )
 
 
 def write_person(root: Path) -> None:

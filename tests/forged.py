@@ -24,8 +24,8 @@ from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.stored_file import (
     Coding,
+    assemble_file,
     encode_tensor,
-    with_header,
 )
 
 Tensors = dict[str, Tensor]
@@ -136,7 +136,7 @@ def stored_as_they_are(tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -
     """
     kept = {name: x for name, x in tensors.items() if x.dtype != torch.bfloat16}
     stored = [encode_tensor(name, x, Coding("exact")) for name, x in sorted(kept.items())]
-    return with_header(dict(info), [entry for entry, _ in stored], [block for _, block in stored])
+    return assemble_file(dict(info), [entry for entry, _ in stored], [block for _, block in stored])
 
 
 def require_drawable(scene: GaussianScene) -> None:

@@ -103,7 +103,7 @@ def sliding_nodes() -> ControlNodes:
     points[..., 0] = torch.arange(4) - 1.5  # the spline of these is t - 0.5
     moved = row_of_balls().means[list(MOVING_ROWS)]
     field = ControlNodes(SLIDING, SETUP, torch.Generator())
-    field.nodes_for(moved)
+    field.update_nodes(moved)
     field.parameters["means"].data.copy_(points)
     return field
 
@@ -171,7 +171,8 @@ def write_moving_run(
     tensors = {f"gaussians.{name}": x.contiguous() for name, x in gaussians.tensors().items()}
     if moves:
         tensors |= {
-            f"model.field.{name}": x for name, x in strip_roles(field_state(sliding_nodes())).items()
+            f"model.field.{name}": x
+            for name, x in strip_roles(field_state(sliding_nodes())).items()
         }
         tensors["model.rows"] = torch.tensor(MOVING_ROWS)
         tensors["model.times"] = torch.tensor(TRAIN_TIMES, dtype=torch.float64)

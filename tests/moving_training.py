@@ -12,7 +12,7 @@ from tiny_fields import cloud
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.core.state import part_of, strip_roles
+from dyngs.core.state import select_prefix, strip_roles
 from dyngs.data.loader import Image
 from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import create_field
@@ -100,7 +100,7 @@ class Run:
     @property
     def model_state(self) -> dict[str, Tensor]:
         """What is stored beside the Gaussians."""
-        return part_of(strip_roles(self.scene.state()), "model")
+        return select_prefix(strip_roles(self.scene.state()), "model")
 
 
 def new_run(

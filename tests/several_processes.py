@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from pretend_gpu import GPU, pretend_gpu
 
-from dyngs.api.following import together
+from dyngs.api.following import run_processes
 from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config import Config
@@ -107,7 +107,7 @@ def trained(configs: list[Config], fails: str = "") -> int:
             train(config, processes=processes)
         return 0
 
-    return together(lead)
+    return run_processes(lead)
 
 
 def trained_on_gpu(configs: list[Config]) -> int:

@@ -18,14 +18,14 @@ import dyngs
 from dyngs.cli.output import print_messages, print_notes
 from dyngs.core.errors import (
     DyngsError,
-    quote_path,
-    counted,
+    describe_error,
+    format_count,
     format_one_line,
-    wrap_read_errors,
-    reason,
+    log_info,
+    log_warning,
+    quote_path,
     require_regular_file,
-    show,
-    warn,
+    wrap_read_errors,
 )
 from dyngs.io.fields import read_json_object
 from dyngs.io.tensor_file import FileKind, read_tensors
@@ -79,8 +79,8 @@ def test_errors_of_the_system_are_said_in_its_words(tmp_path: Path) -> None:
 
 
 def test_reason_of_an_error_without_words_is_its_type() -> None:
-    assert reason(AssertionError()) == "AssertionError"
-    assert reason(KeyError("w")) == "KeyError: 'w'"
+    assert describe_error(AssertionError()) == "AssertionError"
+    assert describe_error(KeyError("w")) == "KeyError: 'w'"
 
 
 def test_printable_keeps_letters_and_escapes_what_a_terminal_obeys() -> None:
@@ -139,7 +139,7 @@ def test_pipes_in_captures_and_runs_stop_nobody(tmp_path: Path) -> None:
 
 
 def test_what_is_counted() -> None:
-    assert [counted(n, "image") for n in (0, 1, 2, 1200)] == [
+    assert [format_count(n, "image") for n in (0, 1, 2, 1200)] == [
         "0 images",
         "1 image",
         "2 images",
@@ -185,7 +185,7 @@ def test_names_in_commands_can_be_copied(
 @pytest.mark.skipif(os.name != "posix", reason="locales of POSIX")
 def test_names_can_be_copied_in_the_locale_c(tmp_path: Path) -> None:
     (tmp_path / "läufer").mkdir()
-    code = "import sys; from dyngs.core.errors import as_word; print('next: cd ' + as_word(sys.argv[1]))"
+    code = "import sys; from dyngs.core.errors import quote_path; print('next: cd ' + quote_path(sys.argv[1]))"
     locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     done = subprocess.run(
         [sys.executable, "-c", code, "läufer"],
@@ -200,8 +200,8 @@ def test_names_can_be_copied_in_the_locale_c(tmp_path: Path) -> None:
 
 
 def test_lines_and_warnings_cannot_steer_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    show("two lines:\n  of \x1b]0;title\x07.png\r")
-    warn("a\x1b[2J.png\nhas changed")
+    log_info("two lines:\n  of \x1b]0;title\x07.png\r")
+    log_warning("a\x1b[2J.png\nhas changed")
     print_notes(("\x9b2J",), ("\x08",))
     output = capsys.readouterr()
     assert output.out == "two lines:\n  of \\x1b]0;title\\x07.png\\r\nnote: \\x9b2J\n"
@@ -223,9 +223,9 @@ def test_warnings_of_the_package_are_escaped() -> None:
 
 def test_messages_are_logged_and_can_be_silenced(capsys: pytest.CaptureFixture[str]) -> None:
     print_messages(quiet=True)
-    show("one")
-    warn("two")
+    log_info("one")
+    log_warning("two")
     assert capsys.readouterr() == ("", "")
-    code = "from dyngs.core.errors import show, warn; show('three'); warn('four')"
+    code = "from dyngs.core.errors import log_info, log_warning; log_info('three'); log_warning('four')"
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("", "four\n")

@@ -14,10 +14,10 @@ from torch import Tensor
 from dyngs.core.state import (
     Role,
     StateTensor,
+    add_prefix,
     move_fields_to,
     move_to_device,
-    part_of,
-    add_prefix,
+    select_prefix,
     strip_roles,
     with_role,
 )
@@ -37,7 +37,7 @@ def test_a_prefix_is_put_before_and_taken_away(
     state = with_role(tensors, role)
     assert all(x.role is role for x in state.values())
     assert strip_roles(state) == tensors
-    assert part_of(strip_roles(add_prefix(prefix, state)), prefix) == tensors
+    assert select_prefix(strip_roles(add_prefix(prefix, state)), prefix) == tensors
     assert strip_roles(add_prefix(prefix, state)) == {
         f"{prefix}.{name}": x for name, x in tensors.items()
     }

@@ -21,10 +21,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.api.first_scene import first_of
+from dyngs.api.first_scene import load_initial_gaussians
 from dyngs.config import BudgetConfig, Config, NetworkColour, PruneConfig, ShColour
 from dyngs.config.io import load_config, packaged_preset
-from dyngs.core.errors import DyngsError, counted, show
+from dyngs.core.errors import DyngsError, format_count, log_info
 from dyngs.core.metrics import psnr
 from dyngs.core.section import ModelSection, Section
 from dyngs.data.capture import Capture, View
@@ -35,7 +35,7 @@ from dyngs.deform.keys import FreeField
 from dyngs.deform.static_errors import changed_fraction, group_fixed_cameras
 from dyngs.gaussians.colour.network import apply_affine_colour, fit_affine_colour
 from dyngs.io.write import write_text
-from dyngs.models.kind import HasGaussians, HasMotion, capability, kind_of
+from dyngs.models.kind import HasGaussians, HasMotion, capability, find_kind
 from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour, evaluation_background
@@ -125,11 +125,11 @@ class Choice:
     def __str__(self) -> str:
         return (
             f"{self.setting} {'taken' if self.taken else 'not taken'}: {self.gain:+.2f} dB (standard error "
-            f"{self.error:.2f}) to {self.without:.2f} dB on {counted(self.views, 'view')} ({self.seconds:.0f} s)"
+            f"{self.error:.2f}) to {self.without:.2f} dB on {format_count(self.views, 'view')} ({self.seconds:.0f} s)"
         )
 
 
-def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capture]:
+def resolve_auto_settings(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capture]:
     """Resolve every setting that is left open by pilot runs.
 
     Returns the resolved config, the results, and the capture with the points that the scene begins
@@ -140,7 +140,7 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
             trained on.
         KeyboardInterrupt: during pilot runs; nothing has been written.
     """
-    problem = kind_of(config.model).refusal(capture)
+    problem = find_kind(config.model).refusal(capture)
     if problem is not None:
         raise DyngsError(f"{config.data.root}: {problem}")
     model: Any = config.model
@@ -156,9 +156,9 @@ def choose(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capt
         moving = _before_fixed_cameras(moving, at_once)
     choice = _motion(moving, capture)
     if choice is None:
-        show(f"model.kind=dynamic {_TOO_SHORT}; model.choose=false trains a moving scene")
+        log_info(f"model.kind=dynamic {_TOO_SHORT}; model.choose=false trains a moving scene")
         return _with_settings(as_static(config), capture)
-    show(f"  {choice}")
+    log_info(f"  {choice}")
     found = moving if choice.taken else as_static(config)
     best, choices, capture = _with_settings(found, capture, moving=choice.taken)
     return best, [choice, *choices], capture
@@ -226,7 +226,9 @@ def _motion(config: Config, capture: Capture) -> Choice | None:
     small = _with(small, "init", num_random=min(config.init.num_random, MOTION.gaussians))
     made_of = capability(config.model, HasGaussians)
     assert made_of is not None
-    small = small.model_copy(update={"model": made_of.with_added_gaussians(config.model, MOTION_RANDOM)})
+    small = small.model_copy(
+        update={"model": made_of.with_added_gaussians(config.model, MOTION_RANDOM)}
+    )
     step = _work_of_step(config, views[0])
     # a step with motion costs two without
     work = len(folds) * 1.4 * MOTION.steps * _work_of_step(small, views[0])
@@ -235,13 +237,15 @@ def _motion(config: Config, capture: Capture) -> Choice | None:
     given = 60 * (config.train.minutes or math.inf)
     begun = time.monotonic()
     capture = add_initial_points(capture, config, log_messages=False)
-    show(f"pilot runs of {counted(MOTION.steps, 'step')}, compared on held-out training views:")
+    log_info(
+        f"pilot runs of {format_count(MOTION.steps, 'step')}, compared on held-out training views:"
+    )
     choice = _compared(
         "model.kind=dynamic",
         [_with(small, "model", motion_from=1.0), small],
         capture,
         folds,
-        plain,
+        plain_psnr,
         errors=ERRORS_OF_MOTION,
         deadline=begun + MOTION.spent * given,
     )
@@ -260,13 +264,13 @@ def _with_settings(
     Open are settings that are ``auto``, the most valuable first; where motion was found to pay, also
     colours.
     """
-    kind = kind_of(config.model)
+    kind = find_kind(config.model)
     is_static = capability(config.model, HasMotion) is None
     found: list[tuple[str, str, Callable[[Section], Section], Score]] = []
     for section, key, score in (
         ("camera", "refine", psnr_after_pose_fit),
         ("train", "exposure", psnr_after_colour_fit),
-        ("train", "robust", explained),
+        ("train", "robust", explained_psnr),
     ):
         if getattr(getattr(config, section), key) == "auto":
             config = _with(config, section, **{key: "never"})
@@ -274,23 +278,25 @@ def _with_settings(
                 always = methodcaller("model_copy", update={key: "always"})
                 found.append((f"{section}.{key}=always", section, always, score))
     if moving and config.colour == ShColour() and not config.colour.model_fields_set:
-        found.append(("colour.kind=network", "colour", lambda _: NetworkColour(), plain))
+        found.append(("colour.kind=network", "colour", lambda _: NetworkColour(), plain_psnr))
     capture = add_initial_points(capture, config)
     views = capture.splits["train"]
     folds = _held_out(views)
     steps, first_side = _affordable(config, views[0], len(found), len(folds))
     choices = list[Choice]()
     if found and (not folds or steps < SETTINGS.fewest_steps):
-        show(f"{', '.join(text for text, *_ in found)} {_TOO_SHORT}")
+        log_info(f"{', '.join(text for text, *_ in found)} {_TOO_SHORT}")
         return config, choices, capture
     if found:
-        show(f"pilot runs of {counted(steps, 'step')}, compared on held-out training views:")
+        log_info(
+            f"pilot runs of {format_count(steps, 'step')}, compared on held-out training views:"
+        )
     for text, section, change, score in found:
         changed = config.model_copy(update={section: change(getattr(config, section))})
         both = [_small(x, SETTINGS, steps, first_side) for x in (config, changed)]
         choice = _compared(text, both, capture, folds, score)
         if choice is not None:
-            show(f"  {choice}")
+            log_info(f"  {choice}")
             choices.append(choice)
             config = changed if choice.taken else config
     return config, choices, capture
@@ -337,7 +343,9 @@ def _trained(
 
     Its last step is left out: in it, a model at rest would begin to move.
     """
-    trainer = build_trainer(config, capture, held_out=held_out, first=first_of(config, capture))
+    trainer = build_trainer(
+        config, capture, held_out=held_out, first=load_initial_gaussians(config, capture)
+    )
     last = config.train.steps - 1
     with Interrupts() as interrupts:
         while trainer.done < last and time.monotonic() < deadline:
@@ -431,18 +439,18 @@ def _motion_of_fixed_cameras(capture: Capture, config: Config) -> bool | None:
     fraction = changed_fraction(images)
     moves = fraction > MIN_DIFFERING
     found = "something moves" if moves else "nothing moves, trained as a static scene"
-    show(f"{found}: {fraction:.2%} of the pixels of fixed cameras differ from their median")
+    log_info(f"{found}: {fraction:.2%} of the pixels of fixed cameras differ from their median")
     return moves
 
 
-def plain(pair: Pair, index: int) -> list[float]:
+def plain_psnr(pair: Pair, index: int) -> list[float]:
     """Return the PSNR of the view; where either has exposures, after an affine colour fitted to
     it."""
     truth, mask, shown = _shown(pair, index)
     return [psnr(rgb, truth, mask) for rgb in shown]
 
 
-def explained(pair: Pair, index: int) -> list[float]:
+def explained_psnr(pair: Pair, index: int) -> list[float]:
     """Return the PSNR over the pixels that at least one of the two explains best, the same ones for
     both.
 

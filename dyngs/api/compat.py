@@ -82,7 +82,7 @@ def rasterization(
     ``meta["means2d"]`` may be asked to ``retain_grad()``; with ``absgrad`` it also gets an
     attribute ``absgrad`` in the backward pass.
 
-    Example::
+    Example:
 
         import torch
 
@@ -108,8 +108,10 @@ def rasterization(
             coefficients.
         viewmats: (C, 4, 4) world to camera, OpenCV axes; rigid, the last row is not read.
         Ks: (C, 3, 3) intrinsics, px; focal lengths positive, skew and the last row are not read.
-        width, height: px.
-        near_plane, far_plane: view-space limits of the centres; far_plane may be infinite.
+        width: px.
+        height: px.
+        near_plane: smallest depth of the centres in view space.
+        far_plane: largest depth of the centres in view space; may be infinite.
         radius_clip: splats with no larger half extent are skipped, px.
         eps2d: 2D low-pass variance, px^2.
         sh_degree: degree to use; None if colors are values.

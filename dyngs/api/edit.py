@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyngs.compress.clean import restore_final_trainer, clean_file, clean_run
+from dyngs.compress.clean import clean_file, clean_run, restore_final_trainer
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
-from dyngs.core.errors import DyngsError, counted, show
+from dyngs.core.errors import DyngsError, format_count, log_info
 from dyngs.export.edit.crop import Region, gaussians_in_region
 from dyngs.export.edit.frame import Frame, GeoFrame, gps_frame
 from dyngs.export.edit.merge import merge_scenes
@@ -156,7 +156,7 @@ def edit_scene(
     edits: Edits,
     reads: Sequence[Path] = (),
     data_root: Path | None = None,
-    tell: Tell = show,
+    tell: Tell = log_info,
 ) -> EditedFile:
     """Edit a run or a file of Gaussians, and write the result; the suffix of ``out`` names the
     format, none is a run.
@@ -223,9 +223,9 @@ def _cropped(found: EditSource, source: Path, edits: Edits, tell: Tell) -> EditS
             ", ".join(f"{x:.10g}" for x in end.tolist()) for end in (points.min(0), points.max(0))
         )
         raise DyngsError(
-            f"{source}: --crop leaves none of {counted(len(scene), 'Gaussian')}; they lie between {low} and {high}"
+            f"{source}: --crop leaves none of {format_count(len(scene), 'Gaussian')}; they lie between {low} and {high}"
         )
-    tell(f"crop: {count:,} of {counted(len(scene), 'Gaussian')} stay")
+    tell(f"crop: {count:,} of {format_count(len(scene), 'Gaussian')} stay")
     return found.kept(rows)
 
 
@@ -329,7 +329,7 @@ def _part(config: Config, run_dir: Path, rows: Tensor) -> Checkpoint:
         trainer = restore_final_trainer(config, run_dir)
         kept = torch.zeros(trainer.num_gaussians, dtype=torch.bool, device=trainer.device)
         kept[rows.to(trainer.device)] = True
-        trainer.model.keep(kept, trainer.done)
+        trainer.model.select_gaussians(kept, trainer.done)
         return trainer.checkpoint()
 
 

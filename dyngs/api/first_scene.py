@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from dyngs.config import Config, SceneInit
-from dyngs.core.errors import DyngsError, counted, warn
+from dyngs.core.errors import DyngsError, format_count, log_warning
 from dyngs.data.capture import Capture
 from dyngs.gaussians.initialization import InitialGaussians
 from dyngs.gaussians.static_scene import StaticScene
@@ -14,7 +14,7 @@ from dyngs.io.formats.splat_file import with_degree
 from dyngs.runs.opened import open_scene
 
 
-def first_of(config: Config, capture: Capture) -> InitialGaussians | None:
+def load_initial_gaussians(config: Config, capture: Capture) -> InitialGaussians | None:
     """Return the Gaussians that ``init.scene`` names, as the capture has them; None: the run begins
     with points.
 
@@ -43,9 +43,11 @@ def first_of(config: Config, capture: Capture) -> InitialGaussians | None:
         frozen = ~((means >= low) & (means <= high)).all(1)
         if bool(frozen.all()):
             raise DyngsError(
-                f"init.box: none of {counted(len(scene), 'Gaussian')} of {init.scene} lie in it"
+                f"init.box: none of {format_count(len(scene), 'Gaussian')} of {init.scene} lie in it"
             )
     mode = scene.options.mode
     if mode is not config.model.rasterize_mode:
-        warn(f"{init.scene}: was trained with model.rasterize_mode={mode.value}, unlike this run")
+        log_warning(
+            f"{init.scene}: was trained with model.rasterize_mode={mode.value}, unlike this run"
+        )
     return InitialGaussians(gaussians, frozen)

@@ -70,12 +70,12 @@ class Leader:
         _tell(self.processes, Order.STEP)
 
 
-def together(lead: Callable[[Processes], int]) -> int:
+def run_processes(lead: Callable[[Processes], int]) -> int:
     """Return the exit code of the processes that ``torchrun`` started: the first calls ``lead``,
     the others follow."""
     with Processes.from_torchrun() as processes:
         if not processes.is_rank_zero:
-            return EXIT_INTERRUPTED if follow(processes) else 0
+            return EXIT_INTERRUPTED if run_follower(processes) else 0
         try:
             code = lead(processes)
         except KeyboardInterrupt as stopped:
@@ -86,7 +86,7 @@ def together(lead: Callable[[Processes], int]) -> int:
     return code
 
 
-def follow(processes: Processes) -> bool:
+def run_follower(processes: Processes) -> bool:
     """Do what the first process says until it says that all is done; nothing is printed.
 
     Returns whether a signal told this process to stop, which the first process then does after the

@@ -11,7 +11,7 @@ from pathlib import Path
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.core.conventions import ProgressCallback, ignore_progress
-from dyngs.core.errors import DyngsError, show
+from dyngs.core.errors import DyngsError, log_info
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.outputs import new_folder
 from dyngs.models.checkpoint import Checkpoint
@@ -43,7 +43,7 @@ def predict(
     views: int | tuple[str, ...] | None = None,
     *,
     steps: int | None = None,
-    say: Callable[[str], None] = show,
+    say: Callable[[str], None] = log_info,
     report: ProgressCallback = ignore_progress,
 ) -> Prediction:
     """Write the person of ``capture`` as a run folder ``out`` for all commands; ``dyngs train
@@ -67,7 +67,7 @@ def predict(
     """
     if steps is not None and steps < 0:
         raise DyngsError(f"cannot train for {steps} steps; give 0 or more")
-    config, checkpoint = trained_network(network)
+    config, checkpoint = read_trained_network(network)
     require_empty(out)  # before the work
     data = config.data.model_copy(update={"root": capture.absolute()})
     network_kind = require_network(config, network)
@@ -84,7 +84,7 @@ def predict(
     return Prediction(out, names, count, done, start - began, end - start)
 
 
-def trained_network(network: Path) -> tuple[Config, Checkpoint]:
+def read_trained_network(network: Path) -> tuple[Config, Checkpoint]:
     """Return configuration and weights of a network: its run, a file, or a published name. Raises
     DyngsError."""
     if not network.exists() and network.name == str(network):

@@ -14,10 +14,10 @@ from dyngs.api.train import train
 from dyngs.compress.search import PruneResult, Search, validation_images
 from dyngs.config import Config, PruneConfig
 from dyngs.config.io import load_resolved
-from dyngs.core.errors import DyngsError, show
+from dyngs.core.errors import DyngsError, log_info
 from dyngs.data.read import require_folder
 from dyngs.io.outputs import new_folder
-from dyngs.models.checkpoint import Checkpoint, read_run_capture, checkpoint_settings
+from dyngs.models.checkpoint import Checkpoint, checkpoint_settings, read_run_capture
 from dyngs.models.kind import HasGaussians, capability
 from dyngs.ops.device import deterministic, keep_freed_memory, select_device
 from dyngs.ops.native import kernel_threads, num_cores
@@ -62,11 +62,11 @@ def prune_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
         save_checkpoint(started, replace(start, settings=checkpoint_settings(config)), 0.0)
         write_config(config, started)
     train(config, resume_from=out)
-    write_scene_file(out, file_of(out))
+    write_scene_file(out, export_folder(out))
     return out
 
 
-def file_of(folder: Path) -> Path:
+def export_folder(folder: Path) -> Path:
     """Return the folder in a pruned run that holds its file and a configuration to draw it with."""
     return folder / EXPORT_FOLDER
 
@@ -76,7 +76,7 @@ def prune_to_loss(
     out: Path,
     max_loss: float,
     overrides: Sequence[str],
-    tell: Callable[[str], None] = show,
+    tell: Callable[[str], None] = log_info,
 ) -> PruneResult:
     """Take as much from the run in ``run_dir`` as ``max_loss`` allows, and write the rest to
     ``out``: a run and a file.
@@ -112,7 +112,9 @@ def prune_to_loss(
     with kernel_threads(config.run.threads or num_cores()), bytewise:
         trainer = build_trainer(config, read_run_capture(config.data, start.info), restored=True)
         trainer.restore(start)
-        chosen, data, promise = Search(trainer, start, tell, validation_images(trainer)).run(max_loss)
+        chosen, data, promise = Search(trainer, start, tell, validation_images(trainer)).run(
+            max_loss
+        )
     with new_folder(out, require_empty) as started:
         _copy_start(run_dir, started)
         seconds = seconds_at(run_dir, start.info.step) + time.perf_counter() - begun

@@ -10,8 +10,14 @@ from dyngs.config.io import load_resolved
 from dyngs.models.checkpoint import restore_model
 from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
-from dyngs.runs.folder import open_export_folder, collect_inputs, read_frame, write_config, write_frame
-from dyngs.runs.stored_file import drawable, encoded, write_scene
+from dyngs.runs.folder import (
+    collect_inputs,
+    open_export_folder,
+    read_frame,
+    write_config,
+    write_frame,
+)
+from dyngs.runs.stored_file import encode_scene, tensors_to_store, write_scene
 
 
 @dataclass(frozen=True)
@@ -44,7 +50,7 @@ def write_scene_file(
         checkpoint = latest_checkpoint(run_dir)
         scene = restore_model(checkpoint, config.model)
         precision, coarseness = plan_storage(config, checkpoint, scene, max_change)
-        data = encoded(checkpoint.info, scene, precision.steps, coarseness)
+        data = encode_scene(checkpoint.info, scene, precision.steps, coarseness)
         write_scene(folder / SCENE_FILE, data)
         if out.resolve() != run_dir.resolve():
             write_config(config, folder)
@@ -56,4 +62,4 @@ def write_scene_file(
 
 def num_bytes_exact(scene: Renderable) -> int:
     """Return the bytes of what drawing needs, as it is in memory."""
-    return sum(x.numel() * x.itemsize for x in drawable(scene).values())
+    return sum(x.numel() * x.itemsize for x in tensors_to_store(scene).values())

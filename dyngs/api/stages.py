@@ -6,20 +6,20 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from dyngs.api.choose import choose
-from dyngs.api.first_scene import first_of
+from dyngs.api.choose import resolve_auto_settings
+from dyngs.api.first_scene import load_initial_gaussians
 from dyngs.capture.sfm.unposed import with_poses
 from dyngs.config import AutoColour, FixedStrategy, SceneInit, ShColour
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.core.conventions import ProgressCallback
-from dyngs.core.errors import DyngsError, counted, show
+from dyngs.core.errors import DyngsError, format_count, log_info
 from dyngs.data.read import capture_folder, read_capture, require_folder, require_images
 from dyngs.models.checkpoint import Checkpoint, read_run_capture
-from dyngs.models.kind import HasBody, HasMotion, PredictsScenes, capability, kind_of
+from dyngs.models.kind import HasBody, HasMotion, PredictsScenes, capability, find_kind
 from dyngs.models.views import training_times
 from dyngs.runs.capture_record import require_same_capture
 from dyngs.runs.checkpoint import SCENE_FILE
-from dyngs.runs.folder import REQUESTED_NAME, EXPORT_FOLDER
+from dyngs.runs.folder import EXPORT_FOLDER, REQUESTED_NAME
 from dyngs.training.limits import apply_gaussian_cap, gaussian_limit
 from dyngs.training.plan import (
     Limits,
@@ -32,12 +32,12 @@ from dyngs.training.plan import (
 from dyngs.training.processes import Processes
 
 
-def planned(plan: RunPlan, stages: Iterable[Stage]) -> RunPlan:
+def run_stages(plan: RunPlan, stages: Iterable[Stage]) -> RunPlan:
     """Return the plan after all ``stages``; their messages are shown."""
     for stage in stages:
         plan, message = stage(plan)
         if message:
-            show(message)
+            log_info(message)
     return plan
 
 
@@ -70,14 +70,14 @@ def find_poses(report: ProgressCallback) -> Stage:
         config = plan.resolved
         data = config.data
         model = config.model
-        kind = kind_of(model)
+        kind = find_kind(model)
         if isinstance(kind, PredictsScenes):
             return plan, None  # its folder holds a capture per person
         root = data.root
         folder = capture_folder(root)
         data = data.model_copy(update={"root": folder})
         if isinstance(kind, HasBody):
-            data = kind.find_body(data, model, show, report)
+            data = kind.find_body(data, model, log_info, report)
         else:
             data = with_poses(data, needs_times=isinstance(kind, HasMotion), report=report)
         if data.root == folder:  # the archive outlives the cache
@@ -95,7 +95,7 @@ def continue_scene(plan: RunPlan) -> tuple[RunPlan, None]:
     init = config.init
     if not isinstance(init, SceneInit):
         return plan, None
-    if "init.scene" not in kind_of(config.model).uses:
+    if "init.scene" not in find_kind(config.model).uses:
         raise DyngsError(
             f"init.kind=scene goes with model.kind=static, not with {config.model.kind}"
         )
@@ -128,7 +128,9 @@ def run_pilots(plan: RunPlan) -> tuple[RunPlan, None]:
     config = plan.resolved
     if capability(config.model, PredictsScenes) is not None:
         return plan, None
-    config, choices, capture = choose(config, require_images(read_capture(config.data)))
+    config, choices, capture = resolve_auto_settings(
+        config, require_images(read_capture(config.data))
+    )
     return replace(plan, resolved=config, capture=capture, choices=tuple(choices)), None
 
 
@@ -137,11 +139,11 @@ def find_first_gaussians(plan: RunPlan) -> tuple[RunPlan, str | None]:
     init = plan.resolved.init
     if not isinstance(init, SceneInit) or plan.capture is None:
         return plan, None
-    first = first_of(plan.resolved, plan.capture)
+    first = load_initial_gaussians(plan.resolved, plan.capture)
     assert first is not None
     frozen = 0 if first.frozen is None else int(first.frozen.sum())
     held = f", of which {frozen:,} stay as they are" if frozen else ""
-    count = counted(len(first.gaussians), "Gaussian")
+    count = format_count(len(first.gaussians), "Gaussian")
     return replace(plan, first=first), f"begins with {count} of {init.scene}{held}"
 
 

@@ -19,9 +19,9 @@ from dyngs.api.stages import (
     extend_run,
     find_first_gaussians,
     find_poses,
-    planned,
     read_same_capture,
     run_pilots,
+    run_stages,
     set_limits,
     share_views,
 )
@@ -30,7 +30,7 @@ from dyngs.compress.stage import prune_stage
 from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.core.conventions import ProgressCallback, ignore_progress
-from dyngs.core.errors import DyngsError, quote_path, counted, show, warn
+from dyngs.core.errors import DyngsError, format_count, log_info, log_warning, quote_path
 from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.outputs import writing
@@ -48,17 +48,17 @@ from dyngs.runs.checkpoint import (
 )
 from dyngs.runs.folder import (
     LOG_NAME,
-    load_requested_config,
-    begin,
-    default_run_dir,
     collect_inputs,
+    default_run_dir,
     is_finished,
-    write_requested_config,
-    update_data_root,
-    require_startable,
-    remove_partial_files,
     is_stopped_before_checkpoint,
+    load_requested_config,
+    remove_partial_files,
+    require_startable,
+    update_data_root,
     write_config,
+    write_new_config,
+    write_requested_config,
 )
 from dyngs.training.clock import SaveTimer, Stopwatch
 from dyngs.training.events import (
@@ -96,7 +96,7 @@ def train(
     Poses of photos and videos are found first, and a body is fitted to a person where that is
     needed.
 
-    Example::
+    Example:
 
         import dyngs
 
@@ -123,14 +123,14 @@ def train(
     """
     folder = resume_from or config.run.dir or default_run_dir(config.run.name)
     processes = processes or Processes()
-    plan = planned(RunPlan(config, config), [share_views(processes)])
+    plan = run_stages(RunPlan(config, config), [share_views(processes)])
     validate_limits(plan.resolved)
     device = select_device(config.run.device)
     if resume_from is None:
         if not (folder / RESOLVED_NAME).is_file():
             collect_inputs(config).require_output(folder)
         with progress() if progress else nullcontext(ignore_progress) as report:
-            plan = planned(plan, [find_poses(report), continue_scene])
+            plan = run_stages(plan, [find_poses(report), continue_scene])
     elif not folder.is_dir():
         latest_checkpoint(folder)  # raises, and says what is there
     keep_freed_memory()
@@ -141,30 +141,30 @@ def train(
         if resume_from is None:
             plan = replace(plan, requested=plan.resolved)
             if is_finished(folder, plan.resolved) and not _is_export_pending(plan.resolved, folder):
-                show(_about_finished(plan.resolved, folder))
+                log_info(_about_finished(plan.resolved, folder))
                 return folder
             require_startable(folder, plan.resolved)
         else:
             update_data_root(folder, config.data)
             resumed = _newest(folder)
             plan = replace(plan, requested=load_requested_config(folder))
-            plan = planned(plan, [extend_run(folder, resumed)])
+            plan = run_stages(plan, [extend_run(folder, resumed)])
         if resumed is not None:
             total = plan.resolved.total_steps
             if resumed.info.step >= total and not _is_export_pending(plan.resolved, folder):
-                show(_about_finished(plan.resolved, folder))
+                log_info(_about_finished(plan.resolved, folder))
                 return folder
         stopwatch = Stopwatch()
         images = None
         if resumed is None:
-            plan = planned(plan, [run_pilots, find_first_gaussians, set_limits])
+            plan = run_stages(plan, [run_pilots, find_first_gaussians, set_limits])
             if plan.limits.seconds is not None:
                 plan, message, images = fit_minutes(plan, stopwatch, _built)
                 if message:
-                    show(message)
+                    log_info(message)
         else:
             resumed.require_settings(plan.resolved)
-            plan = planned(plan, [read_same_capture(folder, resumed), set_limits])
+            plan = run_stages(plan, [read_same_capture(folder, resumed), set_limits])
             stopwatch.exclude(-seconds_at(folder, resumed.info.step))
         trainer = _built(plan, resumed, images)
         run = _Run(plan, trainer, folder, resumed, processes=processes, stopwatch=stopwatch)
@@ -199,7 +199,7 @@ def _about_finished(config: Config, folder: Path) -> str:
     longer = f"`dyngs train --resume {run} train.steps=N` trains longer"
     if config.prune.is_enabled:
         longer = "give another run.dir to train again"
-    return f"{folder}: run already finished ({counted(config.total_steps, 'step')}); {longer}"
+    return f"{folder}: run already finished ({format_count(config.total_steps, 'step')}); {longer}"
 
 
 class _Run:
@@ -253,7 +253,7 @@ class _Run:
         self._saved = trainer.done
         self._save_timer = SaveTimer(config.train.save_minutes, stopwatch.seconds)
         if resumed is None:
-            begin(self.folder, config)
+            write_new_config(self.folder, config)
             write_requested_config(self.folder, plan.requested)
             write_record(self.folder, config.data, plan.capture)
             write_choices(self.folder, plan.choices)
@@ -287,7 +287,8 @@ class _Run:
                 if loop.trainer.done > self._saved:
                     self._save()
                 raise KeyboardInterrupt(
-                    f"stopped after step {loop.trainer.done}; go on with: dyngs train --resume {quote_path(self.folder)}"
+                    f"stopped after step {loop.trainer.done}; go on with: dyngs train --resume "
+                    f"{quote_path(self.folder)}"
                 )
             for line in self._reached():
                 loop.emit(Message(line))
@@ -311,7 +312,7 @@ class _Run:
                     self._evaluate(step)
 
     def _save(self) -> None:
-        begin = self.loop.stopwatch.seconds
+        start = self.loop.stopwatch.seconds
         checkpoint = self.loop.trainer.checkpoint()
         if self._count is not None:
             kept = {f"{_COUNT}.{name}": x for name, x in self._count.state().items()}
@@ -324,7 +325,7 @@ class _Run:
             write_config(self.config, self.folder)
         path = save_checkpoint(self.folder, checkpoint, self.loop.stopwatch.seconds)
         self._saved = self.loop.trainer.done
-        self._save_timer.record_save(begin, self.loop.stopwatch.seconds)
+        self._save_timer.record_save(start, self.loop.stopwatch.seconds)
         self.loop.emit(Saved(self._saved, path))
 
     def _evaluate(self, step: int) -> None:
@@ -353,10 +354,10 @@ class _Run:
 def _show_memory(trainer: Trainer[Any], processes: int) -> None:
     """Show how much memory a run will take, and warn where that is likely to be too much."""
     for forecast in memory_forecasts(trainer, processes):
-        show(str(forecast))
+        log_info(str(forecast))
         warning = forecast.warning()
         if warning is not None:
-            warn(warning)
+            log_warning(warning)
 
 
 def _is_export_pending(config: Config, folder: Path) -> bool:

@@ -16,7 +16,13 @@ import numpy as np
 from dyngs.capture.sfm.frame_choice import STANDS, displaced_by, measured, shrunk
 from dyngs.capture.sfm.several_videos import VIDEOS_FILE, CameraVideo, open_video, read_given
 from dyngs.config import DataConfig
-from dyngs.core.errors import DyngsError, quote_path, counted, format_one_line, wrap_read_errors
+from dyngs.core.errors import (
+    DyngsError,
+    format_count,
+    format_one_line,
+    quote_path,
+    wrap_read_errors,
+)
 from dyngs.data.body_frames import about_pelvis
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry import (
@@ -350,10 +356,10 @@ def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:
         "" if capture.span in (None, (0.0, 1.0)) else f" ({_range(capture.span)} in the files)"
     )
     yield "times", f"{len(times)} in {_range(times)}{written}"
-    cameras = counted(len({view.camera_id for view in views}), "camera")
+    cameras = format_count(len({view.camera_id for view in views}), "camera")
     yield (
         "sequence",
-        f"{cameras} x {counted(len(times), 'time')}, {counted(len(views), 'image')}",
+        f"{cameras} x {format_count(len(times), 'time')}, {format_count(len(views), 'image')}",
     )
     if capture.fps is not None:
         yield "frame rate", f"{capture.fps:.6g} per second"
@@ -508,7 +514,7 @@ def video_facts(video: CameraVideo) -> tuple[dict[str, str], bool]:
         "frames": f"{len(video.seconds)} in {video.seconds[-1] + 1 / video.rate:.2f} s, {rate}",
         "colours": video.info.colours,
         "sound": "yes" if has_sound else "none",
-        "sharpness": counted(blurred, "blurred frame"),
+        "sharpness": format_count(blurred, "blurred frame"),
         "camera": f"moves by up to {displaced:.1%} of its width, {np.median(measures.motion):.2%} from frame to frame",
     }
     stands = displaced <= STANDS

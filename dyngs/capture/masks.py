@@ -15,7 +15,7 @@ import torch
 from scipy import ndimage
 
 from dyngs.capture.sfm.frame_choice import STANDS, displaced_by, shrunk
-from dyngs.core.errors import DyngsError, show
+from dyngs.core.errors import DyngsError, log_info
 from dyngs.data.capture import Capture, Silhouette, View, by_camera, each_view
 from dyngs.data.images.images import (
     SUFFIXES,
@@ -269,7 +269,7 @@ class _Camera:
 
 
 def with_background_masks(
-    capture: Capture, folder: Path, empty: Path | None = None, say: Callable[[str], None] = show
+    capture: Capture, folder: Path, empty: Path | None = None, say: Callable[[str], None] = log_info
 ) -> Capture:
     """Return the capture of fixed cameras with masks of the person, written to ``folder``, which is
     made.

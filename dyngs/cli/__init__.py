@@ -42,7 +42,13 @@ from dyngs.cli import (
 )
 from dyngs.cli.arguments import follows_links, require_outputs_apart
 from dyngs.cli.output import print_messages
-from dyngs.core.errors import DyngsError, NoCaptureError, format_one_line, quote_word, validate_file_name
+from dyngs.core.errors import (
+    DyngsError,
+    NoCaptureError,
+    format_one_line,
+    quote_word,
+    validate_file_name,
+)
 from dyngs.io.containment import following_links_of_runs
 
 EXIT_ERROR = 2

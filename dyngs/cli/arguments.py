@@ -61,7 +61,7 @@ def output_path(text: str) -> Path:
     return Path(text)
 
 
-def whole(what: str, low: int, high: int, more: str = "") -> Callable[[str], int]:
+def integer_type(what: str, low: int, high: int, more: str = "") -> Callable[[str], int]:
     """Return the type of an argument that is a whole number; ``what`` is its name with an article,
     for messages."""
 
@@ -102,7 +102,7 @@ def image_size(text: str) -> tuple[int, int]:
 
 
 def add_threads(parser: argparse.ArgumentParser) -> None:
-    kind = whole("a number of threads", 0, 1024, ", 0 for all cores")
+    kind = integer_type("a number of threads", 0, 1024, ", 0 for all cores")
     parser.add_argument(
         "--threads", type=kind, default=0, metavar="N", help="number of threads, 0 = all cores"
     )
@@ -279,7 +279,7 @@ def computing_device(choice: str) -> torch.device:
 
 
 def add_max_gaussians_drawn(parser: argparse.ArgumentParser, about: str) -> None:
-    kind = whole("a number of Gaussians", 1, 10**9 - 1)
+    kind = integer_type("a number of Gaussians", 1, 10**9 - 1)
     parser.add_argument("--max-gaussians-drawn", type=kind, metavar="N", help=about)
 
 

@@ -7,7 +7,7 @@ import argparse
 from dyngs.cli.arguments import Commands, add_command, input_path, output_path
 from dyngs.cli.output import print_notes, print_written
 from dyngs.cli.splats import add_axes, print_image_difference
-from dyngs.core.errors import counted
+from dyngs.core.errors import format_count
 
 _EPILOG = """\
 examples:
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     said = f"up is {rotated.up} in the file" + (
         f", it was {splat.up}" if rotated.up != splat.up else ", as it was"
     )
-    print_notes((*splat.notes, f"{counted(len(splat.gaussians), 'Gaussian')}; {said}"))
+    print_notes((*splat.notes, f"{format_count(len(splat.gaussians), 'Gaussian')}; {said}"))
     written = write_splats(arguments.target, rotated, sh_degree=arguments.sh_degree)
     print_image_difference(written.notes, [compare_file_with_source(splat, written)])
     print_written(written.path)

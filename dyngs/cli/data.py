@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from dyngs.cli import arguments as args
 from dyngs.cli.output import ProgressBar, print_lines, print_notes
-from dyngs.core.errors import DyngsError, quote_path, counted
+from dyngs.core.errors import DyngsError, format_count, quote_path
 
 if TYPE_CHECKING:
     from dyngs.human.fit.fitted_capture import KnownAvatar
@@ -97,7 +97,7 @@ def _add_sfm(verbs: args.Commands) -> None:
         "--masks", type=args.input_path, metavar="DIR", help="masks of the photos, white = keep"
     )
     frames = "frames to take of a video (default 100; of each of several: up to 300)"
-    kind = args.whole("a number of frames", 2, 10**6)
+    kind = args.integer_type("a number of frames", 2, 10**6)
     parser.add_argument("--frames", type=kind, metavar="N", help=frames)
     args.add_threads(parser)
     args.add_overrides(parser, "data.key=value", "data.follow_links")
@@ -187,7 +187,7 @@ def _add_synth(verbs: args.Commands) -> None:
         "scene", choices=SYNTHETIC_SCENES, metavar="NAME", help=", ".join(SYNTHETIC_SCENES)
     )
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
-    number = args.whole("a number", 1, 10**6)
+    number = args.integer_type("a number", 1, 10**6)
     for name, about in (
         ("size", "width and height in pixels (default 128, for people 256)"),
         ("views", "training views; for fixed cameras, human and people: times (48, 12 and 1)"),
@@ -201,7 +201,9 @@ def _add_synth(verbs: args.Commands) -> None:
     style = "of scenes that move: another camera at each time (default), one on a smooth arc, or fixed ones (room)"
     parser.add_argument("--style", choices=("teleport", "moving", "fixed"), help=style)
     seed = "random seed of cameras, for human of the clothes, for people of everything (default 0)"
-    parser.add_argument("--seed", type=args.whole("a seed", 0, 10**9), metavar="N", help=seed)
+    parser.add_argument(
+        "--seed", type=args.integer_type("a seed", 0, 10**9), metavar="N", help=seed
+    )
 
 
 def run_inspect(arguments: argparse.Namespace) -> int:
@@ -289,7 +291,9 @@ def run_fit(arguments: argparse.Namespace) -> int:
         result = write_fitted_capture(options, arguments.out, report, inputs)
     files = {"model.body": result.model.body, "model.uv": result.model.uv}
     keys = "".join(f" {key}={quote_path(path)}" for key, path in files.items() if path is not None)
-    print_lines(f"{result.summary}\nnext: dyngs train human data.root={quote_path(result.root)}{keys}")
+    print_lines(
+        f"{result.summary}\nnext: dyngs train human data.root={quote_path(result.root)}{keys}"
+    )
     return 0
 
 
@@ -336,7 +340,7 @@ def run_motion(arguments: argparse.Namespace) -> int:
     motion = read_motion(arguments.file, body, arguments.fps, arguments.up, arguments.clip)
     write_amass(motion, out)
     count = len(motion.poses)
-    length = f"{counted(count, 'frame')}, {(count - 1) / motion.fps:.2f} s"
+    length = f"{format_count(count, 'frame')}, {(count - 1) / motion.fps:.2f} s"
     print(f"written: {out}\n         {length} at {motion.fps:g} frames per second")
     print_notes(motion.notes)
     return 0

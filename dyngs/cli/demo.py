@@ -8,9 +8,9 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dyngs.cli.arguments import Commands, add_command, add_threads, output_path, whole
+from dyngs.cli.arguments import Commands, add_command, add_threads, integer_type, output_path
 from dyngs.cli.output import numbers_table, print_tables
-from dyngs.core.errors import quote_path, counted, show
+from dyngs.core.errors import format_count, log_info, quote_path
 
 if TYPE_CHECKING:
     from dyngs.config import Config
@@ -29,7 +29,7 @@ def add_parser(commands: Commands) -> None:
     out = "output folder (default dyngs-demo)"
     default = Path("dyngs-demo")
     parser.add_argument("--out", type=output_path, default=default, metavar="DIR", help=out)
-    kind = whole("a number of steps", 1, 10**9)
+    kind = integer_type("a number of steps", 1, 10**9)
     parser.add_argument(
         "--steps", type=kind, default=3000, metavar="N", help="training steps (default 3000)"
     )
@@ -76,21 +76,21 @@ def run_demo(
     images = folder / "images"
     video = folder / "orbit.mp4"
     capture = folder / "capture"
-    show(f"[1/4] ray tracing the images of the demo scene into {capture}")
+    log_info(f"[1/4] ray tracing the images of the demo scene into {capture}")
     write_dynamic_capture(
         "spin", capture, DynamicOptions(size=SIZE, num_times=NUM_TIMES, samples=3)
     )
-    show(f"[2/4] training {counted(steps, 'step')} into {run_dir}")
+    log_info(f"[2/4] training {format_count(steps, 'step')} into {run_dir}")
     train(demo_config(capture, run_dir, steps, threads), listeners=listeners)
-    show("[3/4] evaluating on held-out views")
+    log_info("[3/4] evaluating on held-out views")
     report = evaluate_run(run_dir, threads=threads)
-    show("[4/4] rendering the test views and an orbit around the moving scene")
+    log_info("[4/4] rendering the test views and an orbit around the moving scene")
     opened = open_run(run_dir)
     write_split_images(opened, "test", images)
     path = choose_path(opened, PathOptions("orbit", 90))
     write_path_images(opened, path, None, OutputOptions(video=video))
     ply = write_run_splats(opened, folder / "splats.ply").path
-    title = counted(report.num_views, "test view")
+    title = format_count(report.num_views, "test view")
     print_tables(numbers_table(title, ("metric", "value"), report_rows(report)))
     print(f"truth, render, error  {images / 'sheet.png'}")
     print(f"orbit video           {video}")

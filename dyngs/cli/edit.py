@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import print_written
-from dyngs.core.errors import DyngsError, quote_path, show
+from dyngs.core.errors import DyngsError, log_info, quote_path
 
 if TYPE_CHECKING:
     from dyngs.api.edit import Edits
@@ -104,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _note(text: str) -> None:
-    show(f"note: {text}")
+    log_info(f"note: {text}")
 
 
 def _edits(arguments: argparse.Namespace) -> Edits:

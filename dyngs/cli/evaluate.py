@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import numbers_table, print_notes, print_tables
-from dyngs.core.errors import counted
+from dyngs.core.errors import format_count
 
 if TYPE_CHECKING:
     from dyngs.evaluate.report import EvalReport
@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(report.to_json(), end="")
         return 0
-    title = f"{counted(report.num_views, 'view')} of the {report.split} split"
+    title = f"{format_count(report.num_views, 'view')} of the {report.split} split"
     print_tables(numbers_table(title, ("metric", "value"), report_rows(report)))
     print_notes(report.notes, report.warnings)
     print(f"written: {report_path(arguments.run_dir, report.split)}")
@@ -99,7 +99,7 @@ def report_rows(report: EvalReport) -> list[tuple[str, str]]:
         worst = min(report.psnr_per_time, key=lambda at: at.psnr)
         mean = sum(values) / len(values)
         spread = f"min {worst.psnr:.2f}, mean {mean:.2f}, max {max(values):.2f} dB; worst at time {worst.time:g}"
-        rows.append((f"PSNR at {counted(len(values), 'time')}", spread))
+        rows.append((f"PSNR at {format_count(len(values), 'time')}", spread))
         moves = report.num_moving or report.flicker is None
         flicker = known("flicker", "{:.3f} of 255") if moves else "0 (nothing moves)"
         rows.append(("flicker", flicker))
@@ -121,7 +121,9 @@ def report_rows(report: EvalReport) -> list[tuple[str, str]]:
     if report.num_gaussians:
         rows.append(("colour", f"{report.colour_floats:.1f} numbers per Gaussian"))
     rows.append(("rendering", f"{report.fps:.1f} frames/s{deforming}"))
-    rows.append(("training", f"{counted(report.step, 'step')} in {report.seconds_train:.0f} s"))
+    rows.append(
+        ("training", f"{format_count(report.step, 'step')} in {report.seconds_train:.0f} s")
+    )
     return rows
 
 

@@ -13,7 +13,7 @@ from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import print_notes, print_written
 from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_image_difference
-from dyngs.core.errors import DyngsError, quote_path, counted
+from dyngs.core.errors import DyngsError, format_count, quote_path
 
 if TYPE_CHECKING:
     from dyngs.data.capture import Split, View
@@ -116,10 +116,10 @@ def add_parser(commands: args.Commands) -> None:
     about = "--format mesh of a radiance field: density of the surface (default: 25 per half extent / 1.5)"
     parser.add_argument("--level", type=float, metavar="X", help=about)
     about = "--format mesh of Gaussians or a field: cells along the longest side of the scene (default 192)"
-    kind = args.whole("a number of cells", 8, 1024)
+    kind = args.integer_type("a number of cells", 8, 1024)
     parser.add_argument("--cells", type=kind, metavar="N", help=about)
     about = "--format mesh of curved triangles: segments of an edge of each (default 6)"
-    kind = args.whole("a number of segments", 1, 64)
+    kind = args.integer_type("a number of segments", 1, 64)
     parser.add_argument("--segments", type=kind, metavar="N", help=about)
     about = "--format html, sog: a folder for a web server, of which a page or PlayCanvas fetches what is seen"
     parser.add_argument("--folder", action="store_true", help=about)
@@ -377,7 +377,9 @@ def _export_tracks(
     tracks = tracks_of(opened.scene, times or opened.scene.times or (0.0,), opened.world, part=part)
     count, moments, _ = tracks.positions.shape
     moving = f"{int(tracks.moving.sum()):,} of them moving"
-    print_notes((f"{counted(count, 'Gaussian')}, {moving}, at {counted(moments, 'time')}",))
+    print_notes(
+        (f"{format_count(count, 'Gaussian')}, {moving}, at {format_count(moments, 'time')}",)
+    )
     return [write_tracks(_target(arguments, "tracks.npz"), tracks)]
 
 
@@ -513,8 +515,8 @@ def _export_surface(arguments: argparse.Namespace) -> None:
         path = out / f"mesh_{i:04d}.ply" if arguments.times else out
         surface = write_surface(opened, path, time=time, options=options, how=how)
         holes = count_holes(surface)
-        closed = "closed" if holes == 0 else f"open at {counted(holes, 'place')}"
-        faces = counted(len(surface.faces), "triangle")
+        closed = "closed" if holes == 0 else f"open at {format_count(holes, 'place')}"
+        faces = format_count(len(surface.faces), "triangle")
         print_notes((f"{faces} with colours of {len(surface.vertices):,} vertices, {closed}",))
         print_written(path)
 
@@ -577,7 +579,7 @@ def _export_cameras(arguments: argparse.Namespace) -> None:
             splits[name] = [found.correct_view(view) for view in views]
     print_notes((line,))
     written = write_cameras(path, capture, splits, run.world)
-    count = counted(len(all_views(capture.splits)), "camera")
+    count = format_count(len(all_views(capture.splits)), "camera")
     root = quote_path(path.parent)
     print(
         f"written: {written} ({count}); `data.root={root} data.follow_links=true` trains with them"

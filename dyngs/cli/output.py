@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, nullcontext, redirect_stdout
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from dyngs.core.errors import LOGGER, escape_control_characters, show, warn
+from dyngs.core.errors import LOGGER, escape_control_characters, log_info, log_warning
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -55,9 +55,9 @@ def redirect_messages(is_json: bool) -> AbstractContextManager[object]:
 def print_notes(notes: Sequence[str], warnings: Sequence[str] = ()) -> None:
     """Print notes and warnings, unless the command is quiet."""
     for note in notes:
-        show(f"note: {note}")
+        log_info(f"note: {note}")
     for warning in warnings:
-        warn(warning)
+        log_warning(warning)
 
 
 def print_written(*paths: Path) -> None:

@@ -6,7 +6,7 @@ import argparse
 
 from dyngs.cli.arguments import Commands, add_command, input_path, output_path
 from dyngs.cli.output import ProgressBar, print_lines
-from dyngs.core.errors import quote_path, counted
+from dyngs.core.errors import format_count, quote_path
 
 _EPILOG = """\
 examples:
@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
     trained = (
         f", after {made.seconds_steps:.2f} s of training on these images" if made.steps else ""
     )
-    what = counted(made.num_gaussians, "Gaussian") if made.num_gaussians else "a field"
+    what = format_count(made.num_gaussians, "Gaussian") if made.num_gaussians else "a field"
     word = quote_path(out)
     # fields are not trained
     refine = f"\n           dyngs train --resume {word}   refines it" if made.num_gaussians else ""

@@ -68,7 +68,7 @@ def add_parser(commands: args.Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Prune, compare with the run before, and print a table."""
-    from dyngs.api.prune import file_of
+    from dyngs.api.prune import export_folder
     from dyngs.api.train import num_cores
     from dyngs.evaluate.report import compare_runs
     from dyngs.runs.checkpoint import load_run
@@ -86,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
     pruned = load_run(folder)
     device = args.computing_device(pruned.config.run.device)
     before, after = compare_runs(
-        [arguments.run_dir, file_of(folder)],
+        [arguments.run_dir, export_folder(folder)],
         arguments.threads or num_cores(),
         device,
         pruned.config.data.root,
@@ -101,8 +101,8 @@ def run(arguments: argparse.Namespace) -> int:
             "note: --masks was ignored; they are for scenes in which a deformation field moves something"
         )
     print(
-        f"written: {folder}, and the file in {file_of(folder)}\n"
-        f"next:    dyngs eval {quote_path(folder)}\n         dyngs render {quote_path(file_of(folder))} "
+        f"written: {folder}, and the file in {export_folder(folder)}\n"
+        f"next:    dyngs eval {quote_path(folder)}\n         dyngs render {quote_path(export_folder(folder))} "
         f"--out {quote_path(folder / 'images')}"
     )
     return 0

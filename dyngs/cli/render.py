@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import ProgressBar, print_notes
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 
 if TYPE_CHECKING:
     from dyngs.export.choose_path import PathOptions
@@ -62,7 +62,7 @@ def add_parser(commands: args.Commands) -> None:
         "--video", type=args.output_path, metavar="FILE.mp4", help="write a video as well"
     )
     frames = "number of frames of orbit, spiral and along (default 120)"
-    kind = args.whole("a number of frames", 1, 10**9)
+    kind = args.integer_type("a number of frames", 1, 10**9)
     parser.add_argument("--frames", type=kind, metavar="N", help=frames)
     fps = "frames per second of the video (default 30, or as in the .json)"
     parser.add_argument("--fps", type=float, metavar="F", help=fps)
@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
     _check(arguments)
     written = _render(arguments)
     folders = sorted({str(path.parent) for path in written})
-    print(f"written: {counted(len(written), 'file')} in {', '.join(folders)}")
+    print(f"written: {format_count(len(written), 'file')} in {', '.join(folders)}")
     for path in written:
         if path.suffix == ".mp4" or path.name == "sheet.png":
             print(f"         {path}")

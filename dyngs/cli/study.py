@@ -16,7 +16,7 @@ from dyngs.cli.output import (
     print_tables,
     redirect_messages,
 )
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 
 if TYPE_CHECKING:
     from dyngs.study.report import Report
@@ -60,11 +60,11 @@ def add_parser(commands: args.Commands) -> None:
     limit = parser.add_mutually_exclusive_group()
     about = "train each for so many minutes"
     limit.add_argument("--minutes", type=amount, metavar="M", help=about)
-    kind = args.whole("a number of steps", 1, 10**8)
+    kind = args.integer_type("a number of steps", 1, 10**8)
     limit.add_argument("--steps", type=kind, metavar="N", help="or so many steps")
     about = "or to a file of at most so many 1e6 bytes"
     limit.add_argument("--max-mb", type=amount, metavar="MB", help=about)
-    kind = args.whole("a number of views", 1, 20)
+    kind = args.integer_type("a number of views", 1, 20)
     about = "views on the page (default 4)"
     parser.add_argument("--views", type=kind, default=4, metavar="N", help=about)
     _add_common(parser, "compare/CAPTURE")
@@ -88,7 +88,7 @@ def add_tradeoff_parser(commands: args.Commands) -> None:
         ("combine", 0, 4, "combinations in each of three directions (default 4)"),
         ("rounds", 1, 5, "renders of each timed view (default 5)"),
     ):
-        kind = args.whole("a number", low, 10**9)
+        kind = args.integer_type("a number", low, 10**9)
         parser.add_argument(f"--{name}", type=kind, default=default, metavar="N", help=about)
     require = "requirements such as 'psnr>=30,fps>=20,mb<=5'; names the best run"
     parser.add_argument("--require", metavar="LIST", help=require)
@@ -109,7 +109,7 @@ def _add_common(parser: argparse.ArgumentParser, out: str) -> None:
         "do several at once by Ray (pip install 'dyngs[ray]'), with so many cores for each, on this machine or the "
         "cluster of RAY_ADDRESS, whose machines must share the files"
     )
-    kind = args.whole("a number of cores", 1, 1024)
+    kind = args.integer_type("a number of cores", 1, 1024)
     parser.add_argument("--ray", type=kind, metavar="CORES", help=about)
     args.add_json(parser)
 
@@ -230,7 +230,7 @@ def _tradeoff(arguments: argparse.Namespace, out: Path) -> int:
     variants = list(found)
     rows = tradeoff.build_rows(list(found.values()))
     rates = tradeoff.exchange_rates(found)
-    about = f"{counted(found[variants[0]].num_views, 'view')}; {_FRONT}"
+    about = f"{format_count(found[variants[0]].num_views, 'view')}; {_FRONT}"
     settings = [variant.setting for variant in variants]
     report = Report(
         "Quality, speed and size",

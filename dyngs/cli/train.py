@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.output import ProgressBar, print_lines
 from dyngs.cli.view import add_serving_arguments
-from dyngs.core.errors import DyngsError, quote_path, counted
+from dyngs.core.errors import DyngsError, format_count, quote_path
 
 if TYPE_CHECKING:
     from dyngs.config import Config
@@ -70,9 +70,9 @@ def run(arguments: argparse.Namespace) -> int:
     processes."""
     if os.environ.get("WORLD_SIZE", "1") == "1":
         return _run(arguments)
-    from dyngs.api.following import together
+    from dyngs.api.following import run_processes
 
-    return together(partial(_run, arguments))
+    return run_processes(partial(_run, arguments))
 
 
 def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> int:
@@ -135,7 +135,7 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
     if scene.is_static:
         return ["motion:  nothing moves, so this became a static model"]
     return [
-        f"motion:  {len(scene.rows):,} of {counted(len(scene), 'Gaussian')} move ({scene.moving_fraction:.1%})"
+        f"motion:  {len(scene.rows):,} of {format_count(len(scene), 'Gaussian')} move ({scene.moving_fraction:.1%})"
     ]
 
 

@@ -46,7 +46,7 @@ def add_serving_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of how the page is served."""
     about = "address to listen on (default: this machine only); others get a link with a token"
     parser.add_argument("--host", default="127.0.0.1", help=about)
-    kind = args.whole("a port", 1, 65535)
+    kind = args.integer_type("a port", 1, 65535)
     parser.add_argument(
         "--port", type=kind, metavar="N", help="port (default: 8080, or the next that is free)"
     )

@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 
 from dyngs.compress.search import held_out_indices, validation_images
-from dyngs.compress.stage import measure_importance, quality_of, scoring_views
+from dyngs.compress.stage import mean_psnr, measure_importance, scoring_views
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import depths_and_contributions
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.checkpoint import read_run_capture
-from dyngs.models.kind import HasGaussians, capability, kind_of
+from dyngs.models.kind import HasGaussians, capability, find_kind
 from dyngs.ops.device import deterministic, select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.checkpoint import has_only_scene_file, latest_checkpoint, load_run
@@ -46,14 +46,14 @@ def remove_floaters(loop: Loop) -> TrainingEdit | None:
     options = trainer.config.train
     if trainer.done != options.steps or not options.remove_floaters:
         return None
-    is_still = "init.scene" in kind_of(trainer.config.model).uses
+    is_still = "init.scene" in find_kind(trainer.config.model).uses
     if not is_still or len(trainer.images) < FEWEST_VIEWS:
         return None
-    found = floaters(trainer)
+    found = find_floaters(trainer)
     count = int(found.sum())
     if not count:
         return None
-    before = counted(len(found), "Gaussian")
+    before = format_count(len(found), "Gaussian")
     message = f"{count:,} of {before} hang close before single cameras"
     if count > MOST * len(found):
         return TrainingEdit(f"{message}: too many to be floaters, none is removed")
@@ -61,7 +61,7 @@ def remove_floaters(loop: Loop) -> TrainingEdit | None:
 
 
 @torch.no_grad()
-def floaters(trainer: GaussianTrainer) -> Tensor:
+def find_floaters(trainer: GaussianTrainer) -> Tensor:
     """Return (N,) bool which Gaussians of a static scene are floaters, by all of its training
     views."""
     gaussians = trainer.model.scene.gaussians.detach()
@@ -103,14 +103,14 @@ def classify_shapes(gaussians: Gaussians, opacities: Tensor) -> dict[str, Tensor
     longest = ordered[:, 0]
     second = ordered[:, 1]
     return {
-        "lone": lone(gaussians.means),
+        "lone": find_isolated(gaussians.means),
         "veils": (opacities < VEIL) & (longest > LARGE * longest.median()),
         "faint": opacities < FAINT,
         "needles": longest > NEEDLE * second.clamp_min(torch.finfo(second.dtype).tiny),
     }
 
 
-def lone(means: Tensor) -> Tensor:
+def find_isolated(means: Tensor) -> Tensor:
     """Return (N,) bool: whose fourth neighbour is ``LONE`` times as far as that of most Gaussians
     (N, 3)."""
     from scipy.spatial import KDTree
@@ -130,14 +130,15 @@ def clean_file(gaussians: Gaussians, tell: Tell) -> Tensor:
     found = classify_shapes(gaussians, gaussians.opacities)
     gone = torch.zeros_like(found["faint"])
     for kind in ("faint", "needles", "lone"):
-        tell(f"clean: {kind}: {counted(int((found[kind] & ~gone).sum()), 'Gaussian')}")
+        tell(f"clean: {kind}: {format_count(int((found[kind] & ~gone).sum()), 'Gaussian')}")
         gone |= found[kind]
     if bool(gone.all()):
         raise DyngsError(
             "--clean: nothing would be left; this scene consists of needles, or of what hardly shows"
         )
     tell(
-        f"clean: {int(gone.sum()):,} of {counted(len(gone), 'Gaussian')} go; without the cameras of a run neither what "
+        f"clean: {int(gone.sum()):,} of {format_count(len(gone), 'Gaussian')} go; without the "
+        "cameras of a run neither what "
         "no camera saw nor what this costs can be measured"
     )
     return ~gone
@@ -170,28 +171,30 @@ def clean_run(
             )
         images = unseen or [trainer.images[i] for i in held]
         scene: GaussianScene = trainer.model.scene.without_masks()
-        before = quality_of(trainer, scene, images)
-        trained_before = quality_of(trainer, scene)
+        before = mean_psnr(trainer, scene, images)
+        trained_before = mean_psnr(trainer, scene)
 
         def losses(kept: Tensor) -> tuple[float, float]:
             """Return the losses of mean PSNR, dB: of the views held out, and of 16 training views
             as well, because few views may be kind by chance."""
             left = scene.select(kept)
-            loss = before - quality_of(trainer, left, images)
-            return loss, max(loss, trained_before - quality_of(trainer, left))
+            loss = before - mean_psnr(trainer, left, images)
+            return loss, max(loss, trained_before - mean_psnr(trainer, left))
 
         kept = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
         for kind, rows in find_removal_candidates(trainer, held).items():
-            kept = taken(kept, kind, rows, lambda left: losses(left)[1] <= max_loss, tell)
+            kept = remove_within_loss(
+                kept, kind, rows, lambda left: losses(left)[1] <= max_loss, tell
+            )
         loss, worst = losses(kept)
-        views = counted(len(images), "validation view" if unseen else "training view")
-        gone = f"clean: {int((~kept).sum()):,} of {counted(len(kept), 'Gaussian')} go"
+        views = format_count(len(images), "validation view" if unseen else "training view")
+        gone = f"clean: {int((~kept).sum()):,} of {format_count(len(kept), 'Gaussian')} go"
         cost = f"{before:.2f} -> {before - loss:.2f} dB ({-loss:+.3f}) on {views} held out"
         tell(f"{gone}; {cost}; {max(worst, 0):.3f} of {max_loss:g} dB lost, with training views")
         return kept.cpu()
 
 
-def taken(
+def remove_within_loss(
     kept: Tensor, kind: str, rows: Tensor, may_stay: Callable[[Tensor], bool], tell: Tell
 ) -> Tensor:
     """Return (N,) bool: ``kept`` without the first of ``rows`` (K,), all or as many as bisection
@@ -212,7 +215,7 @@ def taken(
             high = count
         count = (low + high) // 2
     if len(rows):
-        tell(f"clean: {kind}: {low:,} of {counted(len(rows), 'Gaussian')} go")
+        tell(f"clean: {kind}: {low:,} of {format_count(len(rows), 'Gaussian')} go")
     return left
 
 
@@ -244,7 +247,7 @@ def find_removal_candidates(trainer: GaussianTrainer, held: Sequence[int]) -> di
     contribution = found.contribution
     kinds = {"never seen": contribution <= 0}
     if scene.is_static and len(trainer.images) >= FEWEST_VIEWS:
-        kinds["floaters"] = floaters(trainer)
+        kinds["floaters"] = find_floaters(trainer)
     shapes = classify_shapes(scene.at(None), found.opacities.amax(0))
     kinds |= {kind: shapes[kind] for kind in ("lone", "faint", "veils", "needles")}
     order = torch.sort(contribution, stable=True).indices

@@ -29,13 +29,13 @@ from dyngs.runs.stored_file import (
     MAX_COARSENESS,
     TRIANGLES,
     choose_coding,
-    completed,
-    decoded,
-    drawable,
-    encoded,
-    group_of,
-    restored,
+    decode_scene,
+    encode_scene,
     round_step_down,
+    round_trip,
+    step_group,
+    tensors_to_store,
+    to_checkpoint_tensors,
 )
 
 GREY_LEVELS = 255.0
@@ -102,18 +102,20 @@ def measure_precision(
     """Return the largest steps found that change the images by at most ``max_change``, grey levels
     of 255.
 
-    ``exact``: from ``drawable``, with the coarseness of the Gaussians if they have any; ``draw``
+    ``exact``: from ``tensors_to_store``, with the coarseness of the Gaussians if they have any; ``draw``
     draws its like anew. Raises DyngsError: a value is not finite.
     """
 
     def change(steps: Mapping[str, float], names: Iterable[str] = exact) -> float:
         """Return the mean square over all values, with the tensors of these names quantised."""
-        return mean_square_change(wanted, draw(completed(rounded(exact, steps, names))))
+        return mean_square_change(
+            wanted, draw(to_checkpoint_tensors(quantize_tensors(exact, steps, names)))
+        )
 
     allowed = (max_change / GREY_LEVELS) ** 2
     groups: dict[str, dict[str, Tensor]] = {}
     for name, x in exact.items():
-        group = group_of(name, x)
+        group = step_group(name, x)
         if group is not None and x.numel():
             groups.setdefault(group, {})[name] = x
     sizes = {name: sum(x.numel() for x in group.values()) for name, group in groups.items()}
@@ -136,19 +138,19 @@ def measure_precision(
     return Precision(kept, math.sqrt(found) * GREY_LEVELS, max_change)
 
 
-def rounded(
+def quantize_tensors(
     exact: Mapping[str, Tensor], steps: Mapping[str, float], names: Iterable[str] | None = None
 ) -> dict[str, Tensor]:
     """Return the tensors with those of ``names`` (None: all) as a file with these steps holds them.
 
-    ``exact``: from ``drawable``, and the coarseness of the Gaussians if they have any. ``names``:
+    ``exact``: from ``tensors_to_store``, and the coarseness of the Gaussians if they have any. ``names``:
     of the tensors that are rounded.
     """
     coarseness = exact[COARSENESS].numpy() if COARSENESS in exact else None
     found = dict(exact)
     for name in exact if names is None else names:
         coding = choose_coding(name, exact[name], steps, by_coarseness=coarseness is not None)
-        found[name] = restored(exact[name], coding, coarseness)
+        found[name] = round_trip(exact[name], coding, coarseness)
     return found
 
 
@@ -263,7 +265,9 @@ def plan_storage(
         return assumed or _ASSUMED, None
     coarseness = None
     if isinstance(scene, GaussianScene):
-        coarseness = compute_coarseness(_visibility(scene, _shots(config, capture, scene, LOOKED_AT)))
+        coarseness = compute_coarseness(
+            _visibility(scene, _shots(config, capture, scene, LOOKED_AT))
+        )
     _, background = evaluation_background(config.data.background, capture.has_alpha)
     shots = _shots(config, capture, scene, COMPARED)
     info = checkpoint.info
@@ -289,7 +293,7 @@ def plan_storage(
             float((x.clamp(0, 1) - y).square().mean()) for x, y in zip(wanted, truth, strict=True)
         ]
         max_change = GREY_LEVELS * math.sqrt((10 ** (LOSS_DB / 10) - 1) * fmean(errors))
-    exact = drawable(scene) | ({} if coarseness is None else {COARSENESS: coarseness})
+    exact = tensors_to_store(scene) | ({} if coarseness is None else {COARSENESS: coarseness})
     most = max(max_change, SMALLEST_CHANGE)
     return measure_precision(exact, wanted, redrawn, most), coarseness
 
@@ -309,9 +313,11 @@ def find_coarsest_file(
 
     def is_too_coarse(factor: float) -> bool:
         nonlocal best
-        steps = {name: step and round_step_down(factor * step) for name, step in precision.steps.items()}
-        data = encoded(checkpoint.info, scene, steps, coarseness)
-        found = quality(restore_scene(decoded(data), config.model))
+        steps = {
+            name: step and round_step_down(factor * step) for name, step in precision.steps.items()
+        }
+        data = encode_scene(checkpoint.info, scene, steps, coarseness)
+        found = quality(restore_scene(decode_scene(data), config.model))
         if found >= least:
             best = data, found
         return found < least

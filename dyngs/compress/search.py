@@ -24,9 +24,15 @@ import torch
 from torch import Tensor
 
 from dyngs.compress.measure import find_coarsest_file
-from dyngs.compress.stage import PROBED_VIEWS, probe_images, quality_of, removal, scores_of
+from dyngs.compress.stage import (
+    PROBED_VIEWS,
+    build_removal_edit,
+    importance_scores,
+    mean_psnr,
+    probe_images,
+)
 from dyngs.config import AutoColour, Config
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.training import HELD_OUT_EVERY, MeasuredView, find_view_dependent
@@ -69,7 +75,7 @@ def apply_choice(trainer: GaussianTrainer, choice: PruneChoice, scores: Tensor) 
     prune = config.prune.model_copy(update={"fraction": choice.fraction})
     changed = {"model": model, "colour": colour, "prune": prune}
     trainer.apply(TrainingEdit(config=config.model_copy(update=changed)))
-    trainer.apply(removal(trainer, scores if choice.fraction else None))
+    trainer.apply(build_removal_edit(trainer, scores if choice.fraction else None))
     if choice.harmonics:
         _drop_harmonics(trainer, choice.harmonics)
 
@@ -83,9 +89,9 @@ def _drop_harmonics(trainer: GaussianTrainer, tolerance: float) -> None:
     found = find_view_dependent(
         _looks(trainer, seen, background), looks, trainer.model.options, background, tolerance
     )
-    trainer.model.drop_harmonics(~found.kept_harmonics, found.offsets)
+    trainer.model.drop_harmonics(~found.keeps, found.offsets)
     trainer.model.freeze_plain_harmonics(
-        ~found.kept_harmonics, AutoColour(opacity_entropy=trainer.config.colour.opacity_entropy)
+        ~found.keeps, AutoColour(opacity_entropy=trainer.config.colour.opacity_entropy)
     )
 
 
@@ -198,7 +204,7 @@ class Search:
         self.trials = 0
         self._config = trainer.config
         trainer.hold_out(self.held_out)
-        self._scores = scores_of(trainer, trainer.config.prune)
+        self._scores = importance_scores(trainer, trainer.config.prune)
         self._truths = (
             list(unseen) or [trainer.images[i] for i in self.held_out] or probe_images(trainer)
         )
@@ -206,7 +212,7 @@ class Search:
         self._others = [others[i] for i in evenly_spaced(len(others), PROBED_VIEWS)]
         self.views = "its only training view"
         if unseen:
-            self.views = f"{counted(len(unseen), 'view')} never trained on"
+            self.views = f"{format_count(len(unseen), 'view')} never trained on"
         elif self.held_out:
             self.views = f"{len(self.held_out)} training views held out"
         self._is_fair = bool(unseen)
@@ -234,7 +240,7 @@ class Search:
         how = "" if self._is_fair else ", fine-tuned on the others"
         count = len(self._scores)
         self.tell(
-            f"as it is{how}: {counted(count, 'Gaussian')}, {self._reference:.2f} dB on {self.views}"
+            f"as it is{how}: {format_count(count, 'Gaussian')}, {self._reference:.2f} dB on {self.views}"
         )
         has_harmonics = bool(self.start.tensors["gaussians.sh"][:, 1:].any())
         alpha_min = self._config.model.alpha_min
@@ -273,14 +279,14 @@ class Search:
         )
 
     def _quality(self, scene: GaussianScene) -> float:
-        return quality_of(self.trainer, scene, self._truths, alpha_min=scene.options.alpha_min)
+        return mean_psnr(self.trainer, scene, self._truths, alpha_min=scene.options.alpha_min)
 
     def _measured(self) -> tuple[float, float]:
         """Return the PSNR of the scene of the trainer on views held out, and on others."""
         scene = self.trainer.model.scene
         others = [self.trainer.images[i] for i in self._others]
-        held_out = quality_of(self.trainer, scene, self._truths)
-        return held_out, quality_of(self.trainer, scene, others)
+        held_out = mean_psnr(self.trainer, scene, self._truths)
+        return held_out, mean_psnr(self.trainer, scene, others)
 
     def _bisected(self, levels: Sequence[PruneChoice], allowed: float) -> Candidate | None:
         """Return the last of ``levels`` that loses at most ``allowed``, as if all before it did."""
@@ -291,7 +297,7 @@ class Search:
             tried = self._tried(choice)
             keeps = tried.worst <= allowed
             self.tell(
-                f"trial {self.trials}: without {tried.choice}: {counted(tried.num_gaussians, 'Gaussian')}, "
+                f"trial {self.trials}: without {tried.choice}: {format_count(tried.num_gaussians, 'Gaussian')}, "
                 f"{-tried.loss:+.2f} dB, {-tried.trained_loss:+.2f} on views trained on, "
                 f"{'kept' if keeps else f'more than {allowed:.2f} dB lost'}"
             )

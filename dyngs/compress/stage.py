@@ -23,7 +23,7 @@ from torch import Tensor
 
 from dyngs.config import PruneConfig
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import counted
+from dyngs.core.errors import format_count
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import Image
 from dyngs.data.times import evenly_spaced
@@ -129,7 +129,7 @@ def measure_importance(views: ScoringViews, *, slopes: bool) -> Importance:
     )
 
 
-def highest(scores: Tensor, fraction: float) -> Tensor:
+def select_highest(scores: Tensor, fraction: float) -> Tensor:
     """Return (N,) bool: all but the lowest ``fraction`` of ``scores`` (N,), at least one; of equal
     ones the first."""
     count = min(max(1, math.ceil(len(scores) * (1 - fraction) - 1e-9)), len(scores))
@@ -162,14 +162,16 @@ def build_pruning_edit(trainer: GaussianTrainer) -> TrainingEdit:
     """Return the edit that prunes and masks the Gaussians of ``trainer`` by its config."""
     scene = trainer.model.scene.without_masks()
     options = trainer.config.prune
-    edit = removal(trainer, scores_of(trainer, options) if options.fraction > 0 else None)
+    edit = build_removal_edit(
+        trainer, importance_scores(trainer, options) if options.fraction > 0 else None
+    )
     message = f"pruned: {len(scene):,} -> "
     if edit.keep is None:
         return replace(
-            edit, message=f"{message}{counted(len(scene), 'Gaussian')}{_let_through(edit)}"
+            edit, message=f"{message}{format_count(len(scene), 'Gaussian')}{_let_through(edit)}"
         )
-    gain = quality_of(trainer, scene.select(edit.keep)) - quality_of(trainer, scene)
-    left = counted(int(edit.keep.sum()), "Gaussian")
+    gain = mean_psnr(trainer, scene.select(edit.kept)) - mean_psnr(trainer, scene)
+    left = format_count(int(edit.kept.sum()), "Gaussian")
     cost = f"{gain:+.2f} dB before it is trained again"
     return replace(edit, message=f"{message}{left}, {cost}{_let_through(edit)}")
 
@@ -184,12 +186,12 @@ def _let_through(edit: TrainingEdit) -> str:
 
 
 @torch.no_grad()
-def removal(trainer: GaussianTrainer, scores: Tensor | None) -> TrainingEdit:
+def build_removal_edit(trainer: GaussianTrainer, scores: Tensor | None) -> TrainingEdit:
     """Return the edit that leaves all but the fraction ``prune.fraction`` with the lowest ``scores``
     (N,), and masks them if requested; from then on their number stays."""
     options = trainer.config.prune
     whole = trainer.model.scene.without_masks()
-    kept = None if scores is None else highest(scores, options.fraction)
+    kept = None if scores is None else select_highest(scores, options.fraction)
     masks = None
     moves = capability(trainer.config.model, HasMotion) is not None and not whole.is_static
     if options.mask_times > 1 and moves:
@@ -198,7 +200,7 @@ def removal(trainer: GaussianTrainer, scores: Tensor | None) -> TrainingEdit:
 
 
 @torch.no_grad()
-def scores_of(trainer: GaussianTrainer, options: PruneConfig | None = None) -> Tensor:
+def importance_scores(trainer: GaussianTrainer, options: PruneConfig | None = None) -> Tensor:
     """Return (N,) how much each Gaussian matters now, by the score of ``options``; None: the first
     of docs/prune.md."""
     score = (options or PruneConfig()).score
@@ -245,7 +247,7 @@ def probe_images(trainer: Trainer[Any]) -> list[Image]:
 
 
 @torch.no_grad()
-def quality_of(
+def mean_psnr(
     trainer: Trainer[Any],
     scene: Renderable,
     images: Sequence[Image] | None = None,

@@ -23,18 +23,18 @@ from dyngs.config import Config
 from dyngs.config.kinds import is_kind, package_of
 from dyngs.config.schema import (
     allowed_values,
-    as_written,
-    list_choices,
-    default_kind,
-    has_kinds,
     allows_kind,
+    default_kind,
+    format_yaml_value,
+    has_kinds,
     is_section,
+    list_choices,
     list_kinds,
     section_class,
     section_classes,
 )
 from dyngs.config.yaml_reader import Leaf, read_file, read_override
-from dyngs.core.errors import DyngsError, format_one_line, wrap_read_errors, validate_file_name
+from dyngs.core.errors import DyngsError, format_one_line, validate_file_name, wrap_read_errors
 from dyngs.io.containment import follows_links_of_runs
 from dyngs.io.outputs import command_for
 from dyngs.io.write import write_text
@@ -106,7 +106,7 @@ _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
 def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Config:
     """Return the configuration of a preset with overrides laid over it.
 
-    Example::
+    Example:
 
         import dyngs
 
@@ -188,7 +188,7 @@ def load_resolved(
     return config.model_copy(update={"data": data})
 
 
-def drop_removed_model_keys(model: dict[str, object]) -> dict[str, object]:
+def update_model_keys(model: dict[str, object]) -> dict[str, object]:
     """Return the section ``model`` of an earlier version without the keys of
     ``REMOVED_MODEL_KEYS``."""
     removed = REMOVED_MODEL_KEYS.get(str(model.get("kind")), {})
@@ -354,7 +354,7 @@ def _is_removed(key: str, written: object, removed: Mapping[str, object]) -> boo
     if key not in removed:
         return False
     value = removed[key]
-    if as_written(written) == as_written(value):
+    if format_yaml_value(written) == format_yaml_value(value):
         return True
     try:
         return float(str(written)) == value
@@ -447,7 +447,7 @@ def _section(
 def _not_allowed(keys: tuple[str, ...], allowed: str, value: object, choices: list[str]) -> str:
     close = get_close_matches(value[:100], choices, n=1) if isinstance(value, str) else []
     hint = f"; did you mean {close[0]!r}?" if close else ""
-    return f"{'.'.join(keys)} must be {allowed}, not {format_one_line(as_written(value), 60)}{hint}"
+    return f"{'.'.join(keys)} must be {allowed}, not {format_one_line(format_yaml_value(value), 60)}{hint}"
 
 
 def _about_unknown(section: type[BaseModel], keys: tuple[str, ...], layers: _Layers) -> str:

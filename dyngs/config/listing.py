@@ -21,7 +21,7 @@ WIDTH = 118
 _NO_ROOT = "FOLDER"
 
 
-def listing(source: Path, overrides: list[str]) -> str:
+def format_config(source: Path, overrides: list[str]) -> str:
     """Return the resolved configuration of a preset, a YAML file or a run, as YAML with comments.
 
     It is a preset itself. Where it says no ``data.root``, that key stands in a comment.
@@ -59,7 +59,9 @@ def _section(section: BaseModel, values: dict[str, Any], depth: int) -> Iterator
         about = info.description or ""
         if is_section:
             yield "" if depth == 0 else f"{space}#"
-            about = f"{about}; kind is one of {', '.join(list_kinds(info))}" if list_kinds(info) else ""
+            about = (
+                f"{about}; kind is one of {', '.join(list_kinds(info))}" if list_kinds(info) else ""
+            )
         elif name != "kind":
             about += f" ({allowed_values(info)})"
         yield from (f"{space}# {line}" for line in textwrap.wrap(about, WIDTH - 2 - len(space)))

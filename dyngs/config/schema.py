@@ -1,7 +1,7 @@
 """Descriptions of the configuration keys: allowed values, default, meaning; and look-up of sections
 by kind.
 
-Error messages and the table in docs/cli.md are generated from this, so that neither can disagree
+Error messages and docs/reference/config.md are generated from this, so that neither can disagree
 with ``dyngs.config``.
 """
 
@@ -96,18 +96,6 @@ def _kind_key(name: str, info: FieldInfo, variants: list[type[BaseModel]]) -> Co
     )
 
 
-def keys_table() -> str:
-    """Return all keys as a table in Markdown, for docs/cli.md."""
-    lines = ["| key | allowed | default | meaning |", "|---|---|---|---|"]
-    for key in config_keys():
-        variant = f" ({', '.join(key.kinds)})" if key.kinds else ""
-        default = f"`{key.default}`" if key.default else "required"
-        lines.append(
-            f"| `{key.name}`{variant} | {key.allowed} | {default} | {key.description.replace('|', chr(92) + '|')} |"
-        )
-    return "\n".join(lines) + "\n"
-
-
 def allowed_values(info: FieldInfo, plural: bool = False) -> str:
     """Return the allowed values of a field in words: ``an integer >= 1``, ``one of white,
     black``."""
@@ -153,10 +141,10 @@ def list_choices(annotation: Any) -> list[str]:
 
 
 def default_text(info: FieldInfo) -> str:
-    return "" if info.default is PydanticUndefined else as_written(info.default)
+    return "" if info.default is PydanticUndefined else format_yaml_value(info.default)
 
 
-def as_written(value: object) -> str:
+def format_yaml_value(value: object) -> str:
     """Return a value as one writes it in YAML."""
     match value:
         case Enum():
@@ -166,7 +154,7 @@ def as_written(value: object) -> str:
         case None:
             return "null"
         case list() | tuple():
-            return f"[{', '.join(as_written(item) for item in value)}]"
+            return f"[{', '.join(format_yaml_value(item) for item in value)}]"
         case float():
             return f"{value:g}"
         case _:

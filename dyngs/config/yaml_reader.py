@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from dyngs.core.errors import DyngsError, format_one_line, wrap_read_errors, reason
+from dyngs.core.errors import DyngsError, describe_error, format_one_line, wrap_read_errors
 from dyngs.io.fields import read_limited
 
 MAX_BYTES = 2**18
@@ -88,7 +88,7 @@ def _root(text: str, origin: str) -> yaml.Node | None:
     except (yaml.YAMLError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark is not None else ""
-        problem = getattr(error, "problem", None) or reason(error)
+        problem = getattr(error, "problem", None) or describe_error(error)
         if "'\\t'" in problem:
             problem = "a tab where YAML wants spaces; indent with spaces"
         raise DyngsError(

@@ -22,7 +22,7 @@ class DyngsError(Exception):
 
     The command line prints the message and exits with code 2; library callers catch it.
 
-    Example::
+    Example:
 
         import dyngs
 
@@ -65,7 +65,7 @@ def wrap_read_errors(
         ) from cause
     except Exception as cause:
         raise DyngsError(
-            f"{where}: cannot be read ({reason(cause).removesuffix(f': {where}')}); {advice}"
+            f"{where}: cannot be read ({describe_error(cause).removesuffix(f': {where}')}); {advice}"
         ) from cause
 
 
@@ -95,7 +95,7 @@ def require_regular_file(path: str | os.PathLike[str]) -> None:
         )
 
 
-def reason(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """Return the text of ``error`` on one short line of printable characters; its type where it
     does not say much."""
     if isinstance(error, OSError) and error.strerror:
@@ -128,7 +128,7 @@ def quote_word(text: str) -> str:
     return f"$'{word.decode('ascii')}'"
 
 
-def counted(number: int, noun: str) -> str:
+def format_count(number: int, noun: str) -> str:
     """Return a number with what it counts, for people: "1 image", "1,200 images"."""
     return f"{number:,} {noun}{'s' * (number != 1)}"
 
@@ -140,12 +140,12 @@ def format_one_line(text: str, length: int | None = None) -> str:
     return shown if length is None or len(shown) <= length else f"{shown[: length - 3]}..."
 
 
-def show(text: str) -> None:
+def log_info(text: str) -> None:
     """Log lines as information, without anything that a terminal would obey."""
     LOGGER.info("\n".join(map(escape_control_characters, text.split("\n"))))
 
 
-def warn(text: str) -> None:
+def log_warning(text: str) -> None:
     """Log a warning of one line."""
     LOGGER.warning(format_one_line(text))
 

@@ -54,7 +54,7 @@ def ssim(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
     over pixels and channels. With a mask, ignored pixels are replaced by the truth and the map is
     weighted (Wang et al. 2004).
     """
-    return _weighted_mean(ssim_map(masked(rendered, truth, mask), truth), mask)
+    return _weighted_mean(ssim_map(fill_ignored_pixels(rendered, truth, mask), truth), mask)
 
 
 def ssim_map(rendered: Tensor, truth: Tensor) -> Tensor:
@@ -105,7 +105,7 @@ def flip(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> MetricV
 
     a, b = (
         _clamped(x).cpu().float().contiguous().numpy()
-        for x in (truth, masked(rendered, truth, mask))
+        for x in (truth, fill_ignored_pixels(rendered, truth, mask))
     )
     viewing = {"ppd": _FLIP_PIXELS_PER_DEGREE}
     error, _, _ = evaluate(
@@ -117,7 +117,7 @@ def flip(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> MetricV
     )
 
 
-def masked(rendered: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
+def fill_ignored_pixels(rendered: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
     """Return (H, W, 3) the rendered image with ignored pixels replaced by the truth."""
     return (
         rendered
@@ -140,7 +140,7 @@ class Lpips:
             return MetricValue(None, self.reason)
         a, b = (
             _clamped(x).float().permute(2, 0, 1)[None] * 2 - 1
-            for x in (masked(rendered, truth, mask), truth)
+            for x in (fill_ignored_pixels(rendered, truth, mask), truth)
         )
         try:
             with torch.no_grad():

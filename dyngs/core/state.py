@@ -52,7 +52,7 @@ def strip_roles(state: Mapping[str, StateTensor]) -> dict[str, Tensor]:
     return {name: x.tensor for name, x in state.items()}
 
 
-def part_of(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+def select_prefix(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """Return the tensors whose names start with ``prefix.``, without it."""
     start = f"{prefix}."
     return {name.removeprefix(start): x for name, x in tensors.items() if name.startswith(start)}

@@ -163,7 +163,7 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
     points and bodies are in scene coordinates, see ``scene_space.normalise_capture``. The splits
     train, val and test are always present, val and test possibly empty.
 
-    Example::
+    Example:
 
         import dyngs
         from dyngs.data.loader import ImageLoader

@@ -1,4 +1,4 @@
-"""The kind ``dynamic``: Gaussians that a field moves over time."""
+"""Model kind ``dynamic``: Gaussians moved by a deformation field."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from dyngs.core.section import SceneModel
 from dyngs.deform.keys import (
     DynamicModel,
 )
-from dyngs.models.kind import HasSchedules, HasSizeLimit, HasMotion
+from dyngs.models.kind import HasMotion, HasSchedules, HasSizeLimit
 
 if TYPE_CHECKING:
     from dyngs.data.capture import Capture
     from dyngs.models.kind import Restore, Start
-    from dyngs.models.schedule import Length
+    from dyngs.models.schedule import LengthChange
 
 
 class DynamicKind(HasSizeLimit, HasMotion, HasSchedules):
-    """See the module."""
+    """Dynamic scenes of Gaussians."""
 
     def refusal(self, capture: Capture) -> str | None:
         if len({view.time for view in capture.splits["train"]}) > 1:
             return None
         return (
-            "the images have no times, so nothing can move; train configs/static.yaml, or add a time to each image "
-            "(docs/formats.md), or give data.times=order if their names are in the order of time"
+            "the images have no times; train configs/static.yaml, add a time to each image "
+            "(docs/formats.md), or set data.times=order if the file names are in temporal order"
         )
 
     def functions(self) -> tuple[Start, Restore]:
@@ -32,7 +32,7 @@ class DynamicKind(HasSizeLimit, HasMotion, HasSchedules):
 
         return start, restore
 
-    def extend_schedules(self, section: DynamicModel, length: Length) -> DynamicModel:
+    def extend_schedules(self, section: DynamicModel, length: LengthChange) -> DynamicModel:
         from dyngs.deform.schedule import extend_schedules
 
         return extend_schedules(section, length)

@@ -15,7 +15,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from dyngs.core.conventions import SH_C0
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.core.gaussians import Gaussians
 from dyngs.deform.bodies.field import BodyField, find_body_field
 from dyngs.deform.scene import field_scene_of
@@ -286,7 +286,10 @@ def scene_part(scene: GaussianScene, part: Part) -> GaussianScene:
 
 
 def splats_at(
-    opened: OpenedScene, scene: GaussianScene, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
+    opened: OpenedScene,
+    scene: GaussianScene,
+    time: float,
+    how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> SplatFile:
     """Return the content of a file of Gaussians for a scene at one time, in the requested axes.
 
@@ -415,7 +418,7 @@ def write_4dgs(
     with atomic_file(path) as temporary:
         temporary.write_bytes(data)
     notes = (
-        f"{counted(len(times), 'time')}, each shown for 1/{FOURDGS_FPS:.0f} s",
+        f"{format_count(len(times), 'time')}, each shown for 1/{FOURDGS_FPS:.0f} s",
         *offset_notes(splats[0], "4dgs cannot state it"),
     )
     if any(bool(splat.gaussians.sh[:, 1:].any()) for splat in splats):

@@ -11,7 +11,7 @@ from typing import Any, TextIO, TypeGuard
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, wrap_read_errors, require_regular_file
+from dyngs.core.errors import DyngsError, require_regular_file, wrap_read_errors
 from dyngs.io.containment import inside, require_at_most
 
 MOST_TEXT_BYTES = 1 << 26

@@ -18,7 +18,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, wrap_read_errors, require_regular_file
+from dyngs.core.errors import DyngsError, require_regular_file, wrap_read_errors
 from dyngs.io.fields import require_at_most
 
 _TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}

@@ -43,7 +43,9 @@ def read_arrays(
         total = 0
         for name, info in picked.items():
             with (
-                wrap_read_errors(f"{path}: '{name:.40}'", "it must be an array of numbers; export it again"),
+                wrap_read_errors(
+                    f"{path}: '{name:.40}'", "it must be an array of numbers; export it again"
+                ),
                 archive.open(info) as stream,
             ):
                 found[name] = _array(stream, total, path)

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dyngs.core.errors import DyngsError, quote_path, require_regular_file, warn
+from dyngs.core.errors import DyngsError, log_warning, quote_path, require_regular_file
 from dyngs.io.containment import leaving_links
 from dyngs.io.fields import read_limited
 from dyngs.io.write import remove_quietly, require_replaceable, temporary_folder_beside, write_text
@@ -275,7 +275,7 @@ def _locked(path: Path) -> tuple[int, bool]:
             _lock(file)
         except OSError as error:
             if error.errno in _WITHOUT_LOCKS:
-                warn(
+                log_warning(
                     f"{folder}: this file system has no locks ({error.strerror}); "
                     "see to it that no two commands write into that folder at once"
                 )

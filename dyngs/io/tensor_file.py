@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from dyngs.core.errors import DyngsError, reason, require_regular_file
+from dyngs.core.errors import DyngsError, describe_error, require_regular_file
 from dyngs.io.write import atomic_file, remove_quietly, temporary_folder_beside
 
 
@@ -79,7 +79,7 @@ def read_tensors(
             is_there = not isinstance(error, FileNotFoundError)
             advice = "; the file itself may be whole: keep it, try again" if is_there else ""
         raise DyngsError(
-            f"{path}: cannot be read as {kind.what} ({reason(error)}){advice}"
+            f"{path}: cannot be read as {kind.what} ({describe_error(error)}){advice}"
         ) from error
     if not isinstance(header, dict) or "format" not in header:
         raise DyngsError(f"{path}: not {kind.what} of dyngs{advice}")

@@ -14,11 +14,11 @@ from dyngs.config import Config, DataConfig
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.core.section import ModelSection
-from dyngs.core.state import part_of
+from dyngs.core.state import select_prefix
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.data.scene_space import change_coordinates
-from dyngs.models.kind import kind_of
+from dyngs.models.kind import find_kind
 from dyngs.models.renderable import Renderable
 
 CONFIG_ADVICE = "was its config changed? Otherwise train anew"
@@ -123,7 +123,7 @@ class Checkpoint:
 
     def part(self, prefix: str) -> dict[str, Tensor]:
         """Return the tensors whose names start with ``prefix.``, without it."""
-        return part_of(self.tensors, prefix)
+        return select_prefix(self.tensors, prefix)
 
 
 def restore_model(checkpoint: Checkpoint, model: ModelSection) -> Renderable:
@@ -135,6 +135,6 @@ def restore_model(checkpoint: Checkpoint, model: ModelSection) -> Renderable:
     """
     with wrap_read_errors(checkpoint.name, CONFIG_ADVICE):
         try:
-            return kind_of(model).restore(model, checkpoint)
+            return find_kind(model).restore(model, checkpoint)
         except KeyError as missing:
             raise DyngsError(f"{checkpoint.name} lacks {missing}; {CONFIG_ADVICE}") from None

@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from dyngs.models.model import Model
     from dyngs.models.prediction import Learner, Predictor
     from dyngs.models.renderable import Posable, Renderable
-    from dyngs.models.schedule import Length
+    from dyngs.models.schedule import LengthChange
 
-    Start = Callable[["RunStart"], Model[Any]]
+    Start = Callable[["StartContext"], Model[Any]]
     Restore = Callable[[Any, Checkpoint], Renderable]
     MakeLearner = Callable[[Config, torch.Generator], Learner[Any]]
     MakePredictor = Callable[
@@ -159,7 +159,7 @@ class HasSchedules(ModelKind):
     """A kind whose section has schedules that depend on the length of the run."""
 
     @abstractmethod
-    def extend_schedules(self, section: Any, length: Length) -> ModelSection:
+    def extend_schedules(self, section: Any, length: LengthChange) -> ModelSection:
         """Return the section for a run that goes on to another length. Raises DyngsError: it
         cannot."""
 
@@ -205,12 +205,12 @@ class PlayedMotion:
     notes: tuple[str, ...]
 
 
-def kind_of(section: ModelSection) -> ModelKind:
+def find_kind(section: ModelSection) -> ModelKind:
     """Return the kind of a section of the configuration."""
     return cast(ModelKind, installed_kind(section.kind))
 
 
 def capability(section: ModelSection, wanted: type[C]) -> C | None:
     """Return the kind of a section if it has a capability, else None."""
-    kind = kind_of(section)
+    kind = find_kind(section)
     return kind if isinstance(kind, wanted) else None

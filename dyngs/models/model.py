@@ -21,12 +21,12 @@ from dyngs.ops.adam import Count
 S_co = TypeVar("S_co", bound=Renderable, covariant=True)
 
 
-def nothing() -> None:
+def do_nothing() -> None:
     """Do nothing."""
 
 
 @dataclass(frozen=True)
-class Drawn:
+class RenderOutput:
     """A training image as a model draws it."""
 
     rendering: Rendering  # of the image's camera
@@ -35,7 +35,7 @@ class Drawn:
     # tensors that something learned has moved, by name: one that is not finite would not be drawn,
     # so that a diverging field could go unseen; empty: nothing was
     moved: Mapping[str, Tensor] = field(default_factory=dict)
-    after_backward: Callable[[], None] = nothing  # takes in gradients once they are there
+    after_backward: Callable[[], None] = do_nothing  # takes in gradients once they are there
     # what the rendering is compared with where that is only some pixels of the image; None: the
     # whole image
     image: Image | None = None
@@ -67,7 +67,9 @@ class Model(ABC, Generic[S_co]):
         """What is trained, as it is now."""
 
     @abstractmethod
-    def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+    def draw(
+        self, image: Image, step: int, background: Tensor, *, depth: bool = False
+    ) -> RenderOutput:
         """Return how ``image`` is drawn in ``step`` before ``background`` (3,), differentiable."""
 
     @abstractmethod
@@ -142,7 +144,7 @@ class LossInput:
     index: int  # of the view
     step: int
     image: Image  # what was trained on, with a mask of the pixels that count
-    drawn: Drawn
+    drawn: RenderOutput
     # rendered, truth: (H, W, 3) that are compared, on the same background
     rendered: Tensor
     truth: Tensor

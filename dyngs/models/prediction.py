@@ -249,7 +249,7 @@ def image_loss(
     return loss
 
 
-def updated(
+def optimizer_step(
     optimizer: torch.optim.Optimizer, network: nn.Module, loss: Tensor, rate: float
 ) -> bool:
     """Do a step at the learning rate ``rate``; return False, and do none, for gradients that are

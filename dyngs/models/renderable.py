@@ -92,7 +92,7 @@ class DrawOptions:
 class Rendering:
     """V rendered images.
 
-    Example::
+    Example:
 
         import torch
 
@@ -284,7 +284,7 @@ def fixed_cameras(cameras: Cameras, background: Tensor | None, like: Tensor) -> 
     return cameras
 
 
-def composited(
+def composite_background(
     rgb: Tensor,
     transmittance: Tensor,
     depth: Tensor | None,

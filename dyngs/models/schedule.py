@@ -10,7 +10,7 @@ PUBLISHED_STEPS = 30_000
 
 
 @dataclass(frozen=True)
-class Length:
+class LengthChange:
     """A change of the length of a run."""
 
     done: int
@@ -34,7 +34,7 @@ class Length:
         )
 
 
-def scaled(step: int, steps: int) -> int:
+def scale_step(step: int, steps: int) -> int:
     """Return ``step`` of a 30,000-step run in a run of ``steps``; at least 1."""
     return max(1, round(step * steps / PUBLISHED_STEPS))
 

@@ -19,7 +19,7 @@ LIGHT = 5e-3  # Weight below which a sample hardly shows
 EVERY = 4  # So many of those are one
 
 
-def rays_of(cameras: Cameras, pixels: Tensor | None = None) -> tuple[Rays, Tensor]:
+def camera_rays(cameras: Cameras, pixels: Tensor | None = None) -> tuple[Rays, Tensor]:
     """Return the rays of one camera through the centres of ``pixels`` (R,), row by row; None: of
     all.
 

@@ -174,7 +174,11 @@ def _write_seconds(run_dir: Path, step: int, seconds: float) -> None:
 
 def _instead_of(path: Path) -> str:
     """Return the end of a message on what to do about a damaged checkpoint."""
-    older = [p for p in checkpoint_paths(path.parent.parent) if checkpoint_step(p) < checkpoint_step(path)]
+    older = [
+        p
+        for p in checkpoint_paths(path.parent.parent)
+        if checkpoint_step(p) < checkpoint_step(path)
+    ]
     if older:
         return f"; delete it to go on from the previous one, {older[-1].name}"
     return "; there is no older one, train anew"

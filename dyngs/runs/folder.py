@@ -34,8 +34,8 @@ from dyngs.runs.checkpoint import (
     TIMING_NAME,
     LoadedRun,
     checkpoint_paths,
-    has_only_scene_file,
     checkpoint_step,
+    has_only_scene_file,
 )
 
 BODY_FOLDER = "body"
@@ -113,7 +113,15 @@ CHOICES_NAME = "choices.json"
 REQUESTED_NAME = "asked.yaml"
 """In a run folder: the configuration as it was asked for, where training has chosen something else
 (config.yaml)."""
-_BEGUN = (RESOLVED_NAME, REQUESTED_NAME, LOG_NAME, TIMING_NAME, CHOICES_NAME, RECORD_NAME, BODY_FOLDER)
+_BEGUN = (
+    RESOLVED_NAME,
+    REQUESTED_NAME,
+    LOG_NAME,
+    TIMING_NAME,
+    CHOICES_NAME,
+    RECORD_NAME,
+    BODY_FOLDER,
+)
 """Files that a run stopped before its first checkpoint may have written."""
 
 
@@ -252,7 +260,7 @@ def is_stopped_before_checkpoint(folder: Path) -> bool:
     return _config_of_begun(folder) is not None
 
 
-def begin(folder: Path, config: Config) -> None:
+def write_new_config(folder: Path, config: Config) -> None:
     """Write the configuration of a run, unless the same one is there already."""
     begun = _config_of_begun(folder)
     if begun is None or not _is_same_run(begun, config):
@@ -349,7 +357,8 @@ def _named_by(one: Read) -> Iterator[Path]:
 
 def _files_of_run(run_dir: Path) -> Iterator[Path]:
     yield from (
-        run_dir / name for name in (RESOLVED_NAME, REQUESTED_NAME, LOG_NAME, TIMING_NAME, RECORD_NAME)
+        run_dir / name
+        for name in (RESOLVED_NAME, REQUESTED_NAME, LOG_NAME, TIMING_NAME, RECORD_NAME)
     )
     yield from checkpoint_paths(run_dir)
     yield from (run_dir / BODY_FOLDER).glob("*")

@@ -15,7 +15,7 @@ from torch import Tensor
 from dyngs.config import Config, DataConfig
 from dyngs.config.kinds import installed_kind
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.capture import Capture, Split, View
 from dyngs.data.geometry import up_direction
 from dyngs.gaussians.rendering import file_render_options
@@ -54,7 +54,7 @@ class Cache:
         return self._kept[name]
 
 
-class Captured(Cache):
+class SourceCapture(Cache):
     """The capture that a scene was trained on, in its coordinates.
 
     Attributes:
@@ -95,7 +95,7 @@ class OpenedScene(LoadedRun, Cache):
     """
 
     name: str = ""
-    captured: Captured | None = None
+    captured: SourceCapture | None = None
     turned: tuple[float, float, float, float] = _NO_TURN
     edited: RunFrame | None = None
     stated_up: str | None = None
@@ -125,7 +125,7 @@ class OpenedScene(LoadedRun, Cache):
 
     @property
     def cameras(self) -> Cameras | None:
-        """As of ``Captured``; None where no capture can be read."""
+        """As of ``SourceCapture``; None where no capture can be read."""
         return None if self.captured is None else self.captured.cameras
 
     @property
@@ -305,16 +305,18 @@ def open_scene(
     return replace(opened, info=info, turned=splat.turned)
 
 
-def open_run(folder: Path, data_root: Path | None = None, *, with_capture: bool = True) -> OpenedScene:
+def open_run(
+    folder: Path, data_root: Path | None = None, *, with_capture: bool = True
+) -> OpenedScene:
     """Open a run folder at its newest checkpoint, see ``load_run``."""
     run = load_run(folder, data_root)
     edited = read_frame(folder)
     captured = None
     if with_capture:
         try:
-            captured = Captured(run.config.data, read_run_capture(run.config.data, run.info))
+            captured = SourceCapture(run.config.data, read_run_capture(run.config.data, run.info))
         except DyngsError as error:
-            captured = Captured(run.config.data, error)
+            captured = SourceCapture(run.config.data, error)
     opened = OpenedScene(**vars(run), name=folder.absolute().name, captured=captured, path=folder)
     if edited is None:
         return opened
@@ -362,7 +364,9 @@ def split_views(capture: Capture, split: str) -> Sequence[View]:
     views = {str(name): views for name, views in capture.splits.items() if views}
     if split in views:
         return views[split]
-    there = ", ".join(f"{name} ({counted(len(found), 'view')})" for name, found in views.items())
+    there = ", ".join(
+        f"{name} ({format_count(len(found), 'view')})" for name, found in views.items()
+    )
     raise DyngsError(
         f"{capture.root}: the split {split!r} has no views; there is {there or 'none'}"
     )

@@ -194,7 +194,7 @@ class Coding(NamedTuple):
         return (self.step * 2.0 ** coarseness.astype(np.float64)).reshape(-1, *[1] * (num_axes - 1))
 
 
-def drawable(scene: Renderable) -> dict[str, Tensor]:
+def tensors_to_store(scene: Renderable) -> dict[str, Tensor]:
     """Return the tensors for drawing in an equivalent form that is cheaper to store: axes sorted by
     length.
 
@@ -220,7 +220,7 @@ def drawable(scene: Renderable) -> dict[str, Tensor]:
     return kept
 
 
-def completed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def to_checkpoint_tensors(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the tensors of a checkpoint that can be drawn, but not trained on, from stored ones.
 
     Raises KeyError: one is missing that every scene of Gaussians has. ValueError: the tensors of
@@ -245,7 +245,7 @@ def storage_edit(scene: GaussianScene, means: np.ndarray) -> TopologyEdit:
     return TopologyEdit.select(torch.from_numpy(storage_order(means, scene.offset_rows.numpy())))
 
 
-def group_of(name: str, x: Tensor) -> str | None:
+def step_group(name: str, x: Tensor) -> str | None:
     """Return the name of the group that shares a step, without the number at its end; None where
     there is no step."""
     if x.dtype != torch.float32 or name in (RELATIVE, POSITIVE) or name in FIXED_STEPS:
@@ -263,7 +263,7 @@ def choose_coding(
     ``steps``: group (or name, where it has none) to the largest step, 0 for none: stored as it is;
     a group that lacks is stored in half precision.
     """
-    group = group_of(name, x)
+    group = step_group(name, x)
     if name == POSITIVE or steps.get(group or name) == 0:
         return Coding("exact")
     if name in FIXED_STEPS:
@@ -336,7 +336,7 @@ def dequantize_tensor(
     return torch.from_numpy(np.asarray(values.astype(dtype)))
 
 
-def restored(x: Tensor, coding: Coding, coarseness: np.ndarray | None = None) -> Tensor:
+def round_trip(x: Tensor, coding: Coding, coarseness: np.ndarray | None = None) -> Tensor:
     """Return ``x`` as it is read back."""
     whole = quantize_tensor(x, coding, coarseness)
     return dequantize_tensor(*whole, coding, _name_of(x), coarseness)
@@ -355,7 +355,7 @@ class Packing(NamedTuple):
     planes: int  # bytes per number; all lowest bytes come first
 
 
-def packed(whole: np.ndarray) -> tuple[Packing, bytes]:
+def pack_integers(whole: np.ndarray) -> tuple[Packing, bytes]:
     """Return the smallest of some ways to store ``whole`` (int64, any shape) as bytes."""
     best = -1, True
     if whole.size >= 512:
@@ -368,7 +368,7 @@ def packed(whole: np.ndarray) -> tuple[Packing, bytes]:
     return packing, compress_lzma(plain)
 
 
-def unpacked(packing: Packing, data: bytes, shape: tuple[int, ...]) -> np.ndarray:
+def unpack_integers(packing: Packing, data: bytes, shape: tuple[int, ...]) -> np.ndarray:
     """Return int64 numbers of ``shape``. Raises DyngsError if the bytes do not hold that many
     numbers."""
     count = math.prod(shape)
@@ -463,7 +463,7 @@ class _Header(_Strict):
 
 
 def write_scene(path: Path, data: bytes) -> None:
-    """Write the bytes of ``encoded`` atomically. Raises DyngsError for a full disk and the like."""
+    """Write the bytes of ``encode_scene`` atomically. Raises DyngsError for a full disk and the like."""
     with atomic_file(path, durable=True) as temporary:
         temporary.write_bytes(data)
 
@@ -476,14 +476,14 @@ def read_scene(path: Path) -> Checkpoint:
     """
     require_regular_file(path)
     try:
-        return decoded(path.read_bytes())
+        return decode_scene(path.read_bytes())
     except OSError as error:
         raise DyngsError(f"{path}: cannot be read ({error.strerror or error})") from None
     except DyngsError as error:
         raise DyngsError(f"{path}: {error}") from None
 
 
-def encoded(
+def encode_scene(
     info: CheckpointInfo,
     scene: Renderable,
     steps: Mapping[str, float],
@@ -496,13 +496,13 @@ def encoded(
     precision. ``coarseness`` (N,) uint8 of the Gaussians, see ``coarseness_of``; None: all are
     stored alike.
     """
-    kept = drawable(scene)
+    kept = tensors_to_store(scene)
     rows = None
     if isinstance(scene, GaussianScene):
         means = kept["gaussians.means"]
-        near = restored(means, choose_coding("gaussians.means", means, steps))
+        near = round_trip(means, choose_coding("gaussians.means", means, steps))
         edit = storage_edit(scene, near.numpy())
-        kept = drawable(scene.apply_edit(edit))
+        kept = tensors_to_store(scene.apply_edit(edit))
         if coarseness is not None:
             kept[COARSENESS] = edit.apply(coarseness)
             rows = kept[COARSENESS].numpy()
@@ -513,7 +513,7 @@ def encoded(
         entry, block = encode_tensor(name, kept[name], coding, rows)
         entries.append(entry)
         blocks.append(block)
-    return with_header(asdict(info), entries, blocks)
+    return assemble_file(asdict(info), entries, blocks)
 
 
 def encode_tensor(
@@ -522,14 +522,14 @@ def encode_tensor(
     """Return the entry of a tensor in the header, and its bytes; ``rows`` (N,) is its
     coarseness."""
     numbers, far = quantize_tensor(x, coding, rows)
-    packing, block = packed(numbers)
+    packing, block = pack_integers(numbers)
     own = {"name": name, "dtype": _name_of(x), "shape": tuple(x.shape)}
     own |= {"size": len(block), "far": len(far)}
     entry = _Entry.model_validate(own | coding._asdict() | packing._asdict())
     return entry, block + far.astype("<i8").tobytes()
 
 
-def with_header(info: dict[str, Any], entries: list[_Entry], blocks: list[bytes]) -> bytes:
+def assemble_file(info: dict[str, Any], entries: list[_Entry], blocks: list[bytes]) -> bytes:
     """Return the bytes of a file of stored tensors; ``info`` are the fields of ``CheckpointInfo``."""
     header = _Header(info=info, tensors=tuple(entries)).model_dump_json()
     packed_header = compress_lzma(header.encode(), room=MAX_HEADER)
@@ -540,9 +540,9 @@ def with_header(info: dict[str, Any], entries: list[_Entry], blocks: list[bytes]
     return body + hashlib.sha256(body).digest()
 
 
-def decoded(data: bytes) -> Checkpoint:
+def decode_scene(data: bytes) -> Checkpoint:
     """Return the checkpoint in the bytes of a file. Raises DyngsError: anything but what
-    ``encoded`` makes."""
+    ``encode_scene`` makes."""
     if data[: len(MAGIC)] != MAGIC:
         is_other = data.startswith(MAGIC[:6]) and len(data) > len(MAGIC)
         raise DyngsError(
@@ -556,7 +556,9 @@ def decoded(data: bytes) -> Checkpoint:
     start = len(MAGIC) + 4
     end = start + int.from_bytes(body[len(MAGIC) : start], "little")
     try:
-        header = _Header.model_validate_json(decompress_lzma(body[start:end], MAX_HEADER, exact=False))
+        header = _Header.model_validate_json(
+            decompress_lzma(body[start:end], MAX_HEADER, exact=False)
+        )
         num_values = sum(math.prod(entry.shape) for entry in header.tensors)
         if num_values > FREE_VALUES + VALUES_PER_BYTE * len(body):
             raise DyngsError(f"it claims {num_values} values, more than a file of its size holds")
@@ -567,7 +569,7 @@ def decoded(data: bytes) -> Checkpoint:
             tensors[entry.name] = _tensor(entry, block, tensors.get(COARSENESS))
         if any(body[end:]) or end > len(body):
             raise DyngsError("it holds something else than its header says")
-        return Checkpoint(parse_info(header.info), completed(tensors))
+        return Checkpoint(parse_info(header.info), to_checkpoint_tensors(tensors))
     except KeyError as missing:
         raise DyngsError(f"it lacks {format_one_line(str(missing), 60)}") from None
     except ValidationError as error:
@@ -582,7 +584,7 @@ def _tensor(entry: _Entry, block: bytes, coarseness: Tensor | None) -> Tensor:
     # rotations are stored as three integers
     shape = (*entry.shape[:-1], 3) if entry.kind == "rotation" else entry.shape
     packing = Packing(entry.axis, entry.by_rows, entry.signed, entry.planes)
-    numbers = unpacked(packing, block[: entry.size], shape)
+    numbers = unpack_integers(packing, block[: entry.size], shape)
     far = np.frombuffer(block[entry.size :], dtype="<i8").astype(np.int64).reshape(entry.far, 2)
     coding = Coding(entry.kind, entry.step, entry.by_coarseness)
     rows = None if coarseness is None else coarseness.clamp(0, MAX_COARSENESS).numpy()

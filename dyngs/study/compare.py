@@ -96,7 +96,9 @@ class ModelComparison:
         keys = {word.partition("=")[0] for word in [*fixed, "run.dir", "budget.", "train.minutes"]}
         for word in self.overrides:
             if word.startswith(tuple(keys)):
-                raise DyngsError(f"{format_one_line(word, 80)}: set by `dyngs compare`; use its options")
+                raise DyngsError(
+                    f"{format_one_line(word, 80)}: set by `dyngs compare`; use its options"
+                )
         of_data = [word for word in self.overrides if word.startswith("data.")]
         data = load_config(None, [*of_data, fixed[0]]).data
         capture = read_capture(data)
@@ -183,7 +185,7 @@ class ModelComparison:
                 show(f"{study_scene.name}: skipped: {result}")
             else:
                 done = f"{result.steps:,} steps in {result.seconds:.0f} s"
-                show(f"{study_scene.name}: {result.psnr:.2f} dB, {done}")
+                log_info(f"{study_scene.name}: {result.psnr:.2f} dB, {done}")
         if not study_scenes:
             name, problem = next(iter(left_out.items()))
             raise DyngsError(f"no model could be trained; {name}: {problem}")

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field, TypeAdapter
 
-from dyngs.core.errors import counted, show
+from dyngs.core.errors import format_count, log_info
 from dyngs.core.metrics import load_lpips
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced

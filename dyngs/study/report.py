@@ -186,7 +186,9 @@ def csv_text(rows: Sequence[Mapping[str, object]]) -> str:
 def _escape_formula(value: object) -> object:
     if not isinstance(value, str):
         return value
-    return escape_control_characters(f"'{value}" if value.lstrip()[:1] in ("=", "+", "-", "@") else value)
+    return escape_control_characters(
+        f"'{value}" if value.lstrip()[:1] in ("=", "+", "-", "@") else value
+    )
 
 
 def html_table(head: Sequence[str], cells: Cells) -> str:

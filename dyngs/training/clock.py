@@ -16,7 +16,7 @@ from functools import partial
 from statistics import fmean
 
 from dyngs.config import Config
-from dyngs.models.schedule import image_divisor, scaled
+from dyngs.models.schedule import image_divisor, scale_step
 
 # Cost of a step: constant, per 1e6 rendered pixels, per Gaussian. Milliseconds on two CPU cores.
 FIXED, PER_MEGAPIXEL, PER_GAUSSIAN = 6.0, 300.0, 7e-4
@@ -150,7 +150,7 @@ class TimeForecast:
         detail. The configured cap limits the result.
         """
         now = self._marks[-1]
-        stop = scaled(config.strategy.stop, config.train.steps)
+        stop = scale_step(config.strategy.stop, config.train.steps)
         if now.step >= stop:
             return now.num_gaussians
         added = max(now.num_gaussians - since.num_gaussians, 0) / max(now.step - since.step, 1)

@@ -9,7 +9,7 @@ import torch
 from dyngs.capture.initial_points import with_first_points
 from dyngs.capture.inspection import before_training
 from dyngs.config import Config, PointsInit, RandomInit
-from dyngs.core.errors import warn
+from dyngs.core.errors import log_warning
 from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader, usual_threads
 from dyngs.data.read import read_capture, require_images
@@ -74,7 +74,7 @@ def build_trainer(
             capture.splits["train"], config.data, with_maps=True, decoding_threads=usual_threads()
         )
     priors = PriorLosses()
-    kind = kind_of(config.model)
+    kind = find_kind(config.model)
     if "train.priors" in kind.uses:
         moves = isinstance(kind, HasMotion) and len(set(training_times(capture))) > 1
         priors = load_priors(config, capture, images.views, moves=moves)

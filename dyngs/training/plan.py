@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dyngs.config import Config, TrainConfig
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.capture import Capture
 from dyngs.gaussians.initialization import InitialGaussians
 from dyngs.models.kind import HasSchedules, capability
@@ -68,7 +68,7 @@ def extend_config(config: Config, done: int, steps: int) -> Config:
         DyngsError: ``steps`` is not larger than ``done``, the run was pruned, or its exposures or
             its motion started too early for the new length.
     """
-    length = Length(done, config.train.steps, steps)
+    length = LengthChange(done, config.train.steps, steps)
     if done > length.was:
         raise DyngsError(
             f"train.steps={steps}: a run that was pruned (after step {length.was:,}) cannot be "
@@ -87,7 +87,7 @@ def extend_config(config: Config, done: int, steps: int) -> Config:
     return config.model_copy(update=changed)
 
 
-def _require_exposures_stay(config: Config, length: Length) -> None:
+def _require_exposures_stay(config: Config, length: LengthChange) -> None:
     begun, begins = (round(WARM_UP * steps) for steps in (length.was, length.steps))
     if config.train.exposure == "always" and begun < length.done <= begins:
         raise DyngsError(
@@ -109,13 +109,13 @@ def describe_extension(before: Config, after: Config, done: int) -> str:
     )
 
 
-def _train(options: TrainConfig, length: Length) -> TrainConfig:
+def _train(options: TrainConfig, length: LengthChange) -> TrainConfig:
     changed: dict[str, object] = {"steps": length.steps, "minutes": None}
     full_at = max(options.resolution_grows_from, options.resolution_full_at)
     if options.initial_downscale > 1 and length.done >= options.resolution_grows_from * length.was:
         changed["resolution_grows_from"] = length.kept(options.resolution_grows_from * length.was)
         changed["resolution_full_at"] = length.kept(full_at * length.was)
     if length.steps > length.was:
-        pace = scaled(options.sh_every, length.was)
+        pace = scale_step(options.sh_every, length.was)
         changed["sh_every"] = max(1, pace * PUBLISHED_STEPS // length.steps)
     return options.model_copy(update=changed)

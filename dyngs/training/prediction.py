@@ -60,7 +60,7 @@ class NetworkTrainer:
     def update(self, loss: Tensor, step: int) -> None:
         """Run a step of AdamW, skipped if gradients are not finite."""
         rate = one_cycle_rate(self.learner.lr, step, self.config.train.steps)
-        self.bad_gradients += not updated(self.optimizer, self.learner.network, loss, rate)
+        self.bad_gradients += not optimizer_step(self.optimizer, self.learner.network, loss, rate)
 
     def apply(self, edit: TrainingEdit) -> None:
         """Do nothing: networks have no limits that edit a run."""

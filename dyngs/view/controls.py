@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.scene import as_human_scene
@@ -242,7 +242,7 @@ class Controls:
         def record(**changes: Any) -> None:
             nonlocal recording
             recording = replace(recording, **changes)
-            count = counted(len(recording), "keyframe")
+            count = format_count(len(recording), "keyframe")
             status.content = f"{count}, {recording.duration:.1f} s"
 
         def add(_: Any) -> None:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from dyngs.api.edit import write_part
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.geometry import look_at, perpendicular, with_poses
 from dyngs.export.edit.crop import Box, gaussians_in_region
 from dyngs.gaussians.scene import GaussianScene
@@ -44,7 +44,11 @@ def world_of(opened: OpenedScene) -> Similarity:
 
 
 def pick_point(
-    opened: OpenedScene, origin: np.ndarray, direction: np.ndarray, pixel: float, request: ViewRequest
+    opened: OpenedScene,
+    origin: np.ndarray,
+    direction: np.ndarray,
+    pixel: float,
+    request: ViewRequest,
 ) -> np.ndarray | None:
     """Return the point (3,) where a ray hits the scene, or None.
 

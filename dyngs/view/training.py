@@ -119,7 +119,7 @@ def opened_training(trainer: Trainer[Any]) -> OpenedScene:
     config = trainer.config
     views = trainer.images.views
     shown = captured_views(views, config.data, trainer.images)
-    captured = Captured(config.data, trainer.capture)
+    captured = SourceCapture(config.data, trainer.capture)
     captured.once("views", lambda: shown)
     with torch.no_grad():
         scene = _shell(trainer.model.scene, background_colour(trainer.background))

@@ -16,7 +16,7 @@ from PIL import Image
 from two_balls import two_balls
 
 from dyngs.api import choose as module
-from dyngs.api.choose import Choice, as_static, choose, explained_pixels
+from dyngs.api.choose import Choice, as_static, explained_pixels, resolve_auto_settings
 from dyngs.api.train import train
 from dyngs.config import Config, DataConfig, RunConfig
 from dyngs.config.io import load_config, packaged_preset
@@ -56,7 +56,7 @@ def test_few_views_are_held_out_in_two_folds_and_many_in_one() -> None:
 
 def test_a_capture_without_times_is_refused_with_what_to_add(still: Path) -> None:
     with pytest.raises(DyngsError, match=r"no times.*configs/static.yaml.*data\.times=order"):
-        choose(preset(still), read_capture(DataConfig(root=still)))
+        resolve_auto_settings(preset(still), read_capture(DataConfig(root=still)))
 
 
 def test_half_is_explained_and_neither_image_is_favoured() -> None:
@@ -137,7 +137,7 @@ def test_never_worse_than_static(
         keys = ["init.num_random=300", "model.num_random_moving=150", "data.times=order"]
     monkeypatch.setattr(module, "MOTION", replace(module.MOTION, steps=steps))
     config = preset(root, "train.steps=20_000", *keys, "colour.kind=sh")
-    best, (choice,), _ = choose(config, read_capture(config.data))
+    best, (choice,), _ = resolve_auto_settings(config, read_capture(config.data))
     assert choice.taken is moves, choice
     assert isinstance(best.model, DynamicModel) is moves
 
@@ -162,7 +162,7 @@ def test_interrupted_pilot_runs_leave_nothing_and_repeat(
             train(config)
     assert not list(run.glob("*"))
     capture = read_capture(config.data)
-    first, second = (choose(config, capture)[1][0] for _ in range(2))
+    first, second = (resolve_auto_settings(config, capture)[1][0] for _ in range(2))
     assert replace(first, seconds=0) == replace(second, seconds=0)
 
 
@@ -187,6 +187,6 @@ def test_a_clear_gain_is_taken_and_noise_is_not(
         "data.longest_side=8",
     )
     config = preset(still, *keys, name="static")
-    best, choices, _ = choose(config, read_capture(config.data))
+    best, choices, _ = resolve_auto_settings(config, read_capture(config.data))
     assert compared == [("camera.refine=always", "never"), ("train.exposure=always", "always")]
     assert (best.camera.refine, best.train.exposure, len(choices)) == ("always", "never", 2)

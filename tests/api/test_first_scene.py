@@ -9,7 +9,7 @@ import torch
 from moving_scene import write_moving_run
 
 from dyngs.api.edit import Edits, edit_scene
-from dyngs.api.first_scene import first_of
+from dyngs.api.first_scene import load_initial_gaussians
 from dyngs.api.stages import continue_scene
 from dyngs.api.train import train
 from dyngs.cli import main
@@ -86,7 +86,7 @@ def psnr_of(run: Path) -> float:
 def test_it_begins_where_the_scene_was(kind: str, capture: Path, run: Path, tmp_path: Path) -> None:
     source = run if kind == "run" else write_run_splats(open_run(run), tmp_path / "a.ply").path
     config = settled(going_on(capture, source, tmp_path / "new"))
-    first = first_of(config, read_capture(config.data))
+    first = load_initial_gaussians(config, read_capture(config.data))
     assert first is not None
     assert first.frozen is None
     old = open_run(run).scene.gaussians
@@ -129,7 +129,7 @@ def test_what_is_outside_the_box_keeps_its_bytes(capture: Path, run: Path, tmp_p
     config = settled(
         going_on(capture, run, tmp_path / "new", f"init.box={list(BOX)}", "strategy.kind=fixed")
     )
-    first = first_of(config, read_capture(config.data))
+    first = load_initial_gaussians(config, read_capture(config.data))
     assert first is not None
     assert first.frozen is not None
     frozen, free = (first.gaussians.select(x) for x in (first.frozen, ~first.frozen))
@@ -168,7 +168,7 @@ def test_an_edited_run_goes_on_with_its_own_cameras(
         == 0
     )
     config = going_on(tmp_path / "cameras", edited, tmp_path / "new", "data.follow_links=true")
-    first = first_of(config, read_capture(config.data))
+    first = load_initial_gaussians(config, read_capture(config.data))
     assert first is not None
     again = read_capture(config.data)
     moved = open_run(edited).frame.gaussians(open_run(run).scene.gaussians)

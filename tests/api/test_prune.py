@@ -11,10 +11,10 @@ from moving_scene import write_moving_run
 from pretend_gpu import GPU, pretend_gpu
 from tiny_fields import busy_config, write_tiny_capture
 
-from dyngs.api.prune import file_of, prune_run, prune_to_loss
+from dyngs.api.prune import export_folder, prune_run, prune_to_loss
 from dyngs.api.train import train
 from dyngs.compress.search import held_out_indices
-from dyngs.compress.stage import quality_of
+from dyngs.compress.stage import mean_psnr
 from dyngs.config import PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
@@ -59,7 +59,7 @@ def test_it_is_the_stage_of_training_afterwards(run_dir: Path, tmp_path: Path) -
     assert checkpoint_paths(small)[-1].read_bytes() == checkpoint_paths(whole)[-1].read_bytes()
     assert load_run(run_dir).step == 24, "the first run is as it was"
     assert (small / "log.jsonl").read_text().count("\n") >= 30
-    assert len(load_run(file_of(small)).scene) == len(load_run(small).scene)
+    assert len(load_run(export_folder(small)).scene) == len(load_run(small).scene)
 
 
 @pytest.mark.usefixtures("few_candidates")
@@ -81,13 +81,13 @@ def test_on_a_gpu_it_is_the_same(
     """The search, of few candidates, its file, and the comparison with the run before."""
     briefly = ("prune.steps=1", "run.threads=1")
     expected = prune_to_loss(run_dir, tmp_path / "here", 3.0, briefly, silent)
-    here = compare_runs([run_dir, file_of(tmp_path / "here")], 1)
+    here = compare_runs([run_dir, export_folder(tmp_path / "here")], 1)
     monkeypatch.setattr("dyngs.training.new_trainer.select_device", lambda _: GPU)
     with pretend_gpu():
         found = prune_to_loss(run_dir, tmp_path / "there", 3.0, briefly, silent)
-        there = compare_runs([run_dir, file_of(tmp_path / "there")], 1, GPU)
+        there = compare_runs([run_dir, export_folder(tmp_path / "there")], 1, GPU)
     assert found == expected
-    files = [file_of(tmp_path / name) / SCENE_FILE for name in ("there", "here")]
+    files = [export_folder(tmp_path / name) / SCENE_FILE for name in ("there", "here")]
     assert files[0].read_bytes() == files[1].read_bytes()
     assert [replace(x, fps=1) for x in there] == [replace(x, fps=1) for x in here]
 
@@ -101,17 +101,17 @@ def test_the_promise_is_kept_by_the_file(run_dir: Path, tmp_path: Path) -> None:
     )
     assert first == again
     assert told[: len(told) // 2] == told[len(told) // 2 :]
-    for path in (checkpoint_paths(folder)[-1], file_of(folder) / SCENE_FILE):
+    for path in (checkpoint_paths(folder)[-1], export_folder(folder) / SCENE_FILE):
         assert path.read_bytes() == (tmp_path / "b" / path.relative_to(folder)).read_bytes()
     assert first.before - first.after <= 1.0
     config = load_resolved(folder)
     trainer = build_trainer(config, restored=True)
     trainer.restore(latest_checkpoint(folder))
     shown = [trainer.images[i] for i in held_out_indices(len(trainer.images))]
-    assert quality_of(trainer, load_run(file_of(folder)).scene, shown) == pytest.approx(
+    assert mean_psnr(trainer, load_run(export_folder(folder)).scene, shown) == pytest.approx(
         first.after, abs=1e-4
     )
-    before, after = compare_runs([run_dir, file_of(folder)], 1)
+    before, after = compare_runs([run_dir, export_folder(folder)], 1)
     assert after.num_gaussians < before.num_gaussians
     assert after.stored is not None
     assert after.stored < before.megabytes

@@ -39,7 +39,9 @@ def test_a_run_with_masks_is_stored_with_them(tmp_path: Path) -> None:
     seen = torch.ones(3, 5, dtype=torch.bool)
     seen[1:, 0] = False
     checkpoint = latest_checkpoint(run_dir)
-    masks = strip_roles(add_prefix("model.masks", VisibilityMasks.pack((0.0, 0.5, 1.0), seen).state()))
+    masks = strip_roles(
+        add_prefix("model.masks", VisibilityMasks.pack((0.0, 0.5, 1.0), seen).state())
+    )
     save_checkpoint(run_dir, replace(checkpoint, tensors=checkpoint.tensors | masks), 1.0)
     write_scene_file(run_dir, tmp_path / "small", 0.5)
     stored = load_run(tmp_path / "small").scene

@@ -1,4 +1,4 @@
-"""``dyngs docs`` shows the pages of the documentation, whose links lead to files that are there."""
+"""``dyngs docs`` shows, lists and searches the pages of the documentation."""
 
 from __future__ import annotations
 
@@ -10,16 +10,37 @@ import pytest
 from dyngs.cli import main
 from dyngs.cli.docs import docs_folder
 
-ROOT = Path(__file__).parents[2]
+DOCS = Path(__file__).parents[2] / "docs"
 
 
-def test_pages_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("name", ["install", "install.md", "start/install"])
+def test_page_is_printed(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["docs", name]) == 0
+    assert capsys.readouterr().out == (DOCS / "start" / "install.md").read_text(encoding="utf-8")
+
+
+def test_pages_are_listed_with_their_titles(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["docs"]) == 0
-    assert "# Documentation" in capsys.readouterr().out
-    for topic in ("longer", "longer.md"):
-        assert main(["docs", topic]) == 0
-        shown = capsys.readouterr().out
-        assert shown == (ROOT / "docs" / "longer.md").read_text(encoding="utf-8")
+    listed = capsys.readouterr().out
+    assert re.search(r"^guides$", listed, re.MULTILINE)
+    assert re.search(r"^  photos +\w", listed, re.MULTILINE)
+
+
+def test_guide_comes_before_a_concept_with_the_same_name(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name, folder in (("people", "guides"), ("concepts/people", "concepts")):
+        assert main(["docs", name, "--path"]) == 0
+        assert Path(capsys.readouterr().out.strip()).parent.name == folder
+
+
+def test_search_prints_page_and_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["docs", "--search", "EXIT CODE"]) == 0
+    assert "reference/cli:" in capsys.readouterr().out
+    assert main(["docs", "--search", "no page has this text"]) == 2
+
+
+def test_unknown_page_is_refused_with_a_similar_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["docs", "--path"]) == 0
     assert Path(capsys.readouterr().out.strip()) == docs_folder()
     assert main(["docs", "foto"]) == 2
@@ -27,16 +48,16 @@ def test_pages_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["docs", "../README"]) == 2
 
 
-def test_links_lead_to_what_is_installed() -> None:
-    """All of docs, and what its pages link to outside of it, goes into the package."""
-    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    packed = dict(re.findall(r'^"(\S+)" = "(dyngs/\S+)"', project, re.MULTILINE))
-    assert packed["docs"] == "dyngs/docs"
-    for page in sorted((ROOT / "docs").rglob("*.md")):
-        for target in re.findall(
-            r"\]\(([^)#\s:]+)(?:#[^)\s]*)?\)", page.read_text(encoding="utf-8")
-        ):
-            place = (page.parent / target).resolve()
-            assert place.exists(), (page, target)
-            inside = place.relative_to(ROOT).as_posix()
-            assert inside.startswith("docs/") or packed[inside] == f"dyngs/{inside}", (page, target)
+def test_package_contains_all_pages() -> None:
+    project = (DOCS.parent / "pyproject.toml").read_text(encoding="utf-8")
+    packed = re.findall(r'^"docs/(\S+)" = "dyngs/docs/\1"', project, re.MULTILINE)
+    listed = (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8")
+    for page in re.findall(r": (\S+\.md)$", listed, re.MULTILINE):
+        assert page.split("/")[0] in packed, page
+
+
+def test_api_page_has_signatures_and_docstrings(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["docs", "reference/python"]) == 0
+    shown = capsys.readouterr().out
+    assert "dyngs.load(" in shown
+    assert ":::" not in shown

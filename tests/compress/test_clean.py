@@ -12,7 +12,7 @@ from scaled_files import FACTORS, scaled
 from splat_scenes import cloud
 
 from dyngs.api.train import train
-from dyngs.compress.clean import classify_shapes, clean_file, clean_run, lone
+from dyngs.compress.clean import classify_shapes, clean_file, clean_run, find_isolated
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
@@ -55,7 +55,7 @@ def test_shapes() -> None:
     found = classify_shapes(spoiled(), spoiled().opacities)
     rows = {kind: torch.nonzero(x)[:, 0].tolist() for kind, x in found.items()}
     assert rows == {"needles": [200], "veils": [201], "faint": [202], "lone": [203]}
-    assert not lone(torch.zeros(4, 3)).any()
+    assert not find_isolated(torch.zeros(4, 3)).any()
 
 
 def test_files_without_cameras() -> None:

@@ -10,7 +10,7 @@ import torch
 
 from dyngs.api.train import train
 from dyngs.compress import clean as module
-from dyngs.compress.clean import floaters
+from dyngs.compress.clean import find_floaters
 from dyngs.config import Config
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.camera import Cameras
@@ -52,7 +52,7 @@ def trainer(still: Path) -> Trainer:
 
 
 def test_what_hangs_before_one_camera_is_found(trainer: Trainer) -> None:
-    found = floaters(trainer)
+    found = find_floaters(trainer)
     assert bool(found[-1])
     assert int(found[:-1].sum()) <= 0.02 * len(found)
 
@@ -76,7 +76,7 @@ def test_they_are_removed_before_the_run_is_saved(
 
 def test_cameras_are_those_that_training_found(trainer: Trainer) -> None:
     """A camera that turned out to be elsewhere has nothing close before it."""
-    before = floaters(trainer)
+    before = find_floaters(trainer)
 
     def moved(index: int, cameras: Cameras) -> Cameras:
         pose = cameras.cam_from_world.clone()
@@ -85,4 +85,4 @@ def test_cameras_are_those_that_training_found(trainer: Trainer) -> None:
 
     trainer.images.corrected = moved
     assert bool(before[-1])
-    assert not bool(floaters(trainer)[-1])
+    assert not bool(find_floaters(trainer)[-1])

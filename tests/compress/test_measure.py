@@ -17,7 +17,7 @@ from dyngs.config import SceneModel
 from dyngs.config.io import load_resolved
 from dyngs.gaussians.scene import GaussianScene, restore_scene
 from dyngs.runs.checkpoint import latest_checkpoint, load_run
-from dyngs.runs.stored_file import decoded
+from dyngs.runs.stored_file import decode_scene
 
 
 def plan_of(
@@ -72,7 +72,9 @@ def test_the_coarsest_that_is_good_enough(tmp_path: Path) -> None:
     assert some is not None
     data, reached = some
     assert reached >= -1e-3
-    stored = restore_scene(type(checkpoint)(checkpoint.info, decoded(data).tensors), config.model)
+    stored = restore_scene(
+        type(checkpoint)(checkpoint.info, decode_scene(data).tensors), config.model
+    )
     assert quality(stored) == reached
     assert len(every[0]) <= len(data)
     assert find_coarsest_file(config, checkpoint, lambda scene: -1.0, 0.0) is None

@@ -16,16 +16,16 @@ from dyngs.compress.measure import (
     compute_coarseness,
     measure_precision,
 )
-from dyngs.core.state import part_of
+from dyngs.core.state import select_prefix
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.runs.stored_file import (
     MAX_COARSENESS,
     choose_coding,
-    completed,
-    drawable,
-    restored,
+    round_trip,
+    tensors_to_store,
+    to_checkpoint_tensors,
 )
 
 
@@ -37,12 +37,12 @@ def tensors() -> dict[str, Tensor]:
 
 def scene_of(stored: Mapping[str, Tensor]) -> StaticScene:
     """The scene of a checkpoint's tensors."""
-    return StaticScene(gaussians=Gaussians(**part_of(stored, "gaussians")))
+    return StaticScene(gaussians=Gaussians(**select_prefix(stored, "gaussians")))
 
 
 def measured(stored: Mapping[str, Tensor], draw: Draw, max_change: float) -> Precision:
     """How exactly a static scene must be stored."""
-    return measure_precision(drawable(scene_of(stored)), draw(stored), draw, max_change)
+    return measure_precision(tensors_to_store(scene_of(stored)), draw(stored), draw, max_change)
 
 
 def draw(state: Mapping[str, Tensor]) -> list[Tensor]:
@@ -56,10 +56,12 @@ def draw(state: Mapping[str, Tensor]) -> list[Tensor]:
 @pytest.mark.parametrize("max_change", [0.1, 2.0])
 def test_the_change_is_what_is_allowed_or_less(max_change: float) -> None:
     precision = measured(tensors(), draw, max_change)
-    exact = drawable(scene_of(tensors()))
-    rounded = {name: restored(x, choose_coding(name, x, precision.steps)) for name, x in exact.items()}
+    exact = tensors_to_store(scene_of(tensors()))
+    rounded = {
+        name: round_trip(x, choose_coding(name, x, precision.steps)) for name, x in exact.items()
+    }
     before = draw(tensors())[0].clamp(0, 1)
-    after = draw(completed(rounded))[0].clamp(0, 1)
+    after = draw(to_checkpoint_tensors(rounded))[0].clamp(0, 1)
     change = 255 * float((before - after).double().square().mean().sqrt())
     assert precision.change == pytest.approx(change)
     assert max_change / 4 < change <= max_change
@@ -76,9 +78,9 @@ def change_after(
     stored: dict[str, Tensor], exact: dict[str, Tensor], steps: Mapping[str, float]
 ) -> float:
     """Grey levels by which rounding with ``steps`` changes the image."""
-    rounded = {name: restored(x, choose_coding(name, x, steps)) for name, x in exact.items()}
+    rounded = {name: round_trip(x, choose_coding(name, x, steps)) for name, x in exact.items()}
     before = draw(stored)[0].clamp(0, 1)
-    after = draw(completed(rounded))[0].clamp(0, 1)
+    after = draw(to_checkpoint_tensors(rounded))[0].clamp(0, 1)
     return 255 * float((before - after).double().square().mean().sqrt())
 
 
@@ -95,7 +97,7 @@ def test_an_outlier_does_not_decide_the_steps_of_the_others(name: str) -> None:
     assert precision.change is not None
     assert precision.change <= 0.5
     assert change_after(
-        with_outlier, drawable(scene_of(with_outlier)), precision.steps
+        with_outlier, tensors_to_store(scene_of(with_outlier)), precision.steps
     ) == pytest.approx(precision.change)
     stored = "sh_base" if name == "sh" else name
     steps = measured(usual, draw, 0.5).steps
@@ -114,5 +116,5 @@ def test_what_no_step_is_fine_enough_for_is_stored_as_it_is() -> None:
     precision = measured(far, draw, 0.01)
     assert precision.change is not None
     assert precision.change <= 0.01
-    means = drawable(scene_of(far))["gaussians.means"]
+    means = tensors_to_store(scene_of(far))["gaussians.means"]
     assert choose_coding("gaussians.means", means, precision.steps).kind == "exact"

@@ -1,13 +1,8 @@
-"""Keys in words, for messages and docs/cli.md."""
+"""Descriptions of the configuration keys."""
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
-from dyngs.config.schema import config_keys, keys_table
-
-DOCS = Path(__file__).resolve().parents[2] / "docs" / "cli.md"
+from dyngs.config.schema import config_keys
 
 
 def test_known_rows() -> None:
@@ -24,11 +19,3 @@ def test_known_rows() -> None:
     }
     for key, found in expected.items():
         assert (rows[key].allowed, rows[key].default) == found, key
-
-
-def test_the_documentation_has_the_table() -> None:
-    """If this fails, print the table anew as docs/cli.md says."""
-    table = keys_table()
-    assert DOCS.read_text(encoding="utf-8").endswith(table)
-    for line in table.splitlines():
-        assert len(re.findall(r"(?<!\\)\|", line)) == 5, "a bar would end its cell"

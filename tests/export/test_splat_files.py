@@ -217,7 +217,9 @@ def test_a_file_of_tracks_holds_arrays_without_pickle(tmp_path: Path) -> None:
     assert path.read_bytes() == first
 
 
-def test_moving_files(tmp_path: Path, near: OpenedScene, capsys: pytest.CaptureFixture[str]) -> None:
+def test_moving_files(
+    tmp_path: Path, near: OpenedScene, capsys: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("fourdgs")
     times = [i / 9 for i in range(10)]  # more than one group of key frame and deltas
     splats, _ = write_4dgs(near, tmp_path / "a.4dgs", times)

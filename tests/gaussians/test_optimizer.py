@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dyngs.config import OptimConfig
-from dyngs.core.state import part_of, strip_roles
+from dyngs.core.state import select_prefix, strip_roles
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import GaussianOptimizer
 
@@ -29,7 +29,7 @@ def _stored(optimizer: GaussianOptimizer) -> dict[str, torch.Tensor]:
 
 
 def _restored(tensors: dict[str, torch.Tensor]) -> GaussianOptimizer:
-    parameters = Gaussians(**part_of(tensors, "gaussians"))
+    parameters = Gaussians(**select_prefix(tensors, "gaussians"))
     return GaussianOptimizer(_gaussians(2, seed=9), OptimConfig()).with_state(parameters, tensors)
 
 

@@ -15,7 +15,7 @@ from tiny_fields import busy_config, write_tiny_capture
 from torch import Tensor
 
 from dyngs.config import FixedStrategy
-from dyngs.core.state import Role, part_of, strip_roles
+from dyngs.core.state import Role, select_prefix, strip_roles
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import restore_colour_network
 from dyngs.gaussians.scene import GaussianScene, restore_scene
@@ -67,7 +67,7 @@ def test_what_is_stored_gives_the_same_images(kind: str, drawing: bool) -> None:
     state = scene.drawing_state() if drawing else scene.state()
     found = replace(
         restored(kind, state),
-        colour=restore_colour_network(part_of(strip_roles(state), "model.colour")),
+        colour=restore_colour_network(select_prefix(strip_roles(state), "model.colour")),
     )
     assert type(found) is type(scene)
     assert found.times == scene.times
@@ -166,7 +166,7 @@ def test_a_changed_scene_is_drawn_as_it_is_now(kind: str) -> None:
     scene.gaussians.means.data += 0.25
     if isinstance(scene, HumanScene):
         scene.learned["weights"].data += torch.arange(float(scene.learned["weights"].shape[1]))
-    scene.changed()
+    scene.clear_caches()
     assert_alike(scene.at(0.37), restored(kind, scene.state()).at(0.37), atol=0.0)
 
 

@@ -16,7 +16,7 @@ import dyngs
 from dyngs.cli import main
 from dyngs.config.io import load_config
 from dyngs.config.kinds import GROUP, OWN
-from dyngs.config.schema import keys_table
+from dyngs.config.schema import config_keys
 from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
 from dyngs.evaluate.report import evaluate_run
@@ -82,7 +82,10 @@ def test_a_run_needs_the_package_of_its_kind(capture: Path, tmp_path: Path) -> N
 
 
 def test_its_keys_are_listed_and_validated(capture: Path, tmp_path: Path) -> None:
-    assert "| `model.lr` (toy) | a number > 0 | `0.3` | learning rate |" in keys_table()
+    keys = {key.name: key for key in config_keys() if key.kinds == ("toy",)}
+    assert keys["model.lr"].allowed == "a number > 0"
+    assert keys["model.lr"].default == "0.3"
+    assert keys["model.lr"].description == "learning rate"
     words = options(capture, tmp_path)
     with pytest.raises(DyngsError, match=r"model\.lr must be a number > 0, not -1"):
         load_config(None, [*words, "model.lr=-1"])

@@ -19,7 +19,7 @@ from dyngs.core.state import Role
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
 from dyngs.human.predict.ghg.network import PersonPredictor, new_network
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, restore_model
-from dyngs.models.kind import HasGaussians, PredictsScenes, capability, kind_of
+from dyngs.models.kind import HasGaussians, PredictsScenes, capability, find_kind
 from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable
 from dyngs.training.new_trainer import build_trainer
@@ -97,7 +97,7 @@ def same(one: Checkpoint, other: Checkpoint) -> bool:
 def test_every_kind_is_here() -> None:
     assert set(kind_names()) == TRAINED.keys() | NETWORKS | PREDICTED
     for name in kind_names():
-        kind = kind_of(section_of_kind(name)())
+        kind = find_kind(section_of_kind(name)())
         assert kind.name == name
         assert isinstance(kind, PredictsScenes) == (name in NETWORKS)
 
@@ -169,7 +169,7 @@ def test_only_what_is_made_of_gaussians_passes_for_that(config: Config, trainer:
         assert require_gaussians(scene, "it") is scene
         return
     assert not isinstance(scene, GaussianScene)
-    with pytest.raises(DyngsError, match="it: is not made of Gaussians"):
+    with pytest.raises(DyngsError, match="it: this needs a scene of Gaussians"):
         require_gaussians(scene, "it")
 
 

@@ -13,11 +13,11 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import View
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.models.prediction import (
+    find_views,
     load_optimizer,
     load_weights,
-    find_views,
     optimizer_state,
-    updated,
+    optimizer_step,
 )
 
 
@@ -52,7 +52,7 @@ def test_what_has_had_no_gradient_has_no_moments() -> None:
     networks[1].load_state_dict(networks[0].state_dict())
     optimizers = [torch.optim.AdamW(network.parameters()) for network in networks]
     data = torch.ones(1, 3)
-    assert updated(optimizers[0], networks[0], networks[0][0](data).sum(), 1e-3)
+    assert optimizer_step(optimizers[0], networks[0], networks[0][0](data).sum(), 1e-3)
     networks[1].load_state_dict(networks[0].state_dict())
     state = optimizer_state(optimizers[0], networks[0])
     assert sorted(state) == [
@@ -60,7 +60,7 @@ def test_what_has_had_no_gradient_has_no_moments() -> None:
     ]
     load_optimizer(optimizers[1], networks[1], state)
     for network, optimizer in zip(networks, optimizers, strict=True):
-        assert updated(
+        assert optimizer_step(
             optimizer, network, sum(layer(data).square().sum() for layer in network), 1e-3
         )
     assert all(torch.equal(a, b) for a, b in zip(*(n.parameters() for n in networks), strict=True))

@@ -7,7 +7,7 @@ import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
-from dyngs.models.views import evaluation_background, background_coloured_fraction
+from dyngs.models.views import background_coloured_fraction, evaluation_background
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,9 @@ def half_opaque(level: float, num_alike: int) -> Image:
 def test_the_share_of_pixels_that_look_like_the_background_is_counted() -> None:
     white = torch.ones(3)
     assert background_coloured_fraction([half_opaque(0.95, 8)], white) == pytest.approx(0.2)
-    assert background_coloured_fraction([half_opaque(0.95, 8), half_opaque(0.85, 8)], white) == pytest.approx(0.1)
+    assert background_coloured_fraction(
+        [half_opaque(0.95, 8), half_opaque(0.85, 8)], white
+    ) == pytest.approx(0.1)
     assert background_coloured_fraction([half_opaque(0.95, 8)], torch.zeros(3)) == 0.0
     one_channel_differs = half_opaque(1.0, 40)
     one_channel_differs.rgb_premultiplied[:4, :, 2] = 0.5

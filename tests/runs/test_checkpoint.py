@@ -35,7 +35,7 @@ from dyngs.runs.checkpoint import (
     save_checkpoint,
     seconds_at,
 )
-from dyngs.runs.stored_file import drawable
+from dyngs.runs.stored_file import tensors_to_store
 
 
 def _checkpoint(step: int) -> Checkpoint:
@@ -269,7 +269,9 @@ def test_contents_that_do_not_fit_end_in_one_line_or_a_finite_image(
     )
     path.parent.mkdir(exist_ok=True)
     if has_only_scene_file:
-        tensors = drawable(restore_scene(Checkpoint(CheckpointInfo(**_header()), tensors), model))  # type: ignore[arg-type]
+        tensors = tensors_to_store(
+            restore_scene(Checkpoint(CheckpointInfo(**_header()), tensors), model)
+        )  # type: ignore[arg-type]
     refused = 0
     told = []
     for trial in range(11):

@@ -36,7 +36,13 @@ WRITERS = {
     "write_tensors",
     "save_config",
 }
-CHECKS = {"require_output", "require_empty", "require_new_folder", "new_folder", "folder_of_export"}
+CHECKS = {
+    "require_output",
+    "require_empty",
+    "require_new_folder",
+    "new_folder",
+    "open_export_folder",
+}
 ROOMS_BELOW = ("files/", "config/", "runs/", "data/images/", "splats/", "ops/")
 """Rooms of writers that are handed what they write, or that keep the run folder and the caches of
 dyngs itself."""

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as nps
 
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import part_of
+from dyngs.core.state import select_prefix
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.models.checkpoint import CheckpointInfo
@@ -23,12 +23,12 @@ from dyngs.runs.stored_file import (
     MAGIC,
     MAX_HEADER,
     compress_lzma,
-    decoded,
+    decode_scene,
     decompress_lzma,
-    encoded,
-    packed,
+    encode_scene,
+    pack_integers,
     read_scene,
-    unpacked,
+    unpack_integers,
     write_scene,
 )
 
@@ -74,8 +74,8 @@ def small_scene(count: int = 3) -> dict[str, torch.Tensor]:
 def stored(tensors: dict[str, torch.Tensor], steps: Mapping[str, float] = STEPS) -> bytes:
     """The file of a static scene."""
     own = {name: x for name, x in tensors.items() if name != COARSENESS}
-    scene = StaticScene(gaussians=Gaussians(**part_of(own, "gaussians")))
-    return encoded(INFO, scene, steps, tensors.get(COARSENESS))
+    scene = StaticScene(gaussians=Gaussians(**select_prefix(own, "gaussians")))
+    return encode_scene(INFO, scene, steps, tensors.get(COARSENESS))
 
 
 def with_header(data: bytes, old: bytes, new: bytes) -> bytes:
@@ -93,7 +93,7 @@ def with_header(data: bytes, old: bytes, new: bytes) -> bytes:
 @settings(deadline=None, max_examples=25)
 def test_stored_again_it_is_the_same_file(tensors: dict[str, torch.Tensor]) -> None:
     data = stored(tensors)
-    found = decoded(data)
+    found = decode_scene(data)
     assert found.info == INFO
     for name, x in tensors.items():
         assert found.tensors[name].shape == x.shape
@@ -104,7 +104,7 @@ def test_stored_again_it_is_the_same_file(tensors: dict[str, torch.Tensor]) -> N
 
 def test_values_come_back_within_their_steps() -> None:
     tensors = small_scene(200)
-    found = decoded(stored(tensors)).tensors
+    found = decode_scene(stored(tensors)).tensors
     order = [
         int((tensors["gaussians.means"] - mean).abs().sum(1).argmin())
         for mean in found["gaussians.means"]
@@ -120,11 +120,11 @@ def test_every_cut_and_every_flip_is_an_error(tmp_path: Path) -> None:
     data = stored(small_scene())
     for end in range(len(data)):
         with pytest.raises(DyngsError) as caught:
-            decoded(data[:end])
+            decode_scene(data[:end])
         assert "\n" not in str(caught.value)
     for place in range(len(data)):
         with pytest.raises(DyngsError):
-            decoded(data[:place] + bytes([data[place] ^ (1 << place % 8)]) + data[place + 1 :])
+            decode_scene(data[:place] + bytes([data[place] ^ (1 << place % 8)]) + data[place + 1 :])
     path = tmp_path / "scene.dyngs"
     write_scene(path, data[:-1])
     with pytest.raises(DyngsError, match=r"scene.dyngs: damaged or cut off"):
@@ -144,7 +144,7 @@ def test_a_forged_file_is_an_error_or_a_scene(source: st.DataObject) -> None:
         )
     told = None
     try:
-        found = decoded(bytes(data) + hashlib.sha256(data).digest())
+        found = decode_scene(bytes(data) + hashlib.sha256(data).digest())
     except DyngsError as error:
         told = str(error)
     assert "\n" not in told if told is not None else len(found.tensors["gaussians.sh"]) == 3
@@ -167,15 +167,15 @@ def test_a_forged_file_is_an_error_or_a_scene(source: st.DataObject) -> None:
 def test_a_forged_header_is_refused(old: bytes, new: bytes, said: str) -> None:
     data = stored(small_scene())
     with pytest.raises(DyngsError, match=said):
-        decoded(with_header(data, old, new))
+        decode_scene(with_header(data, old, new))
 
 
 def test_other_versions_and_other_files_are_told_apart() -> None:
     data = stored(small_scene())
     with pytest.raises(DyngsError, match="another version"):
-        decoded(data[:6] + b"\x02" + data[7:])
+        decode_scene(data[:6] + b"\x02" + data[7:])
     with pytest.raises(DyngsError, match="not a stored scene"):
-        decoded(b"ply\nformat binary_little_endian 1.0\n")
+        decode_scene(b"ply\nformat binary_little_endian 1.0\n")
 
 
 ARRAYS = nps.arrays(
@@ -188,8 +188,8 @@ ARRAYS = nps.arrays(
 @given(ARRAYS)
 @settings(deadline=None, max_examples=40)
 def test_numbers_come_back(whole: np.ndarray) -> None:
-    packing, data = packed(whole)
-    back = unpacked(packing, data, whole.shape)
+    packing, data = pack_integers(whole)
+    back = unpack_integers(packing, data, whole.shape)
     assert back.dtype == np.int64
     assert np.array_equal(back, whole)
 

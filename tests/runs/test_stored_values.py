@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import ALL_KINDS, cloud, stirred_field, tiny_options
 
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import part_of
+from dyngs.core.state import select_prefix
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
@@ -29,31 +29,31 @@ from dyngs.runs.stored_file import (
     ROTATION_STEP,
     Coding,
     choose_coding,
-    completed,
-    drawable,
     dequantize_tensor,
-    group_of,
     opacities_from_grid,
     opacities_to_grid,
-    packed,
+    pack_integers,
+    quantize_tensor,
     rotations_from_grid,
     rotations_to_grid,
-    sort_axes,
     round_step_down,
+    sort_axes,
+    step_group,
     storage_edit,
+    tensors_to_store,
+    to_checkpoint_tensors,
     to_grid,
-    quantize_tensor,
-    unpacked,
+    unpack_integers,
 )
 
 
 def read_again(
     x: torch.Tensor, coding: Coding, coarseness: np.ndarray | None = None
 ) -> torch.Tensor:
-    """``x`` as a file gives it back: through bytes, laid out as ``packed`` chose."""
+    """``x`` as a file gives it back: through bytes, laid out as ``pack_integers`` chose."""
     numbers, far = quantize_tensor(x, coding, coarseness)
-    packing, data = packed(numbers)
-    back = unpacked(packing, data, numbers.shape)
+    packing, data = pack_integers(numbers)
+    back = unpack_integers(packing, data, numbers.shape)
     return dequantize_tensor(back, far, coding, str(x.dtype).removeprefix("torch."), coarseness)
 
 
@@ -88,8 +88,10 @@ def test_any_tensor_comes_back_within_its_bound(
 ) -> None:
     """Half a step (0.65 of one where zero is preferred), 11 bits where there is no step; exact
     where out of reach."""
-    group = group_of(name, x)
-    coding = choose_coding(name, x, {} if group is None else {group: step}, by_coarseness=by_coarseness)
+    group = step_group(name, x)
+    coding = choose_coding(
+        name, x, {} if group is None else {group: step}, by_coarseness=by_coarseness
+    )
     rows = np.arange(len(x)) % (MAX_COARSENESS + 1) if coding.by_coarseness else None
     error = (read_again(x, coding, rows).double() - x.double()).abs()
     if coding.kind == "exact":
@@ -119,14 +121,14 @@ def moving(kind: str) -> tuple[DynamicScene, DynamicModel]:
 
 def stored(scene: GaussianScene) -> dict[str, torch.Tensor]:
     """What a file holds of a scene, in its order."""
-    return drawable(scene.apply_edit(storage_edit(scene, scene.gaussians.means.numpy())))
+    return tensors_to_store(scene.apply_edit(storage_edit(scene, scene.gaussians.means.numpy())))
 
 
 def read(tensors: dict[str, torch.Tensor], model: DynamicModel) -> DynamicScene:
     """The scene of what a file holds."""
-    full = completed(tensors)
+    full = to_checkpoint_tensors(tensors)
     return DynamicScene.from_state(
-        model, Gaussians(**part_of(full, "gaussians")), part_of(full, "model")
+        model, Gaussians(**select_prefix(full, "gaussians")), select_prefix(full, "model")
     )
 
 
@@ -147,7 +149,7 @@ def test_what_is_not_finite_is_refused() -> None:
     gaussians = cloud(3)
     gaussians.means[1, 1] = torch.nan
     with pytest.raises(DyngsError, match="means is not finite"):
-        drawable(StaticScene(gaussians=gaussians))
+        tensors_to_store(StaticScene(gaussians=gaussians))
 
 
 FLOATS = st.floats(-(2.0**100), 2.0**100, width=32)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from dyngs.core.camera import Cameras
-from dyngs.core.state import part_of, strip_roles
+from dyngs.core.state import select_prefix, strip_roles
 from dyngs.data.loader import Image
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate, filter_std, fuse_filter
@@ -43,7 +43,7 @@ def test_without_filter_parameters_pass_through() -> None:
     assert moment.penalties == {}
     assert training.optimize(scene, 1) == 0
     assert training.after_step(scene, 1, True) is scene
-    assert part_of(strip_roles(scene.state()), "model") == {}
+    assert select_prefix(strip_roles(scene.state()), "model") == {}
     assert training.state() == {}
 
 
@@ -93,9 +93,7 @@ def test_what_no_view_shows_half_a_pixel_of_is_removed_once() -> None:
     assert result.edit is not None
     assert torch.equal(result.edit.apply(scene.gaussians.means), edited.gaussians.means)
     assert result.message is not None
-    assert result.message.startswith(
-        "2 of 4 Gaussians are removed: each makes up less than 2 px of every"
-    )
+    assert result.message.startswith("pruned 2 of 4 Gaussians that cover less than 2 px in every")
     assert training.edit_scene(edited, 7) is None, "all that is left is large enough"
     assert training.edit_scene(training.first_scene(_sized([1.0, 1.5])), 7) is None, (
         "something is left of every scene"
@@ -129,7 +127,7 @@ def test_the_filter_is_kept_until_it_is_due() -> None:
 def test_state_goes_round() -> None:
     training = StaticTraining(FilterUpdate([_camera()]))
     first = training.first_scene(_gaussians(2.0))
-    stored = part_of(strip_roles(first.state()), "model")
+    stored = select_prefix(strip_roles(first.state()), "model")
     second = training.restore(_gaussians(4.0), stored)
     drawn = (
         training.time_step(scene, _image(), 1).gaussians.log_scales for scene in (first, second)

@@ -19,7 +19,7 @@ from dyngs.data.loader import Image
 from dyngs.gaussians.optimizer import AdamState
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import ModelKind, StartContext
-from dyngs.models.model import Drawn, Model, UpdateResult
+from dyngs.models.model import Model, RenderOutput, UpdateResult
 from dyngs.models.renderable import DrawOptions, Renderable, Rendering, TimeStep
 from dyngs.models.views import background_colour
 
@@ -126,9 +126,11 @@ class Toy(Model[ToyScene]):
     def leaves(self) -> Sequence[Tensor]:
         return [self._grid]
 
-    def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+    def draw(
+        self, image: Image, step: int, background: Tensor, *, depth: bool = False
+    ) -> RenderOutput:
         options = DrawOptions(depth="expected" if depth else "none")
-        return Drawn(
+        return RenderOutput(
             self.scene.render(image.cameras, image.time, options=options, background=background)
         )
 

@@ -55,7 +55,7 @@ def test_the_error_of_alpha_counts_where_the_mask_does_and_fully_late_in_the_run
     """Three of four pixels are opaque, nothing is rendered, and the mask ignores one of these."""
     alpha = torch.tensor([[1.0, 1.0], [1.0, 0.0]])
     mask = torch.tensor([[0.0, 1.0], [1.0, 1.0]])
-    nothing = Drawn(Rendering(torch.zeros(1, 2, 2, 3), torch.ones(1, 2, 2), None))
+    nothing = RenderOutput(Rendering(torch.zeros(1, 2, 2, 3), torch.ones(1, 2, 2), None))
     loss = SilhouetteLoss(0.1, early=0.2, full_from=60)
 
     def at(step: int, image: Image) -> float:

@@ -11,9 +11,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from dyngs.compress.stage import highest, quality_of, scores_of
+from dyngs.compress.stage import importance_scores, mean_psnr, select_highest
 from dyngs.config import Config
-from dyngs.core.errors import counted
+from dyngs.core.errors import format_count
 from dyngs.training.loop import Loop
 from dyngs.training.trainer import Trainer, TrainingEdit
 
@@ -41,13 +41,13 @@ class CountLimit:
         used = 0.0 if self._seconds is None else loop.stopwatch.seconds / self._seconds
         if count <= self.most or not is_late(trainer.config, trainer.done, used):
             return None
-        kept = highest(scores_of(trainer), 1 - self.most / count)
+        kept = select_highest(importance_scores(trainer), 1 - self.most / count)
         scene = trainer.model.scene
-        gain = quality_of(trainer, scene.select(kept)) - quality_of(trainer, scene)
+        gain = mean_psnr(trainer, scene.select(kept)) - mean_psnr(trainer, scene)
         self.before = self.before or count
         self.lost -= gain
         name = _name(trainer.config, self.most)
-        left = counted(self.most, "Gaussian")
+        left = format_count(self.most, "Gaussian")
         return TrainingEdit(f"{name}: {count:,} -> {left}; {gain:+.2f} dB on training views", kept)
 
     def state(self) -> dict[str, Tensor]:
@@ -70,7 +70,7 @@ class CountLimit:
         cost = "it cost nothing"
         if self.before:
             cost = f"{self.before:,} before, {-self.lost:+.2f} dB on training views when they were removed"
-        asked = f"asked for at most {counted(self.most, 'Gaussian')}, got {count:,}"
+        asked = f"asked for at most {format_count(self.most, 'Gaussian')}, got {count:,}"
         return f"{_name(config, self.most)}: {asked}; {cost}"
 
 

@@ -12,15 +12,15 @@ import torch
 from torch import Tensor
 
 from dyngs.compress.measure import plan_storage
-from dyngs.compress.stage import highest, probe_images, quality_of, scores_of
+from dyngs.compress.stage import importance_scores, mean_psnr, probe_images, select_highest
 from dyngs.config.io import RESOLVED_NAME
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.models.checkpoint import restore_model
 from dyngs.models.kind import HasGaussians, capability
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE
 from dyngs.runs.folder import EXPORT_FOLDER, write_config
-from dyngs.runs.stored_file import decoded, encoded, round_step_down, write_scene
+from dyngs.runs.stored_file import decode_scene, encode_scene, round_step_down, write_scene
 from dyngs.training.trainer import Trainer
 
 KEPT = 0.7
@@ -50,7 +50,7 @@ class SizeReport:
     def __str__(self) -> str:
         how = [f"{self.coarser:.3g} times coarser than usual"] if self.coarser > 1 else []
         if self.num_kept < self.num_gaussians:
-            how += [f"{self.num_kept:,} of {counted(self.num_gaussians, 'Gaussian')}"]
+            how += [f"{self.num_kept:,} of {format_count(self.num_gaussians, 'Gaussian')}"]
         return (
             f"budget.max_mb: asked {self.asked:g}, got {self.megabytes:.3g} ({EXPORT_FOLDER}/{SCENE_FILE}"
             f"{''.join(f', {x}' for x in how)}); {self.after - self.before:+.2f} dB on training views "
@@ -77,7 +77,7 @@ def write_limited_file(trainer: Trainer[Any], run_dir: Path, megabytes: float) -
     config = trainer.config
     scene: Any = trainer.model.scene.to(CPU)
     images = probe_images(trainer)  # files are made on the CPU
-    before = quality_of(trainer, scene, images)
+    before = mean_psnr(trainer, scene, images)
     precision, coarseness = plan_storage(config, full, scene, None)
 
     def stored(kept: Any, octaves: Tensor | None) -> tuple[float, float, bytes, int] | None:
@@ -85,21 +85,21 @@ def write_limited_file(trainer: Trainer[Any], run_dir: Path, megabytes: float) -
 
         def encode(factor: float) -> bytes:
             steps = {name: round_step_down(factor * step) for name, step in precision.steps.items()}
-            return encoded(full.info, kept, steps, octaves)
+            return encode_scene(full.info, kept, steps, octaves)
 
         found = _fitted(encode, int(1e6 * megabytes))
         if found is None:
             return None
         data, factor = found
-        read = restore_model(decoded(data), config.model)
-        return quality_of(trainer, read, images), factor, data, len(kept)
+        read = restore_model(decode_scene(data), config.model)
+        return mean_psnr(trainer, read, images), factor, data, len(kept)
 
     chosen = stored(scene, coarseness)
     if capability(config.model, HasGaussians) and (chosen is None or chosen[1] > 1):
-        scores = scores_of(trainer).cpu()
+        scores = importance_scores(trainer).cpu()
         fraction = KEPT
         while fraction * len(scene) >= 1:
-            kept = highest(scores, 1 - fraction)
+            kept = select_highest(scores, 1 - fraction)
             found = stored(scene.select(kept), None if coarseness is None else coarseness[kept])
             if chosen is not None and (found is None or found[0] <= chosen[0]):
                 break

@@ -14,7 +14,7 @@ from statistics import fmean
 from typing import Any
 
 from dyngs.config import Config
-from dyngs.core.errors import counted
+from dyngs.core.errors import format_count
 from dyngs.data.loader import ImageLoader
 from dyngs.training.clock import Stopwatch, TimeForecast
 from dyngs.training.loop import Loop
@@ -52,7 +52,7 @@ def fit_minutes(
         halvings = math.ceil(math.log2(FEWEST / max(steps, 1)) / 2)
         smaller = max(side >> halvings, SMALLEST_SIDE)
         message = (
-            f"train.minutes={seconds / 60:g}: {counted(steps, 'step')} would fit at {side} px, so images are "
+            f"train.minutes={seconds / 60:g}: {format_count(steps, 'step')} would fit at {side} px, so images are "
             f"shrunk to {smaller} px (data.longest_side)"
         )
         trainer.images.rest()
@@ -138,14 +138,14 @@ class TimeLimit:
         if is_small or found <= done or events_before(config, done) != events_before(new, done):
             return None
         return TrainingEdit(
-            f"train.minutes: {found:,} instead of {counted(loop.total, 'step')}", steps=found
+            f"train.minutes: {found:,} instead of {format_count(loop.total, 'step')}", steps=found
         )
 
     def reached(self, loop: Loop) -> str:
         """Return the line about ``train.minutes`` after a run."""
         done = loop.trainer.done
         asked = f"asked {self.seconds / 60:g}, got {loop.stopwatch.seconds / 60:.2f}"
-        line = f"train.minutes: {asked}: {done:,} of {counted(self.most_steps, 'step')}"
+        line = f"train.minutes: {asked}: {done:,} of {format_count(self.most_steps, 'step')}"
         return line if done < self.most_steps else f"{line}: all, it cost nothing"
 
     def cost_of_all(self, loop: Loop) -> str | None:

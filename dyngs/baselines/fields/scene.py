@@ -18,7 +18,7 @@ from dyngs.baselines.fields.kind import FieldModel
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role, State, add_prefix, with_role
-from dyngs.core.tensor_checks import require_times, require_tensor
+from dyngs.core.tensor_checks import require_tensor, require_times
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import focus_point, fraction_in_front, inverse_rigid
 from dyngs.data.scene_space import extent_of
@@ -30,11 +30,11 @@ from dyngs.models.renderable import (
     Surface,
     SurfaceOptions,
     TimeStep,
-    composited,
+    composite_background,
     fixed_cameras,
 )
 from dyngs.models.views import evaluation_background
-from dyngs.models.volume import rays_of
+from dyngs.models.volume import camera_rays
 from dyngs.ops.perceptron import Layer, perceptron
 from dyngs.ops.rays import Rays, Space
 
@@ -247,14 +247,14 @@ class FieldScene(Renderable):
             self._view(cameras.select(i), now.time or 0.0, options) for i in range(len(cameras))
         ]
         rgb, through, depth = (torch.stack(x) for x in zip(*views, strict=True))
-        return composited(rgb, through, depth, options, behind)
+        return composite_background(rgb, through, depth, options, behind)
 
     def _view(
         self, camera: Cameras, time: float, options: DrawOptions
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return colours before black (H, W, 3), transmittance (H, W) and the sum of weight times z
         (H, W)."""
-        rays, z = rays_of(camera)
+        rays, z = camera_rays(camera)
         parts = []
         for begin in range(0, len(rays), CHUNK):
             chosen = slice(begin, begin + CHUNK)

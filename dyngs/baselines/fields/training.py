@@ -17,10 +17,10 @@ from dyngs.data.loader import Image
 from dyngs.gaussians.optimizer import AdamState
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
-from dyngs.models.model import Drawn, LossInput, Loss, Model, UpdateResult
+from dyngs.models.model import Loss, LossInput, Model, RenderOutput, UpdateResult
 from dyngs.models.renderable import DrawOptions, Rendering
 from dyngs.models.views import evaluation_background, training_times
-from dyngs.models.volume import rays_of
+from dyngs.models.volume import camera_rays
 from dyngs.ops.adam import seen_rows
 from dyngs.ops.device import copy_async
 
@@ -108,7 +108,9 @@ class FieldTraining(Model[FieldScene]):
     def rate(self, step: int) -> float:
         """Return the learning rate in ``step``."""
 
-    def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+    def draw(
+        self, image: Image, step: int, background: Tensor, *, depth: bool = False
+    ) -> RenderOutput:
         generator = self._run.generator
         device = background.device
         field = self._scene.field
@@ -119,7 +121,7 @@ class FieldTraining(Model[FieldScene]):
             (len(pixels), field.num_random_values), generator=generator, device="cpu"
         )
         pixels = copy_async(pixels, device)
-        rays, z = rays_of(camera, pixels)
+        rays, z = camera_rays(camera, pixels)
         near = self._scene.options.near
         seen = field.seen(rays, image.time or 0.0, near=near, shifts=copy_async(shifts, device))
         self.count(len(rays), seen.num_samples)
@@ -134,7 +136,7 @@ class FieldTraining(Model[FieldScene]):
         if depth:
             far = (seen.depth * z / (1 - seen.transmittance).clamp_min(1e-9))[None, None]
         rendering = Rendering(rgb[None, None], seen.transmittance[None, None], far)
-        return Drawn(rendering, penalties, image=part)
+        return RenderOutput(rendering, penalties, image=part)
 
     def count(self, num_rays: int, num_samples: int) -> None:
         """Note how many samples the rays of an image needed."""

@@ -30,9 +30,9 @@ from dyngs.models.renderable import (
     Surface,
     SurfaceOptions,
     TimeStep,
-    composited,
-    fixed_cameras,
+    composite_background,
     concatenate_renderings,
+    fixed_cameras,
     single_views,
 )
 from dyngs.models.views import evaluation_background
@@ -274,7 +274,7 @@ class TriangleScene(Renderable):
             image = avg_pool2d(image.permute(0, 3, 1, 2), times).permute(0, 2, 3, 1)
             through = avg_pool2d(through[None], times)[0]
         depth = image[..., 3] if options.depth != "none" else None
-        return composited(image[..., :3], through, depth, options, background), places
+        return composite_background(image[..., :3], through, depth, options, background), places
 
     def _by_direction(self, camera: Cameras) -> Tensor:
         """Return (P, 3): what harmonics add to the colours of each triangle, seen from

@@ -27,7 +27,7 @@ from dyngs.config import DefaultStrategy, ShColour
 from dyngs.config.kinds import section_of_kind
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0, num_sh_terms
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.core.state import Role, State, add_prefix, with_role
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.loader import Image
@@ -52,8 +52,8 @@ from dyngs.gaussians.surface import (
 )
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
-from dyngs.models.model import Drawn, Model, UpdateResult
-from dyngs.models.schedule import scaled
+from dyngs.models.model import Model, RenderOutput, UpdateResult
+from dyngs.models.schedule import scale_step
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.patches import NUM_POINTS, PatchSamples, lattice, lattice_size
@@ -393,7 +393,9 @@ class TriangleTraining(Model[TriangleScene]):
         """Whether textures are learned, and no triangle comes or goes."""
         return self._scene.patches.texture > 0
 
-    def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+    def draw(
+        self, image: Image, step: int, background: Tensor, *, depth: bool = False
+    ) -> RenderOutput:
         if self._awaits_surface:
             self._awaits_surface = False
             patches, unit = _on_surface(self._run, self._model)
@@ -404,7 +406,7 @@ class TriangleTraining(Model[TriangleScene]):
         rendering, places = self._scene.drawn(image.cameras, options, background)
         if not self.is_textured:
             self._now.count(places, image_gradients(image.composite(background)))
-        return Drawn(rendering)
+        return RenderOutput(rendering)
 
     def tallies(self, step: int) -> Sequence[Tensor]:
         return [] if self.is_textured else list(self._now.tensors().values())
@@ -428,9 +430,11 @@ class TriangleTraining(Model[TriangleScene]):
                 self._change(0, 1)  # what is useless goes, and nothing is split
             self._texture()
             count = len(self._scene)
-            return UpdateResult(bad, f"textures are learned from now on, on {count:,} triangles", True)
-        interval = max(LEAST_EVERY, scaled(EVERY, self._steps))
-        last = min(scaled(UNTIL, self._steps), self._first_texture)
+            return UpdateResult(
+                bad, f"textures are learned from now on, on {count:,} triangles", True
+            )
+        interval = max(LEAST_EVERY, scale_step(EVERY, self._steps))
+        last = min(scale_step(UNTIL, self._steps), self._first_texture)
         if step % interval or step > last:
             return UpdateResult(bad)
         self._change(self._model.max_triangles, 1 + (last - step) // interval)
@@ -467,7 +471,7 @@ class TriangleTraining(Model[TriangleScene]):
             return UpdateResult(bad)
         none = {name: x.detach()[:0] for name, x in self._scene.patches.tensors.items()}
         self._exchange(stays.nonzero()[:, 0], none)
-        gone = f"{count - len(self._scene):,} of {counted(count, 'triangle')} are removed"
+        gone = f"{count - len(self._scene):,} of {format_count(count, 'triangle')} are removed"
         return UpdateResult(
             bad, f"{gone}: no training view shows more than {LEAST_SHOWN:g} px of them", True
         )

@@ -27,7 +27,7 @@ from dyngs.capture.sfm.colmap import (
 from dyngs.capture.sfm.frame_choice import STILL, chosen_frames, measured
 from dyngs.capture.sfm.photos import Photo, copied, gather_photos, lay_out
 from dyngs.core.conventions import ProgressCallback, ignore_progress
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.images.images import read_header
 from dyngs.data.images.video import (
     colour_notes,
@@ -202,7 +202,7 @@ def _posed_in(
     else:
         photos, notes = gather_photos(source, capture / "images", out)
     if len(photos) < 3:
-        found = "; ".join((f"{source} has {counted(len(photos), 'image')}", *notes))
+        found = "; ".join((f"{source} has {format_count(len(photos), 'image')}", *notes))
         raise DyngsError(f"{found}; structure from motion needs at least 3, better 30")
     with quiet_colmap():
         masks = options.masks
@@ -234,7 +234,11 @@ def _posed_in(
 
 
 def _laid_out(
-    capture: Path, photos: list[Photo], is_video: bool, options: SfmOptions, report: ProgressCallback
+    capture: Path,
+    photos: list[Photo],
+    is_video: bool,
+    options: SfmOptions,
+    report: ProgressCallback,
 ) -> SfmTask:
     folder = capture / "images"
     work = capture / "colmap"

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, counted, wrap_read_errors
+from dyngs.core.errors import DyngsError, format_count, wrap_read_errors
 from dyngs.data.images.images import (
     END_MARKERS,
     SUFFIXES,
@@ -115,7 +115,7 @@ def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], l
     left_out = len(files) - len(taken)
     if left_out:
         known = ", ".join(sorted(PHOTO_SUFFIXES))
-        notes.append(f"{counted(left_out, 'file')} left out, no photos (photos are {known})")
+        notes.append(f"{format_count(left_out, 'file')} left out, no photos (photos are {known})")
     return photos, notes
 
 

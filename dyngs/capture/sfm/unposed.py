@@ -13,7 +13,7 @@ from dyngs.capture.sfm.photos import digest_of, photos_below
 from dyngs.capture.sfm.several_videos import VIDEOS_FILE, poses_of_videos
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ProgressCallback, ignore_progress
-from dyngs.core.errors import DyngsError, quote_path, counted, wrap_read_errors, show
+from dyngs.core.errors import DyngsError, format_count, log_info, quote_path, wrap_read_errors
 from dyngs.data.images.video import VIDEO_SUFFIXES, videos_in
 from dyngs.data.read import is_capture
 from dyngs.io.outputs import command_for, make_once, note_source
@@ -26,7 +26,7 @@ def with_poses(
     data: DataConfig,
     *,
     needs_times: bool = False,
-    say: Callable[[str], None] = show,
+    say: Callable[[str], None] = log_info,
     report: ProgressCallback = ignore_progress,
 ) -> DataConfig:
     """Return the options with a capture that has poses as their folder: the same one, unless it has
@@ -97,7 +97,8 @@ def is_unposed(data: DataConfig) -> bool:
     photos = [] if videos or command_for(root, captures=False) is not None else photos_below(root)
     if photos:
         raise DyngsError(
-            f"{root}: holds {counted(len(photos), 'photo')} and no cameras; a scene needs at least {FEWEST_PHOTOS} "
+            f"{root}: holds {format_count(len(photos), 'photo')} and no cameras; a scene needs "
+            f"at least {FEWEST_PHOTOS} "
             "photos of it from different places, better 50, or a video"
         )
     return bool(videos)

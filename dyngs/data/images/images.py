@@ -237,7 +237,9 @@ def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool
 
 
 def _reading(path: Path) -> AbstractContextManager[None]:
-    return wrap_read_errors(path, "the image is damaged or of an unknown kind; copy or convert it again")
+    return wrap_read_errors(
+        path, "the image is damaged or of an unknown kind; copy or convert it again"
+    )
 
 
 def read_raw(path: Path) -> tuple[np.ndarray, bool]:

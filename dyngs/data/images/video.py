@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from dyngs.core.conventions import decode_srgb, encode_srgb
-from dyngs.core.errors import DyngsError, counted, wrap_read_errors, reason
+from dyngs.core.errors import DyngsError, describe_error, format_count, wrap_read_errors
 from dyngs.data.capture import VideoFrame
 from dyngs.data.images.images import files_in, rotated_upright
 from dyngs.io.containment import allowed, check_size, inside, require_at_most
@@ -249,7 +249,7 @@ def probe_video(path: Path) -> VideoInfo:
 def colour_notes(videos: Iterable[VideoInfo]) -> list[str]:
     """Return a line for each of the different ``VideoInfo.colours`` of the videos of a capture."""
     counts = Counter(video.colours for video in videos if video.colours)
-    return [f"{counted(count, 'video')}: {note}" for note, count in counts.items()]
+    return [f"{format_count(count, 'video')}: {note}" for note, count in counts.items()]
 
 
 def frame_seconds(path: Path, num_frames: int) -> list[float]:
@@ -311,9 +311,9 @@ def _decoded(
         except FFmpegError as error:
             if index == 0:
                 raise DyngsError(
-                    f"cannot read the video {path}: {error.strerror or reason(error)}"
+                    f"cannot read the video {path}: {error.strerror or describe_error(error)}"
                 ) from error
-            raise _broken(path, index, error.strerror or reason(error)) from error
+            raise _broken(path, index, error.strerror or describe_error(error)) from error
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, counted, wrap_read_errors
+from dyngs.core.errors import DyngsError, format_count, wrap_read_errors
 from dyngs.data.capture import Capture, CaptureFormat, PointCloud
 from dyngs.data.geometry import OPENGL_FROM_OPENCV, opengl_from_cam
 from dyngs.data.images.images import SUFFIXES, files_in, read_header
@@ -68,7 +68,7 @@ def _capture(
         raise DyngsError(
             f"{path}: no photo in {root} has the name of a camera with a pose; put the photos there"
         )
-    count = f"{len(left_out)} of {counted(len(cameras), 'camera')}"
+    count = f"{len(left_out)} of {format_count(len(cameras), 'camera')}"
     line = f"{path.name}: {count} have no pose or no photo and are left out: {first_few(left_out)}"
     return training_capture(
         root, format, FrameFile(root / path.name, frames), *([line] if left_out else [])
@@ -160,7 +160,8 @@ def _metashape_lens(path: Path, sensor: ElementTree.Element) -> _Fields:
     kind = sensor.get("type")
     if kind not in ("frame", "fisheye") or not calibrations:
         raise DyngsError(
-            f"{where}: is of type {kind} with {counted(len(calibrations), 'calibration')}; only calibrated frame and "
+            f"{where}: is of type {kind} with {format_count(len(calibrations), 'calibration')}; "
+            "only calibrated frame and "
             "fisheye sensors are read: convert its photos to those of a frame camera in Metashape"
         )
     adjusted = [

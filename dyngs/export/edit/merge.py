@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, counted
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.export.splat_files import find_up_direction, splats_at
 from dyngs.gaussians.rendering import splat_options
 from dyngs.io.formats.formats import format_to_read, read_splats

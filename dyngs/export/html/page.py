@@ -15,7 +15,7 @@ import numpy as np
 
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
-from dyngs.core.errors import counted
+from dyngs.core.errors import format_count
 from dyngs.data.geometry import look_at_point
 from dyngs.export.choose_path import (
     framing_points,
@@ -122,7 +122,7 @@ def write_page_folder(
     require_new_folder(folder)
     lists = PackedArrays(chunked=True)
     if most is not None or opened.renderable.has_levels:
-        levelled = LevelScene.of(opened.renderable, most)
+        levelled = LevelScene.from_scene(opened.renderable, most)
         colour = levelled.scene.colour
         header = add_levels(levelled.levels, colour, lists) | _render_header(levelled.options)
         header["levels"]["most"] = most
@@ -260,7 +260,7 @@ def _assemble_page(
         "fetched": " connect-src 'self';" if fetches else "",  # only its own files
     }
     size = len(page) + sum(len(x) for x in fixed.values())
-    about = counted(header["count"], "triangle" if "texture" in header else "Gaussian")
+    about = format_count(header["count"], "triangle" if "texture" in header else "Gaussian")
     return fill_template(
         page, fixed | {"about": about + ("" if fetches else f", {size / 1e6:.1f} MB")}
     )

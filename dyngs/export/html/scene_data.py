@@ -23,12 +23,12 @@ from torch import Tensor
 from dyngs.core.gaussians import storage_order
 from dyngs.deform.control_nodes import FOLLOWED, ControlNodes, spline_basis
 from dyngs.deform.field import DeformationField, Offsets
-from dyngs.deform.fields import EDGE, OPEN, WindowedField
+from dyngs.deform.fields import EDGE_WIDTH, OPEN_WINDOW, WindowedField
 from dyngs.deform.free import FreePrimitives
 from dyngs.deform.scene import DynamicScene, field_scene_of
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork
-from dyngs.gaussians.levels import BLOCK, MERGED, PIXELS, Block, Levels
+from dyngs.gaussians.levels import BLOCK, MAX_SPREAD_PX, MERGED, Block, Levels
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.posing import frame_pose, pose_blend_offsets
 from dyngs.human.avatar.scene import HumanScene, as_human_scene
@@ -135,7 +135,7 @@ def add_levels(levels: Levels, colour: ColourNetwork | None, lists: PackedArrays
     lists.exact("blocks", np.concatenate(levels.blocks).astype(np.float32))
     coarsest = block_numbers(levels, (len(levels.levels) - 1, 0), bake_harmonics=colour is None)
     sizes = [len(level) for level in levels.levels]
-    known = {"sizes": sizes, "block": BLOCK, "merged": MERGED, "pixels": PIXELS}
+    known = {"sizes": sizes, "block": BLOCK, "merged": MERGED, "pixels": MAX_SPREAD_PX}
     degree = levels.levels[0].sh_degree if colour is None else 0
     header: dict[str, Any] = {"count": sizes[0], "frames": 0, "moves": False, "degree": degree}
     header["levels"] = known | {"layout": coarsest.layout}

@@ -17,7 +17,7 @@ from torch import Tensor
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, format_one_line
 from dyngs.core.section import ModelSection
-from dyngs.core.state import part_of
+from dyngs.core.state import select_prefix
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import render_options
@@ -154,8 +154,8 @@ def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
     poses = tensors["reference.poses"][None]
     trans = tensors["reference.trans"][None]
     stored = {
-        **{f"anchors.{name}": x for name, x in part_of(tensors, "anchors").items()},
-        **{f"shapes.{name}": x for name, x in part_of(tensors, "shapes").items()},
+        **{f"anchors.{name}": x for name, x in select_prefix(tensors, "anchors").items()},
+        **{f"shapes.{name}": x for name, x in select_prefix(tensors, "shapes").items()},
         "joints": joints,
         "parents": tensors["skeleton.parents"],
         "clip.times": torch.zeros(1, dtype=torch.float64, device="cpu"),
@@ -171,4 +171,4 @@ def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
     stored |= {f"learned.{name}": tensors[name] for name in ("light", "normals") if name in tensors}
     for name, dtype in (("anchors.face", torch.int32), ("anchors.joints", torch.uint8)):
         stored[name] = require_tensor(name, stored[name], stored[name].shape, dtype).long()
-    return HumanScene.from_state(Gaussians.stored(part_of(tensors, "gaussians")), stored)
+    return HumanScene.from_state(Gaussians.stored(select_prefix(tensors, "gaussians")), stored)

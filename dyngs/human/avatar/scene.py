@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyngs.core.state import Role, State, StateTensor, part_of, add_prefix, with_role
+from dyngs.core.state import Role, State, StateTensor, add_prefix, select_prefix, with_role
 from dyngs.core.tensor_checks import (
     require_indices,
-    require_times,
     require_positive,
     require_tensor,
+    require_times,
 )
 from dyngs.data.capture import Capture, Split
 from dyngs.gaussians import Gaussians, TopologyEdit
@@ -71,10 +71,10 @@ class HumanScene(GaussianScene, Posable):
             "learned.weights", torch.zeros_like(tensors["anchors.weights"])
         )  # files hold the sum of both
         require_avatar(gaussians, tensors)
-        anchors = Anchors(**part_of(tensors, "anchors"))
-        clip = MotionClip(**part_of(tensors, "clip"))
+        anchors = Anchors(**select_prefix(tensors, "anchors"))
+        clip = MotionClip(**select_prefix(tensors, "clip"))
         skeleton = Skeleton(tensors["joints"], tuple(tensors["parents"].tolist()))
-        learned = part_of(tensors, "learned")
+        learned = select_prefix(tensors, "learned")
         shapes = None
         if "shapes.directions" in tensors:
             shapes = PoseBlendShapes(

@@ -42,7 +42,7 @@ from dyngs.human.avatar.posing import (
 from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.keys import HumanModel
 from dyngs.models.kind import StartContext
-from dyngs.models.model import LossInput, Loss
+from dyngs.models.model import Loss, LossInput
 from dyngs.models.views import background_colour
 from dyngs.ops.adam import Count
 from dyngs.ops.device import copy_async
@@ -335,12 +335,12 @@ class HumanTraining(SceneTraining[HumanScene]):
         message = line if hardly >= PARAMS.min_reported_fraction else None
         return replace(scene, seen=trust), EditResult(None, changes, message=message)
 
-    def follow(self, edit: TopologyEdit | None = None) -> None:
+    def apply_edit(self, edit: TopologyEdit | None = None) -> None:
         """Find out anew who the neighbours are."""
         self._neighbours = self._mirror_images = None
 
     def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
-        self.follow()
+        self.apply_edit()
         if "refines_from" in tensors:  # the run may have become longer since
             self._has_refined = True
             self.refines_from = min(self.refines_from, int(tensors["refines_from"]))

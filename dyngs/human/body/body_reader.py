@@ -184,7 +184,9 @@ def read_obj(path: Path, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Those of the file may come in any order, as ``f v/vt v/vt v/vt``. Raises DyngsError: the file
     cannot be read, or belongs to another body.
     """
-    with wrap_read_errors(path, "give the .obj made for this body, with triangles 'f v/vt v/vt v/vt'"):
+    with wrap_read_errors(
+        path, "give the .obj made for this body, with triangles 'f v/vt v/vt v/vt'"
+    ):
         uv = []
         triangles: dict[tuple[int, ...], dict[int, int]] = {}
         for line in read_limited(path).decode("latin-1").splitlines():

@@ -21,7 +21,7 @@ from dyngs.capture.masks import at_size, outlined
 from dyngs.capture.sfm.photos import digest_of
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ProgressCallback, ignore_progress
-from dyngs.core.errors import DyngsError, counted, show
+from dyngs.core.errors import DyngsError, format_count, log_info
 from dyngs.data.capture import Capture, View, by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.read import is_capture, read_capture
@@ -108,16 +108,18 @@ def capture_warnings(
     if count < len(images):
         gone = len(images) - count
         lines.append(
-            f"nobody is found in {gone} of {counted(len(images), 'image')}; these are left out"
+            f"nobody is found in {gone} of {format_count(len(images), 'image')}; these are left out"
         )
     if cut > 0.1 * count:
         lines.append(
-            f"the feet are cut off or hidden in {cut} of {counted(count, 'image')}; legs will be a guess there"
+            f"the feet are cut off or hidden in {cut} of {format_count(count, 'image')}; legs will be a guess there"
         )
     if height < 120:
         lines.append(f"the person is {height:.0f} px high; come nearer or record larger images")
     if blurred > 0.1 * count:
-        lines.append(f"{counted(blurred, 'image')} blurred; more light, or slower motion, helps")
+        lines.append(
+            f"{format_count(blurred, 'image')} blurred; more light, or slower motion, helps"
+        )
     if alone and not _turns(detections):
         lines.append("the person never turns around: what the camera never sees will be a guess")
     return lines
@@ -156,7 +158,7 @@ def detect_person(
     detector: Detector,
     folder: Path,
     report: ProgressCallback,
-    say: Callable[[str], None] = show,
+    say: Callable[[str], None] = log_info,
 ) -> FitInputs:
     """Find a person in all views, write masks and key points to ``folder``, and return where they
     are.
@@ -186,7 +188,7 @@ def detect_person(
         else:
             say(
                 f"{where}{detector.name} finds the person, {np.median(heights):.0f} px high, in {len(heights)} of "
-                f"{counted(len(person), 'image')}; left and right swapped in {counted(swapped, 'image')}"
+                f"{format_count(len(person), 'image')}; left and right swapped in {format_count(swapped, 'image')}"
             )
             for warning in capture_warnings(images, person, alone=len(cameras) == 1):
                 say(f"warning: {where}{warning}")
@@ -207,7 +209,7 @@ def detect_person(
             write_image(folder / "masks" / f"{view.name}.png", at_size(mask, view))
     if not points:
         raise DyngsError(
-            f"{capture.root}: {detector.name} finds nobody in {counted(sum(map(len, cameras)), 'image')}; look at "
+            f"{capture.root}: {detector.name} finds nobody in {format_count(sum(map(len, cameras)), 'image')}; look at "
             "them, or give masks of another program to `dyngs data fit` (docs/person.md)"
         )
     _write_keypoints(folder / "keypoints.json", points)
@@ -234,7 +236,7 @@ def write_detected_person(
     out: Path,
     detector: Detector,
     report: ProgressCallback = ignore_progress,
-    say: Callable[[str], None] = show,
+    say: Callable[[str], None] = log_info,
 ) -> FittedCapture:
     """Find a person and fit the body to them: write the capture of ``write_fitted_capture`` to the
     new folder ``out``.
@@ -254,7 +256,10 @@ def write_detected_person(
 
 
 def ensure_detected_person(
-    data: DataConfig, *, say: Callable[[str], None] = show, report: ProgressCallback = ignore_progress
+    data: DataConfig,
+    *,
+    say: Callable[[str], None] = log_info,
+    report: ProgressCallback = ignore_progress,
 ) -> DataConfig:
     """Return the options with the capture of the person that is found in a clip; the same clip is
     looked at once.

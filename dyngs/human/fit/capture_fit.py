@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dyngs.config import DataConfig
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import RasterizeMode, ProgressCallback, ignore_progress
+from dyngs.core.conventions import ProgressCallback, RasterizeMode, ignore_progress
 from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import frame_number, numbered
 from dyngs.data.capture import Capture, Split, View

@@ -25,7 +25,7 @@ from dyngs.capture.sfm.photos import digest_of
 from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.core.conventions import ProgressCallback, ignore_progress
-from dyngs.core.errors import DyngsError, counted, wrap_read_errors, show
+from dyngs.core.errors import DyngsError, format_count, log_info, wrap_read_errors
 from dyngs.data.body_frames import frame_number, numbered, read_body_file
 from dyngs.data.capture import BodyFrames, Capture, Split, View
 from dyngs.data.geometry import opengl_from_cam
@@ -176,7 +176,7 @@ def write_fitted_capture(
     tried = ", ".join(f"{candidate.iou:.3f} with {candidate.name}" for candidate in found.tried)
     worst = int(np.nanargmin(chosen.per_frame))
     lines = [
-        f"{'' if body.name == 'anny' else _called(model, body) + ', '}{counted(len(found.motion.clip), 'frame')}; "
+        f"{'' if body.name == 'anny' else _called(model, body) + ', '}{format_count(len(found.motion.clip), 'frame')}; "
         f"overlap of silhouettes (IoU) on {_judged_on(found.num_held_out)}: {tried}",
         f"taken: {chosen.name}; worst frame {found.motion.frames[worst]} with {chosen.per_frame[worst]:.3f}; look at "
         f"{out / 'fit_overlays.png'}",
@@ -186,7 +186,11 @@ def write_fitted_capture(
 
 
 def _judged_on(left_out: int) -> str:
-    return f"{counted(left_out, 'view')} left out of the fit" if left_out else "the views fitted to"
+    return (
+        f"{format_count(left_out, 'view')} left out of the fit"
+        if left_out
+        else "the views fitted to"
+    )
 
 
 def read_run_template(path: Path) -> HumanModel:
@@ -218,7 +222,9 @@ def read_known_shape(path: Path, body: BodyTemplate) -> BodyFrames:
     ``path`` is a capture or a folder that ``dyngs data fit`` wrote, or the run of an avatar trained
     on one. Raises DyngsError: none of these, or a shape of another template.
     """
-    with wrap_read_errors(path, "give a capture that `dyngs data fit` wrote, or a run trained on it"):
+    with wrap_read_errors(
+        path, "give a capture that `dyngs data fit` wrote, or a run trained on it"
+    ):
         folder = path
         if (path / RESOLVED_NAME).is_file():
             data = load_resolved(path).data
@@ -270,7 +276,7 @@ def _at_most(options: DataConfig, longest_side: int) -> DataConfig:
 
 
 def read_person_capture(
-    options: DataConfig, given: FitInputs, work: Path, say: Callable[[str], None] = show
+    options: DataConfig, given: FitInputs, work: Path, say: Callable[[str], None] = log_info
 ) -> Capture:
     """Return a capture with silhouettes: of a capture, or a video or a folder of images of one
     fixed camera.
@@ -521,7 +527,7 @@ def ensure_fitted_body(
     model: HumanModel | None = None,
     *,
     only_if_needed: bool = False,
-    say: Callable[[str], None] = show,
+    say: Callable[[str], None] = log_info,
     report: ProgressCallback = ignore_progress,
 ) -> DataConfig:
     """Return the options with a fit of a template to the capture; the same capture is fitted once.

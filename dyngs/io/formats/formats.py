@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from dyngs.core.conventions import RasterizeMode
-from dyngs.core.errors import DyngsError, wrap_read_errors, require_regular_file
+from dyngs.core.errors import DyngsError, require_regular_file, wrap_read_errors
 from dyngs.io.formats import ply
 from dyngs.io.formats.antimatter import read_antimatter, write_antimatter
 from dyngs.io.formats.checkpoint import read_checkpoint

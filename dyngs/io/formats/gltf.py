@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.core.conventions import SH_C0, num_sh_terms, decode_srgb
+from dyngs.core.conventions import SH_C0, decode_srgb, num_sh_terms
 from dyngs.core.gaussians import Gaussians
 from dyngs.io.fields import require_at_most
 from dyngs.io.formats.similarity import joined, similarity_of_matrix

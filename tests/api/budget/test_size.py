@@ -10,7 +10,7 @@ import torch
 
 from dyngs.api.budget.size import write_limited_file
 from dyngs.api.train import train
-from dyngs.compress.stage import quality_of
+from dyngs.compress.stage import mean_psnr
 from dyngs.config import (
     BudgetConfig,
     Config,
@@ -80,7 +80,7 @@ def test_a_file_is_never_larger_and_shows_what_is_said(trainer: Trainer, tmp_pat
         assert f"asked {asked:g}" in str(report)
         scene = load_run(file.parent).scene
         assert len(scene) == report.num_kept
-        drawn = quality_of(trainer, scene, [trainer.images[i] for i in range(4)])
+        drawn = mean_psnr(trainer, scene, [trainer.images[i] for i in range(4)])
         assert drawn == pytest.approx(report.after), "what is said is what the file shows"
     after = trainer.checkpoint().tensors
     assert {name.partition(".")[0] for name in before.keys() - after.keys()} <= {"strategy"}

@@ -12,7 +12,7 @@ from dyngs.api.budget.time import fitting_steps
 from dyngs.api.train import train
 from dyngs.config import Config
 from dyngs.config.io import load_config, load_resolved, packaged_preset
-from dyngs.runs.checkpoint import checkpoint_paths, latest_checkpoint, seconds_at, checkpoint_step
+from dyngs.runs.checkpoint import checkpoint_paths, checkpoint_step, latest_checkpoint, seconds_at
 from dyngs.training.clock import TimeForecast
 from dyngs.training.events import Event, Message
 from dyngs.training.trainer import Trainer

@@ -15,7 +15,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.models.volume import rays_of
+from dyngs.models.volume import camera_rays
 from dyngs.ops.native import kernel_threads
 from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
@@ -51,7 +51,7 @@ def test_views_that_were_held_out_are_learned(capture: Path) -> None:
     which = torch.randint(
         24 * 24, (trainer.model.num_rays,), generator=torch.Generator().manual_seed(0)
     )
-    rays, _ = rays_of(image.cameras, which)
+    rays, _ = camera_rays(image.cameras, which)
     samples = field.seen(rays, 0.0, near=0.1).num_samples
     assert 0.4 < samples / 2**12 < 2.5, "rays fill a step, about"
 

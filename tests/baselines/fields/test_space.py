@@ -16,7 +16,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, PointCloud
 from dyngs.data.read import read_capture
-from dyngs.models.volume import rays_of
+from dyngs.models.volume import camera_rays
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def test_rays_go_through_pixel_centres() -> None:
     pose[:3, :3], pose[:3, 3] = turn, torch.tensor([0.3, -0.2, 1.0])
     intrinsics = torch.tensor([[30.0, 0, 11], [0, 28, 7], [0, 0, 1]], dtype=torch.float64)
     camera = Cameras(pose[None], intrinsics[None], 20, 15)
-    rays, z = rays_of(camera)
+    rays, z = camera_rays(camera)
     local = (rays.origins + 2.5 * rays.directions) @ pose[:3, :3].T + pose[:3, 3]
     pixels = local @ intrinsics.T
     expected = torch.stack(
@@ -79,5 +79,5 @@ def test_rays_go_through_pixel_centres() -> None:
     assert torch.allclose(pixels[:, :2] / pixels[:, 2:], expected.view(-1, 2).double())
     assert torch.allclose(local[:, 2], 2.5 * z)
     assert torch.allclose(rays.directions.norm(dim=1), torch.ones(300, dtype=torch.float64))
-    some, _ = rays_of(camera, torch.tensor([21, 299]))
+    some, _ = camera_rays(camera, torch.tensor([21, 299]))
     assert torch.equal(some.directions, rays.directions[[21, 299]])

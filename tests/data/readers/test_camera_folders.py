@@ -265,8 +265,10 @@ def test_numbers_of_frames_must_be_clear(root: Path) -> None:
 
 
 def test_the_documented_example_can_be_read(tmp_path: Path) -> None:
-    """The JSON block of docs/formats.md, as it stands there."""
-    text = (Path(__file__).parents[3] / "docs" / "formats.md").read_text(encoding="utf-8")
+    """Read the JSON block of docs/reference/captures.md."""
+    text = (Path(__file__).parents[3] / "docs" / "reference" / "captures.md").read_text(
+        encoding="utf-8"
+    )
     block = next(
         part.split("```")[0] for part in text.split("```json\n")[1:] if '"cameras"' in part
     )

@@ -19,7 +19,7 @@ from dyngs.human.avatar.training import OutlineLoss, make_outline_loss
 from dyngs.human.keys import HumanModel
 from dyngs.io.write import write_image
 from dyngs.models.kind import StartContext
-from dyngs.models.model import Drawn, LossInput
+from dyngs.models.model import LossInput, RenderOutput
 from dyngs.models.renderable import Rendering
 
 SIDE = 40
@@ -69,7 +69,7 @@ def loss_of(loss: OutlineLoss, seen: list[View], frame: int, alpha: Tensor, rgb:
     """Return the loss of a render with opacity (H, W) and colours (H, W, 3) before white."""
     image = ImageLoader(seen)[frame]
     rendered = alpha[..., None] * rgb + 1 - alpha[..., None]
-    drawn = Drawn(Rendering(rendered[None], 1 - alpha[None], None), {}, {}, lambda: None)
+    drawn = RenderOutput(Rendering(rendered[None], 1 - alpha[None], None), {}, {}, lambda: None)
     look = LossInput(
         frame, 1, image, drawn, rendered, image.composite(torch.ones(3)), cast(Any, None), GENERATOR
     )

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.core.state import part_of, strip_roles
+from dyngs.core.state import select_prefix, strip_roles
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import render
 from dyngs.human.avatar.posing import (
@@ -57,7 +57,9 @@ def stirred() -> HumanScene:
 
 def reloaded(scene: HumanScene) -> HumanScene:
     """The scene of what is stored of it."""
-    return HumanScene.from_state(scene.gaussians, part_of(strip_roles(scene.state()), "model"))
+    return HumanScene.from_state(
+        scene.gaussians, select_prefix(strip_roles(scene.state()), "model")
+    )
 
 
 def seen(gaussians: Gaussians) -> Tensor:

@@ -41,7 +41,7 @@ from dyngs.human.predict.fields.network import (
     split_rays,
 )
 from dyngs.human.predict.people import DILATION, BodyBoundaries, PosedBody
-from dyngs.models.volume import rays_of
+from dyngs.models.volume import camera_rays
 from dyngs.ops.rays import Rays
 
 
@@ -98,7 +98,7 @@ class EgHumanNerf(FieldNetwork):
     def picture(
         self, known: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
     ) -> FieldPicture:
-        rays, z = rays_of(camera)
+        rays, z = camera_rays(camera)
         boundaries, _ = known.own
         first, last, body = (
             (x.flatten() / z).clamp(max=_FAR)[:, None] for x in boundaries.interval(camera)
@@ -205,7 +205,7 @@ class EgHumanNerf(FieldNetwork):
         total = picture.colour.new_zeros(())
         assert image.depth is not None
         assert image.alpha is not None
-        _, z = rays_of(image.cameras)
+        _, z = camera_rays(image.cameras)
         limit = PARAMS.limit
         for rays, at, signed in picture.samples:
             truth, alpha = (x.flatten()[rays][:, None] for x in (image.depth, image.alpha))

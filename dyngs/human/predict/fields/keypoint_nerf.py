@@ -36,7 +36,7 @@ from dyngs.human.predict.fields.network import (
     split_rays,
 )
 from dyngs.human.predict.people import NUM_KEY_POINTS, PosedBody, Sources
-from dyngs.models.volume import select_samples, rays_of, reached_samples, thin_samples
+from dyngs.models.volume import camera_rays, reached_samples, select_samples, thin_samples
 from dyngs.ops.rays import MarchSteps, Rays, Samples, Space, composite, march
 
 
@@ -82,7 +82,7 @@ class KeypointNerf(FieldNetwork):
     def picture(
         self, known: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
     ) -> FieldPicture:
-        rays, _ = rays_of(camera)
+        rays, _ = camera_rays(camera)
         shifts = sample_offsets(len(rays), generator=generator).to(rays.origins)
         pieces = split_rays(torch.arange(len(rays), device=shifts.device))
         found = [self._along(known, rays[some], shifts[some]) for some in pieces]

@@ -16,7 +16,7 @@ from dyngs.config import Config, DataConfig
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import ProgressCallback
 from dyngs.core.errors import DyngsError
-from dyngs.core.state import Role, State, move_fields_to, add_prefix, with_role
+from dyngs.core.state import Role, State, add_prefix, move_fields_to, with_role
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.data.loader import Image
 from dyngs.data.read import captures_in
@@ -47,7 +47,7 @@ from dyngs.human.predict.people import (
 )
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
-from dyngs.models.model import Drawn, Model, UpdateResult
+from dyngs.models.model import Model, RenderOutput, UpdateResult
 from dyngs.models.prediction import (
     Example,
     Learner,
@@ -62,7 +62,7 @@ from dyngs.models.renderable import (
     Renderable,
     Rendering,
     TimeStep,
-    composited,
+    composite_background,
     fixed_cameras,
 )
 from dyngs.models.views import evaluation_background
@@ -131,7 +131,7 @@ class PredictedField(Renderable):
         rgb = torch.stack([view.colour for view in views])
         through = torch.stack([view.transmittance for view in views])
         depth = self.scale * torch.stack([view.depth for view in views])
-        return composited(rgb, through, depth, options, behind)
+        return composite_background(rgb, through, depth, options, behind)
 
 
 def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedField:
@@ -185,7 +185,9 @@ class PredictedModel(Model[PredictedField]):
             "`human` on the capture"
         )
 
-    def draw(self, image: Image, step: int, background: Tensor, *, depth: bool = False) -> Drawn:
+    def draw(
+        self, image: Image, step: int, background: Tensor, *, depth: bool = False
+    ) -> RenderOutput:
         raise self._untrained()
 
     def update(self, step: int) -> UpdateResult:

@@ -51,11 +51,11 @@ from dyngs.models.prediction import (
     Learner,
     Predictor,
     ResidualBlock,
-    initialize_weights,
     image_loss,
+    initialize_weights,
     load_weights,
+    optimizer_step,
     random_index,
-    updated,
     upsample,
 )
 from dyngs.models.renderable import Renderable
@@ -522,7 +522,7 @@ class PersonPredictor(Predictor[AtlasNetwork]):
             scene = self._scene(maps)
             time_steps = [scene.time_step(image.time) for image in images]
             loss = _images_error(scene, time_steps, images, self.background, self.config)[0]
-            if not updated(optimizer, self.network, loss, rate * (1.0 - step / steps)):
+            if not optimizer_step(optimizer, self.network, loss, rate * (1.0 - step / steps)):
                 break
             report("training on the images", step + 1, steps)
         return steps
