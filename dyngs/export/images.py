@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.core.conventions import ProgressCallback, ignore_progress, encode_srgb
+from dyngs.core.conventions import ProgressCallback, encode_srgb, ignore_progress
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import ImageLoader

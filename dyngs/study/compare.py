@@ -21,13 +21,13 @@ from pydantic import TypeAdapter
 from dyngs.api.budget.size import has_file
 from dyngs.config import Config
 from dyngs.config.io import find_preset, load_config, load_resolved
-from dyngs.core.errors import DyngsError, format_one_line, show
+from dyngs.core.errors import DyngsError, format_one_line, log_info
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.view_scores import SceneRenderer
-from dyngs.models.kind import PredictsScenes, capability, kind_of
+from dyngs.models.kind import PredictsScenes, capability, find_kind
 from dyngs.models.views import evaluation_background
 from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.folder import EXPORT_FOLDER
@@ -119,7 +119,7 @@ class ModelComparison:
             try:
                 config = load_config(file, words)
                 validate_limits(config)
-                problem = kind_of(config.model).refusal(capture)
+                problem = find_kind(config.model).refusal(capture)
                 if capability(config.model, PredictsScenes) is not None:
                     problem = "predicts people and needs several captures"
             except DyngsError as error:
@@ -182,7 +182,7 @@ class ModelComparison:
             if isinstance(result, DyngsError):
                 left_out[study_scene.name] = str(result)
                 del study_scenes[study_scene.name]
-                show(f"{study_scene.name}: skipped: {result}")
+                log_info(f"{study_scene.name}: skipped: {result}")
             else:
                 done = f"{result.steps:,} steps in {result.seconds:.0f} s"
                 log_info(f"{study_scene.name}: {result.psnr:.2f} dB, {done}")
@@ -202,7 +202,7 @@ class ModelComparison:
         if not (self.out / "points" / f"{folder.name}.json").is_file():
             log_path = self.out / "logs" / f"{folder.name}.txt"
             log_path.parent.mkdir(parents=True, exist_ok=True)
-            show(f"training {folder.name}: {self.limit}")
+            log_info(f"training {folder.name}: {self.limit}")
             with log_path.open("a", encoding="utf-8") as log, redirect_stdout(log):
                 train_to_end(config, folder, [QualityCurve(self, folder)])
             side = load_resolved(folder).data.longest_side

@@ -182,7 +182,7 @@ class SceneMeasurer:
             groups = [[]]
         for group in groups:
             together = [0, *group]
-            show(f"timing {counted(len(together), 'scene')}")
+            log_info(f"timing {format_count(len(together), 'scene')}")
             drawn = [
                 self._open_renderer(study_scenes[i].run_dir, study_scenes[i].make())
                 for i in together

@@ -25,10 +25,10 @@ from dyngs.compress.stage import build_pruning_edit
 from dyngs.config import BudgetConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.core.conventions import num_sh_terms
-from dyngs.core.errors import DyngsError, format_one_line, show
+from dyngs.core.errors import DyngsError, format_one_line, log_info
 from dyngs.core.section import CutOff
 from dyngs.core.state import strip_roles
-from dyngs.models.checkpoint import read_run_capture, restore_model, checkpoint_settings
+from dyngs.models.checkpoint import checkpoint_settings, read_run_capture, restore_model
 from dyngs.models.kind import HasGaussians, HasMotion, capability
 from dyngs.ops.device import select_device
 from dyngs.ops.native import kernel_threads, num_cores
@@ -242,7 +242,7 @@ class Tradeoff:
         singles = [Variant(), *single_setting_variants(self.settings, own, self.finetune)]
         idle = self.settings.keys() - {name for variant in singles for name in variant.settings}
         if idle:
-            show(f"settings without effect on this run: {', '.join(sorted(idle))}")
+            log_info(f"settings without effect on this run: {', '.join(sorted(idle))}")
         found = self._measure(singles, self.ray_cores)
         # Combinations share folders, so they are created one by one.
         return self._measure([*singles, *combinations(found, self.combine)], None)
@@ -264,7 +264,7 @@ class Tradeoff:
         for study_scene, found in run_tasks(measurer.measure, missing, ray_cores):
             if isinstance(found, DyngsError):
                 raise found
-            show(f"{study_scene.name}: {found.psnr:.2f} dB, {found.mb:.2f} MB")
+            log_info(f"{study_scene.name}: {found.psnr:.2f} dB, {found.mb:.2f} MB")
         return dict(zip(variants, measurer.with_speeds(study_scenes), strict=True))
 
     def folder(self, variant: Variant) -> Path:

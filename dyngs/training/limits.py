@@ -9,7 +9,7 @@ from __future__ import annotations
 from dyngs.config import Config
 from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
-from dyngs.models.kind import HasGaussians, HasSizeLimit, capability, kind_of
+from dyngs.models.kind import HasGaussians, HasSizeLimit, capability, find_kind
 
 # Fraction of the limit reserved for the random Gaussians that are added when motion begins
 RANDOM_FRACTION = 0.1
@@ -21,7 +21,7 @@ FEWEST = 500  # Smallest number of Gaussians that a size limit must allow
 
 def validate_limits(config: Config) -> None:
     """Raise DyngsError if limits or options of ``config`` contradict each other or its kind."""
-    uses = kind_of(config.model).uses
+    uses = find_kind(config.model).uses
     for key, value in _kind_specific_options(config).items():
         if key not in uses:
             raise DyngsError(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image
-from dyngs.models.model import LossInput, Loss
+from dyngs.models.model import Loss, LossInput
 from dyngs.ops.device import AsyncReadback, copy_async
 from dyngs.ops.loss import l1_ssim_loss
 

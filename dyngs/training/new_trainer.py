@@ -17,11 +17,11 @@ from dyngs.data.scene_space import cube_half_side, outside_of_cube
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.initialization import InitialGaussians, scene_geometry
 from dyngs.gaussians.model import GaussianModel
-from dyngs.models.kind import HasMotion, StartContext, kind_of
+from dyngs.models.kind import HasMotion, StartContext, find_kind
 from dyngs.models.views import (
     background_colour,
-    resolve_background,
     background_coloured_fraction,
+    resolve_background,
     training_cameras,
     training_times,
 )
@@ -145,7 +145,7 @@ def prepare_capture(config: Config) -> Capture:
 def add_initial_points(capture: Capture, config: Config, *, log_messages: bool = True) -> Capture:
     """Return ``capture`` with initial points, if the model kind needs them."""
     messages: list[str] = []
-    if "init" in kind_of(config.model).uses:
+    if "init" in find_kind(config.model).uses:
         init = config.init
         if isinstance(init, PointsInit):
             capture, messages = with_first_points(capture, config.data, init)
@@ -159,7 +159,7 @@ def add_initial_points(capture: Capture, config: Config, *, log_messages: bool =
                     f"init.kind=random: points are drawn around the origin, but {why}; use auto"
                 )
     for message in [*messages, *before_training(capture)] if log_messages else []:
-        warn(message)
+        log_warning(message)
     return capture
 
 

@@ -11,7 +11,7 @@ from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.capture import Capture
 from dyngs.gaussians.initialization import InitialGaussians
 from dyngs.models.kind import HasSchedules, capability
-from dyngs.models.schedule import PUBLISHED_STEPS, Length, scaled
+from dyngs.models.schedule import PUBLISHED_STEPS, LengthChange, scale_step
 from dyngs.training.corrections.exposure import WARM_UP
 
 
@@ -77,7 +77,7 @@ def extend_config(config: Config, done: int, steps: int) -> Config:
         )
     if steps <= done:
         raise DyngsError(
-            f"train.steps={steps}: the run already has {counted(done, 'step')}; use a larger number"
+            f"train.steps={steps}: the run already has {format_count(done, 'step')}; use a larger number"
         )
     _require_exposures_stay(config, length)
     changed: dict[str, object] = {"train": _train(config.train, length)}
@@ -104,7 +104,7 @@ def describe_extension(before: Config, after: Config, done: int) -> str:
     no_limit = "" if before.train.minutes is None else "; train.minutes is ignored"
     return (
         f"resuming at step {done:,}, extended from {before.train.steps:,} to "
-        f"{counted(steps, 'step')}; "
+        f"{format_count(steps, 'step')}; "
         f"schedules rescaled{no_limit}"
     )
 

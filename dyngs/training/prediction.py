@@ -14,7 +14,7 @@ from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.models.checkpoint import CONFIG_ADVICE, Checkpoint, CheckpointInfo, checkpoint_settings
 from dyngs.models.kind import PredictsScenes, capability
-from dyngs.models.prediction import Learner, load_optimizer, optimizer_state, updated
+from dyngs.models.prediction import Learner, load_optimizer, optimizer_state, optimizer_step
 from dyngs.training.events import StepReport
 from dyngs.training.trainer import TrainingEdit, ViewSampler
 

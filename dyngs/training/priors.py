@@ -18,7 +18,7 @@ from dyngs.data.tracks import ImageTracks, read_tracks
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.models.model import LossInput, Loss
+from dyngs.models.model import Loss, LossInput
 from dyngs.models.views import training_cameras
 
 SOFT_PX = 0.5  # Constant of the Charbonnier loss, px: smaller errors are penalised quadratically

@@ -145,7 +145,7 @@ class EditState:
             lines.append(f"distance: **{length:.4g} {'m' if self.whole.scaled else 'units'}**")
             lines.append(f'`--scale "{texts[0]} {texts[1]} LENGTHm"`')
         lines.append(f"box: `--crop {low} {high}`")
-        total = counted(len(self.whole.scene), "Gaussian")
+        total = format_count(len(self.whole.scene), "Gaussian")
         lines.append(f"{len(self.rows):,} of {total} remaining")
         return "\n\n".join(lines)
 
@@ -289,7 +289,9 @@ class EditControls:
     def _delete(self, *, inside: bool) -> None:
         gone = self.editing.delete(inside=inside)
         self._show()
-        self._connection.notify("Deleted", f"{counted(gone, 'Gaussian')} (use Undo to restore)")
+        self._connection.notify(
+            "Deleted", f"{format_count(gone, 'Gaussian')} (use Undo to restore)"
+        )
 
     def _undo(self) -> None:
         if self.editing.steps:

@@ -102,7 +102,7 @@ def with_levels(opened: OpenedScene, most: int) -> OpenedScene:
     """Return a static scene with levels of detail: at most ``most`` Gaussians are rendered while it
     moves."""
     opened = opened.noted(f"at most {most:,} Gaussians are rendered while the view moves")
-    opened.once("levels", lambda: LevelScene.of(opened.renderable, most))
+    opened.once("levels", lambda: LevelScene.from_scene(opened.renderable, most))
     return opened
 
 

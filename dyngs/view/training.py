@@ -17,7 +17,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.kind import PredictsScenes, capability
 from dyngs.models.renderable import Renderable
 from dyngs.models.views import background_colour
-from dyngs.runs.opened import Captured, OpenedScene
+from dyngs.runs.opened import OpenedScene, SourceCapture
 from dyngs.training.events import Event, StepDone
 from dyngs.training.trainer import Trainer
 from dyngs.view.server import ServerOptions, Viewer, free_port, require_viser

@@ -55,7 +55,7 @@ from dyngs.io.formats.formats import read_splats, upright, write_splats
 from dyngs.io.formats.similarity import AXES, Similarity, turn_between
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.gltf import GltfFile
-from dyngs.runs.opened import Captured, OpenedScene, open_run, wrap_scene
+from dyngs.runs.opened import OpenedScene, SourceCapture, open_run, wrap_scene
 
 ALL = (0, 1, 2, 3, 4)
 STILL_ROWS = (0, 2, 4)
@@ -133,7 +133,7 @@ def test_up_is_what_the_cameras_or_the_user_say(near: OpenedScene) -> None:
     assert how.turn == turn_between(found[0], AXES["y"])
     assert f"rotated from {name} in the capture" in line or name == "y"
     assert "axes of the capture kept" in choose_write_options(near, name)[1]
-    lost = replace(near, captured=Captured(near.config.data, DyngsError("gone")))
+    lost = replace(near, captured=SourceCapture(near.config.data, DyngsError("gone")))
     assert find_up_direction(lost) is None
     how, line = choose_write_options(lost, "y", sh_degree=2)
     assert (how.turn, how.up, how.sh_degree) == ((1.0, 0.0, 0.0, 0.0), None, 2)

@@ -11,7 +11,7 @@ from scenes import random_scene
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image
-from dyngs.models.model import Drawn, LossInput
+from dyngs.models.model import LossInput, RenderOutput
 from dyngs.models.renderable import Rendering
 from dyngs.training.losses import SilhouetteLoss, StepCheck
 

@@ -13,7 +13,7 @@ from dyngs.data.loader import Image
 from dyngs.data.read import read_capture
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians.rendering import RenderOptions
-from dyngs.models.model import Drawn, LossInput, Model
+from dyngs.models.model import LossInput, Model, RenderOutput
 from dyngs.training.priors import (
     PointTracks,
     PriorLosses,
@@ -88,7 +88,7 @@ def terms(
     rendering = of.render(HERE, 0.0, options=RenderOptions(nonfinite="trust", depth=depth))
     rgb = rendering.rgb[0]
     model = cast(Model[Any], Seen(of, until))
-    look = LossInput(0, 1, own, Drawn(rendering), rgb, rgb, model, GENERATOR)
+    look = LossInput(0, 1, own, RenderOutput(rendering), rgb, rgb, model, GENERATOR)
     return {name: float(x.detach()) for name, x in priors(look).items()}
 
 

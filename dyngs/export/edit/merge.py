@@ -48,7 +48,7 @@ def merge_scenes(
                 f"{file}: its low-pass filter ({other.mode.value}) is replaced by that of the "
                 "first scene"
             )
-        log(f"{file}: {counted(len(gaussians), 'Gaussian')} added")
+        log(f"{file}: {format_count(len(gaussians), 'Gaussian')} added")
         parts.append(gaussians.detach())
     degree = max(part.sh_degree for part in parts)
     return replace(splat, gaussians=joined([with_degree(part, degree) for part in parts]))

@@ -127,7 +127,7 @@ def write_page_folder(
         header = add_levels(levelled.levels, colour, lists) | _render_header(levelled.options)
         header["levels"]["most"] = most
         header |= _view_header(opened, time, *_initial_views(opened, views))
-        parts = block_files(levelled.levels, with_rest=colour is None)
+        parts = block_files(levelled.levels, includes_harmonics=colour is None)
     else:
         header = _header(opened, time, views, lists)
         parts = ((f"{i}.bin", chunk.deflated()) for i, chunk in enumerate(lists.chunks or ()))

@@ -121,8 +121,10 @@ def add_scene(scene: GaussianScene, lists: PackedArrays, tolerance: float) -> di
         header |= _add_person(person, order, lists, tolerance)
     elif moved is not None:
         header |= _add_motion(moved, order, lists, tolerance)
-    bake_harmonics = scene.colour is None
-    header |= _add_gaussians(gaussians.select(order).detach(), lists, bake_harmonics=bake_harmonics)
+    includes_harmonics = scene.colour is None
+    header |= _add_gaussians(
+        gaussians.select(order).detach(), lists, includes_harmonics=includes_harmonics
+    )
     return header if scene.colour is None else header | _add_network(scene.colour, lists)
 
 
@@ -133,7 +135,7 @@ def add_levels(levels: Levels, colour: ColourNetwork | None, lists: PackedArrays
     The page fetches the blocks itself, see ``block_numbers``.
     """
     lists.exact("blocks", np.concatenate(levels.blocks).astype(np.float32))
-    coarsest = block_numbers(levels, (len(levels.levels) - 1, 0), bake_harmonics=colour is None)
+    coarsest = block_numbers(levels, (len(levels.levels) - 1, 0), includes_harmonics=colour is None)
     sizes = [len(level) for level in levels.levels]
     known = {"sizes": sizes, "block": BLOCK, "merged": MERGED, "pixels": MAX_SPREAD_PX}
     degree = levels.levels[0].sh_degree if colour is None else 0
@@ -142,28 +144,28 @@ def add_levels(levels: Levels, colour: ColourNetwork | None, lists: PackedArrays
     return header if colour is None else header | _add_network(colour, lists)
 
 
-def block_numbers(levels: Levels, block: Block, *, bake_harmonics: bool) -> PackedArrays:
+def block_numbers(levels: Levels, block: Block, *, includes_harmonics: bool) -> PackedArrays:
     """Return the arrays of a block with ``BLOCK`` rows. Missing rows are padded with transparent
     Gaussians."""
-    gaussians = levels.of_block(block)
+    gaussians = levels.block_gaussians(block)
     rows = torch.arange(BLOCK, device="cpu").clamp_max(len(gaussians) - 1)
     padded = gaussians.select(rows)
     padded.logit_opacities[len(gaussians) :] = -MOST_LOGIT
     lists = PackedArrays()
-    _add_gaussians(padded, lists, bake_harmonics=bake_harmonics)
+    _add_gaussians(padded, lists, includes_harmonics=includes_harmonics)
     return lists
 
 
-def block_files(levels: Levels, *, bake_harmonics: bool) -> Iterator[tuple[str, bytes]]:
+def block_files(levels: Levels, *, includes_harmonics: bool) -> Iterator[tuple[str, bytes]]:
     """Yield names and contents of the files of all blocks, as requested by ``levels.js``."""
     for level, balls in enumerate(levels.blocks):
         for place in range(len(balls)):
-            numbers = block_numbers(levels, (level, place), bake_harmonics=bake_harmonics)
+            numbers = block_numbers(levels, (level, place), includes_harmonics=includes_harmonics)
             yield f"{level}-{place}.bin", numbers.deflated()
 
 
 def _add_gaussians(
-    gaussians: Gaussians, lists: PackedArrays, *, bake_harmonics: bool
+    gaussians: Gaussians, lists: PackedArrays, *, includes_harmonics: bool
 ) -> dict[str, Any]:
     unit = torch.nn.functional.normalize(gaussians.quats, dim=1)
     logits = gaussians.logit_opacities.clamp(-MOST_LOGIT, MOST_LOGIT)
@@ -172,7 +174,7 @@ def _add_gaussians(
     lists.quantised("log_scales", _numpy(gaussians.log_scales), 8)
     lists.quantised("logit_opacities", _numpy(logits[:, None]), 8)
     lists.quantised("base", _numpy(gaussians.sh[:, 0]), 8)
-    degree = gaussians.sh_degree if bake_harmonics else 0
+    degree = gaussians.sh_degree if includes_harmonics else 0
     if degree:
         lists.quantised("rest", _numpy(gaussians.sh[:, 1:].flatten(1)), 8)
     return {"degree": degree}
@@ -229,7 +231,7 @@ def _add_curves(curves: MotionSplines, order: Tensor, lists: PackedArrays) -> di
         lists.exact("shares", _fractions(curves.fractions[order]))
     if curves.windows is not None:
         lists.quantised("windows", _numpy(curves.windows[order]), 16)
-        header |= {"edge": EDGE, "open": OPEN}
+        header |= {"edge": EDGE_WIDTH, "open": OPEN_WINDOW}
     return header
 
 
@@ -408,9 +410,11 @@ def _error(points: Tensor, offsets_at: Callable[[float], Offsets], pieces: int) 
 
 
 def _curves_of_nodes(field: ControlNodes, means: Tensor) -> MotionSplines:
-    nodes = field.nodes_for(means)
+    nodes = field.update_nodes(means)
     more = 0, FOLLOWED - nodes.followed.shape[1]  # of which a Gaussian follows nothing
     followed, fractions = (
         torch.nn.functional.pad(x, more) for x in (nodes.followed, nodes.weights(means))
     )
-    return MotionSplines(_fit(field.at, field.num_pieces), nodes.positions, followed, fractions)
+    return MotionSplines(
+        _fit(field.offsets_of_nodes, field.num_pieces), nodes.positions, followed, fractions
+    )

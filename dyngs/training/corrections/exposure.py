@@ -31,7 +31,7 @@ from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.colour.network import SATURATED, apply_affine_colour
 from dyngs.gaussians.optimizer import AdamState
-from dyngs.models.model import Correction, LossInput, Loss, RenderedView
+from dyngs.models.model import Correction, Loss, LossInput, RenderedView
 from dyngs.models.renderable import Rendering
 from dyngs.ops.adam import Count
 from dyngs.training.corrections.cells import (
