@@ -13,7 +13,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.geometry import (
     fraction_in_front,
     look_at,
-    look_at_point,
+    estimate_focus,
     perpendicular,
     pinhole_matrix,
     unit,
@@ -38,7 +38,7 @@ def orbit_path(
         up: (3,) axis of the circle. None estimates it from the cameras.
     """
     poses = world_from_cam(cameras)
-    center = look_at_point(cameras)
+    center = estimate_focus(cameras)
     up = up_direction(cameras) if up is None else unit(np.asarray(up, np.float64))
     offsets = poses[:, :3, 3] - center
     heights = offsets @ up
@@ -121,7 +121,7 @@ def spiral_path(cameras: Cameras, num_frames: int, up: np.ndarray | None = None)
     viewing axis by half its width.
     """
     centers = world_from_cam(cameras)[:, :3, 3]
-    target = look_at_point(cameras)
+    target = estimate_focus(cameras)
     up = up_direction(cameras) if up is None else up
     middle = centers.mean(axis=0)
     base = look_at(middle, target, up)[:3, :3]
@@ -207,7 +207,7 @@ def path_along(
     # Features whose distances approximate image differences: position, and viewing direction times
     # the distance to the scene.
     centers = poses[:, :3, 3]
-    reach = float(np.linalg.norm(centers - look_at_point(cameras), axis=1).mean())
+    reach = float(np.linalg.norm(centers - estimate_focus(cameras), axis=1).mean())
     features = np.concatenate([centers, reach * poses[:, :3, 2]], axis=1)
     # Round to nine digits, so that equal poses stay equal in any unit of length.
     features = (features / (float(np.abs(features).max()) or 1.0)).round(9)

@@ -172,7 +172,7 @@ class HasBody(ModelKind):
         self,
         data: DataConfig,
         section: Any,
-        say: Callable[[str], None],
+        log: Callable[[str], None],
         report: ProgressCallback,
     ) -> DataConfig:
         """Return the options of a capture with body parameters: found, and fitted to the

@@ -36,7 +36,7 @@ from dyngs.ops.nodes import SPAN
 
 BONES = 8  # Joints per Gaussian on the page
 FINE = ("means", "quats")  # Splines of nodes that are stored with 16 bits
-MOST_LOGIT = 15.0  # Opacity logits are clamped to this value, which is 1 to seven digits
+MAX_LOGIT = 15.0  # Opacity logits are clamped to this value, which is 1 to seven digits
 CHUNK_BYTES = 1 << 19  # Bytes of splines fetched at once, before compression
 CHUNK = 256  # Rows that share a quantisation range per column; neighbouring rows are close in space
 
@@ -150,7 +150,7 @@ def block_numbers(levels: Levels, block: Block, *, includes_harmonics: bool) -> 
     gaussians = levels.block_gaussians(block)
     rows = torch.arange(BLOCK, device="cpu").clamp_max(len(gaussians) - 1)
     padded = gaussians.select(rows)
-    padded.logit_opacities[len(gaussians) :] = -MOST_LOGIT
+    padded.logit_opacities[len(gaussians) :] = -MAX_LOGIT
     lists = PackedArrays()
     _add_gaussians(padded, lists, includes_harmonics=includes_harmonics)
     return lists
@@ -168,7 +168,7 @@ def _add_gaussians(
     gaussians: Gaussians, lists: PackedArrays, *, includes_harmonics: bool
 ) -> dict[str, Any]:
     unit = torch.nn.functional.normalize(gaussians.quats, dim=1)
-    logits = gaussians.logit_opacities.clamp(-MOST_LOGIT, MOST_LOGIT)
+    logits = gaussians.logit_opacities.clamp(-MAX_LOGIT, MAX_LOGIT)
     lists.quantised("means", _numpy(gaussians.means), 16)
     lists.quantised("quats", _numpy(torch.where(unit[:, :1] < 0, -unit, unit)), 8)
     lists.quantised("log_scales", _numpy(gaussians.log_scales), 8)
