@@ -114,7 +114,7 @@ MUTATIONS = (
     ("io/outputs.py", "fcntl.LOCK_EX | fcntl.LOCK_NB", "fcntl.LOCK_SH | fcntl.LOCK_NB", "io/test_lock.py"),
     ("runs/folder.py", "if not same or checkpoint_paths(folder)", "if not same", "runs/test_folder.py"),
     ("runs/folder.py", "RunConfig(seed=config.run.seed)", "RunConfig()", "runs/test_folder.py"),
-    ("io/containment.py", "amount > most and amount > allowed(most)", "amount > most", "io/test_limits.py"),
+    ("io/containment.py", "amount > most and amount > scaled_limit(most)", "amount > most", "io/test_limits.py"),
     ("io/containment.py", "startswith(root.rstrip(os.sep) + os.sep)", "startswith(root.rstrip(os.sep))", "io/test_containment.py"),
     ("io/containment.py", "max(channels, 4)", "4", "io/test_containment.py"),
     ("io/outputs.py", "if folder in self.paths:", "if folder in ():", "io/test_outputs.py"),

@@ -96,18 +96,20 @@ def pages() -> dict[Path, str]:
 
 
 def link_pages(text: str) -> str:
-    """Replace the command ``dyngs docs NAME`` in sentences by a link to that page."""
+    """Replace ``dyngs docs NAME`` and ``docs/NAME.md`` in sentences by links to that page."""
     names = find_pages(DOCS)
 
     def link(match: re.Match[str]) -> str:
-        path = names.get(match[1])
+        path = names.get(match[1] or match[2])
         if path is None:
             return match[0]
-        return f"[{match[1]}](../{path.relative_to(DOCS).as_posix()})"
+        return f"[{path.stem}](../{path.relative_to(DOCS).as_posix()})"
 
     parts = re.split(r"(^```.*?^```$)", text, flags=re.MULTILINE | re.DOTALL)
     for index in range(0, len(parts), 2):
-        parts[index] = re.sub(r"`?dyngs docs ([a-z][\w/-]*)`?", link, parts[index])
+        parts[index] = re.sub(
+            r"`?dyngs docs ([a-z][\w/-]*)`?|docs/([\w/-]+)\.md", link, parts[index]
+        )
     return "".join(parts)
 
 

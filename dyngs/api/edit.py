@@ -32,12 +32,12 @@ from dyngs.export.splat_files import (
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
     all_suffixes,
+    find_format,
     format_for_path,
     format_to_read,
-    find_format,
-    transform_file,
     read_splats,
     rotate_file,
+    transform_file,
     undo_transforms,
     write_splats,
 )

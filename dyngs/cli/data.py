@@ -63,8 +63,8 @@ def _add_inspect(verbs: args.Commands) -> None:
         verbs,
         "inspect",
         run_inspect,
-        "report what a capture or a video holds and what is suspicious about it",
-        "Report views, sizes, intrinsics, times, points, masks, and everything suspicious. Of videos without poses: "
+        "report the contents of a capture or a video and its problems",
+        "Report views, sizes, intrinsics, times, points, masks, and all problems. Of videos without poses: "
         "size, rate, length, sound, sharpness, motion, and what to run next.",
     )
     path = "capture (folder or .zip), video, or folder of videos"
@@ -73,7 +73,7 @@ def _add_inspect(verbs: args.Commands) -> None:
     parser.add_argument(
         "--format",
         default="auto",
-        help="format of the capture (default: detected; docs/formats.md)",
+        help="format of the capture (default: detected; `dyngs docs captures`)",
     )
     parser.add_argument(
         "--image",
@@ -128,7 +128,7 @@ def _add_people(verbs: args.Commands) -> None:
         "find a person in a video and fit the body to them",
         "Find a person in every frame, their silhouette and key points, follow them through the clip, and fit the body "
         "as `data fit` does. OUT is a capture for `dyngs train human`. MediaPipe detects the person, in an environment "
-        "of its own (docs/person.md).",
+        "of its own (`dyngs docs people`).",
     )
     about = "a video, or a folder of images, of one camera that stands; or a capture with cameras"
     parser.add_argument("clip", type=args.input_path, metavar="CLIP", help=about)

@@ -30,7 +30,7 @@ examples:
   dyngs edit table.ply --undo --out before.ply                                the frame of before
   dyngs edit runs/room --up auto --scale 2 --out runs/upright                 a run: its cameras, motion, exports, too
 
-What is asked for is done in this order: --clean, --crop, --merge, the frame. docs/edit.md explains it.
+What is asked for is done in this order: --clean, --crop, --merge, the frame. Guide: `dyngs docs edit`.
 """
 
 

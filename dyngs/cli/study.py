@@ -27,7 +27,8 @@ examples:
   dyngs compare scans/dance --models static,dynamic,mine.yaml --steps 7000 data.longest_side=400
   dyngs compare scans/bench --models static,mip --max-mb 2 --out study
 
-Each model is a preset or a YAML file. An interrupted command continues when it is given again. Details: docs/cli.md.
+Each model is a preset or a YAML file. An interrupted command continues when it is given again.
+Guide: `dyngs docs compare`.
 """
 _TRADEOFF = """\
 examples:
@@ -35,7 +36,8 @@ examples:
   dyngs tradeoff runs/dance --vary prune=0.5,0.8 --vary storage --finetune 2000
   dyngs tradeoff runs/dance --require 'psnr>=30,fps>=20,mb<=5' --minimize mb
 
-An interrupted or repeated command continues and measures only what is missing. Details: docs/tradeoff.md.
+An interrupted or repeated command continues and measures only what is missing.
+Guide: `dyngs docs compare`.
 """
 _FRONT = "* Pareto front of PSNR, speed and size"
 _CONTINUES = "what is finished is kept; the same command continues"
@@ -124,7 +126,7 @@ def amount(text: str) -> float:
 def run_compare(arguments: argparse.Namespace) -> int:
     """Train, compare, print the table and write the report; the folder is locked against other
     commands."""
-    from dyngs.io.outputs import writing
+    from dyngs.io.outputs import lock_folder
     from dyngs.runs.folder import collect_inputs
     from dyngs.study.compare import ModelComparison
     from dyngs.study.report import Report, build_table, can_plot, page_views, plot_curves
@@ -150,7 +152,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
     configs, unfit = comparison.configs(arguments.models.split(","))
     for config in configs.values():
         collect_inputs(config).require_output(out)
-    with writing(out), redirect_messages(arguments.json):
+    with lock_folder(out), redirect_messages(arguments.json):
         comparison.require_same(configs, unfit)
         try:
             results, left_out, curves = comparison.run(configs, arguments.ray)
@@ -191,14 +193,14 @@ def _print_report(report: Report, stem: Path, *, is_json: bool) -> None:
 def run_tradeoff(arguments: argparse.Namespace) -> int:
     """Measure, print and write the tables, and choose a run; the folder is locked against other
     commands."""
-    from dyngs.io.outputs import writing
+    from dyngs.io.outputs import lock_folder
 
     if not arguments.run_dir.is_dir():
         raise DyngsError(
             f"{arguments.run_dir}: not a run folder; give one that `dyngs train` wrote"
         )
     out: Path = arguments.out or arguments.run_dir / "tradeoff"
-    with writing(out):
+    with lock_folder(out):
         return _tradeoff(arguments, out)
 
 

@@ -33,7 +33,7 @@ examples:
 
 CONFIG is a YAML file or the name of a packaged preset: static, blender, colmap, static_mcmc, mip, dynamic,
 human, human_predictor.
-All keys are listed in docs/cli.md.
+All keys: `dyngs docs config`.
 """
 _LOGGING = tuple(
     f"train.{name}"

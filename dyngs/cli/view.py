@@ -18,7 +18,7 @@ examples:
   dyngs view runs/ann --motion motions           a person, with the motions in a folder
   dyngs view runs/bench --host 0.0.0.0           for other machines; the link that is printed has a token
 
-Needs viser: pip install 'dyngs[view]'. All controls are in docs/viewer.md.
+Needs viser: pip install 'dyngs[view]'. Guide: `dyngs docs view-and-share`.
 """
 
 

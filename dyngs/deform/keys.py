@@ -119,11 +119,11 @@ MIN_STATIC_STEPS = 1000
 
 
 class DynamicModel(SceneModel):
-    """Canonical Gaussians and a deformation field over time (docs/dynamic.md)."""
+    """Canonical Gaussians and a deformation field over time (docs/concepts/motion.md)."""
 
     kind: Literal["dynamic"] = Field(
         default="dynamic",
-        description="canonical Gaussians and a deformation field over time (docs/dynamic.md)",
+        description="canonical Gaussians and a deformation field over time (`dyngs docs motion`)",
     )
     deform: Annotated[
         DeformField,
@@ -135,7 +135,7 @@ class DynamicModel(SceneModel):
         default=False,
         description="decide by short pilot runs, compared on held-out training views, whether to model motion "
         "(else the scene is trained as with the preset static) and, if not requested, the colour "
-        "model (docs/dynamic.md)",
+        "model (`dyngs docs motion`)",
     )
     motion_from: Fraction = Field(
         default=0.13,

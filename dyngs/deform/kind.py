@@ -24,7 +24,7 @@ class DynamicKind(HasSizeLimit, HasMotion, HasSchedules):
             return None
         return (
             "the images have no times; train configs/static.yaml, add a time to each image "
-            "(docs/formats.md), or set data.times=order if the file names are in temporal order"
+            "(`dyngs docs captures`), or set data.times=order if the file names are in temporal order"
         )
 
     def functions(self) -> tuple[Start, Restore]:

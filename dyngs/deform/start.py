@@ -87,7 +87,7 @@ def _training_views(
         return None if colours.network is None else colours.network.shader(time)
 
     def errors_of(gaussians_at: Callable[[float], Gaussians]) -> StaticErrors:
-        shown = [images.shrunk(i, divisor) for i in looked_at]
+        shown = [images.downscaled(i, divisor) for i in looked_at]
         mask_error = SURELY_MOVING * model.motion_threshold
         return static_errors(gaussians_at, shown, options, background, shader, mask_error)
 

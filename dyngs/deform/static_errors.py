@@ -56,7 +56,7 @@ def static_errors(
     that show the Gaussian. Otherwise the rendering is expected, and both are the mean weighted by
     sum_p w_vip, because an unfinished static model errs everywhere.
     """
-    masked = [x for x in images if x.moves is not None]
+    masked = [x for x in images if x.motion_mask is not None]
     expected = {} if masked else _median_images(images, background)
     compared = masked or [x for x in images if _camera_key(x) in expected] or images
     results: list[tuple[Tensor, Tensor]] = []
@@ -64,8 +64,8 @@ def static_errors(
         time = image.time or 0.0
         gaussians = gaussians_at(time).detach()
         truth = image.composite(background)
-        if image.moves is not None:
-            error = (2 * mask_error * image.moves)[..., None].expand_as(truth)
+        if image.motion_mask is not None:
+            error = (2 * mask_error * image.motion_mask)[..., None].expand_as(truth)
         elif expected:
             error = expected[_camera_key(image)] - truth
         else:

@@ -100,7 +100,7 @@ class Regions:
         """Return the moving pixels (H, W) bool, or None if unknown."""
         if image.moves is not None:
             self._moving_from.add("motion masks")
-            return image.moves >= 0.5
+            return image.motion_mask >= 0.5
         indices = self._cameras.get(image.name)
         if indices is None:
             return None

@@ -14,7 +14,14 @@ import torch
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, format_one_line
 from dyngs.data.geometry import from_opengl_pose, validate_pose, invert_rigid, pinhole_matrix
-from dyngs.io.fields import entry, as_float_array, is_number, parse_numbers, read_json, require_at_most
+from dyngs.io.fields import (
+    entry,
+    as_float_array,
+    is_number,
+    parse_numbers,
+    read_json,
+    require_at_most,
+)
 
 _MAX_FRAMES = 100_000  # Longer paths are assumed to be a typing mistake
 AUTOMATIC_PATHS = ("orbit", "spiral", "along")  # Paths that are placed automatically
@@ -189,7 +196,7 @@ def _convert_nerfstudio(found: dict[str, Any], file: Path) -> dict[str, Any]:
     frames = []
     for i, view in enumerate(views if isinstance(views, list) else []):
         where = f"{file}: camera_path[{i}]"
-        pose = entry(where, view, "camera_to_world")
+        pose = require_key(where, view, "camera_to_world")
         half = math.radians(_number(view, "fov", where, 0.01, 179)) / 2
         frame = {"transform_matrix": pose, "fl_x": 0.5 * height / math.tan(half)}
         frames.append(frame | {"time": view["render_time"]} if "render_time" in view else frame)

@@ -11,6 +11,8 @@ import torch
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.geometry import (
+    cameras_at_poses,
+    estimate_focus,
     fraction_in_front,
     look_at,
     estimate_focus,
@@ -18,7 +20,6 @@ from dyngs.data.geometry import (
     pinhole_matrix,
     unit,
     up_direction,
-    with_poses,
     world_from_cam,
 )
 from dyngs.export.camera_paths import CameraPath
@@ -110,7 +111,7 @@ def _on_circle(
 
 
 def _looking_at(cameras: Cameras, eyes: np.ndarray, target: np.ndarray, up: np.ndarray) -> Cameras:
-    return with_poses(cameras, np.stack([look_at(eye, target, up) for eye in eyes]))
+    return cameras_at_poses(cameras, np.stack([look_at(eye, target, up) for eye in eyes]))
 
 
 def spiral_path(cameras: Cameras, num_frames: int, up: np.ndarray | None = None) -> Cameras:

@@ -43,9 +43,9 @@ from dyngs.io.formats.similarity import (
 from dyngs.io.formats.sog import sog_parts
 from dyngs.io.formats.splat_file import (
     SplatFile,
-    drawable,
     from_linear,
     header_comments,
+    make_renderable,
     offset_notes,
     require_writable,
     unit_rotations,
@@ -311,7 +311,9 @@ def splats_at(
     gaussians = opened.file_unit.gaussians(gaussians.detach())
     splat = SplatFile(gaussians, model.rasterize_mode, model.eps2d, (x, y, z), tuple(comments))
     if opened.edited is not None:
-        splat = transform_file(splat, opened.frame.after(opened.file_unit.inverse()), opened.edited.up)
+        splat = transform_file(
+            splat, opened.frame.after(opened.file_unit.inverse()), opened.edited.up
+        )
     splat = rotate_file(splat, how.turn, how.up)
     return splat if how.edit == IDENTITY else transform_file(splat, how.edit, how.up)
 
@@ -437,7 +439,7 @@ def read_4dgs_frame(path: Path, index: int) -> SplatFile:
     sh = ((found["rgb"] - 0.5) / SH_C0)[:, None]
     quats = found["rotations"][:, [3, 0, 1, 2]]
     gaussians = from_linear(found["centers"], quats, found["scales"], found["opacity"], sh)
-    return drawable(SplatFile(gaussians), path, "error")
+    return make_renderable(SplatFile(gaussians), path, "error")
 
 
 def _fourdgs(path: Path) -> tuple[Any, Any, Any]:

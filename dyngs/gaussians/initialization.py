@@ -28,8 +28,8 @@ from dyngs.core.conventions import SH_C0, num_sh_terms
 from dyngs.data.capture import Capture, View
 from dyngs.data.scene_space import (
     MIN_VIEWS,
-    cube_half_side,
     camera_extent,
+    cube_half_side,
     cube_mismatch_reason,
     sample_points_in_frusta,
 )

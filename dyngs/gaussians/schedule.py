@@ -23,7 +23,7 @@ OTHERS_POWER = 1 / 3
 SHORTEST = 500
 """Exponents of 30,000 / steps in the learning rate factors of means and of all other parameters.
 
-Runs shorter than ``SHORTEST`` use the factors of ``SHORTEST`` (docs/benchmarks.md).
+Runs shorter than ``SHORTEST`` use the factors of ``SHORTEST`` (docs/benchmarks/index.md).
 """
 GROWTH, MAX_GROWTH = 0.05, 0.25
 """Fraction of Gaussians that MCMC adds per change in 30,000 steps, and the maximum in shorter

@@ -25,7 +25,7 @@ from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.io.fields import read_limited
 from dyngs.io.formats.similarity import AXES, IDENTITY, Similarity, similarity_from_numbers
-from dyngs.io.outputs import LOCK_NAME, Inputs, atomic_folder, writing
+from dyngs.io.outputs import LOCK_NAME, Inputs, atomic_folder, lock_folder
 from dyngs.io.write import remove_leftovers, remove_quietly, temporary_folder_beside, write_text
 from dyngs.models.kind import PredictsScenes, capability
 from dyngs.runs.capture_record import RECORD_NAME, require_same_capture
@@ -143,7 +143,7 @@ def require_empty(folder: Path) -> None:
         and not folder.is_symlink()
         and [path.name for path in folder.iterdir()] == [LOCK_NAME]
     ):
-        with writing(folder):  # it removes the file at its end
+        with lock_folder(folder):  # it removes the file at its end
             pass
     if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
         raise DyngsError(f"{folder}: exists already; give another --out")
@@ -161,7 +161,7 @@ def open_export_folder(out: Path, run_dir: Path, config: Config) -> Iterator[Pat
         with atomic_folder(out, require_empty) as started:
             yield started
         return
-    with writing(out):
+    with lock_folder(out):
         if out.resolve() != run_dir.resolve():
             _require_export_of(config, out)
         yield out

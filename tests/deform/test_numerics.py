@@ -1,4 +1,4 @@
-"""Dynamic scenes at the extremes: one test per row of the second table in docs/numerics.md."""
+"""Dynamic scenes at the extremes: one test per row of the second table in docs/contributing/numerics.md."""
 
 from __future__ import annotations
 

@@ -214,7 +214,7 @@ def test_changing_brightness_is_no_motion_and_a_thing_that_comes_is() -> None:
 
 
 def masked_image(moves: torch.Tensor | None, mask: torch.Tensor | None = None) -> Image:
-    return Image("a", cameras_around(1), torch.zeros(18, 24, 3), None, mask, 0.0, moves=moves)
+    return Image("a", cameras_around(1), torch.zeros(18, 24, 3), None, mask, 0.0, motion_mask=moves)
 
 
 def left() -> torch.Tensor:

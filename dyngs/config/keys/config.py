@@ -51,15 +51,17 @@ class CameraConfig(Section):
 
 
 class PruneConfig(Section):
-    """A last stage with fewer Gaussians, after ``train.steps`` (docs/prune.md). Off where nothing
-    is asked for."""
+    """A last stage with fewer Gaussians, after ``train.steps``; off by default.
+
+    Guide: docs/guides/smaller-and-faster.md.
+    """
 
     fraction: float = Field(
         default=0.0, ge=0, lt=1, description="fraction of the Gaussians to remove; 0: none"
     )
     score: Literal["variation", "sensitivity", "contribution"] = Field(
         default="sensitivity",
-        description="importance of a Gaussian (docs/prune.md); the lowest are removed",
+        description="importance of a Gaussian (`dyngs docs smaller-and-faster`); the lowest are removed",
     )
     mask_times: int = Field(
         default=0,
@@ -74,7 +76,7 @@ class PruneConfig(Section):
 
 
 class BudgetConfig(Section):
-    """Limits that a run keeps (docs/budget.md); null: none."""
+    """Limits that a run keeps (docs/reference/limits.md); null: none."""
 
     max_gaussians: int | None = Field(
         default=None, ge=1, description="most Gaussians at the end of the run"
@@ -95,7 +97,7 @@ class RunConfig(Section):
     threads: int = Field(default=0, ge=0, le=1024, description="CPU threads; 0: one per core")
     device: Literal["auto", "cpu", "cuda"] = Field(
         default="auto",
-        description="what computes; auto: a CUDA GPU that can be used (docs/gpu.md), else the CPU",
+        description="what computes; auto: a CUDA GPU that can be used (`dyngs docs gpu`), else the CPU",
     )
     deterministic: bool = Field(
         default=True,

@@ -33,7 +33,7 @@ class DataConfig(Section):
         "camera_folders",
     ] = Field(
         default="auto",
-        description="layout of the capture's files (docs/formats.md); auto: detected",
+        description="layout of the capture's files (`dyngs docs captures`); auto: detected",
     )
     frames: str | None = Field(
         default=None,

@@ -26,7 +26,7 @@ class TrainConfig(Section):
         default=1,
         ge=1,
         description="views per step, whose gradients are averaged; processes that torchrun starts share them "
-        "(docs/several_processes.md), and 1 means one for each process there",
+        "(`dyngs docs clusters`), and 1 means one for each process there",
     )
     initial_downscale: Annotated[Literal[1, 2, 4, 8, 16], BeforeValidator(parse_digits)] = Field(
         default=1,
@@ -52,7 +52,7 @@ class TrainConfig(Section):
     priors: tuple[Literal["depth", "flow", "tracks", "motion_masks"], ...] = Field(
         default=("depth", "flow", "tracks", "motion_masks"),
         description="what is used in addition to images where the capture has it: depth maps, optical flow, 2D tracks, "
-        "and masks that say what moves (docs/priors.md)",
+        "and masks that say what moves (`dyngs docs captures`)",
     )
     robust: Literal["never", "auto", "always"] = Field(
         default="never",

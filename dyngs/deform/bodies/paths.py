@@ -161,7 +161,7 @@ def render_frame_stack(
     options = replace(options, depth="expected")
     for image in images:
         size = max(image.cameras.width, image.cameras.height)
-        small = image.shrunk(math.ceil(size / LONGEST_SIDE))
+        small = image.downscaled(math.ceil(size / LONGEST_SIDE))
         shader = shader_at(image.time or 0.0)
         drawn = render(static, small.cameras, options, background=background, shader=shader)
         assert drawn.depth is not None

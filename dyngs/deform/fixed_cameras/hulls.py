@@ -64,7 +64,9 @@ def build_fixed_camera_clip(
     times = []
     camera: Cameras | None = None
     for image in images:
-        small = image.shrunk(math.ceil(max(image.cameras.width, image.cameras.height) / longest))
+        small = image.downscaled(
+            math.ceil(max(image.cameras.width, image.cameras.height) / longest)
+        )
         rgb = small.composite(background).clamp(0, 1)
         shown.append((255 * rgb).round().to(torch.uint8).cpu().numpy())
         counted.append(

@@ -42,7 +42,9 @@ def merge_scenes(
             between = splat.frame.after(Similarity(shift=(x, y, z))).after(other.frame.inverse())
             gaussians = between.gaussians(gaussians)
         elif up is not None and direction is not None:
-            gaussians = Similarity(rotation_between(tuple(direction), tuple(up))).gaussians(gaussians)
+            gaussians = Similarity(rotation_between(tuple(direction), tuple(up))).gaussians(
+                gaussians
+            )
         if splat_options(other) != splat_options(splat):
             log(
                 f"{file}: its low-pass filter ({other.mode.value}) is replaced by that of the "
