@@ -13,14 +13,14 @@ import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, format_one_line
-from dyngs.data.geometry import from_opengl_pose, validate_pose, invert_rigid, pinhole_matrix
+from dyngs.data.geometry import from_opengl_pose, invert_rigid, pinhole_matrix, validate_pose
 from dyngs.io.fields import (
-    entry,
     as_float_array,
     is_number,
     parse_numbers,
     read_json,
     require_at_most,
+    require_key,
 )
 
 _MAX_FRAMES = 100_000  # Longer paths are assumed to be a typing mistake
@@ -208,10 +208,12 @@ def _convert_3dgs_frame(view: object, where: str) -> dict[str, Any]:
     """Convert an entry of a 3DGS cameras.json, which stores camera positions and rotations in the
     world."""
     pose = np.eye(4)
-    pose[:3, :3] = parse_numbers(f"{where}: 'rotation'", entry(where, view, "rotation"), (3, 3))
-    pose[:3, 3] = parse_numbers(f"{where}: 'position'", entry(where, view, "position"), (3,))
+    pose[:3, :3] = parse_numbers(
+        f"{where}: 'rotation'", require_key(where, view, "rotation"), (3, 3)
+    )
+    pose[:3, 3] = parse_numbers(f"{where}: 'position'", require_key(where, view, "position"), (3,))
     names = {"w": "width", "h": "height", "fl_x": "fx", "fl_y": "fy"}
-    others = {key: entry(where, view, name) for key, name in names.items()}
+    others = {key: require_key(where, view, name) for key, name in names.items()}
     return {"cam_from_world": invert_rigid(pose), **others}
 
 

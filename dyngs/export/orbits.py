@@ -15,7 +15,6 @@ from dyngs.data.geometry import (
     estimate_focus,
     fraction_in_front,
     look_at,
-    estimate_focus,
     perpendicular,
     pinhole_matrix,
     unit,
@@ -203,7 +202,7 @@ def path_along(
         seconds = seconds[order]
         if (np.diff(seconds) > 0).all():
             steps = np.linspace(seconds[0], seconds[-1], num_frames)
-            smooth = with_poses(cameras, _smooth_poses(poses[order], seconds, steps, up))
+            smooth = cameras_at_poses(cameras, _smooth_poses(poses[order], seconds, steps, up))
             return CameraPath(smooth, times=tuple(steps.tolist()))
     # Features whose distances approximate image differences: position, and viewing direction times
     # the distance to the scene.
@@ -218,7 +217,7 @@ def path_along(
     lengths = np.linalg.norm(np.diff(features[visited], axis=0), axis=1)
     way = np.concatenate([[0.0], np.cumsum(lengths)])
     smooth = _smooth_poses(poses[visited], way, np.linspace(0, way[-1], num_frames), up)
-    return CameraPath(with_poses(cameras, smooth))
+    return CameraPath(cameras_at_poses(cameras, smooth))
 
 
 def _visiting_order(features: np.ndarray) -> np.ndarray:

@@ -25,10 +25,10 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
     SOG_INDEX,
     WrittenFile,
-    fitted,
     format_by_name,
-    transform_file,
+    limit_to_format,
     rotate_file,
+    transform_file,
     write_splats,
 )
 from dyngs.io.formats.gltf import EXTENSION, add_gaussians
@@ -36,8 +36,8 @@ from dyngs.io.formats.similarity import (
     AXES,
     IDENTITY,
     Similarity,
-    parse_axis,
     nearest_axis,
+    parse_axis,
     rotation_between,
 )
 from dyngs.io.formats.sog import sog_parts
@@ -270,7 +270,7 @@ def write_run_levels(
     """
     collect_inputs(opened).require_output(folder)
     splat = splats_at(opened, scene_part(opened.scene, part), time, how)
-    whole, notes = fitted(folder, format_by_name("sog"), splat, how.sh_degree)
+    whole, notes = limit_to_format(folder, format_by_name("sog"), splat, how.sh_degree)
     return write_sog_levels(folder, whole), notes
 
 

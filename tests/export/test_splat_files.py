@@ -51,7 +51,7 @@ from dyngs.export.splat_files import (
     write_tracks,
 )
 from dyngs.gaussians.rendering import render
-from dyngs.io.formats.formats import read_splats, upright, write_splats
+from dyngs.io.formats.formats import orient_to_axis, read_splats, write_splats
 from dyngs.io.formats.similarity import AXES, Similarity, rotation_between
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.gltf import GltfFile
