@@ -8,7 +8,6 @@ and in blocks of text are checked for the names of their options, ``key=value`` 
 from __future__ import annotations
 
 import argparse
-import ast
 import importlib.util
 import re
 import shlex
@@ -344,15 +343,11 @@ def test_navigation_has_all_pages_of_the_site() -> None:
     assert set(listed) == pages | {"index.md", "research-log.md"}
 
 
-def test_table_of_packages_repeats_their_docstrings() -> None:
-    rows = re.findall(
-        r"^\| `dyngs/(\w+)` \| (.+) \|$", PAGES["docs/contributing/code.md"], re.MULTILINE
+def test_all_packages_are_in_the_table() -> None:
+    rows = re.findall(r"^\| `dyngs/(\w+)` \|", PAGES["docs/contributing/code.md"], re.MULTILINE)
+    assert sorted(rows) == sorted(
+        path.parent.name for path in (ROOT / "dyngs").glob("*/__init__.py")
     )
-    summaries = {}
-    for path in (ROOT / "dyngs").glob("*/__init__.py"):
-        docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
-        summaries[path.parent.name] = " ".join(docstring.split("\n\n")[0].split())
-    assert dict(rows) == summaries
 
 
 # --------------------------------------------------------------------------------- running
