@@ -184,7 +184,7 @@ def _print_report(report: Report, stem: Path, *, is_json: bool) -> None:
         return
     print_tables(*(numbers_table(table.title, table.head, table.cells) for table in report.tables))
     for name, problem in report.left_out.items():
-        print_lines(f"left out: {name}: {problem}")
+        print_lines(f"skipped: {name}: {problem}")
     print(f"written: {paths[0]} and {', '.join(path.suffix for path in paths[1:])}")
     if not can_plot():
         print_notes((MATPLOTLIB_MISSING,))

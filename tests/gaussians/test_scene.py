@@ -84,7 +84,7 @@ def test_every_tensor_has_a_role_and_its_rows(kind: str) -> None:
     copied = TopologyEdit(
         torch.tensor([8, 1, 1, 5, 0]), torch.tensor([False, False, True, False, False])
     )
-    for one in (scene, scene.apply_edit(copied), scene.part("moving"), scene.part("still")):
+    for one in (scene, scene.apply_edit(copied), scene.part("moving"), scene.part("static")):
         for name, x in one.state().items():
             assert isinstance(x.role, Role), name
             if x.role is Role.PER_GAUSSIAN:
@@ -139,7 +139,7 @@ def test_edited_scene_renders_copies(
 def test_moving_and_static_parts_make_the_scene(kind: str) -> None:
     scene = scene_of_kind(kind)
     moving = scene.part("moving")
-    still = scene.part("still")
+    still = scene.part("static")
     moves = torch.zeros(len(scene), dtype=torch.bool)
     moves[scene.rows] = True
     assert (len(moving), len(still)) == (int(moves.sum()), int((~moves).sum()))

@@ -106,7 +106,7 @@ def test_it_is_a_mesh_with_colours(run: Path, tmp_path: Path, suffix: str) -> No
         (["prune", "RUN", "--out", "OUT/pruned"], "Gaussians"),
         (
             ["train", "data.root=CAPTURE", "model.kind=bg_triangle", "budget.max_gaussians=5"],
-            "has no effect with model.kind=bg_triangle",
+            "not supported by model.kind=bg_triangle",
         ),
     ],
 )
