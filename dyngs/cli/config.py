@@ -23,7 +23,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from dyngs.config.format_config import format_config
+    from dyngs.config.listing import format_config
 
     print(format_config(arguments.source, arguments.overrides), end="")
     return 0
