@@ -341,7 +341,9 @@ class Trainer(Generic[M]):
             count = self.images.num_prefetched * self.processes.size
             own_views = self.processes.views_of_process(batch)
             upcoming = self.sampler.peek(count, self._eligible_views(step))
-            self.images.prefetch([view for i, view in enumerate(upcoming) if i % batch in own_views])
+            self.images.prefetch(
+                [view for i, view in enumerate(upcoming) if i % batch in own_views]
+            )
         return image
 
     def _eligible_views(self, step: int) -> Callable[[int], bool]:
