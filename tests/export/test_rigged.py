@@ -17,9 +17,9 @@ from bare_person import (
     bands,
     bare_run,
     bare_scene,
-    with_motion,
     random_clip,
     template,
+    with_motion,
 )
 from gltf_skins import SkinnedGlb
 from moving_scene import write_moving_run
@@ -69,7 +69,7 @@ def test_another_reader_finds_mesh_and_texture(tmp_path: Path) -> None:
     """Each vertex has the colour of its place."""
     run = bare_run()
     notes = write_mesh(run, tmp_path / "ann.glb")
-    assert notes[0].startswith("texture of 256 x 256; ")
+    assert notes[0].startswith("texture 256 x 256; ")
     assert "silhouette IoU" in notes[1]
     loaded = trimesh.load(tmp_path / "ann.glb", process=False)
     (mesh,) = loaded.geometry.values()  # pyright: ignore[reportAttributeAccessIssue]
