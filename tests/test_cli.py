@@ -185,7 +185,7 @@ def test_names_that_are_no_text_can_be_printed(tmp_path: Path) -> None:
         ("trian", "invalid choice: 'trian'"),
         ("train", "give a config"),
         ("train nowhere.yaml data.root=x", "nowhere.yaml: no such preset"),
-        ("train static", "data.root is missing"),
+        ("train static", "data.root is required"),
         ("train static data.rot=x", "did you mean 'data.root'"),
         ("train static data.root=nowhere train.steps=0", "train.steps must be an integer >= 1"),
         ("train static data.root=nowhere", "nowhere"),

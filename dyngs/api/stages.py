@@ -99,10 +99,10 @@ def continue_scene(plan: RunPlan) -> tuple[RunPlan, None]:
         raise DyngsError(
             f"init.kind=scene goes with model.kind=static, not with {config.model.kind}"
         )
-    keeps = init.trains == "colour" or init.box is not None
+    keeps = init.trainable == "colour" or init.box is not None
     train = {"initial_downscale": 1} | ({"remove_floaters": False} if keeps else {})
     changes: dict[str, object] = {"train": config.train.model_copy(update=train)}
-    if init.trains == "colour":
+    if init.trainable == "colour":
         changes["strategy"] = FixedStrategy()
     if keeps and isinstance(config.colour, AutoColour):
         changes["colour"] = ShColour(opacity_entropy=config.colour.opacity_entropy)

@@ -132,11 +132,10 @@ class DynamicModel(SceneModel):
         DeformField,
         Field(discriminator="kind", description="how the canonical Gaussians are moved over time"),
     ] = HexplaneField()
-    choose: bool = Field(
+    pilot_runs: bool = Field(
         default=False,
-        description="find out first, by pilot runs compared on held-out training views, whether motion pays (else the "
-        "scene is trained as preset static does), and what colours are made of where that was not requested "
-        "(docs/dynamic.md)",
+        description="whether pilot runs decide, on held-out training views, if the scene is trained "
+        "as a static scene and, unless set, its colour representation",
     )
     motion_from: Fraction = Field(
         default=0.13,

@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from dyngs.config import Config
-from dyngs.config.io import update_model_keys
+from dyngs.config.io import drop_removed_model_keys
 from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.models.checkpoint import Checkpoint
@@ -71,7 +71,7 @@ def read_network(path: Path) -> tuple[Config, Checkpoint]:
         model = header["model"]
         if not isinstance(model, dict) or model.get("body") is not None:
             raise ValueError("its section model is not that of a network")
-        model = update_model_keys(model)
+        model = drop_removed_model_keys(model)
         config = Config.model_validate({"data": {"root": path.parent}, "model": model})
         if capability(config.model, PredictsScenes) is None:
             raise ValueError(f"it is of model.kind={config.model.kind}")

@@ -118,4 +118,4 @@ def test_a_scene_file_is_drawn(tmp_path: Path, capsys: Capture) -> None:
     other = tmp_path / "small" / "other.dyngs"
     other.write_bytes((tmp_path / "small" / "scene.dyngs").read_bytes())
     capsys.readouterr()
-    assert "must be called scene.dyngs" in refused(capsys, "render", other, *words)
+    assert "must be named scene.dyngs" in refused(capsys, "render", other, *words)

@@ -95,7 +95,7 @@ def test_a_motion_of_romp_without_a_rate_is_read_with_one_and_what_is_assumed_is
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        ("in.npz used.npz", "used.npz exists already; name a new file"),
+        ("in.npz used.npz", "used.npz: already exists; give the name of a new file"),
         ("in.npz new.bvh", "new.bvh: a motion is written as .npz"),
         ("nowhere.npz new.npz", "nowhere.npz: cannot be read (No such file"),
         ("in.txt new.npz", "in.txt: unknown kind of motion"),

@@ -31,7 +31,7 @@ def test_doctor_reports_kernels_that_this_processor_cannot_run() -> None:
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert re.search(r"native core +broken +DYNGS_ISA=v9", done.stdout)
-    assert done.stderr.startswith("dyngs: error: this installation cannot work: native core")
+    assert done.stderr.startswith("dyngs: error: the installation is broken: native core")
 
 
 def test_doctor_reports_a_faster_instruction_set(

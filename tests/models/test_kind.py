@@ -15,7 +15,7 @@ from toy_plugin import FOLDER, installed
 import dyngs
 from dyngs.cli import main
 from dyngs.config.io import load_config
-from dyngs.config.kinds import GROUP, OWN
+from dyngs.config.kinds import BUILT_IN, GROUP
 from dyngs.config.schema import config_keys
 from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StillOptions, write_still_capture
@@ -56,7 +56,7 @@ def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_our_own_kinds_are_entry_points_of_the_package() -> None:
     tomllib = pytest.importorskip("tomllib")  # Python 3.11
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert project["entry-points"][GROUP] == OWN
+    assert project["entry-points"][GROUP] == BUILT_IN
 
 
 def dyngs_command(*words: str, plugin: bool) -> subprocess.CompletedProcess[str]:
