@@ -93,7 +93,7 @@ dyngs {__version__}: Gaussian splatting for static scenes, moving scenes and peo
   dyngs render runs/NAME --out images    render images and videos
   dyngs export runs/NAME                 write .ply and other formats
 
-`dyngs --help` lists all commands, `dyngs docs` shows the manual, `dyngs doctor` checks the installation.\
+`dyngs --help` lists all commands, `dyngs docs` the manual; `dyngs doctor` checks the installation.\
 """
 
 

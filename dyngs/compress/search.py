@@ -89,9 +89,9 @@ def _drop_harmonics(trainer: GaussianTrainer, tolerance: float) -> None:
     found = find_view_dependent(
         _looks(trainer, seen, background), looks, trainer.model.options, background, tolerance
     )
-    trainer.model.drop_harmonics(~found.keeps, found.offsets)
+    trainer.model.drop_harmonics(~found.kept_harmonics, found.offsets)
     trainer.model.freeze_plain_harmonics(
-        ~found.keeps, AutoColour(opacity_entropy=trainer.config.colour.opacity_entropy)
+        ~found.kept_harmonics, AutoColour(opacity_entropy=trainer.config.colour.opacity_entropy)
     )
 
 

@@ -96,7 +96,7 @@ def test_a_motion_of_romp_without_a_rate_is_read_with_one_and_what_is_assumed_is
     ("words", "part"),
     [
         ("in.npz used.npz", "used.npz: already exists; give the name of a new file"),
-        ("in.npz new.bvh", "new.bvh: a motion is written as .npz"),
+        ("in.npz new.bvh", "new.bvh: motions are written as .npz"),
         ("nowhere.npz new.npz", "nowhere.npz: cannot be read (No such file"),
         ("in.txt new.npz", "in.txt: unknown kind of motion"),
         ("in.npz new.npz --clip walk", "do not ask for 'walk'"),
@@ -181,7 +181,7 @@ def test_options_of_one_video_are_refused_for_several(
     for name in ("a.mp4", "b.mp4"):
         (tmp_path / name).write_bytes(b"")
     assert main(["data", "sfm", str(tmp_path), str(tmp_path / "out"), *words]) == 2
-    assert "--matching and --masks are for photos and one video" in capsys.readouterr().err
+    assert "--matching and --masks are not supported for several videos" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
@@ -210,7 +210,7 @@ def test_a_fitted_capture_says_how_good_it_is(tmp_path: Path, capsys: PrintedOut
 def test_the_run_of_a_known_person_finds_poses_by_its_avatar(
     tmp_path: Path, capsys: PrintedOutput, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
+    monkeypatch.setattr(pose_fit, "MAX_WINDOWS", 1)
     options = HumanOptions(
         size=32, num_frames=1, num_pose_frames=0, num_cameras=3, num_test=1, samples=1
     )
@@ -253,7 +253,7 @@ def test_a_body_file_of_ones_own_is_fitted_trained_and_known_again(
     monkeypatch: pytest.MonkeyPatch,
     smpl_files: tuple[Path, Path],
 ) -> None:
-    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
+    monkeypatch.setattr(pose_fit, "MAX_WINDOWS", 1)
     options = HumanOptions(
         size=32, num_frames=1, num_pose_frames=0, num_cameras=3, num_test=1, samples=1
     )
@@ -308,7 +308,7 @@ def test_a_body_file_that_cannot_be_fitted_is_refused_in_one_line(
         (str(damaged), uv, "damaged.npz: "),
         (body, None, "smpl.npz: has no texture coordinates"),
         (body, str(wrong), "wrong.obj: cannot be read"),
-        (None, uv, "goes with --template"),
+        (None, uv, "requires --template"),
     ):
         out = tmp_path / "out"
         words = (["--template", file] if file else []) + (["--uv", atlas] if atlas else [])

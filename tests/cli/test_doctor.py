@@ -42,6 +42,6 @@ def test_doctor_reports_a_faster_instruction_set(
     assert main(["doctor"]) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert (
-        "compiled: v2; this processor also runs v4 (AVX-512): install again on it for more speed"
+        "compiled: v2; this CPU supports v4 (AVX-512): reinstall dyngs from source for more speed"
         in text
     )

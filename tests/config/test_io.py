@@ -346,7 +346,9 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["", "train: {steps: 3}", "data:"])
 def test_an_emptied_config_of_a_run_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / "config.yaml").write_text(text)
-    with pytest.raises(DyngsError, match=r"config\.yaml: does not say which capture .*restore"):
+    with pytest.raises(
+        DyngsError, match=r"config\.yaml: the capture of the run, is missing; restore"
+    ):
         load_resolved(tmp_path)
 
 
