@@ -554,7 +554,9 @@ def test_words_that_can_name_nothing_are_refused(
     capsys: pytest.CaptureFixture[str], text: str
 ) -> None:
     for words in (("render", ".", "--out", text), ("export", text), ("train", f"run.dir={text}")):
-        assert "holds a character that no name or path may hold" in error_line(capsys, *words)
+        assert "contains a character that is invalid in names and paths" in error_line(
+            capsys, *words
+        )
 
 
 def test_memory_that_torch_cannot_have_is_one_line(

@@ -91,8 +91,7 @@ def numbers_table(title: str, head: Sequence[str], cells: Sequence[Sequence[str]
 class ProgressBar:
     """Context manager that shows how far work has come, to be called as a ``ReportProgress``.
 
-    On a terminal, one bar for each kind of work; elsewhere plain lines, none for work that is soon
-    done.
+    Shows one bar per kind of work on a terminal, else a line every ``SECONDS_BETWEEN_LINES``.
     """
 
     def __init__(self, stream: IO[str] | None = None) -> None:

@@ -38,7 +38,7 @@ WORDS = {
     "tradeoff": {"vary", "require", "minimize", "maximize"},
     "compare": {"overrides", "models"},
     "config": {"overrides"},
-    "docs": {"page"},
+    "docs": {"page", "search"},
 }
 """Arguments that are plain words, no paths; the paths among overrides are found by their keys."""
 

@@ -323,7 +323,7 @@ def test_export_of_a_moving_run(
         export(*words)
         assert x_of(path) == pytest.approx(moved_x(still, 0.0).tolist(), abs=ROUNDING)
     wrong = ["--times", "0:1:3", "--out", tmp_path / "a.ply"]
-    assert "--times writes a folder of files" in error_line(capsys, "export", moving_run, *wrong)
+    assert "--times and --folder write a folder" in error_line(capsys, "export", moving_run, *wrong)
 
 
 def test_export_of_tracks(

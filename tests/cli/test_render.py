@@ -129,7 +129,7 @@ def test_a_video_of_a_camera_that_stands_needs_no_folder(moving_run: Path, tmp_p
 
 def test_times_where_nothing_moves(run_dir: Path, tmp_path: Path, capsys: Capture) -> None:
     assert main(["render", str(run_dir), "--out", str(tmp_path / "a"), "--time", "0.5"]) == 0
-    assert "note: the scene is static" in capsys.readouterr().out
+    assert "note: nothing moves in this run" in capsys.readouterr().out
     ply = tmp_path / "splats.ply"
     assert main(["export", str(run_dir), "--out", str(ply), "--time", "0.5"]) == 0
     assert "note: the scene is static" in capsys.readouterr().out

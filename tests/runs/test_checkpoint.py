@@ -297,15 +297,15 @@ def test_contents_that_do_not_fit_end_in_one_line_or_a_finite_image(
 @pytest.mark.parametrize(
     ("name", "change", "said"),
     [
-        ("model.rows", lambda x: x.flip(0), "'rows' does not ascend"),
-        ("model.rows", lambda x: x + 6, "'rows' names something beyond the 9"),
+        ("model.rows", lambda x: x.flip(0), "'rows' is not strictly ascending"),
+        ("model.rows", lambda x: x + 6, "'rows' has indices outside"),
         ("model.rows", lambda x: x.int(), "'rows' is int32"),
         ("model.times", lambda x: x + 0.5, "outside"),
         ("model.filter_std", lambda x: -x, "negative"),
         (
             "model.field.buffers.followed",
             lambda x: x + 5,
-            "'followed' names something beyond the 4",
+            "'followed' has indices outside",
         ),
         ("model.field.buffers.followed", lambda x: x[1:], r"'followed' is int64 \(3, 4\)"),
         ("model.field.buffers.radii", torch.zeros_like, "'radii' must be above 0"),
