@@ -33,9 +33,9 @@ from dyngs.core.errors import DyngsError, format_count, log_info
 from dyngs.core.metrics import psnr, ssim
 from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.read import captures_in, read_capture
+from dyngs.data.read import list_captures, read_capture
 from dyngs.human.predict.gps.rectification import angle_between_views, order_around_person
-from dyngs.io.outputs import new_folder
+from dyngs.io.outputs import atomic_folder
 from dyngs.io.write import write_image, write_text
 from dyngs.models.prediction import Predictor
 from dyngs.models.renderable import Renderable
@@ -111,9 +111,9 @@ def compare_people(bench: PeopleBench, out: Path) -> Table:
     given = load_config(packaged_preset("static"), words).data
     changed = {word.partition("=")[0] for word in bench.data}
     found: list[Score] = []
-    with new_folder(out, require_empty) as folder:
+    with atomic_folder(out, require_empty) as folder:
         pictures = folder / "pictures"
-        for number, person in enumerate(captures_in(given)):
+        for number, person in enumerate(list_captures(given)):
             for name, config, checkpoint in loaded:
                 own = {key: getattr(given, key) for key in changed}
                 data = config.data.model_copy(update={"root": person.root, "test_every": 0} | own)

@@ -33,7 +33,7 @@ from dyngs.api.compat import rasterization
 from dyngs.core.camera import Cameras
 from dyngs.export.orbits import frame_orbit_for_points
 from dyngs.io.formats.formats import read_splats
-from dyngs.io.formats.similarity import axis_of
+from dyngs.io.formats.similarity import parse_axis
 from dyngs.ops.device import gpu_unavailable_reason
 
 Rasterize = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
@@ -76,7 +76,7 @@ def of_file(path: Path, size: tuple[int, int]) -> Arguments:
     """The same of a file of Gaussians, seen from a little above."""
     file = read_splats(path, nonfinite="skip")
     splat = file.gaussians
-    cameras = frame_orbit_for_points(splat.means.double().numpy(), 1, size, axis_of(file.up or "z"))
+    cameras = frame_orbit_for_points(splat.means.double().numpy(), 1, size, parse_axis(file.up or "z"))
     trained = {
         "means": splat.means,
         "quats": splat.quats,

@@ -24,7 +24,7 @@ from dyngs.api.train import train
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.data.capture import Lens
 from dyngs.data.geometry import pinhole_matrix
-from dyngs.data.images.lens import undistorted_points
+from dyngs.data.images.lens import undistort_points
 from dyngs.data.synthetic.captures import f32, scene_at, trace
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.write import write_image, write_text
@@ -43,7 +43,7 @@ def directions(
     y, x = np.mgrid[:height, :width] + np.asarray(shift)[::-1, None, None]
     intrinsics = pinhole_matrix(focal, focal, 0.5 * width, 0.5 * height)
     places = torch.from_numpy(np.stack([x, y], -1).reshape(-1, 2))
-    flat = undistorted_points(lens, intrinsics, places).numpy() - (0.5 * width, 0.5 * height)
+    flat = undistort_points(lens, intrinsics, places).numpy() - (0.5 * width, 0.5 * height)
     rays = np.column_stack([flat[:, 0], -flat[:, 1], np.full(len(flat), -focal)])
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 

@@ -20,16 +20,16 @@ from dyngs.data.synthetic.captures import (
     PaintedBox,
     Primitive,
     Scene,
-    StillOptions,
-    SyntheticShot,
+    StaticOptions,
+    SyntheticView,
     f32,
     hemisphere_cameras,
-    nearest_things,
+    nearest_primitives,
     orbit_cameras,
     sampled_rays,
     write_split,
 )
-from dyngs.io.outputs import new_folder
+from dyngs.io.outputs import atomic_folder
 from dyngs.io.write import write_image
 
 Rgb = tuple[float, float, float]
@@ -187,7 +187,7 @@ def face_ids(scene: Scene, world_from_cam: np.ndarray, size: int, samples: int) 
     origin = world_from_cam[:3, 3].astype(np.float32)
     found = []
     for directions in sampled_rays(world_from_cam, size, samples):
-        nearest, distance = nearest_things(scene, origin, directions)
+        nearest, distance = nearest_primitives(scene, origin, directions)
         ids = np.full(len(directions), -1, np.int64)
         for index, primitive in enumerate(scene.primitives):
             here = np.flatnonzero((nearest == index) & np.isfinite(distance))
@@ -221,7 +221,7 @@ def true_edges(scene: Scene, world_from_cam: np.ndarray, size: int, samples: int
 CLOSE = 0.4  # Distance of close-ups, in that of the other cameras
 
 
-def write_polyhedra_capture(out: Path, options: StillOptions) -> Path:
+def write_polyhedra_capture(out: Path, options: StaticOptions) -> Path:
     """Write images of ``polyhedra`` as ``write_still_capture`` does; returns ``out``.
 
     The split val has as many close-ups as test has images, from 40 % of the distance.
@@ -234,9 +234,9 @@ def write_polyhedra_capture(out: Path, options: StillOptions) -> Path:
         "val": orbit_cameras(options.num_test, close, elevation_deg=33.0, start_deg=10.0),
         "test": orbit_cameras(options.num_test, DISTANCE, elevation_deg=28.0, start_deg=0.0),
     }
-    with new_folder(out) as started:
+    with atomic_folder(out) as started:
         for split, poses in splits.items():
-            shots = [SyntheticShot(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
+            shots = [SyntheticView(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
             write_split(started, split, shots, lambda _: scene, options)
             for shot in shots if split != "train" else ():
                 edges = true_edges(scene, shot.world_from_cam, options.size, options.samples)
@@ -251,7 +251,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--size", type=int, default=128)
     given = parser.parse_args()
-    print(write_polyhedra_capture(given.folder, StillOptions(size=given.size)))
+    print(write_polyhedra_capture(given.folder, StaticOptions(size=given.size)))
 
 
 if __name__ == "__main__":

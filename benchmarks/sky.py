@@ -24,12 +24,12 @@ import trimesh
 
 import dyngs
 from dyngs.api.train import train
-from dyngs.capture.initial_points import points_in_silhouettes
+from dyngs.capture.initial_points import sample_points_in_silhouettes
 from dyngs.config import DataConfig
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.metrics import psnr
 from dyngs.data.capture import PointCloud, Split, Splits, View
-from dyngs.data.geometry import camera_center, inverse_rigid
+from dyngs.data.geometry import camera_center, invert_rigid
 from dyngs.data.images.images import read_image
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
@@ -133,7 +133,7 @@ def with_sky(capture: Path, out: Path, kind: str) -> None:
     shutil.copytree(capture, out)
     splits = dyngs.read_capture(DataConfig(root=out)).splits
     half_side = cube_half_side("auto", splits["train"], 1.0)
-    near = points_in_silhouettes(splits["train"], DataConfig(root=out), 5000, half_side)
+    near = sample_points_in_silhouettes(splits["train"], DataConfig(root=out), 5000, half_side)
     centres = np.stack([camera_center(view.cam_from_world) for view in splits["train"]])
     centre = centres.mean(0)
     scale = float(np.linalg.norm(centres - centre, axis=1).mean())
@@ -155,7 +155,7 @@ def _as_nerfstudio(out: Path, splits: Splits) -> None:
     around the origin."""
     frames = []
     for view in (view for views in splits.values() for view in views):
-        pose = inverse_rigid(view.cam_from_world) * np.array([1, -1, -1, 1])
+        pose = invert_rigid(view.cam_from_world) * np.array([1, -1, -1, 1])
         (fx, _, cx), (_, fy, cy), _ = view.intrinsics.tolist()
         size = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": view.width, "h": view.height}
         path = view.image_path.relative_to(out).as_posix()

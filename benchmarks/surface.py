@@ -20,8 +20,8 @@ import trimesh
 from polyhedra import polyhedra
 from scipy.spatial import cKDTree
 
-from dyngs.data.geometry import inverse_rigid
-from dyngs.data.synthetic.captures import nearest_things, sampled_rays
+from dyngs.data.geometry import invert_rigid
+from dyngs.data.synthetic.captures import nearest_primitives, sampled_rays
 from dyngs.export.surface_file import write_surface
 from dyngs.runs.opened import OpenedScene, open_run
 
@@ -35,11 +35,11 @@ def true_points(opened: OpenedScene) -> np.ndarray:
     scene = polyhedra()
     found = []
     for view in opened.capture.splits["train"]:
-        pose = inverse_rigid(view.cam_from_world).astype(np.float32)
+        pose = invert_rigid(view.cam_from_world).astype(np.float32)
         pose[:3, 1:3] *= -1  # axes of cameras as the ray tracer has them: y up, looking along -z
         origin = pose[:3, 3]
         for directions in sampled_rays(pose, SIDE, 1):
-            _, distance = nearest_things(scene, origin, directions)
+            _, distance = nearest_primitives(scene, origin, directions)
             hit = np.isfinite(distance)
             found.append(origin + distance[hit, None] * directions[hit])
     return np.concatenate(found)

@@ -236,9 +236,9 @@ def two_images(root: Path) -> Capture:
 def read_splats(root: Path) -> object:
     """Read a file of Gaussians, render it, and write it as another one."""
     from dyngs.gaussians.rendering import splat_options
-    from dyngs.io.formats.formats import known_format, read_splats, write_splats
+    from dyngs.io.formats.formats import find_format, read_splats, write_splats
 
-    path = next((p for p in sorted(root.iterdir()) if known_format(p) is not None), root / "a.ply")
+    path = next((p for p in sorted(root.iterdir()) if find_format(p) is not None), root / "a.ply")
     splat = read_splats(path)
     read_splats(path, nonfinite="skip")
     write_splats(root.parent / "out" / "b.ply", splat)

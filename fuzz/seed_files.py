@@ -25,7 +25,7 @@ from dyngs.human.avatar.avatar_file import _KIND as AVATAR_KIND
 from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.motion.amass import write_amass
 from dyngs.io.formats import formats
-from dyngs.io.formats.splat_file import SplatFile, with_degree
+from dyngs.io.formats.splat_file import SplatFile, with_sh_degree
 from dyngs.io.tensor_file import write_tensors
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import Checkpoint, CheckpointInfo, save_checkpoint
@@ -234,8 +234,8 @@ def write_splats(root: Path) -> None:
 def write_packed(name: str, root: Path) -> None:
     """Write a file of Gaussians in the format called ``name``, with harmonics where it holds
     any."""
-    own = formats.format_named(name)
-    splat = SplatFile(with_degree(row_of_balls(), min(own.max_degree, 1)), up="y")
+    own = formats.format_by_name(name)
+    splat = SplatFile(with_sh_degree(row_of_balls(), min(own.max_degree, 1)), up="y")
     formats.write_splats(root / f"a{own.suffixes[0]}", splat)
 
 

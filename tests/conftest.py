@@ -37,7 +37,7 @@ from tiny_captures import random_pixels, write_colmap, write_frames, write_image
 from tiny_fields import write_tiny_capture
 
 from dyngs.cli.output import print_messages
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.human.fit import fitted_capture
 from dyngs.human.fit.capture_fit import FitEffort
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
@@ -190,7 +190,7 @@ def set_threads() -> Iterator[Callable[[int], None]]:
 def still(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four images of 16 px; nothing moves."""
     folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(folder, StillOptions(size=16, num_train=4, num_test=1, samples=1))
+    write_static_capture(folder, StaticOptions(size=16, num_train=4, num_test=1, samples=1))
     return folder
 
 

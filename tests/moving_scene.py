@@ -14,7 +14,7 @@ from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.camera import Cameras
 from dyngs.core.state import Role, strip_roles
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.deform.control_nodes import ControlNodes
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, select_rows
 from dyngs.deform.fields import field_state
@@ -135,8 +135,8 @@ def camera(width: int = 20, height: int = 14) -> Cameras:
 def write_timed_capture(root: Path, *, standing: bool = False) -> Path:
     """A capture of 16x16 px at ``TRAIN_TIMES`` and ``TEST_TIMES``; ``standing``: all test images
     from one pose."""
-    options = StillOptions(size=16, num_train=len(TRAIN_TIMES), num_test=len(TEST_TIMES), samples=1)
-    write_still_capture(root, options)
+    options = StaticOptions(size=16, num_train=len(TRAIN_TIMES), num_test=len(TEST_TIMES), samples=1)
+    write_static_capture(root, options)
     for split, times in (("train", TRAIN_TIMES), ("test", TEST_TIMES)):
         file = root / f"transforms_{split}.json"
         document = json.loads(file.read_text())

@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 
 from dyngs.data.images.maps import read_depth
-from dyngs.io.formats.ply import double_ply
+from dyngs.io.formats.ply import encode_ply
 
 
 def scaled_capture(
@@ -42,5 +42,5 @@ def scaled_capture(
         np.savez(file, **body)
     for file in out.rglob("points*.ply"):
         points = trimesh.load(file)
-        file.write_bytes(double_ply(scale * (points.vertices + offset), points.colors[:, :3]))
+        file.write_bytes(encode_ply(scale * (points.vertices + offset), points.colors[:, :3]))
     return out

@@ -28,7 +28,7 @@ from dyngs.cli.train import parse_config
 from dyngs.config.io import load_config
 from dyngs.config.schema import config_keys
 from dyngs.core.errors import DyngsError
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 
 ROOT = Path(__file__).parents[1]
 PAGES = {
@@ -361,8 +361,8 @@ def test_table_of_packages_repeats_their_docstrings() -> None:
 @pytest.fixture
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Enter a folder with a static capture, ``PATH``, and a run of a moving scene."""
-    write_still_capture(
-        tmp_path / "PATH", StillOptions(size=16, num_train=4, num_test=2, samples=1)
+    write_static_capture(
+        tmp_path / "PATH", StaticOptions(size=16, num_train=4, num_test=2, samples=1)
     )
     (tmp_path / "runs").mkdir()
     write_moving_run(tmp_path / "moving").rename(tmp_path / "runs" / "dance")

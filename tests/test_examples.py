@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 
 import dyngs
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the capture and the run that the examples name."""
     here = tmp_path_factory.mktemp("examples")
-    write_still_capture(here / "lego", StillOptions(size=16, num_train=3, num_test=1, samples=1))
+    write_static_capture(here / "lego", StaticOptions(size=16, num_train=3, num_test=1, samples=1))
     overrides = [
         f"data.root={here / 'lego'}",
         f"run.dir={here / 'runs/lego'}",

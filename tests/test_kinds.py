@@ -24,9 +24,9 @@ from dyngs.data.images.images import read_image
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import (
     DynamicOptions,
-    StillOptions,
+    StaticOptions,
     write_dynamic_capture,
-    write_still_capture,
+    write_static_capture,
 )
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
@@ -42,7 +42,7 @@ from dyngs.training.new_trainer import add_initial_points, build_trainer
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(folder, StillOptions(size=16, num_train=5, num_test=1, samples=1))
+    write_static_capture(folder, StaticOptions(size=16, num_train=5, num_test=1, samples=1))
     return folder
 
 

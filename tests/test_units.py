@@ -19,7 +19,7 @@ from tiny_stereo import STEREO
 import dyngs
 from dyngs.cli import main
 from dyngs.data.loader import ImageLoader
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
 from dyngs.runs.checkpoint import latest_checkpoint, save_checkpoint
@@ -53,7 +53,7 @@ NETWORK_KEYS = {
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("captures")
-    write_still_capture(root / "still", StillOptions(size=24, num_train=8, num_test=2, samples=1))
+    write_static_capture(root / "still", StaticOptions(size=24, num_train=8, num_test=2, samples=1))
     write_tiny_capture(root / "moving")
     person = HumanOptions(
         size=32, num_frames=3, num_pose_frames=1, num_cameras=4, num_test=1, samples=1

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dyngs.config import Config, DataConfig
-from dyngs.data.read import captures_in
+from dyngs.data.read import list_captures
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.predict.people import Person, read_captured_person
 from dyngs.human.synthetic.capture import PeopleOptions, write_people
@@ -30,4 +30,4 @@ def field_config(kind: str, folder: Path, run: Path, **train: object) -> Config:
 
 
 def first_person(folder: Path) -> Person:
-    return read_captured_person(captures_in(DataConfig(root=folder))[0], default_template())
+    return read_captured_person(list_captures(DataConfig(root=folder))[0], default_template())

@@ -32,18 +32,18 @@ from dyngs.export.splat_files import (
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
     all_suffixes,
-    format_of,
+    format_for_path,
     format_to_read,
-    known_format,
-    moved_file,
+    find_format,
+    transform_file,
     read_splats,
-    turned_file,
-    undone_file,
+    rotate_file,
+    undo_transforms,
     write_splats,
 )
-from dyngs.io.formats.similarity import UNMOVED, Similarity, axis_of
+from dyngs.io.formats.similarity import IDENTITY, Similarity, parse_axis
 from dyngs.io.formats.splat_file import SplatFile
-from dyngs.io.outputs import new_folder
+from dyngs.io.outputs import atomic_folder
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.ops.device import deterministic, select_device
 from dyngs.ops.native import kernel_threads, num_cores
@@ -165,7 +165,7 @@ def edit_scene(
     nothing is written.
     """
     moves = out.name.lower().endswith(FOURDGS_SUFFIX)
-    if known_format(out) is None and not moves and out.suffix:
+    if find_format(out) is None and not moves and out.suffix:
         wanted = (
             f"give a name in {all_suffixes()} or {FOURDGS_SUFFIX}, or without a suffix for a run"
         )
@@ -245,16 +245,16 @@ def _written(found: EditSource, out: Path, edits: Edits, tell: Tell) -> EditedFi
     if edits.merge:
         splat = merge_scenes(splat, _up(found, edits.frame), edits.merge, tell)
     if edits.undo:
-        if splat.edited == UNMOVED:
+        if splat.edited == IDENTITY:
             raise DyngsError(
                 "--undo: nothing says that this was edited; `dyngs edit` stores it in what it writes"
             )
-        edited = undone_file(splat)
+        edited = undo_transforms(splat)
         tell("the frame is that of before the first edit")
     else:
-        how, up = _frame(found, edits, format_of(out).up, tell)
+        how, up = _frame(found, edits, format_for_path(out).up, tell)
         is_new = edits.has_frame
-        edited = moved_file(splat, how, up) if is_new else turned_file(splat, how.turn, up)
+        edited = transform_file(splat, how, up) if is_new else rotate_file(splat, how.turn, up)
     written = write_splats(out, edited)
     return EditedFile(written.path, compare_file_with_source(splat, written), written.notes)
 
@@ -306,7 +306,7 @@ def _written_run(
         raise DyngsError(
             f"{source}: holds no checkpoint that a part could be taken of; give --out FILE.ply"
         )
-    with new_folder(out, require_empty) as folder:
+    with atomic_folder(out, require_empty) as folder:
         for name in (LOG_NAME, RECORD_NAME, *([SCENE_FILE] if stored else [])):
             if (source / name).is_file():
                 shutil.copyfile(source / name, folder / name)
@@ -373,7 +373,7 @@ def _frame(
         how = frame.similarity(None, ())
         up = found.opened.stated_up
     else:
-        how = frame.similarity(direction, axis_of(wanted))
+        how = frame.similarity(direction, parse_axis(wanted))
         up = None if direction is None else wanted
     about = "nothing says which way is up, so nothing is turned; --up tells it"
     tell(about if up is None else f"up is {up} in what is written")

@@ -9,8 +9,8 @@ from dyngs.core.errors import DyngsError, format_count, log_warning
 from dyngs.data.capture import Capture
 from dyngs.gaussians.initialization import InitialGaussians
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.io.formats.similarity import UNMOVED, Similarity
-from dyngs.io.formats.splat_file import with_degree
+from dyngs.io.formats.similarity import IDENTITY, Similarity
+from dyngs.io.formats.splat_file import with_sh_degree
 from dyngs.runs.opened import open_scene
 
 
@@ -34,8 +34,8 @@ def load_initial_gaussians(config: Config, capture: Capture) -> InitialGaussians
     gaussians = scene.gaussians.detach() if keeps_filter else scene.at(None)
     x, y, z = capture.world_offset.tolist()
     how = Similarity(scale=capture.world_scale, shift=(x, y, z)).inverse().after(opened.world)
-    gaussians = gaussians if how == UNMOVED else how.gaussians(gaussians)
-    gaussians = with_degree(gaussians, config.stored_sh_degree)
+    gaussians = gaussians if how == IDENTITY else how.gaussians(gaussians)
+    gaussians = with_sh_degree(gaussians, config.stored_sh_degree)
     frozen = None
     if init.box is not None:
         low, high = torch.tensor(init.box, dtype=torch.float64, device="cpu").reshape(2, 3)

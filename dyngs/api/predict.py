@@ -13,7 +13,7 @@ from dyngs.config.io import load_resolved
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, log_info
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.io.outputs import new_folder
+from dyngs.io.outputs import atomic_folder
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import PredictsScenes, capability
 from dyngs.models.prediction import Predictor, find_views
@@ -43,7 +43,7 @@ def predict(
     views: int | tuple[str, ...] | None = None,
     *,
     steps: int | None = None,
-    say: Callable[[str], None] = log_info,
+    log: Callable[[str], None] = log_info,
     report: ProgressCallback = ignore_progress,
 ) -> Prediction:
     """Write the person of ``capture`` as a run folder ``out`` for all commands; ``dyngs train
@@ -71,7 +71,7 @@ def predict(
     require_empty(out)  # before the work
     data = config.data.model_copy(update={"root": capture.absolute()})
     network_kind = require_network(config, network)
-    predictor = network_kind.networks()[1](config, checkpoint, data, say, report)
+    predictor = network_kind.networks()[1](config, checkpoint, data, log, report)
     chosen = _chosen(predictor, network_kind.num_views(config.model) if views is None else views)
     began = time.perf_counter()
     done = predictor.adapt(chosen, steps, report)
@@ -126,7 +126,7 @@ def write_run(
     without_priors = config.train.model_copy(update={"priors": ()})
     trainer = build_trainer(config.model_copy(update={"train": without_priors}), restored=True)
     predictor.begin(trainer.model, scene, config)
-    with new_folder(out, require_empty) as started:
+    with atomic_folder(out, require_empty) as started:
         write_config(config, started)
         save_checkpoint(started, trainer.checkpoint(), seconds)
 

@@ -16,7 +16,7 @@ from dyngs.config import Config, PruneConfig
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, log_info
 from dyngs.data.read import require_folder
-from dyngs.io.outputs import new_folder
+from dyngs.io.outputs import atomic_folder
 from dyngs.models.checkpoint import Checkpoint, checkpoint_settings, read_run_capture
 from dyngs.models.kind import HasGaussians, capability
 from dyngs.ops.device import deterministic, keep_freed_memory, select_device
@@ -57,7 +57,7 @@ def prune_run(run_dir: Path, out: Path, overrides: Sequence[str]) -> Path:
     if not config.prune.is_enabled:
         raise DyngsError("nothing to do: give a share to --prune, or key times to --masks")
     require_folder(config.data.root)
-    with new_folder(out, require_empty) as started:
+    with atomic_folder(out, require_empty) as started:
         _copy_start(run_dir, started)
         save_checkpoint(started, replace(start, settings=checkpoint_settings(config)), 0.0)
         write_config(config, started)
@@ -115,7 +115,7 @@ def prune_to_loss(
         chosen, data, promise = Search(trainer, start, tell, validation_images(trainer)).run(
             max_loss
         )
-    with new_folder(out, require_empty) as started:
+    with atomic_folder(out, require_empty) as started:
         _copy_start(run_dir, started)
         seconds = seconds_at(run_dir, start.info.step) + time.perf_counter() - begun
         smaller = replace(chosen.checkpoint, settings=checkpoint_settings(chosen.config))

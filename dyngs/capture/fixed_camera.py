@@ -10,11 +10,11 @@ from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.capture import Capture, Silhouette, VideoFrame, View
 from dyngs.data.geometry import OPENGL_FROM_OPENCV, pinhole_matrix
-from dyngs.data.images.images import SUFFIXES, files_in, read_header
-from dyngs.data.images.video import colour_notes, decode_frames, planned_frames
+from dyngs.data.images.images import SUFFIXES, list_files, read_header
+from dyngs.data.images.video import colour_messages, decode_frames, locate_cached_frames
 from dyngs.data.readers.transforms import find_masks, mask_of
 from dyngs.data.times import evenly_spaced, natural_order, parse_frames
-from dyngs.io.containment import check_size, inside, staying_within
+from dyngs.io.containment import check_size, inside, restrict_paths_to
 from dyngs.io.outputs import VIDEO_SUFFIXES
 
 FORMAT = "fixed_camera"
@@ -25,7 +25,7 @@ FOCAL = 1.2
 film camera's."""
 
 
-def is_plain_clip(source: Path) -> bool:
+def is_image_sequence(source: Path) -> bool:
     """Whether a path is a video, or a folder that holds images directly or in ``images``."""
     with wrap_read_errors(source):
         if source.is_file():
@@ -48,7 +48,7 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
     """
     source = options.root
     with (
-        staying_within(source if source.is_dir() else source.parent, options.follow_links),
+        restrict_paths_to(source if source.is_dir() else source.parent, options.follow_links),
         wrap_read_errors(source),
     ):
         paths, fps, notes = _frames_of(source)
@@ -99,10 +99,10 @@ def _frames_of(source: Path) -> tuple[Sequence[Path], float | None, list[str]]:
     """Return the image files of a clip, in order, and of a video its frame rate and a line on
     colours."""
     if source.is_file():
-        planned = planned_frames(source)
+        planned = locate_cached_frames(source)
         if not planned.paths:
             raise DyngsError(f"{source}: the video holds no image; copy it again")
-        return planned.paths, planned.info.fps or None, colour_notes([planned.info])
+        return planned.paths, planned.info.fps or None, colour_messages([planned.info])
     images = _images_of(source)
     if not images:
         raise DyngsError(
@@ -112,7 +112,7 @@ def _frames_of(source: Path) -> tuple[Sequence[Path], float | None, list[str]]:
 
 
 def _images_of(folder: Path) -> list[Path]:
-    found = files_in(folder, SUFFIXES) or files_in(folder / "images", SUFFIXES)
+    found = list_files(folder, SUFFIXES) or list_files(folder / "images", SUFFIXES)
     return sorted(found, key=lambda path: natural_order(path.name))
 
 
@@ -134,7 +134,7 @@ def silhouettes_of(masks: Path, names: Sequence[str]) -> list[Silhouette]:
     """
     if not masks.is_dir():
         raise DyngsError(f"no such folder of masks: {masks}")
-    with staying_within(masks), wrap_read_errors(masks):
+    with restrict_paths_to(masks), wrap_read_errors(masks):
         found = find_masks(masks)
         own = [mask_of(name, found) for name in names]
         for path in own:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from dyngs.capture.plane_sweep import dense_points, points_of_depth_maps
+from dyngs.capture.plane_sweep import sweep_dense_points, points_from_depth_maps
 from dyngs.capture.sfm.colmap import (
     ColmapError,
     feature_options,
@@ -31,7 +31,7 @@ from dyngs.config import DataConfig, PointsInit
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import projected
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.scene_space import cube_half_side, outside_of_cube, points_in_frusta
+from dyngs.data.scene_space import cube_half_side, cube_mismatch_reason, sample_points_in_frusta
 from dyngs.data.times import evenly_spaced
 from dyngs.io.write import write_image
 
@@ -62,7 +62,7 @@ GREY = 0.5  # background of images with alpha
 _PROBES = 4000  # random points by which the overlap of images is judged
 
 
-def views_of_a_time_step(views: Sequence[View], limit: int) -> list[View]:
+def views_at_one_time(views: Sequence[View], limit: int) -> list[View]:
     """Return at most ``limit`` views of one time step, evenly spaced; of those with most views, the
     middle.
 
@@ -75,7 +75,7 @@ def views_of_a_time_step(views: Sequence[View], limit: int) -> list[View]:
     return [of_step[i] for i in evenly_spaced(len(of_step), limit)]
 
 
-def triangulated_points(views: Sequence[View], options: DataConfig) -> PointCloud | None:
+def triangulate_from_views(views: Sequence[View], options: DataConfig) -> PointCloud | None:
     """Return points that several views of a time step see, in order of their coordinates; None for
     hardly any.
 
@@ -85,7 +85,7 @@ def triangulated_points(views: Sequence[View], options: DataConfig) -> PointClou
     return _points_of(views, options, None)
 
 
-def points_over_clip(views: Sequence[View], options: DataConfig) -> PointCloud | None:
+def triangulate_clip(views: Sequence[View], options: DataConfig) -> PointCloud | None:
     """Return points of what stands, from one moving camera; None where there are hardly any.
 
     As ``triangulated_points``, of at most ``CLIP_IMAGES`` images and matched between the pairs of
@@ -106,7 +106,7 @@ def clip_pairs(views: Sequence[View]) -> list[tuple[int, int]]:
     """
     count = len(views)
     pairs = {(i, i + step) for step in TIME_STEPS for i in range(count - step)}
-    points, _ = points_in_frusta(views, np.random.default_rng(0).random((_PROBES, 4)))
+    points, _ = sample_points_in_frusta(views, np.random.default_rng(0).random((_PROBES, 4)))
     seen = np.stack([projected(points, view)[1] for view in views]).astype(float)
     axes = np.stack([view.cam_from_world[2, :3] for view in views])
     overlap = np.where(axes @ axes.T > np.cos(np.radians(MAX_TURN)), seen @ seen.T, 0.0)
@@ -210,7 +210,7 @@ AROUND_ORIGIN = ("blender", "body_json")
 """Formats whose scenes lie around the origin by convention."""
 
 
-def with_first_points(
+def create_initial_points(
     capture: Capture, options: DataConfig, init: PointsInit
 ) -> tuple[Capture, list[str]]:
     """Return the capture with the points that a scene begins with, None for random ones, and lines
@@ -236,14 +236,14 @@ def with_first_points(
     views = capture.splits["train"]
     is_by_custom = capture.format in AROUND_ORIGIN
     half_side = cube_half_side(init.half_extent, views, capture.world_scale)
-    why = outside_of_cube(views, half_side) if is_by_custom else None
+    why = cube_mismatch_reason(views, half_side) if is_by_custom else None
     is_in_cube = is_by_custom and why is None
     if why is not None:
         lines.append(
             f"the scene does not lie around the origin, where Blender scenes do by custom: {why}"
         )
     if is_in_cube and views[0].time is None:
-        points = points_in_silhouettes(views, options, init.num_random, half_side)
+        points = sample_points_in_silhouettes(views, options, init.num_random, half_side)
         if points is not None:
             lines.append(
                 f"{len(points.xyz):,} first points were drawn at random in the silhouettes of the images"
@@ -251,19 +251,19 @@ def with_first_points(
         return capture.replace(points=points), lines
     if init.triangulate == 0:
         return capture, lines
-    moment = views_of_a_time_step(views, init.triangulate)
+    moment = views_at_one_time(views, init.triangulate)
     points: PointCloud | None = None
     if views[0].time is None and views[0].depth_path is not None:
-        points = points_of_depth_maps(views, options, init.num_random)
+        points = points_from_depth_maps(views, options, init.num_random)
     if points is not None:
         lines.append(f"{len(points.xyz):,} first points are from the depth maps")
     elif (
         views[0].time is None
         or len({view.cam_from_world.tobytes() for view in moment}) >= MIN_IMAGES
     ):
-        points = triangulated_points(moment, options)
+        points = triangulate_from_views(moment, options)
     elif not is_in_cube:
-        points = points_over_clip(views, options)
+        points = triangulate_clip(views, options)
         if points is not None:
             lines.append(f"{len(points.xyz):,} points were triangulated over the full clip")
     return _with_dense_points(capture.replace(points=points), options, init.dense, lines)
@@ -278,15 +278,15 @@ def _with_dense_points(
     if views[0].time is not None or 2 * num_known >= count:
         return capture, lines
     if points is None:
-        candidates, _ = points_in_frusta(views, np.random.default_rng(0).random((_PROBES, 4)))
-        points = dense_points(views, options, candidates, count, fill=True)
+        candidates, _ = sample_points_in_frusta(views, np.random.default_rng(0).random((_PROBES, 4)))
+        points = sweep_dense_points(views, options, candidates, count, fill=True)
         if points is not None:
             lines = [
                 *lines,
                 f"{len(points.xyz):,} first points are from depth maps by plane sweep (init.dense)",
             ]
         return capture.replace(points=points), lines
-    dense = dense_points(views, options, points.xyz, count)
+    dense = sweep_dense_points(views, options, points.xyz, count)
     if dense is None:
         return capture, lines
     both = PointCloud(
@@ -309,7 +309,7 @@ ENOUGH, DRAWS = 1000, 10
 MOST = 0.5  # fraction of the points inside above which the silhouettes say nothing
 
 
-def points_in_silhouettes(
+def sample_points_in_silhouettes(
     views: Sequence[View], options: DataConfig, num_random: int, half_side: float
 ) -> PointCloud | None:
     """Return random points of the cube around the origin that lie in the silhouettes, in the

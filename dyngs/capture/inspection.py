@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.capture.sfm.frame_choice import STANDS, displaced_by, measured, shrunk
-from dyngs.capture.sfm.several_videos import VIDEOS_FILE, CameraVideo, open_video, read_given
+from dyngs.capture.sfm.frame_choice import STANDS, camera_displacement, measured, shrunk
+from dyngs.capture.sfm.several_videos import VIDEOS_FILE, CameraVideo, open_video, read_video_settings
 from dyngs.config import DataConfig
 from dyngs.core.errors import (
     DyngsError,
@@ -23,21 +23,21 @@ from dyngs.core.errors import (
     quote_path,
     wrap_read_errors,
 )
-from dyngs.data.body_frames import about_pelvis
+from dyngs.data.body_frames import merge_root_rotation
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry import (
     camera_center,
     focus_point,
     fraction_in_front,
-    inverse_rigid,
+    invert_rigid,
     perpendicular,
-    times_seen,
+    count_visible_views,
     unit,
 )
 from dyngs.data.images.images import read_header, read_image, read_mask
-from dyngs.data.images.video import opened_video, read_frames, videos_in
+from dyngs.data.images.video import open_video_container, read_frames, list_videos
 from dyngs.data.times import distinct_times, evenly_spaced
-from dyngs.io.containment import inside, leaving_links
+from dyngs.io.containment import inside, find_escaping_links
 from dyngs.io.outputs import Inputs
 from dyngs.io.write import write_image
 
@@ -57,7 +57,7 @@ LOOKED_AT = 4  # masks that are read
 MOST_IGNORED = 0.5
 
 
-def before_training(capture: Capture) -> list[str]:
+def check_before_training(capture: Capture) -> list[str]:
     """Return one line for everything about a capture that is likely to spoil a training; only some
     masks are read."""
     masks, problems = masks_of(capture)
@@ -86,7 +86,7 @@ def time_problems(capture: Capture) -> list[str]:
         ]
     if not 3 <= len(views) == count or count * CLOSE_IN_TIME >= FEW_VIEWS:
         return []
-    poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
+    poses = np.stack([invert_rigid(view.cam_from_world) for view in views])
     center = focus_point(poses) if capture.points is None else np.median(capture.points.xyz, axis=0)
     if center is None:
         return []
@@ -107,7 +107,7 @@ def body_problems(capture: Capture) -> list[str]:
         return []
     from scipy.spatial.transform import Rotation  # late: importing it takes a tenth of a second
 
-    body = about_pelvis(body, np.zeros(3) if body.pelvis is None else body.pelvis)
+    body = merge_root_rotation(body, np.zeros(3) if body.pelvis is None else body.pelvis)
     rows = {frame: row for row, frame in enumerate(body.frames)}
     seen = [(rows[v.frame], v) for v in capture.splits.get("train", ()) if v.frame in rows]
     if not seen:
@@ -134,7 +134,7 @@ def scene_problems(capture: Capture) -> list[str]:
     camera sees, .."""
     views = all_views(capture.splits)
     problems = []
-    poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
+    poses = np.stack([invert_rigid(view.cam_from_world) for view in views])
     centers = poses[:, :3, 3]
     spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
     is_static = capture.body is None and all(view.time is None for view in views)
@@ -150,7 +150,7 @@ def scene_problems(capture: Capture) -> list[str]:
     if len(xyz):
         sample = xyz[np.random.default_rng(0).permutation(len(xyz))[:2000]]
         some = [views[index] for index in evenly_spaced(len(views), MAX_VIEWS)]
-        unseen = float((times_seen(sample, some) == 0).mean())
+        unseen = float((count_visible_views(sample, some) == 0).mean())
         if unseen > 0.1:
             problems.append(f"{unseen:.0%} of the points are in no camera's view")
     return problems
@@ -213,7 +213,7 @@ def _image_problems(views: Iterable[View], deep: bool) -> list[str]:
             except DyngsError as error:
                 problems.append(str(error))
                 continue
-            if header.size_for(described) != described:
+            if header.size_matching(described) != described:
                 problems.append(
                     f"{path} has {header.width}x{header.height} pixels, its camera says {view.width}x{view.height}"
                 )
@@ -272,18 +272,18 @@ def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectRep
     options = source if isinstance(source, DataConfig) else DataConfig(root=source)
     links = listed(
         f"{path}: a link that leads out of the capture, to {place}"
-        for path, place in leaving_links(options.root)
+        for path, place in find_escaping_links(options.root)
     )
     try:
         capture = read_capture(options, decode_videos=deep)
         with wrap_read_errors(options.root, "`dyngs --debug` shows where"):
-            report = report_on(capture, deep)
+            report = build_report(capture, deep)
     except DyngsError as error:
         return InspectReport(options.root, None, (), (str(error), *links))
     return replace(report, problems=(*links, *report.problems))
 
 
-def report_on(capture: Capture, deep: bool = False) -> InspectReport:
+def build_report(capture: Capture, deep: bool = False) -> InspectReport:
     """Return the report on a capture that has been read; see ``inspect_capture``."""
     problems = dict.fromkeys([*capture.warnings, *problems_of(capture, deep)])
     return InspectReport(capture.root, capture, tuple(_facts_of(capture)), tuple(problems))
@@ -404,7 +404,7 @@ def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
 
     Inputs((capture.root,)).require_output(out)
     views = [(split, view) for split, views in capture.splits.items() for view in views]
-    poses = np.stack([inverse_rigid(view.cam_from_world) for _, view in views])
+    poses = np.stack([invert_rigid(view.cam_from_world) for _, view in views])
     centers = poses[:, :3, 3]
     up = -poses[:, :3, 1].mean(axis=0)
     up = unit(up) if np.linalg.norm(up) > 1e-3 else np.array([0.0, 0.0, 1.0])
@@ -462,7 +462,7 @@ def video_report(path: Path) -> str:
     """Return a report on a video file, or on the videos of a folder, as lines of text; their frames
     are decoded once."""
     videos = [
-        open_video(inside(video)) for video in ([path] if path.is_file() else videos_in(path))
+        open_video(inside(video)) for video in ([path] if path.is_file() else list_videos(path))
     ]
     lines = []
     moving = []
@@ -484,7 +484,7 @@ def video_report(path: Path) -> str:
         names = ", ".join(moving[:5])
         lines.append(f"next: take {names} out: of several videos, only fixed cameras get poses")
     else:
-        is_given = read_given(path, [video.name for video in videos])[0] is not None
+        is_given = read_video_settings(path, [video.name for video in videos])[0] is not None
         known = f"as {VIDEOS_FILE} says" if is_given else "found by sound"
         lines.append(f"{len(videos)} fixed cameras; offsets between them: {known}")
         lines.append(f"next: dyngs train dynamic data.root={where}")
@@ -501,8 +501,8 @@ def video_facts(video: CameraVideo) -> tuple[dict[str, str], bool]:
             yield rgb
 
     measures = measured(frames())
-    displaced = displaced_by(np.stack(small))
-    with opened_video(video.path) as container:
+    displaced = camera_displacement(np.stack(small))
+    with open_video_container(video.path) as container:
         has_sound = len(container.streams.audio) > 0
     gaps = 1000 * np.diff(video.seconds)
     rate = f"{video.rate:.4g} per second"

@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from dyngs.capture.sfm.frame_choice import STANDS, displaced_by, shrunk
+from dyngs.capture.sfm.frame_choice import STANDS, camera_displacement, shrunk
 from dyngs.core.errors import DyngsError, log_info
-from dyngs.data.capture import Capture, Silhouette, View, by_camera, each_view
+from dyngs.data.capture import Capture, Silhouette, View, group_by_camera, map_views
 from dyngs.data.images.images import (
     SUFFIXES,
     area_downscale_uint8,
-    files_in,
+    list_files,
     read_image,
     target_size,
 )
@@ -184,7 +184,7 @@ def _touching(mask: np.ndarray, core: np.ndarray) -> np.ndarray:
 
 def _moves(images: np.ndarray) -> bool:
     """Whether the camera of images (F, H, W, 3) uint8 moves."""
-    return displaced_by(np.stack([shrunk(image) for image in images])) > STANDS
+    return camera_displacement(np.stack([shrunk(image) for image in images])) > STANDS
 
 
 def separation(background: Background, images: np.ndarray, masks: np.ndarray) -> Separation:
@@ -268,8 +268,8 @@ class _Camera:
         return area_downscale_uint8(pixels, *self.size).numpy()
 
 
-def with_background_masks(
-    capture: Capture, folder: Path, empty: Path | None = None, say: Callable[[str], None] = log_info
+def add_background_masks(
+    capture: Capture, folder: Path, empty: Path | None = None, log: Callable[[str], None] = log_info
 ) -> Capture:
     """Return the capture of fixed cameras with masks of the person, written to ``folder``, which is
     made.
@@ -309,14 +309,14 @@ def with_background_masks(
             name = re.sub(r"[^A-Za-z0-9_-]", "_", view.name)
             target = folder / f"{name}.{len(silhouettes):06d}.png"
             mask = person_mask(background, camera.image(view.image_path))
-            write_image(target, at_size(mask, view))
+            write_image(target, resize_mask(mask, view))
             silhouettes[view.name] = Silhouette(target, "white")
     worst = min(found, key=lambda one: one.on_edges)
-    say(
+    log(
         f"masks by the difference from the background: {worst.on_edges:.0%} of the outlines lie on edges of the "
         f"images, the person covers {worst.area:.1%} of them"
     )
-    splits = each_view(
+    splits = map_views(
         capture.splits, lambda view: replace(view, silhouette=silhouettes[view.name])
     )
     return capture.replace(splits=splits, has_alpha=True)
@@ -325,7 +325,7 @@ def with_background_masks(
 def _fixed_cameras(capture: Capture) -> dict[int, _Camera]:
     """Return the cameras of a capture by number, all of which stand."""
     cameras = {}
-    for number, views in by_camera(capture.splits).items():
+    for number, views in group_by_camera(capture.splits).items():
         where = f"{capture.root}, camera {number}"
         first = views[0]
         poses = np.stack([view.cam_from_world for view in views])
@@ -345,7 +345,7 @@ def _plates(empty: Path, cameras: Mapping[int, _Camera]) -> Mapping[int, Path]:
     """Return the image of the background for each camera, by number."""
     if empty.is_file() and len(cameras) == 1:
         return dict.fromkeys(cameras, empty)
-    found = {path: re.search(r"(\d{1,9})\D*$", path.stem) for path in files_in(empty, SUFFIXES)}
+    found = {path: re.search(r"(\d{1,9})\D*$", path.stem) for path in list_files(empty, SUFFIXES)}
     plates = {int(number[1]): path for path, number in found.items() if number}
     missing = sorted(cameras.keys() - plates.keys())
     if missing:
@@ -355,7 +355,7 @@ def _plates(empty: Path, cameras: Mapping[int, _Camera]) -> Mapping[int, Path]:
     return plates
 
 
-def at_size(mask: np.ndarray, view: View) -> np.ndarray:
+def resize_mask(mask: np.ndarray, view: View) -> np.ndarray:
     """Return the mask as grey levels (H, W, 1) uint8 at the size of the view's image, bilinear."""
     values = torch.from_numpy(mask.astype(np.float32))[None, None]
     sized = torch.nn.functional.interpolate(

@@ -20,7 +20,7 @@ from torch.nn.functional import grid_sample, pad
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import PointCloud, View
-from dyngs.data.geometry import camera_center, inverse_rigid, projected
+from dyngs.data.geometry import camera_center, invert_rigid, projected
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
 
@@ -78,11 +78,11 @@ class _Shot:
     def points_at(self, depth: np.ndarray) -> np.ndarray:
         """Return the points (P, 3) in the world of the finite depths (H, W), row by row."""
         local = (self.rays * depth[..., None])[np.isfinite(depth)]
-        world_from_cam = inverse_rigid(self.cam_from_world)
+        world_from_cam = invert_rigid(self.cam_from_world)
         return local @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
 
 
-def dense_points(
+def sweep_dense_points(
     views: Sequence[View], options: DataConfig, sparse: np.ndarray, count: int, fill: bool = False
 ) -> PointCloud | None:
     """Return at most ``count`` points of surfaces that several views show, at random of all that
@@ -109,7 +109,7 @@ def dense_points(
     return _agreed_points(maps, count, MIN_POINTS, fill)
 
 
-def points_of_depth_maps(
+def points_from_depth_maps(
     views: Sequence[View], options: DataConfig, count: int
 ) -> PointCloud | None:
     """Return at most ``count`` points of the depth maps that belong to the images, where several of
@@ -260,7 +260,7 @@ def _mean_of_best_two(correlations: Sequence[Tensor]) -> Tensor:
 def _correlation(shot: _Shot, other: _Shot, inverse: np.ndarray) -> Tensor:
     """Return (D, H, W) normalised correlations of windows of two images, by inverse depth; -1
     outside the other one."""
-    relative = other.cam_from_world @ inverse_rigid(shot.cam_from_world)
+    relative = other.cam_from_world @ invert_rigid(shot.cam_from_world)
     turned = torch.from_numpy(
         np.moveaxis(shot.rays @ (other.intrinsics @ relative[:3, :3]).T, 2, 0).copy()
     ).float()

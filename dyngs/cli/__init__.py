@@ -49,7 +49,7 @@ from dyngs.core.errors import (
     quote_word,
     validate_file_name,
 )
-from dyngs.io.containment import following_links_of_runs
+from dyngs.io.containment import allow_run_links
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
@@ -182,7 +182,7 @@ def _dispatch(arguments: list[str]) -> int:
         parser.print_help()
         return 0
     try:
-        with following_links_of_runs(follows_links(getattr(parsed, "overrides", ()))):
+        with allow_run_links(follows_links(getattr(parsed, "overrides", ()))):
             require_outputs_apart(parsed.parser, parsed)
             return parsed.run(parsed)
     except NoCaptureError as error:

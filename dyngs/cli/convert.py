@@ -40,13 +40,13 @@ def run(arguments: argparse.Namespace) -> int:
 
     from dyngs.export.images import compare_file_with_source
     from dyngs.io.formats.formats import (
-        format_of,
+        format_for_path,
         read_splats,
         upright,
         write_splats,
     )
 
-    format_of(arguments.target)  # before a large file is read
+    format_for_path(arguments.target)  # before a large file is read
     splat = read_splats(arguments.source, nonfinite="skip")
     if arguments.from_up is not None:
         splat = replace(splat, up=arguments.from_up)

@@ -363,7 +363,7 @@ def run_synth(arguments: argparse.Namespace) -> int:
     out: Path = arguments.out
     moving = {"views": "num_times", "cameras": "num_cameras", "style": "style"}
     options, names, preset = {
-        "still": (synthetic.StillOptions, {"views": "num_train"}, "static"),
+        "still": (synthetic.StaticOptions, {"views": "num_train"}, "static"),
         "human": (HumanOptions, {"views": "num_frames", "cameras": "num_cameras"}, "human"),
         "people": (
             PeopleOptions,
@@ -385,7 +385,7 @@ def run_synth(arguments: argparse.Namespace) -> int:
     else:
         require_new_folder(out)
         if scene == "still":
-            synthetic.write_still_capture(out, options(**given))
+            synthetic.write_static_capture(out, options(**given))
         elif scene == "human":
             write_human_capture(out, options(**given))
         else:

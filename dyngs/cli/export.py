@@ -192,14 +192,14 @@ def _kind(arguments: argparse.Namespace) -> str:
 
     Raises DyngsError: an unknown suffix, or a suffix that contradicts --format.
     """
-    from dyngs.io.formats.formats import all_suffixes, known_format
+    from dyngs.io.formats.formats import all_suffixes, find_format
 
     out = arguments.out
     stated = arguments.format
     usual = stated or ("glb" if arguments.bodies else "ply")
     if out is None or out.is_dir():
         return usual
-    found = known_format(out)
+    found = find_format(out)
     named = _OTHER_SUFFIXES.get(out.suffix.lower()) if found is None else found.name
     if stated is None and (named or (_is_sequence(arguments) and not out.suffix)):
         return named or "ply"
@@ -284,9 +284,9 @@ def _export_splats(
         write_run_sequence,
         write_run_splats,
     )
-    from dyngs.io.formats.formats import format_named, known_format, read_splats
+    from dyngs.io.formats.formats import format_by_name, find_format, read_splats
 
-    own = format_named(kind)
+    own = format_by_name(kind)
     part = _part(arguments)
     suffix = own.suffixes[0]
     scene = scene_part(opened.scene, part)
@@ -299,7 +299,7 @@ def _export_splats(
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
     out: Path | None = arguments.out
     is_sequence = _is_sequence(arguments)
-    is_file = out is not None and known_format(out) is not None
+    is_file = out is not None and find_format(out) is not None
     if (arguments.folder and (is_file or is_sequence)) or (
         is_file and is_sequence and not arguments.static
     ):
@@ -446,13 +446,13 @@ def _export_bodies(arguments: argparse.Namespace) -> None:
     """Write a moving scene with its rigid bodies as animated nodes."""
     from dyngs.export.images import compare_file_with_run
     from dyngs.export.splat_files import choose_write_options, write_rigid_bodies
-    from dyngs.io.formats.formats import format_named, read_splats
+    from dyngs.io.formats.formats import format_by_name, read_splats
 
     out = _target(arguments, "bodies.glb")
     opened = _open(arguments)
     time = (_times(arguments) or (0.0,))[0]
     how, line = choose_write_options(
-        opened, format_named("glb").up, arguments.up, arguments.from_up
+        opened, format_by_name("glb").up, arguments.up, arguments.from_up
     )
     written = write_rigid_bodies(opened, out, time, how)
     print_notes((line,))

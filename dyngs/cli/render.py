@@ -96,11 +96,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _check(arguments: argparse.Namespace) -> None:
     """Raise DyngsError for a missing source or output, or options that do not apply."""
-    from dyngs.io.outputs import command_for
+    from dyngs.io.outputs import suggest_command
 
     args.require_motion_for_feet(arguments)
     arguments.source = args.run_of_scene_file(arguments.source)
-    known = command_for(arguments.source)
+    known = suggest_command(arguments.source)
     if known is not None and not (arguments.source / "config.yaml").is_file():
         raise DyngsError(f"{arguments.source}: not a scene; {known}")
     is_file = arguments.source.is_file()

@@ -52,7 +52,7 @@ class TrainingProgress:
                 if self._forecast is not None:
                     self._forecast.exclude(event.seconds)
             case Message():
-                self.say(event.text)
+                self.log(event.text)
 
     def _begin(self, event: Started) -> None:
         self._start = self._next_line = event.step
@@ -88,10 +88,10 @@ class TrainingProgress:
         if self._bar is not None:
             self._bar.update(self._task, completed=step, text=text, left=left)
         else:
-            self.say(f"step {step}/{self._total} {text} {left} left")
+            self.log(f"step {step}/{self._total} {text} {left} left")
             self._next_line = step + max(1, self._total // PLAIN_LINES)
 
-    def say(self, line: str) -> None:
+    def log(self, line: str) -> None:
         """Show ``line`` above the progress bar."""
         line = escape_control_characters(line)
         with suppress(OSError):

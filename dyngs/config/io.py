@@ -33,8 +33,8 @@ from dyngs.config.schema import (
 )
 from dyngs.config.yaml_reader import Leaf, read_file, read_override
 from dyngs.core.errors import DyngsError, format_one_line, validate_file_name, wrap_read_errors
-from dyngs.io.containment import follows_links_of_runs
-from dyngs.io.outputs import command_for
+from dyngs.io.containment import run_links_allowed
+from dyngs.io.outputs import suggest_command
 from dyngs.io.write import write_text
 
 RESOLVED_NAME = "config.yaml"
@@ -162,7 +162,7 @@ def load_resolved(
         data_root: current folder of the capture, if it was moved.
     """
     file = path / RESOLVED_NAME if path.is_dir() else path
-    found = command_for(path)
+    found = suggest_command(path)
     if not file.is_file() or (file == path and found):
         hint = f"{found}; then " if found else ""
         raise DyngsError(
@@ -178,7 +178,7 @@ def load_resolved(
     stored_root = None
     if isinstance(data, dict):
         stored_root = data.get("root")
-        data["follow_links"] = follows_links_of_runs()
+        data["follow_links"] = run_links_allowed()
         if isinstance(data.get("body"), str):
             data["body"] = str(file.parent.absolute() / data["body"])
     layers.add_overrides(overrides)
@@ -232,7 +232,7 @@ def find_preset(path: Path) -> Path:
     Only a bare name or one below ``configs/`` matches a packaged preset, so that other mistyped
     paths are errors. A source checkout uses the presets in the repository's ``configs``.
     """
-    found = command_for(path)
+    found = suggest_command(path)
     if path.is_file() and found is None:
         return path
     packaged = packaged_presets()

@@ -22,10 +22,10 @@ from dyngs.data.capture import (
     Splits,
     View,
     all_views,
-    each_view,
+    map_views,
 )
-from dyngs.io.containment import staying_within
-from dyngs.io.fields import LARGEST, first_few, float_array, numbers_of
+from dyngs.io.containment import restrict_paths_to
+from dyngs.io.fields import LARGEST, first_few, as_float_array, parse_numbers
 from dyngs.io.numpy_files import read_npz
 
 
@@ -68,9 +68,9 @@ def body_frames(
     scales = _rows(where, "scale", scale, frames, 1)
     if not (scales > 0).all():
         raise DyngsError(f"{where}: 'scale' must be positive; export the file again")
-    shape = float_array(betas)
+    shape = as_float_array(betas)
     if shape is not None and (shape.ndim == 1 or len(shape) == 1):
-        shape = numbers_of(f"{where}: 'betas'", shape, None)
+        shape = parse_numbers(f"{where}: 'betas'", shape, None)
     else:
         shape = _rows(where, "betas", betas, frames).mean(axis=0)
     return BodyFrames(
@@ -83,7 +83,7 @@ def body_frames(
     )
 
 
-def about_pelvis(body: BodyFrames, pelvis: np.ndarray) -> BodyFrames:
+def merge_root_rotation(body: BodyFrames, pelvis: np.ndarray) -> BodyFrames:
     """Return the same bodies with ``turns`` merged into the root joint's rotation.
 
     The pelvis keeps its place in the world, ``scale * turn(j) + trans``, where j is the rest
@@ -129,7 +129,7 @@ def rows_of(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
     return np.array([rows[frame_number(view)] for view in views], dtype=np.int64)
 
 
-def of_one_clip(body: BodyFrames) -> dict[Split, BodyFrames]:
+def share_body_across_splits(body: BodyFrames) -> dict[Split, BodyFrames]:
     """``Capture.body`` for a capture whose splits all show the same clip."""
     return {"train": body, "val": body, "test": body}
 
@@ -138,7 +138,7 @@ def _rows(
     where: Path, name: str, value: object, frames: Sequence[int], width: int | None = None
 ) -> np.ndarray:
     """(F, width) float64 numbers of at most ``LARGEST``, any width where that is None."""
-    array = float_array(value)
+    array = as_float_array(value)
     if array is None or array.shape[:1] != (len(frames),):
         raise DyngsError(
             f"{where}: '{name}' must hold as many numbers for each of {len(frames)} frames; export the file again"
@@ -191,7 +191,7 @@ def ensure_fitted_body(capture: Capture, folder: Path) -> Capture:
             f"training with data.root={capture.root} into another run.dir"
         )
     with (
-        staying_within(folder, False),
+        restrict_paths_to(folder, False),
         wrap_read_errors(folder, "give a folder that `dyngs data fit` wrote"),
     ):
         train = read_body_file(folder / "body_train.npz")
@@ -204,7 +204,7 @@ def ensure_fitted_body(capture: Capture, folder: Path) -> Capture:
     return capture.replace(splits=splits, body=body)
 
 
-def number_in_name(where: Path, name: str) -> int:
+def parse_frame_number(where: Path, name: str) -> int:
     """Frame number of ``000123.jpg``, ``frame_000123`` or ``Camera
     (1)_0123_2019-08-23_16.592.jpg``."""
     stem = PurePosixPath(name.replace("\\", "/")).name
@@ -230,4 +230,4 @@ def numbered(splits: Splits) -> Splits:
     if all(view.frame is not None for view in views):
         return splits
     order = {time: i for i, time in enumerate(sorted({view.time or 0.0 for view in views}))}
-    return each_view(splits, lambda view: replace(view, frame=order[view.time or 0.0]))
+    return map_views(splits, lambda view: replace(view, frame=order[view.time or 0.0]))

@@ -118,7 +118,7 @@ def all_views(splits: Mapping[Split, tuple[View, ...]]) -> list[View]:
     return [view for views in splits.values() for view in views]
 
 
-def by_camera(splits: Mapping[Split, tuple[View, ...]]) -> dict[int, list[View]]:
+def group_by_camera(splits: Mapping[Split, tuple[View, ...]]) -> dict[int, list[View]]:
     """Return the views of each camera in order of time, cameras by their numbers."""
     found: dict[int, list[View]] = {}
     for view in sorted(
@@ -128,7 +128,7 @@ def by_camera(splits: Mapping[Split, tuple[View, ...]]) -> dict[int, list[View]]
     return found
 
 
-def each_view(splits: Splits, change: Callable[[View], View]) -> Splits:
+def map_views(splits: Splits, change: Callable[[View], View]) -> Splits:
     """Return the splits with ``change`` of each view."""
     return {name: tuple(map(change, views)) for name, views in splits.items()}
 

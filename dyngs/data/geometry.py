@@ -20,7 +20,7 @@ ROTATION_TOLERANCE = 1e-3
 """Largest entry of ``R^T R - I`` that is taken for rounding and repaired."""
 
 
-def checked_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
+def validate_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
     """Return the rigid (4, 4) float64 transform nearest to ``matrix`` (4, 4) or (3, 4), in any
     convention.
 
@@ -55,18 +55,18 @@ def checked_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
     return pose, error
 
 
-def cam_from_opengl(world_from_cam: np.ndarray) -> np.ndarray:
+def from_opengl_pose(world_from_cam: np.ndarray) -> np.ndarray:
     """Return the OpenCV ``cam_from_world`` of a rigid (4, 4) OpenGL camera-to-world pose: y up, z
     backward."""
-    return inverse_rigid(world_from_cam @ OPENGL_FROM_OPENCV)
+    return invert_rigid(world_from_cam @ OPENGL_FROM_OPENCV)
 
 
-def opengl_from_cam(cam_from_world: np.ndarray) -> np.ndarray:
+def to_opengl_pose(cam_from_world: np.ndarray) -> np.ndarray:
     """Return the (4, 4) OpenGL camera-to-world pose of a rigid OpenCV ``cam_from_world``."""
-    return inverse_rigid(cam_from_world) @ OPENGL_FROM_OPENCV
+    return invert_rigid(cam_from_world) @ OPENGL_FROM_OPENCV
 
 
-def inverse_rigid(pose: np.ndarray) -> np.ndarray:
+def invert_rigid(pose: np.ndarray) -> np.ndarray:
     """Return the (4, 4) inverse of a rigid transform."""
     inverse = np.eye(4)
     inverse[:3, :3] = pose[:3, :3].T
@@ -109,7 +109,7 @@ def scaled_intrinsics(intrinsics: np.ndarray, scale_x: float, scale_y: float) ->
     return np.diag([scale_x, scale_y, 1.0]) @ intrinsics
 
 
-def match_size(
+def match_intrinsics_to_image(
     intrinsics: np.ndarray, described: tuple[int, int], stored: tuple[int, int] | None, where: str
 ) -> tuple[np.ndarray, tuple[int, int], bool]:
     """Return the intrinsics for the stored image, its (width, height), and whether they were
@@ -178,7 +178,7 @@ def projected(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
     return positions, in_front & (positions >= 0).all(axis=1) & (positions < 1).all(axis=1)
 
 
-def times_seen(points: np.ndarray, views: Sequence[View]) -> np.ndarray:
+def count_visible_views(points: np.ndarray, views: Sequence[View]) -> np.ndarray:
     """Return (P,) int64: in how many of the views each of the points (P, 3) lies."""
     counts = np.zeros(len(points), np.int64)
     for view in views:
@@ -210,7 +210,7 @@ def fraction_in_front(world_from_cam: np.ndarray, point: np.ndarray) -> float:
     return float((depth > 0).mean())
 
 
-def look_at_point(cameras: Cameras) -> np.ndarray:
+def estimate_focus(cameras: Cameras) -> np.ndarray:
     """Return the point (3,) float64 nearest to all optical axes in the least-squares sense, in
     front of the cameras.
 

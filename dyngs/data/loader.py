@@ -27,7 +27,7 @@ from dyngs.data.images.images import (
     premultiplied,
     read_image,
     read_mask,
-    straight_uint8,
+    to_straight_uint8,
 )
 from dyngs.data.images.lens import LensMap, is_pinhole, undistort, undistort_map
 from dyngs.data.read import view_size
@@ -45,7 +45,7 @@ Decoded = dict[str, Tensor]
 where a view has them."""
 
 
-def usual_threads() -> int:
+def default_decoding_threads() -> int:
     """Return how many threads work ahead: one for every two cores of this process, one to four."""
     try:
         cores = len(os.sched_getaffinity(0))
@@ -313,7 +313,7 @@ class ImageLoader:
         )
 
     @property
-    def decoded_ahead(self) -> int:
+    def num_prefetched(self) -> int:
         """Number of images that ``expect`` decodes ahead; 0 where all are cached."""
         is_whole = all((i, 1) in self._cache.images for i in range(len(self)))
         return 0 if is_whole else 2 * self._threads
@@ -324,7 +324,7 @@ class ImageLoader:
         return [view_size(view, self._options) for view in self.views]
 
     @property
-    def bytes_to_come(self) -> int:
+    def pending_bytes(self) -> int:
         """Bytes that images will take, in the cache or decoded ahead, next to those that they take
         now."""
         every = min(self._bytes_of_all() - self.bytes_on_gpu, round(self._on_cpu.room))
@@ -381,7 +381,7 @@ class ImageLoader:
         lens_map = None if is_pinhole(view.lens) else self._lens_map(view)
         if lens_map is not None:
             small = area_downscale(undistort(premultiplied(pixels), lens_map), *size)
-            pixels = straight_uint8(small)
+            pixels = to_straight_uint8(small)
             mask = _undistorted_mask(mask, lens_map)
         elif size != (view.width, view.height):
             pixels = area_downscale_uint8(pixels, *size)
@@ -456,7 +456,7 @@ def check_files(views: Sequence[View]) -> None:
     for view in views:
         header = check_image(view.image_path)
         _require_size(
-            view, view.image_path, header.size_for((view.width, view.height))[::-1], "image"
+            view, view.image_path, header.size_matching((view.width, view.height))[::-1], "image"
         )
         if view.mask_path is not None:
             mask = check_image(view.mask_path)
@@ -473,7 +473,7 @@ def _require_size(view: View, path: Path, shape: Sequence[int], what: str) -> No
 
 
 def _nearest(values: Tensor, positions: Tensor) -> Tensor:
-    return image_maps.taken_at(values[..., None], positions)[..., 0]
+    return image_maps.sample_nearest(values[..., None], positions)[..., 0]
 
 
 def _undistorted_mask(mask: Tensor | None, lens_map: LensMap) -> Tensor | None:

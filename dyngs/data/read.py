@@ -19,10 +19,10 @@ from dyngs.data.capture import (
     Splits,
     View,
     all_views,
-    each_view,
+    map_views,
 )
-from dyngs.data.geometry import match_size
-from dyngs.data.images.images import header_if_readable, read_header, target_size
+from dyngs.data.geometry import match_intrinsics_to_image
+from dyngs.data.images.images import try_read_header, read_header, target_size
 from dyngs.data.images.video import decode_frames
 from dyngs.data.readers import (
     camera_folders,
@@ -36,15 +36,15 @@ from dyngs.data.readers import (
 )
 from dyngs.data.scene_space import normalise_capture
 from dyngs.io.archive import is_archive, unpacked
-from dyngs.io.containment import inside, staying_within
-from dyngs.io.find import FileFinder, shrunk_folders
-from dyngs.io.outputs import command_for
+from dyngs.io.containment import inside, restrict_paths_to
+from dyngs.io.find import FileFinder, downscaled_image_folders
+from dyngs.io.outputs import suggest_command
 
 PEOPLE_FILE = "people.json"
 """In a set whose people lie in shards, folders of folders: the options that they were made with."""
 
 
-def captures_in(data: DataConfig) -> list[DataConfig]:
+def list_captures(data: DataConfig) -> list[DataConfig]:
     """Return the paths of the captures in the folders of ``data.root``, or of its shards, by name.
     No capture is read.
 
@@ -84,7 +84,7 @@ def with_smaller_images(
     Copies are not read where an image has no copy or has a mask or depth map, which have its size.
     """
     images = root / "images"
-    copies = shrunk_folders(images)
+    copies = downscaled_image_folders(images)
     views = [view for view in all_views(splits) if view.image_path.is_relative_to(images)]
     if not copies or not views:
         return splits, []
@@ -100,7 +100,7 @@ def with_smaller_images(
             return splits, []
         small[view.name] = copy
     line = f"{copies[number].name} is read in place of images: training takes images of that size or smaller ones"
-    return each_view(splits, lambda view: small.get(view.name, view)), [line]
+    return map_views(splits, lambda view: small.get(view.name, view)), [line]
 
 
 def _shrunk(view: View, path: Path, factor: int) -> View | None:
@@ -108,15 +108,15 @@ def _shrunk(view: View, path: Path, factor: int) -> View | None:
     be."""
     if view.mask_path or view.silhouette or view.depth_path or view.motion_mask_path:
         return None
-    header = header_if_readable(path)
+    header = try_read_header(path)
     described = (view.width, view.height)
-    stored = (0, 0) if header is None else header.size_for(described)
+    stored = (0, 0) if header is None else header.size_matching(described)
     if any(
         abs(factor * small - large) >= factor
         for small, large in zip(stored, described, strict=True)
     ):
         return None
-    intrinsics, size, _ = match_size(view.intrinsics, described, stored, str(path))
+    intrinsics, size, _ = match_intrinsics_to_image(view.intrinsics, described, stored, str(path))
     return replace(
         view, image_path=path, intrinsics=intrinsics, width=size[0], height=size[1], shrunk=factor
     )
@@ -190,7 +190,7 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
         found = [format for format in FORMATS if format.recognise(root)]
     chosen = _chosen_format(options, found)
     with (
-        staying_within(root, options.follow_links),
+        restrict_paths_to(root, options.follow_links),
         wrap_read_errors(
             root,
             "one of its files is not as it should be (`dyngs --debug` shows where); export it again",
@@ -247,7 +247,7 @@ def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFo
     folder."""
     if options.format == "auto":
         if not found:
-            known = command_for(options.root, captures=False)
+            known = suggest_command(options.root, captures=False)
             if known is not None:
                 raise DyngsError(f"{options.root}: no capture found; {known}")
             looked_for = "; ".join(f"{format.name}: {format.files}" for format in FORMATS)
@@ -338,35 +338,35 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
         )
     if capture.body is not None:
         # people are drawn in the poses of their frames, which are found by their times
-        splits = times.times_of_frames(splits)
+        splits = times.times_from_frame_numbers(splits)
     new_poses = splits.pop("pose", None)
     notes: list[str] = []
     rate = options.frames_per_second
     if options.times == "order":
-        splits, line = times.times_by_name(splits, rate)
+        splits, line = times.times_from_names(splits, rate)
         notes.append(line)
         capture = replace(capture, in_seconds=rate is not None, fps=rate or capture.fps)
     elif rate is not None:
         raise DyngsError(
             f"{capture.root}: data.frames_per_second={rate:g} needs data.times=order, which takes times from the names"
         )
-    splits = times.number_cameras(splits)
+    splits = times.assign_camera_ids(splits)
     if options.train_cameras is not None:
         splits = times.split_by_camera(capture.root, splits, options.train_cameras)
         said = tuple(line for line in capture.warnings if line != zju_mocap.FIRST_HELD_OUT)
         capture = replace(capture, warnings=said)
     written = splits
     # People move by frame number: of their captures, times within [0, 1] are left as they are.
-    splits, scaled = times.unit_times(capture.root, splits, stretch=capture.body is None)
+    splits, scaled = times.normalize_times(capture.root, splits, stretch=capture.body is None)
     if options.frames is not None:
         splits, _ = times.split_by_frames(capture.root, splits, options.frames)
-    splits, constant = times.static_if_constant(splits)
+    splits, constant = times.drop_constant_times(splits)
     notes += [*scaled, *constant, *times.frame_count_warnings(splits)]
     if options.pose_frames is not None:
         capture, splits, new_poses = _with_poses_held_out(
             capture, splits, new_poses, options.pose_frames
         )
-    span = times.span_in_files(written, splits)
+    span = times.file_time_span(written, splits)
     seconds = times.clip_seconds(splits, capture.fps)
     if capture.in_seconds and span:
         seconds = span[1] - span[0]
@@ -466,7 +466,7 @@ def _present_priors(splits: Splits, tracks: Path | None) -> tuple[Splits, Path |
         notes.append(
             f"{len(missing)} of {len(paths)} {kind} are missing and do without, first {min(missing)}"
         )
-        splits = each_view(
+        splits = map_views(
             splits,
             lambda v, at=field, no=missing: replace(v, **{at: None}) if getattr(v, at) in no else v,
         )

@@ -11,13 +11,13 @@ import numpy as np
 
 from dyngs.core.section import Length
 from dyngs.data.body_frames import moved
-from dyngs.data.capture import Capture, PointCloud, View, all_views, each_view
+from dyngs.data.capture import Capture, PointCloud, View, all_views, map_views
 from dyngs.data.geometry import (
     camera_center,
     focus_point,
     fraction_in_front,
-    inverse_rigid,
-    times_seen,
+    invert_rigid,
+    count_visible_views,
 )
 from dyngs.data.times import evenly_spaced
 
@@ -43,9 +43,9 @@ def depth_bounds(views: Sequence[View]) -> tuple[float, float]:
     point. With all cameras at one place nothing can be told, and the bounds are those of cameras a
     unit apart.
     """
-    poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
+    poses = np.stack([invert_rigid(view.cam_from_world) for view in views])
     centers = poses[:, :3, 3]
-    baseline = 2 * extent_of(centers) / EXTENT_MARGIN or 1.0
+    baseline = 2 * camera_extent(centers) / EXTENT_MARGIN or 1.0
     focus = focus_point(poses)
     distance = baseline
     if focus is not None and fraction_in_front(poses, focus) > 0.5:
@@ -53,7 +53,7 @@ def depth_bounds(views: Sequence[View]) -> tuple[float, float]:
     return NEAR_PER_FOCUS * distance, max(FAR_PER_BASELINE * baseline, 2 * distance)
 
 
-def points_in_frusta(views: Sequence[View], unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def sample_points_in_frusta(views: Sequence[View], unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return candidates (P, 3) for random points, and in how many of up to ``COUNTED_VIEWS`` views
     each lies.
 
@@ -72,7 +72,7 @@ def points_in_frusta(views: Sequence[View], unit: np.ndarray) -> tuple[np.ndarra
         rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(view.intrinsics).T
         rotation = view.cam_from_world[:3, :3]
         points[rows] = (rays * depth[rows, None]) @ rotation + camera_center(view.cam_from_world)
-    return points, times_seen(points, [views[i] for i in evenly_spaced(len(views), COUNTED_VIEWS)])
+    return points, count_visible_views(points, [views[i] for i in evenly_spaced(len(views), COUNTED_VIEWS)])
 
 
 def cube_half_side(half_extent: Length, views: Sequence[View], world_scale: float) -> float:
@@ -80,17 +80,17 @@ def cube_half_side(half_extent: Length, views: Sequence[View], world_scale: floa
     if half_extent != "auto":
         return half_extent / world_scale
     centers = np.array([camera_center(view.cam_from_world) for view in views])
-    return CUBE_PER_EXTENT * (extent_of(centers) or TYPICAL_EXTENT)
+    return CUBE_PER_EXTENT * (camera_extent(centers) or TYPICAL_EXTENT)
 
 
-def outside_of_cube(views: Sequence[View], half_extent: float) -> str | None:
+def cube_mismatch_reason(views: Sequence[View], half_extent: float) -> str | None:
     """Return why the scene cannot lie in the cube around the origin, in a few words; None where it
     may.
 
     It does not where the point that the cameras look at is outside, or where two cameras (one, if
     there is one) see less than ``MIN_CUBE_SEEN`` of the cube. Half its side is ``half_extent``.
     """
-    poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
+    poses = np.stack([invert_rigid(view.cam_from_world) for view in views])
     focus = focus_point(poses)
     if (
         focus is not None
@@ -102,7 +102,7 @@ def outside_of_cube(views: Sequence[View], half_extent: float) -> str | None:
     grid = half_extent * np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(
         -1, 3
     )
-    seen = (times_seen(grid, views) >= min(2, len(views))).mean()
+    seen = (count_visible_views(grid, views) >= min(2, len(views))).mean()
     if seen < MIN_CUBE_SEEN:
         return f"the cameras see {seen:.0%} of the cube of half side {half_extent:g} around it"
     return None
@@ -122,7 +122,7 @@ ROUNDING = 1e-8  # Relative error of a position written with eight digits
 NEGLIGIBLE = 1e-3
 
 
-def extent_of(centers: np.ndarray) -> float:
+def camera_extent(centers: np.ndarray) -> float:
     """Return 1.1 x the largest distance of a camera centre, of (V, 3), to their mean; 0 where that
     is rounding."""
     offsets = centers - centers.mean(axis=0)
@@ -140,7 +140,7 @@ def normalise_capture(capture: Capture) -> Capture:
     extents from the origin, the point that the cameras look at becomes the origin, or the median
     camera where they look at none. See ``Capture.world_scale`` and ``Capture.world_offset``.
     """
-    poses = np.array([inverse_rigid(view.cam_from_world) for view in all_views(capture.splits)])
+    poses = np.array([invert_rigid(view.cam_from_world) for view in all_views(capture.splits)])
     centers = poses[:, :3, 3]
     median = np.median(centers, axis=0)
     length = _length(capture, centers)
@@ -171,7 +171,7 @@ def _length(capture: Capture, centers: np.ndarray) -> float:
     """
     if capture.body is not None:
         return TYPICAL_EXTENT * float(np.median(capture.body["train"].scale))
-    extent = extent_of(centers)
+    extent = camera_extent(centers)
     if capture.points is None:
         return extent
     median_point = np.median(capture.points.xyz, axis=0)
@@ -205,7 +205,7 @@ def change_coordinates(
     body = capture.body and {name: moved(x, shift, factor) for name, x in capture.body.items()}
     return replace(
         capture,
-        splits=each_view(capture.splits, moved_view),
+        splits=map_views(capture.splits, moved_view),
         points=points,
         body=body,
         world_scale=scale,

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from dyngs.core.errors import DyngsError, format_one_line, wrap_read_errors
-from dyngs.data.capture import Splits, View, all_views, each_view
-from dyngs.data.geometry import inverse_rigid
+from dyngs.data.capture import Splits, View, all_views, map_views
+from dyngs.data.geometry import invert_rigid
 from dyngs.io.fields import is_number, read_json_object
 from dyngs.io.write import write_text
 
@@ -67,7 +67,7 @@ def read_seconds(root: Path) -> dict[str, float]:
         return {name: float(second) for name, second in seconds.items()}
 
 
-def times_by_name(splits: Splits, per_second: float | None = None) -> tuple[Splits, str]:
+def times_from_names(splits: Splits, per_second: float | None = None) -> tuple[Splits, str]:
     """Return the views with times by their names, and a line that says how.
 
     Where the name of every image ends in a number, and no two of a folder in the same, that number
@@ -98,7 +98,7 @@ def times_by_name(splits: Splits, per_second: float | None = None) -> tuple[Spli
     if per_second is not None:
         length = (max(times.values()) - min(times.values())) / per_second
         line += f" at {per_second:g} per second: {length:.4g} s"
-    return each_view(
+    return map_views(
         splits, lambda view: replace(view, time=times[view.name] / (per_second or 1.0))
     ), line + ")"
 
@@ -112,7 +112,7 @@ def natural_order(name: str) -> list[tuple[int, int, str]]:
     ]
 
 
-def times_of_frames(splits: Splits) -> Splits:
+def times_from_frame_numbers(splits: Splits) -> Splits:
     """Return the splits with times by frame number where no view has a time and all have a frame,
     of several.
 
@@ -127,14 +127,14 @@ def times_of_frames(splits: Splits) -> Splits:
         if len(frames) > 1 and all(view.frame is not None and view.time is None for view in views):
             first = min(frames)
             span = max(frames) - min(frames)
-            own = each_view(
+            own = map_views(
                 own, lambda v, at=first, of=span: replace(v, time=((v.frame or 0) - at) / of)
             )
         timed |= own
     return timed
 
 
-def unit_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Splits, list[str]]:
+def normalize_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Splits, list[str]]:
     """Return the splits with the first time at 0 and the last one at 1, and warnings; one scale for
     all splits.
 
@@ -156,7 +156,7 @@ def unit_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Spl
     within = first >= 0 and last <= 1
     if first == last or (within and (not stretch or last - first <= SAME_TIME)):
         return splits, []
-    scaled = each_view(
+    scaled = map_views(
         splits, lambda view: replace(view, time=((view.time or 0.0) - first) / (last - first))
     )
     if within and max(first, 1 - last) < MENTIONED_CHANGE:
@@ -164,16 +164,16 @@ def unit_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Spl
     return scaled, [f"times run from {first:g} to {last:g} and were scaled to [0, 1]"]
 
 
-def static_if_constant(splits: Splits) -> tuple[Splits, list[str]]:
+def drop_constant_times(splits: Splits) -> tuple[Splits, list[str]]:
     """Return the splits without times, and a warning, if all images have the same time."""
     times = {view.time for view in all_views(splits)}
     if len(times) != 1 or times == {None}:
         return splits, []
     line = f"all images have time {times.pop():g}: treated as a static scene"
-    return each_view(splits, lambda view: replace(view, time=None)), [line]
+    return map_views(splits, lambda view: replace(view, time=None)), [line]
 
 
-def span_in_files(written: Splits, kept: Splits) -> tuple[float, float] | None:
+def file_time_span(written: Splits, kept: Splits) -> tuple[float, float] | None:
     """Return the first and the last time of the ``kept`` views as ``written`` in the files; None
     without times."""
     names = {view.name for view in all_views(kept) if view.time is not None}
@@ -271,7 +271,7 @@ def split_by_camera(root: Path, splits: Splits, cameras: Sequence[int]) -> Split
     }
 
 
-def number_cameras(splits: Splits) -> Splits:
+def assign_camera_ids(splits: Splits) -> Splits:
     """Return the views with a number for each camera, where they share one although they are of
     several cameras.
 
@@ -295,14 +295,14 @@ def number_cameras(splits: Splits) -> Splits:
             view, camera_id=cameras.index(first), cam_from_world=views[first].cam_from_world
         )
 
-    return each_view(splits, numbered)
+    return map_views(splits, numbered)
 
 
 def _first_of_pose(views: Sequence[View]) -> list[int]:
     """Return for each view the index of the first one with its pose."""
     from scipy.spatial import KDTree
 
-    poses = np.stack([inverse_rigid(view.cam_from_world)[:3] for view in views])
+    poses = np.stack([invert_rigid(view.cam_from_world)[:3] for view in views])
     centers = poses[:, :, 3] - poses[:, :, 3].mean(axis=0)
     poses[:, :, 3] = centers / (np.linalg.norm(centers, axis=1).max() or 1.0)
     rows = poses.reshape(len(views), -1)
@@ -336,7 +336,7 @@ def videos(views: Sequence[View]) -> list[list[int]]:
     order = sorted(range(len(views)), key=lambda i: views[i].time or 0.0)
     if fixed or len(views) < 3 or len({view.time for view in views} - {None}) < len(views):
         return fixed
-    centers = np.stack([inverse_rigid(views[i].cam_from_world)[:3, 3] for i in order])
+    centers = np.stack([invert_rigid(views[i].cam_from_world)[:3, 3] for i in order])
     apart = np.linalg.norm(centers[:, None] - centers, axis=2)
     usual = float(np.median(apart[np.triu_indices(len(views), 1)]))
     is_scattered = float(np.median(np.diagonal(apart, 1))) > SCATTERED * usual

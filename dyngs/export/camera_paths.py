@@ -14,8 +14,8 @@ import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, format_one_line
-from dyngs.data.geometry import cam_from_opengl, checked_pose, inverse_rigid, pinhole_matrix
-from dyngs.io.fields import entry, float_array, is_number, numbers_of, read_json, require_at_most
+from dyngs.data.geometry import from_opengl_pose, validate_pose, invert_rigid, pinhole_matrix
+from dyngs.io.fields import entry, as_float_array, is_number, parse_numbers, read_json, require_at_most
 
 _MAX_FRAMES = 100_000
 """A longer path is taken for a typing mistake."""
@@ -196,11 +196,11 @@ def _frame_of_3dgs(view: object, where: str) -> dict[str, Any]:
     """Return a frame of a cameras.json, which holds places and rotations of cameras in the
     world."""
     pose = np.eye(4)
-    pose[:3, :3] = numbers_of(f"{where}: 'rotation'", entry(where, view, "rotation"), (3, 3))
-    pose[:3, 3] = numbers_of(f"{where}: 'position'", entry(where, view, "position"), (3,))
+    pose[:3, :3] = parse_numbers(f"{where}: 'rotation'", entry(where, view, "rotation"), (3, 3))
+    pose[:3, 3] = parse_numbers(f"{where}: 'position'", entry(where, view, "position"), (3,))
     names = {"w": "width", "h": "height", "fl_x": "fx", "fl_y": "fy"}
     others = {key: entry(where, view, name) for key, name in names.items()}
-    return {"cam_from_world": inverse_rigid(pose), **others}
+    return {"cam_from_world": invert_rigid(pose), **others}
 
 
 def _read_pose(frame: object, where: str) -> np.ndarray:
@@ -209,11 +209,11 @@ def _read_pose(frame: object, where: str) -> np.ndarray:
     given = [key for key in ("cam_from_world", "transform_matrix") if key in fields]
     if len(given) != 1:
         raise DyngsError(f"{where} needs exactly one of 'cam_from_world' and 'transform_matrix'")
-    matrix = float_array(fields[given[0]])
+    matrix = as_float_array(fields[given[0]])
     if matrix is not None and matrix.shape in ((12,), (16,)):
         matrix = matrix.reshape(-1, 4)
-    pose, _ = checked_pose(np.zeros(0) if matrix is None else matrix, f"{where}: '{given[0]}'")
-    return cam_from_opengl(pose) if given[0] == "transform_matrix" else pose
+    pose, _ = validate_pose(np.zeros(0) if matrix is None else matrix, f"{where}: '{given[0]}'")
+    return from_opengl_pose(pose) if given[0] == "transform_matrix" else pose
 
 
 def _read_intrinsics(

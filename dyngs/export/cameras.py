@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from dyngs.data.capture import Capture, Split, View
-from dyngs.data.geometry import opengl_from_cam
-from dyngs.io.formats.ply import double_ply
+from dyngs.data.geometry import to_opengl_pose
+from dyngs.io.formats.ply import encode_ply
 from dyngs.io.formats.similarity import Similarity
 from dyngs.io.write import atomic_file, write_text
 from dyngs.runs.folder import collect_inputs
@@ -48,7 +48,7 @@ def write_cameras(
         content["fps"] = capture.fps
     if capture.points is not None:
         with atomic_file(path.with_name(POINTS_NAME)) as temporary:
-            temporary.write_bytes(double_ply(world.points(capture.points.xyz), capture.points.rgb))
+            temporary.write_bytes(encode_ply(world.points(capture.points.xyz), capture.points.rgb))
         content["ply_file_path"] = POINTS_NAME
     write_text(path, json.dumps(content | {"frames": frames}, indent=1) + "\n")
     return path
@@ -56,7 +56,7 @@ def write_cameras(
 
 def _frame(view: View, folder: Path, capture: Capture, world: Similarity) -> dict[str, object]:
     """Return the entry of a view; its files are named as seen from ``folder``."""
-    pose = opengl_from_cam(view.cam_from_world)
+    pose = to_opengl_pose(view.cam_from_world)
     pose[:3, :3] = world.rotation @ pose[:3, :3]
     pose[:3, 3] = world.points(pose[:3, 3])
     first, last = capture.span or (0.0, 1.0)

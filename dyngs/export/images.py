@@ -22,7 +22,7 @@ from dyngs.export.orbits import frame_orbit_for_points
 from dyngs.export.video import video_writer
 from dyngs.gaussians.rendering import file_render_options, render, splat_options
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.io.formats.formats import Written, read_splats
+from dyngs.io.formats.formats import WrittenFile, read_splats
 from dyngs.io.formats.similarity import AXES
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.write import to_uint8, write_image
@@ -342,7 +342,7 @@ def compare_file_with_run(
     return _compare(wanted, frame.cameras(cameras), read, scene.options.near * frame.scale)
 
 
-def compare_file_with_source(splat: SplatFile, written: Written) -> float:
+def compare_file_with_source(splat: SplatFile, written: WrittenFile) -> float:
     """Return the PSNR, dB, of a file and what it was converted from, seen from an orbit.
 
     Raises DyngsError: the file cannot be read.

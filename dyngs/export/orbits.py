@@ -13,7 +13,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.geometry import (
     fraction_in_front,
     look_at,
-    look_at_point,
+    estimate_focus,
     perpendicular,
     pinhole_matrix,
     unit,
@@ -36,7 +36,7 @@ def orbit_path(
     cameras near. A note says so.
     """
     poses = world_from_cam(cameras)
-    center = look_at_point(cameras)
+    center = estimate_focus(cameras)
     up = up_direction(cameras) if up is None else unit(np.asarray(up, np.float64))
     offsets = poses[:, :3, 3] - center
     heights = offsets @ up
@@ -121,7 +121,7 @@ def spiral_path(cameras: Cameras, num_frames: int, up: np.ndarray | None = None)
     circles, and moves by half its width along the viewing axis.
     """
     centers = world_from_cam(cameras)[:, :3, 3]
-    target = look_at_point(cameras)
+    target = estimate_focus(cameras)
     up = up_direction(cameras) if up is None else up
     middle = centers.mean(axis=0)
     base = look_at(middle, target, up)[:3, :3]
@@ -199,7 +199,7 @@ def path_along(
     # Distances of these six numbers are those between the images: place, and viewing direction
     # times the distance of what is looked at.
     centers = poses[:, :3, 3]
-    reach = float(np.linalg.norm(centers - look_at_point(cameras), axis=1).mean())
+    reach = float(np.linalg.norm(centers - estimate_focus(cameras), axis=1).mean())
     features = np.concatenate([centers, reach * poses[:, :3, 2]], axis=1)
     # Nine digits of the largest, so that equal poses are equal in any unit of length.
     features = (features / (float(np.abs(features).max()) or 1.0)).round(9)

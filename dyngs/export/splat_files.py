@@ -23,21 +23,21 @@ from dyngs.gaussians.levels import MERGED, build_levels
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
     SOG_INDEX,
-    Written,
+    WrittenFile,
     fitted,
-    format_named,
-    moved_file,
-    turned_file,
+    format_by_name,
+    transform_file,
+    rotate_file,
     write_splats,
 )
 from dyngs.io.formats.gltf import EXTENSION, add_gaussians
 from dyngs.io.formats.similarity import (
     AXES,
-    UNMOVED,
+    IDENTITY,
     Similarity,
-    axis_of,
+    parse_axis,
     nearest_axis,
-    turn_between,
+    rotation_between,
 )
 from dyngs.io.formats.sog import sog_parts
 from dyngs.io.formats.splat_file import (
@@ -48,10 +48,10 @@ from dyngs.io.formats.splat_file import (
     offset_notes,
     require_writable,
     unit_rotations,
-    with_degree,
+    with_sh_degree,
 )
 from dyngs.io.gltf import GlbDocument
-from dyngs.io.outputs import new_folder, require_new_folder
+from dyngs.io.outputs import atomic_folder, require_new_folder
 from dyngs.io.write import atomic_file
 from dyngs.ops.quaternions import align_quat_signs, rotation_matrices, unit_quats
 from dyngs.runs.folder import collect_inputs
@@ -72,7 +72,7 @@ def write_sog_levels(folder: Path, splat: SplatFile) -> tuple[int, ...]:
     levels = build_levels(splat.gaussians).levels[: COARSEST + 1]
     counts = tuple(len(level) for level in levels)
     names: list[str] = []
-    with new_folder(folder) as started:
+    with atomic_folder(folder) as started:
         first = []  # number of a level's first file
         for number, level in enumerate(levels):
             first.append(len(names))
@@ -141,7 +141,7 @@ class WriteOptions:
     up: str | None = None  # axis that then points up, such as "-y"; None: not known
     # degree of the harmonics in the file; None: as they are, up to what the format holds
     sh_degree: int | None = None
-    edit: Similarity = UNMOVED  # made after ``turn``, and stored so that it can be undone
+    edit: Similarity = IDENTITY  # made after ``turn``, and stored so that it can be undone
 
 
 DEFAULT_WRITE_OPTIONS = WriteOptions()
@@ -168,7 +168,7 @@ def choose_write_options(
         return WriteOptions(
             up=own, sh_degree=sh_degree
         ), f"axes are those of the {frame.removesuffix('ed run')}{known}"
-    found = find_up_direction(opened) if from_up is None else (axis_of(from_up), "--from-up")
+    found = find_up_direction(opened) if from_up is None else (parse_axis(from_up), "--from-up")
     if found is None:
         line = "nothing says which way is up in this run, so axes are those of the capture; --from-up=AXIS tells it"
         return WriteOptions(sh_degree=sh_degree), line
@@ -177,7 +177,7 @@ def choose_write_options(
     here = next((name for name, axis in AXES.items() if axis == direction), "a slanted direction")
     turned = f"turned, it was {here} in the {frame}"
     turned = f"the axes of the {frame} are kept" if here == wanted else turned
-    how = WriteOptions(turn_between(direction, axis_of(wanted)), wanted, sh_degree)
+    how = WriteOptions(rotation_between(direction, parse_axis(wanted)), wanted, sh_degree)
     return how, f"up is {wanted} in the file ({turned}, says {who})"
 
 
@@ -203,7 +203,7 @@ def write_run_splats(
     time: float = 0.0,
     part: Part = "all",
     how: WriteOptions = DEFAULT_WRITE_OPTIONS,
-) -> Written:
+) -> WrittenFile:
     """Write a run at a time in [0, 1] as a file of Gaussians; its suffix names the format.
 
     A 3D filter is fused, and colours of a network become harmonics; the header, where the format
@@ -222,7 +222,7 @@ def write_run_sequence(
     part: Part = "all",
     how: WriteOptions = DEFAULT_WRITE_OPTIONS,
     suffix: str = ".ply",
-) -> list[Written]:
+) -> list[WrittenFile]:
     """Write a sequence ``frame_0000.ply`` and so on, one file per time in [0, 1], for players.
 
     Files of an earlier sequence of the same length are replaced. Raises DyngsError: the part is
@@ -259,7 +259,7 @@ def write_run_levels(
     """
     collect_inputs(opened).require_output(folder)
     splat = splats_at(opened, scene_part(opened.scene, part), time, how)
-    whole, notes = fitted(folder, format_named("sog"), splat, how.sh_degree)
+    whole, notes = fitted(folder, format_by_name("sog"), splat, how.sh_degree)
     return write_sog_levels(folder, whole), notes
 
 
@@ -301,9 +301,9 @@ def splats_at(
     gaussians = opened.file_unit.gaussians(gaussians.detach())
     splat = SplatFile(gaussians, model.rasterize_mode, model.eps2d, (x, y, z), tuple(comments))
     if opened.edited is not None:
-        splat = moved_file(splat, opened.frame.after(opened.file_unit.inverse()), opened.edited.up)
-    splat = turned_file(splat, how.turn, how.up)
-    return splat if how.edit == UNMOVED else moved_file(splat, how.edit, how.up)
+        splat = transform_file(splat, opened.frame.after(opened.file_unit.inverse()), opened.edited.up)
+    splat = rotate_file(splat, how.turn, how.up)
+    return splat if how.edit == IDENTITY else transform_file(splat, how.edit, how.up)
 
 
 @dataclass(frozen=True)
@@ -322,7 +322,7 @@ class Tracks:
 
 
 def tracks_of(
-    scene: GaussianScene, times: Sequence[float], frame: Similarity = UNMOVED, *, part: str = "all"
+    scene: GaussianScene, times: Sequence[float], frame: Similarity = IDENTITY, *, part: str = "all"
 ) -> Tracks:
     """Return the tracks of a scene, or with ``part`` "moving" of what moves, moved by ``frame`` to
     what people mean.
@@ -335,12 +335,12 @@ def tracks_of(
         scene_part(scene, "moving")
     ids = torch.arange(len(scene), device="cpu")
     ids = ids[moves] if part == "moving" else ids
-    kind = np.float32 if frame == UNMOVED else np.float64
+    kind = np.float32 if frame == IDENTITY else np.float64
     whole = scene.without_masks()
     positions = np.empty((len(ids), len(times), 3), kind)
     for k, time in enumerate(times):
         positions[:, k] = whole.at(time).means[ids].numpy()
-    if frame != UNMOVED:
+    if frame != IDENTITY:
         positions = frame.points(positions)
     return Tracks(positions, np.array(times, np.float64), moves[ids].numpy(), ids.numpy())
 
@@ -439,7 +439,7 @@ def _fourdgs(path: Path) -> tuple[Any, Any, Any]:
 @torch.no_grad()
 def write_rigid_bodies(
     opened: OpenedScene, path: Path, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
-) -> Written:
+) -> WrittenFile:
     """Write a run at a time in [0, 1] as .glb: a node for each body, with its motion as an
     animation, one for the rest.
 
@@ -457,7 +457,7 @@ def write_rigid_bodies(
     splat = splats_at(opened, scene, time, how)
     require_writable(path, splat.gaussians)
     gaussians = splat.gaussians.replace(quats=unit_rotations(splat.gaussians.quats))
-    gaussians = with_degree(gaussians, min(gaussians.sh_degree, 3))
+    gaussians = with_sh_degree(gaussians, min(gaussians.sh_degree, 3))
     labels = torch.full((len(scene),), -1, device=scene.moving.device)
     labels[scene.moving] = field.rest.labels
     # Twice as many poses as training times: rotations are interpolated between them.
@@ -498,7 +498,7 @@ def write_rigid_bodies(
         f"all else and shadows stand as at time {time:g}; a sequence has their motion",
         *offset_notes(splat, "the file states it"),
     )
-    return Written(path, splat, notes)
+    return WrittenFile(path, splat, notes)
 
 
 def _poses(

@@ -16,8 +16,8 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
 from dyngs.export.splat_files import DEFAULT_WRITE_OPTIONS, WriteOptions, choose_write_options
 from dyngs.gaussians.surface import extract_surface, opaque_box
-from dyngs.io.formats.ply import double_ply
-from dyngs.io.formats.similarity import Similarity, far_offset
+from dyngs.io.formats.ply import encode_ply
+from dyngs.io.formats.similarity import Similarity, origin_offset
 from dyngs.io.write import atomic_file
 from dyngs.models.renderable import Surface, SurfaceOptions
 from dyngs.models.views import training_cameras
@@ -81,9 +81,9 @@ def _mesh_bytes(suffix: str, vertices: np.ndarray, faces: np.ndarray, colours: n
     import trimesh
 
     detail = float(np.median(np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1)))
-    offset = far_offset(vertices, detail)
+    offset = origin_offset(vertices, detail)
     if suffix == ".ply" and offset.any():
-        return double_ply(vertices, colours[:, :3], faces)
+        return encode_ply(vertices, colours[:, :3], faces)
     mesh: Any = trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
     if suffix == ".obj":
         decimals = 8 if detail == 0 else max(8, 3 - math.floor(math.log10(detail)))

@@ -29,9 +29,9 @@ from dyngs.data.capture import Capture, View
 from dyngs.data.scene_space import (
     MIN_VIEWS,
     cube_half_side,
-    extent_of,
-    outside_of_cube,
-    points_in_frusta,
+    camera_extent,
+    cube_mismatch_reason,
+    sample_points_in_frusta,
 )
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import robust_bounding_box
@@ -98,7 +98,7 @@ class SceneGeometry:
         Learning rates and size thresholds are relative to it. Where all cameras share one centre it
         is 1.
         """
-        return extent_of(self.camera_centers) or 1.0
+        return camera_extent(self.camera_centers) or 1.0
 
 
 def scene_geometry(capture: Capture) -> SceneGeometry:
@@ -155,7 +155,7 @@ def _random_points(
     count = min(options.num_random, max_points)
     half_extent = cube_half_side(options.half_extent, scene.views, scene.world_scale)
     if options.kind == "random" or (
-        scene.around_origin and outside_of_cube(scene.views, half_extent) is None
+        scene.around_origin and cube_mismatch_reason(scene.views, half_extent) is None
     ):
         xyz = (
             torch.rand((count, 3), generator=generator, dtype=torch.float64, device="cpu") * 2 - 1
@@ -176,7 +176,7 @@ def _seen_together(views: Sequence[View], count: int, generator: torch.Generator
     unit = torch.rand(
         (CANDIDATES * count, 5), generator=generator, dtype=torch.float64, device="cpu"
     ).numpy()
-    xyz, seen = points_in_frusta(views, unit[:, :4])
+    xyz, seen = sample_points_in_frusta(views, unit[:, :4])
     # The largest of u^(1 / weight) are a weighted sample without replacement (Efraimidis and
     # Spirakis 2006).
     order = np.log(np.maximum(unit[:, 4], 1e-300)) / np.maximum(seen, 1) ** 2

@@ -33,7 +33,7 @@ class HumanKind(HasGaussians, HasBody):
         self,
         data: DataConfig,
         section: HumanModel,
-        say: Callable[[str], None],
+        log: Callable[[str], None],
         report: ProgressCallback,
     ) -> DataConfig:
         """Return the options of a capture with a body: found, and fitted to the silhouettes."""
@@ -43,9 +43,9 @@ class HumanKind(HasGaussians, HasBody):
         if is_unposed(data):
             from dyngs.human.detect.detect_person import ensure_detected_person
 
-            data = ensure_detected_person(data, say=say, report=report)
+            data = ensure_detected_person(data, log=log, report=report)
         return ensure_fitted_body(
-            data, section, only_if_needed=not section.fit, say=say, report=report
+            data, section, only_if_needed=not section.fit, log=log, report=report
         )
 
     def play_motion(

@@ -30,13 +30,13 @@ def python_command(module: str, *arguments: str) -> list[str]:
         user_sites=ascii([site.getusersitepackages()] if site.ENABLE_USER_SITE else []),
         places=ascii(places),
         # Last, because it is the current folder in a checkout that is not installed.
-        home=ascii(str(home_of_dyngs())),
+        home=ascii(str(package_parent())),
         module=ascii(module),
     )
     return [sys.executable, "-I", "-c", start, *arguments]
 
 
-def home_of_dyngs() -> Path:
+def package_parent() -> Path:
     """Return the folder that the package dyngs lies in."""
     return Path(__file__).absolute().parents[2]
 

@@ -39,13 +39,13 @@ def _set(variable: ContextVar[Any], value: object) -> Iterator[None]:
         variable.reset(token)
 
 
-def staying_within(root: Path, follow_links: bool = False) -> AbstractContextManager[None]:
+def restrict_paths_to(root: Path, follow_links: bool = False) -> AbstractContextManager[None]:
     """Make ``inside`` refuse paths outside ``root`` in the block; nothing is refused if
     ``follow_links``."""
     return _set(_boundary, None if follow_links else (root, os.path.realpath(root)))
 
 
-def following_links_of_runs(allowed: bool) -> AbstractContextManager[None]:
+def allow_run_links(allowed: bool) -> AbstractContextManager[None]:
     """Set whether ``data.follow_links`` holds for runs that are opened in the block.
 
     The user decides this on the command line: the config.yaml of a run may be that of a stranger.
@@ -53,7 +53,7 @@ def following_links_of_runs(allowed: bool) -> AbstractContextManager[None]:
     return _set(_links_of_runs, allowed)
 
 
-def follows_links_of_runs() -> bool:
+def run_links_allowed() -> bool:
     """Return whether the innermost block of ``following_links_of_runs`` allows it."""
     return _links_of_runs.get()
 
@@ -108,7 +108,7 @@ def max_decoded_mb() -> int:
     return allowed(MAX_PIXELS) * 16 // 2**20
 
 
-def leaving_links(root: Path) -> list[tuple[Path, str]]:
+def find_escaping_links(root: Path) -> list[tuple[Path, str]]:
     """List links among the first 100,000 entries below ``root`` that lead out of it, with targets;
     none is followed."""
     real = os.path.realpath(root)

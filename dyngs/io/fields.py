@@ -76,7 +76,7 @@ def is_number(value: object) -> TypeGuard[int | float]:
 def matrix_of(where: str, key: str, value: object) -> np.ndarray:
     """Return the numbers of a 4x4 matrix in a JSON file as float64; shape and values are not
     checked."""
-    array = float_array(value)
+    array = as_float_array(value)
     if array is None:
         raise DyngsError(f"{where}: {key} must hold 4x4 numbers; export it again")
     return array
@@ -91,10 +91,10 @@ def entry(where: object, fields: object, key: str) -> Any:
     return fields[key]
 
 
-def numbers_of(where: object, value: object, shape: tuple[int, ...] | None) -> np.ndarray:
+def parse_numbers(where: object, value: object, shape: tuple[int, ...] | None) -> np.ndarray:
     """Return float64 numbers up to ``LARGEST``, reshaped to ``shape``, or flat if that is None; the
     file may differ."""
-    array = float_array(value)
+    array = as_float_array(value)
     fits = array is not None and (shape is None or array.size == math.prod(shape))
     if array is None or not fits or not (np.abs(array) <= LARGEST).all():
         count = "x".join(map(str, shape)) + " " if shape else ""
@@ -109,7 +109,7 @@ def first_few(items: Collection[object]) -> str:
     )
 
 
-def float_array(value: object) -> np.ndarray | None:
+def as_float_array(value: object) -> np.ndarray | None:
     """Return ``value`` as a float64 array, None where it holds anything but numbers."""
     try:
         return np.array(value, dtype=np.float64)

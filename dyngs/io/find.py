@@ -12,7 +12,7 @@ from pathlib import Path, PureWindowsPath
 from dyngs.io.containment import inside
 
 
-def folded(name: str) -> str:
+def normalize_name(name: str) -> str:
     """Return a name or path as a key in which separators, case and Unicode form do not count."""
     return unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
 
@@ -59,9 +59,9 @@ class FileFinder:
         if folder not in self._listings:
             entries: dict[str, list[str]] = {}
             for name in os.listdir(folder) if inside(folder).is_dir() else ():
-                entries.setdefault(folded(name), []).append(name)
+                entries.setdefault(normalize_name(name), []).append(name)
             self._listings[folder] = entries
-        alike = self._listings[folder].get(folded(part), [])
+        alike = self._listings[folder].get(normalize_name(part), [])
         fitting = [part] if part in alike else alike
         if not alike and part == "images":
             fitting = [images_folder(folder).name]
@@ -71,11 +71,11 @@ class FileFinder:
 def images_folder(root: Path) -> Path:
     """Return the folder ``images`` below ``root``; if it is absent, that of the largest copies."""
     images = root / "images"
-    copies = {} if images.is_dir() else shrunk_folders(images)
+    copies = {} if images.is_dir() else downscaled_image_folders(images)
     return copies[min(copies)] if copies else images
 
 
-def shrunk_folders(images: Path) -> dict[int, Path]:
+def downscaled_image_folders(images: Path) -> dict[int, Path]:
     """Map factors to the folders of copies that are so much smaller: 4 to ``images_4``."""
     beside = images.parent.glob(f"{glob.escape(images.name)}_*") if images.name else ()
     found = ((re.fullmatch(r"_(\d{1,3})", path.name[len(images.name) :]), path) for path in beside)

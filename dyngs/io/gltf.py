@@ -25,7 +25,7 @@ _TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 VERTICES, INDICES = 34962, 34963
 """Uses of a buffer view in a mesh."""
-MOST_JOINTS = 4096
+MAX_JOINTS = 4096
 """Limit on the joints of a skeleton."""
 _MOST_DOCUMENT_BYTES = 1 << 24
 _MOST_NUMBERS = 1 << 25

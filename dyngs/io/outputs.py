@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from dyngs.core.errors import DyngsError, log_warning, quote_path, require_regular_file
-from dyngs.io.containment import leaving_links
+from dyngs.io.containment import find_escaping_links
 from dyngs.io.fields import read_limited
 from dyngs.io.write import remove_quietly, require_replaceable, temporary_folder_beside, write_text
 
@@ -35,7 +35,7 @@ _CAPTURE = (
 )
 
 
-def command_for(path: Path, *, captures: bool = True) -> str | None:
+def suggest_command(path: Path, *, captures: bool = True) -> str | None:
     """Return what the path is and the command that takes it, in a few words; None for anything
     else.
 
@@ -128,7 +128,7 @@ def require_new_folder(out: Path) -> None:
 
 
 @contextmanager
-def new_folder(out: Path, require: Callable[[Path], None] = require_new_folder) -> Iterator[Path]:
+def atomic_folder(out: Path, require: Callable[[Path], None] = require_new_folder) -> Iterator[Path]:
     """Yield a hidden folder next to ``out`` that gets its name when the block ends well, and is
     removed otherwise.
 
@@ -149,7 +149,7 @@ def new_folder(out: Path, require: Callable[[Path], None] = require_new_folder) 
         remove_quietly(started)
 
 
-def note_source(capture: Path, source: Path) -> None:
+def record_source(capture: Path, source: Path) -> None:
     """Write into a made capture where its photos or video lie; no output replaces them."""
     names = {"sources": [os.path.abspath(source)]}
     write_text(capture / SOURCES_NAME, json.dumps(names, indent=1) + "\n")
@@ -198,7 +198,7 @@ def writing(folder: Path) -> Iterator[bool]:
         DyngsError: nobody can; a link leads out of the folder.
     """
     require_within_run(folder)
-    links = leaving_links(folder)
+    links = find_escaping_links(folder)
     if links:
         raise DyngsError(
             f"{links[0][0]}: is a link to {links[0][1]}, out of {folder}, which is written to; remove it"
@@ -217,7 +217,7 @@ def writing(folder: Path) -> Iterator[bool]:
 
 
 def make_once(
-    folder: Path, make: Callable[[], None], say: Callable[[str], None], found: str
+    folder: Path, make: Callable[[], None], log: Callable[[str], None], found: str
 ) -> None:
     """Create a folder of the cache by calling ``make``, or print ``found`` if it exists.
 
@@ -233,7 +233,7 @@ def make_once(
             file, _ = _locked(path)
         except InUseError:
             if not is_told:
-                say(f"{folder}: {_owner(path)}; its result is waited for")
+                log(f"{folder}: {_owner(path)}; its result is waited for")
             is_told = True
             time.sleep(_WAIT)
             continue
@@ -246,7 +246,7 @@ def make_once(
                 raise
         finally:
             _freed(path, file)
-    say(found)
+    log(found)
 
 
 def _made(folder: Path) -> list[Path]:

@@ -246,11 +246,11 @@ def to_uint8(pixels: np.ndarray) -> np.ndarray:
 def image_error(source: Any) -> str:
     """Return the last error of OpenImageIO, or of one of its readers and writers, as one short
     line, "" if there is none."""
-    text = any_text(source.geterror).strip()
+    text = read_lenient_text(source.geterror).strip()
     return format_one_line(text.splitlines()[0], 100) if text else ""
 
 
-def any_text(ask: Callable[[], str]) -> str:
+def read_lenient_text(ask: Callable[[], str]) -> str:
     """Return the text of ``ask``; bytes that are not UTF-8, at which OpenImageIO's binding raises,
     as escapes."""
     try:

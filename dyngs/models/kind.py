@@ -167,7 +167,7 @@ class HasBody(ModelKind):
         self,
         data: DataConfig,
         section: Any,
-        say: Callable[[str], None],
+        log: Callable[[str], None],
         report: ProgressCallback,
     ) -> DataConfig:
         """Detect and fit the body if the capture has no body parameters; return its data config."""

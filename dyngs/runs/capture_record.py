@@ -11,7 +11,7 @@ from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
 from dyngs.data.geometry import camera_center
-from dyngs.data.read import captures_in
+from dyngs.data.read import list_captures
 from dyngs.io.fields import first_few, read_limited
 from dyngs.io.write import write_text
 
@@ -64,7 +64,7 @@ def _is_close(one: list[float], other: list[float], extent: float) -> bool:
 
 def _views(data: DataConfig, capture: Capture | None) -> dict[str, list[float]]:
     if capture is None:
-        return {one.root.relative_to(data.root).as_posix(): [] for one in captures_in(data)}
+        return {one.root.relative_to(data.root).as_posix(): [] for one in list_captures(data)}
     return {view.name: _numbers(view, capture) for view in capture.splits["train"]}
 
 

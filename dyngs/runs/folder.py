@@ -21,8 +21,8 @@ from dyngs.core.errors import DyngsError, quote_path
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.io.fields import read_limited
-from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity, similarity_of
-from dyngs.io.outputs import LOCK_NAME, Inputs, new_folder, writing
+from dyngs.io.formats.similarity import AXES, IDENTITY, Similarity, similarity_from_numbers
+from dyngs.io.outputs import LOCK_NAME, Inputs, atomic_folder, writing
 from dyngs.io.write import remove_leftovers, remove_quietly, temporary_folder_beside, write_text
 from dyngs.models.kind import PredictsScenes, capability
 from dyngs.runs.capture_record import RECORD_NAME, require_same_capture
@@ -147,7 +147,7 @@ def require_empty(folder: Path) -> None:
 def open_export_folder(out: Path, run_dir: Path, config: Config) -> Iterator[Path]:
     """Yield the folder to export a run to: ``out``, or a temporary folder that replaces it."""
     if not out.exists():
-        with new_folder(out, require_empty) as started:
+        with atomic_folder(out, require_empty) as started:
             yield started
         return
     with writing(out):
@@ -361,7 +361,7 @@ class RunFrame:
         fixed: whether exports keep the axes, as for control points.
     """
 
-    similarity: Similarity = UNMOVED
+    similarity: Similarity = IDENTITY
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     up: str | None = None
     fixed: bool = False
@@ -385,7 +385,7 @@ def read_frame(folder: Path) -> RunFrame | None:
         return None
     try:
         stored = json.loads(read_limited(path, _MOST_BYTES))
-        similarity = similarity_of([float(a) for a in stored["similarity"]])
+        similarity = similarity_from_numbers([float(a) for a in stored["similarity"]])
         x, y, z = map(float, stored["offset"])
         up = stored["up"]
         fixed = stored["fixed"]

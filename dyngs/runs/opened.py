@@ -22,9 +22,9 @@ from dyngs.gaussians.rendering import file_render_options
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import all_suffixes, format_to_read, read_splats
-from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity
+from dyngs.io.formats.similarity import AXES, IDENTITY, Similarity
 from dyngs.io.formats.splat_file import Nonfinite, SplatFile
-from dyngs.io.outputs import command_for
+from dyngs.io.outputs import suggest_command
 from dyngs.models.checkpoint import CheckpointInfo, read_run_capture
 from dyngs.models.kind import HasBody, capability
 from dyngs.models.renderable import Posable, Renderable
@@ -292,14 +292,14 @@ def open_scene(
     if path.suffix.lower() == AVATAR_SUFFIX:
         return _open_avatar(path)
     if format_to_read(path) is None:
-        other = command_for(path)
+        other = suggest_command(path)
         raise DyngsError(
             f"{path}: not a scene; {f'{other}; then ' if other else ''}give a run folder, a {SCENE_FILE}, an avatar "
             f"or a file of Gaussians ({all_suffixes()}, .ckpt, .pt)"
         )
     splat = read_splats(path, nonfinite=nonfinite)
     opened = scene_from_file(splat, path)
-    if splat.edited != UNMOVED:  # then its own frame is the one that people mean
+    if splat.edited != IDENTITY:  # then its own frame is the one that people mean
         return opened
     info = replace(opened.info, world_offset=splat.world_offset)
     return replace(opened, info=info, turned=splat.turned)

@@ -15,8 +15,8 @@ from dyngs.api.train import train
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError, format_one_line, wrap_read_errors
-from dyngs.io.child import home_of_dyngs
-from dyngs.io.containment import following_links_of_runs, follows_links_of_runs
+from dyngs.io.child import package_parent
+from dyngs.io.containment import allow_run_links, run_links_allowed
 from dyngs.io.fields import read_limited
 from dyngs.io.write import write_text
 from dyngs.runs.checkpoint import checkpoint_paths
@@ -64,18 +64,18 @@ def run_tasks(
             yield task, attempted(task)
         return
     here = os.getcwd()
-    links = follows_links_of_runs()
+    links = run_links_allowed()
 
     def attempted_elsewhere(task: T) -> R | DyngsError:
         os.chdir(here)
-        with following_links_of_runs(links):
+        with allow_run_links(links):
             return attempted(task)
 
     try:
         import ray  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise DyngsError("--ray needs the package ray; run pip install 'dyngs[ray]'") from None
-    os.chdir(home_of_dyngs())  # Ray's processes import modules from the current folder of ray.init
+    os.chdir(package_parent())  # Ray's processes import modules from the current folder of ray.init
     try:
         ray.init()
     finally:

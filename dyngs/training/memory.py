@@ -88,7 +88,7 @@ def memory_forecasts(trainer: Trainer[Any], processes: int = 1) -> list[MemoryFo
     pixels = max((width * height for width, height in images.sizes), default=0)
     side = max((max(size) for size in images.sizes), default=0)
     files = max((view.width * view.height for view in images.views), default=0)
-    decoded = images.bytes_to_come + (images.decoded_ahead // 2 or 1) * DECODING * files
+    decoded = images.pending_bytes + (images.num_prefetched // 2 or 1) * DECODING * files
     count = expected_gaussians(config, trainer.num_gaussians, side)
     gaussians = count * gaussian_bytes(config)
     drawing = STEP + DRAWING * pixels

@@ -6,14 +6,14 @@ from typing import Any
 
 import torch
 
-from dyngs.capture.initial_points import with_first_points
-from dyngs.capture.inspection import before_training
+from dyngs.capture.initial_points import create_initial_points
+from dyngs.capture.inspection import check_before_training
 from dyngs.config import Config, PointsInit, RandomInit
 from dyngs.core.errors import log_warning
 from dyngs.data.capture import Capture
-from dyngs.data.loader import ImageLoader, usual_threads
+from dyngs.data.loader import ImageLoader, default_decoding_threads
 from dyngs.data.read import read_capture, require_images
-from dyngs.data.scene_space import cube_half_side, outside_of_cube
+from dyngs.data.scene_space import cube_half_side, cube_mismatch_reason
 from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.initialization import InitialGaussians, scene_geometry
 from dyngs.gaussians.model import GaussianModel
@@ -72,7 +72,7 @@ def build_trainer(
     generator = torch.Generator().manual_seed(config.run.seed)
     if images is None:
         images = ImageLoader(
-            capture.splits["train"], config.data, with_maps=True, decoding_threads=usual_threads()
+            capture.splits["train"], config.data, with_maps=True, decoding_threads=default_decoding_threads()
         )
     priors = PriorLosses()
     kind = find_kind(config.model)
@@ -153,10 +153,10 @@ def add_initial_points(capture: Capture, config: Config, *, log_messages: bool =
     if "init" in find_kind(config.model).uses:
         init = config.init
         if isinstance(init, PointsInit):
-            capture, lines = with_first_points(capture, config.data, init)
+            capture, lines = create_initial_points(capture, config.data, init)
         elif isinstance(init, RandomInit):
             views = capture.splits["train"]
-            why = outside_of_cube(
+            why = cube_mismatch_reason(
                 views, cube_half_side(init.half_extent, views, capture.world_scale)
             )
             lines = (
@@ -164,7 +164,7 @@ def add_initial_points(capture: Capture, config: Config, *, log_messages: bool =
                 if why is None
                 else [f"init.kind=random draws points around the origin, but {why}: give auto"]
             )
-    for line in [*lines, *before_training(capture)] if log_messages else []:
+    for line in [*lines, *check_before_training(capture)] if log_messages else []:
         log_warning(line)
     return capture
 

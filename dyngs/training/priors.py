@@ -13,7 +13,7 @@ from torch import Tensor
 from dyngs.config import Config
 from dyngs.core.camera import Cameras
 from dyngs.data.capture import Capture, View, all_views
-from dyngs.data.images.lens import undistorted_points
+from dyngs.data.images.lens import undistort_points
 from dyngs.data.loader import Image
 from dyngs.data.tracks import ImageTracks, read_tracks
 from dyngs.gaussians import Gaussians
@@ -108,7 +108,7 @@ def _point_tracks(config: Config, tracks: ImageTracks, views: Sequence[View]) ->
             continue
         stored = torch.from_numpy(np.ascontiguousarray(tracks.xy[row]))
         own = cameras[i].cameras
-        places = undistorted_points(view.lens, view.intrinsics, stored) * _scale(view, own)
+        places = undistort_points(view.lens, view.intrinsics, stored) * _scale(view, own)
         good = places.isfinite().all(1) & (places >= 0).all(1)
         good &= (places <= places.new_tensor([own.width, own.height])).all(1)
         xy[i] = torch.where(good[:, None], places, 0.0)

@@ -339,9 +339,9 @@ class Trainer(Generic[M]):
     def _image(self, index: int, step: int) -> Image:
         """Return the image of view ``index`` for ``step``; those after it begin to be decoded."""
         image = self.images.shrunk(index, image_divisor(self.config.train, step))
-        if self.images.decoded_ahead:
+        if self.images.num_prefetched:
             batch = self.config.train.batch_size
-            count = self.images.decoded_ahead * self.processes.size
+            count = self.images.num_prefetched * self.processes.size
             fraction = self.processes.views_of_process(batch)
             upcoming = self.sampler.peek(count, self._wanted(step))
             self.images.expect([view for i, view in enumerate(upcoming) if i % batch in fraction])

@@ -20,7 +20,7 @@ from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.geometry import look_at, perpendicular, with_poses
 from dyngs.export.edit.crop import Box, gaussians_in_region
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.io.formats.similarity import UNMOVED, Similarity
+from dyngs.io.formats.similarity import IDENTITY, Similarity
 from dyngs.runs.opened import OpenedScene
 from dyngs.view.layers import ViewRequest, depth_of
 from dyngs.view.views import camera_at, initial_viewpoint
@@ -38,7 +38,7 @@ _EDGES = np.array([(a, b) for a, b in combinations(_CORNERS, 2) if np.abs(a - b)
 def world_of(opened: OpenedScene) -> Similarity:
     """Return the way from a scene to the coordinates that `dyngs edit` means: of a file those of
     the file itself."""
-    return UNMOVED if opened.captured is None else opened.world
+    return IDENTITY if opened.captured is None else opened.world
 
 
 def pick_point(

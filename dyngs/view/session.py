@@ -19,7 +19,7 @@ import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.data.geometry import checked_pose
+from dyngs.data.geometry import validate_pose
 from dyngs.export.camera_paths import Keyframes, interpolate_keyframes, resize_cameras
 from dyngs.runs.opened import OpenedScene
 from dyngs.view.layers import Layer, Part, ViewRequest, draw
@@ -146,7 +146,7 @@ class Recording:
         for key in self.keyframes:
             camera = opened.frame.cameras(resize_cameras(key.camera, *size))
             # rotations as readers repair them, which must not move a far camera
-            pose, _ = checked_pose(camera.cam_from_world[0].double().cpu().numpy(), "camera")
+            pose, _ = validate_pose(camera.cam_from_world[0].double().cpu().numpy(), "camera")
             pose[:3, 3] -= pose[:3, :3] @ opened.world_offset
             entry: dict[str, Any] = {"at": start, "fl_x": float(camera.intrinsics[0, 1, 1])}
             entry["cam_from_world"] = pose.tolist()

@@ -11,7 +11,7 @@ import torch
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.core.errors import DyngsError
 from dyngs.io.formats.formats import format_to_read
-from dyngs.io.outputs import command_for
+from dyngs.io.outputs import suggest_command
 from dyngs.ops.device import CPU
 from dyngs.runs.checkpoint import SCENE_FILE, checkpoint_paths
 from dyngs.runs.opened import OpenedScene, open_scene
@@ -50,7 +50,7 @@ def open_source(
             raise DyngsError(f"data.root= goes with one run, {path} is none; leave it out")
         runs = {run.relative_to(path).as_posix(): run for run in runs_in(path)}
     if not runs:
-        known = command_for(path)
+        known = suggest_command(path)
         instead = f"{known}; then " if known else ""
         raise DyngsError(f"{path}: no runs there; {instead}give a run, a file, or a folder of runs")
 

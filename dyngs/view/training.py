@@ -80,14 +80,14 @@ class TrainingView:
     cannot be had.
     """
 
-    def __init__(self, config: Config, serving: ServerOptions, say: Callable[[str], None]) -> None:
+    def __init__(self, config: Config, serving: ServerOptions, log: Callable[[str], None]) -> None:
         if capability(config.model, PredictsScenes) is not None:
             raise DyngsError(
                 "--view shows scenes, and a network has none; `dyngs predict` makes one"
             )
         require_viser()
         free_port(serving.host, serving.port)  # now, not after reading the capture
-        self._say = say
+        self._say = log
         self._serving = replace(serving, in_thread=False, target=0.05)
         self._drawn: BetweenStepRenderer | None = None
         self._stack = ExitStack()

@@ -13,7 +13,7 @@ import torch
 from dyngs.config import DataConfig
 from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
-from dyngs.data.geometry import inverse_rigid, look_at_point, pinhole_matrix, world_from_cam
+from dyngs.data.geometry import invert_rigid, estimate_focus, pinhole_matrix, world_from_cam
 from dyngs.data.loader import ImageLoader
 from dyngs.export.choose_path import framing_points, orbit_cameras_around
 from dyngs.human.avatar.scene import as_human_scene
@@ -102,7 +102,7 @@ def _viewpoint(opened: OpenedScene) -> Viewpoint:
     person = as_human_scene(opened.renderable)
     if len(shown) and cameras is not None:
         start = shown.cameras[0]
-        center = look_at_point(cameras)
+        center = estimate_focus(cameras)
         if person is not None:
             center = person.at(None).means.double().cpu().numpy().mean(0)
     else:
@@ -161,7 +161,7 @@ def camera_at(
     width, height = size
     focal = 0.5 * height / math.tan(0.5 * min(max(fov, 1e-3), MAX_FOV))
     matrix = pinhole_matrix(focal, focal, 0.5 * width, 0.5 * height)
-    poses, matrices = (torch.from_numpy(x).float()[None] for x in (inverse_rigid(pose), matrix))
+    poses, matrices = (torch.from_numpy(x).float()[None] for x in (invert_rigid(pose), matrix))
     return Cameras(poses, matrices, width, height)
 
 

@@ -24,8 +24,8 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import (
-    StillOptions,
-    write_still_capture,
+    StaticOptions,
+    write_static_capture,
 )
 from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians.rendering import render
@@ -100,7 +100,7 @@ def test_as_static_is_the_static_preset_with_what_was_requested(
 
 def write_rolling_ball(root: Path) -> None:
     """32 images of 24 px of a ball that goes 1.6 along x, at eight times, from everywhere."""
-    write_still_capture(root, StillOptions(size=24, num_train=32, num_test=1, samples=1))
+    write_static_capture(root, StaticOptions(size=24, num_train=32, num_test=1, samples=1))
     views = read_capture(DataConfig(root=root)).splits["train"]
     for split, times in (("train", [i % 8 / 7 for i in range(32)]), ("test", [0.5])):
         file = root / f"transforms_{split}.json"
@@ -133,7 +133,7 @@ def test_never_worse_than_static(
     if moves:
         write_rolling_ball(root)
     else:
-        write_still_capture(root, StillOptions(size=24, num_train=48, num_test=1, samples=1))
+        write_static_capture(root, StaticOptions(size=24, num_train=48, num_test=1, samples=1))
         keys = ["init.num_random=300", "model.num_random_moving=150", "data.times=order"]
     monkeypatch.setattr(module, "MOTION", replace(module.MOTION, steps=steps))
     config = preset(root, "train.steps=20_000", *keys, "colour.kind=sh")

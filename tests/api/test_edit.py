@@ -42,7 +42,7 @@ def test_a_frame_in_every_format_and_back(kind: Format, plain: Path, tmp_path: P
     written = edit_scene(plain, path, HALF, tell=silent)
     assert written.redrawn > (99 if kind.name in ("ply", "usd", "glb") else 15)
     assert read_splats(path).up == kind.up
-    if not kind.holds_comments:
+    if not kind.stores_comments:
         return
     edit_scene(path, tmp_path / "back.ply", Edits(undo=True), tell=silent)
     back = read_splats(tmp_path / "back.ply")

@@ -17,7 +17,7 @@ from dyngs.config import Config, FixedStrategy
 from dyngs.config.io import load_config, load_resolved
 from dyngs.core.errors import DyngsError
 from dyngs.data.read import read_capture
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.export.edit.frame import Frame
 from dyngs.export.splat_files import write_run_splats
@@ -32,8 +32,8 @@ BOX = (-9.0, -9.0, -9.0, 0.0, 9.0, 9.0)
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    options = StillOptions(size=24, num_train=6, num_test=2, samples=1)
-    return write_still_capture(tmp_path_factory.mktemp("capture"), options)
+    options = StaticOptions(size=24, num_train=6, num_test=2, samples=1)
+    return write_static_capture(tmp_path_factory.mktemp("capture"), options)
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ from dyngs.config.io import (
     load_resolved,
 )
 from dyngs.core.errors import DyngsError
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.deform.scene import DynamicScene
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.static_section import StaticModel
@@ -59,7 +59,7 @@ sys.exit(main())
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(folder, StillOptions(size=16, num_train=4, num_test=1, samples=1))
+    write_static_capture(folder, StaticOptions(size=16, num_train=4, num_test=1, samples=1))
     return folder
 
 
@@ -198,7 +198,7 @@ def test_a_resumed_run_refuses_another_capture(
     bytes."""
     other = tmp_path / "other"
     copied = tmp_path / "copied"
-    write_still_capture(other, StillOptions(size=24, num_train=4, num_test=1, samples=1))
+    write_static_capture(other, StaticOptions(size=24, num_train=4, num_test=1, samples=1))
     before = (interrupted / RESOLVED_NAME).read_text()
     assert main(["train", "--resume", str(interrupted), f"data.root={other}"]) == 2
     assert "other sizes, times or cameras of train/r_000" in capsys.readouterr().err

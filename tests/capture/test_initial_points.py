@@ -13,11 +13,11 @@ from room_surfaces import distances_to_surface
 import dyngs
 from dyngs.capture.initial_points import (
     ENOUGH,
-    points_in_silhouettes,
-    points_over_clip,
-    triangulated_points,
-    views_of_a_time_step,
-    with_first_points,
+    sample_points_in_silhouettes,
+    triangulate_clip,
+    triangulate_from_views,
+    views_at_one_time,
+    create_initial_points,
 )
 from dyngs.config import DataConfig, PointsInit
 from dyngs.data.capture import Capture, PointCloud, View
@@ -26,15 +26,15 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import (
     DynamicOptions,
-    StillOptions,
+    StaticOptions,
     write_dynamic_capture,
-    write_still_capture,
+    write_static_capture,
 )
 from dyngs.io.write import write_image
 
 
 def begin(capture: Capture, triangulate: int = 24) -> tuple[Capture, list[str]]:
-    return with_first_points(
+    return create_initial_points(
         capture, DataConfig(root=capture.root), PointsInit(triangulate=triangulate)
     )
 
@@ -78,13 +78,13 @@ def train_views(options: DataConfig) -> list[View]:
 
 
 def test_points_lie_on_the_surfaces(furnished: DataConfig) -> None:
-    views = views_of_a_time_step(train_views(furnished), 24)
-    found = triangulated_points(views, furnished.model_copy(update={"longest_side": 20}))
+    views = views_at_one_time(train_views(furnished), 24)
+    found = triangulate_from_views(views, furnished.model_copy(update={"longest_side": 20}))
     assert found is not None
     assert len(found.xyz) > 50
     assert found.rgb.shape == found.xyz.shape
     assert found.rgb.dtype == np.uint8
-    again = triangulated_points(views, furnished)
+    again = triangulate_from_views(views, furnished)
     assert again is not None
     np.testing.assert_array_equal(again.xyz, found.xyz)
     distances = distances_to_surface(found.xyz, views, views[0].time or 0.0)
@@ -99,9 +99,9 @@ def test_points_lie_on_the_surfaces(furnished: DataConfig) -> None:
 def test_the_moment_is_the_middle_one_of_those_with_most_views(furnished: DataConfig) -> None:
     view = train_views(furnished)[0]
     views = [replace(view, time=time) for time in (0.0, 0.2, 0.2, 0.4, 0.4, 0.6, 0.6, 0.8)]
-    assert [chosen.time for chosen in views_of_a_time_step(views, 24)] == [0.4, 0.4]
-    assert len(views_of_a_time_step(views, 1)) == 1
-    assert views_of_a_time_step(views, 0) == views_of_a_time_step([], 24) == []
+    assert [chosen.time for chosen in views_at_one_time(views, 24)] == [0.4, 0.4]
+    assert len(views_at_one_time(views, 1)) == 1
+    assert views_at_one_time(views, 0) == views_at_one_time([], 24) == []
 
 
 def test_over_a_clip_what_stands_has_points_and_what_moves_has_none(
@@ -119,7 +119,7 @@ def test_over_a_clip_what_stands_has_points_and_what_moves_has_none(
         path = tmp_path / f"{i}.png"
         write_image(path, (255 * pixels).round().astype(np.uint8))
         views.append(replace(view, name=str(i), image_path=path, time=i / 7))
-    found = points_over_clip(views[::-1], furnished)
+    found = triangulate_clip(views[::-1], furnished)
     assert found is not None
     distances = distances_to_surface(found.xyz, views, 0.0)
     assert np.median(distances) < 0.05
@@ -131,11 +131,11 @@ def test_over_a_clip_what_stands_has_points_and_what_moves_has_none(
         on_patch += inside & (offset > 4).all(axis=1) & (offset < 44).all(axis=1)
     assert (on_patch >= len(views) - 2).mean() < 0.05
     monkeypatch.setattr("dyngs.capture.initial_points.MIN_CLIP_POINTS", len(found.xyz))
-    again = points_over_clip(views, furnished)
+    again = triangulate_clip(views, furnished)
     assert again is not None
     np.testing.assert_array_equal(again.xyz, found.xyz)
     monkeypatch.setattr("dyngs.capture.initial_points.MIN_CLIP_POINTS", len(found.xyz) + 1)
-    assert points_over_clip(views, furnished) is None
+    assert triangulate_clip(views, furnished) is None
 
 
 RADIUS, FOCAL, SIDE, DISTANCE = 0.4, 60.0, 64, 4.0
@@ -168,7 +168,7 @@ def _views(folder: Path, alpha: float = 0.0) -> list[View]:
 
 def test_points_lie_in_the_ball_with_its_colour(tmp_path: Path) -> None:
     views = _views(tmp_path)
-    found = points_in_silhouettes(views, DataConfig(root=tmp_path), 10_000, HALF_SIDE)
+    found = sample_points_in_silhouettes(views, DataConfig(root=tmp_path), 10_000, HALF_SIDE)
     assert found is not None
     # The hull of six views is larger than the ball, up to the corners of the cube around it; a
     # pixel is 1/15.
@@ -176,17 +176,17 @@ def test_points_lie_in_the_ball_with_its_colour(tmp_path: Path) -> None:
     assert np.linalg.norm(found.xyz, axis=1).max() < RADIUS * 3**0.5
     assert (found.rgb == (255, 128, 0)).all()
     assert len(found.xyz) >= ENOUGH, "150 of 10,000 in the cube lie in the hull: more were drawn"
-    again = points_in_silhouettes(views, DataConfig(root=tmp_path), 10_000, HALF_SIDE)
+    again = sample_points_in_silhouettes(views, DataConfig(root=tmp_path), 10_000, HALF_SIDE)
     assert again is not None
     assert np.array_equal(found.xyz, again.xyz)
 
 
 def test_a_still_blender_scene_begins_in_its_silhouettes(tmp_path: Path) -> None:
-    root = write_still_capture(
-        tmp_path / "still", StillOptions(size=32, num_train=8, num_test=1, samples=1)
+    root = write_static_capture(
+        tmp_path / "still", StaticOptions(size=32, num_train=8, num_test=1, samples=1)
     )
     capture = read_capture(root)
-    begun, lines = with_first_points(capture, DataConfig(root=root), PointsInit())
+    begun, lines = create_initial_points(capture, DataConfig(root=root), PointsInit())
     assert begun.points is not None
     assert lines == [
         f"{len(begun.points.xyz):,} first points were drawn at random in the silhouettes of the images"

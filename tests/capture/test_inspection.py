@@ -14,24 +14,24 @@ from stage_videos import camera, corner, write_videos
 from tiny_captures import opengl_pose
 
 from dyngs.capture.inspection import (
-    before_training,
+    check_before_training,
     body_problems,
     draw_cameras,
     format_report,
     inspect_capture,
     masks_of,
-    report_on,
+    build_report,
     video_facts,
     video_report,
 )
 from dyngs.capture.sfm.several_videos import open_video
 from dyngs.cli import main
 from dyngs.config import DataConfig
-from dyngs.data.body_frames import body_frames, of_one_clip
+from dyngs.data.body_frames import body_frames, share_body_across_splits
 from dyngs.data.capture import Capture, PointCloud, View
-from dyngs.data.geometry import cam_from_opengl, pinhole_matrix
+from dyngs.data.geometry import from_opengl_pose, pinhole_matrix
 from dyngs.data.read import read_capture
-from dyngs.data.synthetic.captures import StillOptions, hemisphere_cameras, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, hemisphere_cameras, write_static_capture
 from dyngs.export.video import video_writer
 from dyngs.io.write import write_image
 
@@ -39,7 +39,7 @@ from dyngs.io.write import write_image
 def clip(count: int, degrees: float) -> Capture:
     """One camera on its way around the origin, an image at each time."""
     k = pinhole_matrix(40.0, 40.0, 16.0, 12.0)
-    poses = [cam_from_opengl(opengl_pose(np.radians(degrees) * i)) for i in range(count)]
+    poses = [from_opengl_pose(opengl_pose(np.radians(degrees) * i)) for i in range(count)]
     views = [
         View(f"{i:03d}", Path(f"{i}.png"), p, k, 32, 24, time=i / (count - 1))
         for i, p in enumerate(poses)
@@ -56,23 +56,23 @@ def with_points(capture: Capture, xyz: np.ndarray) -> Capture:
 )
 def test_few_images_far_apart_are_ill_posed(count: int, degrees: float, says: bool) -> None:
     """Not those of a video, nor many that jump about as in D-NeRF."""
-    lines = before_training(clip(count, degrees))
+    lines = check_before_training(clip(count, degrees))
     expected = "12 images, each at a time of its own, 31 degrees apart on average: what moves is seen from one side"
     assert [line.startswith(expected) for line in lines] == [True] * says
 
 
 def test_one_fixed_camera() -> None:
     capture = clip(12, 0.0)
-    (line,) = before_training(capture)
+    (line,) = check_before_training(capture)
     assert "one camera that does not move saw all 12 times" in line
 
 
 def test_points_and_cameras_that_do_not_meet() -> None:
     capture = clip(40, 9.0)
     xyz = np.random.default_rng(0).normal(size=(300, 3)) * 0.3
-    assert before_training(with_points(capture, xyz)) == []
+    assert check_before_training(with_points(capture, xyz)) == []
     far = with_points(capture, np.concatenate([xyz, xyz[:150] + np.array([0, 0, 50.0])]))
-    assert any("33% of the points are in no camera's view" in line for line in before_training(far))
+    assert any("33% of the points are in no camera's view" in line for line in check_before_training(far))
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_points_and_cameras_that_do_not_meet() -> None:
     ],
 )
 def test_no_false_alarms(shared: Path, name: str) -> None:
-    assert before_training(read_capture(shared / name)) == []
+    assert check_before_training(read_capture(shared / name)) == []
 
 
 def capture_with(tmp_path: Path, mask: np.ndarray | None) -> Capture:
@@ -121,8 +121,8 @@ def test_masks_that_ignore_nearly_everything(tmp_path: Path, mask: np.ndarray) -
     (problem,) = masks_of(capture)[1]
     assert problem.startswith("masks ignore ")
     assert str(tmp_path / "mask1.png") in problem
-    assert problem in before_training(capture)
-    assert problem in report_on(capture).problems
+    assert problem in check_before_training(capture)
+    assert problem in build_report(capture).problems
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def test_sides_of_a_person_that_no_camera_sees(
     whole = None if turns is None else np.tile([0, np.radians(turns), 0], (len(sides), 1))
     body = body_frames(tmp_path, range(len(sides)), poses, trans, np.zeros(10), turns=whole)
     capture = Capture(
-        root=tmp_path, format="x", splits={"train": tuple(views)}, body=of_one_clip(body)
+        root=tmp_path, format="x", splits={"train": tuple(views)}, body=share_body_across_splits(body)
     )
     found = body_problems(capture)
     unseen = {(0,): "back", (90,): "right side", (180,): "front", (270,): "left side"}
@@ -170,7 +170,7 @@ def test_sides_of_a_person_that_no_camera_sees(
     assert [line.split(" is never")[0] for line in found] == [
         f"the person's {side}" for key, side in unseen.items() if key == sides
     ]
-    assert set(found) <= set(before_training(capture))
+    assert set(found) <= set(check_before_training(capture))
 
 
 def _capture(root: Path, count: int = 6) -> Capture:
@@ -180,7 +180,7 @@ def _capture(root: Path, count: int = 6) -> Capture:
         path = root / f"{i}.png"
         write_image(path, np.zeros((24, 32, 3), np.uint8))
         k = np.array([[40.0, 0, 16], [0, 40.0, 12], [0, 0, 1]])
-        views.append(View(f"{i}", path, cam_from_opengl(pose), k, 32, 24))
+        views.append(View(f"{i}", path, from_opengl_pose(pose), k, 32, 24))
     rng = np.random.default_rng(0)
     points = PointCloud(
         rng.normal(size=(200, 3)) * 0.3, rng.integers(0, 256, (200, 3), dtype=np.uint8)
@@ -194,7 +194,7 @@ def _with_view(capture: Capture, **changes: Any) -> Capture:
 
 
 def test_a_good_capture_is_quiet(tmp_path: Path) -> None:
-    report = report_on(_capture(tmp_path), deep=True)
+    report = build_report(_capture(tmp_path), deep=True)
     assert not report.problems, report.problems
     text = format_report(report)
     for fact in ("5 train, 1 test", "32x24", "40 px", "43.6 degrees", "200", "nothing suspicious"):
@@ -213,7 +213,7 @@ def test_a_good_capture_is_quiet(tmp_path: Path) -> None:
     ],
 )
 def test_one_bad_view_gives_its_line(tmp_path: Path, changes: dict[str, Any], line: str) -> None:
-    report = report_on(_with_view(_capture(tmp_path), **changes))
+    report = build_report(_with_view(_capture(tmp_path), **changes))
     assert any(line in problem for problem in report.problems), report.problems
     assert all("\n" not in problem for problem in report.problems)
     assert line in format_report(report)
@@ -221,9 +221,9 @@ def test_one_bad_view_gives_its_line(tmp_path: Path, changes: dict[str, Any], li
 
 def test_scene_faults(tmp_path: Path) -> None:
     good = _capture(tmp_path)
-    assert report_on(good.replace(warnings=("something odd",))).problems == ("something odd",)
+    assert build_report(good.replace(warnings=("something odd",))).problems == ("something odd",)
     untested = good.replace(splits={"train": good.splits["train"][:2], "test": ()})
-    assert [line.split(",")[0] for line in report_on(untested).problems] == [
+    assert [line.split(",")[0] for line in build_report(untested).problems] == [
         "the split 'test' is empty",
         "only 2 training views; a scene needs some 20 or more",
     ]
@@ -233,10 +233,10 @@ def test_scene_faults(tmp_path: Path) -> None:
         for split, views in good.splits.items()
     }
     for points in (good.points, None):
-        problems = report_on(good.replace(splits=turned, points=points)).problems
+        problems = build_report(good.replace(splits=turned, points=points)).problems
         assert any("look away" in line for line in problems), problems
     still = _with_view(good, cam_from_world=good.splits["test"][0].cam_from_world)
-    assert any("share their pose" in line for line in report_on(still).problems)
+    assert any("share their pose" in line for line in build_report(still).problems)
 
 
 def _sequence(root: Path, cameras: int, times: int) -> Capture:
@@ -264,7 +264,7 @@ def _sequence(root: Path, cameras: int, times: int) -> Capture:
 
 
 def test_cameras_by_times(tmp_path: Path) -> None:
-    report = report_on(_sequence(tmp_path, 4, 3))
+    report = build_report(_sequence(tmp_path, 4, 3))
     assert not report.problems, report.problems
     facts = dict(report.facts)
     assert facts["times"] == "3 in 0 to 1"
@@ -288,7 +288,7 @@ def test_drawing_shows_cameras_and_points(tmp_path: Path) -> None:
 def test_links_that_leave_the_capture_are_reported(tmp_path: Path) -> None:
     """Also those that no image needs; and an image that lies outside is the first problem."""
     root = tmp_path / "capture"
-    write_still_capture(root, StillOptions(size=8, num_train=4))
+    write_static_capture(root, StaticOptions(size=8, num_train=4))
     assert not inspect_capture(root).problems
     (root / "notes").symlink_to(tmp_path)
     report = inspect_capture(root)

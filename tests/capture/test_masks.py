@@ -15,7 +15,7 @@ from dyngs.capture.masks import (
     outlined,
     person_mask,
     separation,
-    with_background_masks,
+    add_background_masks,
 )
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
@@ -141,8 +141,8 @@ def iou_of(mask: np.ndarray, step: int, index: int) -> float:
 
 def test_who_walks_by_gets_masks(tmp_path: Path) -> None:
     said: list[str] = []
-    capture = with_background_masks(
-        moving_block(tmp_path / "c", 8), tmp_path / "m", say=said.append
+    capture = add_background_masks(
+        moving_block(tmp_path / "c", 8), tmp_path / "m", log=said.append
     )
     assert capture.has_alpha
     assert all(iou_of(mask_of(capture, i), 8, i) > 0.9 for i in range(COUNT))
@@ -153,24 +153,24 @@ def test_who_walks_by_gets_masks(tmp_path: Path) -> None:
 def test_who_stays_needs_a_image_of_the_place(tmp_path: Path) -> None:
     capture = moving_block(tmp_path / "c", 0)
     with pytest.raises(DyngsError, match="--background"):
-        with_background_masks(capture, tmp_path / "m")
+        add_background_masks(capture, tmp_path / "m")
     write_image(tmp_path / "empty.png", ground())
-    found = with_background_masks(
-        capture, tmp_path / "m", tmp_path / "empty.png", say=lambda _: None
+    found = add_background_masks(
+        capture, tmp_path / "m", tmp_path / "empty.png", log=lambda _: None
     )
     assert iou_of(mask_of(found, 4), 0, 4) > 0.9
     write_image(tmp_path / "plates" / "0.png", ground())
-    again = with_background_masks(capture, tmp_path / "n", tmp_path / "plates", say=lambda _: None)
+    again = add_background_masks(capture, tmp_path / "n", tmp_path / "plates", log=lambda _: None)
     assert np.array_equal(mask_of(again, 4), mask_of(found, 4))
 
 
 def test_a_camera_that_moves_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="moves, so there is no background"):
-        with_background_masks(moving_block(tmp_path / "c", 8, turn=2), tmp_path / "m")
+        add_background_masks(moving_block(tmp_path / "c", 8, turn=2), tmp_path / "m")
     capture = moving_block(tmp_path / "d", 8)
     views = list(capture.splits["train"])
     pose = views[3].cam_from_world.copy()
     pose[0, 3] = 0.1
     views[3] = replace(views[3], cam_from_world=pose)
     with pytest.raises(DyngsError, match="moves, so there is no background"):
-        with_background_masks(capture.replace(splits={"train": tuple(views)}), tmp_path / "m")
+        add_background_masks(capture.replace(splits={"train": tuple(views)}), tmp_path / "m")

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from dyngs.capture import initial_points
-from dyngs.capture.initial_points import with_first_points
+from dyngs.capture.initial_points import create_initial_points
 from dyngs.capture.plane_sweep import (
-    dense_points,
-    points_of_depth_maps,
+    sweep_dense_points,
+    points_from_depth_maps,
 )
 from dyngs.config import DataConfig, PointsInit
 from dyngs.data.capture import Capture, View
@@ -74,7 +74,7 @@ def _views(folder: Path, count: int = 7, contrast: float = 1.0, unit: float = 1.
 def test_points_lie_on_the_plane_in_its_colours(tmp_path: Path) -> None:
     views = _views(tmp_path)
     options = DataConfig(root=tmp_path)
-    found = dense_points(views, options, SPARSE, 100_000)
+    found = sweep_dense_points(views, options, SPARSE, 100_000)
     assert found is not None
     assert len(found.xyz) > 0.5 * len(views) * WIDTH * HEIGHT
     x, y, z = found.xyz.T
@@ -84,7 +84,7 @@ def test_points_lie_on_the_plane_in_its_colours(tmp_path: Path) -> None:
     )
     assert np.quantile(error, 0.95) < 0.02 * DISTANCE
     assert np.abs(found.rgb / 255 - _colour(x, y)).mean() < 0.02
-    few = dense_points(views, options, SPARSE, 50)
+    few = sweep_dense_points(views, options, SPARSE, 50)
     assert few is not None
     assert len(few.xyz) == 50
 
@@ -95,22 +95,22 @@ def test_given_depth_maps_have_points_where_they_agree(tmp_path: Path) -> None:
     wrong = np.load(tmp_path / "3.npy")
     wrong[:, : WIDTH // 2] *= 1.2
     np.save(tmp_path / "3.npy", wrong)
-    found = points_of_depth_maps(views, options, 100_000)
+    found = points_from_depth_maps(views, options, 100_000)
     assert found is not None
     assert len(found.xyz) > 0.7 * len(views) * WIDTH * HEIGHT
     x, y, z = found.xyz.T
     np.testing.assert_allclose(z, SLOPE * x, atol=1e-5 * DISTANCE)
     assert np.abs(found.rgb - 255 * _colour(x, y)).max() < 3
-    few = points_of_depth_maps(views, options, 1000)
+    few = points_from_depth_maps(views, options, 1000)
     assert few is not None
     assert len(few.xyz) == 1000
 
 
 def test_depth_maps_in_another_unit_have_none(tmp_path: Path) -> None:
     options = DataConfig(root=tmp_path)
-    assert points_of_depth_maps(_views(tmp_path, unit=2.0), options, 1000) is None
+    assert points_from_depth_maps(_views(tmp_path, unit=2.0), options, 1000) is None
     plain = [replace(view, depth_path=None) for view in _views(tmp_path)]
-    assert points_of_depth_maps(plain, options, 1000) is None
+    assert points_from_depth_maps(plain, options, 1000) is None
 
 
 def test_a_still_capture_without_any_points_is_swept(
@@ -118,10 +118,10 @@ def test_a_still_capture_without_any_points_is_swept(
 ) -> None:
     """Random candidates say how deep to look; pixels without texture take the depth of their
     neighbours."""
-    monkeypatch.setattr(initial_points, "triangulated_points", lambda *_: None)
+    monkeypatch.setattr(initial_points, "triangulate_from_views", lambda *_: None)
     views = [replace(view, depth_path=None) for view in _views(tmp_path)]
     capture = Capture(tmp_path, "nerfstudio", {"train": tuple(views)})
-    begun, lines = with_first_points(capture, DataConfig(root=tmp_path), PointsInit(dense=2000))
+    begun, lines = create_initial_points(capture, DataConfig(root=tmp_path), PointsInit(dense=2000))
     assert begun.points is not None
     assert len(begun.points.xyz) == 2000
     assert lines == ["2,000 first points are from depth maps by plane sweep (init.dense)"]
@@ -130,13 +130,13 @@ def test_a_still_capture_without_any_points_is_swept(
     assert np.median(error) < 0.01 * DISTANCE
     assert np.quantile(error, 0.9) < 0.05 * DISTANCE
     assert (
-        with_first_points(capture, DataConfig(root=tmp_path), PointsInit(dense=0))[0].points is None
+        create_initial_points(capture, DataConfig(root=tmp_path), PointsInit(dense=0))[0].points is None
     )
     timed = capture.replace(
         splits={"train": tuple(replace(view, time=0.1 * i) for i, view in enumerate(views))}
     )
     assert (
-        with_first_points(timed, DataConfig(root=tmp_path), PointsInit(dense=2000))[0].points
+        create_initial_points(timed, DataConfig(root=tmp_path), PointsInit(dense=2000))[0].points
         is None
     )
 
@@ -149,7 +149,7 @@ def test_any_number_of_threads_finds_the_same_points(tmp_path: Path) -> None:
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
-            found.append(dense_points(views, options, SPARSE, 1000))
+            found.append(sweep_dense_points(views, options, SPARSE, 1000))
     finally:
         torch.set_num_threads(before)
     first = found[0]
@@ -185,4 +185,4 @@ def test_without_evidence_there_are_no_points(tmp_path: Path, fault: str) -> Non
         views = [views[0]] * 5
     elif fault == "no points seen":
         sparse = SPARSE - (0, 0, 100)
-    assert dense_points(views, DataConfig(root=tmp_path), sparse, 1000) is None
+    assert sweep_dense_points(views, DataConfig(root=tmp_path), sparse, 1000) is None

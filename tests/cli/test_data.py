@@ -15,7 +15,7 @@ from tiny_captures import write_colmap
 
 from dyngs.cli import main
 from dyngs.config import DataConfig
-from dyngs.data.read import captures_in, read_capture
+from dyngs.data.read import list_captures, read_capture
 from dyngs.human.avatar import pose_fit
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
@@ -151,7 +151,7 @@ def test_people_are_synthesised(tmp_path: Path, capsys: PrintedOutput) -> None:
     for count in (1, 2):
         assert main([*words, str(count)]) == 0
         assert f"dyngs train gps data.root={out}" in capsys.readouterr().out
-        people = captures_in(DataConfig(root=out))
+        people = list_captures(DataConfig(root=out))
         captures = [read_capture(person) for person in people]
         assert [sum(map(len, capture.splits.values())) for capture in captures] == [3] * count
     assert "other options" in error_line(capsys, *words, "2", "--seed", "5")

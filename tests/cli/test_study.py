@@ -19,7 +19,7 @@ from toy_plugin import installed
 
 from dyngs.api.budget import time as budget_time
 from dyngs.cli import main
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.outputs import LOCK_NAME, writing
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
@@ -33,7 +33,7 @@ OPTIONS = ("--steps", "20", "--threads", "1", "init.num_random=100", "--views", 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("captures") / "box"
-    write_still_capture(folder, StillOptions(size=16, num_train=6, num_test=3, samples=1))
+    write_static_capture(folder, StaticOptions(size=16, num_train=6, num_test=3, samples=1))
     return folder
 
 

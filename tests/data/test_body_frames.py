@@ -15,7 +15,7 @@ from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import (
-    about_pelvis,
+    merge_root_rotation,
     body_frames,
     ensure_fitted_body,
 )
@@ -72,7 +72,7 @@ def test_turns_about_the_origin_become_turns_about_the_pelvis(seed: int) -> None
     joints = rng.normal(size=(24, 3))
     weights = rng.dirichlet(np.ones(24), 8)
     body = random_body(seed)
-    same = about_pelvis(body, joints[0])
+    same = merge_root_rotation(body, joints[0])
     assert same.turns is None
     for row in range(3):
         expected = in_world(body, row, points, joints, weights)

@@ -148,7 +148,7 @@ def test_images_decoded_ahead_are_the_same(cache_mb: float, tmp_path: Path) -> N
             assert torch.equal(found.rgb_premultiplied, wanted.rgb_premultiplied)
             ahead.expect((*order[position + 1 : position + 4], 0))
             assert ahead._on_cpu.num_bytes <= cache_mb * 1e6
-    assert ahead.decoded_ahead == (0 if cache_mb == 1 else 4)
+    assert ahead.num_prefetched == (0 if cache_mb == 1 else 4)
     ahead.rest()
     assert not [x for x in enumerate_threads() if x.name.startswith("dyngs-images")]
 
@@ -186,7 +186,7 @@ def test_images_given_out_on_a_gpu_are_the_same(
                 there.expect((*order[position + 1 : position + 4], 0))
                 assert there._on_cpu.num_bytes <= cache_mb * 1e6
                 assert there._cache.num_bytes <= there._cache.room
-        assert there.decoded_ahead == (0 if free is None else 2 * threads)
+        assert there.num_prefetched == (0 if free is None else 2 * threads)
         assert there.bytes_on_gpu == {None: 6 * 8 * 12 * 3, 0: 0}.get(free, int(2.5 * 8 * 12 * 4))
 
 

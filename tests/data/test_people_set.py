@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from dyngs.config import DataConfig
-from dyngs.data.read import PEOPLE_FILE, captures_in
+from dyngs.data.read import PEOPLE_FILE, list_captures
 
 
 def found(root: Path) -> list[str]:
-    return [one.root.relative_to(root).as_posix() for one in captures_in(DataConfig(root=root))]
+    return [one.root.relative_to(root).as_posix() for one in list_captures(DataConfig(root=root))]
 
 
 def test_people_are_in_folders_or_in_shards(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from tiny_captures import (
 from tiny_priors import with_priors
 
 from dyngs.api.load import read_capture
-from dyngs.capture.inspection import report_on
+from dyngs.capture.inspection import build_report
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data import readers
@@ -130,7 +130,7 @@ def test_times_are_stretched_to_the_span_of_all_splits(blender_root: Path) -> No
     )
     assert capture.warnings == ("times run from 0 to 0.06 and were scaled to [0, 1]",)
     assert (capture.span, capture.seconds) == ((0.0, 0.06), None)
-    assert dict(report_on(capture).facts)["times"] == "17 in 0 to 1 (0 to 0.06 in the files)"
+    assert dict(build_report(capture).facts)["times"] == "17 in 0 to 1 (0 to 0.06 in the files)"
 
 
 def test_frames_of_any_format_with_times(blender_root: Path) -> None:

@@ -12,20 +12,20 @@ from tiny_captures import opengl_pose
 
 from dyngs.data.capture import Capture, PointCloud, View, all_views
 from dyngs.data.geometry import (
-    cam_from_opengl,
+    from_opengl_pose,
     camera_center,
-    checked_pose,
+    validate_pose,
     pinhole_matrix,
     projected,
-    times_seen,
+    count_visible_views,
 )
 from dyngs.data.scene_space import (
     FAR_PER_BASELINE,
     change_coordinates,
     depth_bounds,
     normalise_capture,
-    outside_of_cube,
-    points_in_frusta,
+    cube_mismatch_reason,
+    sample_points_in_frusta,
 )
 
 
@@ -38,16 +38,16 @@ def circle(
         pose = opengl_pose(2 * np.pi * i / count)
         pose[:3, 3] = scale * pose[:3, 3] + offset
         k = pinhole_matrix(60.0, 60.0, 20.0, 15.0)
-        views.append(View(str(i), Path(f"{i}.png"), cam_from_opengl(pose), k, 40, 30))
+        views.append(View(str(i), Path(f"{i}.png"), from_opengl_pose(pose), k, 40, 30))
     return views
 
 
 def test_the_cube_is_seen_or_not() -> None:
-    assert outside_of_cube(circle(), 1.3) is None
-    assert "look at (7, -3, 11)" in (outside_of_cube(circle((7.0, -3.0, 11.0)), 1.3) or "")
+    assert cube_mismatch_reason(circle(), 1.3) is None
+    assert "look at (7, -3, 11)" in (cube_mismatch_reason(circle((7.0, -3.0, 11.0)), 1.3) or "")
     # Far too near: only a few points of the cube are in two images.
     assert "of the cube of half side 1.3" in (
-        outside_of_cube(circle(scale=0.2, count=2), 1.3) or ""
+        cube_mismatch_reason(circle(scale=0.2, count=2), 1.3) or ""
     )
 
 
@@ -64,7 +64,7 @@ def capture_at(offset: np.ndarray, radius: float = 4.0, count: int = 6) -> Captu
     for pose in poses:
         pose[:3, 3] += offset
     views = tuple(
-        View(str(i), Path(f"{i}.png"), cam_from_opengl(pose), np.eye(3), 1, 1)
+        View(str(i), Path(f"{i}.png"), from_opengl_pose(pose), np.eye(3), 1, 1)
         for i, pose in enumerate(poses)
     )
     points = PointCloud(offset + np.arange(6.0).reshape(2, 3), np.zeros((2, 3), np.uint8))
@@ -135,7 +135,7 @@ def test_fixed_camera_stays_where_it_is(jitter: float) -> None:
 def test_checked_pose_reports_how_far_off_it_was() -> None:
     pose = opengl_pose(1.1)
     pose[:3, :3] *= 1 + 1e-4
-    repaired, error = checked_pose(pose[:3], "here")
+    repaired, error = validate_pose(pose[:3], "here")
     assert error == pytest.approx(2e-4, rel=1e-3)
     np.testing.assert_allclose(repaired, opengl_pose(1.1), atol=1e-12)
 
@@ -143,9 +143,9 @@ def test_checked_pose_reports_how_far_off_it_was() -> None:
 def test_candidates_lie_in_their_view_between_the_bounds() -> None:
     views = circle((5.0, 0.0, 0.0))
     near, far = depth_bounds(views)
-    xyz, seen = points_in_frusta(views, np.random.default_rng(0).random((500, 4)))
+    xyz, seen = sample_points_in_frusta(views, np.random.default_rng(0).random((500, 4)))
     assert seen.min() >= 1
-    np.testing.assert_array_equal(seen, times_seen(xyz, views))
+    np.testing.assert_array_equal(seen, count_visible_views(xyz, views))
     depths = np.stack(
         [xyz @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3] for view in views]
     )

@@ -18,14 +18,14 @@ from dyngs.data.capture import Split, Splits, View, all_views
 from dyngs.data.times import (
     SECONDS_FILE,
     clip_seconds,
-    number_cameras,
+    assign_camera_ids,
     parse_frames,
     read_seconds,
-    span_in_files,
+    file_time_span,
     split_by_camera,
     split_by_frames,
-    times_by_name,
-    unit_times,
+    times_from_names,
+    normalize_times,
     videos,
     write_seconds,
 )
@@ -49,7 +49,7 @@ def times_of(splits: dict[Split, tuple[View, ...]], split: Split = "train") -> l
 @pytest.mark.parametrize("time", [math.nan, -math.inf, "0.5", True, None])
 def test_no_number(time: object) -> None:
     with pytest.raises(DyngsError, match="time of b must be a finite number"):
-        unit_times(ROOT, train(view("a", 0.0), view("b", time)))
+        normalize_times(ROOT, train(view("a", 0.0), view("b", time)))
 
 
 @given(
@@ -60,7 +60,7 @@ def test_scaled_over_all_splits(times: list[float], cut: int) -> None:
     """Whatever the order: one affine map for all splits, onto [0, 1]."""
     views = [view(f"v{i}", time) for i, time in enumerate(times)]
     cut = min(cut, len(views) - 1)
-    splits, notes = unit_times(ROOT, {"train": tuple(views[cut:]), "test": tuple(views[:cut])})
+    splits, notes = normalize_times(ROOT, {"train": tuple(views[cut:]), "test": tuple(views[:cut])})
     found = times_of(splits, "test") + times_of(splits)
     low = min(times)
     high = max(times)
@@ -84,7 +84,7 @@ def test_scaled_over_all_splits(times: list[float], cut: int) -> None:
 def test_stretched_to_the_span_of_the_clip(times: list[float], mentioned: bool | None) -> None:
     """None: nothing changes, not by rounding either; so do the times of people."""
     splits = train(*(view(f"v{i}", time) for i, time in enumerate(times)))
-    scaled, notes = unit_times(ROOT, splits)
+    scaled, notes = normalize_times(ROOT, splits)
     if mentioned is None:
         assert (times_of(scaled), notes) == (times, [])
     else:
@@ -93,20 +93,20 @@ def test_stretched_to_the_span_of_the_clip(times: list[float], mentioned: bool |
         assert [f"times run from {min(times):g} to {max(times):g}" in note for note in notes] == [
             True
         ] * mentioned
-    assert unit_times(ROOT, splits, stretch=False) == (splits, [])
+    assert normalize_times(ROOT, splits, stretch=False) == (splits, [])
 
 
 def test_span_and_seconds() -> None:
     written = train(*(view(f"v{i}", 2.0 + i) for i in range(5)))
-    kept, _ = unit_times(ROOT, train(*written["train"][1:4]))
-    assert span_in_files(written, kept) == (3.0, 5.0)
+    kept, _ = normalize_times(ROOT, train(*written["train"][1:4]))
+    assert file_time_span(written, kept) == (3.0, 5.0)
     assert clip_seconds(kept, 4.0) == pytest.approx(0.5)
     assert clip_seconds(kept, None) is None
-    uneven, _ = unit_times(ROOT, train(*written["train"][:2], written["train"][4]))
+    uneven, _ = normalize_times(ROOT, train(*written["train"][:2], written["train"][4]))
     assert clip_seconds(uneven, 4.0) is None
     numbered = train(*(replace(kept, frame=10 * i) for i, kept in enumerate(uneven["train"])))
     assert clip_seconds(numbered, 4.0) == pytest.approx(5.0)
-    assert span_in_files(train(view("a", None)), train(view("a", None))) is None
+    assert file_time_span(train(view("a", None)), train(view("a", None))) is None
 
 
 def rig(counts: list[int], folder: str = "cam{:02d}/") -> dict[Split, tuple[View, ...]]:
@@ -140,7 +140,7 @@ def sharing_one_number(splits: Splits, noise: float = 0.0) -> Splits:
 @pytest.mark.parametrize("noise", [0.0, 1e-7, 1e-6])
 @pytest.mark.parametrize("counts", [[5, 5, 5, 5], [3, 5, 2], [6, 6]])
 def test_poses_that_repeat_at_the_same_times_are_cameras(noise: float, counts: list[int]) -> None:
-    numbered = number_cameras(sharing_one_number(rig(counts), noise))
+    numbered = assign_camera_ids(sharing_one_number(rig(counts), noise))
     views = all_views(numbered)
     assert [(v.name, v.camera_id) for v in views] == [
         (v.name, v.camera_id) for v in all_views(rig(counts))
@@ -173,7 +173,7 @@ def test_cameras_that_keep_their_numbers(case: str) -> None:
         # a moving camera and a fixed one
         "beside": {"train": tuple(walk), "test": rig([9])["test"]},
     }[case]
-    assert number_cameras(splits) is splits
+    assert assign_camera_ids(splits) is splits
 
 
 def test_videos_are_those_of_fixed_cameras_or_of_the_one_that_moves() -> None:
@@ -303,7 +303,7 @@ def _views(*names: str) -> tuple[View, ...]:
 
 def _times(*names: str, test: tuple[str, ...] = ()) -> tuple[dict[str, float | None], str]:
     splits: Splits = {"train": _views(*names), "test": _views(*test)}
-    timed, line = times_by_name(splits)
+    timed, line = times_from_names(splits)
     return {view.name: view.time for view in all_views(timed)}, line
 
 
@@ -326,6 +326,6 @@ def test_other_names_are_in_natural_order() -> None:
 
 def test_a_frame_rate_makes_seconds_of_numbers() -> None:
     splits: Splits = {"train": _views("frame_10", "frame_25", "frame_60")}
-    timed, line = times_by_name(splits, 25.0)
+    timed, line = times_from_names(splits, 25.0)
     assert [view.time for view in timed["train"]] == [0.4, 1.0, 2.4]
     assert "data.times=order at 25 per second: 2 s" in line

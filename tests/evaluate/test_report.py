@@ -19,7 +19,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.evaluate.report import (
     evaluate_run,
@@ -52,8 +52,8 @@ def some_gaussians(count: int = 12, degree: int = 0) -> Gaussians:
 
 def write_run(folder: Path, gaussians: Gaussians, background: str = "auto") -> Path:
     """A run folder with a 16x16 capture of 2 train and 3 test images beside it."""
-    root = write_still_capture(
-        folder / "capture", StillOptions(size=16, num_train=2, num_test=3, samples=1)
+    root = write_static_capture(
+        folder / "capture", StaticOptions(size=16, num_train=2, num_test=3, samples=1)
     )
     run_dir = folder / "run"
     data = DataConfig.model_validate({"root": root, "background": background})

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.data.geometry import look_at, look_at_point, up_direction
+from dyngs.data.geometry import look_at, estimate_focus, up_direction
 from dyngs.export.orbits import frame_orbit_for_points, orbit_path, path_along, spiral_path
 
 ORIGIN = np.zeros(3)
@@ -29,7 +29,7 @@ def looking_in(eyes: list[tuple[float, float, float]], target: np.ndarray = ORIG
 
 def test_parallel_cameras_look_forward() -> None:
     cameras = forward_facing(8)
-    assert look_at_point(cameras)[1] > 1.0
+    assert estimate_focus(cameras)[1] > 1.0
     np.testing.assert_allclose(up_direction(cameras), UP, atol=1e-9)
 
 

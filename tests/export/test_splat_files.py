@@ -52,7 +52,7 @@ from dyngs.export.splat_files import (
 )
 from dyngs.gaussians.rendering import render
 from dyngs.io.formats.formats import read_splats, upright, write_splats
-from dyngs.io.formats.similarity import AXES, Similarity, turn_between
+from dyngs.io.formats.similarity import AXES, Similarity, rotation_between
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.gltf import GltfFile
 from dyngs.runs.opened import OpenedScene, SourceCapture, open_run, wrap_scene
@@ -130,7 +130,7 @@ def test_up_is_what_the_cameras_or_the_user_say(near: OpenedScene) -> None:
     assert found is not None
     name = next(name for name, axis in AXES.items() if axis == found[0])
     how, line = choose_write_options(near, "y")
-    assert how.turn == turn_between(found[0], AXES["y"])
+    assert how.turn == rotation_between(found[0], AXES["y"])
     assert f"it was {name} in the capture" in line or name == "y"
     assert "the axes of the capture are kept" in choose_write_options(near, name)[1]
     lost = replace(near, captured=SourceCapture(near.config.data, DyngsError("gone")))
@@ -138,7 +138,7 @@ def test_up_is_what_the_cameras_or_the_user_say(near: OpenedScene) -> None:
     how, line = choose_write_options(lost, "y", sh_degree=2)
     assert (how.turn, how.up, how.sh_degree) == ((1.0, 0.0, 0.0, 0.0), None, 2)
     assert "--from-up=AXIS tells it" in line
-    assert choose_write_options(lost, "y", from_up="z")[0].turn == turn_between(
+    assert choose_write_options(lost, "y", from_up="z")[0].turn == rotation_between(
         AXES["z"], AXES["y"]
     )
     assert choose_write_options(lost, "y", "keep", "z")[0].turn == (1.0, 0.0, 0.0, 0.0)
@@ -161,7 +161,7 @@ def test_edits_of_every_kind_of_scene_are_exact(kind: str) -> None:
 
 
 def test_a_file_drawn_again_is_compared_with_its_run(near: OpenedScene, tmp_path: Path) -> None:
-    for how in (WriteOptions(), WriteOptions(turn_between(AXES["z"], AXES["-y"]), "-y")):
+    for how in (WriteOptions(), WriteOptions(rotation_between(AXES["z"], AXES["-y"]), "-y")):
         written = write_run_splats(near, tmp_path / "a.ply", 0.7, how=how)
         read = read_splats(written.path)
         assert compare_file_with_run(near, near.scene, 0.7, written.splat, read) > 80

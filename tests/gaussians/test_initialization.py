@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from dyngs.config import DefaultStrategy, McmcStrategy, PointsInit, RandomInit
 from dyngs.data.capture import View
-from dyngs.data.geometry import pinhole_matrix, times_seen
+from dyngs.data.geometry import pinhole_matrix, count_visible_views
 from dyngs.gaussians.initialization import (
     InitialValues,
     SceneGeometry,
@@ -119,7 +119,7 @@ def test_other_random_points_lie_where_cameras_look(
     )
     xyz = gaussians.means.double().numpy()
     assert len(xyz) == 2000
-    assert times_seen(xyz, scene.views).min() >= 3
+    assert count_visible_views(xyz, scene.views).min() >= 3
     distances = np.linalg.norm(xyz - offset, axis=1)
     assert np.median(distances) < 2.0
     assert float((gaussians.base_rgb - 0.5).abs().max()) < 0.28209479177387814 / 255 + 1e-6

@@ -27,7 +27,7 @@ from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
-from dyngs.io.containment import check_size, inside, leaving_links, staying_within
+from dyngs.io.containment import check_size, inside, find_escaping_links, restrict_paths_to
 
 PLY = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 1\n"  # noqa: E501
 
@@ -146,7 +146,7 @@ def test_a_capture_that_is_a_link_and_links_inside_it_are_fine(tmp_path: Path) -
     assert len(read(tmp_path / "link").splits["train"]) == 3
     os.chdir(root)
     assert len(read(Path(".")).splits["train"]) == 3
-    assert leaving_links(tmp_path / "link") == []
+    assert find_escaping_links(tmp_path / "link") == []
 
 
 def test_links_that_leave_are_listed_and_none_is_followed(tmp_path: Path) -> None:
@@ -157,13 +157,13 @@ def test_links_that_leave_are_listed_and_none_is_followed(tmp_path: Path) -> Non
     (root / "in").symlink_to("a")
     (root / "gone").symlink_to("/nowhere/at/all")
     (root / "loop").symlink_to("loop")
-    found = [(path.relative_to(root).as_posix(), place) for path, place in leaving_links(root)]
+    found = [(path.relative_to(root).as_posix(), place) for path, place in find_escaping_links(root)]
     assert found == [("gone", "/nowhere/at/all"), ("a/up", os.path.realpath(tmp_path))]
 
 
 def test_a_folder_whose_name_begins_the_same_is_outside(tmp_path: Path) -> None:
     (tmp_path / "capture").mkdir()
-    with staying_within(tmp_path / "capture"):
+    with restrict_paths_to(tmp_path / "capture"):
         assert inside(tmp_path / "capture" / "a.png") == tmp_path / "capture" / "a.png"
         with pytest.raises(DyngsError, match="lies outside the capture"):
             inside(tmp_path / "capture2" / "a.png")

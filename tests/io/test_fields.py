@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.io.fields import numbers_of, open_text, read_json_object
+from dyngs.io.fields import parse_numbers, open_text, read_json_object
 
 
 def test_numbers_in_another_shape() -> None:
-    assert numbers_of("f", [[[1], [2]]], (2,)).tolist() == [1, 2]
+    assert parse_numbers("f", [[[1], [2]]], (2,)).tolist() == [1, 2]
     for value in ([1, 2, 3], "ab", [[1], [2, 3]], None, [1, np.inf], [True, {}]):
         with pytest.raises(DyngsError, match="f must hold 2 finite numbers"):
-            numbers_of("f", value, (2,))
+            parse_numbers("f", value, (2,))
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-8-sig"])

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.io.containment import inside, staying_within
-from dyngs.io.find import FileFinder, images_folder, shrunk_folders
+from dyngs.io.containment import inside, restrict_paths_to
+from dyngs.io.find import FileFinder, images_folder, downscaled_image_folders
 
 FORMS = {form: unicodedata.normalize(form, "Gärten/é 1.png") for form in ("NFC", "NFD")}
 
@@ -74,7 +74,7 @@ def test_nothing_outside_is_found(tmp_path: Path, written: str) -> None:
     root = tmp_path / "capture"
     root.mkdir()
     (root / "link").symlink_to(tmp_path)
-    with staying_within(root), suppress(DyngsError):
+    with restrict_paths_to(root), suppress(DyngsError):
         assert inside(FileFinder(root).find(written)).resolve() != secret
 
 
@@ -83,7 +83,7 @@ def test_images_of_another_size(tmp_path: Path) -> None:
     for name in ("images_8", "images_2", "images_old", "other_3"):
         (tmp_path / name).mkdir()
     touched(tmp_path / "images_5")
-    assert shrunk_folders(tmp_path / "images") == {
+    assert downscaled_image_folders(tmp_path / "images") == {
         2: tmp_path / "images_2",
         8: tmp_path / "images_8",
     }

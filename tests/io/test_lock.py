@@ -17,7 +17,7 @@ import pytest
 
 from dyngs.core.errors import DyngsError
 from dyngs.io import outputs
-from dyngs.io.outputs import LOCK_NAME, InUseError, make_once, new_folder, writing
+from dyngs.io.outputs import LOCK_NAME, InUseError, make_once, atomic_folder, writing
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 HOLD = "import sys, time; from pathlib import Path; from dyngs.io.outputs import writing\n"
@@ -129,7 +129,7 @@ def _made_by(
 
 def _publish(folder: Path, content: str) -> None:
     """Make the folder in one piece."""
-    with new_folder(folder) as started:
+    with atomic_folder(folder) as started:
         time.sleep(0.2)
         (started / "x.txt").write_text(content)
 

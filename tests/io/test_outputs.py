@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.io.outputs import Inputs, new_folder, require_new_folder
+from dyngs.io.outputs import Inputs, atomic_folder, require_new_folder
 
 
 def filled(root: Path) -> Path:
@@ -49,7 +49,7 @@ def test_folders_around_and_within_a_capture(tmp_path: Path) -> None:
 
 
 def stopped(out: Path, error: type[BaseException]) -> None:
-    with new_folder(out) as started:
+    with atomic_folder(out) as started:
         (started / "1.jpg").write_text("half")
         raise error
 
@@ -60,7 +60,7 @@ def test_a_new_folder_appears_complete_or_not_at_all(tmp_path: Path) -> None:
         with pytest.raises(error):
             stopped(out, error)
         assert list(tmp_path.iterdir()) == []
-    with new_folder(out) as started:
+    with atomic_folder(out) as started:
         (started / "1.jpg").write_text("full")
         assert not out.exists()
     assert [path.name for path in tmp_path.iterdir()] == ["capture"]

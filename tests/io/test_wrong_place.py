@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dyngs.io.outputs import command_for
+from dyngs.io.outputs import suggest_command
 
 
 @pytest.fixture
@@ -50,5 +50,5 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 )
 @pytest.mark.usefixtures("workplace")
 def test_the_command_for_a_path(path: str, command: str | None) -> None:
-    found = command_for(Path(path))
+    found = suggest_command(Path(path))
     assert found is None if command is None else command in (found or "")

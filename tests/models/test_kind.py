@@ -18,7 +18,7 @@ from dyngs.config.io import load_config
 from dyngs.config.kinds import BUILT_IN, GROUP
 from dyngs.config.schema import config_keys
 from dyngs.core.errors import DyngsError
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.export.choose_path import PathOptions, choose_path
 from dyngs.export.images import OutputOptions, write_path_images
@@ -39,7 +39,7 @@ def toy() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(folder, StillOptions(size=24, num_train=6, num_test=2, samples=1))
+    write_static_capture(folder, StaticOptions(size=24, num_train=6, num_test=2, samples=1))
     return folder
 
 

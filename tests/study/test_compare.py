@@ -9,7 +9,7 @@ import pytest
 
 import dyngs
 from dyngs.core.errors import DyngsError
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.study.compare import MOST_STEPS, ModelComparison, QualityCurve
 
@@ -17,7 +17,7 @@ from dyngs.study.compare import MOST_STEPS, ModelComparison, QualityCurve
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("captures") / "box"
-    write_still_capture(folder, StillOptions(size=16, num_train=4, num_test=2, samples=1))
+    write_static_capture(folder, StaticOptions(size=16, num_train=4, num_test=2, samples=1))
     return folder
 
 

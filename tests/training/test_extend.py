@@ -23,7 +23,7 @@ from dyngs.config import (
 )
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.schedule import deform_schedule
 from dyngs.gaussians.schedule import RateSchedule, active_sh_degree
@@ -41,7 +41,7 @@ ALL_KINDS = ("default", "mcmc", "control_nodes", "human")
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("captures")
-    write_still_capture(root / "still", StillOptions(size=16, num_train=4, num_test=1, samples=1))
+    write_static_capture(root / "still", StaticOptions(size=16, num_train=4, num_test=1, samples=1))
     write_tiny_capture(root / "moving")
     write_human_capture(root / "person", TINY)
     return root

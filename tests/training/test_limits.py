@@ -20,7 +20,7 @@ from dyngs.config import (
 )
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.errors import DyngsError
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.deform.keys import DynamicModel
 from dyngs.human.keys import HumanPredictorModel
 from dyngs.models.static_section import StaticModel
@@ -44,7 +44,7 @@ def limited(config: Config = NOTHING, **limits: float) -> Config:
 @pytest.fixture(scope="module")
 def still(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(folder, StillOptions(size=16, num_train=4, num_test=1, samples=1))
+    write_static_capture(folder, StaticOptions(size=16, num_train=4, num_test=1, samples=1))
     return folder
 
 

@@ -24,7 +24,7 @@ from dyngs.core.state import Role, State, with_role
 from dyngs.data.images.images import read_image
 from dyngs.data.loader import Image
 from dyngs.data.read import read_capture
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.gaussians.model import SceneTraining
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
@@ -39,7 +39,7 @@ from dyngs.training.trainer import ViewSampler
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(folder, StillOptions(size=16, num_train=2, num_test=1, samples=1))
+    write_static_capture(folder, StaticOptions(size=16, num_train=2, num_test=1, samples=1))
     return folder
 
 
@@ -297,7 +297,7 @@ def test_what_a_mask_ignores_does_not_matter(capture: Path, tmp_path: Path) -> N
 
 def test_two_equal_views_in_a_step_are_one_seen_twice(tmp_path: Path) -> None:
     """The mean of two equal gradients has the bytes of either; densification counts both views."""
-    write_still_capture(tmp_path, StillOptions(size=16, num_train=1, num_test=1, samples=1))
+    write_static_capture(tmp_path, StaticOptions(size=16, num_train=1, num_test=1, samples=1))
     states = []
     for batch in (1, 2):
         trainer = _trainer(tmp_path)

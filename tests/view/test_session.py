@@ -19,7 +19,7 @@ from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.export.camera_paths import read_path
 from dyngs.gaussians.scene import GaussianScene
-from dyngs.io.formats.similarity import UNMOVED, Similarity
+from dyngs.io.formats.similarity import IDENTITY, Similarity
 from dyngs.runs.opened import OpenedScene
 from dyngs.view import session
 from dyngs.view.layers import ViewRequest, draw
@@ -210,7 +210,7 @@ def at_depth(depth: float) -> Cameras:
     return Cameras(pose, one.intrinsics, 40, 28)
 
 
-def placed(frame: Similarity = UNMOVED, offset: tuple[float, ...] = (10.0, -20.0, 5.0)) -> Any:
+def placed(frame: Similarity = IDENTITY, offset: tuple[float, ...] = (10.0, -20.0, 5.0)) -> Any:
     return SimpleNamespace(frame=frame, world_offset=np.array(offset))
 
 

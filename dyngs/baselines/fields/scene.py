@@ -20,8 +20,8 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role, State, add_prefix, with_role
 from dyngs.core.tensor_checks import require_tensor, require_times
 from dyngs.data.capture import Capture, View
-from dyngs.data.geometry import focus_point, fraction_in_front, inverse_rigid
-from dyngs.data.scene_space import extent_of
+from dyngs.data.geometry import focus_point, fraction_in_front, invert_rigid
+from dyngs.data.scene_space import camera_extent
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.renderable import (
     DrawOptions,
@@ -297,10 +297,10 @@ def space_of(model: FieldModel, cells: int | None, capture: Capture) -> Space:
     """
     views = capture.splits["train"]
     requested = None if model.half_extent is None else model.half_extent / capture.world_scale
-    poses = np.stack([inverse_rigid(view.cam_from_world) for view in views])
+    poses = np.stack([invert_rigid(view.cam_from_world) for view in views])
     centres = poses[:, :3, 3]
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-    if not extent_of(centres):
+    if not camera_extent(centres):
         raise DyngsError(
             "the capture has a single camera position, from which a field cannot tell depth: give more images, or a "
             "capture whose camera moves"

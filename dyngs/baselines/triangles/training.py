@@ -63,7 +63,7 @@ RADIUS = 1.5  # Of the first triangles, in mean distances of their points' three
 INNER = 0.02  # Fraction of the points on either side that does not count for the scene's size
 # Gaussians whose surface triangles begin on
 LONGEST_SIDE = 160  # Of the images that Gaussians learn, px
-MOST_GAUSSIANS = 20_000
+MAX_GAUSSIANS = 20_000
 VIEWS = 64  # Whose depths are fused
 SURFACE_CELLS = 128  # Along the scene, at most; no more than pixels along an image
 
@@ -131,7 +131,7 @@ def _trained_gaussians(run: StartContext, steps: int) -> GaussianModel:
     config = run.config
     changed = {
         "model": section_of_kind("static").model_validate({"sh_degree": 0}),
-        "strategy": DefaultStrategy(max_gaussians=MOST_GAUSSIANS),
+        "strategy": DefaultStrategy(max_gaussians=MAX_GAUSSIANS),
         "train": config.train.model_copy(update={"steps": steps, "initial_downscale": 1}),
         "colour": ShColour(),
     }

@@ -25,12 +25,12 @@ from dyngs.capture.sfm.colmap import (
     quiet_colmap,
 )
 from dyngs.capture.sfm.frame_choice import STILL, chosen_frames, measured
-from dyngs.capture.sfm.photos import Photo, copied, gather_photos, lay_out
+from dyngs.capture.sfm.photos import Photo, copied, gather_photos, prepare_colmap_images
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.images.images import read_header
 from dyngs.data.images.video import (
-    colour_notes,
+    colour_messages,
     frame_seconds,
     probe_video,
     read_frames,
@@ -38,9 +38,9 @@ from dyngs.data.images.video import (
 )
 from dyngs.data.readers.transforms import find_masks, mask_of
 from dyngs.data.times import write_seconds
-from dyngs.io.containment import inside, staying_within
+from dyngs.io.containment import inside, restrict_paths_to
 from dyngs.io.fields import first_few
-from dyngs.io.outputs import new_folder
+from dyngs.io.outputs import atomic_folder
 from dyngs.io.write import write_image
 
 if TYPE_CHECKING:
@@ -187,8 +187,8 @@ def estimate_poses(
     if options.masks is not None and not options.masks.is_dir():
         raise DyngsError(f"no such folder of masks: {options.masks}")
     with (
-        new_folder(out) as capture,
-        staying_within(source, options.follow_links or source.is_file()),
+        atomic_folder(out) as capture,
+        restrict_paths_to(source, options.follow_links or source.is_file()),
     ):
         return _posed_in(capture, source, out, options, report)
 
@@ -206,7 +206,7 @@ def _posed_in(
         raise DyngsError(f"{found}; structure from motion needs at least 3, better 30")
     with quiet_colmap():
         masks = options.masks
-        with nullcontext() if masks is None else staying_within(masks, options.follow_links):
+        with nullcontext() if masks is None else restrict_paths_to(masks, options.follow_links):
             task = _laid_out(capture, photos, source.is_file(), options, report)
         find_features(task)
         match_pairs(task, pairs_to_match(task))
@@ -251,7 +251,7 @@ def _laid_out(
         raise DyngsError(
             f"{options.masks}: no mask is named as an image is (a.jpg.png, a.jpg or a.png for a.jpg)"
         )
-    names = lay_out(photos, folder, work / "images", masks)
+    names = prepare_colmap_images(photos, folder, work / "images", masks)
     for name, mask in masks.items():
         copied(inside(mask).resolve(), folder.with_name("masks") / (name + mask.suffix))
     used = work / "masks" if masks else None
@@ -333,7 +333,7 @@ def _frames_of(
     seconds = frame_seconds(video, len(measures))
     write_seconds(capture, {name: seconds[index] for index, name in names.items()})
     notes = [
-        *colour_notes([probe_video(video)]),
+        *colour_messages([probe_video(video)]),
         f"{len(numbers)} of {len(measures)} frames taken, by motion and sharpness",
     ]
     return photos, notes, [names[index] for index in blurred]

@@ -145,7 +145,7 @@ side."""
 SAMPLES = 16  # images that are compared with the median one
 
 
-def displaced_by(small: np.ndarray) -> float:
+def camera_displacement(small: np.ndarray) -> float:
     """Return how far the small images (F, h, w) of a video are displaced against their median, in
     fractions of the longer side; see ``STANDS``.
 

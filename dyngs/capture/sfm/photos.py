@@ -20,7 +20,7 @@ from dyngs.data.images.images import (
     SUFFIXES,
     ImageHeader,
     check_image,
-    is_lying,
+    is_rotated_sideways,
     read_header,
     read_image,
     read_mask,
@@ -53,7 +53,7 @@ class Photo:
     source: str = ""
 
 
-def photos_below(folder: Path) -> list[Path]:
+def list_photos(folder: Path) -> list[Path]:
     """Return all photos below the folder, sorted; hidden files and folders are left out."""
     return [path for path in _files_below(folder) if path.suffix.lower() in PHOTO_SUFFIXES]
 
@@ -65,7 +65,7 @@ def digest_of(source: Path, files: Sequence[Path] | None = None) -> str:
     Of a video, or of ``files`` of a folder, None: all photos below it.
     """
     digest = hashlib.sha256()
-    for path in files or ([source] if source.is_file() else photos_below(source)):
+    for path in files or ([source] if source.is_file() else list_photos(source)):
         with wrap_read_errors(path):
             status = path.stat()
             digest.update(os.fsencode(path.relative_to(source.parent)))
@@ -125,7 +125,7 @@ def copied(source: Path, target: Path) -> None:
         shutil.copyfile(source, temporary)
 
 
-def lay_out(
+def prepare_colmap_images(
     photos: list[Photo], stored_in: Path, images: Path, masks: dict[str, Path]
 ) -> list[str]:
     """Write upright images under plain names into ``images`` for COLMAP, masks next to; return the
@@ -138,7 +138,7 @@ def lay_out(
     images.mkdir(exist_ok=True)
     for index, photo in enumerate(photos):
         stored = stored_in / photo.name
-        lies = is_lying(photo.header.orientation) and photo.header.upright_size != photo.header.size
+        lies = is_rotated_sideways(photo.header.orientation) and photo.header.upright_size != photo.header.size
         is_written = lies or photo.header.format_name not in _FOR_COLMAP
         name = f"{index:06d}" + (".png" if is_written else _FOR_COLMAP[photo.header.format_name])
         names.append(name)

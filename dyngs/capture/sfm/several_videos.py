@@ -29,24 +29,24 @@ from dyngs.capture.sfm.colmap import (
     matching_options,
     quiet_colmap,
 )
-from dyngs.capture.sfm.frame_choice import STANDS, displaced_by, shrunk
+from dyngs.capture.sfm.frame_choice import STANDS, camera_displacement, shrunk
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.images.video import (
     VideoInfo,
-    colour_notes,
+    colour_messages,
     frame_seconds,
-    opened_video,
+    open_video_container,
     probe_video,
     read_numbered_frames,
-    videos_in,
+    list_videos,
 )
 from dyngs.data.readers.camera_folders import MIN_CAMERAS_TO_HOLD_OUT
 from dyngs.data.readers.colmap import TEST_LIST
 from dyngs.data.times import evenly_spaced, write_seconds
-from dyngs.io.containment import inside, staying_within
+from dyngs.io.containment import inside, restrict_paths_to
 from dyngs.io.fields import first_few, is_number, read_json_object
-from dyngs.io.outputs import new_folder
+from dyngs.io.outputs import atomic_folder
 from dyngs.io.write import write_image, write_text
 
 if TYPE_CHECKING:
@@ -103,19 +103,19 @@ def poses_of_videos(
         source: a folder with two videos or more, and ``videos.json`` if something is known.
         out: a folder that does not exist, or is empty.
     """
-    with new_folder(out) as work, staying_within(source, options.follow_links):
-        videos = [open_video(inside(path)) for path in videos_in(source)]
+    with atomic_folder(out) as work, restrict_paths_to(source, options.follow_links):
+        videos = [open_video(inside(path)) for path in list_videos(source)]
         names = [video.name for video in videos]
         if len(videos) < 2:
             raise DyngsError(
                 f"{source}: holds {len(videos)} videos, two or more are needed; give one video as the file itself"
             )
-        starts, test = read_given(source, names)
-        lines = colour_notes(video.info for video in videos)
+        starts, test = read_video_settings(source, names)
+        lines = colour_messages(video.info for video in videos)
         images, line = _static_images(source, videos, report)
         lines.append(line)
         if starts is None:
-            starts, line = starts_by_sound(videos)
+            starts, line = estimate_starts_by_sound(videos)
         else:
             line = f"offsets between the cameras as given: {_described(starts)}"
         lines.append(line)
@@ -147,7 +147,7 @@ def poses_of_videos(
 # What is known beforehand
 
 
-def read_given(
+def read_video_settings(
     folder: Path, names: Sequence[str]
 ) -> tuple[dict[str, float] | None, list[str] | None]:
     """Return when the videos begin, by camera, in one clock, and the cameras for testing; None: not
@@ -201,7 +201,7 @@ WHOLE = 0.2  # offsets so near to whole frames, in frames, are taken as whole
 MAX_RATE = 60.0  # frames per second
 
 
-def starts_by_sound(videos: Sequence[CameraVideo]) -> tuple[dict[str, float], str]:
+def estimate_starts_by_sound(videos: Sequence[CameraVideo]) -> tuple[dict[str, float], str]:
     """Estimate the seconds at which videos begin, by name, the earliest at 0, from their sound;
     with a line on how sure they are.
 
@@ -218,7 +218,7 @@ def starts_by_sound(videos: Sequence[CameraVideo]) -> tuple[dict[str, float], st
     # of the second signal of a pair against the first one
     samples, peaks, deviations = np.zeros((3, count, count))
     for i, j in combinations(range(count), 2):
-        samples[i, j], peaks[i, j], deviations[i, j] = shift_of(sounds[i], sounds[j])
+        samples[i, j], peaks[i, j], deviations[i, j] = estimate_shift(sounds[i], sounds[j])
     samples -= samples.T
     peaks += peaks.T
     middle = int(peaks.sum(axis=0).argmax())
@@ -249,7 +249,7 @@ def _unknown(videos: Sequence[CameraVideo], reason: str) -> DyngsError:
     )
 
 
-def shift_of(a: np.ndarray, b: np.ndarray) -> tuple[int, float, float]:
+def estimate_shift(a: np.ndarray, b: np.ndarray) -> tuple[int, float, float]:
     """Return the shift of the highest correlation of two signals (T, B) of one rate, in samples:
     time of ``b`` plus the shift is time of ``a``; that correlation, 0 if it is low or not alone;
     and its height in standard deviations of the others.
@@ -311,7 +311,7 @@ def _samples(path: Path) -> np.ndarray | None:
     lead = 0.0
     with (
         wrap_read_errors(path, "it must be a video; copy or convert it again"),
-        opened_video(path) as container,
+        open_video_container(path) as container,
     ):
         if not container.streams.audio:
             return None
@@ -359,7 +359,7 @@ def _static_images(
         most = max(MEDIAN_BYTES // frame_bytes, 3)
         wanted = evenly_spaced(len(video.seconds), min(MEDIAN_FRAMES, most))
         frames = np.stack([rgb for _, rgb in read_numbered_frames(video.path, wanted)])
-        displaced[video.name] = displaced_by(np.stack([shrunk(rgb) for rgb in frames]))
+        displaced[video.name] = camera_displacement(np.stack([shrunk(rgb) for rgb in frames]))
         frames.sort(axis=0)
         images[video.name] = frames[len(frames) // 2]
         report("what stands, cameras", len(images), len(videos))

@@ -9,14 +9,14 @@ from pathlib import Path
 
 from dyngs.capture.sfm.colmap import SfmOptions
 from dyngs.capture.sfm.estimate import estimate_poses
-from dyngs.capture.sfm.photos import digest_of, photos_below
+from dyngs.capture.sfm.photos import digest_of, list_photos
 from dyngs.capture.sfm.several_videos import VIDEOS_FILE, poses_of_videos
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info, quote_path, wrap_read_errors
-from dyngs.data.images.video import VIDEO_SUFFIXES, videos_in
+from dyngs.data.images.video import VIDEO_SUFFIXES, list_videos
 from dyngs.data.read import is_capture
-from dyngs.io.outputs import command_for, make_once, note_source
+from dyngs.io.outputs import suggest_command, make_once, record_source
 from dyngs.io.write import cache_folder
 
 FEWEST_PHOTOS = 3
@@ -26,7 +26,7 @@ def with_poses(
     data: DataConfig,
     *,
     needs_times: bool = False,
-    say: Callable[[str], None] = log_info,
+    log: Callable[[str], None] = log_info,
     report: ProgressCallback = ignore_progress,
 ) -> DataConfig:
     """Return the options with a capture that has poses as their folder: the same one, unless it has
@@ -44,7 +44,7 @@ def with_poses(
     if not is_unposed(data):
         return data
     source = data.root / "images" if (data.root / "images").is_dir() else data.root
-    videos = videos_in(source) if is_several_videos(source) else []
+    videos = list_videos(source) if is_several_videos(source) else []
     if videos and not needs_times:
         raise DyngsError(
             f"{source}: holds {len(videos)} videos, which a static scene cannot be made of; give `dyngs train dynamic "
@@ -64,17 +64,17 @@ def with_poses(
     folder = cache_folder("poses") / f"{re.sub(r'[^A-Za-z0-9-]', '_', source.stem)[:40]}.{digest}"
 
     def estimate() -> None:
-        say(
+        log(
             f"{source} has no poses; they are estimated first, as by `dyngs data sfm`, into {folder}"
         )
         options = SfmOptions(masks=masks, follow_links=data.follow_links)
         if videos:
-            say(poses_of_videos(source, folder, options, report))
+            log(poses_of_videos(source, folder, options, report))
         else:
-            say(estimate_poses(source, folder, options, report).summary())
+            log(estimate_poses(source, folder, options, report).summary())
 
-    make_once(folder, estimate, say, f"{source} has no poses; those of before are in {folder}")
-    note_source(folder, data.root)
+    make_once(folder, estimate, log, f"{source} has no poses; those of before are in {folder}")
+    record_source(folder, data.root)
     return data.model_copy(update={"root": folder})
 
 
@@ -91,10 +91,10 @@ def is_unposed(data: DataConfig) -> bool:
         return False
     if _holds_photos(root):
         return True
-    videos = videos_in(root)
+    videos = list_videos(root)
     if len(videos) == 1:
         raise DyngsError(f"{root}: holds one video; give that: data.root={quote_path(videos[0])}")
-    photos = [] if videos or command_for(root, captures=False) is not None else photos_below(root)
+    photos = [] if videos or suggest_command(root, captures=False) is not None else list_photos(root)
     if photos:
         raise DyngsError(
             f"{root}: holds {format_count(len(photos), 'photo')} and no cameras; a scene needs "
@@ -106,7 +106,7 @@ def is_unposed(data: DataConfig) -> bool:
 
 def is_several_videos(source: Path) -> bool:
     """Whether ``source`` is a folder of two videos or more, and not of photos."""
-    return source.is_dir() and not _holds_photos(source) and len(videos_in(source)) > 1
+    return source.is_dir() and not _holds_photos(source) and len(list_videos(source)) > 1
 
 
 def is_videos(source: Path) -> bool:
@@ -118,10 +118,10 @@ def is_videos(source: Path) -> bool:
         source.is_dir()
         and not is_capture(source)
         and not _holds_photos(source)
-        and bool(videos_in(source))
+        and bool(list_videos(source))
     )
 
 
 def _holds_photos(folder: Path) -> bool:
     with wrap_read_errors(folder, "choose another folder or change its permissions"):
-        return len(photos_below(folder)) >= FEWEST_PHOTOS
+        return len(list_photos(folder)) >= FEWEST_PHOTOS

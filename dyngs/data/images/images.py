@@ -18,7 +18,7 @@ from dyngs.core.conventions import encode_srgb
 from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.io.containment import check_size, inside, max_decoded_mb
 from dyngs.io.fields import first_few
-from dyngs.io.write import any_text, image_error
+from dyngs.io.write import read_lenient_text, image_error
 
 if TYPE_CHECKING:
     import OpenImageIO
@@ -49,7 +49,7 @@ class ExrLayer:
         return found if len(found) == len(names) else ()
 
 
-def layers_of(parts: Sequence[tuple[str, Sequence[str]]]) -> list[ExrLayer]:
+def list_layers(parts: Sequence[tuple[str, Sequence[str]]]) -> list[ExrLayer]:
     """Return the layers of a file by its parts, (name, names of channels such as ``layer.R``)."""
     layers: dict[tuple[int, str], ExrLayer] = {}
     for number, (part, names) in enumerate(parts):
@@ -61,7 +61,7 @@ def layers_of(parts: Sequence[tuple[str, Sequence[str]]]) -> list[ExrLayer]:
     return list(layers.values())
 
 
-def beauty_pass(layers: Sequence[ExrLayer]) -> ExrLayer | None:
+def find_beauty_pass(layers: Sequence[ExrLayer]) -> ExrLayer | None:
     """Return the beauty pass; None if no layer has such a name, or several have.
 
     Blender's compositor writes ``Composite.Combined`` beside the ``Combined`` of each view layer.
@@ -81,18 +81,18 @@ _FOCAL_RANGE = (0.1, 20.0)
 tag."""
 
 
-def is_lying(orientation: int) -> bool:
+def is_rotated_sideways(orientation: int) -> bool:
     """Whether width and height are exchanged when an image of this orientation is rotated
     upright."""
     return orientation >= 5
 
 
-def rotated_upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+def rotate_upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Return the (H, W, D) image as the orientation of EXIF says it is to be shown; exact."""
     down = orientation in (3, 4, 6, 7)
     across = orientation in (2, 3, 7, 8)
     rotated = pixels[:: -1 if down else 1, :: -1 if across else 1]
-    return np.ascontiguousarray(rotated.swapaxes(0, 1) if is_lying(orientation) else rotated)
+    return np.ascontiguousarray(rotated.swapaxes(0, 1) if is_rotated_sideways(orientation) else rotated)
 
 
 def _focal_px(spec: OpenImageIO.ImageSpec) -> float | None:
@@ -161,9 +161,9 @@ class ImageHeader:
     @property
     def upright_size(self) -> tuple[int, int]:
         """(width, height) when it is shown as its EXIF tag says."""
-        return (self.height, self.width) if is_lying(self.orientation) else self.size
+        return (self.height, self.width) if is_rotated_sideways(self.orientation) else self.size
 
-    def size_for(self, described: tuple[int, int] | None) -> tuple[int, int]:
+    def size_matching(self, described: tuple[int, int] | None) -> tuple[int, int]:
         """Return the stored or the upright (width, height), that which has the shape of a camera's
         ``described`` one.
 
@@ -177,7 +177,7 @@ class ImageHeader:
         return self.upright_size if lies else self.size
 
 
-def files_in(folder: Path, suffixes: Collection[str]) -> list[Path]:
+def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
     """Return the files directly in a folder that end in one of the suffixes, by name; hidden files
     are left out."""
     found = folder.iterdir() if folder.is_dir() else ()
@@ -196,7 +196,7 @@ def read_header(path: Path) -> ImageHeader:
         return header
 
 
-def header_if_readable(path: Path) -> ImageHeader | None:
+def try_read_header(path: Path) -> ImageHeader | None:
     """Read the header of a capture's image; None where it is missing or damaged, which the loader
     reports.
 
@@ -231,8 +231,8 @@ def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool
         is_exact = not header.is_float and not header.is_premultiplied
         kind = oiio.TypeDesc(oiio.UINT8 if is_exact else oiio.FLOAT)
         pixels = _decoded(path, reader, kind)
-        if upright or (size is not None and header.size_for(size) != header.size):
-            pixels = rotated_upright(pixels, header.orientation)
+        if upright or (size is not None and header.size_matching(size) != header.size):
+            pixels = rotate_upright(pixels, header.orientation)
         return torch.as_tensor(np.ascontiguousarray(_straight_srgb(pixels, header)), device="cpu")
 
 
@@ -312,7 +312,7 @@ def area_downscale_uint8(pixels: Tensor, width: int, height: int) -> Tensor:
         last = min(-(-end * old // height), old)
         rows = premultiplied(pixels[first:last])
         part = _shrink_axis(rows, 0, old, height, (begin, end), first)
-        parts.append(straight_uint8(_shrink_axis(part, 1, part.shape[1], width)))
+        parts.append(to_straight_uint8(_shrink_axis(part, 1, part.shape[1], width)))
     return torch.cat(parts)
 
 
@@ -325,7 +325,7 @@ def premultiplied(pixels: Tensor) -> Tensor:
     return scaled
 
 
-def straight_uint8(pixels: Tensor) -> Tensor:
+def to_straight_uint8(pixels: Tensor) -> Tensor:
     """Return (H, W, 3 or 4) uint8 with straight alpha from premultiplied floats; inverse of
     ``premultiplied``."""
     if pixels.shape[-1] == 4:
@@ -363,7 +363,7 @@ def _open(path: Path) -> tuple[OpenImageIO.ImageInput, ImageHeader]:
         orientation=orientation if 1 <= orientation <= 8 else 1,
         focal_px=_focal_px(spec),
         exposure=_exposure(spec),
-        camera=any_text(partial(spec.get_string_attribute, "Model")),
+        camera=read_lenient_text(partial(spec.get_string_attribute, "Model")),
     )
 
 
@@ -391,11 +391,11 @@ def _exr_layer(path: Path, reader: OpenImageIO.ImageInput) -> ExrLayer | None:
         spec = reader.spec()
         # Deep parts hold samples at several depths instead of pixels.
         names = () if spec.deep else spec.channelnames
-        parts.append((any_text(partial(spec.get_string_attribute, "oiio:subimagename")), names))
-    layers = layers_of(parts)
+        parts.append((read_lenient_text(partial(spec.get_string_attribute, "oiio:subimagename")), names))
+    layers = list_layers(parts)
     if not layers:
         raise DyngsError(f"{path}: the image is deep, which dyngs does not read; flatten it")
-    chosen = layers[0] if len(layers) == 1 else beauty_pass(layers)
+    chosen = layers[0] if len(layers) == 1 else find_beauty_pass(layers)
     if chosen is None:
         raise DyngsError(
             f"{path}: which layer is the image is not clear; name one rgba, Combined, C or beauty, or save it alone. "

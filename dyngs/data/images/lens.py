@@ -57,7 +57,7 @@ def distort(lens: Lens, points: Tensor) -> Tensor:
     return distort_points(points.reshape(1, -1, 2), identity, coefficients).reshape(points.shape)
 
 
-def undistorted_points(lens: Lens, intrinsics: np.ndarray, points: Tensor) -> Tensor:
+def undistort_points(lens: Lens, intrinsics: np.ndarray, points: Tensor) -> Tensor:
     """Return the (..., 2) pixel positions in the pinhole image of ``points`` (..., 2) in the
     stored, distorted one.
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.capture import Silhouette, View
 from dyngs.data.images.images import read_image, read_raw
-from dyngs.data.images.lens import LensMap, undistorted_points
+from dyngs.data.images.lens import LensMap, undistort_points
 from dyngs.io.containment import check_size, inside
 from dyngs.io.numpy_files import read_hdf5, read_map
 
@@ -149,10 +149,10 @@ def nearest_positions(width: int, height: int, grid: Tensor | None = None) -> Te
     """
     x, y = ((2 * torch.arange(n, device="cpu") + 1) / n - 1 for n in (width, height))
     positions = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
-    return positions if grid is None else taken_at(grid, positions)
+    return positions if grid is None else sample_nearest(grid, positions)
 
 
-def taken_at(values: Tensor, positions: Tensor) -> Tensor:
+def sample_nearest(values: Tensor, positions: Tensor) -> Tensor:
     """Return the (H, W, D) nearest of the ``values`` (h, w, D) at ``positions`` (H, W, 2) in [-1,
     1]."""
     size = values.new_tensor([values.shape[1], values.shape[0]])
@@ -165,7 +165,7 @@ def resized(flow: Tensor, width: int, height: int) -> Tensor:
     """Return the (height, width, 2) flow of a smaller image, in its pixels, from ``flow`` (H, W,
     2)."""
     scale = flow.new_tensor([width / flow.shape[1], height / flow.shape[0]])
-    return taken_at(flow, nearest_positions(width, height)) * scale
+    return sample_nearest(flow, nearest_positions(width, height)) * scale
 
 
 def flow_at(flow: Tensor, view: View, size: tuple[int, int], lens_map: LensMap | None) -> Tensor:
@@ -180,5 +180,5 @@ def flow_at(flow: Tensor, view: View, size: tuple[int, int], lens_map: LensMap |
     stored = flow.new_tensor([view.width, view.height])
     start = (nearest_positions(view.width, view.height) + 1) / 2 * stored
     at = (lens_map.grid + 1) / 2 * stored
-    end = undistorted_points(view.lens, view.intrinsics, at + taken_at(flow, lens_map.grid))
+    end = undistort_points(view.lens, view.intrinsics, at + sample_nearest(flow, lens_map.grid))
     return resized(torch.where(lens_map.valid[..., None], end - start, torch.nan), *size)

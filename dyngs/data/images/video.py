@@ -23,7 +23,7 @@ import numpy as np
 from dyngs.core.conventions import decode_srgb, encode_srgb
 from dyngs.core.errors import DyngsError, describe_error, format_count, wrap_read_errors
 from dyngs.data.capture import VideoFrame
-from dyngs.data.images.images import files_in, rotated_upright
+from dyngs.data.images.images import list_files, rotate_upright
 from dyngs.io.containment import allowed, check_size, inside, require_at_most
 from dyngs.io.fields import read_limited
 from dyngs.io.outputs import VIDEO_SUFFIXES as VIDEO_SUFFIXES
@@ -157,7 +157,7 @@ DECODER_VERSION = b"2"
 """Changes when frames are converted in another way, so that frames cached before are not used."""
 _FULL_RANGE = 2  # FFmpeg's number of a range from 0 to the largest level
 BT709_MATRIX, BT601_MATRIX, BT2020_MATRIX = 1, 5, 9
-KNOWN_MATRICES = (0, BT709_MATRIX, UNSPECIFIED, 4, BT601_MATRIX, 6, 7, BT2020_MATRIX, 10)
+SUPPORTED_MATRICES = (0, BT709_MATRIX, UNSPECIFIED, 4, BT601_MATRIX, 6, 7, BT2020_MATRIX, 10)
 """Matrices of ITU-T H.273 that swscale converts from; the others are YCgCo, ICtCp and the like."""
 
 
@@ -175,13 +175,13 @@ class VideoInfo:
     colours: str = ""
 
 
-def videos_in(folder: Path) -> list[Path]:
+def list_videos(folder: Path) -> list[Path]:
     """Return the videos directly in a folder, by name; hidden files are left out.
 
     Raises DyngsError: two with the same name but for the suffix.
     """
     with wrap_read_errors(folder, "choose another folder or change its permissions"):
-        videos = files_in(folder, VIDEO_SUFFIXES)
+        videos = list_files(folder, VIDEO_SUFFIXES)
     names: dict[str, Path] = {}
     for path in videos:
         if names.setdefault(path.stem, path) != path:
@@ -229,7 +229,7 @@ def probe_video(path: Path) -> VideoInfo:
         raise _broken(path, 0, "it holds no image")
     _, first, tags = decoded
     height, width = _rotated_rgb(path, first, tags).shape[:2]
-    with _reading(path), opened_video(path) as container:
+    with _reading(path), open_video_container(path) as container:
         stream = container.streams.video[0]
         fps = float(stream.average_rate or 0)
         hidden = [packet.is_discard for packet in _packets(container)]
@@ -246,7 +246,7 @@ def probe_video(path: Path) -> VideoInfo:
     return VideoInfo(width, height, count, fps if math.isfinite(fps) else 0.0, note)
 
 
-def colour_notes(videos: Iterable[VideoInfo]) -> list[str]:
+def colour_messages(videos: Iterable[VideoInfo]) -> list[str]:
     """Return a line for each of the different ``VideoInfo.colours`` of the videos of a capture."""
     counts = Counter(video.colours for video in videos if video.colours)
     return [f"{format_count(count, 'video')}: {note}" for note, count in counts.items()]
@@ -260,7 +260,7 @@ def frame_seconds(path: Path, num_frames: int) -> list[float]:
     too few, the mean rate does, and 30 frames per second where the file names none either.
     """
     stamps: list[float] = []
-    with _reading(path), opened_video(path) as container:
+    with _reading(path), open_video_container(path) as container:
         fps = float(container.streams.video[0].average_rate or 0) or 30.0
         for packet in _packets(container):
             if not packet.is_discard and packet.pts is not None and packet.time_base:
@@ -297,7 +297,7 @@ def _decoded(
     index = 0
     with _reading(path):
         try:
-            with opened_video(path) as container:
+            with open_video_container(path) as container:
                 stream = container.streams.video[0]
                 stream.thread_type = threads
                 # Decoders of HEVC and ProRes overwrite what the container says, even by
@@ -317,7 +317,7 @@ def _decoded(
 
 
 @contextmanager
-def opened_video(path: Path) -> Iterator[InputContainer]:
+def open_video_container(path: Path) -> Iterator[InputContainer]:
     """Open the file for PyAV, which must contain the video itself: playlists, which name other
     files, are refused.
 
@@ -382,7 +382,7 @@ def _matrix_of(frame: av.VideoFrame, tags: ColourTags) -> int:
 
 def _rotated_rgb(path: Path, frame: av.VideoFrame, tags: ColourTags) -> np.ndarray:
     matrix = _matrix_of(frame, tags)
-    if matrix not in KNOWN_MATRICES:  # as that of Dolby Vision without a base layer
+    if matrix not in SUPPORTED_MATRICES:  # as that of Dolby Vision without a base layer
         raise DyngsError(
             f"{path}: its colours have the matrix {matrix} of ITU-T H.273, which dyngs cannot convert; "
             "export the video as SDR, HLG or HDR10"
@@ -408,7 +408,7 @@ def _rotated_rgb(path: Path, frame: av.VideoFrame, tags: ColourTags) -> np.ndarr
                 else convert(format="rgb24") * np.uint16(white // 255)
             )
             rgb = to_srgb(wide, tags, white)
-        return rotated_upright(rgb, orientation_of(frame))
+        return rotate_upright(rgb, orientation_of(frame))
 
 
 # Cache of frames as image files, found again by the content of the video
@@ -429,7 +429,7 @@ class VideoFrames:
     paths: tuple[Path, ...]
 
 
-def planned_frames(video: Path) -> VideoFrames:
+def locate_cached_frames(video: Path) -> VideoFrames:
     """Return the frames of ``video`` and where they are cached; nothing is written.
 
     They lie in ``CACHE/frames/NAME.DIGEST/frame_000000.png`` and so on; ``video.json`` next to them

@@ -14,11 +14,11 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, CaptureFormat, Splits, VideoFrame, View
 from dyngs.data.geometry import (
     OPENGL_FROM_OPENCV,
-    checked_pose,
-    opengl_from_cam,
+    validate_pose,
+    to_opengl_pose,
 )
-from dyngs.data.images.images import SUFFIXES, files_in
-from dyngs.data.images.video import VideoFrames, colour_notes, planned_frames, videos_in
+from dyngs.data.images.images import SUFFIXES, list_files
+from dyngs.data.images.video import VideoFrames, colour_messages, locate_cached_frames, list_videos
 from dyngs.data.readers.transforms import MAX_FPS, FrameEntry, FrameFile, read_views
 from dyngs.io.fields import first_few, is_number, matrix_of, read_json_object
 from dyngs.io.numpy_files import read_npy
@@ -44,10 +44,10 @@ def find_cameras(root: Path) -> dict[str, Path]:
     Images lie in the folder itself or in ``images`` below it. Raises DyngsError: two videos for one
     camera.
     """
-    found = {path.stem: path for path in videos_in(root)}
+    found = {path.stem: path for path in list_videos(root)}
     for path in sorted(root.iterdir()):
         if path.is_dir() and not path.name.startswith("."):
-            folder = next((f for f in (path, path / "images") if files_in(f, SUFFIXES)), None)
+            folder = next((f for f in (path, path / "images") if list_files(f, SUFFIXES)), None)
             if folder is not None:
                 found[path.name] = folder
     return dict(sorted(found.items()))
@@ -60,10 +60,10 @@ def open_camera(name: str, path: Path) -> CameraSource:
     opened.
     """
     if path.is_file():
-        planned = planned_frames(path)
+        planned = locate_cached_frames(path)
         return CameraSource(name, dict(enumerate(planned.paths)), planned)
     images: dict[int, Path] = {}
-    for image in files_in(path, SUFFIXES):
+    for image in list_files(path, SUFFIXES):
         digits = re.findall(r"\d+", image.stem)
         if not digits:
             raise DyngsError(
@@ -92,7 +92,7 @@ def sequence_views(
     numbers = sorted({number for camera in cameras for number in camera.images})
     span = max(numbers[-1] - numbers[0], 1)
     views: dict[str, tuple[View, ...]] = {}
-    warnings = colour_notes(camera.video.info for camera in cameras if camera.video is not None)
+    warnings = colour_messages(camera.video.info for camera in cameras if camera.video is not None)
     for index, camera in enumerate(cameras):
         own = calibrations[camera.name]
         where = f"{path}, camera {camera.name}"
@@ -190,8 +190,8 @@ def _calibration(value: object, where: str) -> dict[str, object]:
         )
     if "cam_from_world" not in own:
         return own
-    pose, _ = checked_pose(matrix_of(where, "cam_from_world", own.pop("cam_from_world")), where)
-    own["transform_matrix"] = opengl_from_cam(pose).tolist()
+    pose, _ = validate_pose(matrix_of(where, "cam_from_world", own.pop("cam_from_world")), where)
+    own["transform_matrix"] = to_opengl_pose(pose).tolist()
     return own
 
 

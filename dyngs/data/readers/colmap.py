@@ -18,18 +18,18 @@ from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.capture import Capture, CaptureFormat, Lens, PointCloud, Splits, View
 from dyngs.data.geometry import (
     ROTATION_TOLERANCE,
-    checked_pose,
-    match_size,
+    validate_pose,
+    match_intrinsics_to_image,
     pinhole_matrix,
     repair_warning,
     rescale_warning,
 )
-from dyngs.data.images.images import header_if_readable
-from dyngs.data.readers.transforms import find_masks, mask_of, unmasked_warning, view_name
+from dyngs.data.images.images import try_read_header
+from dyngs.data.readers.transforms import find_masks, mask_of, missing_mask_warning, view_name
 from dyngs.data.times import read_seconds
 from dyngs.io.containment import inside
 from dyngs.io.fields import open_text, read_text
-from dyngs.io.find import FileFinder, folded, images_folder
+from dyngs.io.find import FileFinder, normalize_name, images_folder
 
 NUM_PARAMS = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
@@ -288,9 +288,9 @@ def read_colmap(root: Path) -> Capture:
         where = f"{folder}, image {image.name}"
         camera = cameras[image.camera]
         intrinsics, lens = pinhole_and_lens(camera, where)
-        header = header_if_readable(path)
-        stored = None if header is None else header.size_for(camera.size)
-        intrinsics, size, changed = match_size(intrinsics, camera.size, stored, where)
+        header = try_read_header(path)
+        stored = None if header is None else header.size_matching(camera.size)
+        intrinsics, size, changed = match_intrinsics_to_image(intrinsics, camera.size, stored, where)
         if changed:
             rescaled.append(where)
         view = View(view_name(path, images), path, pose, intrinsics, *size, lens, image.camera)
@@ -302,7 +302,7 @@ def read_colmap(root: Path) -> Capture:
     warnings += [
         *repair_warning(repaired),
         *rescale_warning(rescaled),
-        *unmasked_warning(views, bool(masks)),
+        *missing_mask_warning(views, bool(masks)),
     ]
     splits, notes = _splits(folder, [image.name for image in listed], views)
     cloud = points if len(points.xyz) else None
@@ -336,7 +336,7 @@ def _poses(folder: Path, images: list[ModelImage]) -> tuple[list[np.ndarray], di
                 f"{where}: the quaternion of its rotation has length {length:.6g}, not 1; export it again"
             )
         rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
-        pose, repaired[where] = checked_pose(np.column_stack([rotation, translation]), where)
+        pose, repaired[where] = validate_pose(np.column_stack([rotation, translation]), where)
         poses.append(pose)
     return poses, repaired
 
@@ -372,8 +372,8 @@ def _splits(folder: Path, names: list[str], views: list[View]) -> tuple[Splits, 
         return {"train": tuple(views)}, []
     with wrap_read_errors(path, "it must list names of images, a line each; repair or remove it"):
         text = read_text(path)
-    listed = {folded(line.strip()) for line in text.splitlines() if line.strip()}
-    unknown = sorted(listed - set(map(folded, names)))
+    listed = {normalize_name(line.strip()) for line in text.splitlines() if line.strip()}
+    unknown = sorted(listed - set(map(normalize_name, names)))
     notes = (
         [f"{path}: {len(unknown)} listed images have no pose, first {unknown[0]:.80}"]
         if unknown
@@ -381,7 +381,7 @@ def _splits(folder: Path, names: list[str], views: list[View]) -> tuple[Splits, 
     )
     splits: Splits = {"train": (), "test": ()}
     for name, view in zip(names, views, strict=True):
-        splits["test" if folded(name) in listed else "train"] += (view,)
+        splits["test" if normalize_name(name) in listed else "train"] += (view,)
     return splits if splits["test"] else {"train": splits["train"]}, notes
 
 

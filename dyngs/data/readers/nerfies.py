@@ -13,9 +13,9 @@ import numpy as np
 from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.capture import Capture, CaptureFormat, PointCloud, Splits
 from dyngs.data.geometry import OPENGL_FROM_OPENCV
-from dyngs.data.images.images import SUFFIXES, files_in
+from dyngs.data.images.images import SUFFIXES, list_files
 from dyngs.data.readers.transforms import FrameEntry, FrameFile, read_views
-from dyngs.io.fields import entry, numbers_of, read_json_object
+from dyngs.io.fields import entry, parse_numbers, read_json_object
 from dyngs.io.numpy_files import read_npy
 
 
@@ -95,14 +95,14 @@ def _metadata(path: Path, names: list[str]) -> dict[str, dict[str, Any]]:
 
 
 def _numbers(path: Path, fields: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray:
-    return numbers_of(f"{path}: '{key}'", entry(path, fields, key), shape)
+    return parse_numbers(f"{path}: '{key}'", entry(path, fields, key), shape)
 
 
 def _image_folder(root: Path) -> Path:
     """Return the folder of the largest images: ``1x`` if it holds any, else ``2x`` and so on."""
     found = [path for path in root.glob("*x") if re.fullmatch(r"[1-9]\d{0,3}x", path.name)]
     for folder in sorted(found, key=lambda path: int(path.name[:-1])):
-        if files_in(folder, SUFFIXES):
+        if list_files(folder, SUFFIXES):
             return folder
     raise DyngsError(f"{root}: no images in 1x, 2x, 4x or the like; restore one of these folders")
 

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from dyngs.core.errors import DyngsError, wrap_read_errors
-from dyngs.data.body_frames import body_frames, number_in_name, of_one_clip
+from dyngs.data.body_frames import body_frames, parse_frame_number, share_body_across_splits
 from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette, Splits, View
-from dyngs.data.geometry import checked_pose
+from dyngs.data.geometry import validate_pose
 from dyngs.data.readers.colmap import is_colmap, read_colmap
 from dyngs.data.readers.transforms import SPLITS
 from dyngs.io.containment import inside
-from dyngs.io.fields import entry, first_few, numbers_of, read_limited
+from dyngs.io.fields import entry, first_few, parse_numbers, read_limited
 from dyngs.io.numpy_files import read_npz
 from dyngs.io.pickles import read_pickle, read_pickled_array
 
@@ -39,7 +39,7 @@ def read_neuman(root: Path) -> Capture:
     capture = read_colmap(root)
     posed = sorted(capture.splits["train"], key=lambda view: view.image_path.name)
     names = [view.image_path.name for view in posed]
-    numbers = [number_in_name(root / "images", name) for name in names]
+    numbers = [parse_frame_number(root / "images", name) for name in names]
     first = min(numbers, default=0)
     last = max(numbers, default=0)
     people: dict[str, View] = {}
@@ -68,7 +68,7 @@ def read_neuman(root: Path) -> Capture:
     splits, more = _splits(root, people)
     warnings = (*capture.warnings, *notes, *more)
     return capture.replace(
-        format="neuman", splits=splits, body=of_one_clip(body), warnings=warnings
+        format="neuman", splits=splits, body=share_body_across_splits(body), warnings=warnings
     )
 
 
@@ -89,12 +89,12 @@ def _fitted(root: Path, names: list[str], numbers: list[int]) -> BodyFrames:
     trans = []
     for name in names:
         where = f"{root / ALIGNMENTS}, {name}"
-        matrix = numbers_of(where, entry(root / ALIGNMENTS, alignments, name), (4, 3)).T
+        matrix = parse_numbers(where, entry(root / ALIGNMENTS, alignments, name), (4, 3)).T
         scale = float(np.cbrt(np.linalg.det(matrix[:, :3])))
         if scale <= 0:
             raise DyngsError(f"{where}: the alignment is no similarity; export it again")
         rigid = np.concatenate([matrix[:, :3] / scale, matrix[:, 3:]], axis=1)
-        pose, _ = checked_pose(rigid, where)
+        pose, _ = validate_pose(rigid, where)
         scales.append(scale)
         turns.append(Rotation.from_matrix(pose[:3, :3]).as_rotvec())
         trans.append(pose[:3, 3])

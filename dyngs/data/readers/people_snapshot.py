@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.core.errors import DyngsError
-from dyngs.data.body_frames import body_frames, of_one_clip
+from dyngs.data.body_frames import body_frames, share_body_across_splits
 from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette
-from dyngs.data.geometry import opengl_from_cam
-from dyngs.data.images.images import files_in
+from dyngs.data.geometry import to_opengl_pose
+from dyngs.data.images.images import list_files
 from dyngs.data.images.maps import MASKS
 from dyngs.data.images.video import VIDEO_SUFFIXES
 from dyngs.data.readers.camera_folders import open_camera, sequence_views, video_fps
 from dyngs.io.containment import inside
-from dyngs.io.fields import entry, numbers_of
+from dyngs.io.fields import entry, parse_numbers
 from dyngs.io.numpy_files import hdf5_length, read_hdf5
 from dyngs.io.pickles import read_pickle
 
@@ -56,7 +56,7 @@ def read_people_snapshot(root: Path) -> Capture:
         warnings.append(
             f"{video.name}: {lost} of {len(camera.images)} frames lack a mask or a pose and are left out"
         )
-    own = of_one_clip(body)
+    own = share_body_across_splits(body)
     fps = video_fps([camera])
     lines = tuple(warnings)
     return Capture(root, "people_snapshot", {"train": people}, fps=fps, body=own, warnings=lines)
@@ -64,7 +64,7 @@ def read_people_snapshot(root: Path) -> Capture:
 
 def _video(root: Path) -> Path:
     """Find the only video of the folder, or the one named like the folder."""
-    found = files_in(root, VIDEO_SUFFIXES)
+    found = list_files(root, VIDEO_SUFFIXES)
     named = [path for path in found if path.stem == root.resolve().name] or found
     if len(named) != 1:
         what = f"{len(found)} videos" if found else "no video"
@@ -78,7 +78,7 @@ def _calibration(path: Path) -> dict[str, object]:
     fields = read_pickle(inside(path))
 
     def numbers(key: str, count: int) -> np.ndarray:
-        return numbers_of(f"{path}: '{key}'", entry(path, fields, key), (count,))
+        return parse_numbers(f"{path}: '{key}'", entry(path, fields, key), (count,))
 
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_rotvec(numbers("camera_rt", 3)).as_matrix()
@@ -87,7 +87,7 @@ def _calibration(path: Path) -> dict[str, object]:
     values = [x for key, count in counts.items() for x in numbers(key, count).tolist()]
     keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "w", "h")
     own = dict(zip(keys, values, strict=True))
-    return own | {"transform_matrix": opengl_from_cam(pose).tolist()}
+    return own | {"transform_matrix": to_opengl_pose(pose).tolist()}
 
 
 def _body(path: Path) -> BodyFrames:

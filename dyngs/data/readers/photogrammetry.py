@@ -15,11 +15,11 @@ import numpy as np
 
 from dyngs.core.errors import DyngsError, format_count, wrap_read_errors
 from dyngs.data.capture import Capture, CaptureFormat, PointCloud
-from dyngs.data.geometry import OPENGL_FROM_OPENCV, opengl_from_cam
-from dyngs.data.images.images import SUFFIXES, files_in, read_header
+from dyngs.data.geometry import OPENGL_FROM_OPENCV, to_opengl_pose
+from dyngs.data.images.images import SUFFIXES, list_files, read_header
 from dyngs.data.readers.transforms import FrameEntry, FrameFile, training_capture
 from dyngs.io.containment import inside
-from dyngs.io.fields import entry, first_few, numbers_of, read_json_object
+from dyngs.io.fields import entry, first_few, parse_numbers, read_json_object
 
 _HEAD_BYTES = 4096
 _ADVICE = "export it again"
@@ -78,7 +78,7 @@ def _capture(
 def _exports(root: Path, suffix: str, mark: bytes) -> list[Path]:
     """Return the files of a program: those with ``mark`` in their beginning."""
     found: list[Path] = []
-    for path in files_in(root, (suffix,)):
+    for path in list_files(root, (suffix,)):
         with path.open("rb") as file:
             if mark in file.read(_HEAD_BYTES):
                 found.append(path)
@@ -294,7 +294,7 @@ def read_odm(root: Path) -> Capture:
                 for point in model.get("points", {}).values()
             ]
             if listed:
-                table = numbers_of(f"{path}: points", listed, (len(listed), 6))
+                table = parse_numbers(f"{path}: points", listed, (len(listed), 6))
                 points = PointCloud(table[:, :3], table[:, 3:].clip(0, 255).astype(np.uint8))
         else:
             lenses = json.loads(inside(root / "cameras.json").read_text(encoding="utf-8-sig"))
@@ -342,7 +342,7 @@ def _odm_camera(path: Path, name: str, shot: _Fields, lenses: dict[str, _Fields]
     pose[:3, 3] = shot["translation"]
     if path.suffix == ".geojson":
         pose[:3, 3] = -pose[:3, :3] @ pose[:3, 3]
-    return {**own, **distortion, "transform_matrix": opengl_from_cam(pose).tolist()}
+    return {**own, **distortion, "transform_matrix": to_opengl_pose(pose).tolist()}
 
 
 ODM_FORMAT = CaptureFormat(
@@ -376,7 +376,7 @@ def read_polycam(root: Path) -> Capture:
     """
     images, cameras = _existing(root, _POLYCAM)[0]
     frames: list[FrameEntry] = []
-    for image in files_in(images, SUFFIXES):
+    for image in list_files(images, SUFFIXES):
         path = cameras / f"{image.stem}.json"
         fields = read_json_object(path)
         own: dict[str, object] = {
@@ -401,7 +401,7 @@ def _existing(root: Path, places: Sequence[tuple[str, str]]) -> list[tuple[Path,
     return [
         (images, cameras)
         for images, cameras in pairs
-        if cameras.exists() and files_in(images, SUFFIXES)
+        if cameras.exists() and list_files(images, SUFFIXES)
     ]
 
 
@@ -424,14 +424,14 @@ def read_record3d(root: Path) -> Capture:
 
     images, path = _existing(root, _RECORD3D)[0]
     fields = read_json_object(path)
-    poses = numbers_of(f"{path}: poses", entry(path, fields, "poses"), None).reshape(-1, 7)
-    fx, _, _, _, fy, _, cx, cy, _ = numbers_of(f"{path}: K", entry(path, fields, "K"), (9,))
+    poses = parse_numbers(f"{path}: poses", entry(path, fields, "poses"), None).reshape(-1, 7)
+    fx, _, _, _, fy, _, cx, cy, _ = parse_numbers(f"{path}: K", entry(path, fields, "K"), (9,))
     lenses = np.tile((fx, fy, cx, cy), (len(poses), 1))
     own_lenses = fields.get("perFrameIntrinsicCoeffs")
     if own_lenses:
-        lenses = numbers_of(f"{path}: perFrameIntrinsicCoeffs", own_lenses, (len(poses), 4))
+        lenses = parse_numbers(f"{path}: perFrameIntrinsicCoeffs", own_lenses, (len(poses), 4))
     frames: list[FrameEntry] = []
-    for image in files_in(images, SUFFIXES):
+    for image in list_files(images, SUFFIXES):
         if not image.stem.isdecimal():  # a copy, such as "12(1).jpg"
             continue
         number = int(image.stem)

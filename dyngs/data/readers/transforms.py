@@ -27,21 +27,21 @@ from dyngs.data.capture import (
     VideoFrame,
     View,
     all_views,
-    each_view,
+    map_views,
 )
 from dyngs.data.geometry import (
     MAX_SIDE,
-    cam_from_opengl,
-    checked_pose,
-    match_size,
+    from_opengl_pose,
+    validate_pose,
+    match_intrinsics_to_image,
     pinhole_matrix,
     repair_warning,
     rescale_warning,
 )
-from dyngs.data.images.images import SUFFIXES, ImageHeader, header_if_readable, read_header
+from dyngs.data.images.images import SUFFIXES, ImageHeader, try_read_header, read_header
 from dyngs.io.containment import inside
 from dyngs.io.fields import is_number, matrix_of, read_json_object
-from dyngs.io.find import FileFinder, folded
+from dyngs.io.find import FileFinder, normalize_name
 
 GREY = 128
 _NAMES = (
@@ -174,7 +174,7 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
             f"{file.path}: {twice[0]} is listed more than once; remove the duplicate frames"
         )
     headers = [
-        header_if_readable(path) if frame.video is None else None
+        try_read_header(path) if frame.video is None else None
         for frame, path in zip(file.frames, paths, strict=True)
     ]
     # images without a size of their own share the focal length of the file
@@ -213,17 +213,17 @@ def _view(
     """Return a view, by how much its rotation was repaired, and whether its intrinsics were
     rescaled."""
     described = _described_size(frame)
-    stored = header.size_for(described) if header else frame.stored
+    stored = header.size_matching(described) if header else frame.stored
     described = described or stored or common
     if described is None:
         described = read_header(path).upright_size  # raises the error
-    intrinsics, size, rescaled = match_size(
+    intrinsics, size, rescaled = match_intrinsics_to_image(
         _intrinsics(frame, *described), described, stored, frame.where
     )
     if frame.own.get("transform_matrix") is None:
         raise DyngsError(f"{frame.where}: the key 'transform_matrix' is missing")
     matrix = matrix_of(frame.where, "transform_matrix", frame.own["transform_matrix"])
-    pose, error = checked_pose(matrix, frame.where)
+    pose, error = validate_pose(matrix, frame.where)
     motion_mask = _named_file(files, frame, "motion_mask_path")
     labels = _named_file(files, frame, "instance_mask_path")
     silhouette = _named_file(files, frame, "silhouette_path")
@@ -231,7 +231,7 @@ def _view(
     view = View(
         name=view_name(path, files.root),
         image_path=path,
-        cam_from_world=cam_from_opengl(pose),
+        cam_from_world=from_opengl_pose(pose),
         intrinsics=intrinsics,
         width=size[0],
         height=size[1],
@@ -435,8 +435,8 @@ def find_masks(folder: Path) -> dict[str, Path]:
     for path in sorted(inside(folder).rglob("*")) if folder.is_dir() else ():
         if path.suffix.lower() in SUFFIXES:
             relative = path.relative_to(folder)
-            found[folded(relative.as_posix())] = path
-            found.setdefault(folded(relative.with_suffix("").as_posix()), path)
+            found[normalize_name(relative.as_posix())] = path
+            found.setdefault(normalize_name(relative.with_suffix("").as_posix()), path)
     return found
 
 
@@ -445,10 +445,10 @@ def mask_of(image_name: str, masks: Mapping[str, Path]) -> Path | None:
     ``a/b.mask.png``."""
     stem = image_name.rpartition(".")[0]
     names = (f"{image_name}.png", image_name, stem, f"{stem}.mask")
-    return next((masks[key] for name in names if (key := folded(name)) in masks), None)
+    return next((masks[key] for name in names if (key := normalize_name(name)) in masks), None)
 
 
-def unmasked_warning(views: list[View], has_masks: bool) -> list[str]:
+def missing_mask_warning(views: list[View], has_masks: bool) -> list[str]:
     """Return a line about the images that have no mask although others have, none if there are
     none."""
     without = [view.name for view in views if view.mask_path is None]
@@ -497,8 +497,8 @@ def _with_masks(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
         )
         return replace(view, mask_path=next(filter(None, found), None))
 
-    splits = each_view(splits, with_mask)
-    return splits, unmasked_warning(all_views(splits), bool(masks))
+    splits = map_views(splits, with_mask)
+    return splits, missing_mask_warning(all_views(splits), bool(masks))
 
 
 def _capture_of(

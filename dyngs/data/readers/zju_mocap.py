@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from dyngs.core.errors import DyngsError, wrap_read_errors
-from dyngs.data.body_frames import body_frames, number_in_name, of_one_clip, rows_of
+from dyngs.data.body_frames import body_frames, parse_frame_number, share_body_across_splits, rows_of
 from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette, Splits
-from dyngs.data.geometry import checked_pose, opengl_from_cam
+from dyngs.data.geometry import validate_pose, to_opengl_pose
 from dyngs.data.readers.camera_folders import MIN_CAMERAS_TO_HOLD_OUT
 from dyngs.data.readers.transforms import FrameEntry, FrameFile, read_views
 from dyngs.io.containment import inside
-from dyngs.io.fields import entry, numbers_of
+from dyngs.io.fields import entry, parse_numbers
 from dyngs.io.pickles import read_pickle, read_pickled_array
 
 ANNOTATIONS = "annots.npy"
@@ -60,7 +60,7 @@ def read_zju_mocap(root: Path) -> Capture:
         with wrap_read_errors(found):
             by_name = _by_name(found)
             infos = [(f"{found}, {name}", own) for name, own in by_name.items()]
-            body = _body(found, [number_in_name(found, name) for name in by_name], infos)
+            body = _body(found, [parse_frame_number(found, name) for name in by_name], infos)
             pelvis = np.mean(_column(infos, "tpose_joints", 72), axis=0)[:3]
             body = replace(body, pelvis=pelvis)
         kind, folders = "white", ("masks",)
@@ -88,7 +88,7 @@ def read_zju_mocap(root: Path) -> Capture:
             "test": tuple(view for view in people if view.camera_id == 0),
         }
         warnings.append(FIRST_HELD_OUT)
-    return Capture(root, "zju_mocap", splits, body=of_one_clip(body), warnings=tuple(warnings))
+    return Capture(root, "zju_mocap", splits, body=share_body_across_splits(body), warnings=tuple(warnings))
 
 
 def _annotated_shots(path: Path) -> list[FrameEntry]:
@@ -99,12 +99,12 @@ def _annotated_shots(path: Path) -> list[FrameEntry]:
     for k, d, r, t in zip(*(cams[key] for key in ("K", "D", "R", "T")), strict=True):
         where = f"{path}, camera {len(calibrations)}"
         pose = np.eye(4)
-        pose[:3, :3] = numbers_of(f"{where}: 'R'", r, (3, 3))
-        pose[:3, 3] = numbers_of(f"{where}: 'T'", t, (3,)) / 1000
+        pose[:3, :3] = parse_numbers(f"{where}: 'R'", r, (3, 3))
+        pose[:3, 3] = parse_numbers(f"{where}: 'T'", t, (3,)) / 1000
         calibrations.append(_calibration(where, k, d, pose))
     shots = []
     for own in fields["ims"]:
-        frame = number_in_name(path, own["ims"][0])
+        frame = parse_frame_number(path, own["ims"][0])
         for camera, (file, calibration) in enumerate(zip(own["ims"], calibrations, strict=True)):
             fields_of = calibration | {"file_path": str(file), "camera": camera, "frame": frame}
             shots.append(FrameEntry(f"{path}, camera {camera}", fields_of))
@@ -118,10 +118,10 @@ def _single_shots(path: Path) -> list[FrameEntry]:
     shots = []
     for name, own in sorted(_by_name(path).items()):
         where = f"{path}, {name}"
-        pose = numbers_of(f"{where}: 'extrinsics'", entry(where, own, "extrinsics"), (4, 4))
+        pose = parse_numbers(f"{where}: 'extrinsics'", entry(where, own, "extrinsics"), (4, 4))
         lens = own.get("distortions", np.zeros(5))
         calibration = _calibration(where, entry(where, own, "intrinsics"), lens, pose)
-        frame = number_in_name(path, name)
+        frame = parse_frame_number(path, name)
         fields = calibration | {"file_path": f"images/{name}", "camera": 0, "frame": frame}
         shots.append(FrameEntry(where, fields))
     return shots
@@ -143,19 +143,19 @@ def _column(
     """Finite numbers at ``key`` of each of the named dictionaries, ``width`` of them unless that is
     None."""
     shape = None if width is None else (width,)
-    return [numbers_of(f"{where}: '{key}'", entry(where, own, key), shape) for where, own in rows]
+    return [parse_numbers(f"{where}: '{key}'", entry(where, own, key), shape) for where, own in rows]
 
 
 def _calibration(
     where: str, intrinsics: object, lens: object, cam_from_world: np.ndarray
 ) -> dict[str, Any]:
-    k = numbers_of(f"{where}: the intrinsics", intrinsics, (3, 3))
-    values = numbers_of(f"{where}: the distortion", lens, None).tolist()
+    k = parse_numbers(f"{where}: the intrinsics", intrinsics, (3, 3))
+    values = parse_numbers(f"{where}: the distortion", lens, None).tolist()
     if len(values) not in (4, 5, 8):
         raise DyngsError(
             f"{where}: the distortion must have 4, 5 or 8 coefficients, got {len(values)}; export it again"
         )
-    pose, _ = checked_pose(cam_from_world, where)
+    pose, _ = validate_pose(cam_from_world, where)
     return {
         "fl_x": float(k[0, 0]),
         "fl_y": float(k[1, 1]),
@@ -163,7 +163,7 @@ def _calibration(
         "cy": float(k[1, 2]) + 0.5,
         "camera_model": "FULL_OPENCV" if len(values) == 8 else "OPENCV",
         **dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), values, strict=False)),
-        "transform_matrix": opengl_from_cam(pose).tolist(),
+        "transform_matrix": to_opengl_pose(pose).tolist(),
     }
 
 

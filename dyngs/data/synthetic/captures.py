@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from dyngs.core.conventions import encode_srgb
 from dyngs.core.errors import DyngsError
 from dyngs.data.tracks import TrueTracks, write_true_tracks
-from dyngs.io.outputs import new_folder
+from dyngs.io.outputs import atomic_folder
 from dyngs.io.write import write_image, write_text
 
 CAMERA_ANGLE_X = 0.6911112070083618
@@ -191,7 +191,7 @@ def render_scene(
     return (rgba * 255.0 + 0.5).astype(np.uint8).reshape(size, size, 4)
 
 
-def render_things(
+def render_motion_labels(
     scene: Scene, world_from_cam: np.ndarray, size: int, samples: int = 3
 ) -> np.ndarray:
     """(size, size) uint8: which thing that moves a pixel of ``render_scene`` shows, 1 the first; 0
@@ -200,7 +200,7 @@ def render_things(
     Of several in one pixel the one that most samples see; light does not count.
     """
     directions = sampled_rays(world_from_cam, size, samples).reshape(-1, 3)
-    nearest, distance = nearest_things(scene, f32(world_from_cam[:3, 3]), directions)
+    nearest, distance = nearest_primitives(scene, f32(world_from_cam[:3, 3]), directions)
     things = np.where(np.isfinite(distance), nearest, -1).reshape(samples**2, -1)
     nothing = np.zeros(size * size, np.int64)
     counts = [nothing, *((things == index).sum(axis=0) for index in scene.movers)]
@@ -212,11 +212,11 @@ def is_seen(scene: Scene, points: np.ndarray, world_from_cam: np.ndarray) -> np.
     origin = world_from_cam[:3, 3]
     offset = points - origin
     distance = np.sqrt(_dot(offset, offset))
-    _, nearest = nearest_things(scene, f32(origin), f32(offset / distance[:, None]))
+    _, nearest = nearest_primitives(scene, f32(origin), f32(offset / distance[:, None]))
     return nearest > distance - _SURFACE
 
 
-def nearest_things(
+def nearest_primitives(
     scene: Scene, origin: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return, per ray, the primitive that it hits first and the distance to it, inf where it hits
@@ -233,7 +233,7 @@ def trace(
 
     The lamp is at a place (R, 3) of its own for each ray.
     """
-    nearest, distance = nearest_things(scene, origin, directions)
+    nearest, distance = nearest_primitives(scene, origin, directions)
     hit = np.flatnonzero(np.isfinite(distance))
     points = origin + distance[hit, None] * directions[hit]
     rgb = np.zeros((len(hit), 3), np.float32)
@@ -620,7 +620,7 @@ class ImageOptions:
 
 
 @dataclass(frozen=True)
-class StillOptions(ImageOptions):
+class StaticOptions(ImageOptions):
     """Options of a capture of the static scene, with ``num_train`` training images."""
 
     num_train: int = 48
@@ -649,7 +649,7 @@ class DynamicOptions(ImageOptions):
 
 
 @dataclass(frozen=True)
-class SyntheticShot:
+class SyntheticView:
     """One image to render: its path below the root without suffix, the (4, 4) OpenGL pose, the
     time, a fixed camera."""
 
@@ -659,7 +659,7 @@ class SyntheticShot:
     camera: int | None = None
 
 
-def write_still_capture(out: Path, options: StillOptions = StillOptions()) -> Path:
+def write_static_capture(out: Path, options: StaticOptions = StaticOptions()) -> Path:
     """Write images of ``still_life`` in the layout of the NeRF-synthetic scenes; returns ``out``.
 
     Files: ``transforms_SPLIT.json`` (OpenGL camera-to-world) and ``SPLIT/r_000.png`` (RGBA,
@@ -671,9 +671,9 @@ def write_still_capture(out: Path, options: StillOptions = StillOptions()) -> Pa
         "train": hemisphere_cameras(options.num_train, DISTANCE, options.seed),
         "test": orbit_cameras(options.num_test, DISTANCE, elevation_deg=28.0, start_deg=0.0),
     }
-    with new_folder(out) as started:
+    with atomic_folder(out) as started:
         for split, poses in splits.items():
-            shots = [SyntheticShot(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
+            shots = [SyntheticView(f"{split}/r_{i:03d}", pose) for i, pose in enumerate(poses)]
             write_split(started, split, shots, lambda _: scene, options)
     return out
 
@@ -704,7 +704,7 @@ def write_dynamic_capture(
             "the walls of the room would hide it from cameras all around; choose --style fixed or moving"
         )
     splits = _fixed_shots(options) if style == "fixed" else _single_shots(options, style)
-    with new_folder(out) as started:
+    with atomic_folder(out) as started:
         for split, shots in splits.items():
             write_split(
                 started,
@@ -724,8 +724,8 @@ def write_dynamic_capture(
 def write_split(
     out: Path,
     split: str,
-    shots: Sequence[SyntheticShot],
-    scene_of: Callable[[SyntheticShot], Scene],
+    shots: Sequence[SyntheticView],
+    scene_of: Callable[[SyntheticView], Scene],
     options: ImageOptions,
     is_opaque: bool = False,
 ) -> None:
@@ -741,7 +741,7 @@ def write_split(
             frame["camera"] = shot.camera
         if shot.time is not None:
             frame["time"] = shot.time
-            things = render_things(scene, shot.world_from_cam, options.size, options.samples)
+            things = render_motion_labels(scene, shot.world_from_cam, options.size, options.samples)
             write_image(out / "things" / f"{shot.name}.png", things)
             if split != "train":
                 frame["instance_mask_path"] = f"./things/{shot.name}.png"
@@ -750,7 +750,7 @@ def write_split(
     write_text(out / f"transforms_{split}.json", json.dumps(transforms, indent=1) + "\n")
 
 
-def _single_shots(options: DynamicOptions, style: CaptureStyle) -> dict[str, list[SyntheticShot]]:
+def _single_shots(options: DynamicOptions, style: CaptureStyle) -> dict[str, list[SyntheticView]]:
     """One image per training time, by cameras in random order or on a smooth arc.
 
     Test cameras lie on an orbit; a moving camera is tested by a fixed one in its middle.
@@ -775,14 +775,14 @@ def _single_shots(options: DynamicOptions, style: CaptureStyle) -> dict[str, lis
     between = [(int((i + 0.5) * gaps / count) + 0.5) / gaps for i in range(count)]
     return {
         split: [
-            SyntheticShot(f"{split}/r_{i:03d}", pose, time)
+            SyntheticView(f"{split}/r_{i:03d}", pose, time)
             for i, (pose, time) in enumerate(zip(poses, own, strict=True))
         ]
         for split, poses, own in (("train", train, times), ("test", test, between))
     }
 
 
-def _fixed_shots(options: DynamicOptions) -> dict[str, list[SyntheticShot]]:
+def _fixed_shots(options: DynamicOptions) -> dict[str, list[SyntheticView]]:
     """Fixed cameras on an arc in front, low and high in turn; the test camera in the middle of the
     arc."""
     count = options.num_cameras
@@ -795,7 +795,7 @@ def _fixed_shots(options: DynamicOptions) -> dict[str, list[SyntheticShot]]:
     cameras = {"train": range(count), "test": (count,) if options.num_test else ()}
     return {
         split: [
-            SyntheticShot(f"cam{camera:02d}/frame_{i:04d}", poses[camera], time, camera)
+            SyntheticView(f"cam{camera:02d}/frame_{i:04d}", poses[camera], time, camera)
             for i, time in enumerate(_even_times(options.num_times))
             for camera in own
         ]
@@ -845,7 +845,7 @@ POINTS_PER_THING = 200
 
 
 def true_tracks(
-    scene_of: Callable[[float], Scene], shots: Sequence[SyntheticShot], seed: int = 0
+    scene_of: Callable[[float], Scene], shots: Sequence[SyntheticView], seed: int = 0
 ) -> TrueTracks:
     """Return the tracks of points spread over all that moves in the scene at a time in [0, 1].
 

@@ -15,7 +15,7 @@ from dyngs.core.errors import DyngsError, format_one_line
 from dyngs.data.capture import all_views
 from dyngs.data.scene_space import MAX_DISTANCE
 from dyngs.io.fields import read_limited
-from dyngs.io.formats.similarity import AXES, Similarity, similarity_of_matrix, turn_between
+from dyngs.io.formats.similarity import AXES, Similarity, similarity_from_matrix, rotation_between
 from dyngs.runs.opened import OpenedScene
 
 _FACTORS = (1e-9, 1e9)
@@ -45,7 +45,7 @@ class Frame:
         """
         found = Similarity(scale=self.scale)
         if up is not None:
-            found = found.after(Similarity(turn_between(tuple(up), tuple(wanted))))
+            found = found.after(Similarity(rotation_between(tuple(up), tuple(wanted))))
         if self.origin is None:
             return found
         x, y, z = (-found.points(np.array(self.origin))).tolist()
@@ -125,7 +125,7 @@ def fit_similarity(points: np.ndarray, wanted: np.ndarray) -> Similarity:
         spread = np.linalg.svd(rows - rows.mean(axis=0), compute_uv=False)
         if not spread[1] > 1e-4 * spread[0]:
             raise DyngsError(f"the control points lie on one line in {where}; give one beside it")
-    found = similarity_of_matrix(estimate_transform("similarity", points, wanted).params)
+    found = similarity_from_matrix(estimate_transform("similarity", points, wanted).params)
     if found is None:
         raise DyngsError("the scale would be beyond all bounds; check the units of the points")
     return found

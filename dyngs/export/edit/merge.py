@@ -12,8 +12,8 @@ from dyngs.core.errors import DyngsError, format_count
 from dyngs.export.splat_files import find_up_direction, splats_at
 from dyngs.gaussians.rendering import splat_options
 from dyngs.io.formats.formats import format_to_read, read_splats
-from dyngs.io.formats.similarity import Similarity, axis_of, joined, turn_between
-from dyngs.io.formats.splat_file import SplatFile, with_degree
+from dyngs.io.formats.similarity import Similarity, parse_axis, joined, rotation_between
+from dyngs.io.formats.splat_file import SplatFile, with_sh_degree
 from dyngs.runs.opened import open_scene
 
 
@@ -36,7 +36,7 @@ def merge_scenes(
             between = splat.frame.after(Similarity(shift=(x, y, z))).after(other.frame.inverse())
             gaussians = between.gaussians(gaussians)
         elif up is not None and direction is not None:
-            gaussians = Similarity(turn_between(tuple(direction), tuple(up))).gaussians(gaussians)
+            gaussians = Similarity(rotation_between(tuple(direction), tuple(up))).gaussians(gaussians)
         if splat_options(other) != splat_options(splat):
             tell(
                 f"{file}: was trained for another low-pass filter ({other.mode.value}); it is drawn as the rest is"
@@ -44,7 +44,7 @@ def merge_scenes(
         tell(f"{file}: {format_count(len(gaussians), 'Gaussian')} added")
         parts.append(gaussians.detach())
     degree = max(part.sh_degree for part in parts)
-    return replace(splat, gaussians=joined([with_degree(part, degree) for part in parts]))
+    return replace(splat, gaussians=joined([with_sh_degree(part, degree) for part in parts]))
 
 
 def _still(file: Path) -> tuple[SplatFile, Sequence[float] | None]:
@@ -52,7 +52,7 @@ def _still(file: Path) -> tuple[SplatFile, Sequence[float] | None]:
     them."""
     if format_to_read(file) is not None:
         splat = read_splats(file, nonfinite="skip")
-        return splat, None if splat.up is None else axis_of(splat.up)
+        return splat, None if splat.up is None else parse_axis(splat.up)
     opened = open_scene(file)
     if not opened.scene.is_static:
         raise DyngsError(

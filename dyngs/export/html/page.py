@@ -16,7 +16,7 @@ import numpy as np
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import format_count
-from dyngs.data.geometry import look_at_point
+from dyngs.data.geometry import estimate_focus
 from dyngs.export.choose_path import (
     framing_points,
     frontal_cameras,
@@ -28,7 +28,7 @@ from dyngs.gaussians.levels import LevelScene
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.human.avatar.scene import as_human_scene
 from dyngs.io.formats.similarity import AXES
-from dyngs.io.outputs import new_folder, require_new_folder
+from dyngs.io.outputs import atomic_folder, require_new_folder
 from dyngs.io.write import write_text
 from dyngs.models.views import training_cameras
 from dyngs.runs.folder import collect_inputs
@@ -126,7 +126,7 @@ def write_page_folder(
         header = _header(opened, time, views, lists)
         parts = ((f"{i}.bin", chunk.deflated()) for i, chunk in enumerate(lists.chunks or ()))
     text = _assembled(opened, header, lists, title)
-    with new_folder(folder) as started:
+    with atomic_folder(folder) as started:
         write_text(started / PAGE, text)
         write_text(started / ELEMENT, element_script())
         for name, data in parts:
@@ -183,14 +183,14 @@ def _beginning(
         others = list(distinct.values())[::-1]
         rows = np.linspace(0, len(others) - 1, min(len(others), MOST_VIEWS)).round().astype(int)
         chosen = (select_view(capture), *(others[i] for i in rows))
-        return training_cameras(chosen, opened.config.data), look_at_point(cameras).tolist()
+        return training_cameras(chosen, opened.config.data), estimate_focus(cameras).tolist()
     target = np.median(framing_points(opened.renderable).cpu().numpy(), axis=0)
     if not views:
         ring = orbit_cameras_around(opened, _RING)
         views = [ring.select(i) for i in range(_RING)]
         if opened.person is not None:
             views = [frontal_cameras(opened).select(1), *views]
-            target = look_at_point(ring)
+            target = estimate_focus(ring)
     return views, target.tolist()
 
 

@@ -36,7 +36,7 @@ from dyngs.ops.nodes import SPAN
 
 BONES = 8  # bones that a Gaussian follows on the page
 FINE = ("means", "quats")  # splines of nodes that are stored in 16 bits
-MOST_LOGIT = 15.0  # opacities beyond that of this logit are 1 to seven digits
+MAX_LOGIT = 15.0  # opacities beyond that of this logit are 1 to seven digits
 CHUNK_BYTES = 1 << 19  # of splines that are fetched at once, before they are deflated
 CHUNK = 256  # rows of a list that share a range for each column: neighbours in space are alike
 
@@ -145,7 +145,7 @@ def block_numbers(levels: Levels, block: Block, *, with_rest: bool) -> PackedArr
     gaussians = levels.of_block(block)
     rows = torch.arange(BLOCK, device="cpu").clamp_max(len(gaussians) - 1)
     padded = gaussians.select(rows)
-    padded.logit_opacities[len(gaussians) :] = -MOST_LOGIT
+    padded.logit_opacities[len(gaussians) :] = -MAX_LOGIT
     lists = PackedArrays()
     _add_gaussians(padded, lists, with_rest=with_rest)
     return lists
@@ -161,7 +161,7 @@ def block_files(levels: Levels, *, with_rest: bool) -> Iterator[tuple[str, bytes
 
 def _add_gaussians(gaussians: Gaussians, lists: PackedArrays, *, with_rest: bool) -> dict[str, Any]:
     unit = torch.nn.functional.normalize(gaussians.quats, dim=1)
-    logits = gaussians.logit_opacities.clamp(-MOST_LOGIT, MOST_LOGIT)
+    logits = gaussians.logit_opacities.clamp(-MAX_LOGIT, MAX_LOGIT)
     lists.quantised("means", _numpy(gaussians.means), 16)
     lists.quantised("quats", _numpy(torch.where(unit[:, :1] < 0, -unit, unit)), 8)
     lists.quantised("log_scales", _numpy(gaussians.log_scales), 8)

@@ -16,19 +16,19 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from dyngs.capture.fixed_camera import is_plain_clip, read_fixed_camera
-from dyngs.capture.masks import at_size, outlined
+from dyngs.capture.fixed_camera import is_image_sequence, read_fixed_camera
+from dyngs.capture.masks import resize_mask, outlined
 from dyngs.capture.sfm.photos import digest_of
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info
-from dyngs.data.capture import Capture, View, by_camera
+from dyngs.data.capture import Capture, View, group_by_camera
 from dyngs.data.images.images import area_downscale_uint8, read_image, target_size
 from dyngs.data.read import is_capture, read_capture
 from dyngs.human.detect.detector import MIN_CONFIDENCE, Detection, Detector, MediaPipe
 from dyngs.human.fit.capture_fit import viterbi_path
 from dyngs.human.fit.fitted_capture import FitInputs, FittedCapture, write_fitted_capture
-from dyngs.io.outputs import make_once, note_source, require_new_folder
+from dyngs.io.outputs import make_once, record_source, require_new_folder
 from dyngs.io.write import cache_folder, temporary_folder_beside, write_image, write_text
 
 SWAP_COST = 0.04
@@ -158,7 +158,7 @@ def detect_person(
     detector: Detector,
     folder: Path,
     report: ProgressCallback,
-    say: Callable[[str], None] = log_info,
+    log: Callable[[str], None] = log_info,
 ) -> FitInputs:
     """Find a person in all views, write masks and key points to ``folder``, and return where they
     are.
@@ -169,7 +169,7 @@ def detect_person(
     Raises DyngsError: nobody is found.
     """
     points: dict[str, np.ndarray] = {}
-    cameras = [*by_camera(capture.splits).values()]
+    cameras = [*group_by_camera(capture.splits).values()]
     for index, views in enumerate(cameras, 1):
         # A detector reads files, which only live here.
         size = target_size(views[0].width, views[0].height, 1.0, DETECTOR_SIDE_PX)
@@ -184,14 +184,14 @@ def detect_person(
         where = "" if len(cameras) == 1 else f"camera {views[0].camera_id}: "
         heights = [x.height for x in person if x is not None]
         if not heights:
-            say(f"warning: {where}{detector.name} finds nobody, its images are left out")
+            log(f"warning: {where}{detector.name} finds nobody, its images are left out")
         else:
-            say(
+            log(
                 f"{where}{detector.name} finds the person, {np.median(heights):.0f} px high, in {len(heights)} of "
                 f"{format_count(len(person), 'image')}; left and right swapped in {format_count(swapped, 'image')}"
             )
             for warning in capture_warnings(images, person, alone=len(cameras) == 1):
-                say(f"warning: {where}{warning}")
+                log(f"warning: {where}{warning}")
         masks = np.zeros(images.shape[:3], bool)
         for row, own in enumerate(person):
             if own is not None:
@@ -201,12 +201,12 @@ def detect_person(
         better = outlined(images, masks) if heights else None
         if better is not None:
             common = (better & masks).sum() / max(int((better | masks).sum()), 1)
-            say(
+            log(
                 f"the camera stands: outlines by its background, which agree with the detector's to {common:.3f} (IoU)"
             )
             masks = better
         for view, mask in zip(views, masks, strict=True):
-            write_image(folder / "masks" / f"{view.name}.png", at_size(mask, view))
+            write_image(folder / "masks" / f"{view.name}.png", resize_mask(mask, view))
     if not points:
         raise DyngsError(
             f"{capture.root}: {detector.name} finds nobody in {format_count(sum(map(len, cameras)), 'image')}; look at "
@@ -236,7 +236,7 @@ def write_detected_person(
     out: Path,
     detector: Detector,
     report: ProgressCallback = ignore_progress,
-    say: Callable[[str], None] = log_info,
+    log: Callable[[str], None] = log_info,
 ) -> FittedCapture:
     """Find a person and fit the body to them: write the capture of ``write_fitted_capture`` to the
     new folder ``out``.
@@ -245,11 +245,11 @@ def write_detected_person(
     cameras. Raises DyngsError: see ``detect_person`` and ``write_fitted_capture``.
     """
     require_new_folder(out)
-    clip = options.format == "auto" and not is_capture(options.root) and is_plain_clip(options.root)
+    clip = options.format == "auto" and not is_capture(options.root) and is_image_sequence(options.root)
     folder = temporary_folder_beside(out.with_name(f"{out.name}.found"))
     try:
         capture = read_fixed_camera(options) if clip else read_capture(options)
-        found = detect_person(capture, detector, folder, report, say)
+        found = detect_person(capture, detector, folder, report, log)
         return write_fitted_capture(options, out, report, found)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -258,7 +258,7 @@ def write_detected_person(
 def ensure_detected_person(
     data: DataConfig,
     *,
-    say: Callable[[str], None] = log_info,
+    log: Callable[[str], None] = log_info,
     report: ProgressCallback = ignore_progress,
 ) -> DataConfig:
     """Return the options with the capture of the person that is found in a clip; the same clip is
@@ -272,9 +272,9 @@ def ensure_detected_person(
 
     def find() -> None:
         detector = MediaPipe()
-        say(f"person:  found first, as by `dyngs data people`, into {folder}")
-        say(write_detected_person(data, folder, detector, report, say).summary)
+        log(f"person:  found first, as by `dyngs data people`, into {folder}")
+        log(write_detected_person(data, folder, detector, report, log).summary)
 
-    make_once(folder, find, say, f"person:  found before, in {folder}")
-    note_source(folder, data.root)
+    make_once(folder, find, log, f"person:  found before, in {folder}")
+    record_source(folder, data.root)
     return data.model_copy(update={"root": folder, "frames": None})

@@ -16,11 +16,11 @@ import torch
 
 from dyngs.capture.fixed_camera import (
     FORMAT,
-    is_plain_clip,
+    is_image_sequence,
     read_fixed_camera,
     silhouettes_of,
 )
-from dyngs.capture.masks import with_background_masks
+from dyngs.capture.masks import add_background_masks
 from dyngs.capture.sfm.photos import digest_of
 from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
@@ -28,8 +28,8 @@ from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info, wrap_read_errors
 from dyngs.data.body_frames import frame_number, numbered, read_body_file
 from dyngs.data.capture import BodyFrames, Capture, Split, View
-from dyngs.data.geometry import opengl_from_cam
-from dyngs.data.images.images import straight_uint8
+from dyngs.data.geometry import to_opengl_pose
+from dyngs.data.images.images import to_straight_uint8
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import is_capture, read_capture
 from dyngs.data.times import evenly_spaced
@@ -49,7 +49,7 @@ from dyngs.human.fit.capture_fit import (
 from dyngs.human.fit.keypoints import read_joints, read_keypoints
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion
-from dyngs.io.outputs import make_once, new_folder
+from dyngs.io.outputs import make_once, atomic_folder
 from dyngs.io.write import atomic_file, cache_folder, write_image, write_text
 
 _BODY = "body_train.npz"
@@ -111,7 +111,7 @@ def write_fitted_capture(
     body = load_template(model)
     _require_texels(model, body)
     person = None if given.person is None else read_known_shape(given.person, body)
-    with new_folder(out) as folder:
+    with atomic_folder(out) as folder:
         masks = folder / ".masks"
         capture = read_person_capture(options, given, masks)
         capture = capture.replace(splits=numbered(capture.splits))
@@ -276,7 +276,7 @@ def _at_most(options: DataConfig, longest_side: int) -> DataConfig:
 
 
 def read_person_capture(
-    options: DataConfig, given: FitInputs, work: Path, say: Callable[[str], None] = log_info
+    options: DataConfig, given: FitInputs, work: Path, log: Callable[[str], None] = log_info
 ) -> Capture:
     """Return a capture with silhouettes: of a capture, or a video or a folder of images of one
     fixed camera.
@@ -286,10 +286,10 @@ def read_person_capture(
     none that can be made.
     """
     source = options.root
-    if options.format == "auto" and not is_capture(source) and is_plain_clip(source):
+    if options.format == "auto" and not is_capture(source) and is_image_sequence(source):
         capture = read_fixed_camera(options, given.masks)
         for line in capture.warnings:
-            say(line)
+            log(line)
     else:
         capture = read_capture(options)
         if given.masks is not None:
@@ -306,7 +306,7 @@ def read_person_capture(
             raise DyngsError(
                 f"{source}: no silhouettes, and the camera moves; add masks of the person"
             )
-        capture = with_background_masks(capture, work, given.background, say)
+        capture = add_background_masks(capture, work, given.background, log)
     if capture.format != FORMAT and given.masks is None:
         return capture
     # Found masks may be empty: frames with less than a fifth of the usual area are left out.
@@ -322,7 +322,7 @@ def read_person_capture(
         raise DyngsError(f"{capture.root}: nobody is seen in the masks; white is the person")
     if len(kept) < len(views):
         gone = next(view.name for view in views if view not in kept)
-        say(
+        log(
             f"{len(views) - len(kept)} frames in which hardly anybody is seen are left out, first {gone}"
         )
     return capture.replace(splits={**capture.splits, "train": kept})
@@ -431,8 +431,8 @@ def write_split(
         parts = [photo.rgb_premultiplied]
         if photo.alpha is not None:
             parts.append(photo.alpha[..., None])
-        write_image(out / f"images/{stem}", straight_uint8(torch.cat(parts, dim=-1)).numpy())
-        pose = opengl_from_cam(view.cam_from_world).copy()
+        write_image(out / f"images/{stem}", to_straight_uint8(torch.cat(parts, dim=-1)).numpy())
+        pose = to_opengl_pose(view.cam_from_world).copy()
         pose[:3, 3] = capture.world_scale * pose[:3, 3] + capture.world_offset
         fl_x, _, cx, _, fl_y, cy = image.cameras.intrinsics[0, :2].double().flatten().tolist()
         frame: dict[str, object] = {
@@ -450,7 +450,7 @@ def write_split(
         if view.time is not None:
             frame["time"] = view.time
         if view.silhouette is not None and image.alpha is not None:
-            write_image(out / f"masks/{stem}", straight_uint8(image.alpha[..., None]).numpy())
+            write_image(out / f"masks/{stem}", to_straight_uint8(image.alpha[..., None]).numpy())
             frame["silhouette_path"] = f"masks/{stem}"
         frames.append(frame)
     write_text(out / f"transforms_{split}.json", json.dumps({"frames": frames}, indent=1) + "\n")
@@ -527,7 +527,7 @@ def ensure_fitted_body(
     model: HumanModel | None = None,
     *,
     only_if_needed: bool = False,
-    say: Callable[[str], None] = log_info,
+    log: Callable[[str], None] = log_info,
     report: ProgressCallback = ignore_progress,
 ) -> DataConfig:
     """Return the options with a fit of a template to the capture; the same capture is fitted once.
@@ -541,7 +541,7 @@ def ensure_fitted_body(
     if data.body is not None:
         path = data.body / _BODY
         if path.is_file() and not has_same_shape_space(load_template(model), read_body_file(path)):
-            say(
+            log(
                 f"body:    {data.body} is a fit of another template: its poses are taken, not its shape"
             )
         return data
@@ -561,7 +561,7 @@ def ensure_fitted_body(
                 f"{data.root}: has neither silhouettes nor body parameters, so no person can be found; add masks of "
                 "the person (docs/person.md)"
             )
-        say(f"{data.root}: no silhouettes, so the body parameters are taken as given")
+        log(f"{data.root}: no silhouettes, so the body parameters are taken as given")
         return data
     _require_texels(model, body)
     own = "" if model.body is None else f".{body.fingerprint}"
@@ -569,14 +569,14 @@ def ensure_fitted_body(
     folder = cache_folder("bodies") / f"{name}.{_digest(data)}{own}"
 
     def fit() -> None:
-        say(
+        log(
             f"body:    {_called(model, body)} is fitted to the silhouettes first, as by `dyngs data fit`, into {folder}"
         )
         points = data.root / "keypoints"  # as OpenPose writes them
         inputs = FitInputs(points if points.is_dir() else None, template=model)
-        say(write_fitted_capture(data, folder, report, inputs, with_images=False).summary)
+        log(write_fitted_capture(data, folder, report, inputs, with_images=False).summary)
 
-    make_once(folder, fit, say, f"body:    the fit of before, in {folder}")
+    make_once(folder, fit, log, f"body:    the fit of before, in {folder}")
     return data.model_copy(update={"body": folder})
 
 

@@ -16,9 +16,9 @@ from torch import Tensor
 from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.body_frames import frame_number
 from dyngs.data.capture import Capture, View
-from dyngs.data.images.lens import undistorted_points
+from dyngs.data.images.lens import undistort_points
 from dyngs.human.body.joints import JOINT_NAMES
-from dyngs.io.fields import LARGEST, float_array, numbers_of, read_json_object
+from dyngs.io.fields import LARGEST, as_float_array, parse_numbers, read_json_object
 from dyngs.io.numpy_files import read_npz
 
 _COCO = """
@@ -117,7 +117,7 @@ def read_keypoints(path: Path, views: Sequence[View]) -> Keypoints:
 
 def _marked_joints(file: Path, numbers: object, view: View) -> Tensor:
     """Return the joints (55, 3) of a list of column, row, confidence, undistorted."""
-    points = numbers_of(f"{file}: a list of key points", numbers, None).reshape(-1, 3)
+    points = parse_numbers(f"{file}: a list of key points", numbers, None).reshape(-1, 3)
     names = _IN_IMAGES.get(len(points))
     if names is None:
         raise DyngsError(
@@ -129,7 +129,7 @@ def _marked_joints(file: Path, numbers: object, view: View) -> Tensor:
     for name, point in zip(names, points, strict=False):
         if name in JOINTS and point[2] > 0:
             joints[JOINTS[name]] = torch.from_numpy(point)
-    positions = undistorted_points(view.lens, view.intrinsics, joints[:, :2])
+    positions = undistort_points(view.lens, view.intrinsics, joints[:, :2])
     # What is further away, px, is a mistake; false for NaN.
     near = (positions.abs() < 1e6).all(1, keepdim=True)
     marked = [torch.where(near, positions, 0.0), joints[:, 2:].clamp(0, 1) * near]
@@ -180,7 +180,7 @@ def _placed_joints(file: Path, values: object) -> Tensor:
 
     Joints inside the trunk, which differ from model to model by centimetres, count by 0.3.
     """
-    rows = float_array(values)
+    rows = as_float_array(values)
     if rows is None or rows.ndim != 2 or rows.shape[1] not in (3, 4) or len(rows) not in _IN_SPACE:
         raise DyngsError(
             f"{file}: 'joints' must be (frames, joints, 3 or 4) numbers of {sorted(_IN_SPACE)} joints; export it again"

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from dyngs.core.errors import wrap_read_errors
 from dyngs.human.motion.motion import SkeletonMotion, require_frame_count, sample_times
 from dyngs.io.fields import require_at_most
-from dyngs.io.gltf import MOST_JOINTS, GltfFile
+from dyngs.io.gltf import MAX_JOINTS, GltfFile
 
 _KINDS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}
 _AT_REST = {"translation": (0, 0, 0), "rotation": (0, 0, 0, 1), "scale": (1, 1, 1)}
@@ -62,7 +62,7 @@ def read_gltf(path: Path, fps: float = 30.0, clip: str | None = None) -> Skeleto
             else:
                 joints = _animated_nodes(file, clip)
             names = [file.nodes[node].get("name", "") for node in joints]
-        require_at_most(path, len(joints), MOST_JOINTS, "joints")
+        require_at_most(path, len(joints), MAX_JOINTS, "joints")
         chain = _with_ancestors(file, joints)
         curves = _curves(file, _chosen(file, chain, clip), chain)
         start = min(times[0] for times, _, _ in curves.values())

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import move_fields_to
-from dyngs.data.body_frames import about_pelvis, rows_of
+from dyngs.data.body_frames import merge_root_rotation, rows_of
 from dyngs.data.capture import BodyFrames, View
 from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.human.body.skinning import axis_angle_to_matrix
@@ -264,7 +264,7 @@ def captured_motion(
     Joints that the body of ``given`` lacks do not rotate. Views without times are spread over [0,
     1] by frame number. Raises DyngsError: a view without parameters.
     """
-    found = about_pelvis(given, joints[0].double().cpu().numpy())
+    found = merge_root_rotation(given, joints[0].double().cpu().numpy())
     rows = rows_of(where, found, views)
     last = max(len(found.frames) - 1, 1)
     times = {

@@ -31,7 +31,7 @@ from dyngs.human.body.joints import JOINT_NAMES
 from dyngs.human.body.mesh import Fragments, interpolate, normalized, rasterize, vertex_normals
 from dyngs.human.motion.amass import write_amass
 from dyngs.human.motion.motion import Motion
-from dyngs.io.outputs import new_folder, require_new_folder
+from dyngs.io.outputs import atomic_folder, require_new_folder
 from dyngs.io.write import write_image, write_text
 
 FPS = 12.0
@@ -492,7 +492,7 @@ def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Pa
     clips = {"train": (options.num_frames, {"train": train, "test": test})}
     if options.num_pose_frames and test:
         clips["pose"] = options.num_pose_frames, {"pose": test}
-    with new_folder(out) as started:
+    with atomic_folder(out) as started:
         for name, (num_frames, splits) in clips.items():
             clip = _clip(body, num_frames, options.scene_seed, name == "pose")
             motion = replace(

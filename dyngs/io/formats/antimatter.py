@@ -14,7 +14,7 @@ import torch
 from dyngs.core.conventions import SH_C0
 from dyngs.core.errors import DyngsError
 from dyngs.io.fields import require_at_most
-from dyngs.io.formats.splat_file import MOST_GAUSSIANS, SplatFile, from_linear
+from dyngs.io.formats.splat_file import MAX_GAUSSIANS, SplatFile, from_linear
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
@@ -26,7 +26,7 @@ def read_antimatter(path: Path) -> SplatFile:
         raise DyngsError(
             f"{path}: is truncated: its {size:,} bytes are not a multiple of {_ROW.itemsize} (a .splat)"
         )
-    require_at_most(path, size // _ROW.itemsize, MOST_GAUSSIANS, "Gaussians")
+    require_at_most(path, size // _ROW.itemsize, MAX_GAUSSIANS, "Gaussians")
     rows = np.fromfile(path, _ROW)
     rgba = rows["rgba"].astype(np.float32) / 255
     quats = (rows["quats"].astype(np.float32) - 128) / 128

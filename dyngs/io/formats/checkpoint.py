@@ -14,7 +14,7 @@ from dyngs.core.conventions import MAX_SH_DEGREE, SH_C0, num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.gaussians import Gaussians
 from dyngs.io.fields import require_at_most
-from dyngs.io.formats.splat_file import MOST_GAUSSIANS, SplatFile, unit_rotations
+from dyngs.io.formats.splat_file import MAX_GAUSSIANS, SplatFile, unit_rotations
 
 _HINT = "export a .ply with the program that wrote it, such as `ns-export gaussian-splat`"
 _SHAPES = {"means": 3, "scales": 3, "quats": 4, "opacities": 1}
@@ -32,7 +32,7 @@ def read_checkpoint(path: Path) -> SplatFile:
             f"{path}: holds no Gaussians as nerfstudio's splatfacto and gsplat store them; {_HINT}"
         )
     count = len(found["means"])
-    require_at_most(path, count, MOST_GAUSSIANS, "Gaussians")
+    require_at_most(path, count, MAX_GAUSSIANS, "Gaussians")
     means, scales, quats, opacities = (
         found[name].detach().float().reshape(count, width) for name, width in _SHAPES.items()
     )

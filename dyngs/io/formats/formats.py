@@ -17,10 +17,10 @@ from dyngs.io.formats.gltf import read_gltf, write_gltf
 from dyngs.io.formats.ply import read_ply, write_ply
 from dyngs.io.formats.similarity import (
     AXES,
-    UNMOVED,
+    IDENTITY,
     Similarity,
-    axis_of,
-    turn_between,
+    parse_axis,
+    rotation_between,
 )
 from dyngs.io.formats.sog import read_sog, write_sog
 from dyngs.io.formats.splat_file import (
@@ -31,7 +31,7 @@ from dyngs.io.formats.splat_file import (
     offset_notes,
     require_writable,
     unit_rotations,
-    with_degree,
+    with_sh_degree,
 )
 from dyngs.io.formats.spz import read_spz, write_spz
 from dyngs.io.formats.usd import read_usd, write_usd
@@ -48,8 +48,8 @@ class Format:
     max_degree: int  # largest degree of the harmonics that it holds
     read: Callable[[Path], SplatFile]
     write: Callable[[Path, SplatFile], None] | None
-    states_mode: bool = True  # whether it can say that the scene is antialiased
-    holds_comments: bool = True  # whether its files say how they were turned and edited
+    stores_render_mode: bool = True  # whether it can say that the scene is antialiased
+    stores_comments: bool = True  # whether its files say how they were turned and edited
 
 
 FORMATS = (
@@ -68,7 +68,7 @@ SOG_INDEX = "lod-meta.json"  # of a .sog in levels of detail
 
 
 @dataclass(frozen=True)
-class Written:
+class WrittenFile:
     """A file that was written."""
 
     path: Path  # of it
@@ -76,16 +76,16 @@ class Written:
     notes: tuple[str, ...] = ()  # a line about each thing that the format could not hold
 
 
-def format_of(path: Path) -> Format:
+def format_for_path(path: Path) -> Format:
     """Return the format that the suffix of ``path`` names. Raises DyngsError: none does; names all
     of them."""
-    found = known_format(path)
+    found = find_format(path)
     if found is None:
         raise DyngsError(f"{path}: no suffix of a file of Gaussians; use one of {all_suffixes()}")
     return found
 
 
-def known_format(path: Path) -> Format | None:
+def find_format(path: Path) -> Format | None:
     """Return the format that the suffix of ``path`` names, None if none does."""
     name = path.name.lower()
     for candidate in FORMATS:
@@ -99,10 +99,10 @@ def format_to_read(path: Path) -> Format | None:
     folder."""
     if path.is_dir():
         return None
-    return CHECKPOINT if path.suffix.lower() in CHECKPOINT.suffixes else known_format(path)
+    return CHECKPOINT if path.suffix.lower() in CHECKPOINT.suffixes else find_format(path)
 
 
-def format_named(name: str) -> Format:
+def format_by_name(name: str) -> Format:
     """Return the format called ``name``. Raises DyngsError if there is none."""
     known = {candidate.name: candidate for candidate in FORMATS}
     if name not in known:
@@ -124,7 +124,7 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
     before the header has been compared with the size of the file.
     """
     path = Path(path)
-    own = format_to_read(path) or format_of(path)
+    own = format_to_read(path) or format_for_path(path)
     if not path.exists():
         raise DyngsError(f"{path}: no such file")
     require_regular_file(path)
@@ -135,7 +135,7 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
         return drawable(move_to_origin(splat), path, nonfinite)
 
 
-def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = None) -> Written:
+def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = None) -> WrittenFile:
     """Write a file of Gaussians, into which any 3D filter is fused, atomically; its suffix names
     the format.
 
@@ -144,7 +144,7 @@ def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = 
     that the format does not hold.
     """
     path = Path(path)
-    own = format_of(path)
+    own = format_for_path(path)
     whole, notes = fitted(path, own, splat, sh_degree)
     with atomic_file(path) as temporary:
         assert own.write is not None
@@ -153,7 +153,7 @@ def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = 
         except DyngsError as error:
             reason = str(error).removeprefix(f"{temporary}: ")
             raise DyngsError(f"{path}: not written: {reason}") from error
-    return Written(path, whole, notes)
+    return WrittenFile(path, whole, notes)
 
 
 def fitted(
@@ -175,16 +175,16 @@ def fitted(
     if degree < gaussians.sh_degree and bool(gaussians.sh[:, (degree + 1) ** 2 :].any()):
         why = f"{own.name} holds no more" if sh_degree is None else "as asked for"
         notes.append(f"harmonics above degree {degree} are left out: {why}")
-    if splat.mode is RasterizeMode.ANTIALIASED and not own.states_mode:
+    if splat.mode is RasterizeMode.ANTIALIASED and not own.stores_render_mode:
         notes.append(
             f"the scene is antialiased, which {own.name} cannot say: viewers draw thin parts thicker"
         )
     notes += offset_notes(
-        splat, "the file states it" if own.holds_comments else f"{own.name} cannot state it"
+        splat, "the file states it" if own.stores_comments else f"{own.name} cannot state it"
     )
-    if splat.edited != UNMOVED and not own.holds_comments:
+    if splat.edited != IDENTITY and not own.stores_comments:
         notes.append(f"{own.name} cannot state how it was edited: this file cannot be undone")
-    gaussians = with_degree(gaussians.replace(quats=unit_rotations(gaussians.quats)), degree)
+    gaussians = with_sh_degree(gaussians.replace(quats=unit_rotations(gaussians.quats)), degree)
     return replace(splat, gaussians=gaussians), tuple(notes)
 
 
@@ -197,35 +197,35 @@ def upright(splat: SplatFile, up: str | None, path: Path) -> SplatFile:
     """
     if up == "keep" or splat.up is None:
         return splat
-    wanted = format_of(path).up if up is None else up
-    return turned_file(splat, turn_between(axis_of(splat.up), axis_of(wanted)), wanted)
+    wanted = format_for_path(path).up if up is None else up
+    return rotate_file(splat, rotation_between(parse_axis(splat.up), parse_axis(wanted)), wanted)
 
 
-def turned_file(
+def rotate_file(
     splat: SplatFile, turn: tuple[float, float, float, float], up: str | None
 ) -> SplatFile:
     """Return the contents turned by a quaternion wxyz about the origin, ``up`` being what then
     points up."""
-    if splat.edited == UNMOVED:
+    if splat.edited == IDENTITY:
         gaussians = Similarity(turn).gaussians(splat.gaussians)
         turned = Similarity(turn).after(Similarity(splat.turned)).turn
         return replace(splat, gaussians=gaussians, up=up, turned=turned)
-    return moved_file(splat, Similarity(turn), up)
+    return transform_file(splat, Similarity(turn), up)
 
 
-def moved_file(splat: SplatFile, how: Similarity, up: str | None) -> SplatFile:
+def transform_file(splat: SplatFile, how: Similarity, up: str | None) -> SplatFile:
     """Return the contents rotated, scaled and shifted, so that it can be undone; ``up`` is what
     then points up."""
     gaussians = how.gaussians(splat.gaussians)
     return replace(splat, gaussians=gaussians, up=up, edited=how.after(splat.edited))
 
 
-def undone_file(splat: SplatFile) -> SplatFile:
+def undo_transforms(splat: SplatFile) -> SplatFile:
     """Return the contents as they lay before all of ``moved_file``; up is known where it was an
     axis."""
     back = splat.edited.inverse()
     up = splat.up
     if up is not None:
-        before = back.rotation @ axis_of(up)
+        before = back.rotation @ parse_axis(up)
         up = next((name for name, axis in AXES.items() if before @ axis > 1 - 1e-6), None)
-    return replace(splat, gaussians=back.gaussians(splat.gaussians), up=up, edited=UNMOVED)
+    return replace(splat, gaussians=back.gaussians(splat.gaussians), up=up, edited=IDENTITY)

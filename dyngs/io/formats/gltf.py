@@ -17,14 +17,14 @@ import numpy as np
 from dyngs.core.conventions import SH_C0, decode_srgb, num_sh_terms
 from dyngs.core.gaussians import Gaussians
 from dyngs.io.fields import require_at_most
-from dyngs.io.formats.similarity import joined, similarity_of_matrix
+from dyngs.io.formats.similarity import joined, similarity_from_matrix
 from dyngs.io.formats.splat_file import (
-    MOST_GAUSSIANS,
+    MAX_GAUSSIANS,
     SplatFile,
     described,
     from_linear,
     header_comments,
-    stored_comments,
+    comments_from_json,
 )
 from dyngs.io.gltf import VERTICES, GlbDocument, GltfFile
 
@@ -49,7 +49,7 @@ def read_gltf(path: Path) -> SplatFile:
     file = GltfFile(path)
     found: list[Gaussians] = []
     for primitive, world in _primitives(file):
-        place = similarity_of_matrix(world)
+        place = similarity_from_matrix(world)
         if place is None:
             raise file.error(
                 "a node distorts or mirrors its Gaussians; apply its transform before exporting"
@@ -58,7 +58,7 @@ def read_gltf(path: Path) -> SplatFile:
         found.append(place.gaussians(own.replace(means=own.means.double())))
     if not found:
         raise file.error(f"holds no Gaussians ({EXTENSION})")
-    comments = stored_comments(file.json["asset"].get("extras"))
+    comments = comments_from_json(file.json["asset"].get("extras"))
     return described(SplatFile(joined(found), comments=comments))
 
 
@@ -154,7 +154,7 @@ def _gaussians(file: GltfFile, primitive: dict[str, Any]) -> Gaussians:
 
     def numbers(name: str, kind: str = "VEC3") -> np.ndarray:
         found = file.numbers(names[f"{EXTENSION}:{name}"], kind, np.float32)
-        require_at_most(file.path, len(found), MOST_GAUSSIANS, "Gaussians")
+        require_at_most(file.path, len(found), MAX_GAUSSIANS, "Gaussians")
         return found
 
     terms = []

@@ -36,25 +36,25 @@ def unpack_fractions(words: np.ndarray, bits: Sequence[int]) -> np.ndarray:
     return np.stack(columns, axis=1)
 
 
-def smallest_three(quats: np.ndarray) -> np.ndarray:
+def pack_rotations(quats: np.ndarray) -> np.ndarray:
     """Return rotations (N, 4) wxyz as (N,) uint32: 2 bits name the largest entry, 10 each hold the
     others.
 
     The others, in the order of wxyz, run from -sqrt(1/2) to sqrt(1/2).
     """
-    largest, others = largest_and_others(quats)
+    largest, others = split_largest(quats)
     return (largest.astype(np.uint32) << np.uint32(30)) | pack_fractions(
         others * _HALF_ROOT + 0.5, (10, 10, 10)
     )
 
 
-def whole_rotations(words: np.ndarray) -> np.ndarray:
+def unpack_rotations(words: np.ndarray) -> np.ndarray:
     """Return the unit quaternions (N, 4) wxyz that ``smallest_three`` packed."""
     others = (unpack_fractions(words, (10, 10, 10)) - 0.5) / _HALF_ROOT
-    return with_largest(words >> np.uint32(30), others)
+    return restore_largest(words >> np.uint32(30), others)
 
 
-def largest_and_others(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def split_largest(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return which entry of unit quaternions (N, 4) is largest (N,), and the others (N, 3) if that
     is positive."""
     largest = np.abs(quats).argmax(axis=1)
@@ -63,7 +63,7 @@ def largest_and_others(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return largest, (quats * sign)[keep].reshape(-1, 3)
 
 
-def with_largest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
+def restore_largest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Return the unit quaternions (N, 4) float32 with the entries that ``largest_and_others``
     returned."""
     quats = np.empty((len(others), 4), np.float32)

@@ -28,13 +28,13 @@ from dyngs.io.fields import require_at_most
 from dyngs.io.formats.packing import (
     logit,
     pack_fractions,
-    smallest_three,
+    pack_rotations,
     unpack_fractions,
-    whole_rotations,
+    unpack_rotations,
 )
 from dyngs.io.formats.splat_file import (
-    MOST_GAUSSIANS,
-    MOST_LOG_SCALE,
+    MAX_GAUSSIANS,
+    MAX_LOG_SCALE,
     SplatFile,
     described,
     header_comments,
@@ -71,7 +71,7 @@ def read_ply(path: Path) -> SplatFile:
     if "vertex" not in elements:
         raise ValueError("it has no vertices, or list properties in or before them")
     vertices = elements["vertex"]
-    require_at_most(path, len(vertices), MOST_GAUSSIANS, "Gaussians")
+    require_at_most(path, len(vertices), MAX_GAUSSIANS, "Gaussians")
     is_compressed = "packed_position" in (vertices.dtype.names or ())
     gaussians = _unpacked(elements) if is_compressed else _gaussians(vertices)
     return described(SplatFile(gaussians, comments=comments))
@@ -155,7 +155,7 @@ def _unpacked(elements: Mapping[str, np.ndarray]) -> Gaussians:
         sh = np.concatenate([sh, _rest(elements["sh"])], axis=1)
     return Gaussians(
         means=torch.from_numpy(ranged(unpack_fractions(position, _BITS_3), _POSITION)),
-        quats=torch.from_numpy(whole_rotations(rotation)),
+        quats=torch.from_numpy(unpack_rotations(rotation)),
         log_scales=torch.from_numpy(ranged(unpack_fractions(size, _BITS_3), _SIZE)),
         logit_opacities=torch.from_numpy(logit(rgba[:, 3])),
         sh=torch.from_numpy(sh),
@@ -185,7 +185,7 @@ def write_compressed(path: Path, splat: SplatFile) -> None:
     chunk_of = np.arange(n) // _PER_CHUNK
     ranges = []
     fractions = []
-    log_scales = gaussians.log_scales.numpy().clip(-_MOST_LOG, min(_MOST_LOG, MOST_LOG_SCALE))
+    log_scales = gaussians.log_scales.numpy().clip(-_MOST_LOG, min(_MOST_LOG, MAX_LOG_SCALE))
     for values in (gaussians.means.numpy(), log_scales, sh[:, 0] * SH_C0 + 0.5):
         low = np.minimum.reduceat(values, starts)
         high = np.maximum.reduceat(values, starts)
@@ -194,7 +194,7 @@ def write_compressed(path: Path, splat: SplatFile) -> None:
         fractions.append((values - low[chunk_of]) / span[chunk_of])
     words = [
         pack_fractions(fractions[0], _BITS_3),
-        smallest_three(gaussians.quats.numpy()),
+        pack_rotations(gaussians.quats.numpy()),
         pack_fractions(fractions[1], _BITS_3),
         pack_fractions(
             np.concatenate([fractions[2], gaussians.opacities.numpy()[:, None]], axis=1), _BITS_4
@@ -292,7 +292,7 @@ def header_bytes(
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 
-def double_ply(xyz: np.ndarray, rgb: np.ndarray, faces: np.ndarray | None = None) -> bytes:
+def encode_ply(xyz: np.ndarray, rgb: np.ndarray, faces: np.ndarray | None = None) -> bytes:
     """Return a .ply of coloured points (V, 3) in float64, or of a mesh with triangles (F, 3).
 
     ``rgb``: (V, 3) uint8.

@@ -82,7 +82,7 @@ class Similarity:
 
         A 3D filter must be fused already, as in ``GaussianScene.at``.
         """
-        if self == UNMOVED:
+        if self == IDENTITY:
             return gaussians
         means = gaussians.means.double()
         quats = gaussians.quats
@@ -92,7 +92,7 @@ class Similarity:
             matrix = rotation_matrices(turn)
             means = means @ matrix.T
             quats = quat_product(turn, quats.double()).to(quats.dtype)
-            sh = turned_harmonics(sh, matrix)
+            sh = rotate_harmonics(sh, matrix)
         means = self.scale * means
         if any(self.shift):
             means = means + torch.tensor(self.shift, dtype=torch.float64, device="cpu")
@@ -106,7 +106,7 @@ class Similarity:
     def cameras(self, cameras: Cameras) -> Cameras:
         """Return the cameras that see the moved scene as ``cameras`` see the scene: depths are
         scaled, too."""
-        if self == UNMOVED:
+        if self == IDENTITY:
             return cameras
         poses = cameras.cam_from_world.double()
         rotations = poses[:, :3, :3] @ torch.from_numpy(self.rotation.T).to(poses)
@@ -116,10 +116,10 @@ class Similarity:
         return replace(cameras, cam_from_world=moved.to(cameras.cam_from_world.dtype))
 
 
-UNMOVED = Similarity()
+IDENTITY = Similarity()
 
 
-def similarity_of(numbers: Sequence[float]) -> Similarity:
+def similarity_from_numbers(numbers: Sequence[float]) -> Similarity:
     """Return what ``numbers`` (8,) of a file say, as of ``Similarity.numbers``. Raises ValueError:
     no such numbers."""
     a, b, c, d, scale, x, y, z = (float(value) for value in numbers)
@@ -130,7 +130,7 @@ def similarity_of(numbers: Sequence[float]) -> Similarity:
     return Similarity((a, b, c, d), scale, (x, y, z))
 
 
-def similarity_of_matrix(world: np.ndarray) -> Similarity | None:
+def similarity_from_matrix(world: np.ndarray) -> Similarity | None:
     """Return the similarity of an affine matrix (4, 4), None where that distorts or mirrors."""
     linear = world[:3, :3]
     if not np.isfinite(world).all():
@@ -141,10 +141,10 @@ def similarity_of_matrix(world: np.ndarray) -> Similarity | None:
     if abs(scale - 1) < 1e-7:
         scale = 1.0
     x, y, z = world[:3, 3].tolist()
-    return Similarity(turn_of(linear / scale), scale, (x, y, z))
+    return Similarity(quat_from_matrix(linear / scale), scale, (x, y, z))
 
 
-def turn_of(rotation: np.ndarray) -> Quaternion:
+def quat_from_matrix(rotation: np.ndarray) -> Quaternion:
     """Return the quaternion wxyz of a rotation (3, 3)."""
     from scipy.spatial.transform import Rotation
 
@@ -152,7 +152,7 @@ def turn_of(rotation: np.ndarray) -> Quaternion:
     return w, x, y, z
 
 
-def far_offset(points: np.ndarray, detail: float) -> np.ndarray:
+def origin_offset(points: np.ndarray, detail: float) -> np.ndarray:
     """Return (3,) to be subtracted from points (N, 3) that are too far from the origin for float32;
     0 if none are.
 
@@ -182,11 +182,11 @@ def mirrored(gaussians: Gaussians) -> Gaussians:
     """Return the mirror image of Gaussians, x becoming -x."""
     flip = torch.tensor([-1.0, 1.0, 1.0], dtype=gaussians.means.dtype, device="cpu")
     turn = torch.tensor([1.0, 1.0, -1.0, -1.0], dtype=gaussians.quats.dtype, device="cpu")
-    sh = turned_harmonics(gaussians.sh, flip.double().diag())
+    sh = rotate_harmonics(gaussians.sh, flip.double().diag())
     return gaussians.replace(means=gaussians.means * flip, quats=gaussians.quats * turn, sh=sh)
 
 
-def turned_harmonics(sh: Tensor, matrix: Tensor) -> Tensor:
+def rotate_harmonics(sh: Tensor, matrix: Tensor) -> Tensor:
     """Return harmonics (N, K, 3) whose colour towards ``matrix @ d`` is that of ``sh`` towards d.
 
     A rotation mixes the harmonics of one degree only among themselves; how, is solved for from
@@ -210,7 +210,7 @@ def turned_harmonics(sh: Tensor, matrix: Tensor) -> Tensor:
     return torch.cat(parts, dim=1).contiguous()
 
 
-def turn_between(start: Sequence[float], end: Sequence[float]) -> Quaternion:
+def rotation_between(start: Sequence[float], end: Sequence[float]) -> Quaternion:
     """Return the smallest rotation, a quaternion wxyz, from one direction to another; about x where
     they are opposite.
 
@@ -228,7 +228,7 @@ def turn_between(start: Sequence[float], end: Sequence[float]) -> Quaternion:
     return w, x, y, z
 
 
-def axis_of(text: str) -> tuple[float, float, float]:
+def parse_axis(text: str) -> tuple[float, float, float]:
     """Return the unit vector of an axis name such as "-y". Raises DyngsError: no such axis."""
     if text not in AXES:
         raise DyngsError(f"no axis {text!r:.20}; use one of {', '.join(AXES)}")

@@ -23,18 +23,18 @@ from dyngs.core.gaussians import Gaussians, morton_order
 from dyngs.io.fields import require_at_most
 from dyngs.io.formats.packing import (
     codebook,
-    largest_and_others,
+    split_largest,
     logit,
     nearest_entries,
     palette,
-    with_largest,
+    restore_largest,
 )
 from dyngs.io.formats.splat_file import (
-    MOST_GAUSSIANS,
+    MAX_GAUSSIANS,
     SplatFile,
     described,
     header_comments,
-    stored_comments,
+    comments_from_json,
 )
 
 _META = "meta.json"
@@ -85,7 +85,7 @@ def sog_parts(splat: SplatFile) -> Iterator[tuple[str, bytes]]:
     high = far.max(axis=0)
     grid = np.round((far - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
     means = [draw("means_l.webp", grid & 255), draw("means_u.webp", grid >> 8)]
-    largest, others = largest_and_others(gaussians.quats.numpy())
+    largest, others = split_largest(gaussians.quats.numpy())
     coded = np.concatenate(
         [np.round((others * _HALF_ROOT + 0.5) * 255), _MODE + largest[:, None]], axis=1
     )
@@ -154,7 +154,7 @@ def _read(path: Path, archive: zipfile.ZipFile) -> SplatFile:
     n = meta["count"]
     if type(n) is not int or n < 1:
         raise ValueError("its count is no number of Gaussians")
-    require_at_most(path, n, MOST_GAUSSIANS, "Gaussians")
+    require_at_most(path, n, MAX_GAUSSIANS, "Gaussians")
 
     def pixels(part: str, index: int = 0) -> np.ndarray:
         found = _image(path, archive, meta[part]["files"][index]).reshape(-1, 4)
@@ -190,14 +190,14 @@ def _read(path: Path, archive: zipfile.ZipFile) -> SplatFile:
         sh = np.concatenate([sh, rows[labels[:, 0] | labels[:, 1] << 8]], axis=1)
     gaussians = Gaussians(
         means=torch.from_numpy(means),
-        quats=torch.from_numpy(with_largest(coded[:, 3] - _MODE, others)),
+        quats=torch.from_numpy(restore_largest(coded[:, 3] - _MODE, others)),
         log_scales=torch.from_numpy(table("scales")[pixels("scales")[:, :3]]),
         logit_opacities=torch.from_numpy(logit(base[:, 3].astype(np.float32) / 255)),
         sh=torch.from_numpy(sh),
     )
     mode = RasterizeMode.ANTIALIASED if meta.get("antialias") else RasterizeMode.CLASSIC
     asset = meta.get("asset")
-    comments = stored_comments(asset.get("comments") if isinstance(asset, dict) else None)
+    comments = comments_from_json(asset.get("comments") if isinstance(asset, dict) else None)
     return described(SplatFile(gaussians, mode, comments=comments))
 
 

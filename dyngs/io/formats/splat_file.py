@@ -16,17 +16,17 @@ from dyngs.core.conventions import RasterizeMode, num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.gaussians import Gaussians
 from dyngs.io.formats.packing import logit
-from dyngs.io.formats.similarity import AXES, UNMOVED, Similarity, far_offset, similarity_of
+from dyngs.io.formats.similarity import AXES, IDENTITY, Similarity, origin_offset, similarity_from_numbers
 from dyngs.ops.registration import finite_rows
 
 Nonfinite = Literal["error", "skip"]
 
-MOST_LOGIT = 16.0
+MAX_LOGIT = 16.0
 """Infinite logits become this: an opacity of 1 - 1e-7. Files with opacities in 8 bits hold exactly
 0 and 1."""
-LEAST_LOG_SCALE = -30.0  # scales of 0, flat Gaussians, become exp(-30) = 1e-13
-MOST_LOG_SCALE = 80.0  # beyond 88 the scale itself is infinite in float32
-MOST_GAUSSIANS = 1 << 26
+MIN_LOG_SCALE = -30.0  # scales of 0, flat Gaussians, become exp(-30) = 1e-13
+MAX_LOG_SCALE = 80.0  # beyond 88 the scale itself is infinite in float32
+MAX_GAUSSIANS = 1 << 26
 """Limit on the Gaussians of a file whose size does not bound them: 16 GB in memory with harmonics
 of degree 3."""
 
@@ -55,7 +55,7 @@ class SplatFile:
     # to the means, plus ``world_offset``, gives the coordinates of the original capture
     turned: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     # by `dyngs edit`, after ``turned``: its inverse gives the frame of before
-    edited: Similarity = UNMOVED
+    edited: Similarity = IDENTITY
     notes: tuple[str, ...] = ()  # a line about each thing that was changed in reading
     # (3,) float64, added to the means it gives the positions of the file, where those are too far
     # away for float32
@@ -73,14 +73,14 @@ def move_to_origin(splat: SplatFile) -> SplatFile:
     means = splat.gaussians.means.double()
     sizes = splat.gaussians.log_scales.amax(1)
     sizes = sizes[sizes.isfinite()]
-    offset = far_offset(means.numpy(), float(sizes.median().exp()) if len(sizes) else 0.0)
+    offset = origin_offset(means.numpy(), float(sizes.median().exp()) if len(sizes) else 0.0)
     gaussians = splat.gaussians.replace(means=(means - torch.from_numpy(offset)).float())
     if not offset.any():
         return replace(splat, gaussians=gaussians)
     x, y, z = offset.tolist()
     note = f"the scene is far from the origin: {x:.12g} {y:.12g} {z:.12g} is subtracted from its positions"
     near = replace(splat, gaussians=gaussians, file_offset=(x, y, z), notes=(*splat.notes, note))
-    if splat.edited != UNMOVED:
+    if splat.edited != IDENTITY:
         return replace(near, edited=Similarity(shift=(-x, -y, -z)).after(splat.edited))
     x, y, z = (Similarity(splat.turned).inverse().points(offset) + splat.world_offset).tolist()
     return replace(near, world_offset=(x, y, z))
@@ -92,7 +92,7 @@ def offset_notes(splat: SplatFile, remark: str) -> tuple[str, ...]:
 
     ``remark`` is about the format.
     """
-    if splat.edited != UNMOVED or not any(splat.world_offset):
+    if splat.edited != IDENTITY or not any(splat.world_offset):
         return ()
     offset = " ".join(f"{x:.12g}" for x in splat.frame.points(np.array(splat.world_offset)))
     return (
@@ -110,11 +110,11 @@ def drawable(splat: SplatFile, path: Path, nonfinite: Nonfinite) -> SplatFile:
     gaussians = splat.gaussians
     total = len(gaussians)
     logits = gaussians.logit_opacities
-    logits = torch.where(logits.isinf(), logits.clamp(-MOST_LOGIT, MOST_LOGIT), logits)
+    logits = torch.where(logits.isinf(), logits.clamp(-MAX_LOGIT, MAX_LOGIT), logits)
     scales = gaussians.log_scales
-    scales = torch.where(scales == -torch.inf, LEAST_LOG_SCALE, scales)
+    scales = torch.where(scales == -torch.inf, MIN_LOG_SCALE, scales)
     gaussians = gaussians.replace(logit_opacities=logits, log_scales=scales)
-    good = finite_rows(list(gaussians.tensors().values())) & ~(scales > MOST_LOG_SCALE).any(1)
+    good = finite_rows(list(gaussians.tensors().values())) & ~(scales > MAX_LOG_SCALE).any(1)
     count = int((~good).sum())
     if count:
         bad = f"{count:,} of {total:,} Gaussians"
@@ -138,7 +138,7 @@ def require_writable(path: Path, gaussians: Gaussians) -> None:
         )
 
 
-def with_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
     """Return the Gaussians with harmonics of ``degree``: higher ones left out, missing ones
     zero."""
     terms = num_sh_terms(degree)
@@ -203,7 +203,7 @@ def header_comments(splat: SplatFile) -> list[str]:
         "eps2d": () if splat.eps2d is None else (splat.eps2d,),
         "world_offset": splat.world_offset if any(splat.world_offset) else (),
         "turned": splat.turned if any(splat.turned[1:]) else (),
-        "edited": splat.edited.numbers if splat.edited != UNMOVED else (),
+        "edited": splat.edited.numbers if splat.edited != IDENTITY else (),
     }
     for key, numbers in stated.items():
         if numbers:
@@ -214,7 +214,7 @@ def header_comments(splat: SplatFile) -> list[str]:
     return [*notes, *kept]
 
 
-def stored_comments(value: object) -> tuple[str, ...]:
+def comments_from_json(value: object) -> tuple[str, ...]:
     """Return the comments that a file of ours holds as a list of JSON; none where ``value`` is
     anything else."""
     return tuple(x for x in value if isinstance(x, str)) if isinstance(value, list) else ()
@@ -244,7 +244,7 @@ def described(splat: SplatFile) -> SplatFile:
                 raise ValueError(f"{comment!r:.80} should hold {_COUNTS[key]} finite numbers")
             found[key] = numbers[0] if key == "eps2d" else numbers
             if key == "turned":
-                similarity_of((*numbers, 1, 0, 0, 0))
+                similarity_from_numbers((*numbers, 1, 0, 0, 0))
             elif key == "edited":
-                found[key] = similarity_of(numbers)
+                found[key] = similarity_from_numbers(numbers)
     return replace(splat, **found)

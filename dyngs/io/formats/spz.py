@@ -21,9 +21,9 @@ from dyngs.core.conventions import MAX_SH_DEGREE, RasterizeMode, num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.gaussians import Gaussians
 from dyngs.io.fields import require_at_most
-from dyngs.io.formats.packing import largest_and_others, logit, with_largest
-from dyngs.io.formats.similarity import Similarity, mirrored, turn_of
-from dyngs.io.formats.splat_file import MOST_GAUSSIANS, SplatFile, unit_rotations
+from dyngs.io.formats.packing import split_largest, logit, restore_largest
+from dyngs.io.formats.similarity import Similarity, mirrored, quat_from_matrix
+from dyngs.io.formats.splat_file import MAX_GAUSSIANS, SplatFile, unit_rotations
 
 _MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")
@@ -55,7 +55,7 @@ def read_spz(path: Path) -> SplatFile:
     rows = {"means": 9, "alphas": 1, "colours": 3, "scales": 3, "quats": 3 if version < 3 else 4}
     rows["sh"] = 3 * (num_sh_terms(degree) - 1)
     total = count * sum(rows.values())
-    require_at_most(path, count, MOST_GAUSSIANS, "Gaussians")
+    require_at_most(path, count, MAX_GAUSSIANS, "Gaussians")
     require_at_most(path, total, _MOST_BYTES, "bytes of Gaussians")
     if is_gzip:
         more = _MOST_EXTENSION_BYTES if flags & _HAS_EXTENSIONS else 0
@@ -176,7 +176,7 @@ def _from_system(splat: SplatFile, number: int) -> SplatFile:
         axes[:, 0] *= -1
     note = "it states other axes than right, up and back: turned to those"
     return replace(
-        splat, gaussians=Similarity(turn_of(axes)).gaussians(gaussians), notes=(*splat.notes, note)
+        splat, gaussians=Similarity(quat_from_matrix(axes)).gaussians(gaussians), notes=(*splat.notes, note)
     )
 
 
@@ -209,7 +209,7 @@ def _splat(parts: Mapping[str, np.ndarray], fraction_bits: int, flags: int) -> S
 def _packed_rotations(quats: np.ndarray) -> np.ndarray:
     """Return (N,) uint32: which of xyzw is largest in 2 bits, the sign and 9 bits of each of the
     others."""
-    largest, others = largest_and_others(quats[:, [1, 2, 3, 0]])
+    largest, others = split_largest(quats[:, [1, 2, 3, 0]])
     size = np.minimum(np.abs(others) / _ROOT_HALF * _TOP + 0.5, _TOP).astype(np.uint32)
     coded = size | ((others < 0).astype(np.uint32) << np.uint32(9))
     words = largest.astype(np.uint32)
@@ -224,7 +224,7 @@ def _unpacked_rotations(words: np.ndarray) -> np.ndarray:
     )
     size = (fields & np.uint32(_TOP)).astype(np.float32) / _TOP * _ROOT_HALF
     others = np.where(fields >> np.uint32(9), -size, size)
-    return with_largest(words >> np.uint32(30), others)[:, [3, 0, 1, 2]]
+    return restore_largest(words >> np.uint32(30), others)[:, [3, 0, 1, 2]]
 
 
 def _as_bytes(values: np.ndarray) -> bytes:

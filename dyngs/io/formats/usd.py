@@ -23,7 +23,7 @@ from dyngs.core.gaussians import Gaussians
 from dyngs.io.child import python_command
 from dyngs.io.fields import require_at_most
 from dyngs.io.formats import usd_child
-from dyngs.io.formats.similarity import joined, similarity_of_matrix
+from dyngs.io.formats.similarity import joined, similarity_from_matrix
 from dyngs.io.formats.splat_file import SplatFile, described, from_linear, header_comments
 
 _SECONDS = 600.0  # of wall time; the child has less of processor time
@@ -125,7 +125,7 @@ def _gaussians(arrays: Mapping[str, np.ndarray]) -> Gaussians:
     means = arrays["means"]
     sh = arrays["sh"].reshape(len(means), num_sh_terms(degree), 3)
     found = from_linear(means, arrays["quats"], arrays["scales"], arrays["opacities"], sh)
-    place = similarity_of_matrix(arrays["world"])
+    place = similarity_from_matrix(arrays["world"])
     if place is None:
         raise ValueError("a prim distorts or mirrors its Gaussians; apply its transform first")
     return place.gaussians(found.replace(means=found.means.double()))

@@ -22,7 +22,7 @@ from dyngs.config import (
 )
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import (
     SCENE_FILE,
@@ -41,7 +41,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.fixture(scope="module")
 def still(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(folder, StillOptions(size=16, num_train=4, num_test=1, samples=1))
+    write_static_capture(folder, StaticOptions(size=16, num_train=4, num_test=1, samples=1))
     return folder
 
 

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 
 
 @pytest.fixture(scope="session")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """24 views of an object before nothing, 24 px."""
     folder = tmp_path_factory.mktemp("fields") / "capture"
-    write_still_capture(folder, StillOptions(size=24, num_train=24, num_test=2, samples=1))
+    write_static_capture(folder, StaticOptions(size=24, num_train=24, num_test=2, samples=1))
     return folder

@@ -10,7 +10,7 @@ from dyngs.capture.sfm.frame_choice import (
     STILL,
     FrameMeasures,
     chosen_frames,
-    displaced_by,
+    camera_displacement,
     measured,
 )
 
@@ -74,15 +74,15 @@ def test_a_camera_stands_though_something_large_moves_and_light_changes() -> Non
         frame = _shown(30, scenery) + i
         frame[20:80, 5 * i : 5 * i + 50] = 128
         frames.append(np.clip(frame, 0, 255).astype(np.uint8))
-    assert displaced_by(np.stack(frames)) < 0.001 < STANDS
+    assert camera_displacement(np.stack(frames)) < 0.001 < STANDS
 
 
 @pytest.mark.parametrize("step", [0.2, 4.0, 12.0])
 def test_a_camera_that_turns_does_not_stand(step: float) -> None:
     frames = np.stack([_shown(10 + step * i, _scenery()).astype(np.uint8) for i in range(16)])
-    assert displaced_by(frames) > STANDS
+    assert camera_displacement(frames) > STANDS
 
 
 def test_images_that_show_nothing_count_as_standing() -> None:
-    assert displaced_by(np.full((5, 40, 60), 90, np.uint8)) == 0
-    assert displaced_by(np.zeros((1, 40, 60), np.uint8)) == 0
+    assert camera_displacement(np.full((5, 40, 60), 90, np.uint8)) == 0
+    assert camera_displacement(np.zeros((1, 40, 60), np.uint8)) == 0

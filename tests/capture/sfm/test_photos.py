@@ -11,7 +11,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from dyngs.capture.sfm.estimate import estimate_poses
-from dyngs.capture.sfm.photos import gather_photos, lay_out
+from dyngs.capture.sfm.photos import gather_photos, prepare_colmap_images
 from dyngs.core.errors import DyngsError
 from dyngs.data.images.images import read_header, read_image
 
@@ -89,7 +89,7 @@ def test_photos_are_read_by_content_whatever_their_name(
     stored = read_image(tmp_path / "images" / photos[0].name).numpy().astype(int)
     assert np.abs(stored - COLOURS).max() <= tolerance
     (tmp_path / "work").mkdir()
-    (laid,) = lay_out(photos, tmp_path / "images", tmp_path / "work" / "images", {})
+    (laid,) = prepare_colmap_images(photos, tmp_path / "images", tmp_path / "work" / "images", {})
     with Image.open(tmp_path / "work" / "images" / laid) as image:
         assert image.format is not None
         assert image.format.lower() in ("jpeg", "png")

@@ -19,9 +19,9 @@ from dyngs.capture.sfm.several_videos import (
     frames_at_steps,
     open_video,
     poses_of_videos,
-    read_given,
-    shift_of,
-    starts_by_sound,
+    read_video_settings,
+    estimate_shift,
+    estimate_starts_by_sound,
 )
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import all_views
@@ -101,7 +101,7 @@ def _written(folder: Path, value: object) -> Path:
 
 def test_starts_and_test_cameras(tmp_path: Path) -> None:
     _written(tmp_path, {"starts": {"left": 0, "right": 1.25}, "test": ["left"]})
-    assert read_given(tmp_path, NAMES) == ({"left": 0.0, "right": 1.25}, ["left"])
+    assert read_video_settings(tmp_path, NAMES) == ({"left": 0.0, "right": 1.25}, ["left"])
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_starts_and_test_cameras(tmp_path: Path) -> None:
 )
 def test_mistakes_are_named(tmp_path: Path, value: object, message: str) -> None:
     with pytest.raises(DyngsError, match=message):
-        read_given(_written(tmp_path, value), NAMES)
+        read_video_settings(_written(tmp_path, value), NAMES)
 
 
 HERTZ = 16000
@@ -184,7 +184,7 @@ def test_offsets_of_recordings_with_noise_of_their_own(tmp_path: Path) -> None:
         for gain, part in zip((1.0, 0.3, 0.6), parts, strict=True)
     ]
     films = [open_video(_write(tmp_path / f"{i}.mp4", sound)) for i, sound in enumerate(noisy)]
-    seconds, line = starts_by_sound(films)
+    seconds, line = estimate_starts_by_sound(films)
     assert list(seconds.values()) == pytest.approx(starts, abs=0.015)
     assert "by the sound (3 of 3 pairs agree" in line
 
@@ -205,12 +205,12 @@ def _shown(signal: np.ndarray, begin: float, length: int) -> np.ndarray:
 @pytest.mark.parametrize("shift", [0.0, 7.0, -12.4])
 def test_a_shift_is_found_to_half_a_sample(shift: float) -> None:
     signal = _smooth_noise(np.random.default_rng(0), 600)
-    samples, peak, deviations = shift_of(_shown(signal, 30, 420), _shown(signal, 30 + shift, 400))
+    samples, peak, deviations = estimate_shift(_shown(signal, 30, 420), _shown(signal, 30 + shift, 400))
     assert samples == pytest.approx(shift, abs=0.5)
     assert peak > 0.9
     assert deviations > 6
     unrelated = _smooth_noise(np.random.default_rng(1), 400)
-    assert shift_of(signal, unrelated)[2] < 6
+    assert estimate_shift(signal, unrelated)[2] < 6
 
 
 def _videos(*clips: tuple[float, int]) -> list[CameraVideo]:

@@ -57,15 +57,15 @@ def _videos(folder: Path, count: int) -> Path:
 def test_photos_get_poses_once(tmp_path: Path, asked: list[Path]) -> None:
     said: list[str] = []
     data = DataConfig(root=_photos(tmp_path / "photos"))
-    first = with_poses(data, say=said.append)
+    first = with_poses(data, log=said.append)
     assert cache_folder("poses") in first.root.parents
     assert "estimated first" in said[0]
     assert "3 of 3 images" in said[1]
-    assert with_poses(data, say=said.append) == first
+    assert with_poses(data, log=said.append) == first
     assert asked == [tmp_path / "photos"]
     assert "of before" in said[-1]
     write_image(tmp_path / "photos" / "photo_1.png", np.zeros((4, 8, 3), np.uint8))
-    assert with_poses(data, say=said.append).root != first.root, "a photo has changed"
+    assert with_poses(data, log=said.append).root != first.root, "a photo has changed"
     assert len(asked) == 2
 
 
@@ -78,7 +78,7 @@ def test_no_output_replaces_the_video_that_a_run_is_made_of(
         add(np.zeros((16, 16, 3), np.uint8))
     before = video.read_bytes()
     for _ in ("estimated", "of before"):
-        data = with_poses(DataConfig(root=video), say=lambda _: None)
+        data = with_poses(DataConfig(root=video), log=lambda _: None)
         save_config(Config(data=data), tmp_path / "run" / "config.yaml")
         assert (
             main(["render", str(tmp_path / "run"), "--path", "along", "--video", str(video)]) == 2
@@ -104,4 +104,4 @@ def test_what_cannot_work_is_said_before_poses_are_estimated(
         with_poses(DataConfig(root=_photos(tmp_path / "two", 2)))
     assert asked == []
     ordered = photos.model_copy(update={"times": "order"})
-    assert with_poses(ordered, needs_times=True, say=lambda _: None).root != photos.root
+    assert with_poses(ordered, needs_times=True, log=lambda _: None).root != photos.root

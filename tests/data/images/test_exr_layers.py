@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from dyngs.data.images.images import beauty_pass, layers_of
+from dyngs.data.images.images import find_beauty_pass, list_layers
 
 
 def channels(layer: str, names: str = "RGBA") -> list[str]:
@@ -31,7 +31,7 @@ def channels(layer: str, names: str = "RGBA") -> list[str]:
     ],
 )
 def test_the_image_itself(parts: list[tuple[str, list[str]]], name: str) -> None:
-    layer = beauty_pass(layers_of(parts))
+    layer = find_beauty_pass(list_layers(parts))
     assert layer is not None
     assert layer.name == name
     names = parts[layer.part][1]

@@ -19,7 +19,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import VideoFrame
 from dyngs.data.images import video
 from dyngs.data.images.images import read_image
-from dyngs.data.images.video import decode_frames, planned_frames
+from dyngs.data.images.video import decode_frames, locate_cached_frames
 from dyngs.io.write import cache_folder
 
 
@@ -31,7 +31,7 @@ def root(tmp_path: Path) -> Path:
 
 def plan(path: Path) -> dict[Path, VideoFrame]:
     """All frames of a video."""
-    return {image: VideoFrame(path, i) for i, image in enumerate(planned_frames(path).paths)}
+    return {image: VideoFrame(path, i) for i, image in enumerate(locate_cached_frames(path).paths)}
 
 
 def some(frames: dict[Path, VideoFrame], *numbers: int) -> dict[Path, VideoFrame]:
@@ -79,7 +79,7 @@ def test_another_video_under_the_same_name(root: Path) -> None:
     """Neither its size nor its frames are mixed up with the former one's, even if size and time are
     the same."""
     source = root / "cam00.mp4"
-    before = planned_frames(source)
+    before = locate_cached_frames(source)
     decode_frames(root, plan(source))
     status = source.stat()
     data = bytearray(source.read_bytes())
@@ -87,9 +87,9 @@ def test_another_video_under_the_same_name(root: Path) -> None:
     source.write_bytes(data)
     os.utime(source, ns=(status.st_atime_ns, status.st_mtime_ns))
     video._digest.cache_clear()
-    assert not set(planned_frames(source).paths) & set(before.paths)
+    assert not set(locate_cached_frames(source).paths) & set(before.paths)
     write_video(source, 4, size=(32, 16))
-    frames = planned_frames(source)
+    frames = locate_cached_frames(source)
     assert (frames.info.width, frames.info.num_frames) == (32, 4)
     decode_frames(root, some(plan(source), 0, 1))
     assert read_image(frames.paths[0]).shape == (16, 32, 3)

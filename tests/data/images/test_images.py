@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image, ImageOps
 from tiny_captures import random_pixels, write_image
 
-from dyngs.capture.sfm.photos import gather_photos, lay_out
+from dyngs.capture.sfm.photos import gather_photos, prepare_colmap_images
 from dyngs.core.conventions import encode_srgb
 from dyngs.core.errors import DyngsError
 from dyngs.data.images.images import (
@@ -25,7 +25,7 @@ from dyngs.data.images.images import (
     read_image,
     read_mask,
     read_raw,
-    straight_uint8,
+    to_straight_uint8,
     target_size,
 )
 
@@ -188,7 +188,7 @@ def test_area_filter_is_the_mean_over_the_covered_rectangle(
 def test_colour_of_transparent_pixels_does_not_bleed() -> None:
     """Opaque red beside invisible green shrinks to half-covered red."""
     pixels = torch.tensor([[[255, 0, 0, 255], [0, 255, 0, 0]]], dtype=torch.uint8)
-    small = straight_uint8(area_downscale(premultiplied(pixels), 1, 1))
+    small = to_straight_uint8(area_downscale(premultiplied(pixels), 1, 1))
     assert small[0, 0].tolist() == [255, 0, 0, 128]
 
 
@@ -274,7 +274,7 @@ def test_each_orientation_is_turned_as_pillow_turns_it(tmp_path: Path, orientati
     )
     if header.upright_size != header.size:
         assert np.array_equal(read_image(path, header.upright_size).numpy(), shown)
-        assert header.size_for((30, 50)) == header.upright_size, "of another size, too"
+        assert header.size_matching((30, 50)) == header.upright_size, "of another size, too"
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -283,11 +283,11 @@ def test_photos_are_upright_for_colmap_and_for_us(tmp_path: Path, orientation: i
     path = _photo(tmp_path / "photos" / "a b.png", orientation, UPRIGHT)
     shown = read_image(path, upright=True).numpy()
     photos, _ = gather_photos(tmp_path / "photos", tmp_path / "images", tmp_path / "out")
-    (name,) = lay_out(photos, tmp_path / "images", tmp_path / "images", {})
+    (name,) = prepare_colmap_images(photos, tmp_path / "images", tmp_path / "images", {})
     with Image.open(tmp_path / "images" / name) as image:
         seen = np.asarray(image)
     assert np.array_equal(seen, shown)
     size = (seen.shape[1], seen.shape[0])
     stored = tmp_path / "images" / photos[0].name
-    assert read_header(stored).size_for(size) == size
+    assert read_header(stored).size_matching(size) == size
     assert np.array_equal(read_image(stored, size).numpy(), shown)

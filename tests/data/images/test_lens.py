@@ -10,7 +10,7 @@ from dyngs.data.images.lens import (
     distort,
     undistort,
     undistort_map,
-    undistorted_points,
+    undistort_points,
 )
 
 BARREL = Lens("opencv", (-0.2, 0.05, 0.002, -0.003))
@@ -87,7 +87,7 @@ def test_undistorted_points_go_back(lens: Lens) -> None:
     points = torch.rand(40, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 40
     focal = torch.tensor([50.0, 52.0]).double()
     center = torch.tensor([31.0, 23.5]).double()
-    straight = (undistorted_points(lens, INTRINSICS, points) - center) / focal
+    straight = (undistort_points(lens, INTRINSICS, points) - center) / focal
     torch.testing.assert_close(distort(lens, straight) * focal + center, points, rtol=0, atol=0.05)
 
 

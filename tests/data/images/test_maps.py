@@ -12,14 +12,14 @@ from tiny_captures import write_image
 
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Lens, View
-from dyngs.data.images.lens import undistort_map, undistorted_points
+from dyngs.data.images.lens import undistort_map, undistort_points
 from dyngs.data.images.maps import (
     flow_at,
     nearest_positions,
     read_depth,
     read_flow,
     silhouette_box,
-    taken_at,
+    sample_nearest,
 )
 
 
@@ -75,8 +75,8 @@ INTRINSICS = np.array([[40.0, 0, 16], [0, 42.0, 12], [0, 0, 1]])
 
 def test_nothing_is_averaged() -> None:
     values = torch.arange(24.0).reshape(4, 6, 1)
-    torch.testing.assert_close(taken_at(values, nearest_positions(6, 4)), values)
-    assert taken_at(values, nearest_positions(3, 2))[..., 0].tolist() == [[7, 9, 11], [19, 21, 23]]
+    torch.testing.assert_close(sample_nearest(values, nearest_positions(6, 4)), values)
+    assert sample_nearest(values, nearest_positions(3, 2))[..., 0].tolist() == [[7, 9, 11], [19, 21, 23]]
 
 
 def test_flow_through_a_lens_ends_where_the_pinhole_sees_the_point() -> None:
@@ -88,8 +88,8 @@ def test_flow_through_a_lens_ends_where_the_pinhole_sees_the_point() -> None:
     found = flow_at(flow, view, (32, 24), lens_map)
     start = torch.tensor([20.5, 8.5])
     stored = (lens_map.grid[8, 20] + 1) / 2 * torch.tensor([32.0, 24.0])
-    end = undistorted_points(lens, INTRINSICS, stored + torch.tensor([3.0, 0.0]))
+    end = undistort_points(lens, INTRINSICS, stored + torch.tensor([3.0, 0.0]))
     torch.testing.assert_close(found[8, 20], end - start, rtol=0, atol=1e-3)
     torch.testing.assert_close(
-        undistorted_points(lens, INTRINSICS, stored), start, rtol=0, atol=1e-2
+        undistort_points(lens, INTRINSICS, stored), start, rtol=0, atol=1e-2
     )

@@ -13,7 +13,7 @@ from tiny_captures import edit_json, opengl_pose, pixel_of, random_pixels, write
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
-from dyngs.data.body_frames import about_pelvis, rows_of
+from dyngs.data.body_frames import merge_root_rotation, rows_of
 from dyngs.data.capture import BodyFrames, Capture, Lens, Silhouette, View, all_views
 from dyngs.data.images.images import read_image
 from dyngs.data.readers.transforms import (
@@ -485,7 +485,7 @@ def test_the_pelvis_lies_inside_the_person(shared: Path, name: str) -> None:
     pelvis = np.load(template)["J"][0].astype(float)
     for split, body in bodies(capture).items():
         views: tuple[View, ...] = dict(capture.splits).get(split, ())[::11]  # type: ignore[call-overload]
-        places = about_pelvis(body, pelvis)
+        places = merge_root_rotation(body, pelvis)
         for view, row in zip(views, rows_of(capture.root, body, views), strict=True):
             x, y = pixel_of(view, places.scale[row] * pelvis + places.trans[row])
             assert read_image(view.image_path)[int(y), int(x), 3] == 255, view.name

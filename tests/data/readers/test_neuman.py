@@ -14,7 +14,7 @@ from tiny_captures import write_colmap, write_image
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
-from dyngs.data.body_frames import about_pelvis
+from dyngs.data.body_frames import merge_root_rotation
 from dyngs.data.capture import BodyFrames, Capture, Silhouette
 from dyngs.data.readers.neuman import FORMAT, read_neuman
 
@@ -93,7 +93,7 @@ def test_bodies_are_brought_into_the_models_world(root: Path) -> None:
     """``world = s R v + t`` with v as SMPL has it without a translation; here a point that hangs on
     the root alone."""
     body = body_of(read_neuman(root))
-    same = about_pelvis(body, PELVIS)
+    same = merge_root_rotation(body, PELVIS)
     point = np.array([0.3, 0.1, -0.2])
     for index in range(COUNT):
         scale, turn, trans = alignment(index)

@@ -22,7 +22,7 @@ from dyngs.data.readers.transforms import (
     read_nerfstudio,
     read_points,
 )
-from dyngs.io.containment import staying_within
+from dyngs.io.containment import restrict_paths_to
 
 ODD = (
     *(
@@ -274,7 +274,7 @@ def test_a_named_file_must_be_there_and_a_found_one_may_be_broken(tmp_path: Path
 def test_a_link_that_leads_out_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / "capture").mkdir()
     (tmp_path / "capture" / "points3d.ply").symlink_to(write_ply(tmp_path / "own.ply", 3))
-    with staying_within(tmp_path / "capture"):
+    with restrict_paths_to(tmp_path / "capture"):
         points, _, warnings = find_points(names_file(tmp_path / "capture"))
     assert points is None
     assert "points3d.ply" in warnings[0]

@@ -15,7 +15,7 @@ from tiny_captures import pixel_of, random_pixels, side_poses, write_image
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
-from dyngs.data.body_frames import about_pelvis
+from dyngs.data.body_frames import merge_root_rotation
 from dyngs.data.capture import BodyFrames, Capture, Silhouette
 from dyngs.data.readers.zju_mocap import FORMAT, read_zju_mocap
 
@@ -150,7 +150,7 @@ def test_global_motion_is_about_the_origin(tmp_path: Path, write: Callable[[Path
     turned root."""
     write(tmp_path)
     body = body_of(read_zju_mocap(tmp_path))
-    same = about_pelvis(body, PELVIS)
+    same = merge_root_rotation(body, PELVIS)
     for frame in body.frames:
         own = params(frame)
         turn = Rotation.from_rotvec(own["Rh"][0])

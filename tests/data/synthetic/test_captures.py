@@ -15,8 +15,8 @@ from dyngs.data.synthetic.captures import (
     POINTS_PER_THING,
     DynamicOptions,
     SceneName,
-    SyntheticShot,
-    nearest_things,
+    SyntheticView,
+    nearest_primitives,
     orbit_cameras,
     sampled_rays,
     scene_at,
@@ -71,7 +71,7 @@ def test_visible_points_lie_where_something_moving_is_seen(name: SceneName) -> N
     poses = [orbit_cameras(1, 4.0, elevation, azimuth)[0] for elevation, azimuth in CAMERAS]
     times = np.linspace(0, 1, 5)
     shots = [
-        SyntheticShot(f"v{i}", pose, float(time))
+        SyntheticView(f"v{i}", pose, float(time))
         for i, (time, pose) in enumerate(zip(times, poses, strict=True))
     ]
     tracks = true_tracks(lambda time: scene_at(name, time), shots)
@@ -85,7 +85,7 @@ def test_visible_points_lie_where_something_moving_is_seen(name: SceneName) -> N
         assert seen.mean() > 0.1
         assert seen.mean() < 0.9, "others are on the far side or hidden"
         rays = sampled_rays(pose, SIZE, 1)[0]
-        nearest, _ = nearest_things(scene_at(name, time), pose[:3, 3], rays)
+        nearest, _ = nearest_primitives(scene_at(name, time), pose[:3, 3], rays)
         labels = np.pad(nearest.reshape(SIZE, SIZE), 1)
         x, y = projected(tracks.points[k][seen], pose).astype(int).T
         own = scene_at(name, time).movers[0] + np.flatnonzero(seen) // POINTS_PER_THING

@@ -23,7 +23,7 @@ from dyngs.config import (
     TrainConfig,
 )
 from dyngs.core.state import strip_roles
-from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.colour.network import restore_colour_network
 from dyngs.gaussians.colour.training import (
@@ -134,7 +134,7 @@ COLOURS = {
 @pytest.fixture(scope="module")
 def seven_views(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("capture")
-    write_still_capture(folder, StillOptions(size=16, num_train=7, num_test=1, samples=1))
+    write_static_capture(folder, StaticOptions(size=16, num_train=7, num_test=1, samples=1))
     return folder
 
 

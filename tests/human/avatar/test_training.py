@@ -143,10 +143,10 @@ def test_what_all_frames_share_is_learned_before_poses_of_single_ones(capture: P
 
 
 def test_a_capture_without_bodies_is_an_error(capture: Path, tmp_path: Path) -> None:
-    from dyngs.data.synthetic.captures import StillOptions, write_still_capture
+    from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 
-    write_still_capture(
-        tmp_path / "still", StillOptions(size=16, num_train=2, num_test=1, samples=1)
+    write_static_capture(
+        tmp_path / "still", StaticOptions(size=16, num_train=2, num_test=1, samples=1)
     )
     with pytest.raises(DyngsError, match="has no body parameters"):
         build_trainer(tiny(tmp_path / "still"))

@@ -143,7 +143,7 @@ def test_a_capture_of_the_person_comes_out(
     monkeypatch.setattr("dyngs.human.fit.capture_fit.STEPS", 2)
     out = tmp_path / "ann"
     result = write_detected_person(
-        DataConfig(root=clip, frames="0:10:4"), out, Rough(), say=[].append
+        DataConfig(root=clip, frames="0:10:4"), out, Rough(), log=[].append
     )
     assert result.root == out
     capture = read_capture(DataConfig(root=out))
@@ -154,7 +154,7 @@ def test_a_capture_of_the_person_comes_out(
         "nothing else is left behind"
     )
     with pytest.raises(DyngsError, match=r"exists|not empty"):
-        write_detected_person(DataConfig(root=clip), out, Rough(), say=[].append)
+        write_detected_person(DataConfig(root=clip), out, Rough(), log=[].append)
 
 
 def test_a_clip_is_looked_at_once(
@@ -173,7 +173,7 @@ def test_a_clip_is_looked_at_once(
     monkeypatch.setattr(module, "write_detected_person", write)
     said: list[str] = []
     for frames in ("0:8", "0:8", "0:4"):
-        data = ensure_detected_person(DataConfig(root=clip, frames=frames), say=said.append)
+        data = ensure_detected_person(DataConfig(root=clip, frames=frames), log=said.append)
         assert (data.root, data.frames) == (made[-1], None)
     assert len(made) == 2
     assert [line for line in said if "found before" in line] == [said[2]]

@@ -54,7 +54,7 @@ def data(person_of_zeros: Path, tmp_path: Path, short_fits: None) -> DataConfig:
 
 def test_a_capture_is_fitted_once(data: DataConfig) -> None:
     said: list[str] = []
-    fitted = ensure_fitted_body(data, say=said.append)
+    fitted = ensure_fitted_body(data, log=said.append)
     assert fitted.body is not None
     assert {path.name for path in fitted.body.iterdir()} == {
         *("body_train.npz", "body_pose.npz", "fit_report.json", "fit_overlays.png")
@@ -65,7 +65,7 @@ def test_a_capture_is_fitted_once(data: DataConfig) -> None:
         ("train", "val", "test", "pose"), "anny"
     )
     assert "fitted to the silhouettes first" in said[0]
-    again = ensure_fitted_body(data, say=said.append)
+    again = ensure_fitted_body(data, log=said.append)
     assert again == fitted
     assert "the fit of before" in said[-1]
 
@@ -84,13 +84,13 @@ def test_a_fit_is_fitted_again_only_for_another_template(
     ).root
     given = DataConfig(root=out)
     said = list[str]()
-    assert ensure_fitted_body(given, smpl, say=pytest.fail) == given
-    assert ensure_fitted_body(given, say=said.append) != given
+    assert ensure_fitted_body(given, smpl, log=pytest.fail) == given
+    assert ensure_fitted_body(given, log=said.append) != given
     assert "fitted to the silhouettes first" in said[0]
     named = data.model_copy(update={"body": out})
     said = []
-    assert ensure_fitted_body(named, smpl, say=pytest.fail) == named
-    assert ensure_fitted_body(named, say=said.append) == named
+    assert ensure_fitted_body(named, smpl, log=pytest.fail) == named
+    assert ensure_fitted_body(named, log=said.append) == named
     assert "is a fit of another template: its poses are taken, not its shape" in said[0]
 
 

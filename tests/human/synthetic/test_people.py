@@ -11,7 +11,7 @@ from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import ImageLoader
-from dyngs.data.read import captures_in
+from dyngs.data.read import list_captures
 from dyngs.human.synthetic.capture import PeopleOptions, write_people
 
 SMALL = PeopleOptions(people=2, size=64, cameras=3)
@@ -33,14 +33,14 @@ def contents(root: Path) -> dict[str, bytes]:
 def test_the_same_options_give_the_same_bytes_also_in_parts(root: Path, tmp_path: Path) -> None:
     out = tmp_path / "again"
     write_people(out, PeopleOptions(people=1, size=64, cameras=3))
-    assert len(captures_in(DataConfig(root=out))) == 1
+    assert len(list_captures(DataConfig(root=out))) == 1
     write_people(out, SMALL)
     assert contents(out) == contents(root)
 
 
 def test_depth_and_silhouettes_agree_between_views(root: Path) -> None:
     """A pixel's point, by its depth, lies inside the silhouettes of all other views."""
-    for data in captures_in(DataConfig(root=root, test_every=0)):
+    for data in list_captures(DataConfig(root=root, test_every=0)):
         views = read_capture(data).splits["train"]
         images = [*ImageLoader(views, data, with_maps=True)]
         assert len(images) == 3

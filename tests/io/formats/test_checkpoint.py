@@ -14,7 +14,7 @@ from splat_scenes import cloud
 
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians import Gaussians
-from dyngs.io.formats.formats import format_of, read_splats
+from dyngs.io.formats.formats import format_for_path, read_splats
 
 
 def parameters(scene: Gaussians, of_nerfstudio: bool) -> torch.nn.ParameterDict:
@@ -139,4 +139,4 @@ def test_other_checkpoints_are_refused(tmp_path: Path) -> None:
         with pytest.raises(DyngsError, match=problem):
             read_splats(path)
     with pytest.raises(DyngsError, match="no suffix of a file"):
-        format_of(path)
+        format_for_path(path)

@@ -24,13 +24,13 @@ from dyngs.io.containment import LIMITS_VARIABLE
 from dyngs.io.formats.formats import (
     FORMATS,
     Format,
-    moved_file,
+    transform_file,
     read_splats,
-    undone_file,
+    undo_transforms,
     upright,
     write_splats,
 )
-from dyngs.io.formats.similarity import UNMOVED, Similarity
+from dyngs.io.formats.similarity import IDENTITY, Similarity
 from dyngs.io.formats.splat_file import SplatFile
 
 LEAST_PSNR = {
@@ -89,8 +89,8 @@ def test_what_the_format_cannot_say_is_said(kind: Format, tmp_path: Path) -> Non
     assert (f"harmonics above degree {kind.max_degree} are left out" in said) == (
         kind.max_degree < 4
     )
-    assert ("antialiased" in said) == (not kind.states_mode)
-    if kind.states_mode:
+    assert ("antialiased" in said) == (not kind.stores_render_mode)
+    if kind.stores_render_mode:
         assert splat_options(read_splats(written.path)).mode is RasterizeMode.ANTIALIASED
 
 
@@ -172,30 +172,30 @@ def test_the_place_of_a_far_scene_is_stored_or_told(kind: Format, tmp_path: Path
     splat = SplatFile(cloud(20, 0), world_offset=FAR, up=kind.up, turned=turn.turn)
     written = write_splats(path, splat)
     line = " ".join(f"{x:.12g}" for x in turn.points(np.array(FAR)))
-    end = "the file states it" if kind.holds_comments else f"{kind.name} cannot state it"
+    end = "the file states it" if kind.stores_comments else f"{kind.name} cannot state it"
     assert written.notes == (
         f"the scene is far from the origin: {line} is subtracted from its positions ({end})",
     )
     back = read_splats(path)
-    if kind.holds_comments:
+    if kind.stores_comments:
         assert (back.world_offset, back.turned) == (FAR, turn.turn)
 
 
 @pytest.mark.parametrize(
-    "kind", [x for x in readable() if x.holds_comments], ids=lambda kind: kind.name
+    "kind", [x for x in readable() if x.stores_comments], ids=lambda kind: kind.name
 )
 def test_edits_are_stored_and_undone(kind: Format, tmp_path: Path) -> None:
     path = tmp_path / f"a{kind.suffixes[0]}"
     before = SplatFile(cloud(30, kind.max_degree), up="-y", turned=(0.0, 0.0, 1.0, 0.0))
-    edited = moved_file(
-        moved_file(before, Similarity((0.6, 0.0, 0.8, 0.0), 0.5), "-y"),
+    edited = transform_file(
+        transform_file(before, Similarity((0.6, 0.0, 0.8, 0.0), 0.5), "-y"),
         Similarity(shift=(1, 2, 3)),
         "-y",
     )
     back = read_splats(write_splats(path, upright(edited, None, path)).path)
     assert back.edited.numbers == pytest.approx(upright(edited, None, path).edited.numbers)
-    undone = undone_file(back)
-    assert (undone.up, undone.edited) == ("-y", UNMOVED)
+    undone = undo_transforms(back)
+    assert (undone.up, undone.edited) == ("-y", IDENTITY)
     order = (before.gaussians.means[:, None] - undone.gaussians.means).norm(dim=2)
     assert float(order.amin(1).max()) < 0.02  # of a cloud of size 1, in the coarsest format
 

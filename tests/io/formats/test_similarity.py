@@ -18,11 +18,11 @@ from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.io.formats.similarity import (
     AXES,
     Similarity,
-    axis_of,
-    far_offset,
+    parse_axis,
+    origin_offset,
     mirrored,
     nearest_axis,
-    turn_between,
+    rotation_between,
 )
 from dyngs.ops.quaternions import rotate
 
@@ -103,18 +103,18 @@ def test_points_that_leave_it_open(points: np.ndarray, wanted: np.ndarray, said:
 def test_points_near_the_origin_keep_their_coordinates() -> None:
     points = np.random.default_rng(0).normal(size=(200, 3))
     for factor in (1e-4, 1.0, 1e3):
-        assert not far_offset(factor * (points + np.array([5.0, 0, 0])), 1e-3 * factor).any()
-    assert not far_offset(points + np.array([5000.0, 3000.0, 0.0]), 0.02).any(), (
+        assert not origin_offset(factor * (points + np.array([5.0, 0, 0])), 1e-3 * factor).any()
+    assert not origin_offset(points + np.array([5000.0, 3000.0, 0.0]), 0.02).any(), (
         "float32 is fine enough"
     )
-    assert not far_offset(np.full((3, 3), np.nan), 1.0).any()
+    assert not origin_offset(np.full((3, 3), np.nan), 1.0).any()
 
 
 @pytest.mark.parametrize("factor", [1e-4, 1.0, 2.0**10])
 def test_points_far_from_the_origin_come_near_it_in_any_unit(factor: float) -> None:
     points = np.random.default_rng(0).normal(size=(200, 3))
     far = factor * (points + np.array([5e5, -4.6e6, 100.0]))
-    offset = far_offset(far, 0.02 * factor)
+    offset = origin_offset(far, 0.02 * factor)
     assert np.abs(far - offset).max() < 10 * factor
     np.testing.assert_array_equal(
         (far.astype(np.float32) - offset).astype(np.float32) + offset, far.astype(np.float32)
@@ -124,11 +124,11 @@ def test_points_far_from_the_origin_come_near_it_in_any_unit(factor: float) -> N
 @pytest.mark.parametrize("start", AXES)
 @pytest.mark.parametrize("end", AXES)
 def test_the_turn_between_axes(start: str, end: str) -> None:
-    turn = turn_between(axis_of(start), axis_of(end))
+    turn = rotation_between(parse_axis(start), parse_axis(end))
     quat = torch.tensor(turn, dtype=torch.float64)
-    wanted = torch.tensor(axis_of(end), dtype=torch.float64)
+    wanted = torch.tensor(parse_axis(end), dtype=torch.float64)
     torch.testing.assert_close(
-        rotate(quat, torch.tensor(axis_of(start), dtype=torch.float64)), wanted
+        rotate(quat, torch.tensor(parse_axis(start), dtype=torch.float64)), wanted
     )
 
 
@@ -137,7 +137,7 @@ def test_names_of_axes() -> None:
     assert nearest_axis((1.0, 1.0, 1.0)) is None
     assert nearest_axis((0.0, 0.0, 0.0)) is None
     with pytest.raises(DyngsError, match="no axis 'up'"):
-        axis_of("up")
+        parse_axis("up")
 
 
 @pytest.mark.parametrize("degree", [0, 2, 4])

@@ -19,7 +19,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.state import Role, State, add_prefix, move_fields_to, with_role
 from dyngs.core.tensor_checks import require_indices, require_positive, require_tensor
 from dyngs.data.loader import Image
-from dyngs.data.read import captures_in
+from dyngs.data.read import list_captures
 from dyngs.data.times import distinct_times
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.body_reader import default_template, read_body
@@ -322,14 +322,14 @@ def learner(config: Config, generator: torch.Generator) -> FieldLearner:
     """Return a network before the first step."""
     device = select_device(config.run.device)
     network = NETWORKS[config.model.kind](generator).to(device)
-    return FieldLearner(config, network, captures_in(config.data), device)
+    return FieldLearner(config, network, list_captures(config.data), device)
 
 
 def predictor(
     config: Config,
     checkpoint: Checkpoint,
     data: DataConfig,
-    say: Callable[[str], None],
+    log: Callable[[str], None],
     report: ProgressCallback,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
@@ -341,7 +341,7 @@ def predictor(
     network = NETWORKS[model.kind](torch.Generator())
     load_weights(network, checkpoint)
     if model.body is None:
-        data = ensure_fitted_body(data, only_if_needed=True, say=say, report=report)
+        data = ensure_fitted_body(data, only_if_needed=True, log=log, report=report)
     return FieldPredictor(config, network, read_captured_person(data, template_of(model)), data)
 
 

@@ -27,7 +27,7 @@ from dyngs.core.state import move_fields_to
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.data.capture import View
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.read import captures_in, read_capture
+from dyngs.data.read import list_captures, read_capture
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import RestPose
 from dyngs.gaussians.scene import GaussianTimeStep, render_options
@@ -612,7 +612,7 @@ def learner(config: Config, generator: torch.Generator) -> AtlasLearner:
     model: Any = config.model
     body = load_template(human_options(model))
     network = new_network(model, generator).to(device)
-    people = [read_atlas_person(data, model, body) for data in captures_in(config.data)]
+    people = [read_atlas_person(data, model, body) for data in list_captures(config.data)]
     source_choices = [_choices(person, model.source_views, generator) for person in people]
     mean = mean_colours(people, model.resolution).to(device)
     return AtlasLearner(config, network, people, source_choices, mean, device)
@@ -622,7 +622,7 @@ def predictor(
     config: Config,
     checkpoint: Checkpoint,
     data: DataConfig,
-    say: Callable[[str], None],
+    log: Callable[[str], None],
     report: ProgressCallback,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
@@ -634,7 +634,7 @@ def predictor(
     network = new_network(model, torch.Generator())
     mean = load_network(network, checkpoint, model.resolution)
     data = ensure_fitted_body(
-        data, human_options(model), only_if_needed=True, say=say, report=report
+        data, human_options(model), only_if_needed=True, log=log, report=report
     )
     person = read_atlas_person(data, model, load_template(human_options(model)))
     return PersonPredictor(config, network, mean, person, data)

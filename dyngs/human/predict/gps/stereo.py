@@ -35,7 +35,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.state import move_fields_to
 from dyngs.data.capture import Capture, all_views
 from dyngs.data.loader import Image, ImageLoader
-from dyngs.data.read import captures_in, read_capture
+from dyngs.data.read import list_captures, read_capture
 from dyngs.data.times import distinct_times
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.filters import FilterUpdate
@@ -440,14 +440,14 @@ def _picture(pair: RectifiedPair, offsets: Tensor) -> Tensor:
 def learner(config: Config, generator: torch.Generator) -> GpsLearner:
     """Return the network of ``model.kind: gps`` before the first step."""
     device = select_device(config.run.device)
-    return GpsLearner(config, GpsNetwork(generator).to(device), captures_in(config.data), device)
+    return GpsLearner(config, GpsNetwork(generator).to(device), list_captures(config.data), device)
 
 
 def predictor(
     config: Config,
     checkpoint: Checkpoint,
     data: DataConfig,
-    say: Callable[[str], None],
+    log: Callable[[str], None],
     report: ProgressCallback,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the capture of ``data``."""

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.data.capture import BodyFrames, Capture, View
-from dyngs.data.geometry import cam_from_opengl
+from dyngs.data.geometry import from_opengl_pose
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.synthetic.captures import CAMERA_ANGLE_X
 from dyngs.human.avatar.posing import BodyPose
@@ -75,7 +75,7 @@ def body() -> BodyTemplate:
 
 def sitter(poses: Tensor) -> AtlasPerson:
     """A person of whom there is one view, in the pose (55, 3), scaffolds at 0 and 4 cm."""
-    view = View("v", Path("v.png"), cam_from_opengl(FRONT), np.eye(3), SIZE, SIZE, frame=0)
+    view = View("v", Path("v.png"), from_opengl_pose(FRONT), np.eye(3), SIZE, SIZE, frame=0)
     frames = BodyFrames(
         (0,), poses[None].double().numpy(), np.zeros((1, 3)), np.zeros(10), np.ones(1)
     )
@@ -122,7 +122,7 @@ def image(poses: Tensor, texture: np.ndarray, pose: np.ndarray) -> Image:
     focal = 0.5 * SIZE / np.tan(0.5 * CAMERA_ANGLE_X)
     intrinsics = torch.tensor([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]]).float()
     camera = Cameras(
-        torch.from_numpy(cam_from_opengl(pose)).float()[None], intrinsics[None], SIZE, SIZE
+        torch.from_numpy(from_opengl_pose(pose)).float()[None], intrinsics[None], SIZE, SIZE
     )
     return Image("v", camera, rgba[..., :3] * rgba[..., 3:], rgba[..., 3], None, None, 0)
 

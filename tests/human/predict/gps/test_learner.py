@@ -23,7 +23,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr
 from dyngs.data.geometry import look_at
 from dyngs.data.loader import ImageLoader
-from dyngs.data.read import captures_in, read_capture
+from dyngs.data.read import list_captures, read_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.human.predict.gps.rectification import neighbours
@@ -45,7 +45,7 @@ def run(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def read_captured_person(folder: Path) -> Path:
-    return captures_in(DataConfig(root=folder))[0].root
+    return list_captures(DataConfig(root=folder))[0].root
 
 
 def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, run: Path, tmp_path: Path) -> None:
@@ -207,7 +207,7 @@ def test_published_weights_predict_somebody_unknown(tmp_path: Path) -> None:
     )
     if not weights.is_file():
         pytest.skip("no published weights here: they come with the repository alone")
-    person = captures_in(
+    person = list_captures(
         DataConfig(root=write_people(tmp_path / "set", PeopleOptions(1, 192, seed=7)))
     )[0].root
     made = predict(weights, person, tmp_path / "two", ("f000_c03.png", "f000_c05.png"))
