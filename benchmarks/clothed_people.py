@@ -6,7 +6,7 @@ and the truth.
 
 AVATAR.glb is a glTF 2.0 file with a skin and the joint names of a common program, in a T-pose that
 faces +z, without compression. The motions are AMASS files for the free template (`dyngs data
-motion` makes them of other formats). The people of docs/human.md are VALID avatars
+motion` makes them of other formats). The people of docs/guides/people.md are VALID avatars
 (https://github.com/c-frame/valid-avatars-glb, MIT, (c) 2022 Tiffany Do), whose files are
 compressed; Node decodes them, once:
 

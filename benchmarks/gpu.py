@@ -76,7 +76,9 @@ def of_file(path: Path, size: tuple[int, int]) -> Arguments:
     """The same of a file of Gaussians, seen from a little above."""
     file = read_splats(path, nonfinite="skip")
     splat = file.gaussians
-    cameras = frame_orbit_for_points(splat.means.double().numpy(), 1, size, parse_axis(file.up or "z"))
+    cameras = frame_orbit_for_points(
+        splat.means.double().numpy(), 1, size, parse_axis(file.up or "z")
+    )
     trained = {
         "means": splat.means,
         "quats": splat.quats,

@@ -42,7 +42,7 @@ from dyngs.data.synthetic.captures import (
     Primitive,
     SceneName,
     is_in_image,
-    is_seen,
+    is_visible,
     scene_at,
     write_dynamic_capture,
 )
@@ -95,7 +95,7 @@ class Motion:
     def between(rest: Primitive, now: Primitive) -> Motion:
         """Return the motion of ``rest`` to ``now``, two states of one ball or box."""
         corners = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-        moved = now.placed(rest.local(corners)).astype(np.float64)
+        moved = now.to_world(rest.local(corners)).astype(np.float64)
         return Motion(
             torch.from_numpy((moved[1:] - moved[0]).T).float(), torch.from_numpy(moved[0]).float()
         )
@@ -197,7 +197,7 @@ def oracle(name: SceneName, config: Config, seed: int = 0) -> GaussianTrainer:
     generator = torch.Generator().manual_seed(seed)
     values = InitialValues.for_strategy(config.strategy)
     gaussians = initial_gaussians(start, PointsInit(), values, model.sh_degree, generator)
-    moving = torch.nonzero(labels >= scene_at(name, REST).movers.start)[:, 0]
+    moving = torch.nonzero(labels >= scene_at(name, REST).moving_indices.start)[:, 0]
     times = tuple(sorted(set(training_times(capture))))
     setup = FieldSetup(*box_of(gaussians, trainer.extent), len(times), len(moving), trainer.extent)
     scene = DynamicScene(
@@ -222,11 +222,13 @@ def surface_points(
     colours = []
     labels = []
     for label, primitive in enumerate(rest.primitives):
-        local = primitive.sampled(DRAWN if label not in rest.movers else 2 * PER_MOVER, random)
+        local = primitive.sample_surface(
+            DRAWN if label not in rest.moving_indices else 2 * PER_MOVER, random
+        )
         local = local[_seen(name, label, local, looks)][
-            : PER_MOVER if label in rest.movers else MOST_STILL
+            : PER_MOVER if label in rest.moving_indices else MOST_STILL
         ]
-        points.append(primitive.placed(local))
+        points.append(primitive.to_world(local))
         colours.append(
             (255 * np.clip(0.8 * primitive.paint(local), 0, 1) ** (1 / 2.2)).astype(np.uint8)
         )
@@ -241,8 +243,8 @@ def _seen(name: SceneName, label: int, local: np.ndarray, looks: Sequence[View])
         scene: TrueScene = scene_at(name, view.time or 0.0)
         if label < len(scene.primitives):
             pose = np.linalg.inv(view.cam_from_world) @ np.diag([1.0, -1.0, -1.0, 1.0])
-            points = scene.primitives[label].placed(local)
-            seen |= is_in_image(points, pose) & is_seen(scene, points, pose)
+            points = scene.primitives[label].to_world(local)
+            seen |= is_in_image(points, pose) & is_visible(scene, points, pose)
     return seen
 
 

@@ -96,18 +96,20 @@ def pages() -> dict[Path, str]:
 
 
 def link_pages(text: str) -> str:
-    """Replace the command ``dyngs docs NAME`` in sentences by a link to that page."""
+    """Replace ``dyngs docs NAME`` and ``docs/NAME.md`` in sentences by links to that page."""
     names = find_pages(DOCS)
 
     def link(match: re.Match[str]) -> str:
-        path = names.get(match[1])
+        path = names.get(match[1] or match[2])
         if path is None:
             return match[0]
-        return f"[{match[1]}](../{path.relative_to(DOCS).as_posix()})"
+        return f"[{path.stem}](../{path.relative_to(DOCS).as_posix()})"
 
     parts = re.split(r"(^```.*?^```$)", text, flags=re.MULTILINE | re.DOTALL)
     for index in range(0, len(parts), 2):
-        parts[index] = re.sub(r"`?dyngs docs ([a-z][\w/-]*)`?", link, parts[index])
+        parts[index] = re.sub(
+            r"`?dyngs docs ([a-z][\w/-]*)`?|docs/([\w/-]+)\.md", link, parts[index]
+        )
     return "".join(parts)
 
 
@@ -260,10 +262,20 @@ def describe_section(
     parts = [f"## {section}", "", f"{about[:1].upper()}{about[1:]}.", ""]
     for kinds in dict.fromkeys(key.kinds for key in keys):
         if kinds:
-            parts += ["", f"### {section}: {', '.join(kinds)}", ""]
+            parts += ["", f"### {section}: {describe_kinds(kinds)}", ""]
         rows = [key_row(key, presets) for key in keys if key.kinds == kinds]
         parts += ["| key | default | allowed | meaning |", "|---|---|---|---|", *rows]
     return "\n".join(parts) + "\n"
+
+
+def describe_kinds(kinds: tuple[str, ...]) -> str:
+    """Return the kinds that have some keys, for instance ``dynamic with hexplane or mlp``."""
+    alternatives = [kind.split(" or ") for kind in kinds]
+    lists = [
+        f"{', '.join(names[:-1])} or {names[-1]}" if len(names) > 1 else names[0]
+        for names in alternatives
+    ]
+    return " with ".join(lists)
 
 
 def key_row(key: ConfigKey, presets: dict[str, dict[str, str]]) -> str:
@@ -276,7 +288,7 @@ def key_row(key: ConfigKey, presets: dict[str, dict[str, str]]) -> str:
     ]
     meaning = cell(key.description)
     if settings and not key.name.endswith("model.kind"):
-        meaning += f" *Presets: {', '.join(settings)}.*"
+        meaning = f"{meaning.rstrip('.')}. *Presets: {', '.join(settings)}.*"
     return f"| `{key.name}` | {default} | {cell(key.allowed)} | {meaning} |"
 
 

@@ -84,7 +84,7 @@ def read_whole_capture(root: Path) -> object:
     except DyngsError:
         report = inspect_capture(options, deep=True)
         if not report.problems:
-            raise AssertionError("refused, but nothing suspicious in its report") from None
+            raise AssertionError("refused, but its report lists no problems") from None
         require_lines(format_report(report))
         raise
     require_lines(format_report(inspect_capture(options, deep=True)))

@@ -103,7 +103,7 @@ def sliding_nodes() -> ControlNodes:
     points[..., 0] = torch.arange(4) - 1.5  # the spline of these is t - 0.5
     moved = row_of_balls().means[list(MOVING_ROWS)]
     field = ControlNodes(SLIDING, SETUP, torch.Generator())
-    field.nodes_for(moved)
+    field.update_nodes(moved)
     field.parameters["means"].data.copy_(points)
     return field
 
@@ -135,7 +135,9 @@ def camera(width: int = 20, height: int = 14) -> Cameras:
 def write_timed_capture(root: Path, *, standing: bool = False) -> Path:
     """A capture of 16x16 px at ``TRAIN_TIMES`` and ``TEST_TIMES``; ``standing``: all test images
     from one pose."""
-    options = StaticOptions(size=16, num_train=len(TRAIN_TIMES), num_test=len(TEST_TIMES), samples=1)
+    options = StaticOptions(
+        size=16, num_train=len(TRAIN_TIMES), num_test=len(TEST_TIMES), samples=1
+    )
     write_static_capture(root, options)
     for split, times in (("train", TRAIN_TIMES), ("test", TEST_TIMES)):
         file = root / f"transforms_{split}.json"

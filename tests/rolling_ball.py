@@ -18,7 +18,7 @@ from dyngs.data.synthetic.captures import (
     render_scene,
     scene_at,
 )
-from dyngs.deform.bodies.paths import NEVER, FrameStack
+from dyngs.deform.bodies.paths import NO_DEPTH, FrameStack
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -74,7 +74,7 @@ def seen(balls: Sequence[PaintedBall], size: int) -> tuple[FrameStack, np.ndarra
         static=np.stack(static),
         alphas=np.zeros((count, size, size)),
         static_alphas=np.zeros((count, size, size)),
-        depths=np.full((count, size, size), NEVER),
+        depths=np.full((count, size, size), NO_DEPTH),
         poses=np.stack([FLIP @ np.linalg.inv(pose) for pose in poses]),
         intrinsics=np.repeat(lens[None], count, axis=0),
     )

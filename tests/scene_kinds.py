@@ -9,7 +9,7 @@ from tiny_fields import cloud, stirred_field, tiny_options
 
 from dyngs.core.camera import Cameras
 from dyngs.core.state import State, select_prefix, strip_roles
-from dyngs.deform.fields import OPEN, WindowedField
+from dyngs.deform.fields import OPEN_WINDOW, WindowedField
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.scene import DynamicScene
 from dyngs.gaussians import Gaussians
@@ -48,7 +48,7 @@ def scene_of_kind(kind: str) -> GaussianScene:
     field = stirred_field(_field(kind), len(MOVING))
     if kind == "windowed":
         field = WindowedField(field, len(MOVING))
-        field.edges.data[:] = torch.tensor([[0.1, 0.4], [0.3, 1.2], [-0.1, 0.8], OPEN])
+        field.edges.data[:] = torch.tensor([[0.1, 0.4], [0.3, 1.2], [-0.1, 0.8], OPEN_WINDOW])
     return DynamicScene(
         gaussians=cloud(),
         training_times=SEEN_AT,

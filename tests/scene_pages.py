@@ -140,7 +140,7 @@ def levels_of_a_cloud(folder: Path, most: int | None = None) -> tuple[LevelScene
     assert written.num_bytes == sum(file.stat().st_size for file in folder.iterdir())
     blocks = [*(f"0-{i}.bin" for i in range(4)), "1-0.bin"]
     assert sorted(file.name for file in folder.iterdir()) == [*blocks, ELEMENT, PAGE]
-    return LevelScene.of(still, most), view
+    return LevelScene.from_scene(still, most), view
 
 
 def from_afar(view: Cameras, factor: float) -> Cameras:

@@ -596,4 +596,6 @@ def test_a_gpu_that_is_not_there_is_told_in_one_line(
     assert main(words) == 2
     printed = capsys.readouterr()
     assert printed.out == ""
-    assert re.fullmatch(r"dyngs: error: device cuda: .+: .+, or give device cpu\n", printed.err)
+    assert re.fullmatch(
+        r"dyngs: error: device cuda is not usable: .+: .+, or use device cpu\n", printed.err
+    )

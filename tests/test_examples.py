@@ -33,7 +33,7 @@ def test_every_public_name_has_an_example_that_runs(
     name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = inspect.getdoc(getattr(dyngs, name)) or ""
-    examples = re.findall(r"::\n\n((?:(?:    .*)?\n)+)", text + "\n")
+    examples = re.findall(r"Examples?:\n\n((?:(?:    .*)?\n)+)", text + "\n")
     assert examples, f"dyngs.{name} has no example"
     monkeypatch.chdir(folder)
     for example in examples:

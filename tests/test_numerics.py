@@ -1,4 +1,4 @@
-"""Numbers at the extremes: one test per row of the table in docs/numerics.md.
+"""Numbers at the extremes: one test per row of the table in docs/contributing/numerics.md.
 
 Each compares float32 with float64 on the same numbers, or with the analytic answer, or asserts the
 exact error; and in each every gradient is finite.

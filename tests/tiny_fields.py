@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyngs.config import Config, DataConfig, DefaultStrategy, RandomInit, RunConfig, TrainConfig
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
-from dyngs.deform.control_nodes import Nodes, follow
+from dyngs.deform.control_nodes import Nodes, blend_node_motion
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, innermost
 from dyngs.deform.fields import create_field
 from dyngs.deform.keys import (
@@ -76,7 +76,7 @@ def followed(nodes: Nodes, means: Tensor, at_nodes: Offsets) -> Offsets:
     turns = identity_quat(shifts).expand(len(shifts), 4) + heads.get("quats", 0)
     values = torch.cat([shifts[:, :0], *heads.values()], 1)
     sizes = {name: x.shape[1] for name, x in heads.items()}
-    return follow(nodes, means, torch.cat([shifts, turns], 1), values, sizes)
+    return blend_node_motion(nodes, means, torch.cat([shifts, turns], 1), values, sizes)
 
 
 def stir(field: DeformationField, size: float = 0.2) -> None:

@@ -228,7 +228,7 @@ void test_nothing_to_draw() {
   compare("no Gaussians", random_scene(0, 20, 18, 3, 0.1));
 }
 
-// Rows of the table of docs/numerics.md.
+// Rows of the table of docs/contributing/numerics.md.
 void test_extremes() {
   const auto changed = [](const std::string& what, const std::function<void(Scene&)>& change,
                           const Tolerance& to = {}) {

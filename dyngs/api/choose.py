@@ -354,7 +354,7 @@ def _trained(
                     "stopped before training began: nothing is written, give the command again"
                 )
             trainer.step()
-    trainer.images.rest()
+    trainer.images.stop_prefetching()
     return trainer if trainer.done >= last else None
 
 

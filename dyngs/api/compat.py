@@ -82,7 +82,7 @@ def rasterization(
     ``meta["means2d"]`` may be asked to ``retain_grad()``; with ``absgrad`` it also gets an
     attribute ``absgrad`` in the backward pass.
 
-    Example::
+    Example:
 
         import torch
 

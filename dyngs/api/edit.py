@@ -329,7 +329,7 @@ def _part(config: Config, run_dir: Path, rows: Tensor) -> Checkpoint:
         trainer = restore_final_trainer(config, run_dir)
         kept = torch.zeros(trainer.num_gaussians, dtype=torch.bool, device=trainer.device)
         kept[rows.to(trainer.device)] = True
-        trainer.model.keep(kept, trainer.done)
+        trainer.model.select_gaussians(kept, trainer.done)
         return trainer.checkpoint()
 
 

@@ -124,7 +124,7 @@ def _follow_run(
                 case Order.STEP:
                     trainer.step()
                 case _:
-                    trainer.images.rest()
+                    trainer.images.stop_prefetching()
                     return order, payload
 
 

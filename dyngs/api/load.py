@@ -26,7 +26,7 @@ def load(path: Path | str) -> GaussianScene:
 
     Coordinates are those of the capture's files, as in ``read_capture``.
 
-    Example::
+    Example:
 
         import torch
 
@@ -65,7 +65,7 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
     ``Capture.world_offset`` is subtracted. For arguments, splits, times and errors see
     ``dyngs.data.read.read_capture``.
 
-    Example::
+    Example:
 
         import dyngs
         from dyngs.data.loader import ImageLoader

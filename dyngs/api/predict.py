@@ -109,7 +109,7 @@ def require_network(config: Config, run_dir: Path) -> PredictsScenes:
     if network is None:
         raise DyngsError(
             f"{run_dir}: a run of model.kind={config.model.kind}; a prediction needs the run of a network "
-            "(docs/people_network.md)"
+            "(`dyngs docs people`)"
         )
     return network
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dyngs.api.choose import resolve_auto_settings
 from dyngs.api.first_scene import load_initial_gaussians
-from dyngs.capture.sfm.unposed import with_poses
+from dyngs.capture.sfm.unposed import ensure_poses
 from dyngs.config import AutoColour, FixedStrategy, SceneInit, ShColour
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.core.conventions import ProgressCallback
@@ -79,7 +79,7 @@ def find_poses(report: ProgressCallback) -> Stage:
         if isinstance(kind, HasBody):
             data = kind.find_body(data, model, log_info, report)
         else:
-            data = with_poses(data, needs_times=isinstance(kind, HasMotion), report=report)
+            data = ensure_poses(data, needs_times=isinstance(kind, HasMotion), report=report)
         if data.root == folder:  # the archive outlives the cache
             data = data.model_copy(update={"root": root})
         message = None if folder == root else f"{root} is unpacked in {folder}"

@@ -33,7 +33,7 @@ from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info, log_warning, quote_path
 from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.report import evaluate_run
-from dyngs.io.outputs import writing
+from dyngs.io.outputs import lock_folder
 from dyngs.models.kind import PredictsScenes, capability
 from dyngs.ops.device import deterministic, keep_freed_memory, select_device
 from dyngs.ops.native import kernel_threads, num_cores
@@ -96,7 +96,7 @@ def train(
     Poses of photos and videos are found first, and a body is fitted to a person where that is
     needed.
 
-    Example::
+    Example:
 
         import dyngs
 
@@ -135,7 +135,7 @@ def train(
         latest_checkpoint(folder)  # raises, and says what is there
     keep_freed_memory()
     bytewise = deterministic(device, config.run.deterministic)
-    with writing(folder) as alone, kernel_threads(_num_threads(config, processes)), bytewise:
+    with lock_folder(folder) as alone, kernel_threads(_num_threads(config, processes)), bytewise:
         remove_partial_files(folder, sole_writer=alone)
         resumed = None
         if resume_from is None:
@@ -282,7 +282,7 @@ class _Run:
                 loop.run(lambda: interrupts.requested or self._processes.is_stop_requested())
             finally:
                 if isinstance(loop.trainer, Trainer):
-                    loop.trainer.images.rest()
+                    loop.trainer.images.stop_prefetching()
             if loop.trainer.done < loop.total:
                 if loop.trainer.done > self._saved:
                     self._save()

@@ -12,9 +12,9 @@ from dyngs.data.capture import Capture, Silhouette, VideoFrame, View
 from dyngs.data.geometry import OPENGL_FROM_OPENCV, pinhole_matrix
 from dyngs.data.images.images import SUFFIXES, list_files, read_header
 from dyngs.data.images.video import colour_messages, decode_frames, locate_cached_frames
-from dyngs.data.readers.transforms import find_masks, mask_of
+from dyngs.data.readers.transforms import find_mask, find_masks
 from dyngs.data.times import evenly_spaced, natural_order, parse_frames
-from dyngs.io.containment import check_size, inside, restrict_paths_to
+from dyngs.io.containment import check_inside, check_size, restrict_paths_to
 from dyngs.io.outputs import VIDEO_SUFFIXES
 
 FORMAT = "fixed_camera"
@@ -67,7 +67,8 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
     )
     if other is not None:
         raise DyngsError(
-            f"{paths[other]}: has another size than {paths[numbers[0]].name}; give the frames of one camera"
+            f"{paths[other]}: its size differs from {paths[numbers[0]].name}; give frames of one "
+            "camera"
         )
     focal = first.focal_px or FOCAL * max(width, height)
     intrinsics = pinhole_matrix(focal, focal, width / 2, height / 2)
@@ -89,7 +90,7 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
     )
     has_alpha = masks is not None or first.alpha is not None
     note = f"{len(numbers)} of {len(paths)} frames, focal length {focal:.0f} px "
-    note += "by the EXIF tags" if first.focal_px else "guessed"
+    note += "from EXIF" if first.focal_px else "guessed"
     return Capture(
         source, FORMAT, {"train": views}, has_alpha=has_alpha, fps=fps, warnings=(note, *notes)
     )
@@ -101,14 +102,12 @@ def _frames_of(source: Path) -> tuple[Sequence[Path], float | None, list[str]]:
     if source.is_file():
         planned = locate_cached_frames(source)
         if not planned.paths:
-            raise DyngsError(f"{source}: the video holds no image; copy it again")
+            raise DyngsError(f"{source}: the video contains no frame; copy it again")
         return planned.paths, planned.info.fps or None, colour_messages([planned.info])
     images = _images_of(source)
     if not images:
-        raise DyngsError(
-            f"{source}: holds no images; give a folder of the frames of a clip, or a video"
-        )
-    return [inside(path) for path in images], None, []
+        raise DyngsError(f"{source}: no images found; give a video or a folder of its frames")
+    return [check_inside(path) for path in images], None, []
 
 
 def _images_of(folder: Path) -> list[Path]:
@@ -136,14 +135,15 @@ def silhouettes_of(masks: Path, names: Sequence[str]) -> list[Silhouette]:
         raise DyngsError(f"no such folder of masks: {masks}")
     with restrict_paths_to(masks), wrap_read_errors(masks):
         found = find_masks(masks)
-        own = [mask_of(name, found) for name in names]
+        own = [find_mask(name, found) for name in names]
         for path in own:
             if path is not None:
-                inside(path)
+                check_inside(path)
     missing = [name for name, path in zip(names, own, strict=True) if path is None]
     if missing:
         raise DyngsError(
-            f"{masks}: no mask for {len(missing)} of {len(names)} images, first {missing[0]}; a mask is named as its "
-            "image (a.jpg.png, a.jpg or a.png for a.jpg), white where the person is"
+            f"{masks}: no mask for {len(missing)} of {len(names)} images, first {missing[0]}; "
+            "name a mask after its image (a.jpg.png, a.jpg or a.png for a.jpg), white where the "
+            "person is"
         )
     return [Silhouette(path, "white") for path in own if path is not None]

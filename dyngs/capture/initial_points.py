@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from dyngs.capture.plane_sweep import sweep_dense_points, points_from_depth_maps
+from dyngs.capture.plane_sweep import points_from_depth_maps, sweep_dense_points
 from dyngs.capture.sfm.colmap import (
     ColmapError,
     feature_options,
@@ -29,7 +29,7 @@ from dyngs.capture.sfm.colmap import (
 )
 from dyngs.config import DataConfig, PointsInit
 from dyngs.data.capture import Capture, PointCloud, View
-from dyngs.data.geometry import projected
+from dyngs.data.geometry import project_points
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.scene_space import cube_half_side, cube_mismatch_reason, sample_points_in_frusta
 from dyngs.data.times import evenly_spaced
@@ -107,7 +107,7 @@ def clip_pairs(views: Sequence[View]) -> list[tuple[int, int]]:
     count = len(views)
     pairs = {(i, i + step) for step in TIME_STEPS for i in range(count - step)}
     points, _ = sample_points_in_frusta(views, np.random.default_rng(0).random((_PROBES, 4)))
-    seen = np.stack([projected(points, view)[1] for view in views]).astype(float)
+    seen = np.stack([project_points(points, view)[1] for view in views]).astype(float)
     axes = np.stack([view.cam_from_world[2, :3] for view in views])
     overlap = np.where(axes @ axes.T > np.cos(np.radians(MAX_TURN)), seen @ seen.T, 0.0)
     for i, row in enumerate(overlap):
@@ -229,9 +229,7 @@ def create_initial_points(
     if capture.points is not None:
         if capture.points_file is not None:
             count = f"{len(capture.points.xyz):,} points"
-            lines.append(
-                f"{capture.points_file.name}: {count}, which the first Gaussians are made from"
-            )
+            lines.append(f"{capture.points_file.name}: {count} used as initial points")
         return _with_dense_points(capture, options, init.dense, lines)
     views = capture.splits["train"]
     is_by_custom = capture.format in AROUND_ORIGIN
@@ -240,13 +238,13 @@ def create_initial_points(
     is_in_cube = is_by_custom and why is None
     if why is not None:
         lines.append(
-            f"the scene does not lie around the origin, where Blender scenes do by custom: {why}"
+            f"the scene is not centred at the origin, as Blender scenes usually are: {why}"
         )
     if is_in_cube and views[0].time is None:
         points = sample_points_in_silhouettes(views, options, init.num_random, half_side)
         if points is not None:
             lines.append(
-                f"{len(points.xyz):,} first points were drawn at random in the silhouettes of the images"
+                f"{len(points.xyz):,} initial points sampled at random inside the silhouettes"
             )
         return capture.replace(points=points), lines
     if init.triangulate == 0:
@@ -256,7 +254,7 @@ def create_initial_points(
     if views[0].time is None and views[0].depth_path is not None:
         points = points_from_depth_maps(views, options, init.num_random)
     if points is not None:
-        lines.append(f"{len(points.xyz):,} first points are from the depth maps")
+        lines.append(f"{len(points.xyz):,} initial points from the depth maps")
     elif (
         views[0].time is None
         or len({view.cam_from_world.tobytes() for view in moment}) >= MIN_IMAGES
@@ -265,7 +263,7 @@ def create_initial_points(
     elif not is_in_cube:
         points = triangulate_clip(views, options)
         if points is not None:
-            lines.append(f"{len(points.xyz):,} points were triangulated over the full clip")
+            lines.append(f"{len(points.xyz):,} initial points triangulated from the whole clip")
     return _with_dense_points(capture.replace(points=points), options, init.dense, lines)
 
 
@@ -278,12 +276,14 @@ def _with_dense_points(
     if views[0].time is not None or 2 * num_known >= count:
         return capture, lines
     if points is None:
-        candidates, _ = sample_points_in_frusta(views, np.random.default_rng(0).random((_PROBES, 4)))
+        candidates, _ = sample_points_in_frusta(
+            views, np.random.default_rng(0).random((_PROBES, 4))
+        )
         points = sweep_dense_points(views, options, candidates, count, fill=True)
         if points is not None:
             lines = [
                 *lines,
-                f"{len(points.xyz):,} first points are from depth maps by plane sweep (init.dense)",
+                f"{len(points.xyz):,} initial points from plane-sweep depth maps (init.dense)",
             ]
         return capture.replace(points=points), lines
     dense = sweep_dense_points(views, options, points.xyz, count)
@@ -293,7 +293,7 @@ def _with_dense_points(
         np.concatenate([points.xyz, dense.xyz]), np.concatenate([points.rgb, dense.rgb])
     )
     added = (
-        f"{len(dense.xyz):,} points of depth maps were added to {len(points.xyz):,} (init.dense)"
+        f"{len(dense.xyz):,} dense points added to {len(points.xyz):,} initial points (init.dense)"
     )
     return capture.replace(points=both), [*lines, added]
 
@@ -362,7 +362,7 @@ def _colours_at(xyz: np.ndarray, shown: Sequence[tuple[View, np.ndarray]]) -> np
     outside."""
     found = np.full((len(shown), len(xyz), 4), np.nan)
     for i, (view, image) in enumerate(shown):
-        positions, inside = projected(xyz, view)
+        positions, inside = project_points(xyz, view)
         size = np.array(image.shape[1::-1])
         column, row = np.minimum((positions[inside] * size).astype(int), size - 1).T
         found[i, inside] = image[row, column]

@@ -13,8 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from dyngs.capture.sfm.frame_choice import STANDS, camera_displacement, measured, shrunk
-from dyngs.capture.sfm.several_videos import VIDEOS_FILE, CameraVideo, open_video, read_video_settings
+from dyngs.capture.sfm.frame_choice import (
+    FIXED_CAMERA_LIMIT,
+    camera_displacement,
+    measure_frames,
+    small_brightness,
+)
+from dyngs.capture.sfm.several_videos import (
+    VIDEOS_FILE,
+    CameraVideo,
+    open_video,
+    read_video_settings,
+)
 from dyngs.config import DataConfig
 from dyngs.core.errors import (
     DyngsError,
@@ -27,17 +37,17 @@ from dyngs.data.body_frames import merge_root_rotation
 from dyngs.data.capture import Capture, View, all_views
 from dyngs.data.geometry import (
     camera_center,
+    count_visible_views,
     focus_point,
     fraction_in_front,
     invert_rigid,
     perpendicular,
-    count_visible_views,
     unit,
 )
 from dyngs.data.images.images import read_header, read_image, read_mask
-from dyngs.data.images.video import open_video_container, read_frames, list_videos
+from dyngs.data.images.video import list_videos, open_video_container, read_frames
 from dyngs.data.times import distinct_times, evenly_spaced
-from dyngs.io.containment import inside, find_escaping_links
+from dyngs.io.containment import check_inside, find_escaping_links
 from dyngs.io.outputs import Inputs
 from dyngs.io.write import write_image
 
@@ -60,7 +70,7 @@ MOST_IGNORED = 0.5
 def check_before_training(capture: Capture) -> list[str]:
     """Return one line for everything about a capture that is likely to spoil a training; only some
     masks are read."""
-    masks, problems = masks_of(capture)
+    masks, problems = describe_masks(capture)
     line = [] if masks is None else [f"masks of {masks}"]
     found = [*capture.warnings, *line, *problems, *time_problems(capture), *scene_problems(capture)]
     return list(dict.fromkeys([*found, *body_problems(capture)]))
@@ -81,8 +91,8 @@ def time_problems(capture: Capture) -> list[str]:
         return []
     if len({view.cam_from_world.round(9).tobytes() for view in views}) == 1:
         return [
-            f"one camera that does not move saw all {count} times: a moving scene cannot be reconstructed in 3D from "
-            "that; move the camera or use several"
+            f"a single fixed camera recorded all {count} times: a moving scene cannot be "
+            "reconstructed from one viewpoint; move the camera or use several"
         ]
     if not 3 <= len(views) == count or count * CLOSE_IN_TIME >= FEW_VIEWS:
         return []
@@ -95,8 +105,8 @@ def time_problems(capture: Capture) -> list[str]:
     if not angles.mean() >= WIDE_BASELINE:
         return []
     return [
-        f"{len(views)} images, each at a time of its own, {angles.mean():.0f} degrees apart on average: what moves "
-        "is seen from one side only at each time; expect a static result"
+        f"{len(views)} images at different times, {angles.mean():.0f} degrees apart on average: "
+        "moving objects are seen from one side only at each time; expect a static result"
     ]
 
 
@@ -124,8 +134,9 @@ def body_problems(capture: Capture) -> list[str]:
     middle = round((around[widest] + gaps[widest] / 2) / 90) % 4
     side = ("front", "left side", "back", "right side")[middle]
     return [
-        f"the person's {side} is never seen: all cameras are within {360 - gaps[widest]:.0f} degrees around the body; "
-        "what they do not see will be a guess (turn around once, or use more cameras)"
+        f"the person's {side} is in no image: all cameras are within {360 - gaps[widest]:.0f} "
+        "degrees around the body; the unseen side will be guessed (film a full turn, or use "
+        "more cameras)"
     ]
 
 
@@ -139,56 +150,54 @@ def scene_problems(capture: Capture) -> list[str]:
     spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
     is_static = capture.body is None and all(view.time is None for view in views)
     if len(poses) > 1 and spread < 1e-9 and is_static:
-        problems.append("all cameras are at one place, so no depth can be found")
+        problems.append("all cameras are at the same position, so depth cannot be estimated")
     xyz = capture.points.xyz if capture.points is not None else np.zeros((0, 3))
     focus = np.median(xyz, axis=0) if len(xyz) else focus_point(poses)
     if focus is not None and fraction_in_front(poses, focus) < 0.5:
         problems.append(
-            f"{1 - fraction_in_front(poses, focus):.0%} of the cameras look away from the scene: are the poses in the "
-            "axes that the format wants (OpenGL camera-to-world for JSON files)?"
+            f"{1 - fraction_in_front(poses, focus):.0%} of the cameras look away from the scene; "
+            "check the axes of the poses (JSON files use OpenGL camera-to-world)"
         )
     if len(xyz):
         sample = xyz[np.random.default_rng(0).permutation(len(xyz))[:2000]]
         some = [views[index] for index in evenly_spaced(len(views), MAX_VIEWS)]
         unseen = float((count_visible_views(sample, some) == 0).mean())
         if unseen > 0.1:
-            problems.append(f"{unseen:.0%} of the points are in no camera's view")
+            problems.append(f"{unseen:.0%} of the points are not visible in any view")
     return problems
 
 
-def listed(lines: Iterable[str]) -> list[str]:
+def limit_messages(lines: Iterable[str]) -> list[str]:
     """Return the lines, and a count of those beyond ``MAX_LINES_PER_KIND``."""
     found = list(lines)
     more = len(found) - MAX_LINES_PER_KIND
     if more <= 0:
         return found
-    return [*found[:MAX_LINES_PER_KIND], f"... and {more} more like the last one"]
+    return [*found[:MAX_LINES_PER_KIND], f"... and {more} more of this kind"]
 
 
-def problems_of(capture: Capture, deep: bool) -> list[str]:
+def find_problems(capture: Capture, deep: bool) -> list[str]:
     """Return a line for everything suspicious, next to the capture's own warnings; ``deep``: decode
     every image."""
     views = all_views(capture.splits)
     train = capture.splits.get("train", ())
     problems = []
     if not capture.splits.get("test"):
-        problems.append(
-            "the split 'test' is empty, so nothing can be measured (see data.test_every)"
-        )
+        problems.append("no test views, so quality cannot be measured (see data.test_every)")
     if len(train) < 3:
-        problems.append(f"only {len(train)} training views; a scene needs some 20 or more")
+        problems.append(f"only {len(train)} training views; use at least 20")
     poses = Counter(view.cam_from_world.round(9).tobytes() for view in views if view.time is None)
     same = sum(count for count in poses.values() if count > 1)
     if same:
-        problems.append(f"{same} views of a static scene share their pose with another one")
-    problems += listed(
-        f"'{view.name}': odd intrinsics for an image of {view.width}x{view.height}: focal lengths "
+        problems.append(f"{same} views of a static scene have the same pose as another view")
+    problems += limit_messages(
+        f"'{view.name}': unusual intrinsics for an image of {view.width}x{view.height}: focal lengths "
         f"({view.intrinsics[0, 0]:g}, {view.intrinsics[1, 1]:g}), centre ({view.intrinsics[0, 2]:g}, "
         f"{view.intrinsics[1, 2]:g}) px"
         for view in views
         if not _is_usual_camera(view)
     )
-    problems += [*_image_problems(views, deep), *masks_of(capture)[1]]
+    problems += [*_image_problems(views, deep), *describe_masks(capture)[1]]
     return [*problems, *time_problems(capture), *scene_problems(capture), *body_problems(capture)]
 
 
@@ -215,12 +224,13 @@ def _image_problems(views: Iterable[View], deep: bool) -> list[str]:
                 continue
             if header.size_matching(described) != described:
                 problems.append(
-                    f"{path} has {header.width}x{header.height} pixels, its camera says {view.width}x{view.height}"
+                    f"{path} has {header.width}x{header.height} pixels, but its camera is "
+                    f"{view.width}x{view.height}"
                 )
-    return listed(problems)
+    return limit_messages(problems)
 
 
-def masks_of(capture: Capture) -> tuple[str | None, list[str]]:
+def describe_masks(capture: Capture) -> tuple[str | None, list[str]]:
     """Return a description of the masks of a capture, None without any, and a line if they ignore
     most of the pixels.
 
@@ -230,18 +240,18 @@ def masks_of(capture: Capture) -> tuple[str | None, list[str]]:
     paths = [view.mask_path for view in views if view.mask_path is not None]
     if not paths:
         return None, []
-    found = f"{len(paths)} of {len(views)} images; white counts, black is ignored"
+    found = f"{len(paths)} of {len(views)} images (white = used, black = ignored)"
     sample = [paths[index] for index in evenly_spaced(len(paths), LOOKED_AT)]
     try:
         ignored = fmean(1 - float(read_mask(path).float().mean()) for path in sample)
     except DyngsError:
         return found, []
-    found += f": {ignored:.0%} of the pixels in {len(sample)} that were read"
+    found += f": {ignored:.0%} of the pixels ignored in {len(sample)} sampled masks"
     if ignored <= MOST_IGNORED:
         return found, []
     return found, [
-        f"masks ignore {ignored:.0%} of the pixels in {len(sample)} that were looked at, first {sample[0]}; white "
-        "(255) counts and black is ignored: are they inverted, or labels?"
+        f"masks ignore {ignored:.0%} of the pixels in {len(sample)} sampled masks, first "
+        f"{sample[0]}; white (255) = used, black = ignored: are they inverted, or label images?"
     ]
 
 
@@ -270,13 +280,13 @@ def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectRep
     from dyngs.data.read import read_capture
 
     options = source if isinstance(source, DataConfig) else DataConfig(root=source)
-    links = listed(
-        f"{path}: a link that leads out of the capture, to {place}"
+    links = limit_messages(
+        f"{path}: link to {place}, outside the capture"
         for path, place in find_escaping_links(options.root)
     )
     try:
         capture = read_capture(options, decode_videos=deep)
-        with wrap_read_errors(options.root, "`dyngs --debug` shows where"):
+        with wrap_read_errors(options.root, "see `dyngs --debug`"):
             report = build_report(capture, deep)
     except DyngsError as error:
         return InspectReport(options.root, None, (), (str(error), *links))
@@ -285,7 +295,7 @@ def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectRep
 
 def build_report(capture: Capture, deep: bool = False) -> InspectReport:
     """Return the report on a capture that has been read; see ``inspect_capture``."""
-    problems = dict.fromkeys([*capture.warnings, *problems_of(capture, deep)])
+    problems = dict.fromkeys([*capture.warnings, *find_problems(capture, deep)])
     return InspectReport(capture.root, capture, tuple(_facts_of(capture)), tuple(problems))
 
 
@@ -293,9 +303,9 @@ def format_report(report: InspectReport) -> str:
     """Return the report as plain text of several lines."""
     lines = [f"capture {report.root}", *_aligned(dict(report.facts))]
     if not report.problems:
-        lines.append("nothing suspicious")
+        lines.append("no problems found")
     else:
-        lines.append(f"suspicious ({len(report.problems)}):")
+        lines.append(f"problems ({len(report.problems)}):")
         lines += [f"  - {format_one_line(problem)}" for problem in report.problems]
     return "\n".join(lines)
 
@@ -320,7 +330,7 @@ def _facts_of(capture: Capture) -> Iterator[tuple[str, str]]:
     yield "field of view", f"{_range(fov_deg)} degrees across"
     yield "lens", _tallied(view.lens.model for view in views)
     yield "alpha", "transparent background" if capture.has_alpha else "none"
-    yield "masks", masks_of(capture)[0] or "none"
+    yield "masks", describe_masks(capture)[0] or "none"
     priors = {
         "depth maps": sum(view.depth_path is not None for view in views),
         "motion masks": sum(view.motion_mask_path is not None for view in views),
@@ -353,7 +363,9 @@ def _time_facts(capture: Capture) -> Iterator[tuple[str, str]]:
         return
     times = set(distinct_times(views).values())
     written = (
-        "" if capture.span in (None, (0.0, 1.0)) else f" ({_range(capture.span)} in the files)"
+        ""
+        if capture.file_time_span in (None, (0.0, 1.0))
+        else f" ({_range(capture.file_time_span)} in the files)"
     )
     yield "times", f"{len(times)} in {_range(times)}{written}"
     cameras = format_count(len({view.camera_id for view in views}), "camera")
@@ -462,7 +474,8 @@ def video_report(path: Path) -> str:
     """Return a report on a video file, or on the videos of a folder, as lines of text; their frames
     are decoded once."""
     videos = [
-        open_video(inside(video)) for video in ([path] if path.is_file() else list_videos(path))
+        open_video(check_inside(video))
+        for video in ([path] if path.is_file() else list_videos(path))
     ]
     lines = []
     moving = []
@@ -472,20 +485,19 @@ def video_report(path: Path) -> str:
         lines += [f"video {video.path}", *_aligned(facts)]
     where = quote_path(videos[0].path if len(videos) == 1 else path)
     if len(videos) == 1 and moving:
-        lines.append(
-            f"next: dyngs train static data.root={where}     # nothing but the camera moves"
-        )
-        lines.append(f"      dyngs train dynamic data.root={where}    # something else moves, too")
+        lines.append(f"next: dyngs train static data.root={where}     # only the camera moves")
+        lines.append(f"      dyngs train dynamic data.root={where}    # objects move as well")
     elif len(videos) == 1:
         lines.append(
-            "next: one fixed camera shows no depth; put videos of two or more that ran at once into a folder"
+            "next: one fixed camera gives no depth; put synchronous videos of two or more into a "
+            "folder"
         )
     elif moving:
         names = ", ".join(moving[:5])
-        lines.append(f"next: take {names} out: of several videos, only fixed cameras get poses")
+        lines.append(f"next: remove {names}: several videos are supported only for fixed cameras")
     else:
         is_given = read_video_settings(path, [video.name for video in videos])[0] is not None
-        known = f"as {VIDEOS_FILE} says" if is_given else "found by sound"
+        known = f"from {VIDEOS_FILE}" if is_given else "estimated from sound"
         lines.append(f"{len(videos)} fixed cameras; offsets between them: {known}")
         lines.append(f"next: dyngs train dynamic data.root={where}")
     return "\n".join(lines)
@@ -497,17 +509,17 @@ def video_facts(video: CameraVideo) -> tuple[dict[str, str], bool]:
 
     def frames() -> Iterator[np.ndarray]:
         for rgb in islice(read_frames(video.path), min(MAX_FRAMES, len(video.seconds))):
-            small.append(shrunk(rgb))
+            small.append(small_brightness(rgb))
             yield rgb
 
-    measures = measured(frames())
+    measures = measure_frames(frames())
     displaced = camera_displacement(np.stack(small))
     with open_video_container(video.path) as container:
         has_sound = len(container.streams.audio) > 0
     gaps = 1000 * np.diff(video.seconds)
     rate = f"{video.rate:.4g} per second"
     if len(gaps) and gaps.max() > UNEVEN * np.median(gaps):
-        rate = f"variable rate: {gaps.min():.0f} to {gaps.max():.0f} ms between frames (times are kept)"
+        rate = f"variable rate: {gaps.min():.0f} to {gaps.max():.0f} ms between frames"
     blurred = int((measures.sharpness < BLURRED * np.median(measures.sharpness)).sum())
     facts: dict[str, Any] = {
         "size": f"{video.info.width}x{video.info.height}",
@@ -517,6 +529,6 @@ def video_facts(video: CameraVideo) -> tuple[dict[str, str], bool]:
         "sharpness": format_count(blurred, "blurred frame"),
         "camera": f"moves by up to {displaced:.1%} of its width, {np.median(measures.motion):.2%} from frame to frame",
     }
-    stands = displaced <= STANDS
-    facts |= {"camera": "stands still"} if stands else {}
+    stands = displaced <= FIXED_CAMERA_LIMIT
+    facts |= {"camera": "fixed"} if stands else {}
     return {name: value for name, value in facts.items() if value}, stands

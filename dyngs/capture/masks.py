@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from dyngs.capture.sfm.frame_choice import STANDS, camera_displacement, shrunk
+from dyngs.capture.sfm.frame_choice import FIXED_CAMERA_LIMIT, camera_displacement, small_brightness
 from dyngs.core.errors import DyngsError, log_info
 from dyngs.data.capture import Capture, Silhouette, View, group_by_camera, map_views
 from dyngs.data.images.images import (
@@ -137,7 +137,7 @@ def person_mask(
     return np.isin(labels, 1 + np.flatnonzero(sizes >= LEAST_FRACTION * sizes.max()))
 
 
-def outlined(images: np.ndarray, masks: np.ndarray) -> np.ndarray | None:
+def refine_outlines(images: np.ndarray, masks: np.ndarray) -> np.ndarray | None:
     """Return masks (F, H, W) bool that are near the person as a detector has them, with outlines by
     the background.
 
@@ -184,10 +184,13 @@ def _touching(mask: np.ndarray, core: np.ndarray) -> np.ndarray:
 
 def _moves(images: np.ndarray) -> bool:
     """Whether the camera of images (F, H, W, 3) uint8 moves."""
-    return camera_displacement(np.stack([shrunk(image) for image in images])) > STANDS
+    return (
+        camera_displacement(np.stack([small_brightness(image) for image in images]))
+        > FIXED_CAMERA_LIMIT
+    )
 
 
-def separation(background: Background, images: np.ndarray, masks: np.ndarray) -> Separation:
+def measure_separation(background: Background, images: np.ndarray, masks: np.ndarray) -> Separation:
     """Return how well masks (F, H, W) bool separate what is in images (F, H, W, 3) uint8 from the
     background."""
     on_edges = []
@@ -243,8 +246,8 @@ def _disc(radius: int) -> np.ndarray:
 SAMPLES = 41  # images of a camera whose median is the background
 LEAST = 8  # least number of images of a camera
 SIDE = 960  # longest side of the images that are compared, px
-_MOVES = "moves, so there is no background to compare with; give masks of the person (--masks)"
-_ADVICE = "give masks of the person (--masks), or an image of the place without them (--background)"
+_MOVES = "moves, so its background is unknown; give masks of the person (--masks)"
+_ADVICE = "give masks of the person (--masks), or an image of the empty background (--background)"
 
 
 @dataclass(frozen=True)
@@ -262,8 +265,8 @@ class _Camera:
         pixels = read_image(path, (first.width, first.height))[..., :3]
         if pixels.shape[:2] != (first.height, first.width):
             raise DyngsError(
-                f"{path}: is {pixels.shape[1]}x{pixels.shape[0]}, images of its camera {first.width}x{first.height}; "
-                "take it with the same camera"
+                f"{path}: is {pixels.shape[1]}x{pixels.shape[0]}, images of its camera "
+                f"{first.width}x{first.height}; take it with the same camera"
             )
         return area_downscale_uint8(pixels, *self.size).numpy()
 
@@ -297,13 +300,14 @@ def add_background_masks(
         else:
             background = background_of(sampled)
         masks = np.stack([person_mask(background, image) for image in sampled])
-        found.append(separation(background, sampled, masks))
+        found.append(measure_separation(background, sampled, masks))
         with_plate = number in plates and found[-1].area > 0 and found[-1].on_edges > 0.5
         if not (found[-1].is_clear or with_plate):
             raise DyngsError(
-                f"{camera.where}: nobody stands out from the background, or the person never leaves their place, so "
-                f"that it is not seen ({found[-1].staying:.0%} of the masks are where somebody is most of the time, "
-                f"{found[-1].on_edges:.0%} of their outlines on edges); {_ADVICE}"
+                f"{camera.where}: no person stands out from the background, or the person stays "
+                f"in one place, so that the background is never visible ({found[-1].staying:.0%} "
+                f"of the mask pixels are covered most of the time, {found[-1].on_edges:.0%} of "
+                f"the outlines lie on image edges); {_ADVICE}"
             )
         for view in camera.views:
             name = re.sub(r"[^A-Za-z0-9_-]", "_", view.name)
@@ -313,8 +317,8 @@ def add_background_masks(
             silhouettes[view.name] = Silhouette(target, "white")
     worst = min(found, key=lambda one: one.on_edges)
     log(
-        f"masks by the difference from the background: {worst.on_edges:.0%} of the outlines lie on edges of the "
-        f"images, the person covers {worst.area:.1%} of them"
+        f"masks by background subtraction: {worst.on_edges:.0%} of the outlines lie on image "
+        f"edges, images, the person covers {worst.area:.1%} of them"
     )
     splits = map_views(
         capture.splits, lambda view: replace(view, silhouette=silhouettes[view.name])
@@ -334,7 +338,7 @@ def _fixed_cameras(capture: Capture) -> dict[int, _Camera]:
             raise DyngsError(f"{where} {_MOVES}")
         if len(views) < LEAST:
             raise DyngsError(
-                f"{where}: has {len(views)} images, too few for a background; {_ADVICE}"
+                f"{where}: has {len(views)} images, too few to estimate the background; {_ADVICE}"
             )
         size = target_size(first.width, first.height, 1.0, SIDE)
         cameras[number] = _Camera(where, tuple(views), size)
@@ -350,7 +354,8 @@ def _plates(empty: Path, cameras: Mapping[int, _Camera]) -> Mapping[int, Path]:
     missing = sorted(cameras.keys() - plates.keys())
     if missing:
         raise DyngsError(
-            f"{empty}: no background for camera {missing[0]}; give a folder with {missing[0]}.png"
+            f"{empty}: no background image for camera {missing[0]}; add {missing[0]}.png to the "
+            "folder"
         )
     return plates
 

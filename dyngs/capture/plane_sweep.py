@@ -20,7 +20,7 @@ from torch.nn.functional import grid_sample, pad
 
 from dyngs.config import DataConfig
 from dyngs.data.capture import PointCloud, View
-from dyngs.data.geometry import camera_center, invert_rigid, projected
+from dyngs.data.geometry import camera_center, invert_rigid, project_points
 from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
 
@@ -93,7 +93,7 @@ def sweep_dense_points(
     pixel that has one. None where hardly any points are found: without texture, neighbours, or
     right poses.
     """
-    groups = neighbours(views, sparse)
+    groups = choose_neighbours(views, sparse)
     needed = sorted({i for group in groups for i in group})
     loader = ImageLoader([views[i] for i in needed], _small(options))
     shots = {i: _shot(loader, k) for k, i in enumerate(needed)}
@@ -181,7 +181,7 @@ def _gaps_filled(shot: _Shot, depth: np.ndarray) -> np.ndarray:
     return np.where(is_unknown & shot.counts, depth[rows, columns], np.nan)
 
 
-def neighbours(views: Sequence[View], sparse: np.ndarray) -> list[list[int]]:
+def choose_neighbours(views: Sequence[View], sparse: np.ndarray) -> list[list[int]]:
     """Return groups of indices of views: one whose depth is looked for, then up to ``NEIGHBOURS``
     to compare it with.
 
@@ -189,7 +189,7 @@ def neighbours(views: Sequence[View], sparse: np.ndarray) -> list[list[int]]:
     apart nor too large for windows to look alike; a view with fewer than ``MIN_NEIGHBOURS`` of them
     has no group.
     """
-    sees = np.stack([projected(sparse, view)[1] for view in views]).astype(np.float64)
+    sees = np.stack([project_points(sparse, view)[1] for view in views]).astype(np.float64)
     centers = np.stack([camera_center(view.cam_from_world) for view in views])
     groups = []
     for i in evenly_spaced(len(views), MAPS):
@@ -224,7 +224,8 @@ def _depth_range(view: View, sparse: np.ndarray) -> tuple[float, float]:
     """Return the nearest and the farthest depth of the points (P, 3) that lie in the image, but for
     a few."""
     depths = (
-        sparse[projected(sparse, view)[1]] @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3]
+        sparse[project_points(sparse, view)[1]] @ view.cam_from_world[2, :3]
+        + view.cam_from_world[2, 3]
     )
     near, far = np.percentile(depths, _RANGE)
     return float(near), float(far)

@@ -42,7 +42,6 @@ def run(arguments: argparse.Namespace) -> int:
     from dyngs.io.formats.formats import (
         format_for_path,
         read_splats,
-        upright,
         write_splats,
     )
 
@@ -50,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     splat = read_splats(arguments.source, nonfinite="skip")
     if arguments.from_up is not None:
         splat = replace(splat, up=arguments.from_up)
-    rotated = upright(splat, arguments.up, arguments.target)
+    rotated = orient_to_axis(splat, arguments.up, arguments.target)
     said = f"up is {rotated.up} in the file" + (
         f", it was {splat.up}" if rotated.up != splat.up else ", as it was"
     )

@@ -39,13 +39,13 @@ def add_parser(commands: Commands) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo in ``--out``, or in ``OUT-2``, ``OUT-3`` ... if it is not empty."""
     from dyngs.cli.training_progress import TrainingProgress
-    from dyngs.io.outputs import writing
+    from dyngs.io.outputs import lock_folder
 
     folder: Path = arguments.out
     numbers = count(2)
     while not is_unused(folder):
         folder = arguments.out.with_name(f"{arguments.out.name}-{next(numbers)}")
-    with writing(folder), TrainingProgress() as progress:
+    with lock_folder(folder), TrainingProgress() as progress:
         run_demo(folder, arguments.steps, arguments.threads, [progress])
     return 0
 

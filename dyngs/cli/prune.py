@@ -25,7 +25,8 @@ examples:
   dyngs prune runs/dance model.alpha_min=0.02 --out runs/fast --prune 0.8
   dyngs train --resume runs/fifth                                continue an interrupted fine-tuning
 
-As a stage of training: dyngs train CONFIG ... prune.fraction=0.8. All options are explained in docs/prune.md.
+As a stage of training: dyngs train CONFIG ... prune.fraction=0.8.
+Guide: `dyngs docs smaller-and-faster`.
 """
 
 
@@ -61,7 +62,7 @@ def add_parser(commands: args.Commands) -> None:
     )
     args.add_threads(parser)
     args.add_run_device(parser)
-    args.add_overrides(parser, "key=value", "other config keys of the run (docs/cli.md)")
+    args.add_overrides(parser, "key=value", "other config keys of the run (`dyngs docs config`)")
     parser.set_defaults(takes_root=True)
     args.add_json(parser)
 

@@ -153,7 +153,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
     configs, unfit = comparison.configs(arguments.models.split(","))
     for config in configs.values():
         collect_inputs(config).require_output(out)
-    with writing(out), redirect_messages(arguments.json):
+    with lock_folder(out), redirect_messages(arguments.json):
         comparison.require_same(configs, unfit)
         try:
             results, left_out, curves = comparison.run(configs, arguments.ray)
@@ -200,7 +200,7 @@ def run_tradeoff(arguments: argparse.Namespace) -> int:
             f"{arguments.run_dir}: not a run folder; give a folder written by `dyngs train`"
         )
     out: Path = arguments.out or arguments.run_dir / "tradeoff"
-    with writing(out):
+    with lock_folder(out):
         return _tradeoff(arguments, out)
 
 

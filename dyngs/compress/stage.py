@@ -144,7 +144,7 @@ STILL_VIEWS = 100
 PROBED_VIEWS = 16  # Number of training images on which the loss is measured
 MASKED_BELOW = 0.5
 """At a key time, Gaussians that contribute no more px to all views together are masked
-(docs/prune.md)."""
+(docs/guides/smaller-and-faster.md)."""
 
 
 def prune_stage(loop: Loop) -> TrainingEdit | None:
@@ -202,7 +202,7 @@ def build_removal_edit(trainer: GaussianTrainer, scores: Tensor | None) -> Train
 @torch.no_grad()
 def importance_scores(trainer: GaussianTrainer, options: PruneConfig | None = None) -> Tensor:
     """Return (N,) how much each Gaussian matters now, by the score of ``options``; None: the first
-    of docs/prune.md."""
+    of docs/guides/smaller-and-faster.md."""
     score = (options or PruneConfig()).score
     scene = trainer.model.scene.without_masks()
     found = measure_importance(scoring_views(trainer, scene), slopes=score == "sensitivity")

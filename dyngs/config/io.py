@@ -107,7 +107,7 @@ _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
 def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Config:
     """Return the configuration of a preset with overrides applied.
 
-    Example::
+    Example:
 
         import dyngs
 

@@ -12,7 +12,7 @@ from torch import Tensor
 class Cameras:
     """V pinhole cameras of one image size.
 
-    Example::
+    Example:
 
         import torch
 

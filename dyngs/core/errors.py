@@ -21,7 +21,7 @@ class DyngsError(Exception):
 
     The command line prints the message and exits with code 2; library callers catch it.
 
-    Example::
+    Example:
 
         import dyngs
 

@@ -19,7 +19,7 @@ LARGEST_LOG_SCALE = 88  # Natural logarithm of the largest size that float32 can
 class Gaussians:
     """N Gaussians in the parametrisation that is optimised.
 
-    Example::
+    Example:
 
         import torch
 

@@ -1,2 +1,2 @@
-"""Captures as values: `readers/` (one module per layout), images, the image loader, synthetic
+"""Captures in memory: `readers/` (one module per file layout), images, the image loader, synthetic
 scenes."""

@@ -1,7 +1,7 @@
-"""Body parameters of captured people, one row per frame: checks, changes of frame, fitted files.
+"""Body parameters per frame: validation, change of coordinates, and files of fitted parameters.
 
-Local letters: F frames, J joints, B shape coefficients. Bodies are those of SMPL (Loper et al.
-2015) and its heirs.
+Local letters: F frames, J joints, B shape coefficients. Body models are SMPL (Loper et al. 2015),
+SMPL-H and SMPL-X.
 """
 
 from __future__ import annotations
@@ -25,43 +25,46 @@ from dyngs.data.capture import (
     map_views,
 )
 from dyngs.io.containment import restrict_paths_to
-from dyngs.io.fields import LARGEST, first_few, as_float_array, parse_numbers
+from dyngs.io.fields import LARGEST, as_float_array, first_few, parse_numbers
 from dyngs.io.numpy_files import read_npz
 
 
-def body_frames(
+def build_body_frames(
     where: Path,
     frames: Sequence[int],
     poses: object,
     trans: object,
     betas: object,
     scale: object = 1.0,
-    turns: object = None,
+    origin_rotations: object = None,
 ) -> BodyFrames:
-    """Return checked body parameters, sorted by frame; arrays may have any shape with one row per
-    frame.
+    """Validate body parameters and return them sorted by frame number.
 
-    Raises DyngsError: counts that differ, another width, NaN, a scale that is not positive, a frame
-    twice.
+    Arrays may have any shape with one row per frame. Raises DyngsError on mismatching counts or
+    widths, non-finite values, non-positive scales and duplicate frames.
 
     Args:
-        frames: F distinct numbers.
-        poses: F rows of 72, 156 or 165 numbers; ``trans`` and ``turns``: of 3.
-        betas: (B,), or one such row per frame, of which the mean is taken.
+        where: file for error messages.
+        frames: F distinct frame numbers.
+        poses: F rows of 72, 156 or 165 numbers.
+        trans, origin_rotations: F rows of 3 numbers.
+        betas: (B,), or F rows of B, which are averaged.
         scale: one number, or one per frame.
     """
     order = np.argsort(np.asarray(frames, dtype=np.int64), kind="stable")
     numbers = tuple(int(frames[i]) for i in order)
     if not numbers:
-        raise DyngsError(f"{where}: holds no frame; export the body parameters again")
+        raise DyngsError(f"{where}: no frames found; export the body parameters again")
     if len(set(numbers)) < len(numbers):
         twice = numbers[int(np.argmin(np.diff(numbers)))]
-        raise DyngsError(f"{where}: frame {twice} has body parameters twice; remove one of them")
+        raise DyngsError(
+            f"{where}: frame {twice} has two sets of body parameters; remove one of them"
+        )
     rows = _rows(where, "poses", poses, frames)
     if rows.shape[1] // 3 not in BODY_KINDS or rows.shape[1] % 3:
         wanted = ", ".join(f"{3 * joints} ({kind})" for joints, kind in BODY_KINDS.items())
         raise DyngsError(
-            f"{where}: 'poses' has {rows.shape[1]} numbers per frame; the known bodies have {wanted}"
+            f"{where}: 'poses' has {rows.shape[1]} numbers per frame; supported bodies: {wanted}"
         )
     scale = np.asarray(scale)
     scale = np.full(len(frames), scale.item()) if scale.size == 1 else scale
@@ -79,43 +82,50 @@ def body_frames(
         trans=_rows(where, "trans", trans, frames, 3)[order],
         betas=shape,
         scale=scales[order, 0],
-        turns=None if turns is None else _rows(where, "turns", turns, frames, 3)[order],
+        origin_rotations=None
+        if origin_rotations is None
+        else _rows(where, "origin_rotations", origin_rotations, frames, 3)[order],
     )
 
 
 def merge_root_rotation(body: BodyFrames, pelvis: np.ndarray) -> BodyFrames:
-    """Return the same bodies with ``turns`` merged into the root joint's rotation.
+    """Merge ``origin_rotations`` into the rotation of the root joint.
 
-    The pelvis keeps its place in the world, ``scale * turn(j) + trans``, where j is the rest
-    position of the fitted body's pelvis if the files say it, else ``pelvis`` (3,), that of the
-    shaped template that is to be posed. Hence the root rotates by ``turn * poses[:, 0]``, and
-    ``trans' = trans + scale * (turn(j) - pelvis)``.
+    The pelvis keeps its world position ``scale * R j + trans``, where R is the origin rotation and
+    j the rest position of the pelvis of the fitted body (of the given ``pelvis`` (3,) if the files
+    do not store it). Hence ``root' = R root`` and ``trans' = trans + scale * (R j - pelvis)``.
     """
     fitted = pelvis if body.pelvis is None else body.pelvis
     poses = body.poses
     turned = fitted
-    if body.turns is not None:
+    if body.origin_rotations is not None:
         from scipy.spatial.transform import Rotation  # late: importing it takes a tenth of a second
 
-        turns = Rotation.from_rotvec(body.turns)
+        turns = Rotation.from_rotvec(body.origin_rotations)
         turned = turns.apply(fitted)
         roots = (turns * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
         poses = np.concatenate([roots[:, None], poses[:, 1:]], axis=1)
     trans = body.trans + body.scale[:, None] * (turned - pelvis)
     return replace(
-        body, poses=poses, trans=trans, turns=None, pelvis=np.asarray(pelvis, dtype=np.float64)
+        body,
+        poses=poses,
+        trans=trans,
+        origin_rotations=None,
+        pelvis=np.asarray(pelvis, dtype=np.float64),
     )
 
 
-def moved(body: BodyFrames, shift: np.ndarray, factor: float) -> BodyFrames:
-    """Return the bodies of a world in which a point x is ``factor * (x - shift)``, with ``shift``
-    (3,)."""
+def transform_body(body: BodyFrames, shift: np.ndarray, factor: float) -> BodyFrames:
+    """Apply ``x -> factor * (x - shift)``, with ``shift`` (3,), to the world coordinates of the
+    body."""
     return replace(body, trans=factor * (body.trans - shift), scale=factor * body.scale)
 
 
-def rows_of(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
-    """Return (V,) the row of ``body`` for each view, by frame number; each must have one with
-    parameters."""
+def match_frames(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
+    """Return (V,) the row of ``body`` for each view, by frame number.
+
+    Raises DyngsError if a view has no frame number or its frame has no body parameters.
+    """
     rows = {number: row for row, number in enumerate(body.frames)}
     unnumbered = next((view.image_path for view in views if view.frame is None), None)
     if unnumbered is not None:
@@ -123,46 +133,49 @@ def rows_of(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
     lacking = sorted({frame_number(view) for view in views} - rows.keys())
     if lacking:
         raise DyngsError(
-            f"{where}: no body parameters for {len(lacking)} frames that have images ({first_few(lacking)}); the "
-            f"file has {len(rows)} frames from {body.frames[0]} to {body.frames[-1]}; add them or remove the images"
+            f"{where}: no body parameters for {len(lacking)} frames that have images "
+            f"({first_few(lacking)}); the file has {len(rows)} frames from {body.frames[0]} to "
+            f"{body.frames[-1]}; add them or remove the images"
         )
     return np.array([rows[frame_number(view)] for view in views], dtype=np.int64)
 
 
 def share_body_across_splits(body: BodyFrames) -> dict[Split, BodyFrames]:
-    """``Capture.body`` for a capture whose splits all show the same clip."""
+    """Return ``Capture.body`` for a capture whose splits all show the same clip."""
     return {"train": body, "val": body, "test": body}
 
 
 def _rows(
     where: Path, name: str, value: object, frames: Sequence[int], width: int | None = None
 ) -> np.ndarray:
-    """(F, width) float64 numbers of at most ``LARGEST``, any width where that is None."""
+    """Return (F, width) float64 numbers of magnitude up to ``LARGEST``; any width if None."""
     array = as_float_array(value)
     if array is None or array.shape[:1] != (len(frames),):
         raise DyngsError(
-            f"{where}: '{name}' must hold as many numbers for each of {len(frames)} frames; export the file again"
+            f"{where}: '{name}' must hold as many numbers for each of {len(frames)} frames; "
+            "export the file again"
         )
     array = array.reshape(len(frames), -1)
     if width not in (None, array.shape[1]):
         raise DyngsError(
-            f"{where}: '{name}' has {array.shape[1]} numbers per frame instead of {width}; export it again"
+            f"{where}: '{name}' has {array.shape[1]} numbers per frame instead of {width}; "
+            "export it again"
         )
     bad = ~(np.abs(array) <= LARGEST).all(axis=1)
     if bad.any():
         raise DyngsError(
-            f"{where}: '{name}' of frame {frames[int(np.argmax(bad))]} holds NaN, infinite or huge numbers; repair or "
-            "remove it"
+            f"{where}: '{name}' of frame {frames[int(np.argmax(bad))]} contains NaN, infinite or "
+            "huge values; repair or remove it"
         )
     return array
 
 
 def read_body_file(path: Path) -> BodyFrames:
-    """Read body parameters: poses (F, 72, 156 or 165), trans (F, 3), betas and, if there, scale and
-    ``frames`` (F,).
+    """Read body parameters from an .npz.
 
-    Without ``frames``, row n is for frame n. ``surface_model_type`` "anny" says that betas are of
-    the free template's shape space, ``fitted_to`` which other template dyngs fitted.
+    Arrays: ``poses`` (F, 72, 156 or 165), ``trans`` (F, 3), ``betas`` and optionally ``scale`` and
+    ``frames`` (F,); by default row n belongs to frame n. ``surface_model_type`` "anny" marks betas
+    of the free template's shape space; ``fitted_to`` identifies the template of a fit by dyngs.
     """
     found = read_npz(
         path, ("poses", "trans", "betas"), ("scale", "surface_model_type", "frames", "fitted_to")
@@ -174,7 +187,7 @@ def read_body_file(path: Path) -> BodyFrames:
             f"{path}: 'frames' must hold one whole number for each row of 'poses'; export it again"
         )
     frames = [int(number) for number in numbers]
-    body = body_frames(
+    body = build_body_frames(
         path, frames, found["poses"], found["trans"], found["betas"], found.get("scale", 1.0)
     )
     if str(found.get("surface_model_type")) == "anny":
@@ -182,13 +195,13 @@ def read_body_file(path: Path) -> BodyFrames:
     return replace(body, fitted_to=str(found.get("fitted_to", "")))
 
 
-def ensure_fitted_body(capture: Capture, folder: Path) -> Capture:
-    """Return the capture with the body parameters of ``folder``: ``body_train.npz``, and
-    ``body_pose.npz`` if there."""
+def attach_fitted_body(capture: Capture, folder: Path) -> Capture:
+    """Return the capture with the body parameters in ``folder``: ``body_train.npz`` and, if
+    present, ``body_pose.npz``."""
     if not (folder / "body_train.npz").is_file():
         raise DyngsError(
-            f"{folder / 'body_train.npz'}: no such file (data.body); a fit that `dyngs train human` made comes back by "
-            f"training with data.root={capture.root} into another run.dir"
+            f"{folder / 'body_train.npz'}: no such file (data.body); to reuse a fit by `dyngs "
+            f"train human`, train with data.root={capture.root} and another run.dir"
         )
     with (
         restrict_paths_to(folder, False),
@@ -198,34 +211,36 @@ def ensure_fitted_body(capture: Capture, folder: Path) -> Capture:
         body: dict[Split, BodyFrames] = {"train": train, "val": train, "test": train}
         if (folder / "body_pose.npz").is_file():
             body["pose"] = read_body_file(folder / "body_pose.npz")
-    splits = numbered(capture.splits)
+    splits = assign_frame_numbers(capture.splits)
     if "pose" in splits and "pose" not in body:
         splits = {name: views for name, views in splits.items() if name != "pose"}
     return capture.replace(splits=splits, body=body)
 
 
 def parse_frame_number(where: Path, name: str) -> int:
-    """Frame number of ``000123.jpg``, ``frame_000123`` or ``Camera
-    (1)_0123_2019-08-23_16.592.jpg``."""
+    """Return the frame number in an image name.
+
+    Accepts ``000123.jpg``, ``frame_000123`` and ``Camera (1)_0123_2019-08-23_16.592.jpg``.
+    """
     stem = PurePosixPath(name.replace("\\", "/")).name
     found = re.search(r"\)_(\d{1,15})(?!\d)", stem) or re.search(
         r"(?<!\d)(\d{1,15})(?:\.\w+)?$", stem
     )
     if not found:
         raise DyngsError(
-            f"{where}: no frame number in the name {name!r:.80}; call the image 000000.jpg or the like"
+            f"{where}: no frame number in the name {name!r:.80}; rename the image, for example "
+            "to 000000.jpg"
         )
     return int(found[1])
 
 
 def frame_number(view: View) -> int:
-    """Return the frame number of a view; -1 without one."""
+    """Return the frame number of a view, -1 if it has none."""
     return -1 if view.frame is None else view.frame
 
 
-def numbered(splits: Splits) -> Splits:
-    """Return the views with frame numbers; if any has none, all get them by the order of their
-    times."""
+def assign_frame_numbers(splits: Splits) -> Splits:
+    """Return views with frame numbers; if any is missing, all are numbered in order of time."""
     views = all_views(splits)
     if all(view.frame is not None for view in views):
         return splits

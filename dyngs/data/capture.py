@@ -1,4 +1,4 @@
-"""Captures in memory: views with cameras, sparse points and body parameters; images stay on
+"""Data classes of a capture: views with cameras, sparse points and body parameters. Images stay on
 disk."""
 
 from __future__ import annotations
@@ -11,18 +11,19 @@ from typing import Literal
 import numpy as np
 
 Split = Literal["train", "val", "test", "pose"]
-"""The split "pose" shows a person in another clip, with times and frame numbers of its own."""
+"""Splits of a capture; "pose" is a separate clip of a person, with its own times and frame
+numbers."""
 
 BodyKind = Literal["smpl", "smplh", "smplx"]
 ShapeSpace = Literal["smpl", "anny"]
 
 BODY_KINDS: dict[int, BodyKind] = {24: "smpl", 52: "smplh", 55: "smplx"}
-"""Number of joints to body model."""
+"""Body model by number of joints."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Lens distortion of one view; images are undistorted to a pinhole on load.
+    """Lens distortion of a view; images are undistorted to a pinhole image on load.
 
     Attributes:
         model: "none", "opencv" (k1 k2 p1 p2 [k3 k4 k5 k6]) or "fisheye" (OpenCV equidistant
@@ -44,12 +45,11 @@ class VideoFrame:
 
 @dataclass(frozen=True)
 class Silhouette:
-    """Mask of a person in an image, in a file.
+    """Mask file of a person.
 
     Attributes:
-        path: an image of the same size, or an HDF5 file whose data set ``masks`` (F, H, W) has a
-            row per frame.
-        person: how the person's pixels are marked: "white" (grey levels are partial coverage),
+        path: an image of the same size, or an HDF5 file with a data set ``masks`` (F, H, W).
+        person: how pixels of the person are marked: "white" (grey levels are partial coverage),
             "black" (the inverse of "white"), or "nonzero" (labels: everything but 0).
         row: row of the data set, None for an image.
     """
@@ -61,29 +61,28 @@ class Silhouette:
 
 @dataclass(frozen=True)
 class View:
-    """One image and its camera; what a capture does not have is None.
+    """One image and its camera; fields that a capture does not have are None.
 
     Attributes:
         name: unique within the capture (usually the path below the root, without extension).
-        image_path: image file; for a frame of a ``video`` the file it is decoded to, see
-            ``images.video``.
+        image_path: image file; for a frame of a ``video`` the cached file, see ``images.video``.
         cam_from_world: (4, 4) float64, OpenCV axes, in scene coordinates (see
             ``Capture.world_scale``).
         intrinsics: (3, 3) float64 in pixels of the *stored* image size.
         width, height: stored image size in pixels.
         camera_id: index of the physical camera.
-        mask_path: white = keep, black = ignore.
+        mask_path: white = used, black = ignored.
         time: in [0, 1], or None for a static scene.
         frame: frame number of a sequence.
         video: the video frame that ``image_path`` is decoded from.
         silhouette: mask of the person, which becomes the image's alpha.
-        depth_path: depth map, in any unit, see ``images.maps``.
-        depth_scale: scene units in the unit of the files, which that of the depth map may be.
-        motion_mask_path: white = moves; if ``motion_mask_labels``, all but 0 does.
-        flow_path: optical flow to the view ``flow_to``, the next one of this camera in its file.
-        exposure: light let in by the EXIF tags, by ``ImageHeader``: comparable among views of one
-            capture.
-        shrunk: how many times smaller the file is than the image that it is a copy of.
+        depth_path: depth map, see ``images.maps``.
+        depth_scale: factor from depth values to scene units, if they are in the unit of the files.
+        motion_mask_path: white = moving; with ``motion_mask_labels``, every label but 0.
+        flow_path: optical flow to the view ``flow_to``, the next view of the same camera.
+        exposure: relative exposure from EXIF, see ``ImageHeader``; comparable within a capture.
+        copy_factor: how many times smaller the file is than the original image of which it is a
+            copy.
     """
 
     name: str
@@ -106,20 +105,20 @@ class View:
     flow_path: Path | None = None
     flow_to: str | None = None
     exposure: float | None = None
-    shrunk: int = 1
+    copy_factor: int = 1
 
 
 Splits = dict[Split, tuple[View, ...]]
-"""Split name to its views."""
+"""Views by split name."""
 
 
 def all_views(splits: Mapping[Split, tuple[View, ...]]) -> list[View]:
-    """The views of all splits, one split after the other."""
+    """Return the views of all splits, one split after the other."""
     return [view for views in splits.values() for view in views]
 
 
 def group_by_camera(splits: Mapping[Split, tuple[View, ...]]) -> dict[int, list[View]]:
-    """Return the views of each camera in order of time, cameras by their numbers."""
+    """Return the views of each camera in order of time, by camera id."""
     found: dict[int, list[View]] = {}
     for view in sorted(
         all_views(splits), key=lambda view: (view.camera_id, view.time or 0.0, view.name)
@@ -129,7 +128,7 @@ def group_by_camera(splits: Mapping[Split, tuple[View, ...]]) -> dict[int, list[
 
 
 def map_views(splits: Splits, change: Callable[[View], View]) -> Splits:
-    """Return the splits with ``change`` of each view."""
+    """Return the splits with ``change`` applied to each view."""
     return {name: tuple(map(change, views)) for name, views in splits.items()}
 
 
@@ -143,25 +142,24 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class BodyFrames:
-    """Body parameters of the frames of one clip, float64, in the world and the unit of the clip's
-    cameras.
+    """Body parameters of the frames of one clip, float64, in the world and unit of its cameras.
 
-    A point x of the shaped template at rest is mapped to ``scale * turn(LBS(x; poses)) + trans``.
-    LBS rotates the whole body by ``poses[:, 0]`` about the pelvis (joint 0), ``turn`` about the
-    template's origin; ``about_pelvis`` merges the two.
+    A point x of the shaped template in rest pose is mapped to ``scale * R LBS(x; poses) + trans``.
+    LBS rotates the body by ``poses[:, 0]`` about the pelvis (joint 0), R (``origin_rotations``)
+    about the template's origin; ``merge_root_rotation`` merges the two.
 
     Attributes:
         frames: (F,) ascending frame numbers, as in ``View.frame``.
         poses: (F, J, 3) axis-angle, radians, J = 24, 52 or 55.
-        trans: (F, 3).
-        betas: (B,) shape coefficients, in the shape space ``shape_space``.
+        trans: (F, 3) translations.
+        betas: (B,) shape coefficients in ``shape_space``.
         scale: (F,) world units per metre of the template, positive.
-        turns: (F, 3) axis-angle, radians, rotation about the template's origin; None for none.
-        pelvis: (3,) rest position of the pelvis of the fitted body, None where the files do not
-            say.
-        shape_space: that of ``betas``: of SMPL's family, or of the free template.
-        fitted_to: ``fingerprint`` of the template that dyngs fitted; empty for the free one and
-            parameters of others.
+        origin_rotations: (F, 3) axis-angle, radians; None for the identity.
+        pelvis: (3,) rest position of the pelvis of the fitted body, None if the files do not store
+            it.
+        shape_space: space of ``betas``: that of the SMPL family, or of the free template.
+        fitted_to: ``fingerprint`` of the template that dyngs fitted; empty for the free template
+            and for parameters from elsewhere.
     """
 
     frames: tuple[int, ...]
@@ -169,41 +167,41 @@ class BodyFrames:
     trans: np.ndarray
     betas: np.ndarray
     scale: np.ndarray
-    turns: np.ndarray | None = None
+    origin_rotations: np.ndarray | None = None
     pelvis: np.ndarray | None = None
     shape_space: ShapeSpace = "smpl"
     fitted_to: str = ""
 
     @property
     def kind(self) -> BodyKind:
-        """The body model with that number of joints."""
+        """Body model with this number of joints."""
         return BODY_KINDS[self.poses.shape[1]]
 
 
 @dataclass(frozen=True)
 class Capture:
-    """A scene on disk.
+    """A capture on disk: its views, points, body parameters and coordinate frame.
 
     Attributes:
         root: the folder.
-        format: as ``data.format`` has it.
-        splits: split name to views, each tuple sorted by name; train is never empty.
+        format: name of its format, as in ``data.format``.
+        splits: views by split, each tuple sorted by name; train is never empty.
         points: sparse points or None.
-        points_file: the .ply that the points are from, which is not known to fit the cameras; None
-            for other points.
+        points_file: .ply of the points if they may be in other coordinates than the cameras, else
+            None.
         world_scale: power of two, length of a scene unit in the unit of the files. A point x in
-            scene coordinates is ``world_scale * x + world_offset`` in the files. See
+            scene coordinates is ``world_scale * x + world_offset`` in the files, see
             ``scene_space.normalise_capture``.
-        world_offset: (3,) float64 in the unit of the files; zero unless the scene lies far from its
-            origin.
-        has_alpha: images carry straight alpha that means "transparent here".
-        body: body parameters of each split, by frame number, for captures of people.
+        world_offset: (3,) float64 in the unit of the files; zero unless the scene lies far from
+            the origin.
+        has_alpha: images have straight alpha, with 0 = transparent.
+        body: body parameters of each split, for captures of people.
         fps: frames per second of the recording.
-        span: first and last time as written in the files, which are 0 and 1 in the views.
-        in_seconds: times in the files are seconds.
-        seconds: from time 0 to time 1.
+        file_time_span: first and last time in the files, which become 0 and 1 in the views.
+        times_in_seconds: times in the files are seconds.
+        seconds: duration from time 0 to time 1.
         tracks_path: 2D tracks, see ``data.tracks``.
-        warnings: suspicious findings of the reader, one line each.
+        warnings: messages of the reader.
     """
 
     root: Path
@@ -216,27 +214,26 @@ class Capture:
     has_alpha: bool = False
     body: dict[Split, BodyFrames] | None = None
     fps: float | None = None
-    span: tuple[float, float] | None = None
-    in_seconds: bool = False
+    file_time_span: tuple[float, float] | None = None
+    times_in_seconds: bool = False
     seconds: float | None = None
     tracks_path: Path | None = None
     warnings: tuple[str, ...] = ()
 
     def replace(self, **changes: object) -> Capture:
-        """Return the capture with other attributes."""
+        """Return a copy with some attributes replaced."""
         return replace(self, **changes)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
 class CaptureFormat:
-    """A capture format: how a folder of this format is recognised and read.
+    """A capture format: how a folder is recognised and read.
 
     Attributes:
-        files: the files by which it is recognised, for messages.
-        recognise: whether a folder holds these files; opens none of them.
-        read: reads the folder; ``dyngs.data.read`` then finishes splits and times.
-        extends: name of the format of which this one is a special case: its folders are recognised
-            as that one, too.
+        files: names of its files, for messages.
+        recognise: whether a folder contains these files; opens none of them.
+        read: reads the folder; ``dyngs.data.read`` then completes splits and times.
+        extends: name of a more general format whose files this one contains as well.
     """
 
     name: str

@@ -1,6 +1,5 @@
-"""Camera geometry: checks and changes of poses, pinhole matrices, projection, the point that
-cameras look at.
-"""
+"""Camera geometry: pose validation, axis conventions, intrinsics, projection, focus point,
+look-at."""
 
 from __future__ import annotations
 
@@ -15,17 +14,18 @@ from dyngs.data.capture import View
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 LARGEST = 1e12
-"""Largest entry of a pose: beyond it float64 is too coarse to recentre the scene."""
+"""Largest pose entry: beyond it float64 is too coarse to recentre the scene."""
 ROTATION_TOLERANCE = 1e-3
-"""Largest entry of ``R^T R - I`` that is taken for rounding and repaired."""
+"""Largest entry of ``R^T R - I`` that counts as rounding and is repaired."""
 
 
 def validate_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
-    """Return the rigid (4, 4) float64 transform nearest to ``matrix`` (4, 4) or (3, 4), in any
-    convention.
+    """Return the rigid (4, 4) float64 transform nearest to ``matrix``, (4, 4) or (3, 4), and its
+    error.
 
-    And by how much that was not rigid: the largest entry of ``|R^T R - I|``. Raises DyngsError: not
-    finite, not a pose, mirrored, scaled, or further than ``ROTATION_TOLERANCE`` from a rotation.
+    The error is the largest entry of ``|R^T R - I|``. Works for any axis convention. Raises
+    DyngsError if the matrix is not finite, mirrored, scaled, or farther than
+    ``ROTATION_TOLERANCE`` from a rotation.
     """
     if matrix.shape not in ((4, 4), (3, 4)):
         raise DyngsError(
@@ -33,7 +33,8 @@ def validate_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
         )
     if not np.abs(matrix).max() <= LARGEST:
         raise DyngsError(
-            f"{where}: the pose holds NaN, or numbers beyond {LARGEST:g}; remove or repair this frame"
+            f"{where}: the pose contains NaN or values above {LARGEST:g}; remove or repair this "
+            "frame"
         )
     if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise DyngsError(
@@ -45,8 +46,8 @@ def validate_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
     if error > ROTATION_TOLERANCE or determinant <= 0:
         fault = "mirrored; flip one axis when exporting" if determinant < 0 else "not a rotation"
         raise DyngsError(
-            f"{where}: the pose is {fault} (its determinant is {determinant:.3g}, R^T R differs from the identity by "
-            f"{error:.2g}; scale positions only)"
+            f"{where}: the pose is {fault} (its determinant is {determinant:.3g}, R^T R differs "
+            f"from the identity by {error:.2g}; scale positions only)"
         )
     u, _, vt = np.linalg.svd(rotation)
     pose = np.eye(4)
@@ -56,7 +57,7 @@ def validate_pose(matrix: np.ndarray, where: str) -> tuple[np.ndarray, float]:
 
 
 def from_opengl_pose(world_from_cam: np.ndarray) -> np.ndarray:
-    """Return the OpenCV ``cam_from_world`` of a rigid (4, 4) OpenGL camera-to-world pose: y up, z
+    """Return the OpenCV ``cam_from_world`` of an OpenGL camera-to-world pose (4, 4): y up, z
     backward."""
     return invert_rigid(world_from_cam @ OPENGL_FROM_OPENCV)
 
@@ -80,44 +81,46 @@ def camera_center(cam_from_world: np.ndarray) -> np.ndarray:
 
 
 def repair_warning(errors: dict[str, float]) -> list[str]:
-    """Return one line about the rotations that were not orthonormal, by origin, as ``checked_pose``
-    says; or none."""
+    """Return a warning on rotations that were repaired, given ``validate_pose`` errors by
+    location."""
     off = {where: error for where, error in errors.items() if error > 1e-5}
     if not off:
         return []
     worst = max(off, key=lambda where: off[where])
     return [
-        f"{len(off)} rotations were not orthonormal and were repaired, the worst by {off[worst]:.1e} ({worst})"
+        f"{len(off)} rotations were not orthonormal and have been repaired, largest error "
+        f"{off[worst]:.1e} ({worst})"
     ]
 
 
 MAX_SIDE = 2**20
-"""Largest side of an image in pixels; more is taken for a mistake."""
+"""Largest plausible side of an image in pixels."""
 FOCAL_RANGE = (1e-4, 1e6)
-"""Plausible focal lengths, in units of the image's longer side: fields of view from 0.00006 to
-179.99 degrees."""
+"""Plausible focal lengths in longer sides of the image: fields of view from 0.00006 to 179.99
+degrees."""
 
 
 def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
-    """Return the (3, 3) float64 camera matrix, in pixels."""
+    """Return the (3, 3) float64 camera matrix in pixels."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def scaled_intrinsics(intrinsics: np.ndarray, scale_x: float, scale_y: float) -> np.ndarray:
-    """Return the (3, 3) matrix for the image scaled by the two factors; exact, as pixel centres are
-    at (0.5, 0.5)."""
+    """Return the (3, 3) matrix for a scaled image; exact, as pixel centres are at (0.5, 0.5)."""
     return np.diag([scale_x, scale_y, 1.0]) @ intrinsics
 
 
 def match_intrinsics_to_image(
     intrinsics: np.ndarray, described: tuple[int, int], stored: tuple[int, int] | None, where: str
 ) -> tuple[np.ndarray, tuple[int, int], bool]:
-    """Return the intrinsics for the stored image, its (width, height), and whether they were
-    rescaled.
+    """Rescale intrinsics to the stored image; return them, its (width, height), and whether they
+    changed.
 
-    From those of an image of ``described`` size; ``stored`` is that of the file, None where it
-    could not be opened. Raises DyngsError: another aspect ratio, so that no rescaling is right; an
-    implausible focal length or principal point.
+    Args:
+        described: image size that the intrinsics are for.
+        stored: size of the file, None if it could not be opened.
+
+    Raises DyngsError on another aspect ratio, or an implausible focal length or principal point.
     """
     _check_plausible(intrinsics, described, where)
     if stored is None or stored == described:
@@ -130,8 +133,9 @@ def match_intrinsics_to_image(
     if abs(scale_x / scale_y - 1) > 2 * slack:
         rotated = " (rotated by its EXIF tag?)" if stored == described[::-1] else ""
         raise DyngsError(
-            f"{where}: the image is {stored[0]}x{stored[1]} but its intrinsics are for {described[0]}x{described[1]}"
-            f"{rotated}; correct the size and focal length or restore the original image"
+            f"{where}: the image is {stored[0]}x{stored[1]} but its intrinsics are for "
+            f"{described[0]}x{described[1]}{rotated}; correct the size and focal length or "
+            "restore the original image"
         )
     return scaled_intrinsics(intrinsics, scale_x, scale_y), stored, True
 
@@ -143,30 +147,31 @@ def _check_plausible(intrinsics: np.ndarray, described: tuple[int, int], where: 
     fx, fy, *center = (float(intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     if not (low <= fx <= high and low <= fy <= high and all(abs(x) <= high for x in center)):
         raise DyngsError(
-            f"{where}: the focal length ({fx:g}, {fy:g}) px or the principal point ({center[0]:g}, {center[1]:g}) px "
-            f"does not suit an image of {described[0]}x{described[1]}; correct it, or the field of view that it "
-            "follows from"
+            f"{where}: the focal length ({fx:g}, {fy:g}) px or the principal point "
+            f"({center[0]:g}, {center[1]:g}) px is implausible for an image of "
+            f"{described[0]}x{described[1]}; correct it, or the field of view"
         )
 
 
 def rescale_warning(where: list[str]) -> list[str]:
-    """Return one line about the images whose intrinsics were rescaled, none if there are none."""
+    """Return a warning on images whose intrinsics were rescaled, none for an empty list."""
     if not where:
         return []
     return [
-        f"{len(where)} images have another size than their intrinsics, which were rescaled; first {where[0]}"
+        f"{len(where)} images differ in size from their intrinsics, which were rescaled; first "
+        f"{where[0]}"
     ]
 
 
 NEAREST = 1e-9
-"""Points nearer to a camera's plane than this, in world units, or behind it are not seen."""
+"""Points nearer to the camera plane than this, in world units, or behind it are not visible."""
 
 
-def projected(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions of points (P, 3) in an image: (P, 2) in [0, 1] across and down, and (P,)
-    if they lie in it.
+def project_points(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Project points (P, 3) with the pinhole camera of a view.
 
-    As a pinhole camera sees them; positions of points that are not in the image mean nothing.
+    Returns (P, 2) positions in [0, 1] across and down, and (P,) bool whether they are in the
+    image; other positions are undefined.
     """
     local = points @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
     in_front = local[:, 2] > NEAREST
@@ -179,18 +184,19 @@ def projected(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
 
 
 def count_visible_views(points: np.ndarray, views: Sequence[View]) -> np.ndarray:
-    """Return (P,) int64: in how many of the views each of the points (P, 3) lies."""
+    """Return (P,) int64 in how many of the views each of the points (P, 3) is visible."""
     counts = np.zeros(len(points), np.int64)
     for view in views:
-        counts += projected(points, view)[1]
+        counts += project_points(points, view)[1]
     return counts
 
 
 def focus_point(world_from_cam: np.ndarray) -> np.ndarray | None:
-    """Return the (3,) point nearest to all optical axes (least squares), None where they are nearly
-    parallel.
+    """Return the (3,) point nearest to all optical axes (least squares), None for nearly parallel
+    axes.
 
-    Of (V, 4, 4) rigid OpenCV poses; it may lie behind the cameras, see ``fraction_in_front``.
+    ``world_from_cam``: (V, 4, 4) rigid OpenCV poses. The point may lie behind cameras, see
+    ``fraction_in_front``.
     """
     centers = world_from_cam[:, :3, 3]
     axes = world_from_cam[:, :3, 2]
@@ -204,18 +210,16 @@ def focus_point(world_from_cam: np.ndarray) -> np.ndarray | None:
 
 
 def fraction_in_front(world_from_cam: np.ndarray, point: np.ndarray) -> float:
-    """Return the fraction in [0, 1] of the cameras (V, 4, 4) that have ``point`` (3,) in front of
-    them."""
+    """Return the fraction of the cameras (V, 4, 4) that have ``point`` (3,) in front of them."""
     depth = np.einsum("vi,vi->v", point - world_from_cam[:, :3, 3], world_from_cam[:, :3, 2])
     return float((depth > 0).mean())
 
 
 def estimate_focus(cameras: Cameras) -> np.ndarray:
-    """Return the point (3,) float64 nearest to all optical axes in the least-squares sense, in
-    front of the cameras.
+    """Return the point (3,) float64 in front of the cameras that is nearest to their optical axes.
 
-    (Nearly) parallel axes do not determine it: then it lies in front of the mean camera, at three
-    times the spread of the cameras (1 if they coincide).
+    For nearly parallel axes it lies in front of the mean camera, at three times the spread of the
+    cameras (1 if they coincide).
     """
     poses = world_from_cam(cameras)
     centers = poses[:, :3, 3]
@@ -232,11 +236,10 @@ def estimate_focus(cameras: Cameras) -> np.ndarray:
 
 
 def up_direction(cameras: Cameras) -> np.ndarray:
-    """Return the direction (3,) that is up for the cameras.
+    """Estimate the up direction (3,) of the scene from its cameras.
 
-    Cameras that look around, and are held level, have right axes in one plane: up is its normal,
-    whichever way they are tilted. Where that plane is not determined, or they are not held level,
-    it is the mean of their own up directions.
+    Level cameras that look around have their right axes in one plane, whatever their tilt; up is
+    its normal. Otherwise it is the mean of the cameras' own up directions.
     """
     poses = world_from_cam(cameras)
     ups = -poses[:, :3, 1]
@@ -251,7 +254,7 @@ def up_direction(cameras: Cameras) -> np.ndarray:
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Return the OpenCV camera-to-world pose (4, 4) at ``eye``, z towards ``target``, y away from
+    """Return the OpenCV camera-to-world pose (4, 4) at ``eye``: z towards ``target``, y away from
     ``up``."""
     forward = target - eye
     has_length = np.linalg.norm(forward) > 1e-12 * np.linalg.norm(eye)
@@ -264,23 +267,23 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     return pose
 
 
-def with_poses(cameras: Cameras, poses: np.ndarray) -> Cameras:
-    """Return cameras at camera-to-world ``poses`` (F, 4, 4), with intrinsics, dtype and device of
-    the first camera."""
+def cameras_at_poses(cameras: Cameras, poses: np.ndarray) -> Cameras:
+    """Return cameras at camera-to-world ``poses`` (F, 4, 4) with the intrinsics, dtype and device
+    of the first camera."""
     cam_from_world = torch.from_numpy(np.linalg.inv(poses)).to(cameras.cam_from_world)
     intrinsics = cameras.intrinsics[:1].expand(len(cam_from_world), 3, 3).clone()
     return Cameras(cam_from_world, intrinsics, cameras.width, cameras.height)
 
 
 def world_from_cam(cameras: Cameras) -> np.ndarray:
-    """Return camera-to-world poses (V, 4, 4), float64."""
+    """Return the camera-to-world poses (V, 4, 4), float64."""
     if not len(cameras):
-        raise ValueError("a camera path is placed by at least one camera")
+        raise ValueError("a camera path needs at least one camera")
     return np.linalg.inv(cameras.cam_from_world.detach().cpu().double().numpy())
 
 
 def unit(a: np.ndarray) -> np.ndarray:
-    """Return vectors (..., 3) that are not zero at length 1."""
+    """Normalise nonzero vectors (..., 3)."""
     return a / np.linalg.norm(a, axis=-1, keepdims=True)
 
 

@@ -1,4 +1,5 @@
-"""Images of views in memory, decoded ahead in background threads."""
+"""Image loader: images of views as training targets, cached and prefetched in background
+threads."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ from dyngs.data.images.images import (
     area_downscale,
     area_downscale_uint8,
     check_image,
-    premultiplied,
+    premultiply,
     read_image,
     read_mask,
     to_straight_uint8,
@@ -33,20 +34,20 @@ from dyngs.data.images.lens import LensMap, is_pinhole, undistort, undistort_map
 from dyngs.data.read import view_size
 from dyngs.ops.device import CPU, copy_async, gpu_memory
 
-# mean of the mask over a shrunk pixel from which the whole pixel is kept; allows for rounding
+# A downscaled pixel is kept if the mean of the mask over its area reaches this value.
 FULLY_KEPT = 1 - 1e-4
 
 GPU_FRACTION = 0.25
-"""Fraction of the free memory of a GPU that images may take: the rest is for the scene and what is
-drawn."""
+"""Fraction of the free GPU memory for images; the scene and rendering need the rest."""
 
 Decoded = dict[str, Tensor]
-"""``pixels`` (H, W, 3 or 4) uint8, straight alpha; ``mask`` (H, W) bool and the maps of ``Image``
-where a view has them."""
+"""``pixels`` (H, W, 3 or 4) uint8 with straight alpha, ``mask`` (H, W) bool, and the maps of
+``Image``, if present."""
 
 
 def default_decoding_threads() -> int:
-    """Return how many threads work ahead: one for every two cores of this process, one to four."""
+    """Return the number of decoding threads: one per two cores of this process, from one to
+    four."""
     try:
         cores = len(os.sched_getaffinity(0))
     except AttributeError:  # not on Linux
@@ -56,22 +57,21 @@ def default_decoding_threads() -> int:
 
 @dataclass(frozen=True)
 class Image:
-    """The image of the view ``name`` with its camera, as a training target; what a view does not
-    have is None.
+    """An image with its camera, as a training target; fields that a view does not have are None.
 
     Attributes:
+        name: name of the view.
         cameras: one pinhole camera (V = 1) of this image's size, float32.
         rgb_premultiplied: (H, W, 3) float32, colours times alpha.
         alpha: (H, W) float32 in [0, 1].
-        mask: (H, W) float32, 1 = counts in the loss, 0 = ignore; None where all pixels count.
+        mask: (H, W) float32, 1 = used in the loss, 0 = ignored; None if all pixels are used.
         time: in [0, 1].
-        frame: the view's frame number.
-        moves: (H, W) float32, the fraction of each pixel that moves, by the motion mask.
-        labels: (H, W) int64, which thing moves there, 0 for none; of a motion mask that tells them
-            apart.
-        depth: (H, W) float32 depth in the unit of its map, 0 where unknown.
-        flow: (H, W, 2) float32 displacement in pixels of this image up to the view ``flow_to``, NaN
-            where unknown.
+        frame: frame number of the view.
+        motion_mask: (H, W) float32, moving fraction of each pixel.
+        labels: (H, W) int64 index of the moving object, 0 for none, if the motion mask has labels.
+        depth: (H, W) float32 depth, 0 = unknown.
+        flow: (H, W, 2) float32 displacement to the view ``flow_to`` in pixels of this image, NaN =
+            unknown.
     """
 
     name: str
@@ -81,13 +81,13 @@ class Image:
     mask: Tensor | None
     time: float | None
     frame: int | None = None
-    moves: Tensor | None = None
+    motion_mask: Tensor | None = None
     labels: Tensor | None = None
     depth: Tensor | None = None
     flow: Tensor | None = None
 
     def composite(self, background: Tensor) -> Tensor:
-        """Return the (H, W, 3) image over the colour ``background`` (3,)."""
+        """Return the (H, W, 3) image over the ``background`` colour (3,)."""
         if self.alpha is None:
             return self.rgb_premultiplied
         return self.rgb_premultiplied + (1 - self.alpha[..., None]) * background.to(
@@ -95,17 +95,16 @@ class Image:
         )
 
     def to(self, device: torch.device | str) -> Image:
-        """Return the same image, with its camera, on another device."""
+        """Return a copy of the image and its camera on another device."""
         tensors: Any = {name: copy_async(x, device) for name, x in self.tensors().items()}
         return replace(self, cameras=self.cameras.to(device=device), **tensors)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors that are there, by name."""
+        """Return the tensors that are not None, by name."""
         return {name: x for name, x in vars(self).items() if isinstance(x, Tensor)}
 
-    def shrunk(self, factor: int) -> Image:
-        """Return the image with both sides divided by ``factor``, averaged over pixel areas, and
-        its camera."""
+    def downscaled(self, factor: int) -> Image:
+        """Return the image and its camera with both sides divided by ``factor`` (area average)."""
         if factor == 1:
             return self
         cameras = self.cameras.scaled(1 / factor)
@@ -113,7 +112,7 @@ class Image:
         small: Any = {}
         for name, values in self.tensors().items():
             if name == "flow":
-                small[name] = image_maps.resized(values, *size)
+                small[name] = image_maps.resize_flow(values, *size)
             elif name in ("depth", "labels"):
                 small[name] = _nearest(values, image_maps.nearest_positions(*size))
             elif name == "rgb_premultiplied":
@@ -126,11 +125,10 @@ class Image:
 
 
 class _ImageCache:
-    """Images in memory by the index of their view and the factor by which they are shrunk, of at
-    most ``room`` bytes.
+    """Images by view index and downscale factor, up to ``room`` bytes.
 
-    Once it is full, what is in it stays: where every image is requested once per epoch, in a new
-    order each time, the one used last is the one needed last.
+    Nothing is evicted when it is full: each image is requested once per epoch in random order, so
+    the least recently used image is needed first.
     """
 
     def __init__(self, room: float) -> None:
@@ -139,7 +137,7 @@ class _ImageCache:
         self.num_bytes = 0
 
     def keep(self, key: tuple[int, int], image: Decoded | Image, reserved: float) -> bool:
-        """Return whether the image is kept: it fits, and ``reserved`` bytes beside it."""
+        """Add an image if it fits with ``reserved`` bytes to spare; return whether it fits."""
         size = _num_bytes(image)
         fits = self.num_bytes + size + reserved <= self.room
         if fits and key not in self.images:
@@ -148,7 +146,7 @@ class _ImageCache:
         return fits
 
     def drop(self, key: tuple[int, int]) -> None:
-        """Remove an image, if it is there."""
+        """Remove an image if it is cached."""
         if key in self.images:
             self.num_bytes -= _num_bytes(self.images.pop(key))
 
@@ -159,18 +157,16 @@ def _num_bytes(image: Decoded | Image) -> int:
 
 
 class ImageLoader:
-    """A sequence of images, decoded on demand or ahead of it; the first ones are cached up to
-    ``options.cache_mb``.
+    """A sequence of decoded images with a cache of up to ``options.cache_mb`` and prefetching.
 
-    The same index always gives the same bytes, cached or not, decoded ahead or not. Safe to use
-    from several threads. Images are decoded on the CPU. Those given out on a GPU are kept there as
-    far as a quarter of its free memory goes.
+    An index always returns the same bytes, whether cached, prefetched or not. Thread-safe. Images
+    are decoded on the CPU; images on a GPU are cached in up to a quarter of its free memory.
 
     Attributes:
         views: the views, in the order of the images.
-        times: times of the views in [0, 1], None where a view has none.
-        corrected: returns the camera of an image, given the index of its view and its camera by the
-            capture; None: the latter.
+        times: times of the views in [0, 1] or None.
+        camera_correction: returns the corrected camera of an image, given its index and the camera
+            of the capture; None: no correction.
     """
 
     def __init__(
@@ -181,24 +177,22 @@ class ImageLoader:
         with_maps: bool = False,
         decoding_threads: int = 0,
     ) -> None:
-        """Check every file (not every pixel) at once, so that a bad capture fails before training
+        """Check all files (headers, not pixels), so that a bad capture fails before training
         starts.
 
         Args:
             views: one split of a capture.
-            options: ``downscale``, ``longest_side`` and ``cache_mb`` count; None: the defaults.
-            with_maps: read depth maps and flow, too.
-            decoding_threads: decode what is to be expected in so many threads; none if ``cache_mb``
-                is 0.
+            options: uses ``downscale``, ``longest_side`` and ``cache_mb``; None: defaults.
+            with_maps: also read depth maps and flow.
+            decoding_threads: threads for prefetching; unused if ``cache_mb`` is 0.
         """
         self.views = tuple(views)
         self.times = tuple(view.time for view in self.views)
-        self.corrected: Callable[[int, Cameras], Cameras] | None = None
+        self.camera_correction: Callable[[int, Cameras], Cameras] | None = None
         self._options = options = options or DataConfig(root=Path())
         self._with_maps = with_maps
         self._device = CPU
         self._on_cpu = _ImageCache(options.cache_mb * 1e6)
-        # where images are given out
         self._cache = self._on_cpu
         self._factor = 1
         self._threads = decoding_threads if options.cache_mb > 0 else 0
@@ -213,14 +207,14 @@ class ImageLoader:
 
     @property
     def device(self) -> torch.device:
-        """Where images and cameras are given out."""
+        """Device of the returned images and cameras."""
         return self._device
 
     @device.setter
     def device(self, device: torch.device) -> None:
         if device == self._device:
             return
-        self.rest()
+        self.stop_prefetching()
         memory = gpu_memory(device)
         self._device = device
         self._cache = self._on_cpu
@@ -231,9 +225,9 @@ class ImageLoader:
         index = range(len(self))[index]
         return self._given_out(index, self._as_stored(index))
 
-    def shrunk(self, index: int, factor: int) -> Image:
-        """Return ``self[index].shrunk(factor)``; cached for the last factor, where memory is
-        left."""
+    def downscaled(self, index: int, factor: int) -> Image:
+        """Return ``self[index].downscaled(factor)``; cached for the last factor if memory
+        allows."""
         key = (range(len(self))[index], factor)
         with self._lock:
             if factor != self._factor:
@@ -242,21 +236,21 @@ class ImageLoader:
                 self._factor = factor
             small = self._cache.images.get(key) if factor > 1 else None
         if small is None:
-            small = self._as_stored(key[0]).shrunk(factor)
+            small = self._as_stored(key[0]).downscaled(factor)
             if factor > 1:
                 with self._lock:
                     self._cache.keep(key, small, 0)
         return self._given_out(key[0], small)
 
     def _given_out(self, index: int, image: Image) -> Image:
-        if self.corrected is not None:
-            image = replace(image, cameras=self.corrected(index, image.cameras))
+        if self.camera_correction is not None:
+            image = replace(image, cameras=self.camera_correction(index, image.cameras))
         return image if self._device == CPU else image.to(self._device)
 
     def _as_stored(self, index: int) -> Image:
         view = self.views[index]
         decoded = dict(self._decoded(index))
-        pixels = premultiplied(decoded.pop("pixels"))
+        pixels = premultiply(decoded.pop("pixels"))
         height, width = pixels.shape[:2]
         mask = decoded.pop("mask", None)
         return Image(
@@ -271,14 +265,14 @@ class ImageLoader:
         )
 
     def cameras(self) -> list[Cameras]:
-        """Return the cameras of all images as they are by now, one each; no image is read."""
+        """Return the (corrected) camera of each image; no image is read."""
         found = [_camera_of(view, *size) for view, size in zip(self.views, self.sizes, strict=True)]
-        if self.corrected is not None:
-            found = [self.corrected(i, cameras) for i, cameras in enumerate(found)]
+        if self.camera_correction is not None:
+            found = [self.camera_correction(i, cameras) for i, cameras in enumerate(found)]
         return [cameras.to(device=self.device) for cameras in found]
 
-    def expect(self, indices: Sequence[int]) -> None:
-        """Begin to decode the images that are requested next, in this order, as far as they are not
+    def prefetch(self, indices: Sequence[int]) -> None:
+        """Start decoding the images that are requested next, in this order, unless they are
         cached."""
         if not self._threads:
             return
@@ -297,8 +291,8 @@ class ImageLoader:
                 if index not in self._pending:
                     self._pending[index] = self._pool.submit(self._on_demand, index)
 
-    def rest(self) -> None:
-        """End the threads that decode ahead; they begin anew with the next ``expect``."""
+    def stop_prefetching(self) -> None:
+        """Stop the decoding threads; the next ``prefetch`` starts them again."""
         pool = self._pool
         self._pool = None
         self._pending = {}
@@ -306,7 +300,7 @@ class ImageLoader:
             pool.shutdown(wait=True, cancel_futures=True)
 
     def without_motion_masks(self) -> ImageLoader:
-        """Return a loader of the same images that reads no motion masks."""
+        """Return a loader of the same images without motion masks."""
         views = [replace(view, motion_mask_path=None) for view in self.views]
         return ImageLoader(
             views, self._options, with_maps=self._with_maps, decoding_threads=self._threads
@@ -314,30 +308,28 @@ class ImageLoader:
 
     @property
     def num_prefetched(self) -> int:
-        """Number of images that ``expect`` decodes ahead; 0 where all are cached."""
+        """Number of images that ``prefetch`` decodes ahead; 0 if all are cached."""
         is_whole = all((i, 1) in self._cache.images for i in range(len(self)))
         return 0 if is_whole else 2 * self._threads
 
     @property
     def sizes(self) -> list[tuple[int, int]]:
-        """Width and height of the images, in px, without decoding any."""
+        """Width and height of the images in px; no image is decoded."""
         return [view_size(view, self._options) for view in self.views]
 
     @property
     def pending_bytes(self) -> int:
-        """Bytes that images will take, in the cache or decoded ahead, next to those that they take
-        now."""
+        """Bytes of CPU memory that images will take in addition to those they take now."""
         every = min(self._bytes_of_all() - self.bytes_on_gpu, round(self._on_cpu.room))
         return max(every - self._on_cpu.num_bytes, 0)
 
     @property
     def bytes_on_gpu(self) -> int:
-        """Bytes that images will take of the memory of a GPU."""
+        """Bytes of GPU memory that images will take."""
         return 0 if self._device == CPU else int(min(self._bytes_of_all(), self._cache.room))
 
     def _bytes_of_all(self) -> int:
-        """Return the bytes of all images once decoded; whether a file has alpha is not known, and
-        taken as no."""
+        """Return the bytes of all decoded images, assuming no alpha channel."""
         sizes = zip(self.views, self.sizes, strict=True)
         return sum(
             width * height * (3 + (view.mask_path is not None)) for view, (width, height) in sizes
@@ -372,7 +364,7 @@ class ImageLoader:
     def _decode(self, view: View) -> Decoded:
         pixels = read_image(view.image_path, (view.width, view.height))
         if view.silhouette is not None:
-            pixels = image_maps.cut_out(pixels, view.silhouette)
+            pixels = image_maps.apply_silhouette(pixels, view.silhouette)
         mask = None
         if view.mask_path is not None:
             mask = read_mask(view.mask_path)
@@ -380,7 +372,7 @@ class ImageLoader:
         size = view_size(view, self._options)
         lens_map = None if is_pinhole(view.lens) else self._lens_map(view)
         if lens_map is not None:
-            small = area_downscale(undistort(premultiplied(pixels), lens_map), *size)
+            small = area_downscale(undistort(premultiply(pixels), lens_map), *size)
             pixels = to_straight_uint8(small)
             mask = _undistorted_mask(mask, lens_map)
         elif size != (view.width, view.height):
@@ -393,8 +385,7 @@ class ImageLoader:
         return decoded
 
     def _maps(self, view: View, size: tuple[int, int], lens_map: LensMap | None) -> Decoded:
-        """Return motion mask, depth and flow of a view, as far as it has them, for the image of
-        ``size``."""
+        """Return the motion mask, depth and flow of a view, if present, resampled to ``size``."""
         maps: Decoded = {}
 
         def at_pixels(values: Tensor) -> Tensor:
@@ -410,7 +401,7 @@ class ImageLoader:
             moves = (found != 0).float()[..., None]
             if lens_map is not None:
                 moves = undistort(moves, lens_map)
-            maps["moves"] = area_downscale(moves, *size)[..., 0]
+            maps["motion_mask"] = area_downscale(moves, *size)[..., 0]
         if self._with_maps and view.depth_path is not None:
             maps["depth"] = view.depth_scale * at_pixels(image_maps.read_depth(view.depth_path))
             if lens_map is not None:
@@ -423,8 +414,8 @@ class ImageLoader:
         return maps
 
     def _lens_map(self, view: View) -> LensMap:
-        """Return the undistortion map; only the last is cached: most captures have one camera, and
-        maps are large."""
+        """Return the undistortion map; only the last one is cached, as most captures have one
+        camera."""
         key = (view.lens, view.intrinsics.tobytes(), view.width, view.height)
         last = self._last_map
         if last is None or last[0] != key:
@@ -434,7 +425,7 @@ class ImageLoader:
 
 
 def _camera_of(view: View, width: int, height: int) -> Cameras:
-    """Return the camera of a view as an image of this size, by the capture."""
+    """Return the camera of a view for an image of this size, without correction."""
     intrinsics = scaled_intrinsics(view.intrinsics, width / view.width, height / view.height)
     pose, intrinsics = (
         torch.as_tensor(x, dtype=torch.float32, device="cpu")[None]
@@ -444,8 +435,7 @@ def _camera_of(view: View, width: int, height: int) -> Cameras:
 
 
 def check_files(views: Sequence[View]) -> None:
-    """Check that all images and masks of ``views`` exist, look complete and have the size of their
-    view."""
+    """Check that all images and masks exist, look complete and have the size of their view."""
     for view in views:
         silhouette = view.silhouette and view.silhouette.path
         for path in (view.image_path, view.mask_path, silhouette):
@@ -467,8 +457,8 @@ def _require_size(view: View, path: Path, shape: Sequence[int], what: str) -> No
     height, width = shape[:2]
     if (width, height) != (view.width, view.height):
         raise DyngsError(
-            f"{path}: the {what} is {width}x{height}, but its camera says {view.width}x{view.height}; make them the "
-            "same size"
+            f"{path}: the {what} is {width}x{height}, but its camera is "
+            f"{view.width}x{view.height}; make them the same size"
         )
 
 
@@ -477,8 +467,8 @@ def _nearest(values: Tensor, positions: Tensor) -> Tensor:
 
 
 def _undistorted_mask(mask: Tensor | None, lens_map: LensMap) -> Tensor | None:
-    """(H, W) bool mask of pixels inside the stored image with a kept neighbourhood; None if all
-    are."""
+    """Return the (H, W) bool mask of valid pixels with a fully kept neighbourhood; None if all are
+    kept."""
     keep = lens_map.valid
     if mask is not None:
         keep = keep & (undistort(mask.float()[..., None], lens_map)[..., 0] > 0.999)

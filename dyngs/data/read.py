@@ -1,4 +1,5 @@
-"""Reading of a capture or a set of people: choice of the format, splits, missing images, masks."""
+"""Capture reading: format detection, splits, missing files and smaller copies; sets of captures of
+people."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ import numpy as np
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError, NoCaptureError, wrap_read_errors
 from dyngs.data import times
-from dyngs.data.body_frames import ensure_fitted_body
+from dyngs.data.body_frames import attach_fitted_body
 from dyngs.data.capture import (
     Capture,
     CaptureFormat,
@@ -22,7 +23,7 @@ from dyngs.data.capture import (
     map_views,
 )
 from dyngs.data.geometry import match_intrinsics_to_image
-from dyngs.data.images.images import try_read_header, read_header, target_size
+from dyngs.data.images.images import read_header, target_size, try_read_header
 from dyngs.data.images.video import decode_frames
 from dyngs.data.readers import (
     camera_folders,
@@ -35,27 +36,28 @@ from dyngs.data.readers import (
     zju_mocap,
 )
 from dyngs.data.scene_space import normalise_capture
-from dyngs.io.archive import is_archive, unpacked
-from dyngs.io.containment import inside, restrict_paths_to
+from dyngs.io.archive import is_archive, unpack_archive
+from dyngs.io.containment import check_inside, restrict_paths_to
 from dyngs.io.find import FileFinder, downscaled_image_folders
 from dyngs.io.outputs import suggest_command
 
 PEOPLE_FILE = "people.json"
-"""In a set whose people lie in shards, folders of folders: the options that they were made with."""
+"""File in a set of people with subfolders of folders (shards): the options it was generated
+with."""
 
 
 def list_captures(data: DataConfig) -> list[DataConfig]:
-    """Return the paths of the captures in the folders of ``data.root``, or of its shards, by name.
-    No capture is read.
+    """Return one config per capture in the subfolders of ``data.root``, or of its shards, sorted
+    by name.
 
-    Raises DyngsError: there are none.
+    No capture is read. Raises DyngsError if there are no subfolders.
     """
     root = data.root
     shards = _folders(root) if (root / PEOPLE_FILE).is_file() else [root]
     people = [person for shard in shards for person in _folders(shard)]
     if not people:
         raise DyngsError(
-            f"{root}: holds no folders; give one that holds a capture of a person in each of its folders"
+            f"{root}: contains no folders; give a folder with one capture of a person per subfolder"
         )
     return [data.model_copy(update={"root": folder}) for folder in people]
 
@@ -71,17 +73,17 @@ def _folders(root: Path) -> list[Path]:
 def view_size(view: View, options: DataConfig) -> tuple[int, int]:
     """Return the (width, height) of a view in training."""
     return target_size(
-        view.width, view.height, options.downscale / view.shrunk, options.longest_side
+        view.width, view.height, options.downscale / view.copy_factor, options.longest_side
     )
 
 
 def with_smaller_images(
     root: Path, splits: Splits, options: DataConfig
 ) -> tuple[Splits, list[str]]:
-    """Return views of the smallest copies that are large enough for training, and a line on what is
-    read.
+    """Replace views by the smallest image copies that are large enough for training; also return a
+    message.
 
-    Copies are not read where an image has no copy or has a mask or depth map, which have its size.
+    Copies are not used if an image has no copy, or has a mask or depth map of its own size.
     """
     images = root / "images"
     copies = downscaled_image_folders(images)
@@ -99,13 +101,13 @@ def with_smaller_images(
         if copy is None:
             return splits, []
         small[view.name] = copy
-    line = f"{copies[number].name} is read in place of images: training takes images of that size or smaller ones"
+    line = f"{copies[number].name} is read instead of images, because training uses images of that size or smaller"
     return map_views(splits, lambda view: small.get(view.name, view)), [line]
 
 
 def _shrunk(view: View, path: Path, factor: int) -> View | None:
-    """Return the view with a copy of its image, ``factor`` times smaller; None if that cannot
-    be."""
+    """Return the view with a copy of its image that is ``factor`` times smaller, None if it does
+    not fit."""
     if view.mask_path or view.silhouette or view.depth_path or view.motion_mask_path:
         return None
     header = try_read_header(path)
@@ -118,11 +120,16 @@ def _shrunk(view: View, path: Path, factor: int) -> View | None:
         return None
     intrinsics, size, _ = match_intrinsics_to_image(view.intrinsics, described, stored, str(path))
     return replace(
-        view, image_path=path, intrinsics=intrinsics, width=size[0], height=size[1], shrunk=factor
+        view,
+        image_path=path,
+        intrinsics=intrinsics,
+        width=size[0],
+        height=size[1],
+        copy_factor=factor,
     )
 
 
-# points with larger coordinates are dropped as mistakes; their squares would not fit into float32
+# Points with larger coordinates are dropped: their squares exceed the range of float32.
 FARTHEST = 1e18
 
 _PRIORS = {
@@ -130,8 +137,7 @@ _PRIORS = {
     "motion_mask_path": "motion masks",
     "flow_path": "flow fields",
 }
-"""Files of priors that a capture may name, none of them required: fields of views, and what they
-are called."""
+"""Fields of views with optional prior files, and their names in messages."""
 
 FORMATS: tuple[CaptureFormat, ...] = (
     transforms.BODY_FORMAT,
@@ -150,37 +156,35 @@ FORMATS: tuple[CaptureFormat, ...] = (
     camera_folders.FORMAT,
     camera_folders.LLFF_FORMAT,
 )
-"""All formats, in the order in which a folder is tried: of several that are recognised the first
-one is read."""
+"""All formats in order of priority: the first one that is recognised is read."""
 
 
 def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) -> Capture:
-    """Read the capture in a folder or a .zip; images are not decoded, only their headers are read.
+    """Read the capture in a folder or .zip; of images only the headers are read.
 
-    Views are sorted by name. ``frames`` of the options chooses among the times of all splits, and
-    ``pose_frames`` those of a person that become the split pose. Where the format names no test
-    views, every ``test_every``-th image is one. Times are scaled to [0, 1] over all splits. Poses,
-    points and bodies are in scene coordinates, see ``scene_space.normalise_capture``. The splits
-    train, val and test are always present, val and test possibly empty.
+    Views are sorted by name. ``frames`` of the options selects among the times of all splits,
+    ``pose_frames`` the times of the split pose. If the format defines no test views, every
+    ``test_every``-th image is one. Times are scaled to [0, 1] over all splits. Poses, points and
+    bodies are in scene coordinates, see ``scene_space.normalise_capture``. Splits train, val and
+    test always exist; val and test may be empty.
 
-    Example::
+    Example:
 
         import dyngs
         from dyngs.data.loader import ImageLoader
 
         capture = dyngs.read_capture("lego")
         image = ImageLoader(capture.splits["train"])[0].to("cpu")
-        image.cameras, image.rgb_premultiplied  # what to render from, and what should come out
+        image.cameras, image.rgb_premultiplied  # the camera and the target image
 
     Args:
-        source: the folder or .zip, or a ``dyngs.config.DataConfig`` with it as ``root`` and options
-            such as ``frames``.
-        decode_videos: write the chosen frames of videos as image files, see ``images.video``;
-            otherwise views may name files that do not exist yet.
+        source: the folder or .zip, or a ``dyngs.config.DataConfig`` with it as ``root`` and
+            options such as ``frames``.
+        decode_videos: write the selected video frames as image files, see ``images.video``;
+            otherwise these files may not exist yet.
 
     Raises:
-        DyngsError: no such folder, no capture in it, or anything in it that cannot be right; names
-            the file.
+        DyngsError: no such folder, no capture in it, or an invalid file, which is named.
     """
     options = source if isinstance(source, DataConfig) else DataConfig(root=Path(source))
     require_folder(options.root)
@@ -193,42 +197,40 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
         restrict_paths_to(root, options.follow_links),
         wrap_read_errors(
             root,
-            "one of its files is not as it should be (`dyngs --debug` shows where); export it again",
+            "one of its files is invalid (see `dyngs --debug`); export it again",
         ),
     ):
         capture = _finished(chosen.read(root), options, decode_videos)
     others = [other for other in found if other is not chosen and other.name != chosen.extends]
     if options.format == "auto" and others:
-        note = f"read as {chosen.name}, but there is also a {others[0].name} capture; data.format= chooses"
+        note = f"read as {chosen.name}; a {others[0].name} capture is also there, choose with data.format"
         capture = replace(capture, warnings=(note, *capture.warnings))
     return capture
 
 
 def require_folder(root: Path) -> None:
-    """Check that the folder or the archive of a capture exists. Raises NoCaptureError."""
+    """Raise NoCaptureError unless the folder or archive exists."""
     if not root.is_dir() and not is_archive(root):
         problem = (
-            "is a file; give the folder that holds it"
-            if root.is_file()
-            else "no such folder; check data.root"
+            "is a file; give its folder" if root.is_file() else "no such folder; check data.root"
         )
         raise NoCaptureError(f"{root}: {problem}")
 
 
 def is_capture(root: Path) -> bool:
-    """Whether a folder, or an archive, is recognised as a capture of any format."""
+    """Whether a folder or archive is recognised as a capture of any format."""
     folder = capture_folder(root)
     return folder.is_dir() and _is_recognised(folder)
 
 
 def capture_folder(root: Path) -> Path:
-    """Return the folder of a capture: ``root``, or that of an archive, unpacked.
+    """Return the folder of a capture: ``root``, or the unpacked archive.
 
-    Many archives hold a single folder, in which the capture lies.
+    If an archive contains only a single folder, that folder is returned.
     """
     if not is_archive(root):
         return root
-    folder: Path = unpacked(root)
+    folder: Path = unpack_archive(root)
     while not _is_recognised(folder):
         inner = list(folder.iterdir())
         if len(inner) != 1 or not inner[0].is_dir():
@@ -243,8 +245,7 @@ def _is_recognised(folder: Path) -> bool:
 
 
 def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFormat:
-    """The format that ``options.format`` names, with "auto" the first one that was ``found`` in the
-    folder."""
+    """Return the format of ``options.format``, or the first recognised one for "auto"."""
     if options.format == "auto":
         if not found:
             known = suggest_command(options.root, captures=False)
@@ -255,9 +256,9 @@ def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFo
         return found[0]
     chosen = next(format for format in FORMATS if format.name == options.format)
     if chosen not in found:
-        also = f"; but there is a {found[0].name} capture" if found else ""
+        also = f"; it contains a {found[0].name} capture" if found else ""
         raise DyngsError(
-            f"{options.root}: no {chosen.name} capture, which would have {chosen.files}{also}"
+            f"{options.root}: no {chosen.name} capture (expected {chosen.files}){also}"
         )
     return chosen
 
@@ -289,7 +290,7 @@ def _finished(capture: Capture, options: DataConfig, decode_videos: bool) -> Cap
         warnings=(*warnings, *lacking, *layers, *notes, *copies, *more, *absent),
     )
     return normalise_capture(
-        capture if options.body is None else ensure_fitted_body(capture, options.body)
+        capture if options.body is None else attach_fitted_body(capture, options.body)
     )
 
 
@@ -298,7 +299,7 @@ def _is_missing(view: View) -> bool:
 
 
 def _missing(splits: Splits) -> list[str]:
-    """Return a line on the images that are not there, none if all are."""
+    """Return a message with the number of missing images, none if all exist."""
     views = all_views(splits)
     missing = [view.image_path for view in views if _is_missing(view)]
     return (
@@ -309,25 +310,23 @@ def _missing(splits: Splits) -> list[str]:
 
 
 def _without_missing(capture: Capture) -> Capture:
-    """Return the capture without the views whose images are not there, with a warning."""
+    """Return the capture without views whose images are missing, and with a warning."""
     present: Splits = {}
     for name, views in capture.splits.items():
         present[name] = tuple(view for view in views if not _is_missing(view))
-    lines = [f"{line}; these views are left out" for line in _missing(capture.splits)]
+    lines = [f"{line}; their views are skipped" for line in _missing(capture.splits)]
     return replace(capture, splits=present, warnings=(*capture.warnings, *lines))
 
 
 def require_images(capture: Capture) -> Capture:
-    """Return the capture. Raises DyngsError with their number: images are missing."""
+    """Return the capture, or raise DyngsError if images are missing."""
     for line in _missing(capture.splits):
-        raise DyngsError(
-            f"{line}; restore them, or train on the others with data.skip_missing=true"
-        )
+        raise DyngsError(f"{line}; restore them, or skip them with data.skip_missing=true")
     return capture
 
 
 def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[str]]:
-    """Return the capture with final splits and times, and lines about these."""
+    """Return the capture with final splits and times, and messages about them."""
     splits: Splits = {
         name: tuple(sorted(views, key=lambda view: view.name))
         for name, views in capture.splits.items()
@@ -337,7 +336,7 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
             f"{capture.root}: the {capture.format} capture has no training views; add posed images"
         )
     if capture.body is not None:
-        # people are drawn in the poses of their frames, which are found by their times
+        # The body pose of a view is looked up by its time.
         splits = times.times_from_frame_numbers(splits)
     new_poses = splits.pop("pose", None)
     notes: list[str] = []
@@ -345,10 +344,11 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
     if options.times == "order":
         splits, line = times.times_from_names(splits, rate)
         notes.append(line)
-        capture = replace(capture, in_seconds=rate is not None, fps=rate or capture.fps)
+        capture = replace(capture, times_in_seconds=rate is not None, fps=rate or capture.fps)
     elif rate is not None:
         raise DyngsError(
-            f"{capture.root}: data.frames_per_second={rate:g} needs data.times=order, which takes times from the names"
+            f"{capture.root}: data.frames_per_second={rate:g} needs data.times=order (times from "
+            "file names)"
         )
     splits = times.assign_camera_ids(splits)
     if options.train_cameras is not None:
@@ -356,7 +356,7 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
         said = tuple(line for line in capture.warnings if line != zju_mocap.FIRST_HELD_OUT)
         capture = replace(capture, warnings=said)
     written = splits
-    # People move by frame number: of their captures, times within [0, 1] are left as they are.
+    # Bodies are posed by frame number, so times of people within [0, 1] are not stretched.
     splits, scaled = times.normalize_times(capture.root, splits, stretch=capture.body is None)
     if options.frames is not None:
         splits, _ = times.split_by_frames(capture.root, splits, options.frames)
@@ -368,7 +368,7 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
         )
     span = times.file_time_span(written, splits)
     seconds = times.clip_seconds(splits, capture.fps)
-    if capture.in_seconds and span:
+    if capture.times_in_seconds and span:
         seconds = span[1] - span[0]
     if "test" not in splits:
         views = splits["train"]
@@ -377,22 +377,26 @@ def _with_splits(capture: Capture, options: DataConfig) -> tuple[Capture, list[s
         splits["train"] = tuple(view for i, view in enumerate(views) if not every or i % every)
     if not splits["train"]:
         raise DyngsError(
-            f"{capture.root}: no training views are left; change data.frames, data.pose_frames or data.test_every"
+            f"{capture.root}: no training views remain; change data.frames, data.pose_frames or "
+            "data.test_every"
         )
     splits.setdefault("val", ())
     if new_poses is not None:
         splits["pose"] = new_poses
-    return replace(capture, splits=splits, span=span, seconds=seconds), notes
+    return replace(capture, splits=splits, file_time_span=span, seconds=seconds), notes
 
 
 def _with_poses_held_out(
     capture: Capture, splits: Splits, new_poses: tuple[View, ...] | None, frames: str
 ) -> tuple[Capture, Splits, tuple[View, ...]]:
-    """Return the capture and its splits without the times that ``frames`` selects, and the views of
-    split pose: those of cameras that only have test views, if there are any."""
+    """Move the times selected by ``frames`` to the split pose; return the capture and its splits.
+
+    If some cameras have only test views, the split pose consists of their views.
+    """
     if capture.body is None or new_poses is not None:
         raise DyngsError(
-            f"{capture.root}: data.pose_frames={frames} is for people without a clip of new poses of their own"
+            f"{capture.root}: data.pose_frames={frames} only applies to captures of people "
+            "without a clip of new poses"
         )
     held, kept = times.split_by_frames(capture.root, splits, frames, "data.pose_frames")
     views = all_views(held)
@@ -403,12 +407,12 @@ def _with_poses_held_out(
 
 
 def _check_places(view: View) -> None:
-    """Refuse images, masks and maps that lie outside the capture."""
+    """Raise DyngsError if an image, mask or map lies outside the capture."""
     image = view.image_path if view.video is None else view.video.video
     priors = (view.depth_path, view.motion_mask_path, view.flow_path)
     for path in (image, view.mask_path, view.silhouette and view.silhouette.path, *priors):
         if path is not None:
-            inside(path)
+            check_inside(path)
 
 
 def _check_names(root: Path, splits: Splits) -> list[str]:
@@ -416,7 +420,8 @@ def _check_names(root: Path, splits: Splits) -> list[str]:
     for view in all_views(splits):
         if named.setdefault(view.name, view.image_path) != view.image_path:
             raise DyngsError(
-                f"{root}: the images {named[view.name]} and {view.image_path} share the name {view.name}; rename one"
+                f"{root}: the images {named[view.name]} and {view.image_path} share the view "
+                f"name {view.name}; rename one"
             )
     train = {view.image_path for view in splits["train"]}
     leaked = [view.name for view in splits["test"] if view.image_path in train]
@@ -426,7 +431,7 @@ def _check_names(root: Path, splits: Splits) -> list[str]:
 
 
 def _first_image(views: tuple[View, ...]) -> tuple[bool, list[str]]:
-    """Return whether the first readable image has alpha, and a line on the layer of EXR images."""
+    """Return whether the first readable image has alpha, and a message on the chosen EXR layer."""
     for view in views:
         if view.silhouette is not None:
             return True, []
@@ -435,7 +440,7 @@ def _first_image(views: tuple[View, ...]) -> tuple[bool, list[str]]:
         except DyngsError:
             continue
         return header.alpha is not None, [
-            f"the layer {header.layer} of EXR images is read"
+            f"EXR layer {header.layer} is used"
         ] if header.layer else []
     return False, []
 
@@ -445,18 +450,14 @@ def _finite_points(points: PointCloud | None) -> tuple[PointCloud | None, list[s
         return None, []
     keep = (np.abs(points.xyz) < FARTHEST).all(axis=1)
     lost = int((~keep).sum())
-    notes = (
-        [f"{lost} points hold NaN, infinite or far too large numbers and are ignored"]
-        if lost
-        else []
-    )
+    notes = [f"{lost} points with NaN, infinite or huge coordinates are ignored"] if lost else []
     points = PointCloud(points.xyz[keep], points.rgb[keep])
     return (points if len(points.xyz) else None), notes
 
 
 def _present_priors(splits: Splits, tracks: Path | None) -> tuple[Splits, Path | None, list[str]]:
-    """Return the splits and the tracks without priors whose files are missing, and a line for each
-    kind of those."""
+    """Remove missing prior files from the splits and tracks; return these and a message per
+    kind."""
     notes: list[str] = []
     for field, kind in _PRIORS.items():
         paths = [path for view in all_views(splits) if (path := getattr(view, field)) is not None]
@@ -464,12 +465,12 @@ def _present_priors(splits: Splits, tracks: Path | None) -> tuple[Splits, Path |
         if not missing:
             continue
         notes.append(
-            f"{len(missing)} of {len(paths)} {kind} are missing and do without, first {min(missing)}"
+            f"{len(missing)} of {len(paths)} {kind} are missing and ignored, first {min(missing)}"
         )
         splits = map_views(
             splits,
             lambda v, at=field, no=missing: replace(v, **{at: None}) if getattr(v, at) in no else v,
         )
-    if tracks is not None and not inside(tracks).is_file():
-        return splits, None, [*notes, f"the tracks {tracks} are missing and are not used"]
+    if tracks is not None and not check_inside(tracks).is_file():
+        return splits, None, [*notes, f"the tracks {tracks} are missing and ignored"]
     return splits, tracks, notes

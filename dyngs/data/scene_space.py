@@ -1,5 +1,5 @@
-"""Where a scene lies: the space that its cameras see, and moving it to the origin if that is far
-away."""
+"""Scene space: depth bounds, the volume that cameras see, and normalisation of scene
+coordinates."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from dataclasses import replace
 import numpy as np
 
 from dyngs.core.section import Length
-from dyngs.data.body_frames import moved
+from dyngs.data.body_frames import transform_body
 from dyngs.data.capture import Capture, PointCloud, View, all_views, map_views
 from dyngs.data.geometry import (
     camera_center,
+    count_visible_views,
     focus_point,
     fraction_in_front,
     invert_rigid,
-    count_visible_views,
 )
 from dyngs.data.times import evenly_spaced
 
 NEAR_PER_FOCUS = 0.25  # nearest depth, in distances from the cameras to what they look at
 FAR_PER_BASELINE = 38.0
-"""Farthest depth, in the largest distance between cameras: from there it is seen under 1.5 degrees,
-COLMAP's least."""
+"""Farthest depth, in the largest distance between cameras: a triangulation angle of 1.5 degrees,
+COLMAP's minimum."""
 MIN_VIEWS = 3
-"""Images that see a random point, where there are as many."""
+"""Views that must see a random point, if there are as many."""
 COUNTED_VIEWS = 60  # views, evenly spaced, in which points are counted
 # 3DGS: 1.3 units in NeRF-synthetic scenes, whose cameras have an extent of 5.2
 CUBE_PER_EXTENT = 0.25
@@ -34,14 +34,12 @@ MIN_CUBE_SEEN = 0.5  # fraction of a cube that two cameras must see for the scen
 
 
 def depth_bounds(views: Sequence[View]) -> tuple[float, float]:
-    """Return the nearest and the farthest depth, in world units, at which the cameras can tell
-    depth.
+    """Return the nearest and farthest depth, in world units, that the cameras can resolve.
 
-    The nearest is ``NEAR_PER_FOCUS`` times the median distance of the cameras to the point that
-    they look at; where the axes are parallel or part, times the largest distance between cameras.
-    The farthest is ``FAR_PER_BASELINE`` times that distance, and at least twice the distance to the
-    point. With all cameras at one place nothing can be told, and the bounds are those of cameras a
-    unit apart.
+    The nearest is ``NEAR_PER_FOCUS`` times the median distance of the cameras to their focus
+    point, or times the largest distance between cameras if there is none. The farthest is
+    ``FAR_PER_BASELINE`` times the largest distance between cameras, and at least twice the
+    distance to the focus. Cameras at one position are treated as a unit apart.
     """
     poses = np.stack([invert_rigid(view.cam_from_world) for view in views])
     centers = poses[:, :3, 3]
@@ -53,13 +51,14 @@ def depth_bounds(views: Sequence[View]) -> tuple[float, float]:
     return NEAR_PER_FOCUS * distance, max(FAR_PER_BASELINE * baseline, 2 * distance)
 
 
-def sample_points_in_frusta(views: Sequence[View], unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return candidates (P, 3) for random points, and in how many of up to ``COUNTED_VIEWS`` views
-    each lies.
+def sample_points_in_frusta(
+    views: Sequence[View], unit: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return random points (P, 3) in the view frusta, and the number of views that see each.
 
-    Each lies anywhere in the image of a random view; its inverse depth is uniform between
-    ``depth_bounds``. ``unit`` (P, 4) float64, uniform in [0, 1), says the view, the position across
-    and down, the depth.
+    Each point lies in a random pixel of a random view; its inverse depth is uniform between
+    ``depth_bounds``. ``unit`` (P, 4) in [0, 1) selects the view, the position across and down, and
+    the depth. Visibility is counted in up to ``COUNTED_VIEWS`` views.
     """
     near, far = depth_bounds(views)
     depth = 1 / (1 / far + unit[:, 3] * (1 / near - 1 / far))
@@ -72,11 +71,13 @@ def sample_points_in_frusta(views: Sequence[View], unit: np.ndarray) -> tuple[np
         rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(view.intrinsics).T
         rotation = view.cam_from_world[:3, :3]
         points[rows] = (rays * depth[rows, None]) @ rotation + camera_center(view.cam_from_world)
-    return points, count_visible_views(points, [views[i] for i in evenly_spaced(len(views), COUNTED_VIEWS)])
+    return points, count_visible_views(
+        points, [views[i] for i in evenly_spaced(len(views), COUNTED_VIEWS)]
+    )
 
 
 def cube_half_side(half_extent: Length, views: Sequence[View], world_scale: float) -> float:
-    """Return half the side, scene units, of the cube that ``init.half_extent`` asks for."""
+    """Return half the side, in scene units, of the cube that ``init.half_extent`` specifies."""
     if half_extent != "auto":
         return half_extent / world_scale
     centers = np.array([camera_center(view.cam_from_world) for view in views])
@@ -84,11 +85,10 @@ def cube_half_side(half_extent: Length, views: Sequence[View], world_scale: floa
 
 
 def cube_mismatch_reason(views: Sequence[View], half_extent: float) -> str | None:
-    """Return why the scene cannot lie in the cube around the origin, in a few words; None where it
-    may.
+    """Return why the scene cannot lie in the cube around the origin, None if it may.
 
-    It does not where the point that the cameras look at is outside, or where two cameras (one, if
-    there is one) see less than ``MIN_CUBE_SEEN`` of the cube. Half its side is ``half_extent``.
+    It does not if the focus point of the cameras is outside, or if two cameras (one, if there is
+    only one) see less than ``MIN_CUBE_SEEN`` of the cube.
     """
     poses = np.stack([invert_rigid(view.cam_from_world) for view in views])
     focus = focus_point(poses)
@@ -110,35 +110,35 @@ def cube_mismatch_reason(views: Sequence[View], half_extent: float) -> str | Non
 
 EXTENT_MARGIN = 1.1
 SMALLEST_EXTENT = 3.25
-"""Normalised scenes have an extent from this to twice as much: those of NeRF-synthetic scenes (5.2)
-and of many COLMAP models lie between, so that these keep their own unit."""
+"""Smallest extent of a normalised scene; the largest is twice that. NeRF-synthetic scenes (5.2)
+and many COLMAP models are within this range and keep their unit."""
 TYPICAL_EXTENT = 4.6  # Middle of that range
 MAX_DISTANCE = 100.0
-"""Distance from the origin, in extents, from which a scene is moved there: float32 is 0.01 px
-coarse at a focal length of 1,000 px."""
+"""Distance from the origin, in extents, beyond which a scene is recentred: float32 then has an
+error of 0.01 px at a focal length of 1,000 px."""
 DEPTH_PER_EXTENT = 20.0  # Median depth of the points, in extents, beyond which the depth decides
 ROUNDING = 1e-8  # Relative error of a position written with eight digits
-# Extent, in median depths of the points, below which the cameras tell nothing about lengths
+# Extent of the cameras, in median depths of the points, below which it does not set the unit
 NEGLIGIBLE = 1e-3
 
 
 def camera_extent(centers: np.ndarray) -> float:
-    """Return 1.1 x the largest distance of a camera centre, of (V, 3), to their mean; 0 where that
-    is rounding."""
+    """Return 1.1 x the largest distance of a camera centre (V, 3) from their mean; 0 if it is
+    rounding."""
     offsets = centers - centers.mean(axis=0)
     largest = float(np.linalg.norm(offsets, axis=1).max())
     return EXTENT_MARGIN * largest if largest > ROUNDING * float(np.abs(centers).max()) else 0.0
 
 
 def normalise_capture(capture: Capture) -> Capture:
-    """Return the capture in scene coordinates: near the origin, and in a unit in which thresholds
-    are meaningful.
+    """Return the capture in scene coordinates: near the origin and in a unit that suits
+    thresholds.
 
     The unit is the power of two of the files' unit in which the extent of all cameras is at least
-    ``SMALLEST_EXTENT`` and less than twice that; for a person it is about a metre. A power of two
-    changes no digit of a coordinate. Where the median camera is farther than ``MAX_DISTANCE``
-    extents from the origin, the point that the cameras look at becomes the origin, or the median
-    camera where they look at none. See ``Capture.world_scale`` and ``Capture.world_offset``.
+    ``SMALLEST_EXTENT`` and less than twice that; for a person it is about a metre. Scaling by a
+    power of two is exact. If the median camera is farther than ``MAX_DISTANCE`` extents from the
+    origin, the focus point of the cameras becomes the origin, or the median camera if they have
+    none. See ``Capture.world_scale`` and ``Capture.world_offset``.
     """
     poses = np.array([invert_rigid(view.cam_from_world) for view in all_views(capture.splits)])
     centers = poses[:, :3, 3]
@@ -164,8 +164,8 @@ def normalise_capture(capture: Capture) -> Capture:
 
 
 def _length(capture: Capture, centers: np.ndarray) -> float:
-    """Return the length that is to become ``SMALLEST_EXTENT`` or up to twice as much; 0 where
-    nothing tells one.
+    """Return the length that is scaled to ``SMALLEST_EXTENT`` or up to twice that; 0 if
+    undetermined.
 
     ``centers`` (V, 3) of all cameras.
     """
@@ -182,7 +182,7 @@ def _length(capture: Capture, centers: np.ndarray) -> float:
 def change_coordinates(
     capture: Capture, scale: float, offset: Sequence[float] | np.ndarray
 ) -> Capture:
-    """Return the capture in other scene coordinates, with this ``world_scale`` and ``world_offset``
+    """Return the capture in scene coordinates with this ``world_scale`` and ``world_offset``
     (3,)."""
     offset = np.asarray(offset, np.float64)
     if scale == capture.world_scale and (offset == capture.world_offset).all():
@@ -202,7 +202,9 @@ def change_coordinates(
     points = capture.points and PointCloud(
         factor * (capture.points.xyz - shift), capture.points.rgb
     )
-    body = capture.body and {name: moved(x, shift, factor) for name, x in capture.body.items()}
+    body = capture.body and {
+        name: transform_body(x, shift, factor) for name, x in capture.body.items()
+    }
     return replace(
         capture,
         splits=map_views(capture.splits, moved_view),

@@ -1,8 +1,7 @@
-"""Times of views: where they are from, their scale of [0, 1], which are selected, and who sees what
-when.
+"""Times of views: sources, normalisation to [0, 1], selection, and assignment of cameras.
 
-Times are from the fields of a capture, ``times.json``, frame numbers, or names. Their order in
-files does not matter.
+Times are read from the capture, ``times.json``, frame numbers, or file names. The order of views
+in files does not matter.
 """
 
 from __future__ import annotations
@@ -26,20 +25,17 @@ from dyngs.io.fields import is_number, read_json_object
 from dyngs.io.write import write_text
 
 SECONDS_FILE = "times.json"
-"""Seconds of the images of a capture, next to them: COLMAP's models have no times."""
+"""File next to the images with the second of each image, as COLMAP models have no times."""
 SAME_TIME = 1e-6
-"""Times closer than this are the same time: files of one capture are often rounded differently."""
+"""Times closer than this are equal: files of one capture are often rounded differently."""
 SAME_POSE = 1e-5
-"""Entries of rotations, and positions in distances of the farthest camera from the mean one, up to
-which poses of a camera that does not move differ by rounding: 0.01 px at a focal length of 1,000
-px."""
+"""Largest difference of poses of a fixed camera: 0.01 px at a focal length of 1,000 px. It applies
+to rotation entries, and to positions relative to the distance of the farthest camera from the
+mean."""
 MENTIONED_CHANGE = 0.05
-"""Times that are scaled by less than this are not mentioned: the last of n times is often written
-as (n - 1) / n."""
-SCATTERED = 0.5
-"""Distance between cameras that follow each other in time, in medians of the distance of any two,
-from which time and viewpoint have nothing to do with each other."""
-# longest over shortest gap of evenly spaced times, with allowance for rounding in the files
+"""Smaller changes of scale are not reported: the last of n times is often written as (n - 1) /
+n."""
+# Largest ratio of the longest to the shortest gap of evenly spaced times, for rounding in files.
 _EVEN = 1.1
 _DIGITS = re.compile(r"(\d+)")
 
@@ -61,19 +57,19 @@ def read_seconds(root: Path) -> dict[str, float]:
     if not path.is_file():
         return {}
     with wrap_read_errors(
-        path, "it needs an object 'seconds' of image names and seconds; see docs/formats.md"
+        path, "it needs an object 'seconds' that maps image names to seconds; see docs/formats.md"
     ):
         seconds: Any = read_json_object(path)["seconds"]
         return {name: float(second) for name, second in seconds.items()}
 
 
 def times_from_names(splits: Splits, per_second: float | None = None) -> tuple[Splits, str]:
-    """Return the views with times by their names, and a line that says how.
+    """Return the views with times from file names, and a message that describes them.
 
-    Where the name of every image ends in a number, and no two of a folder in the same, that number
-    is the time: frames that are missing leave gaps. Otherwise times are positions in the order of
-    the names, numbers in them read as numbers. Each folder is a camera; the same numbers, or
-    positions, in another one are the same times. With ``per_second``, so many of them are a second.
+    If every name ends in a number that is unique in its folder, that number is the time, so
+    missing frames leave gaps. Otherwise the time is the position in natural order of the names.
+    Each folder is a camera; equal numbers or positions are equal times. ``per_second`` is the
+    number of time units per second.
     """
     folders: dict[Path, list[View]] = defaultdict(list)
     for view in all_views(splits):
@@ -88,13 +84,13 @@ def times_from_names(splits: Splits, per_second: float | None = None) -> tuple[S
         }
         times |= {name: time for time, name in found.items()}
     line = f"from {min(times.values(), default=0):g} to {max(times.values(), default=0):g}"
-    line = f"times are the numbers in the names of the images, {line} (data.times=order"
+    line = f"times from the numbers in file names, {line} (data.times=order"
     if len(times) < len(all_views(splits)):
         for seen in folders.values():
             seen.sort(key=lambda view: natural_order(view.image_path.name))
             times |= {view.name: float(position) for position, view in enumerate(seen)}
         first = next(iter(folders.values()))[0].name
-        line = f"times are the order of the names, {first} first (data.times=order"
+        line = f"times from the order of file names, starting with {first} (data.times=order"
     if per_second is not None:
         length = (max(times.values()) - min(times.values())) / per_second
         line += f" at {per_second:g} per second: {length:.4g} s"
@@ -104,7 +100,7 @@ def times_from_names(splits: Splits, per_second: float | None = None) -> tuple[S
 
 
 def natural_order(name: str) -> list[tuple[int, int, str]]:
-    """Return a key by which 9 sorts before 10."""
+    """Return a sort key by which 9 comes before 10."""
     return [
         (0, int(part), "") if part.isdecimal() else (1, 0, part)
         for part in _DIGITS.split(name)
@@ -113,11 +109,11 @@ def natural_order(name: str) -> list[tuple[int, int, str]]:
 
 
 def times_from_frame_numbers(splits: Splits) -> Splits:
-    """Return the splits with times by frame number where no view has a time and all have a frame,
-    of several.
+    """Return the splits with times from frame numbers, if all views have a frame and none has a
+    time.
 
-    The first frame of all splits is at 0 and the last one at 1; the split pose is a clip of its
-    own.
+    The first frame of all splits gets time 0 and the last one 1; the split pose is a separate
+    clip.
     """
     timed: Splits = {}
     for is_pose in (False, True):
@@ -134,13 +130,14 @@ def times_from_frame_numbers(splits: Splits) -> Splits:
     return timed
 
 
-def normalize_times(root: Path, splits: Splits, *, stretch: bool = True) -> tuple[Splits, list[str]]:
-    """Return the splits with the first time at 0 and the last one at 1, and warnings; one scale for
-    all splits.
+def normalize_times(
+    root: Path, splits: Splits, *, stretch: bool = True
+) -> tuple[Splits, list[str]]:
+    """Scale times so that the first one of all splits is 0 and the last one 1; also return
+    messages.
 
-    Times that are all equal are left as they are, see ``static_if_constant``; without ``stretch``
-    all within [0, 1] are. Raises DyngsError: some views have a time, and one has none, or one that
-    is no finite number; names the view.
+    Equal times are left as they are, see ``drop_constant_times``; without ``stretch``, so are
+    times within [0, 1]. Raises DyngsError if only some views have a time, or one is not finite.
     """
     views = all_views(splits)
     times = [view.time for view in views if view.time is not None]
@@ -149,7 +146,7 @@ def normalize_times(root: Path, splits: Splits, *, stretch: bool = True) -> tupl
     for view in views:
         if not (is_number(view.time) and math.isfinite(view.time)):
             raise DyngsError(
-                f"{root}: the time of {view.name} must be a finite number, as of other images, got {view.time!r:.40}"
+                f"{root}: the time of {view.name} must be a finite number, got {view.time!r:.40}"
             )
     first = min(times)
     last = max(times)
@@ -161,20 +158,20 @@ def normalize_times(root: Path, splits: Splits, *, stretch: bool = True) -> tupl
     )
     if within and max(first, 1 - last) < MENTIONED_CHANGE:
         return scaled, []
-    return scaled, [f"times run from {first:g} to {last:g} and were scaled to [0, 1]"]
+    return scaled, [f"times {first:g} to {last:g} scaled to [0, 1]"]
 
 
 def drop_constant_times(splits: Splits) -> tuple[Splits, list[str]]:
-    """Return the splits without times, and a warning, if all images have the same time."""
+    """Remove the times if all images have the same one, with a message."""
     times = {view.time for view in all_views(splits)}
     if len(times) != 1 or times == {None}:
         return splits, []
-    line = f"all images have time {times.pop():g}: treated as a static scene"
+    line = f"all images have time {times.pop():g}; treated as a static scene"
     return map_views(splits, lambda view: replace(view, time=None)), [line]
 
 
 def file_time_span(written: Splits, kept: Splits) -> tuple[float, float] | None:
-    """Return the first and the last time of the ``kept`` views as ``written`` in the files; None
+    """Return the first and the last time of the ``kept`` views as ``written`` in the files, None
     without times."""
     names = {view.name for view in all_views(kept) if view.time is not None}
     times = [
@@ -184,11 +181,9 @@ def file_time_span(written: Splits, kept: Splits) -> tuple[float, float] | None:
 
 
 def clip_seconds(splits: Splits, fps: float | None) -> float | None:
-    """Return the seconds from time 0 to time 1 at ``fps`` frames per second, None where they are
-    not known.
+    """Return the seconds from time 0 to time 1 at ``fps`` frames per second, None if unknown.
 
-    From the frame numbers where all views have one, else from the number of times where these are
-    evenly spaced.
+    Uses frame numbers if all views have one, else the number of times if they are evenly spaced.
     """
     views = all_views(splits)
     times = sorted(set(distinct_times(views).values()))
@@ -204,7 +199,7 @@ def clip_seconds(splits: Splits, fps: float | None) -> float | None:
 
 
 def distinct_times(views: Iterable[View]) -> dict[float, float]:
-    """Map every time of the views to the first of those that count as the same time."""
+    """Map each time to the first of the times that count as equal."""
     distinct: dict[float, float] = {}
     before = first = -math.inf
     for time in sorted({view.time for view in views if view.time is not None}):
@@ -216,14 +211,14 @@ def distinct_times(views: Iterable[View]) -> dict[float, float]:
 
 
 def parse_frames(text: str, key: str = "data.frames") -> slice:
-    """Parse ``start:stop`` or ``start:stop:step``: whole numbers, each optional, as written at
+    """Parse ``start:stop`` or ``start:stop:step`` (optional whole numbers), the value of
     ``key``."""
     is_slice = re.fullmatch(r"(\s*([-+]?\d+)?\s*:){1,2}\s*([-+]?\d+)?\s*", text, re.ASCII)
     parts = [int(part) if part.strip() else None for part in text.split(":")] if is_slice else []
     if not is_slice or parts[2:] == [0]:
         raise DyngsError(
-            f"{key}={format_one_line(repr(text), 60)}: write start:stop or start:stop:step in whole numbers, such as "
-            "0:100:2, and a step that is not 0"
+            f"{key}={format_one_line(repr(text), 60)}: must be start:stop or start:stop:step in whole "
+            "numbers, such as 0:100:2, and a step that is not 0"
         )
     return slice(*parts)
 
@@ -231,17 +226,19 @@ def parse_frames(text: str, key: str = "data.frames") -> slice:
 def split_by_frames(
     root: Path, splits: Splits, frames: str, key: str = "data.frames"
 ) -> tuple[Splits, Splits]:
-    """Return the views at the times that the slice ``frames`` selects from the sorted distinct
-    times of all splits, and those at other times.
+    """Split views into those at the selected times and those at other times.
 
-    Of both, the first time becomes 0 and the last one 1; a single one becomes 0. Raises DyngsError:
-    a bad slice, or one that selects no time, as of views without times.
+    ``frames`` is a slice of the sorted distinct times of all splits. In both parts the first time
+    becomes 0 and the last one 1. Raises DyngsError on an invalid slice, or one that selects
+    nothing.
     """
     distinct = distinct_times(all_views(splits))
     times = sorted(set(distinct.values()))
     picked = sorted(times[parse_frames(frames, key)])
     if not picked:
-        raise DyngsError(f"{root}: {key}={frames} picks none of the capture's {len(times)} times")
+        raise DyngsError(
+            f"{root}: {key}={frames} selects none of the {len(times)} times of the capture"
+        )
 
     def at(chosen: Sequence[float]) -> Splits:
         span = (chosen[-1] - chosen[0] if chosen else 0.0) or 1.0
@@ -256,14 +253,13 @@ def split_by_frames(
 
 
 def split_by_camera(root: Path, splits: Splits, cameras: Sequence[int]) -> Splits:
-    """Return the views of the splits anew: those of ``cameras`` for training, those of all others
-    for testing."""
+    """Assign views of ``cameras`` to train and all others to test."""
     views = all_views(splits)
     known = sorted({view.camera_id for view in views})
     if not set(cameras) < set(known):
         raise DyngsError(
-            f"{root}: data.train_cameras=[{', '.join(map(str, cameras))}] must name some of the {len(known)} cameras, "
-            f"from {known[0]} to {known[-1]}, and leave one for testing"
+            f"{root}: data.train_cameras=[{', '.join(map(str, cameras))}] must name some of the "
+            f"{len(known)} cameras, from {known[0]} to {known[-1]}, and leave one for testing"
         )
     return {
         "train": tuple(view for view in views if view.camera_id in cameras),
@@ -272,11 +268,10 @@ def split_by_camera(root: Path, splits: Splits, cameras: Sequence[int]) -> Split
 
 
 def assign_camera_ids(splits: Splits) -> Splits:
-    """Return the views with a number for each camera, where they share one although they are of
-    several cameras.
+    """Give each fixed camera an id of its own if all views share one.
 
-    These are cameras that do not move: each pose repeats at another time, up to rounding, and some
-    times are seen from several poses. The views of a camera get exactly one pose.
+    Fixed cameras are detected if each pose repeats at other times, up to rounding, and some times
+    are seen from several poses. The views of a camera get exactly one pose.
     """
     views = sorted(all_views(splits), key=lambda view: view.name)
     if len({view.camera_id for view in views}) != 1 or any(view.time is None for view in views):
@@ -299,7 +294,7 @@ def assign_camera_ids(splits: Splits) -> Splits:
 
 
 def _first_of_pose(views: Sequence[View]) -> list[int]:
-    """Return for each view the index of the first one with its pose."""
+    """Return for each view the index of the first view with the same pose."""
     from scipy.spatial import KDTree
 
     poses = np.stack([invert_rigid(view.cam_from_world)[:3] for view in views])
@@ -310,11 +305,11 @@ def _first_of_pose(views: Sequence[View]) -> list[int]:
 
 
 def static_cameras(views: Sequence[View]) -> list[list[int]]:
-    """Return indices of views, in order of time, for each static camera with images at several
+    """Return indices of views in order of time, for each fixed camera with images at several
     times.
 
-    A camera is a pose, intrinsics, a lens and a size; of several views of one time the first is
-    taken.
+    A camera is a pose, intrinsics, a lens and a size; of several views at one time the first is
+    used.
     """
     cameras: defaultdict[tuple[object, ...], dict[float, int]] = defaultdict(dict)
     for i, view in enumerate(views):
@@ -326,25 +321,8 @@ def static_cameras(views: Sequence[View]) -> list[list[int]]:
     return [[at[t] for t in sorted(at)] for at in cameras.values() if len(at) > 1]
 
 
-def videos(views: Sequence[View]) -> list[list[int]]:
-    """Return indices of views, in order of time, for each video: of a fixed camera, or of the one
-    that moves.
-
-    No video where views without a common camera jump about in time.
-    """
-    fixed = static_cameras(views)
-    order = sorted(range(len(views)), key=lambda i: views[i].time or 0.0)
-    if fixed or len(views) < 3 or len({view.time for view in views} - {None}) < len(views):
-        return fixed
-    centers = np.stack([invert_rigid(views[i].cam_from_world)[:3, 3] for i in order])
-    apart = np.linalg.norm(centers[:, None] - centers, axis=2)
-    usual = float(np.median(apart[np.triu_indices(len(views), 1)]))
-    is_scattered = float(np.median(np.diagonal(apart, 1))) > SCATTERED * usual
-    return [] if is_scattered else [order]
-
-
 def frame_count_warnings(splits: Splits) -> list[str]:
-    """Return a warning of cameras with different numbers of frames."""
+    """Return a warning if cameras have different numbers of frames."""
     views = [view for view in all_views(splits) if view.time is not None]
     paths = {(view.camera_id, view.image_path) for view in views}
     counts = Counter(camera for camera, _ in paths)
@@ -352,5 +330,6 @@ def frame_count_warnings(splits: Splits) -> list[str]:
         return []
     few = min(counts, key=lambda camera: counts[camera])
     return [
-        f"cameras have different numbers of frames, from {counts[few]} (camera {few}) to {max(counts.values())}"
+        f"cameras have different numbers of frames, from {counts[few]} (camera {few}) to "
+        f"{max(counts.values())}"
     ]

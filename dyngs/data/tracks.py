@@ -1,4 +1,4 @@
-"""Tracks of points of surfaces: in the images, as users give them, and true ones in the world."""
+"""Point tracks: 2D tracks in images given by users, and ground-truth 3D tracks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
-from dyngs.io.containment import inside
+from dyngs.io.containment import check_inside
 from dyngs.io.numpy_files import read_npz
 from dyngs.io.write import atomic_file
 
@@ -19,13 +19,13 @@ _LARGEST = 1e6
 
 @dataclass(frozen=True)
 class ImageTracks:
-    """Tracks of P points in F images.
+    """2D tracks of P points in F images.
 
     Attributes:
-        names: (F,) names of views, or their ``file_path`` as the capture's files have it.
-        xy: (F, P, 2) float32 in pixels of the stored images; the centre of the first pixel is (0.5,
-            0.5).
-        visible: (F, P) bool; where a point is not seen, ``xy`` means nothing.
+        names: (F,) names of views, or their ``file_path`` in the capture.
+        xy: (F, P, 2) float32 in pixels of the stored images; the centre of the first pixel is
+            (0.5, 0.5).
+        visible: (F, P) bool; ``xy`` is undefined where it is false.
     """
 
     names: tuple[str, ...]
@@ -33,7 +33,7 @@ class ImageTracks:
     visible: np.ndarray
 
     def rows_of(self, views: Sequence[View]) -> dict[str, int]:
-        """Return the row of each view that the tracks name, by the view's name."""
+        """Return the track row of each view that the tracks list, by view name."""
         rows: dict[str, int] = {}
         for row, name in enumerate(self.names):
             plain = PurePosixPath(_plain(name))
@@ -42,10 +42,10 @@ class ImageTracks:
 
 
 def read_tracks(path: Path) -> ImageTracks:
-    """Read tracks from a ``.npz`` with the arrays of ``ImageTracks``; positions that are not finite
-    are not visible."""
+    """Read an .npz with the arrays of ``ImageTracks``; points at non-finite positions are not
+    visible."""
     if not path.is_file():
-        raise DyngsError(f"{path}: no such tracks; restore them or remove tracks_file_path")
+        raise DyngsError(f"{path}: no such file of tracks; restore it or remove tracks_file_path")
     arrays = read_npz(path, ("xy", "visible", "names"))
     xy = arrays["xy"]
     visible = arrays["visible"]
@@ -63,8 +63,8 @@ def read_tracks(path: Path) -> ImageTracks:
         or names.dtype.kind not in "US"
     ):
         raise DyngsError(
-            f"{path}: must hold xy (F, P, 2), visible (F, P) and names (F,) of text, got {xy.shape}, {visible.shape} "
-            f"and {names.shape} of {names.dtype}; export it again"
+            f"{path}: must hold xy (F, P, 2), visible (F, P) and names (F,) of text, got "
+            f"{xy.shape}, {visible.shape} and {names.shape} of {names.dtype}; export it again"
         )
     listed = tuple(
         x.decode("utf-8", "replace") if isinstance(x, bytes) else str(x) for x in names.tolist()
@@ -77,7 +77,7 @@ def read_tracks(path: Path) -> ImageTracks:
 
 
 def _plain(name: str) -> str:
-    """Return a name as ``View.name`` would have it, but with its extension."""
+    """Return a file path in the form of ``View.name``, but with its extension."""
     return "/".join(
         part
         for part in PurePosixPath(name.replace("\\", "/")).parts
@@ -90,15 +90,16 @@ TRACKS_FILE = "true_tracks.npz"
 
 @dataclass(frozen=True)
 class TrueTracks:
-    """Tracks of P material points at T times; fields are named as the arrays of the file.
+    """Ground-truth 3D tracks of P material points at T times; the fields are the arrays of the
+    file.
 
     Attributes:
         points: (T, P, 3) world units, in the coordinates of the capture's files; NaN where a point
             does not exist.
-        times: (T,) ascending, as the capture's files have them.
-        views: (V,) names of the views of all splits, as ``View.name``.
-        moments: (V,) row of ``times`` at which each view was taken.
-        visible: (V, P) whether the view shows the point: in the image, and nothing before it.
+        times: (T,) ascending, as in the capture's files.
+        views: (V,) names of the views of all splits.
+        moments: (V,) index into ``times`` of each view.
+        visible: (V, P) whether the point is in the image and not occluded.
     """
 
     points: np.ndarray
@@ -109,8 +110,7 @@ class TrueTracks:
 
 
 def write_true_tracks(root: Path, tracks: TrueTracks, name: str = TRACKS_FILE) -> Path:
-    """Write the tracks of a capture to the file ``name``, atomically; returns the path. Raises
-    DyngsError."""
+    """Write the tracks of a capture to the file ``name``, atomically; return the path."""
     path = root / name
     with atomic_file(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, **asdict(tracks))
@@ -118,10 +118,10 @@ def write_true_tracks(root: Path, tracks: TrueTracks, name: str = TRACKS_FILE) -
 
 
 def read_true_tracks(capture: Capture, name: str = TRACKS_FILE) -> TrueTracks | None:
-    """Return the tracks of a capture in scene coordinates (see ``Capture.world_scale``); None
-    without any."""
+    """Return the tracks of a capture in scene coordinates (see ``Capture.world_scale``), None
+    without a file."""
     path = capture.root / name
-    if not inside(path).is_file():
+    if not check_inside(path).is_file():
         return None
     found = read_npz(path, ("points", "times", "views", "moments", "visible"))
     points, times, views, moments, visible = found.values()
@@ -134,12 +134,10 @@ def read_true_tracks(capture: Capture, name: str = TRACKS_FILE) -> TrueTracks | 
     if kinds != "ffUib" or not fits or not views.shape == moments.shape == visible.shape[:1]:
         shapes = ", ".join(f"{name} {x.shape} of {x.dtype}" for name, x in found.items())
         raise DyngsError(
-            f"{path}: needs points (T, P, 3), times (T,), views (V,) names, moments (V,) whole numbers and visible "
-            f"(V, P) bool, got {shapes}; write it again, or remove it to do without"
+            f"{path}: needs points (T, P, 3), times (T,), views (V,) names, moments (V,) whole "
+            f"numbers and visible (V, P) bool, got {shapes}; write it again, or remove it"
         )
     if len(moments) and not (moments.min() >= 0 and moments.max() < len(times)):
-        raise DyngsError(
-            f"{path}: moments must be rows of times; write it again, or remove it to do without"
-        )
+        raise DyngsError(f"{path}: moments must be rows of times; write it again, or remove it")
     points = (points - capture.world_offset) / capture.world_scale
     return TrueTracks(points, times, views, moments, visible)

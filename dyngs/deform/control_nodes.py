@@ -1,12 +1,9 @@
-"""Control nodes that move along cubic splines: no network, and a cost that hardly grows with the
-Gaussians.
+"""Control nodes on cubic splines: sparse rigid motions that Gaussians follow, without a network.
 
 After SC-GS (Huang et al. 2024) and Dynamic 3D Gaussians (Luiten et al. 2024): nodes carry rigid
-motions, neighbours move alike, and a motion that leaves the times seen so far goes on at constant
-velocity.
-
-Every image moves four neighbouring control points of each spline: poses that few images show are
-shared by many.
+motions, neighbours move as rigidly as possible, and motion outside the trained times continues at
+constant velocity. Each image updates four neighbouring control points per spline, so that poses
+with few images share them.
 
 Local letters: S nodes, P control points.
 """
@@ -29,8 +26,8 @@ from dyngs.deform.field import (
     DeformationField,
     FieldSetup,
     Offsets,
+    build_offsets,
     head_sizes,
-    offsets_of,
     select_rows,
 )
 from dyngs.deform.keys import ControlNodesField
@@ -43,32 +40,31 @@ from dyngs.ops.skinning import blend_skinning
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
-FOLLOWED = 4  # Nodes that a Gaussian follows
+FOLLOWED = 4  # nodes that a Gaussian follows
 
 
 @dataclass(frozen=True)
 class Nodes:
-    """Control nodes, and the ones that each of M points follows."""
+    """Control nodes, and the nodes that each of M points follows."""
 
-    positions: Tensor  # (S, 3) canonical
-    radii: Tensor  # (S,) of influence, world units: the mean distance to the nearest other nodes
-    followed: Tensor  # (M, B) indices of the nodes that each point follows, nearest first
+    positions: Tensor  # (S, 3) canonical positions
+    # (S,) radius of influence, world units: mean distance to the nearest other nodes
+    radii: Tensor
+    followed: Tensor  # (M, B) node indices, nearest first
 
     def weights(self, means: Tensor) -> Tensor:
-        """Return (M, B) weights of the followed nodes: Gaussians of the distance, normalised;
-        constant in ``means``."""
+        """Return skinning weights (M, B): normalised Gaussians of the distance, without gradient."""
         apart = (means.detach()[:, None] - self.positions[self.followed]).square().sum(-1)
         return torch.softmax(-0.5 * apart / self.radii[self.followed].square(), dim=1)
 
 
-def nodes_at(positions: Tensor, means: Tensor) -> Nodes:
-    """Return the nodes at ``positions`` (S, 3), at least one, followed by the points ``means`` (M,
-    3)."""
+def build_nodes(positions: Tensor, means: Tensor) -> Nodes:
+    """Return nodes at ``positions`` (S, 3), S >= 1, followed by the points ``means`` (M, 3)."""
     tree = _tree(positions)
     count = min(FOLLOWED, len(positions))
 
     def nearest(points: Tensor, which: int) -> Tensor:
-        """Return (M, count) distances (0) to the nearest nodes, or their indices (1)."""
+        """Return distances (0) or indices (1) of the nearest nodes, (M, count)."""
         numbers = points.detach().double().cpu().numpy()
         ranks: Any = range(1, count + 1)
         return torch.from_numpy(tree.query(numbers, k=ranks)[which])
@@ -80,11 +76,11 @@ def nodes_at(positions: Tensor, means: Tensor) -> Nodes:
 
 
 def farthest_points(points: Tensor, count: int, taken: Tensor) -> Tensor:
-    """Return indices of at most ``count`` ``points`` (M, 3), each the farthest from those before it
-    and from ``taken``.
+    """Select at most ``count`` of ``points`` (M, 3) by farthest point sampling, away from
+    ``taken``.
 
-    None coincides with another or with one of ``taken`` (S, 3). Without those, the first is nearest
-    to the mean.
+    No two selected points coincide with each other or with ``taken`` (S, 3). If that is empty, the
+    first point is the one nearest to the mean.
     """
     points = points.detach().double()
     picked: list[int] = []
@@ -93,8 +89,11 @@ def farthest_points(points: Tensor, count: int, taken: Tensor) -> Tensor:
         apart = torch.from_numpy(nearest).to(points.device).square()
     else:
         # largest at the mean
-        stray = (points - points.mean(0)).square().sum(1)
-        apart = (2 * torch.cat([stray, stray.new_zeros(1)]).max() - stray).clamp_min(1e-300)
+        squared_distances = (points - points.mean(0)).square().sum(1)
+        apart = (
+            2 * torch.cat([squared_distances, squared_distances.new_zeros(1)]).max()
+            - squared_distances
+        ).clamp_min(1e-300)
     while len(picked) < min(count, len(points)):
         farthest = int(apart.argmax())
         if float(apart[farthest]) <= 0:
@@ -104,25 +103,23 @@ def farthest_points(points: Tensor, count: int, taken: Tensor) -> Tensor:
     return torch.tensor(picked, dtype=torch.long, device=points.device)
 
 
-def follow(
+def blend_node_motion(
     nodes: Nodes, means: Tensor, motion: Tensor, values: Tensor, heads: Mapping[str, int]
 ) -> Offsets:
-    """Return offsets of the points ``means`` (M, 3) from the nodes' ``motion`` (S, 7) and
-    ``values`` (S, D).
+    """Blend node motions into offsets of the points ``means`` (M, 3) (linear blend skinning).
 
-    A node turns what follows it about its own place: x' = sum_b w_b (R_b (x - p_b) + p_b + d_b);
-    differentiable in x, the weights taken as constant. The values of all other ``heads``, names and
-    sizes in order, are blended alike.
+    x' = sum_b w_b (R_b (x - p_b) + p_b + d_b) with ``motion`` (S, 7); differentiable in x with
+    constant weights. ``values`` (S, D) of all other ``heads`` (sizes by name, in order) are
+    blended alike.
     """
     moved, blended = blend_skinning(
         means, nodes.positions, nodes.radii, nodes.followed, motion, values
     )
-    return offsets_of(moved, blended, heads)
+    return build_offsets(moved, blended, heads)
 
 
 def rotate_by_offsets(offsets: Tensor, vectors: Tensor) -> Tensor:
-    """Return (..., 3) ``vectors`` turned by the rotations identity + ``offsets`` (..., 4), of any
-    length."""
+    """Rotate ``vectors`` (..., 3) by the quaternions identity + ``offsets`` (..., 4), of any norm."""
     return rotate(offsets + identity_quat(offsets), vectors)
 
 
@@ -133,11 +130,8 @@ def _tree(points: Tensor) -> KDTree:
 
 
 def spline_basis(places: Tensor, pieces: int) -> Tensor:
-    """Return (K, pieces + 3) float64 weights of the control points of a uniform cubic B-spline at
-    ``places`` (K,).
-
-    Places lie in [0, 1], which the pieces share evenly.
-    """
+    """Return weights (K, pieces + 3), float64, of a uniform cubic B-spline at ``places`` (K,) in
+    [0, 1]."""
     scaled = places.double().clamp(0, 1) * pieces
     piece = scaled.long().clamp_max(pieces - 1)
     weights = torch.stack(cubic_fractions(scaled - piece), dim=1)
@@ -145,23 +139,22 @@ def spline_basis(places: Tensor, pieces: int) -> Tensor:
     return basis.scatter_(1, piece[:, None] + torch.arange(SPAN, device=places.device), weights)
 
 
-NOTHING = torch.zeros(0, 3, device="cpu")
+NO_NODES = torch.zeros(0, 3, device="cpu")
 LR = {"quats": 6e-3, "log_scales": 1e-3, "logit_opacities": 1e-2, "colors": 2e-3}
-"""Learning rates of the nodes' attributes other than positions."""
-LR_DECAY = 0.2  # Ratio of the last to the first learning rate
+"""Learning rates of node attributes other than positions."""
+LR_DECAY = 0.2  # ratio of the last to the first learning rate
 PIECES_PER_TIME = 0.3
-"""Pieces of the splines per training time. With more, poses follow single images; with fewer, they
-lag behind."""
-SMOOTHNESS = 0.01  # Weight of the nodes' squared acceleration, in node spacings
+"""Spline pieces per training time; more overfit single images, fewer lag behind fast motion."""
+SMOOTHNESS = 0.01  # weight of the squared node acceleration, in node spacings
 
 
 class ControlNodes(DeformationField):
-    """Offsets of nodes, uniform cubic B-splines of time, blended into those of the Gaussians that
-    follow them.
+    """Offsets from nodes on uniform cubic B-splines of time, blended over the Gaussians that
+    follow.
 
-    Nodes are placed when first needed. Whenever the set of Gaussians has changed, nodes that
-    nothing follows are dropped and new ones start, with the motion found there, where Gaussians are
-    farthest from any.
+    Nodes are placed at the first call. After each topology edit, nodes without followers are
+    dropped, and new nodes start at the Gaussians farthest from any node, with the motion
+    interpolated there.
     """
 
     def __init__(
@@ -171,7 +164,7 @@ class ControlNodes(DeformationField):
         self.num_pieces = options.pieces or min(
             max(1, round(PIECES_PER_TIME * setup.num_times)), MAX_KEY_TIMES
         )
-        self.buffers = {"positions": NOTHING}
+        self.buffers = {"positions": NO_NODES}
         self.parameters = self._untrained(0)
 
     def with_state(self, tensors: Mapping[str, Tensor]) -> ControlNodes:
@@ -224,33 +217,33 @@ class ControlNodes(DeformationField):
         return self.num_pieces + SPAN - 1
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        if not len(means):  # whatever nodes there are
-            return self.at(time).select(slice(0))
-        return self._follow(means, rows, *self._motion(means, time))
+        if not len(means):  # also without nodes
+            return self.offsets_of_nodes(time).select(slice(0))
+        return self._blend(means, rows, *self._motion(means, time))
 
     def in_training(self, means: Tensor, time: float) -> tuple[Offsets, dict[str, Tensor]]:
         if not len(means):
             return super().in_training(means, time)
         motion, values = self._motion(means, time)
-        return self._follow(means, None, motion, values), self._penalties(motion)
+        return self._blend(means, None, motion, values), self._penalties(motion)
 
     def penalties(self, time: float) -> dict[str, Tensor]:
         return self._penalties(spline_motion(self._heads(), time)[0])
 
     def _motion(self, means: Tensor, time: float) -> tuple[Tensor, Tensor]:
-        self.nodes_for(means)
+        self.update_nodes(means)
         return spline_motion(self._heads(), time)
 
-    def _follow(
-        self, means: Tensor, rows: Tensor | None, motion: Tensor, values: Tensor
-    ) -> Offsets:
-        nodes = self.nodes_for(means)
+    def _blend(self, means: Tensor, rows: Tensor | None, motion: Tensor, values: Tensor) -> Offsets:
+        nodes = self.update_nodes(means)
         nodes = replace(nodes, followed=select_rows(nodes.followed, rows))
-        return follow(nodes, select_rows(means, rows), motion, values, head_sizes(self.options))
+        return blend_node_motion(
+            nodes, select_rows(means, rows), motion, values, head_sizes(self.options)
+        )
 
     def _penalties(self, motion: Tensor) -> dict[str, Tensor]:
-        """Return the nodes' acceleration and their neighbours' deviation from rigid motion, in
-        squared spacings."""
+        """Return the regularisers: node acceleration and as-rigid-as-possible, in squared node
+        spacings."""
         if self.num_nodes < 2:
             return {}
         places, radii, near = (self.buffers[name] for name in ("positions", "radii", "neighbours"))
@@ -264,10 +257,10 @@ class ControlNodes(DeformationField):
 
     @torch.no_grad()
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
-        """Go on at constant velocity, that of the last two intervals.
+        """Extrapolate at constant velocity, that of the last two intervals.
 
-        The outermost point that a time in ``seen`` depends on counts as not seen, unless no time
-        lies beyond: its share is too small.
+        The outermost control point of the window ``seen`` is extrapolated too, unless the window
+        ends the clip, because it hardly affects the window.
         """
         last = self.num_points - 1
         low = 0 if seen[0] <= 0 else math.floor(seen[0] * self.num_pieces) + 1
@@ -282,9 +275,9 @@ class ControlNodes(DeformationField):
             pace = (x[:, low] - x[:, low + reach]) / max(reach, 1)
             x[:, :low] = x[:, low, None] + before * pace[:, None]
 
-    def at(self, time: float) -> Offsets:
+    def offsets_of_nodes(self, time: float) -> Offsets:
         motion, values = spline_motion(self._heads(), time)
-        return offsets_of(motion[:, :3], values, head_sizes(self.options))
+        return build_offsets(motion[:, :3], values, head_sizes(self.options))
 
     def _untrained(self, count: int) -> Parameters:
         sizes = head_sizes(self.options)
@@ -302,41 +295,41 @@ class ControlNodes(DeformationField):
     def _heads(self) -> list[Tensor | None]:
         return [self.parameters.get(field.name) for field in fields(Offsets)]
 
-    def nodes_for(self, means: Tensor) -> Nodes:
-        """Return the nodes, placed among ``means`` (M, 3) if need be, which follow them."""
+    def update_nodes(self, means: Tensor) -> Nodes:
+        """Return the nodes that ``means`` (M, 3) follow; place them first if necessary."""
         if "followed" not in self.buffers:
-            self._place(means.detach())
+            self._place_nodes(means.detach())
         return Nodes(self.buffers["positions"], self.buffers["radii"], self.buffers["followed"])
 
     @torch.no_grad()
-    def _place(self, means: Tensor) -> None:
-        """Drop nodes that nothing follows, add some where they are missing, and let ``means`` (M,
-        3) follow."""
+    def _place_nodes(self, means: Tensor) -> None:
+        """Drop nodes without followers, add nodes where they are missing, and assign ``means`` (M,
+        3)."""
         old = self.buffers["positions"]
         kept = torch.zeros(0, dtype=torch.long, device=means.device)
         if len(old):
-            kept = nodes_at(old, means).followed[:, 0].unique()
+            kept = build_nodes(old, means).followed[:, 0].unique()
         added = farthest_points(means, self.options.nodes - len(kept), old[kept])
         source = torch.cat([kept, torch.zeros(len(added), dtype=torch.long, device=kept.device)])
         is_new = torch.arange(len(source), device=source.device) >= len(kept)
         started = self._motion_at(means[added])
         values = {name: torch.cat([x[kept], started[name]]) for name, x in self._splines().items()}
         self.parameters = self.parameters.reorder(values, source, is_new)
-        self._assign(torch.cat([old[kept], means[added]]), means)
+        self._assign_followers(torch.cat([old[kept], means[added]]), means)
 
-    def _assign(self, positions: Tensor, means: Tensor) -> None:
-        nodes = nodes_at(positions, means)
-        around = nodes_at(positions, positions).followed[:, 1:]
-        found = {"radii": nodes.radii, "followed": nodes.followed, "neighbours": around}
-        self.buffers = {"positions": positions} | found
+    def _assign_followers(self, positions: Tensor, means: Tensor) -> None:
+        nodes = build_nodes(positions, means)
+        around = build_nodes(positions, positions).followed[:, 1:]
+        buffers = {"radii": nodes.radii, "followed": nodes.followed, "neighbours": around}
+        self.buffers = {"positions": positions} | buffers
 
     def _motion_at(self, points: Tensor) -> dict[str, Tensor]:
-        """Return the control points (S', P, size), by head, that the present nodes give to
-        ``points`` (S', 3)."""
+        """Return control points (S', P, size) by head, interpolated from the present nodes at
+        ``points``."""
         splines = self._splines()
         if not self.num_nodes or not len(points):
             return {name: x.new_zeros(len(points), *x.shape[1:]) for name, x in splines.items()}
-        nodes = nodes_at(self.buffers["positions"], points)
+        nodes = build_nodes(self.buffers["positions"], points)
         weights = nodes.weights(points)
         started = {
             name: torch.einsum("mb,mbpd->mpd", weights, x[nodes.followed])

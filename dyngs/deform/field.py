@@ -1,6 +1,6 @@
-"""The interface of deformation fields, their decoder, and Gaussians with offsets applied.
+"""Interface of deformation fields, their decoder, and offsets applied to Gaussians.
 
-Local letters: M moving Gaussians, a subset of the N of a scene.
+Local letters: M moving Gaussians, a subset of the N Gaussians of a scene.
 """
 
 from __future__ import annotations
@@ -26,122 +26,117 @@ from dyngs.ops.skinning import add_offsets_, offset_gradients
 F = TypeVar("F", bound="DeformationField")
 Outer = TypeVar("Outer", bound="OuterField")
 
-# Limit on the default number of key times; longer clips may set more, which takes memory
+# Limit on the default number of key times; configs may set more, which takes memory.
 MAX_KEY_TIMES = 256
 
 
 @dataclass(frozen=True)
 class Offsets:
-    """Changes of M Gaussians from their canonical form at one time; zeros mean no change."""
+    """Changes of M Gaussians from their canonical values at one time; zeros mean no change."""
 
     means: Tensor  # (M, 3) world units
-    # (M, 4) added to the identity (1, 0, 0, 0); the sum turns the Gaussian after its own rotation
+    # (M, 4) added to the identity (1, 0, 0, 0); this rotation is applied after the canonical one.
     quats: Tensor | None = None
     log_scales: Tensor | None = None  # (M, 3)
     logit_opacities: Tensor | None = None  # (M,)
-    # (M, 3) of the base colour, in units of the constant SH coefficient
+    # (M, 3) change of the degree-0 SH coefficients
     colors: Tensor | None = None
 
     def select(self, index: Tensor | slice) -> Offsets:
-        inner_field = (self.quats, self.log_scales, self.logit_opacities, self.colors)
-        return Offsets(self.means[index], *(None if x is None else x[index] for x in inner_field))
+        others = (self.quats, self.log_scales, self.logit_opacities, self.colors)
+        return Offsets(self.means[index], *(None if x is None else x[index] for x in others))
 
 
 @dataclass(frozen=True)
 class FieldSetup:
-    """Properties of the scene that a field needs."""
+    """Properties of the scene that a field is built for."""
 
-    # center, half_size: (3,) of the box in which things move, world units; no side is zero
+    # Centre and half size (3,) of the box that contains the motion, world units; no half size is
+    # zero.
     center: Tensor
     half_size: Tensor
     num_times: int
     num_moving: int
-    extent: float  # of the scene, world units; learning rates are relative to it
+    extent: float  # scene extent, world units; learning rates are relative to it
 
-    def normalized(self, means: Tensor) -> Tensor:
-        """Return (M, 3) ``means`` in the box's own coordinates: [-1, 1] inside."""
+    def normalize(self, means: Tensor) -> Tensor:
+        """Normalise ``means`` (M, 3) to the box: [-1, 1] inside."""
         return (means - self.center) / self.half_size
 
 
 class DeformationField:
-    """Offsets of canonical Gaussians over time, the identity before training."""
+    """Offsets of canonical Gaussians over time; the identity before training."""
 
     setup: FieldSetup
     parameters: Parameters
-    """All that is optimised."""
+    """All trained parameters."""
     has_lifetime = False
-    """Moving Gaussians are there for a while each, and stay as they are in steps that do not show
-    them."""
+    """Moving Gaussians exist for a limited time and are updated only in steps that render them."""
     can_fade = False
-    """Moving Gaussians may be there for a part of the clip only."""
+    """Opacities may fade in or out, so that a Gaussian exists for a part of the clip."""
 
     @property
     def num_values(self) -> int:
-        """Number of values that the field stores."""
+        """Number of stored values."""
         return self.parameters.num_values
 
     @property
     def leaves(self) -> list[Tensor]:
-        """All that receives gradients."""
+        """All trained tensors."""
         return self.parameters.leaves
 
     def step(self, step: int, progress: float) -> Count:
-        """Update all that is optimised; see ``Parameters.step``."""
+        """Update all parameters; see ``Parameters.step``."""
         return self.parameters.step(step, progress)
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        """Return the offsets at ``time`` in [0, 1] of the moving Gaussians with canonical ``means``
-        (M, 3), in order.
+        """Return the offsets at ``time`` in [0, 1] of moving Gaussians with canonical ``means``
+        (M, 3).
 
-        Only ``rows`` (A,) of them are requested, in this order, and cost anything; None: all.
+        ``rows`` (A,): compute only these rows, in this order; None: all.
         """
         raise NotImplementedError
 
     def penalties(self, time: float) -> dict[str, Tensor]:
-        """Return differentiable regularizers of the field itself, weighted, by name; some look at
-        ``time`` only."""
+        """Return weighted regularisation terms of the field by name; some depend on ``time``."""
         return {}
 
     def in_training(self, means: Tensor, time: float) -> tuple[Offsets, dict[str, Tensor]]:
-        """Return ``offsets`` and ``penalties`` of one time, which may share work."""
+        """Return ``offsets`` and ``penalties`` of one time; subclasses share work between them."""
         return self.offsets(means, time), self.penalties(time)
 
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
-        """Continue what was learned for the times in ``seen`` to those in ``soon``, which are
-        trained on next."""
+        """Extrapolate from the time window ``seen`` to the next window ``soon``."""
 
     def apply_shading(
         self, gaussians: Gaussians, rows: Tensor | None, which: Tensor | None, time: float
     ) -> Gaussians:
-        """Return the Gaussians drawn at ``time`` in the light that what moves leaves to them.
+        """Apply shadows and shading of moving bodies to the Gaussians at ``time``.
 
-        Of those that move, ``which`` (None: all) are drawn, at ``rows`` (None: in order, and
-        nothing else is).
+        ``which``: the moving Gaussians that are drawn (None: all). ``rows``: their positions in
+        ``gaussians`` (None: all rows, in order).
         """
         return gaussians
 
     def zero_gradients_outside_(self, window: tuple[float, float]) -> None:
-        """Drop the gradients of what times in ``window`` hardly show: Adam would take them for as
-        much as any."""
+        """Zero gradients of parameters that hardly affect the time ``window``; Adam would amplify
+        them."""
 
     def apply_edit(self: F, edit: TopologyEdit) -> F:
-        """Return the field after an edit of the moving Gaussians."""
+        """Return the field after a topology edit of the moving Gaussians."""
         return self
 
     def invalidate(self) -> None:
-        """Drop what was derived from the set of Gaussians; it is computed again when next
-        needed."""
+        """Clear caches that depend on the set of Gaussians."""
 
     def state(self) -> State:
-        """Return the state that ``restored`` needs, without the setup."""
+        """Return the state for ``with_state``, without the setup."""
         return add_prefix("learned", self.parameters.state())
 
     def with_state(self: F, tensors: Mapping[str, Tensor]) -> F:
-        """Return the field of a state that ``state`` returned, with the options and the setup of
-        this one.
+        """Return this field with the parameters in a state that ``state`` returned.
 
-        Raises KeyError or ValueError: a tensor is missing, or is not as a field of these options
-        has it.
+        Raises KeyError or ValueError for missing or inconsistent tensors.
         """
         return self.with_parameters(self.parameters.with_state(select_prefix(tensors, "learned")))
 
@@ -157,23 +152,22 @@ class DeformationField:
 
 
 class OuterField(DeformationField):
-    """A field that changes the offsets of another one, ``others``, of the same Gaussians."""
+    """A field that modifies the offsets of an inner field of the same Gaussians."""
 
     def __init__(self, inner_field: DeformationField) -> None:
         self.setup = inner_field.setup
         self.inner_field = inner_field
 
-    def changed(self, found: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
-        """Return the offsets ``found`` by the other field with the changes; arguments as of
-        ``offsets``."""
+    def modify(self, offsets: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
+        """Return the modified ``offsets`` of the inner field; other arguments as for ``offsets``."""
         raise NotImplementedError
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        return self.changed(self.inner_field.offsets(means, time, rows), means, time, rows)
+        return self.modify(self.inner_field.offsets(means, time, rows), means, time, rows)
 
     def in_training(self, means: Tensor, time: float) -> tuple[Offsets, dict[str, Tensor]]:
-        found, penalties = self.inner_field.in_training(means, time)
-        return self.changed(found, means, time, None), penalties
+        offsets, penalties = self.inner_field.in_training(means, time)
+        return self.modify(offsets, means, time, None), penalties
 
     @property
     def num_values(self) -> int:
@@ -204,10 +198,10 @@ class OuterField(DeformationField):
         self.inner_field.invalidate()
 
     def apply_edit(self: Outer, edit: TopologyEdit) -> Outer:
-        return self.around(self.inner_field.apply_edit(edit))
+        return self.with_inner(self.inner_field.apply_edit(edit))
 
-    def around(self: Outer, inner_field: DeformationField) -> Outer:
-        """Return the same changes of another field of the same Gaussians."""
+    def with_inner(self: Outer, inner_field: DeformationField) -> Outer:
+        """Return a copy of this field around another inner field."""
         field = copy.copy(self)
         field.inner_field = inner_field
         return field
@@ -219,13 +213,13 @@ class OuterField(DeformationField):
 
 
 def innermost(field: DeformationField) -> DeformationField:
-    """Return the field within all others that change its offsets."""
+    """Return the innermost field of nested fields."""
     return innermost(field.inner_field) if isinstance(field, OuterField) else field
 
 
 def apply_offsets(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None = None) -> Gaussians:
-    """Return ``gaussians`` with ``offsets`` applied to ``rows`` ((M,) long; None = all, in order);
-    differentiable.
+    """Apply ``offsets`` to the ``rows`` (M,) of ``gaussians``; None: all rows, in order.
+    Differentiable.
 
     No row may occur twice.
     """
@@ -239,8 +233,7 @@ def apply_offsets(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None = 
 
 
 class _AddOffsets(torch.autograd.Function):
-    """Gaussians with offsets, None for what stays as it is; the gradient fills and copies no arrays
-    of all of them."""
+    """``apply_offsets`` for autograd; None for unchanged tensors, to avoid gradients of size N."""
 
     @staticmethod
     def forward(
@@ -258,8 +251,8 @@ class _AddOffsets(torch.autograd.Function):
             x if by is None else x.contiguous().clone() for x, by in zip(own, offsets, strict=True)
         ]
         add_offsets_(copies, rows, offsets)
-        turned = () if offsets[1] is None else (quats, offsets[1])
-        ctx.save_for_backward(*([] if rows is None else [rows]), *turned)
+        quat_offsets = () if offsets[1] is None else (quats, offsets[1])
+        ctx.save_for_backward(*([] if rows is None else [rows]), *quat_offsets)
         ctx.has_rows, ctx.count = rows is not None, len(means) if rows is None else len(rows)
         return tuple(None if by is None else x for x, by in zip(copies, offsets, strict=True))
 
@@ -273,13 +266,12 @@ class _AddOffsets(torch.autograd.Function):
 
 
 def select_rows(x: Tensor, rows: Tensor | None) -> Tensor:
-    """Return the ``rows`` of ``x``; all for None."""
+    """Return the ``rows`` of ``x``; None: all."""
     return x if rows is None else x.index_select(0, rows)
 
 
 class Decoder:
-    """A multilayer perceptron whose last layer starts at zero; layer ``skip`` sees the features
-    once more."""
+    """A multilayer perceptron with a zero last layer; layer ``skip`` gets the features again."""
 
     def __init__(
         self,
@@ -293,7 +285,7 @@ class Decoder:
         self.skip = skip
 
     def start_values(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """Return weights after Glorot and Bengio 2010 and zero biases; the last layer all zero."""
+        """Return Glorot weights (Glorot and Bengio 2010) and zero biases; the last layer is zero."""
         values: dict[str, Tensor] = {}
         last = len(self.widths) - 2
         for i in range(last + 1):
@@ -313,7 +305,7 @@ class Decoder:
 
 
 def head_sizes(options: FieldSection) -> Mapping[str, int]:
-    """Return the number of outputs of each head of ``Offsets`` by name, in order."""
+    """Return the output size of each head of ``Offsets`` by name, in order."""
     heads = {
         "rotations": ("quats", 4),
         "scales": ("log_scales", 3),
@@ -324,13 +316,13 @@ def head_sizes(options: FieldSection) -> Mapping[str, int]:
 
 
 def split_heads(outputs: Tensor, options: FieldSection) -> Offsets:
-    """Return the outputs (M, K) of the heads by name."""
-    return offsets_of(outputs[:, :3], outputs[:, 3:], head_sizes(options))
+    """Split the decoder outputs (M, K) into the heads of ``Offsets``."""
+    return build_offsets(outputs[:, :3], outputs[:, 3:], head_sizes(options))
 
 
-def offsets_of(means: Tensor, values: Tensor, heads: Mapping[str, int]) -> Offsets:
-    """Return offsets with ``means`` (M, 3), and the ``values`` (M, D) of all other ``heads`` by
-    name."""
+def build_offsets(means: Tensor, values: Tensor, heads: Mapping[str, int]) -> Offsets:
+    """Build offsets from ``means`` (M, 3) and the concatenated ``values`` (M, D) of all other
+    heads."""
     sizes = {name: size for name, size in heads.items() if name != "means"}
     parts = dict(zip(sizes, values.split(list(sizes.values()), dim=1), strict=True))
     if "logit_opacities" in parts:

@@ -1,4 +1,4 @@
-"""Deformation fields from the configuration, new or from a checkpoint, and the windows in time around them."""
+"""Creation and restoration of deformation fields, and opacity windows in time around them."""
 
 from __future__ import annotations
 
@@ -21,42 +21,41 @@ from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.adam import Count
 
-EDGE = 0.05  # Time over which the logit falls by 1 outside of a window, in units of the clip
-# Edges by which an open window is longer than the clip, at either end: slopes can still be felt
+EDGE_WIDTH = 0.05  # time over which the logit falls by 1 outside a window, in units of the clip
+# Edges by which an open window exceeds the clip at either end, so that gradients do not vanish.
 MARGIN = 3.0
-OPEN = -MARGIN * EDGE, 1 + MARGIN * EDGE
+OPEN_WINDOW = -MARGIN * EDGE_WIDTH, 1 + MARGIN * EDGE_WIDTH
 LR, LR_DECAY = 1e-2, 0.1
 
 
 class WindowedField(OuterField):
-    """The offsets of ``others``, and the window of each of M Gaussians added to the logit of its
-    opacity.
+    """A field that adds a window in time to the opacity logits of an inner field's M Gaussians.
 
-    w(t) = log s((t - a) / e) + log s((b - t) / e), less what it is where a window is open: s is the
-    logistic function, a and b, the ``edges`` (M, 2), are where the window begins and ends.
+    w(t) = log s((t - a) / e) + log s((b - t) / e), minus the value of an open window. s is the
+    logistic function; a and b, the ``edges`` (M, 2), are start and end of the window.
     """
 
     can_fade = True
 
     def __init__(self, inner_field: DeformationField, num_moving: int) -> None:
         super().__init__(inner_field)
-        edges = torch.tensor(OPEN, device="cpu").expand(num_moving, 2)
+        edges = torch.tensor(OPEN_WINDOW, device="cpu").expand(num_moving, 2)
         self.parameters = Parameters({"edges": edges}, {"edges": LR}, LR_DECAY, Role.PER_MOVING)
 
     @property
     def edges(self) -> Tensor:
         return self.parameters["edges"]
 
-    def changed(self, found: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
+    def modify(self, offsets: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
         edges = select_rows(self.edges, rows)
-        window = _window(edges, time) - _window(edges.new_tensor([OPEN]), time)
-        logits = window if found.logit_opacities is None else found.logit_opacities + window
-        return replace(found, logit_opacities=logits)
+        window = _window(edges, time) - _window(edges.new_tensor([OPEN_WINDOW]), time)
+        logits = window if offsets.logit_opacities is None else offsets.logit_opacities + window
+        return replace(offsets, logit_opacities=logits)
 
     def step(self, step: int, progress: float) -> Count:
         count = super().step(step, progress)
-        self.edges.data[:, 0].clamp_min_(OPEN[0])
-        self.edges.data[:, 1].clamp_max_(OPEN[1])
+        self.edges.data[:, 0].clamp_min_(OPEN_WINDOW[0])
+        self.edges.data[:, 1].clamp_max_(OPEN_WINDOW[1])
         return count
 
     def apply_edit(self, edit: TopologyEdit) -> WindowedField:
@@ -71,21 +70,22 @@ class WindowedField(OuterField):
 
     @staticmethod
     def from_state(inner_field: DeformationField, tensors: Mapping[str, Tensor]) -> WindowedField:
-        """Return the field of a state within the restored ``others``; raises as ``restored``."""
+        """Return the windows in a state around the restored ``inner_field``; errors as for
+        ``with_state``."""
         field = WindowedField(inner_field, inner_field.setup.num_moving)
         field.parameters = field.parameters.with_state(tensors)
         return field
 
 
 def _window(edges: Tensor, time: float) -> Tensor:
-    inside = torch.stack([time - edges[:, 0], edges[:, 1] - time], dim=1) / EDGE
+    inside = torch.stack([time - edges[:, 0], edges[:, 1] - time], dim=1) / EDGE_WIDTH
     return torch.nn.functional.logsigmoid(inside).sum(1)
 
 
 def create_field(
     options: DeformField, setup: FieldSetup, generator: torch.Generator
 ) -> DeformationField:
-    """Return an untrained field of the kind asked for: every Gaussian stays where it is."""
+    """Create an untrained field: all offsets are zero."""
     kinds: dict[type, Callable[[Any, FieldSetup, torch.Generator], DeformationField]] = {
         HexplaneField: Hexplane,
         MlpField: Mlp,
@@ -96,7 +96,7 @@ def create_field(
 
 
 def num_values(options: DeformField, num_times: int, num_moving: int = 0) -> int:
-    """Return the number of values that a field learns for so many Gaussians that move."""
+    """Return the number of trained values of a field for ``num_moving`` Gaussians."""
     setup = FieldSetup(
         torch.zeros(3, device="cpu"), torch.ones(3, device="cpu"), num_times, num_moving, 1.0
     )
@@ -104,7 +104,7 @@ def num_values(options: DeformField, num_times: int, num_moving: int = 0) -> int
 
 
 def field_state(field: DeformationField) -> State:
-    """Return the state that ``restored_field`` needs, by name."""
+    """Return the state for ``restore_field`` by name."""
     box = torch.stack([field.setup.center, field.setup.half_size])
     numbers = torch.tensor(
         [field.setup.num_times, field.setup.extent], dtype=torch.float64, device="cpu"
@@ -115,7 +115,7 @@ def field_state(field: DeformationField) -> State:
 def restore_field(
     options: DeformField, tensors: Mapping[str, Tensor], num_moving: int
 ) -> DeformationField:
-    """Return the field of a checkpoint for M moving Gaussians."""
+    """Return the field in a checkpoint for M moving Gaussians."""
     num_times, extent = require_positive(
         "numbers", require_tensor("numbers", tensors["numbers"], (2,), None)
     ).tolist()

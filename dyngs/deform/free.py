@@ -1,10 +1,8 @@
-"""Free primitives: each moving Gaussian has its own moment, span and velocity, and is not there
-before and after.
+"""Free primitives: each moving Gaussian has its own time, lifetime and velocity.
 
-After FreeTimeGS (Wang et al. 2025), with windows that are added to the logit of the opacity, so
-that what is opaque is equally so for most of its span. Nothing ties one time to another: what comes
-and goes, changes shape or travels by more than its own size is learned from the views of its times
-alone, which should be several.
+After FreeTimeGS (Wang et al. 2025). Windows are added to the opacity logits, so that opaque
+Gaussians stay opaque for most of their lifetime. Nothing links time steps: objects that appear,
+change shape or move fast are learned from the views at their time alone, which should be several.
 """
 
 from __future__ import annotations
@@ -23,24 +21,25 @@ from dyngs.deform.keys import COPIES_OF_MOVING, FreeField
 from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.optimizer import Parameters
 
-SHORTEST = 0.25  # Least span, in gaps between times: less would flicker between them
-SHIFT = 0.5  # Spans by which a new Gaussian is earlier or later than the one it descends from
+MIN_SPAN = 0.25  # shortest lifetime in time steps; shorter ones would flicker
+TIME_SHIFT = 0.5  # lifetimes by which a new Gaussian is shifted in time from its source
 LR_CENTERS, LR_SPANS, LR_VELOCITIES = 0.01, 0.01, 1e-4
-"""Learning rates: in gaps between times, of the logarithm, in scene extents per gap."""
-LR_DECAY = 0.1  # Ratio of the last to the first learning rate
-FIRST_SPAN = 0.6  # Of a Gaussian at a single time, in gaps: at 1.3 of them it is half as opaque
-OTHERS_SPAN = 0.25  # Of Gaussians that may belong to any time, in units of the clip
-FAINT = -2.2
-"""Logit of the opacity, 0.1, at which copies of static Gaussians begin where there are moments:
-most are ghosts."""
+"""Learning rates: centres in time steps, log lifetimes, velocities in scene extents per time step.
+"""
+LR_DECAY = 0.1  # ratio of the last to the first learning rate
+FIRST_SPAN = 0.6  # lifetime of a Gaussian at a single time, in time steps; half opaque after 1.3
+RANDOM_SPAN = 0.25  # lifetime of random Gaussians, in units of the clip
+FAINT_LOGIT = -2.2
+"""Initial opacity logit (opacity 0.1) of copies of static Gaussians, if there are timed Gaussians.
+"""
 NAMES = "centers", "origins", "log_spans", "velocities"
 
 
 class FreePrimitives(DeformationField):
     """x(t) = x + v (t - o) and logit(t) = logit - (t - c)^2 / (2 d^2) for each of M Gaussians.
 
-    c is the centre of its window, d the span, v the velocity; o, the time at which it is at its
-    canonical place, is not learned: a window may shift without its path.
+    c is the centre of its window, d the lifetime, v the velocity. o, the time of its canonical
+    position, is not trained, so that the window can shift without the path.
     """
 
     has_lifetime = can_fade = True
@@ -63,27 +62,27 @@ class FreePrimitives(DeformationField):
             select_rows(self.parameters[name], rows) for name in NAMES
         )
         shift = velocities * (time - origins.detach())
-        spans = log_spans.exp() + SHORTEST * self.gap
+        spans = log_spans.exp() + MIN_SPAN * self.gap
         window = -0.5 * ((time - centers) / spans).square()
         return Offsets(shift, logit_opacities=window[:, 0])
 
     def apply_edit(self, edit: TopologyEdit) -> FreePrimitives:
-        """Return the field after an edit; new rows are earlier and later in turn than those they
-        descend from."""
+        """Return the field after a topology edit; new rows are shifted in time, alternately back
+        and forth."""
         parameters = self.parameters.apply_edit(Role.PER_MOVING, edit)
         new = torch.nonzero(edit.is_new)[:, 0]
         if len(new):
-            # two of one source get both signs
+            # two copies of one source get opposite signs
             ordered = new[edit.source[new].sort(stable=True).indices]
             signs = torch.ones(len(new), 1, device=new.device)
             signs[::2] = -1
-            spans = parameters["log_spans"].data[ordered].exp() + SHORTEST * self.gap
+            spans = parameters["log_spans"].data[ordered].exp() + MIN_SPAN * self.gap
             centers = parameters["centers"].data
-            centers[ordered] = (centers[ordered] + SHIFT * spans * signs).clamp(0, 1)
+            centers[ordered] = (centers[ordered] + TIME_SHIFT * spans * signs).clamp(0, 1)
         return self.with_parameters(parameters)
 
     def _untrained(self, centers: Tensor, spans: Tensor, velocities: Tensor) -> Parameters:
-        log_spans = (spans - SHORTEST * self.gap).clamp_min(1e-3 * self.gap).log()
+        log_spans = (spans - MIN_SPAN * self.gap).clamp_min(1e-3 * self.gap).log()
         tensors = {
             "centers": centers,
             "origins": centers.clone(),
@@ -101,42 +100,46 @@ class FreePrimitives(DeformationField):
 
 @dataclass(frozen=True)
 class FreeInitialization:
-    """Gaussians to add when motion begins, and windows of all M that move: those of the static
-    model come first."""
+    """Gaussians that are added when motion starts, and windows of all M moving Gaussians.
 
-    logits: Tensor  # (M0,) opacities of those that the static model has, from now on
+    The moving Gaussians of the static model come first.
+    """
+
+    logits: Tensor  # (M0,) new opacity logits of the moving Gaussians of the static model
     added: tuple[Gaussians, ...]
-    centers: Tensor  # (M,) in units of the clip
-    spans: Tensor  # (M,)
+    centers: Tensor  # (M,) centre of the window, in units of the clip
+    spans: Tensor  # (M,) lifetime, in units of the clip
     velocities: Tensor  # (M, 3) world units per clip
 
 
 def initialize_free(
     static: Gaussians, timed_gaussians: Sequence[TimedGaussians], others: Gaussians, num_times: int
 ) -> FreeInitialization:
-    """Return copies of the M ``still`` Gaussians that move, the Gaussians of ``moments``, and
-    ``others``.
+    """Initialise free primitives: copies of the moving ``static`` Gaussians, timed and random
+    Gaussians.
 
-    Of the first there are so many that each is there for a part of the clip only; those of moments
-    are there for about a gap between times, ``others`` for a quarter of the clip, somewhere.
+    The copies split the clip evenly. Timed Gaussians last about one time step, ``others`` a
+    quarter of the clip, at evenly spaced times.
     """
     copies = min(num_times, max(COPIES_OF_MOVING // max(len(static), 1), 1))
     faint = static.replace(
-        logit_opacities=static.logit_opacities.clamp_max(FAINT if timed_gaussians else math.inf)
+        logit_opacities=static.logit_opacities.clamp_max(
+            FAINT_LOGIT if timed_gaussians else math.inf
+        )
     )
-    resting = torch.zeros(3, device="cpu")
-    parts = [TimedGaussians((i + 0.5) / copies, faint, resting) for i in range(copies)]
+    no_motion = torch.zeros(3, device="cpu")
+    parts = [TimedGaussians((i + 0.5) / copies, faint, no_motion) for i in range(copies)]
     groups = [*parts, *timed_gaussians]
     sizes = torch.tensor([len(one.gaussians) for one in groups], device="cpu")
     centers = torch.tensor([one.time for one in groups], device="cpu")
     spans = torch.full_like(centers, FIRST_SPAN / max(num_times - 1, 1))
     spans[:copies] = 1 / copies
     velocities = torch.stack([one.velocity for one in groups]).repeat_interleave(sizes, dim=0)
-    rest = torch.linspace(0, 1, len(others), device="cpu")
+    other_times = torch.linspace(0, 1, len(others), device="cpu")
     return FreeInitialization(
         faint.logit_opacities,
         (*(one.gaussians for one in groups[1:]), others),
-        torch.cat([centers.repeat_interleave(sizes), rest]),
-        torch.cat([spans.repeat_interleave(sizes), torch.full_like(rest, OTHERS_SPAN)]),
+        torch.cat([centers.repeat_interleave(sizes), other_times]),
+        torch.cat([spans.repeat_interleave(sizes), torch.full_like(other_times, RANDOM_SPAN)]),
         torch.cat([velocities, torch.zeros(len(others), 3, device="cpu")]),
     )

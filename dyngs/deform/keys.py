@@ -1,4 +1,4 @@
-"""Section ``model`` of moving scenes, and the deformation fields of ``model.deform``."""
+"""Config section ``model`` of dynamic scenes, and the deformation fields of ``model.deform``."""
 
 from __future__ import annotations
 
@@ -9,32 +9,32 @@ from pydantic import Field, model_validator
 from dyngs.core.section import Fraction, Positive, SceneModel, Section
 
 COPIES_OF_MOVING = 12_000
-"""Copies over time of what moves in a static model, at most, that free primitives begin with."""
+"""Most copies over time of the moving Gaussians that free primitives start with."""
 
 
 Attribute = Literal["rotations", "scales", "opacities", "colors"]
 
 
 class FieldSection(Section):
-    """Key that deformation fields share."""
+    """Key shared by deformation fields."""
 
     moves: tuple[Attribute, ...] = Field(
         default=("rotations", "scales"),
-        description="what changes over time besides positions; with opacities things may appear and disappear",
+        description="attributes that change over time besides positions; opacities let objects appear and disappear",
     )
 
     @model_validator(mode="before")
     @classmethod
     def _read_flags(cls, given: Any) -> Any:
-        """Read runs of earlier versions, which had a flag for each: ``move_rotations`` and so on."""
+        """Read configs of earlier versions with one flag per attribute (``move_rotations``)."""
         flags = (
             {k: given[k] for k in given if k.startswith("move_")} if isinstance(given, dict) else {}
         )
         if not flags:
             return given
-        usual = given.get("moves", cls.model_fields["moves"].default)
+        default = given.get("moves", cls.model_fields["moves"].default)
         moves = [
-            x for x in get_args(Attribute) if flags.get(f"move_{x}", x in usual) in (True, "true")
+            x for x in get_args(Attribute) if flags.get(f"move_{x}", x in default) in (True, "true")
         ]
         return {k: x for k, x in given.items() if k not in flags} | {"moves": moves}
 
@@ -53,7 +53,7 @@ class HexplaneField(FieldSection):
     levels: tuple[Annotated[int, Field(ge=1)], ...] = Field(
         default=(1, 2),
         min_length=1,
-        description="one set of planes for each, with so many times that resolution",
+        description="multiples of the resolution, one set of planes each",
     )
     width: int = Field(default=64, ge=1, description="neurons per hidden layer of the decoder")
     depth: int = Field(default=1, ge=1, description="hidden layers of the decoder before the heads")
@@ -66,11 +66,11 @@ class HexplaneField(FieldSection):
 
 
 class MlpField(FieldSection):
-    """A multilayer perceptron on encoded position and time (Deformable-3DGS, Yang et al. 2024)."""
+    """An MLP on encoded position and time (Deformable-3DGS, Yang et al. 2024)."""
 
     kind: Literal["mlp"] = Field(
         default="mlp",
-        description="a perceptron on encoded position and time (Deformable-3DGS); slow on a CPU",
+        description="an MLP on encoded position and time (Deformable-3DGS); slow on a CPU",
     )
     depth: int = Field(default=8, ge=2, description="hidden layers")
     width: int = Field(default=256, ge=1, description="neurons per hidden layer")
@@ -78,38 +78,36 @@ class MlpField(FieldSection):
 
 
 class ControlNodesField(FieldSection):
-    """Control nodes that move along splines, which Gaussians around them follow (after SC-GS, Huang
-    et al. 2024)."""
+    """Control nodes on splines that nearby Gaussians follow (after SC-GS, Huang et al. 2024)."""
 
     kind: Literal["control_nodes"] = Field(
         default="control_nodes",
-        description="sparse control nodes on cubic splines, which Gaussians follow (after SC-GS); no network",
+        description="sparse control nodes on cubic splines that Gaussians follow (after SC-GS); no network",
     )
     nodes: int = Field(default=512, ge=1, description="number of control nodes")
     pieces: int = Field(
         default=0,
         ge=0,
-        description="polynomial pieces of each spline; 0: 0.3 times the number of training times",
+        description="polynomial pieces per spline; 0: 0.3 times the number of training times",
     )
     lr_means: Positive = Field(
-        default=6e-4, description="learning rate of the nodes' places, times the scene extent"
+        default=6e-4, description="learning rate of the node positions, times the scene extent"
     )
     rigidity: float = Field(
         default=0.5,
         ge=0,
-        description="weight of the as-rigid-as-possible term: squared strain between neighbouring nodes, in node "
-        "spacings; lower where things bend",
+        description="weight of the as-rigid-as-possible loss: squared strain between neighbouring nodes, in node "
+        "spacings; lower it for objects that bend",
     )
 
 
 class FreeField(Section):
-    """Gaussians that each have a moment, a span and a velocity of their own (after FreeTimeGS, Wang
-    et al. 2025)."""
+    """Gaussians with their own time, lifetime and velocity (FreeTimeGS, Wang et al. 2025)."""
 
     kind: Literal["free"] = Field(
         default="free",
-        description="each moving Gaussian has a moment, a span and a velocity of its own (after FreeTimeGS); for views "
-        "of several cameras at each time",
+        description="each moving Gaussian has its own time, lifetime and velocity (after FreeTimeGS); needs several "
+        "cameras at each time",
     )
 
 
@@ -117,57 +115,59 @@ DeformField = HexplaneField | MlpField | ControlNodesField | FreeField
 
 
 MIN_STATIC_STEPS = 1000
-"""Steps that a static model needs to show where it fails; short runs spend at most a third on
-it."""
+"""Steps of the static model before motion; short runs spend at most a third of their steps."""
 
 
 class DynamicModel(SceneModel):
-    """Canonical Gaussians and a deformation field over time (docs/dynamic.md)."""
+    """Canonical Gaussians and a deformation field over time (docs/concepts/motion.md)."""
 
     kind: Literal["dynamic"] = Field(
         default="dynamic",
-        description="canonical Gaussians and a deformation field over time (docs/dynamic.md)",
+        description="canonical Gaussians and a deformation field over time (`dyngs docs motion`)",
     )
     deform: Annotated[
         DeformField,
-        Field(discriminator="kind", description="how the canonical Gaussians are moved over time"),
+        Field(
+            discriminator="kind", description="deformation field that moves the canonical Gaussians"
+        ),
     ] = HexplaneField()
     pilot_runs: bool = Field(
         default=False,
-        description="whether pilot runs decide, on held-out training views, if the scene is trained "
-        "as a static scene and, unless set, its colour representation",
+        description="decide by short pilot runs, compared on held-out training views, whether to model motion "
+        "(else the scene is trained as with the preset static) and, if not requested, the colour "
+        "model (`dyngs docs motion`)",
     )
     motion_from: Fraction = Field(
         default=0.13,
-        description="fraction of the run after which motion is learned; until then a static model is trained on all "
-        "views, for 1000 steps or a third of the run at least (coarse stage of 4DGS)",
+        description="fraction of the run after which motion is trained; before, a static model is trained on all views "
+        "(coarse stage of 4DGS), for at least 1000 steps or a third of the run",
     )
     motion_threshold: float = Field(
         default=0.04,
         ge=0,
-        description="colour error (0 to 1) of the static model from which Gaussians are taken to move",
+        description="colour error (0 to 1) of the static model from which Gaussians are treated as moving",
     )
     num_random_moving: int = Field(
         default=4000,
         ge=0,
-        description="Gaussians that are added among the moving ones when motion begins: random ones, or, for free "
-        "primitives before fixed cameras, at most so many on things and as many on surfaces",
+        description="moving Gaussians added when motion starts: random ones, or, for free primitives with "
+        "fixed cameras, at most this many on moving objects and as many on changing surfaces",
     )
     time_window: Fraction = Field(
         default=1.0,
-        description="fraction of the training views, around the middle of the clip, that motion is first learned on; "
-        "1: all at once",
+        description="fraction of the training views, around the middle of the clip, that motion is first trained on; "
+        "1: all",
     )
     time_window_grows_from: Fraction = Field(
-        default=0.0, description="fraction of the run after which more views are added to these"
+        default=0.0, description="fraction of the run after which the time window grows"
     )
     time_window_full_at: Fraction = Field(
-        default=0.5, description="fraction of the run after which all views are trained on"
+        default=0.5, description="fraction of the run after which the time window covers all views"
     )
     freeze_below_px: float = Field(
         default=0.3,
         ge=0,
-        description="Gaussians that move by less than this many px in the nearest training view are frozen; 0: none",
+        description="Gaussians that move less than this many px in the nearest training view are frozen; 0: none",
     )
     motion_sparsity: float = Field(
         default=0.01,
@@ -187,5 +187,5 @@ class DynamicModel(SceneModel):
 
     @property
     def bytes_per_moving_gaussian(self) -> int:
-        # features from space-time grids, or neurons of a network, of each Gaussian
+        # activations per Gaussian of space-time grids or networks
         return 200 if isinstance(self.deform, (ControlNodesField, FreeField)) else 2000

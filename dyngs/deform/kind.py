@@ -1,4 +1,4 @@
-"""The kind ``dynamic``: Gaussians that a field moves over time."""
+"""Model kind ``dynamic``: Gaussians moved by a deformation field."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 
 class DynamicKind(HasSizeLimit, HasMotion, HasSchedules):
-    """See the module."""
+    """Dynamic scenes of Gaussians."""
 
     def refusal(self, capture: Capture) -> str | None:
         if len({view.time for view in capture.splits["train"]}) > 1:
             return None
         return (
-            "the images have no times, so nothing can move; train configs/static.yaml, or add a time to each image "
-            "(docs/formats.md), or give data.times=order if their names are in the order of time"
+            "the images have no times; train configs/static.yaml, add a time to each image "
+            "(`dyngs docs captures`), or set data.times=order if the file names are in temporal order"
         )
 
     def functions(self) -> tuple[Start, Restore]:

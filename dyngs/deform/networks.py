@@ -1,4 +1,4 @@
-"""Fields that are networks: HexPlane (4DGS: Wu et al. 2024) and a perceptron (Deformable-3DGS: Yang et al. 2024)."""
+"""Network fields: HexPlane (4DGS, Wu et al. 2024) and an MLP (Deformable-3DGS, Yang et al. 2024)."""
 
 from __future__ import annotations
 
@@ -21,21 +21,22 @@ from dyngs.deform.keys import HexplaneField, MlpField
 from dyngs.gaussians.optimizer import Parameters
 from dyngs.ops.planes import PlaneLevel, hexplane_features, plane_penalty
 
-WEIGHTS = (1e-4, 0.01, 1e-4)
-"""Of the smoothness of space planes, of that along time, and of the sparsity of planes with time
-(Wu et al.)."""
-LR_DECAY = 0.01  # Ratio of the last to the first learning rate
+PENALTY_WEIGHTS = (1e-4, 0.01, 1e-4)
+"""Weights of the smoothness of space planes, smoothness along time, and sparsity of time planes.
+
+From Wu et al.
+"""
+LR_DECAY = 0.01  # ratio of the last to the first learning rate
 SPACE_RANGE = (0.1, 0.5)
-"""Planes over space start uniformly in it, those with time at 1 (Wu et al.): the product does not
-depend on time."""
+"""Space planes start uniformly in this range, time planes at 1, so that features do not depend on
+time."""
 
 
 class Hexplane(DeformationField):
-    """Features from six planes per level, decoded into offsets.
+    """Features from six planes per level, decoded into offsets (4DGS).
 
-    Time covers the planes' whole range, and the decoder's last layer starts at zero, so that the
-    field starts as the identity. Each head has as many hidden units as the trunk; the last layer
-    may mix them (in Wu et al. it is block-diagonal).
+    Time spans the whole range of the planes. The decoder's last layer starts at zero, so that the
+    field starts as the identity. The last layer may mix the heads (block-diagonal in Wu et al.).
     """
 
     def __init__(
@@ -69,16 +70,16 @@ class Hexplane(DeformationField):
         ]
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
-        coords = self.setup.normalized(select_rows(means.detach(), rows))
+        coords = self.setup.normalize(select_rows(means.detach(), rows))
         features = hexplane_features(coords, time, self.levels)
         return split_heads(self.decoder(features, self.parameters), self.options)
 
     def penalties(self, time: float) -> dict[str, Tensor]:
-        return {"plane smoothness": plane_penalty(self.levels, WEIGHTS)}
+        return {"plane smoothness": plane_penalty(self.levels, PENALTY_WEIGHTS)}
 
     @torch.no_grad()
     def extend(self, seen: tuple[float, float], soon: tuple[float, float]) -> None:
-        """Copy the outermost rows of time that have been trained to those that will be next."""
+        """Copy the outermost trained time rows to the rows of the next window."""
         for level in self.levels:
             planes = level.time.data
             last = level.time.shape[1] - 1
@@ -88,17 +89,17 @@ class Hexplane(DeformationField):
             planes[:, high + 1 : math.ceil(soon[1] * last) + 1] = planes[:, high, None]
 
 
-SPACE_FREQUENCIES, TIME_FREQUENCIES = 10, 6  # Octaves of the positional encodings
-MLP_LR_DECAY = 0.002  # Ratio of the last to the first learning rate
-# The input is fed once more into this layer (counted from 0), where there are that many hidden ones
+SPACE_FREQUENCIES, TIME_FREQUENCIES = 10, 6  # octaves of the positional encodings
+MLP_LR_DECAY = 0.002  # ratio of the last to the first learning rate
+# This layer (counted from 0) gets the input again, in networks that are deep enough.
 SKIP_LAYER = 5
 
 
 class Mlp(DeformationField):
-    """Offsets by a deep network; starts as the identity, because its last layer starts at zero.
+    """Offsets from a deep network on encoded position and time (Deformable-3DGS).
 
-    Differs from Deformable-3DGS in two small ways: time is encoded like position instead of by a
-    network of its own, and scales change in the logarithm, so that they stay positive.
+    Unlike the paper, time is encoded like position instead of by its own network, and scales
+    change in the logarithm, so that they stay positive. The last layer starts at zero.
     """
 
     def __init__(self, options: MlpField, setup: FieldSetup, generator: torch.Generator) -> None:
@@ -111,16 +112,15 @@ class Mlp(DeformationField):
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
         space = encode_frequencies(
-            self.setup.normalized(select_rows(means.detach(), rows)), SPACE_FREQUENCIES
+            self.setup.normalize(select_rows(means.detach(), rows)), SPACE_FREQUENCIES
         )
-        moment = encode_frequencies(space.new_full((1, 1), time), TIME_FREQUENCIES)
-        features = torch.cat([space, moment.expand(len(space), -1)], dim=1)
+        encoded_time = encode_frequencies(space.new_full((1, 1), time), TIME_FREQUENCIES)
+        features = torch.cat([space, encoded_time.expand(len(space), -1)], dim=1)
         return split_heads(self.decoder(features, self.parameters), self.options)
 
 
 def encode_frequencies(x: Tensor, num_frequencies: int) -> Tensor:
-    """Return (M, D * (1 + 2 L)) ``x`` (M, D) and its sines and cosines at L octaves (NeRF:
-    Mildenhall et al. 2020)."""
+    """Return ``x`` (M, D) with sines and cosines at L octaves, (M, D * (1 + 2 L)) (NeRF)."""
     octaves = 2.0 ** torch.arange(num_frequencies, dtype=x.dtype, device=x.device)
     angles = (x[:, None, :] * octaves[:, None]).flatten(1)
     return torch.cat([x, angles.sin(), angles.cos()], dim=1)

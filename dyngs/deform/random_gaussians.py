@@ -1,4 +1,4 @@
-"""Faint Gaussians at random points of a scene, for moving things that a static model has lost."""
+"""Faint random Gaussians, for moving objects that the static model does not contain."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from torch import Tensor
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 
 BOX_MARGIN = 1.1
-SCALE = 0.3  # Standard deviation of each, as a fraction of the distance between them
-LOGIT = -2.2  # Opacity 0.1, as all Gaussians begin
-SOLID = 0.05  # Opacity from which a Gaussian counts for the bounding box
+SCALE = 0.3  # standard deviation, relative to the mean distance
+LOGIT = -2.2  # opacity 0.1, the initial opacity of 3DGS
+MIN_OPACITY = 0.05  # opacity from which a Gaussian counts for the bounding box
 
 
 def random_gaussians(
     gaussians: Gaussians, count: int, extent: float, generator: torch.Generator
 ) -> Gaussians:
-    """Return ``count`` faint grey Gaussians at random points of the box of ``gaussians``."""
+    """Create ``count`` faint grey Gaussians at random positions in the box of ``gaussians``."""
     center, half_size = box_of(gaussians, extent)
     unit = torch.rand((count, 3), generator=generator, device="cpu").to(center.device)
     places = center + half_size * (2 * unit - 1)
@@ -30,8 +30,7 @@ def random_gaussians(
 
 
 def with_gaussians(gaussians: Gaussians, added: Sequence[Gaussians]) -> EditResult:
-    """Return the edit that adds ``added``, all of the same degree, on any device, after
-    ``gaussians``."""
+    """Return the edit that appends ``added`` (same SH degree, any device) to ``gaussians``."""
     device = gaussians.means.device
     count = sum(map(len, added))
     old = torch.arange(len(gaussians), device=device)
@@ -44,14 +43,12 @@ def with_gaussians(gaussians: Gaussians, added: Sequence[Gaussians]) -> EditResu
 
 
 def box_of(gaussians: Gaussians, extent: float) -> tuple[Tensor, Tensor]:
-    """Return centre and half sides (3,) of a box a little larger than all opaque Gaussians; no side
-    is zero.
+    """Return centre and half size (3,) of a box around the opaque Gaussians; no half size is zero.
 
-    The outer percent of the Gaussians on either side is left out: there the field is that of the
-    box's border.
+    The outer percent on either side is ignored; outside the box the field is constant.
     """
     now = gaussians.detach()
-    solid = (now.opacities >= SOLID) & now.means.isfinite().all(1)
+    solid = (now.opacities >= MIN_OPACITY) & now.means.isfinite().all(1)
     means = now.means[solid] if bool(solid.any()) else now.means.nan_to_num()
     if not len(means):
         return torch.zeros(3, device=means.device), torch.full((3,), extent, device=means.device)

@@ -1,4 +1,4 @@
-"""The dynamic scene: canonical Gaussians, and a field that moves some of them over time."""
+"""Dynamic scenes: canonical Gaussians of which a deformation field moves some."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _NONE = torch.zeros(0, dtype=torch.long, device="cpu")
 
 @dataclass(frozen=True, kw_only=True)
 class DynamicScene(GaussianScene):
-    """N canonical Gaussians of which a field moves M."""
+    """N canonical Gaussians, of which a field moves M."""
 
     training_times: tuple[float, ...]  # distinct training times in [0, 1], ascending
     field: DeformationField | None = None
-    moving: Tensor = _NONE  # (M,) ascending indices of the Gaussians that it moves
+    moving: Tensor = _NONE  # (M,) ascending indices of the moving Gaussians
     filter_std: Tensor | None = None
 
     @staticmethod
@@ -75,36 +75,35 @@ class DynamicScene(GaussianScene):
         return 0 if self.field is None or self.is_static else self.field.num_values
 
     def time_step(self, time: float | None) -> GaussianTimeStep:
-        """Return all N Gaussians at ``time``, or with masks only those that are seen around then,
-        in their order.
+        """Return the N Gaussians at ``time``; with masks only the visible ones, in their order.
 
-        What does not move is not computed anew.
+        Static Gaussians are not recomputed.
         """
         now = clamp_time(time)
         if self.field is None or self.is_static:
             return GaussianTimeStep(apply_filter(self.gaussians, self.filter_std), now)
-        part = self._drawn_around(now)
-        offsets = self.field.offsets(part.moving_means, now, part.asked)
-        return GaussianTimeStep(part.moved(offsets, self.field, now), now)
+        part = self._visible_around(now)
+        offsets = self.field.offsets(part.moving_means, now, part.visible_rows)
+        return GaussianTimeStep(part.apply(offsets, self.field, now), now)
 
     def in_training(
         self, time: float, *, detach: bool
     ) -> tuple[Gaussians, Offsets, dict[str, Tensor]]:
-        """Return the Gaussians drawn at ``time``, the offsets of those of them that move, and the
-        field's penalties.
+        """Return the Gaussians at ``time``, the offsets of the moving ones, and the field's
+        penalties.
 
-        With ``detach`` gradients reach the field alone, not the canonical Gaussians.
+        With ``detach`` only the field gets gradients, not the canonical Gaussians.
         """
         if self.field is None:
-            raise ValueError("nothing moves")
+            raise ValueError("the scene has no deformation field")
         interval = 0 if self.masks is None else self.masks.interval(time)
-        part = self._selected(self.gaussians.detach() if detach else self.gaussians, interval)
-        if part.asked is None:
+        part = self._select_visible(self.gaussians.detach() if detach else self.gaussians, interval)
+        if part.visible_rows is None:
             offsets, penalties = self.field.in_training(part.moving_means, time)
         else:
-            offsets = self.field.offsets(part.moving_means, time, part.asked)
+            offsets = self.field.offsets(part.moving_means, time, part.visible_rows)
             penalties = self.field.penalties(time)
-        return part.moved(offsets, self.field, time), offsets, penalties
+        return part.apply(offsets, self.field, time), offsets, penalties
 
     def apply_edit(self, edit: TopologyEdit) -> DynamicScene:
         position = torch.full((len(self),), -1, device=self.moving.device)
@@ -130,43 +129,42 @@ class DynamicScene(GaussianScene):
             state["rows"] = StateTensor(self.moving, Role.SHARED)
         return state if self.masks is None else state | add_prefix("masks", self.masks.state())
 
-    def _drawn_around(self, time: float) -> _DrawnPart:
-        """Return the Gaussians drawn around ``time``; without gradients, those of the last mask
-        interval are kept."""
+    def _visible_around(self, time: float) -> _VisiblePart:
+        """Return the visible part around ``time``; without gradients the last one is cached."""
         interval = 0 if self.masks is None else self.masks.interval(time)
         if torch.is_grad_enabled():
-            return self._selected(self.gaussians, interval)
+            return self._select_visible(self.gaussians, interval)
         if interval not in self._derived:
             self._derived.clear()
-            self._derived[interval] = self._selected(self.gaussians, interval)
+            self._derived[interval] = self._select_visible(self.gaussians, interval)
         return self._derived[interval]
 
-    def _selected(self, gaussians: Gaussians, interval: int) -> _DrawnPart:
+    def _select_visible(self, gaussians: Gaussians, interval: int) -> _VisiblePart:
         means = gaussians.means.index_select(0, self.moving)
         if self.masks is None:
             rows = None if len(self.moving) == len(self) else self.moving
-            return _DrawnPart(gaussians, self.filter_std, means, None, rows)
+            return _VisiblePart(gaussians, self.filter_std, means, None, rows)
         active = self.masks.active(interval)
         std = None if self.filter_std is None else self.filter_std[active]
-        asked, rows = intersect_sorted(self.moving, active, len(self))
-        return _DrawnPart(gaussians.picked(active), std, means, asked, rows)
+        visible_rows, rows = intersect_sorted(self.moving, active, len(self))
+        return _VisiblePart(gaussians.picked(active), std, means, visible_rows, rows)
 
 
 def field_scene_of(scene: Renderable) -> DynamicScene | None:
-    """Return ``scene`` if a deformation field moves it, None for any other scene."""
+    """Return ``scene`` if a deformation field moves it, else None."""
     return scene if isinstance(scene, DynamicScene) and not scene.is_static else None
 
 
 @dataclass(frozen=True)
-class _DrawnPart:
-    """Gaussians drawn around a time."""
+class _VisiblePart:
+    """The A Gaussians that are visible around a time."""
 
-    gaussians: Gaussians  # A canonical ones
-    filter_std: Tensor | None  # (A,) of theirs, or None
-    moving_means: Tensor  # (M, 3) canonical means of all that move
-    asked: Tensor | None  # which of the M are drawn; None: all
-    rows: Tensor | None  # their places among the A; None: all of them, in order
+    gaussians: Gaussians  # A canonical Gaussians
+    filter_std: Tensor | None  # (A,) or None
+    moving_means: Tensor  # (M, 3) canonical means of all moving Gaussians
+    visible_rows: Tensor | None  # indices of the visible ones among the M; None: all
+    rows: Tensor | None  # their rows among the A; None: all, in order
 
-    def moved(self, offsets: Offsets, field: DeformationField, time: float) -> Gaussians:
+    def apply(self, offsets: Offsets, field: DeformationField, time: float) -> Gaussians:
         now = apply_filter(apply_offsets(self.gaussians, offsets, self.rows), self.filter_std)
-        return field.apply_shading(now, self.rows, self.asked, time)
+        return field.apply_shading(now, self.rows, self.visible_rows, time)

@@ -1,8 +1,8 @@
-"""The steps at which the phases of a moving scene begin, and the part of a clip that each step trains on.
+"""Training phases of dynamic scenes, and the window of times that each step trains on.
 
-The window of times starts around the middle and grows until it is all. Motion over a whole clip may
-be far larger than the thing that moves. From the few images around one moment a sharp canonical form
-can be had, and a field that has followed it so far needs little to follow it a little farther.
+The window grows from the middle of the clip to all times. Motion over a whole clip may exceed the
+size of the object. A few images around one time give a sharp canonical model, from which the field
+follows small further motion.
 """
 
 from __future__ import annotations
@@ -16,30 +16,28 @@ from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians.schedule import RateSchedule
 from dyngs.models.schedule import LengthChange
 
-SPLITS = (0.1, 0.3, 0.5)
-"""Steps at which static Gaussians are frozen, as fractions of the part of the run that sees all
-times."""
+FREEZE_FRACTIONS = (0.1, 0.3, 0.5)
+"""Steps at which Gaussians are frozen, as fractions of the steps after the window is full."""
 
 
 @dataclass(frozen=True)
 class DeformSchedule:
-    """The steps at which the phases of training begin."""
+    """Steps at which the training phases start."""
 
-    coarse_end: int  # last step without motion
-    # opens, full: steps between which the window of times grows, to all of them
+    coarse_end: int  # last step of the static model
+    # The time window grows between these steps.
     window_grows_from: int
     window_full_at: int
-    decay_from: int  # step from which the field's rates fall
-    freeze_steps: tuple[int, ...]  # steps after which Gaussians that do not move are frozen
+    decay_from: int  # step from which the field's learning rates decay
+    freeze_steps: tuple[int, ...]  # steps after which Gaussians without visible motion are frozen
     rates: RateSchedule
 
 
 def deform_schedule(model: DynamicModel, rates: RateSchedule) -> DeformSchedule:
-    """Return the phases of a dynamic model in a run with ``rates``; ``freeze_below_px`` 0 freezes
-    nothing.
+    """Return the training phases of a dynamic model; with ``freeze_below_px`` 0 nothing is frozen.
 
-    While new times come in, the field learns at its first rate: what has slowed down follows
-    nothing.
+    The learning rate of the field is constant while the window grows, because it must follow new
+    motion.
     """
     steps = rates.steps
     coarse_end = model.motion_start_step(steps)
@@ -47,7 +45,12 @@ def deform_schedule(model: DynamicModel, rates: RateSchedule) -> DeformSchedule:
     window_full_at = max(window_grows_from, round(model.time_window_full_at * steps))
     decay_from = window_full_at if model.time_window < 1 else coarse_end
     freeze_steps = (
-        sorted({window_full_at + round(fraction * (steps - window_full_at)) for fraction in SPLITS})
+        sorted(
+            {
+                window_full_at + round(fraction * (steps - window_full_at))
+                for fraction in FREEZE_FRACTIONS
+            }
+        )
         if model.freeze_below_px > 0
         else []
     )
@@ -58,9 +61,10 @@ def deform_schedule(model: DynamicModel, rates: RateSchedule) -> DeformSchedule:
 
 
 def extend_schedules(model: DynamicModel, length: LengthChange) -> DynamicModel:
-    """Return the section for a run of another length; phases that have begun keep their step.
+    """Return the model section for a run of another length; phases that have started keep their
+    step.
 
-    Raises DyngsError: its motion began too early for that length.
+    Raises DyngsError if motion started too early for the new length.
     """
     old = deform_schedule(model, RateSchedule(length.was))
     fractions = {"motion_from": _motion_from(old, model, length)}
@@ -80,27 +84,25 @@ def extend_schedules(model: DynamicModel, length: LengthChange) -> DynamicModel:
 
 
 def _motion_from(old: DeformSchedule, model: DynamicModel, length: LengthChange) -> float:
-    """Return the share after which motion is learned: the step where it began, else one that is
-    still to come."""
+    """Return the fraction of the run after which motion starts, as it was or at the next step."""
     if length.done >= old.coarse_end:
         return length.kept(old.coarse_end)
     new = deform_schedule(model, RateSchedule(length.steps))
     return length.kept(length.done + 1) if new.coarse_end <= length.done else model.motion_from
 
 
-MIN_VIEWS = 6
+MIN_WINDOW_VIEWS = 6
 MIDDLE = 0.5
 FRONTIER_VIEWS = 6
-"""Number of newest views, at the window's ends, that every other step trains on while the window
-grows."""
+"""Newest views, at the ends of the window, that every other step trains on while it grows."""
 
 
 @dataclass(frozen=True)
 class TimeWindow:
-    """The times that are trained on at each step."""
+    """Times that each step trains on."""
 
     time_offsets: tuple[float, ...]
-    first: float
+    initial_fraction: float
     motion_start: int
     window_grows_from: int
     window_full_at: int
@@ -111,14 +113,14 @@ class TimeWindow:
     @staticmethod
     def around_middle(
         times: Sequence[float],
-        first: float,
+        initial_fraction: float,
         motion_start: int,
         window_grows_from: int,
         window_full_at: int,
     ) -> TimeWindow:
         return TimeWindow(
             tuple(sorted(abs(time - MIDDLE) for time in times)),
-            first,
+            initial_fraction,
             motion_start,
             window_grows_from,
             window_full_at,
@@ -126,7 +128,8 @@ class TimeWindow:
 
     def num_views(self, step: int) -> int:
         start = min(
-            len(self.time_offsets), max(MIN_VIEWS, math.ceil(self.first * len(self.time_offsets)))
+            len(self.time_offsets),
+            max(MIN_WINDOW_VIEWS, math.ceil(self.initial_fraction * len(self.time_offsets))),
         )
         progress = (step - self.window_grows_from) / max(
             self.window_full_at - self.window_grows_from, 1
@@ -144,12 +147,12 @@ class TimeWindow:
         return MIDDLE - reach, MIDDLE + reach
 
     def contains(self, time: float, step: int) -> bool:
-        """Return whether ``time`` is trained on at ``step``; while it grows, every other step takes
-        only new times."""
-        # Not by ``bounds``: their rounding may shut out the very times that the window ends with.
+        """Return whether ``step`` trains on ``time``; frontier steps train on the newest times
+        only."""
+        # ``bounds`` is rounded and could exclude the outermost times.
         if step <= self.motion_start:
             return True
-        if step not in self._limits:  # once, though all views ask
+        if step not in self._limits:  # cached, because all views call this
             oldest = (
                 self.time_offsets[max(self.num_views(step) - FRONTIER_VIEWS, 0)]
                 if self.is_frontier_step(step)
@@ -161,7 +164,7 @@ class TimeWindow:
         return oldest <= abs(time - MIDDLE) <= newest
 
     def is_frontier_step(self, step: int) -> bool:
-        """Return whether ``step`` is for the newest views only: every other one while the window
+        """Return whether ``step`` trains on the newest views only: every other step while it
         grows."""
         return (
             self.window_grows_from < step < self.window_full_at

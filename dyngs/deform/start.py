@@ -1,4 +1,4 @@
-"""The kind of moving scenes: what they begin with, and how they are restored."""
+"""Creation and restoration of dynamic models."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from dyngs.core.errors import DyngsError
 from dyngs.data.times import evenly_spaced
-from dyngs.deform.bodies.paths import FrameStack, one_camera, render_frame_stack
+from dyngs.deform.bodies.paths import FrameStack, order_moving_camera, render_frame_stack
 from dyngs.deform.fixed_cameras.hulls import FixedCameraClip, build_fixed_camera_clip
 from dyngs.deform.keys import DynamicModel
 from dyngs.deform.kind import DYNAMIC
@@ -36,16 +36,18 @@ from dyngs.models.kind import StartContext
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import evaluation_background, training_cameras, training_times
 
-MAX_STANDING = 12  # Fixed cameras from which tracks are found, at most
-MAX_SHOTS = 150  # Images of one moving camera in which bodies are sought, at most
-# Steps of the run for each: those take ten times as long as the search in one image
-STEPS_PER_SHOT = 50
-SECONDS_PER_SHOT = 3.0  # Of train.minutes for each, where that is given, likewise
+MAX_FIXED_CAMERAS = 12  # most fixed cameras in which tracks are searched
+MAX_SEARCHED_IMAGES = 150  # most images of a moving camera in which rigid bodies are searched
+# Training steps per searched image, because the search takes as long as ten steps.
+STEPS_PER_IMAGE = 50
+SECONDS_PER_IMAGE = 3.0  # seconds of ``train.minutes`` per searched image
 
 
 def start(run: StartContext) -> GaussianModel:
-    """Return the model of a moving scene before its first step. Raises DyngsError: there are no
-    times to move in."""
+    """Create the model of a dynamic scene before its first step.
+
+    Raises DyngsError if the images have no times.
+    """
     model = run.config.model
     assert isinstance(model, DynamicModel)
     problem = DYNAMIC.refusal(run.capture)
@@ -62,7 +64,7 @@ def start(run: StartContext) -> GaussianModel:
 
 
 def restore(model: DynamicModel, checkpoint: Checkpoint) -> DynamicScene:
-    """Return the scene of a checkpoint."""
+    """Return the scene in a checkpoint."""
     scene = DynamicScene.from_state(
         model, Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
     )
@@ -85,24 +87,24 @@ def _training_views(
         return None if colours.network is None else colours.network.shader(time)
 
     def errors_of(gaussians_at: Callable[[float], Gaussians]) -> StaticErrors:
-        shown = [images.shrunk(i, divisor) for i in looked_at]
-        sure = SURELY_MOVING * model.motion_threshold
-        return static_errors(gaussians_at, shown, options, background, shader, sure)
+        shown = [images.downscaled(i, divisor) for i in looked_at]
+        mask_error = SURELY_MOVING * model.motion_threshold
+        return static_errors(gaussians_at, shown, options, background, shader, mask_error)
 
     in_place = group_fixed_cameras(views)
 
     def fixed_clips() -> list[FixedCameraClip]:
-        used = [in_place[i] for i in evenly_spaced(len(in_place), MAX_STANDING)]
+        used = [in_place[i] for i in evenly_spaced(len(in_place), MAX_FIXED_CAMERAS)]
         total = sum(map(len, used))
         return [
             build_fixed_camera_clip((images[i] for i in seen), background, total) for seen in used
         ]
 
     def frame_stack(static: Gaussians) -> FrameStack | None:
-        order = one_camera(views)
-        limit = min(MAX_SHOTS, rate_schedule(config).steps // STEPS_PER_SHOT)
+        order = order_moving_camera(views)
+        limit = min(MAX_SEARCHED_IMAGES, rate_schedule(config).steps // STEPS_PER_IMAGE)
         if config.train.minutes is not None:
-            limit = min(limit, int(60 * config.train.minutes / SECONDS_PER_SHOT))
+            limit = min(limit, int(60 * config.train.minutes / SECONDS_PER_IMAGE))
         if order is None or limit == 0 or len(set(images.sizes)) > 1:
             return None
         used = (images[order[i]] for i in evenly_spaced(len(order), limit))

@@ -1,5 +1,4 @@
-"""What may move: errors of a static model in the images, or motion masks that the capture has in
-place of these."""
+"""Motion detection: errors of a static model in the images, or motion masks of the capture."""
 
 from __future__ import annotations
 
@@ -18,22 +17,21 @@ from dyngs.deform.fixed_cameras.hulls import median_image
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, Shader, render
 
-# Difference from the median image, mean over channels, from which a pixel shows something else
-DIFFERS = 0.06
-MIN_SAME = 3  # Fewest images of one camera whose median shows what is still
-# What moves differs from the median in three of ten images or more; what is hidden at times, in
-# fewer
-USUAL = 0.7
-MOMENTS = 8  # Images of one camera that are compared
-SHOWS = 1e-3  # Sum of weights, in pixels, from which a Gaussian counts as visible in an image
+# Difference from the median image (mean over channels) from which a pixel counts as changed.
+CHANGE_THRESHOLD = 0.06
+MIN_SAME = 3  # fewest images of a fixed camera for a median image
+# Moving parts differ from the median in at least three of ten images, occluded parts in fewer.
+TYPICAL_QUANTILE = 0.7
+VIEWS_PER_CAMERA = 8  # images per fixed camera that are compared
+MIN_WEIGHT = 1e-3  # sum of weights, in pixels, from which a Gaussian is visible in an image
 
 
 @dataclass(frozen=True)
 class StaticErrors:
     """Errors of a static scene in the images, per Gaussian."""
 
-    peak: Tensor  # (N,) large where anything moves, be it this Gaussian or what hides it at times
-    typical: Tensor  # (N,) large where this moves
+    peak: Tensor  # (N,) large if anything moves here: this Gaussian or an occluder
+    typical: Tensor  # (N,) large if this Gaussian moves
 
 
 def static_errors(
@@ -42,33 +40,32 @@ def static_errors(
     options: RenderOptions,
     background: Tensor,
     shader_at: Callable[[float], Shader | None] = lambda _: None,
-    sure: float = 1.0,
+    mask_error: float = 1.0,
 ) -> StaticErrors:
-    """Return the errors of a static scene in the images, where each Gaussian is seen.
+    """Compute the errors of a static scene in the images, per Gaussian.
 
-    e_vi = |sum_p w_vip (expected - truth)| / sum_p w_vip with w = alpha T for each image v, a mean
-    over channels. Errors of one view are summed with their sign over what a Gaussian covers: detail
-    that is not yet resolved cancels, a thing that has come or gone does not. Both sums come from
-    passes back through the blending of a constant colour. Masked pixels do not count; a Gaussian
-    that shows nowhere has 0.
+    e_vi = |sum_p w_vip (expected - truth)| / sum_p w_vip with w = alpha T for image v, mean over
+    channels. Signed errors are summed over the pixels of a Gaussian: unresolved detail cancels, an
+    object that appears or disappears does not. Both sums are gradients of the blended image by a
+    constant colour. Masked pixels are ignored; Gaussians that are visible nowhere get 0.
 
-    Where images have motion masks, the error of a pixel is its mask instead, and images without one
-    do not count; ``sure`` is the error of a Gaussian half of which lies in masks. Where cameras stay
-    in place, what is expected of one with ``MIN_SAME`` images or more is their median, which holds
-    whatever is still exactly as it is. In both cases ``most`` is the largest, ``usual`` the
-    ``USUAL`` quantile of e_vi over images in which a Gaussian shows. Else the rendering is expected,
-    and both are the mean, weighted by sum_p w_vip: a still model that is not yet right errs too.
+    The expected image depends on the capture. With motion masks, the error of a pixel is its mask,
+    and images without mask are ignored; ``mask_error`` is the error of a Gaussian that is half
+    inside masks. Fixed cameras with at least ``MIN_SAME`` images use their median image. In both
+    cases ``peak`` is the maximum and ``typical`` the ``TYPICAL_QUANTILE`` of e_vi over the images
+    that show the Gaussian. Otherwise the rendering is expected, and both are the mean weighted by
+    sum_p w_vip, because an unfinished static model errs everywhere.
     """
-    masked = [x for x in images if x.moves is not None]
+    masked = [x for x in images if x.motion_mask is not None]
     expected = {} if masked else _median_images(images, background)
-    looked_at = masked or [x for x in images if _camera_key(x) in expected] or images
-    found: list[tuple[Tensor, Tensor]] = []
-    for image in looked_at:
+    compared = masked or [x for x in images if _camera_key(x) in expected] or images
+    results: list[tuple[Tensor, Tensor]] = []
+    for image in compared:
         time = image.time or 0.0
         gaussians = gaussians_at(time).detach()
         truth = image.composite(background)
-        if image.moves is not None:
-            error = (2 * sure * image.moves)[..., None].expand_as(truth)
+        if image.motion_mask is not None:
+            error = (2 * mask_error * image.motion_mask)[..., None].expand_as(truth)
         elif expected:
             error = expected[_camera_key(image)] - truth
         else:
@@ -85,24 +82,23 @@ def static_errors(
             torch.ones_like(truth) if image.mask is None else image.mask[..., None].expand_as(truth)
         )
         signed, weight = weighted_sums(gaussians, image.cameras, options, [error * counts, counts])
-        found.append((signed.abs().mean(1), weight[:, 0]))
-    errors, weights = (torch.stack(x) for x in zip(*found, strict=True))
+        results.append((signed.abs().mean(1), weight[:, 0]))
+    errors, weights = (torch.stack(x) for x in zip(*results, strict=True))
     if not masked and not expected:
         mean = errors.sum(0) / weights.sum(0).clamp_min(1e-6)
         return StaticErrors(mean, mean)
-    shows = weights > SHOWS
-    ordered = torch.where(shows, errors / weights.clamp_min(SHOWS), 0.0).sort(0, True).values
-    rank = ((1 - USUAL) * shows.sum(0)).long().clamp_max(len(ordered) - 1)
+    shows = weights > MIN_WEIGHT
+    ordered = torch.where(shows, errors / weights.clamp_min(MIN_WEIGHT), 0.0).sort(0, True).values
+    rank = ((1 - TYPICAL_QUANTILE) * shows.sum(0)).long().clamp_max(len(ordered) - 1)
     return StaticErrors(ordered[0], ordered.gather(0, rank[None])[0])
 
 
 def weighted_sums(
     gaussians: Gaussians, cameras: Cameras, options: RenderOptions, images: Sequence[Tensor]
 ) -> list[Tensor]:
-    """Return, for each image (H, W, 3), the (N, 3) sums over its pixels, times the blending weight
-    of each Gaussian.
+    """Return, per image (H, W, 3), the sums (N, 3) over its pixels weighted by each Gaussian.
 
-    By passes back through the blending of a constant colour.
+    Computed as gradients of the blended image by a constant colour.
     """
     flat = torch.zeros(len(gaussians), 1, 3, requires_grad=True, device=gaussians.means.device)
     blended = render(gaussians.replace(sh=flat), cameras, options).rgb[0]
@@ -112,22 +108,22 @@ def weighted_sums(
 
 
 def group_fixed_cameras(views: Sequence[View]) -> list[list[int]]:
-    """Return the indices of the views of each fixed camera that took ``MIN_SAME`` views or more."""
+    """Return the view indices of each fixed camera with at least ``MIN_SAME`` views."""
     return [seen for seen in static_cameras(views) if len(seen) >= MIN_SAME]
 
 
 def select_comparison_views(views: Sequence[View], limit: int = 50) -> list[int]:
-    """Return indices of at most ``limit`` views, evenly chosen; of fixed cameras, ``MOMENTS`` of
-    each or more."""
+    """Return indices of at most ``limit`` evenly spaced views; at least ``MOMENTS`` per fixed
+    camera."""
     cameras = group_fixed_cameras(views)
     if not cameras:
         return evenly_spaced(len(views), limit)
-    chosen = [cameras[i] for i in evenly_spaced(len(cameras), max(limit // MOMENTS, 1))]
+    chosen = [cameras[i] for i in evenly_spaced(len(cameras), max(limit // VIEWS_PER_CAMERA, 1))]
     return [seen[i] for seen in chosen for i in evenly_spaced(len(seen), limit // len(chosen))]
 
 
 def _median_images(images: Sequence[Image], background: Tensor) -> dict[bytes, Tensor]:
-    """Return the median image (H, W, 3) of each camera with enough images."""
+    """Return the median image (H, W, 3) of each fixed camera with enough images."""
     same: dict[bytes, list[Tensor]] = {}
     for image in images:
         same.setdefault(_camera_key(image), []).append(image.composite(background))
@@ -135,7 +131,7 @@ def _median_images(images: Sequence[Image], background: Tensor) -> dict[bytes, T
 
 
 def _camera_key(image: Image) -> bytes:
-    """Return a key that is equal for images from the same camera pose, but for rounding."""
+    """Return a key that is equal for images of the same camera pose, up to rounding."""
     cameras = image.cameras
     return b"".join(
         x.round(decimals=6).cpu().numpy().tobytes()
@@ -144,8 +140,7 @@ def _camera_key(image: Image) -> bytes:
 
 
 def otsu_threshold(scores: Tensor) -> float:
-    """Return the threshold between two groups of ``scores`` (N,) (Otsu 1979); infinite where all
-    are equal."""
+    """Return Otsu's threshold of ``scores`` (N,) (Otsu 1979); infinite if all scores are equal."""
     from skimage.filters import threshold_otsu
 
     if not len(scores) or float(scores.min()) == float(scores.max()):
@@ -157,8 +152,8 @@ def otsu_threshold(scores: Tensor) -> float:
 def changed_fraction(cameras: Sequence[Sequence[Tensor]]) -> float:
     """Return the fraction of pixels that differ from the median image of their camera.
 
-    Each image is first brought to the brightness of the median (changing exposure is no motion) and
-    averaged over 2x2 pixels, against noise.
+    Images are first matched to the median in brightness, because exposure changes are not motion,
+    and averaged over 2x2 pixels against noise.
     """
     differing = total = 0
     for images in cameras:
@@ -167,6 +162,6 @@ def changed_fraction(cameras: Sequence[Sequence[Tensor]]) -> float:
         for image in smooth:
             gap = image - typical
             gap = gap - gap.flatten(1).median(1).values[:, None, None]
-            differing += int((gap.abs().mean(0) > DIFFERS).sum())
+            differing += int((gap.abs().mean(0) > CHANGE_THRESHOLD).sum())
             total += gap[0].numel()
     return differing / max(total, 1)

@@ -1,8 +1,7 @@
-"""Training of a dynamic scene.
+"""Training of dynamic scenes.
 
-Training goes through three phases: coarse (nothing moves), fine (the field moves all Gaussians),
-and from the first split on the field moves only those whose motion can be seen; the others are
-frozen and cost nothing more.
+Three phases: coarse (a static model), fine (the field moves all selected Gaussians), and frozen:
+Gaussians without visible motion become static and are skipped by the field.
 """
 
 from __future__ import annotations
@@ -38,41 +37,41 @@ from dyngs.gaussians.scene import GaussianTimeStep
 from dyngs.ops.adam import Count
 
 PX_PER_OPACITY = 6.0
-"""A change of opacity, or of a colour in units of SH, by x counts as much as a motion by 6 x
-pixels."""
+"""Pixels of motion that a change of opacity, or of an SH coefficient, by 1 counts as."""
 
 
 @torch.no_grad()
 def measure_motion(
     field: DeformationField, gaussians: Gaussians, times: Sequence[float], px_size: Tensor
 ) -> tuple[Tensor, Offsets]:
-    """Return the motion of M Gaussians over ``times``, of which at most 24 are looked
-    at, evenly chosen: (M,) in pixels, and the means of the offsets.
+    """Return the motion (M,) of Gaussians in pixels over ``times``, and their mean offsets.
 
-    The score is max_t |x_t - mean| + s (2 |q_t - mean| + max_axis |log s_t - mean|) over the size
-    of a pixel, s being the Gaussian's longest standard deviation, plus ``PX_PER_OPACITY`` times the
-    change of opacity and colour. A pixel covers ``px_size`` (M,) world units in the nearest
+    At most 24 times are sampled. The score is max_t |x_t - mean| + s (2 |q_t - mean| + max_axis
+    |log s_t - mean|) in pixels, where s is the longest standard deviation, plus ``PX_PER_OPACITY``
+    times the change of opacity and colour. ``px_size`` (M,): world units per pixel in the nearest
     training view.
     """
     picked = torch.linspace(0, len(times) - 1, min(len(times), 24), device="cpu").round().long()
     samples = [field.offsets(gaussians.means, times[i]) for i in picked.tolist()]
     heads = [
-        [x for x in found if x is not None]
-        for found in zip(*(vars(s).values() for s in samples), strict=True)
+        [x for x in head if x is not None]
+        for head in zip(*(vars(s).values() for s in samples), strict=True)
     ]
-    means = [torch.stack(found).mean(0) if found else None for found in heads]
+    means = [torch.stack(head).mean(0) if head else None for head in heads]
     mean = Offsets(*means)  # type: ignore[arg-type]
     longest = gaussians.scales.amax(1)
     score = torch.zeros_like(longest)
-    nothing = torch.zeros_like(gaussians.quats)
+    no_rotation = torch.zeros_like(gaussians.quats)
     for sample in samples:
-        apart: dict[str, Tensor] = {
-            name: nothing if x is None else x - getattr(mean, name)
+        deviations: dict[str, Tensor] = {
+            name: no_rotation if x is None else x - getattr(mean, name)
             for name, x in vars(sample).items()
         }
-        stray = apart["means"].norm(dim=1) + 2 * longest * apart["quats"][:, 1:].norm(dim=1)
-        stray = stray + longest * apart["log_scales"].abs().amax(1)
-        pixels = stray / px_size + PX_PER_OPACITY * apart["colors"].abs().amax(1)
+        displacement = deviations["means"].norm(dim=1) + 2 * longest * deviations["quats"][
+            :, 1:
+        ].norm(dim=1)
+        displacement = displacement + longest * deviations["log_scales"].abs().amax(1)
+        pixels = displacement / px_size + PX_PER_OPACITY * deviations["colors"].abs().amax(1)
         if sample.logit_opacities is not None and mean.logit_opacities is not None:
             now = (gaussians.logit_opacities + sample.logit_opacities).sigmoid()
             typical = (gaussians.logit_opacities + mean.logit_opacities).sigmoid()
@@ -83,39 +82,41 @@ def measure_motion(
 
 @torch.no_grad()
 def bake_(gaussians: Gaussians, rows: Tensor, offsets: Offsets) -> None:
-    """Apply ``offsets`` to ``rows`` (R,) of ``gaussians`` for good, in place."""
+    """Add ``offsets`` to the ``rows`` (R,) of ``gaussians`` permanently, in place."""
     moved = apply_offsets(gaussians.detach(), offsets, rows).tensors()
     for name, x in gaussians.tensors().items():
         x.data.copy_(moved[name])
 
 
-SURELY_MOVING = 1.5  # Multiple of ``motion_threshold`` above which an error always counts as motion
-SURELY_STILL = 0.25
-"""Multiple of ``motion_threshold`` below which an error counts as still, where cameras stay in
-place."""
-# Fraction of surely moving Gaussians up to which the scene counts as still
+# multiple of ``motion_threshold`` above which an error always counts as motion
+SURELY_MOVING = 1.5
+SURELY_STATIC = 0.25
+"""Multiple of ``motion_threshold`` below which Gaussians are frozen, with fixed cameras."""
+# Fraction of surely moving Gaussians up to which the scene is static.
 MIN_MOVING_FRACTION = 0.02
 
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """Properties of the capture that training a dynamic scene needs."""
+    """Training views of a dynamic scene."""
 
-    times: tuple[float, ...]  # of the training views, in [0, 1], ascending; at least two differ
+    # of the training views, in [0, 1], ascending; at least two distinct times
+    times: tuple[float, ...]
     cameras: Sequence[Cameras]
     extent: float
-    # how far its images disagree with what is still, where N Gaussians are seen
+    # Computes the errors of a static scene, given its Gaussians at a time.
     static_errors: Callable[[Callable[[float], Gaussians]], StaticErrors]
-    has_fixed_cameras: bool = False  # in place, so that images show what is still exactly alike
-    fixed_clips: Callable[[], Sequence[FixedCameraClip]] = tuple  # returns what those cameras show
-    # what one moving camera shows, against N Gaussians that stand still; None where there is no
-    # such camera
+    has_fixed_cameras: bool = False  # fixed cameras show static parts unchanged
+    # returns the clips of the fixed cameras
+    fixed_clips: Callable[[], Sequence[FixedCameraClip]] = tuple
+    # Returns the images of one moving camera and the renderings of N static Gaussians; None if no
+    # single moving camera took the images.
     frame_stack: Callable[[Gaussians], FrameStack | None] = lambda _: None
-    options: RenderOptions = field(default_factory=RenderOptions)  # how training images are drawn
+    options: RenderOptions = field(default_factory=RenderOptions)  # of training images
 
 
 class DynamicTraining(SceneTraining[DynamicScene]):
-    """See ``SceneTraining``."""
+    """Training of a dynamic scene, see ``SceneTraining``."""
 
     deformation_name = ("field", "model.deform")
 
@@ -130,12 +131,14 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         self.options, self.schedule, self.capture = options, schedule, capture
         self._is_free = isinstance(options.deform, FreeField)
         self.times = tuple(sorted(set(capture.times)))
-        self._see_all(False)
+        self._set_time_window(False)
         self._update, self._generator = update, generator
 
     def first_scene(self, gaussians: Gaussians) -> DynamicScene:
         return DynamicScene(
-            gaussians=gaussians, training_times=self.times, filter_std=self._update.of(gaussians)
+            gaussians=gaussians,
+            training_times=self.times,
+            filter_std=self._update.compute(gaussians),
         )
 
     def trains_on(self, time: float | None, step: int) -> bool:
@@ -172,31 +175,32 @@ class DynamicTraining(SceneTraining[DynamicScene]):
 
     def after_step(self, scene: DynamicScene, step: int, edited: bool) -> DynamicScene:
         if self._update.is_due(step, edited):
-            scene = replace(scene, filter_std=self._update.of(scene.gaussians))
+            scene = replace(scene, filter_std=self._update.compute(scene.gaussians))
         if scene.field is None:
             return scene
         if edited:
             scene.field.invalidate()
         scene.field.extend(self._window.bounds(step), self._window.bounds(step + 1))
-        scene = self._windowed(scene, step)
-        return self._frozen(scene) if step in self.schedule.freeze_steps else scene
+        scene = self._add_windows(scene, step)
+        return self._freeze_static(scene) if step in self.schedule.freeze_steps else scene
 
     def edit_scene(self, scene: DynamicScene, step: int) -> tuple[DynamicScene, EditResult] | None:
-        """Return the scene with Gaussians to begin motion with; None where a static model explains
-        all."""
+        """Add the Gaussians that motion starts with; None if a static model explains all images."""
         if step != self.schedule.coarse_end:
             return None
         now = scene.gaussians
-        found = self.capture.static_errors(lambda _: now)
+        errors = self.capture.static_errors(lambda _: now)
         floor = self.options.motion_threshold
-        errs = bool((found.peak > SURELY_MOVING * floor).float().mean() > MIN_MOVING_FRACTION)
-        threshold = min(max(otsu_threshold(found.typical), floor), SURELY_MOVING * floor)
-        rows = torch.nonzero(found.typical > threshold)[:, 0]
-        first = self._first_motion(now.detach())
-        if not errs and not first.timed_gaussians:
+        has_errors = bool(
+            (errors.peak > SURELY_MOVING * floor).float().mean() > MIN_MOVING_FRACTION
+        )
+        threshold = min(max(otsu_threshold(errors.typical), floor), SURELY_MOVING * floor)
+        rows = torch.nonzero(errors.typical > threshold)[:, 0]
+        first = self._find_initial_motion(now.detach())
+        if not has_errors and not first.timed_gaussians:
             return None
-        bodies = self._first_bodies(now.detach())
-        added, start = self._begun(now.detach(), rows, first, bodies)
+        bodies = self._find_bodies(now.detach())
+        added, start = self._build_added(now.detach(), rows, first, bodies)
         message = first.message if bodies is None else bodies.message
         result = replace(with_gaussians(now.detach(), added), message=message)
         if start is not None:
@@ -209,52 +213,51 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         if isinstance(field, FreePrimitives) and start is not None:
             field = field.with_initialization(start)
         if bodies is not None:
-            field = bodies.within(field)
-            self._see_all(bodies.explains_all_motion)
-        std = self._update.of(gaussians)
+            field = bodies.build_field(field)
+            self._set_time_window(bodies.explains_all_motion)
+        std = self._update.compute(gaussians)
         field = field.to(now.means.device)
         return replace(
             scene, gaussians=gaussians, field=field, moving=moving, filter_std=std
         ), result
 
     def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> DynamicScene:
-        self._see_all("all_times" in tensors)
+        self._set_time_window("all_times" in tensors)
         return DynamicScene.from_state(self.options, gaussians, tensors)
 
     def state(self) -> State:
         return (
             with_role({"all_times": torch.ones(1, device="cpu")}, Role.TRAINING)
-            if self._sees_all
+            if self._all_times
             else {}
         )
 
-    def _see_all(self, at_once: bool) -> None:
-        """Train on all times from the first if ``at_once``: nothing need be followed outwards."""
-        first = 1.0 if at_once or self._is_free else self.options.time_window
+    def _set_time_window(self, all_times: bool) -> None:
+        """Set the time window: all times at once if ``all_times``, else growing from the middle."""
+        first = 1.0 if all_times or self._is_free else self.options.time_window
         phases = (
             self.schedule.coarse_end,
             self.schedule.window_grows_from,
             self.schedule.window_full_at,
         )
-        self._sees_all = at_once
+        self._all_times = all_times
         self._window = TimeWindow.around_middle(self.capture.times, first, *phases)
 
-    def _first_bodies(self, static: Gaussians) -> Bodies | None:
-        """Return what moves rigidly before one moving camera."""
+    def _find_bodies(self, static: Gaussians) -> Bodies | None:
+        """Find rigid bodies in the images of one moving camera."""
         frame_stack = None if self._is_free else self.capture.frame_stack(static)
         if frame_stack is None:
             return None
         return find_bodies(frame_stack, self.options.num_random_moving, static.sh.shape[1])
 
-    def _begun(
+    def _build_added(
         self,
         now: Gaussians,
         rows: Tensor,
         first: InitialMotion,
         bodies: Bodies | None,
     ) -> tuple[Sequence[Gaussians], FreeInitialization | None]:
-        """Return the Gaussians to add when motion begins, and the windows of all that move where
-        these have some."""
+        """Return the Gaussians to add when motion starts, and the windows of free primitives."""
         is_explained = first.timed_gaussians or (bodies and bodies.explains_all_motion)
         count = 0 if is_explained else self.options.num_random_moving
         added = random_gaussians(now, count, self.capture.extent, self._generator)
@@ -264,8 +267,8 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         start = initialize_free(static, first.timed_gaussians, others, len(self.times))
         return start.added, start
 
-    def _first_motion(self, static: Gaussians) -> InitialMotion:
-        """Return what changes before fixed cameras, for a field that can begin there."""
+    def _find_initial_motion(self, static: Gaussians) -> InitialMotion:
+        """Find motion in front of fixed cameras, for free primitives."""
         if not self._is_free:
             return InitialMotion()
         capture = self.capture
@@ -275,9 +278,8 @@ class DynamicTraining(SceneTraining[DynamicScene]):
             capture.fixed_clips(), static, capture.extent, limit, capture.options
         )
 
-    def _windowed(self, scene: DynamicScene, step: int) -> DynamicScene:
-        """Return the scene in which what follows nodes may be there for a part of the clip, once
-        all times are seen."""
+    def _add_windows(self, scene: DynamicScene, step: int) -> DynamicScene:
+        """Add opacity windows around control nodes once all times are trained on."""
         field = scene.field
         if step != max(self.schedule.window_full_at, self.schedule.coarse_end + 1) or field is None:
             return scene
@@ -286,9 +288,8 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         open_ = WindowedField(field, len(scene.moving)).to(scene.moving.device)
         return replace(scene, field=open_)
 
-    def _frozen(self, scene: DynamicScene) -> DynamicScene:
-        """Return the scene in which Gaussians whose motion is too small to be seen no longer
-        move."""
+    def _freeze_static(self, scene: DynamicScene) -> DynamicScene:
+        """Freeze the Gaussians whose motion is too small to be visible."""
         field = scene.field
         now = scene.gaussians.detach()
         if field is None:
@@ -300,15 +301,14 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         moves = pixels >= self.options.freeze_below_px
         if self.capture.has_fixed_cameras:
             means = now.means[scene.moving]
-            seen = self.capture.static_errors(
+            errors = self.capture.static_errors(
                 lambda time: apply_offsets(now, field.offsets(means, time), scene.moving)
             )
-            moves &= seen.typical[scene.moving] > SURELY_STILL * self.options.motion_threshold
-        return _with_frozen(scene, mean, ~moves)
+            moves &= errors.typical[scene.moving] > SURELY_STATIC * self.options.motion_threshold
+        return _freeze(scene, mean, ~moves)
 
     def _sparsity(self, offsets: Offsets) -> dict[str, Tensor]:
-        """Return the mean motion as a penalty: what need not move should not. Windows are short
-        instead."""
+        """Return the mean displacement as a regularisation term; free primitives have none."""
         if self.options.motion_sparsity == 0 or self._is_free or not len(offsets.means):
             return {}
         tiny = 1e-6 * self.capture.extent
@@ -316,9 +316,8 @@ class DynamicTraining(SceneTraining[DynamicScene]):
         return {"motion sparsity": length * (self.options.motion_sparsity / self.capture.extent)}
 
 
-def _with_frozen(scene: DynamicScene, mean: Offsets, stays: Tensor) -> DynamicScene:
-    """Return the scene in which those of the moving Gaussians that ``stays`` (M,) names stand still
-    at ``mean``."""
+def _freeze(scene: DynamicScene, mean: Offsets, stays: Tensor) -> DynamicScene:
+    """Freeze the moving Gaussians where ``stays`` (M,) is true, at their ``mean`` offsets."""
     static = torch.nonzero(stays)[:, 0]
     kept = torch.nonzero(~stays)[:, 0]
     bake_(scene.gaussians, scene.moving[static], mean.select(static))

@@ -124,7 +124,7 @@ def load_split_images(
     images = ImageLoader(views, run.config.data)
     found = load_camera_corrections(run_dir, run, capture.splits["train"])
     if found is not None:
-        images.corrected = lambda index, cameras: found.correct_cameras(
+        images.camera_correction = lambda index, cameras: found.correct_cameras(
             images.views[index], cameras
         )
     return images
@@ -133,7 +133,7 @@ def load_split_images(
 @dataclass(frozen=True, kw_only=True)
 class EvalReport:
     """The report that ``dyngs eval`` prints and writes; the fields are the keys of the file, see
-    docs/formats.md."""
+    docs/reference/runs.md."""
 
     split: str
     num_views: int

@@ -100,9 +100,9 @@ class Regions:
 
     def moving(self, image: Image) -> Tensor | None:
         """Return (H, W) bool, the pixels in which something moves; None where that is not known."""
-        if image.moves is not None:
+        if image.motion_mask is not None:
             self._moving_from.add("motion masks")
-            return image.moves >= 0.5
+            return image.motion_mask >= 0.5
         indices = self._cameras.get(image.name)
         if indices is None:
             return None

@@ -1,5 +1,7 @@
-"""Camera paths for rendering: their scene times, JSON files (docs/camera_paths.md) of dyngs and of
-other programs, and the interpolation of keyframes."""
+"""Camera paths for rendering: scene times, JSON files of dyngs and of other programs, keyframes.
+
+The file format is described in docs/reference/camera-paths.md.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,15 @@ import torch
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, format_one_line
-from dyngs.data.geometry import from_opengl_pose, validate_pose, invert_rigid, pinhole_matrix
-from dyngs.io.fields import entry, as_float_array, is_number, parse_numbers, read_json, require_at_most
+from dyngs.data.geometry import from_opengl_pose, invert_rigid, pinhole_matrix, validate_pose
+from dyngs.io.fields import (
+    as_float_array,
+    is_number,
+    parse_numbers,
+    read_json,
+    require_at_most,
+    require_key,
+)
 
 _MAX_FRAMES = 100_000
 """A longer path is taken for a typing mistake."""
@@ -84,7 +93,7 @@ def camera_path_file(path: str) -> Path | None:
     if not path.endswith(".json"):
         names = ", ".join(AUTOMATIC_PATHS)
         raise DyngsError(
-            f"no camera path {path!r}; use {names}, or a .json file (docs/camera_paths.md)"
+            f"no camera path {path!r}; use {names}, or a .json file (`dyngs docs camera-paths`)"
         )
     return Path(path)
 
@@ -112,7 +121,7 @@ def parse_times(text: str) -> tuple[float, ...]:
 def read_path(
     file: Path, world_offset: np.ndarray | None = None, size: tuple[int, int] | None = None
 ) -> CameraPath:
-    """Read a camera path from a JSON file (docs/camera_paths.md); cameras are float32 on the CPU.
+    """Read a camera path from a JSON file, see docs/reference/camera-paths.md.
 
     The file is in the coordinates of the capture, the returned cameras are in the world rebased by
     ``world_offset`` (3,), ``Capture.world_offset``. ``size``: of the images, for files without one.
@@ -163,7 +172,7 @@ def _as_document(found: Any, file: Path) -> tuple[dict[str, Any], tuple[str, ...
     if isinstance(found, list):
         return {"frames": [_frame_of_3dgs(x, f"{file}: [{i}]") for i, x in enumerate(found)]}, ()
     if not isinstance(found, dict):
-        raise DyngsError(f"{file}: a camera path is a JSON object; see docs/camera_paths.md")
+        raise DyngsError(f"{file}: a camera path is a JSON object; see `dyngs docs camera-paths`")
     kind = str(found.get("camera_type", found.get("camera_model")))
     panoramic = ("fisheye", "equirectangular", "spherical", "omni", "vr180")
     if any(name in kind.lower() for name in panoramic):
@@ -184,7 +193,7 @@ def _of_nerfstudio(found: dict[str, Any], file: Path) -> dict[str, Any]:
     frames = []
     for i, view in enumerate(views if isinstance(views, list) else []):
         where = f"{file}: camera_path[{i}]"
-        pose = entry(where, view, "camera_to_world")
+        pose = require_key(where, view, "camera_to_world")
         half = math.radians(_number(view, "fov", where, 0.01, 179)) / 2
         frame = {"transform_matrix": pose, "fl_x": 0.5 * height / math.tan(half)}
         frames.append(frame | {"time": view["render_time"]} if "render_time" in view else frame)
@@ -196,10 +205,12 @@ def _frame_of_3dgs(view: object, where: str) -> dict[str, Any]:
     """Return a frame of a cameras.json, which holds places and rotations of cameras in the
     world."""
     pose = np.eye(4)
-    pose[:3, :3] = parse_numbers(f"{where}: 'rotation'", entry(where, view, "rotation"), (3, 3))
-    pose[:3, 3] = parse_numbers(f"{where}: 'position'", entry(where, view, "position"), (3,))
+    pose[:3, :3] = parse_numbers(
+        f"{where}: 'rotation'", require_key(where, view, "rotation"), (3, 3)
+    )
+    pose[:3, 3] = parse_numbers(f"{where}: 'position'", require_key(where, view, "position"), (3,))
     names = {"w": "width", "h": "height", "fl_x": "fx", "fl_y": "fy"}
-    others = {key: entry(where, view, name) for key, name in names.items()}
+    others = {key: require_key(where, view, name) for key, name in names.items()}
     return {"cam_from_world": invert_rigid(pose), **others}
 
 

@@ -59,7 +59,7 @@ def _frame(view: View, folder: Path, capture: Capture, world: Similarity) -> dic
     pose = to_opengl_pose(view.cam_from_world)
     pose[:3, :3] = world.rotation @ pose[:3, :3]
     pose[:3, 3] = world.points(pose[:3, 3])
-    first, last = capture.span or (0.0, 1.0)
+    first, last = capture.file_time_span or (0.0, 1.0)
     lens = view.lens
     matrix = view.intrinsics
     model, names = {

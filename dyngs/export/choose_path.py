@@ -40,7 +40,7 @@ class PathOptions:
     """Cameras and times to render."""
 
     # "orbit", "spiral", "along" (the training cameras), a JSON file of cameras
-    # (docs/camera_paths.md), or None: one fixed camera
+    # (docs/reference/camera-paths.md), or None: one fixed camera
     path: str | None = "orbit"
     # frames of a path that is not a file; None: as many as a motion has, else 120
     num_frames: int | None = None

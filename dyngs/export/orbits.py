@@ -11,14 +11,14 @@ import torch
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.geometry import (
+    cameras_at_poses,
+    estimate_focus,
     fraction_in_front,
     look_at,
-    estimate_focus,
     perpendicular,
     pinhole_matrix,
     unit,
     up_direction,
-    with_poses,
     world_from_cam,
 )
 from dyngs.export.camera_paths import CameraPath
@@ -110,7 +110,7 @@ def _on_circle(
 
 
 def _looking_at(cameras: Cameras, eyes: np.ndarray, target: np.ndarray, up: np.ndarray) -> Cameras:
-    return with_poses(cameras, np.stack([look_at(eye, target, up) for eye in eyes]))
+    return cameras_at_poses(cameras, np.stack([look_at(eye, target, up) for eye in eyes]))
 
 
 def spiral_path(cameras: Cameras, num_frames: int, up: np.ndarray | None = None) -> Cameras:
@@ -194,7 +194,7 @@ def path_along(
         seconds = seconds[order]
         if (np.diff(seconds) > 0).all():
             steps = np.linspace(seconds[0], seconds[-1], num_frames)
-            smooth = with_poses(cameras, _smoothed(poses[order], seconds, steps, up))
+            smooth = cameras_at_poses(cameras, _smoothed(poses[order], seconds, steps, up))
             return CameraPath(smooth, times=tuple(steps.tolist()))
     # Distances of these six numbers are those between the images: place, and viewing direction
     # times the distance of what is looked at.
@@ -209,7 +209,7 @@ def path_along(
     lengths = np.linalg.norm(np.diff(features[visited], axis=0), axis=1)
     way = np.concatenate([[0.0], np.cumsum(lengths)])
     smooth = _smoothed(poses[visited], way, np.linspace(0, way[-1], num_frames), up)
-    return CameraPath(with_poses(cameras, smooth))
+    return CameraPath(cameras_at_poses(cameras, smooth))
 
 
 def _walk(features: np.ndarray) -> np.ndarray:

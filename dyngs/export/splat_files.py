@@ -24,10 +24,10 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.formats import (
     SOG_INDEX,
     WrittenFile,
-    fitted,
     format_by_name,
-    transform_file,
+    limit_to_format,
     rotate_file,
+    transform_file,
     write_splats,
 )
 from dyngs.io.formats.gltf import EXTENSION, add_gaussians
@@ -35,16 +35,16 @@ from dyngs.io.formats.similarity import (
     AXES,
     IDENTITY,
     Similarity,
-    parse_axis,
     nearest_axis,
+    parse_axis,
     rotation_between,
 )
 from dyngs.io.formats.sog import sog_parts
 from dyngs.io.formats.splat_file import (
     SplatFile,
-    drawable,
     from_linear,
     header_comments,
+    make_renderable,
     offset_notes,
     require_writable,
     unit_rotations,
@@ -259,7 +259,7 @@ def write_run_levels(
     """
     collect_inputs(opened).require_output(folder)
     splat = splats_at(opened, scene_part(opened.scene, part), time, how)
-    whole, notes = fitted(folder, format_by_name("sog"), splat, how.sh_degree)
+    whole, notes = limit_to_format(folder, format_by_name("sog"), splat, how.sh_degree)
     return write_sog_levels(folder, whole), notes
 
 
@@ -301,7 +301,9 @@ def splats_at(
     gaussians = opened.file_unit.gaussians(gaussians.detach())
     splat = SplatFile(gaussians, model.rasterize_mode, model.eps2d, (x, y, z), tuple(comments))
     if opened.edited is not None:
-        splat = transform_file(splat, opened.frame.after(opened.file_unit.inverse()), opened.edited.up)
+        splat = transform_file(
+            splat, opened.frame.after(opened.file_unit.inverse()), opened.edited.up
+        )
     splat = rotate_file(splat, how.turn, how.up)
     return splat if how.edit == IDENTITY else transform_file(splat, how.edit, how.up)
 
@@ -407,7 +409,9 @@ def write_4dgs(
         *offset_notes(splats[0], "4dgs cannot state it"),
     )
     if any(bool(splat.gaussians.sh[:, 1:].any()) for splat in splats):
-        notes += ("harmonics above degree 0 are left out: .4dgs holds none of moving Gaussians",)
+        notes += (
+            "SH coefficients above degree 0 are dropped: .4dgs stores none for moving Gaussians",
+        )
     return splats, notes
 
 
@@ -422,7 +426,7 @@ def read_4dgs_frame(path: Path, index: int) -> SplatFile:
     sh = ((found["rgb"] - 0.5) / SH_C0)[:, None]
     quats = found["rotations"][:, [3, 0, 1, 2]]
     gaussians = from_linear(found["centers"], quats, found["scales"], found["opacity"], sh)
-    return drawable(SplatFile(gaussians), path, "error")
+    return make_renderable(SplatFile(gaussians), path, "error")
 
 
 def _fourdgs(path: Path) -> tuple[Any, Any, Any]:
@@ -496,7 +500,7 @@ def write_rigid_bodies(
     notes = (
         f"bodies: {len(channels) // 2}, which turn for {opened.seconds:.1f} s in the colours of time {time:g}",
         f"all else and shadows stand as at time {time:g}; a sequence has their motion",
-        *offset_notes(splat, "the file states it"),
+        *offset_notes(splat, "stored in the file"),
     )
     return WrittenFile(path, splat, notes)
 

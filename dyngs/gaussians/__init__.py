@@ -1,5 +1,4 @@
-"""Shared by all Gaussian models: values, rendering, initialisation, densification, colour,
-Adam."""
+"""Code shared by all Gaussian models: rendering, initialisation, densification, colour, optimiser."""
 
 from __future__ import annotations
 
@@ -13,11 +12,12 @@ from dyngs.core.gaussians import TopologyEdit as TopologyEdit
 
 @dataclass(frozen=True)
 class EditResult:
-    """A change of the set of Gaussians and of their values."""
+    """A topology edit and new values of the Gaussians after it."""
 
-    edit: TopologyEdit | None  # how rows move; None where all stay in place
-    # field name to its new values (N_new, ...), for the fields that are not just rows moved
+    edit: TopologyEdit | None  # source row of every new row; None: the topology does not change
+    # new values (N_new, ...) by field name, for fields that are not simply gathered from source
+    # rows
     changes: dict[str, Tensor] = field(default_factory=dict[str, Tensor])
-    # fields whose optimizer moments start anew in every row
+    # fields whose Adam moments are reset to zero in every row
     zero_moments: frozenset[str] = frozenset()
-    message: str | None = None  # a line for people about why, or None
+    message: str | None = None  # log message that explains the edit, or None

@@ -1,7 +1,6 @@
-"""Adding and removing Gaussians: clone, split and prune by the gradient of the 2D means (3DGS,
-AbsGS).
+"""Densification strategies: clone, split and prune by 2D gradients (3DGS, AbsGS), and 3DGS-MCMC.
 
-``Densifier`` is what a model asks of any strategy; the other one is in ``mcmc.py``.
+``Densifier`` is the interface of all strategies.
 """
 
 from __future__ import annotations
@@ -18,33 +17,33 @@ from dyngs.core.tensor_checks import require_tensor
 from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.ops.quaternions import rotate
 
-DENSE_FRACTION = 0.01  # Scale, in reaches, up to which Gaussians are cloned; larger ones are split
-# Scale, in reaches, from which Gaussians are removed after the first opacity reset
+# relative to the reference length: smaller Gaussians are cloned, larger split
+DENSE_FRACTION = 0.01
+# Relative to the reference length: larger Gaussians are pruned after the first opacity reset.
 PRUNE_SCALE = 0.1
-FAR = 5.0  # Distance, in scene extents, from which a Gaussian is far
+FAR = 5.0  # scene extents; the reference length of Gaussians beyond is their distance
 SPLIT_SHRINK = 1.6
 RESET_OPACITY = 0.01
-MAX_LOG_VARIANCE = 60.0  # Random offsets stay finite whatever the scales
+MAX_LOG_VARIANCE = 60.0  # keeps random offsets finite for any scale
 
 
 @dataclass(frozen=True)
 class DensifySchedule:
-    """The steps at which the set of Gaussians changes, in steps of this run (already scaled with
-    its length)."""
+    """Steps of densification, already scaled to the length of the run."""
 
-    # start, stop: changes happen strictly between the two
+    # Densification happens strictly between ``start`` and ``stop``.
     start: int
     stop: int
     every: int
     resets: tuple[int, ...] = ()
-    prune_scale_after: int = 0  # from this step on, Gaussians that are too large are removed
+    prune_scale_after: int = 0  # too large Gaussians are pruned from this step on
 
     def densifies_at(self, step: int) -> bool:
         return self.start < step < self.stop and step % self.every == 0
 
 
 class Densifier:
-    """A strategy that changes the set of Gaussians during training; this one leaves it as it is."""
+    """Interface of densification strategies; this base class changes nothing."""
 
     def needs_gradient(self, step: int) -> bool:
         """Return whether ``after_backward`` needs the gradient of the 2D means at ``step``."""
@@ -53,12 +52,12 @@ class Densifier:
     def after_backward(
         self, step: int, probe_grad: Tensor, radii: Tensor, size: tuple[int, int]
     ) -> None:
-        """Take in the probe's gradient (V, N, 4) and radii (V, N, 2) of images of ``size`` (width,
-        height)."""
+        """Accumulate the probe's gradient (V, N, 4) and radii (V, N, 2) of images of ``size``
+        (width, height)."""
 
     def tallies(self, step: int, count: int) -> list[Tensor]:
-        """Return what ``step`` has taken in of N = ``count`` Gaussians; processes that share it sum
-        it in place."""
+        """Return the sums of ``step`` over N = ``count`` Gaussians; processes all-reduce them in
+        place."""
         return []
 
     def edit(
@@ -68,45 +67,45 @@ class Densifier:
         return None
 
     def regularizers(self, parameters: Gaussians) -> dict[str, Tensor]:
-        """Return differentiable scalars, already weighted, that are added to the loss, by name."""
+        """Return weighted regularisation terms of the loss by name."""
         return {}
 
     def perturb(self, parameters: Gaussians, lr_means: float, generator: torch.Generator) -> None:
-        """Add the strategy's noise to the parameters, in place, after the optimizer's step."""
+        """Add the noise of the strategy to the parameters in place, after the optimiser step."""
 
-    def place(self, device: torch.device) -> None:
-        """Go on on ``device``."""
+    def move_to(self, device: torch.device) -> None:
+        """Move the state to ``device``."""
 
     def limit(self, max_gaussians: int) -> None:
-        """Limit the number of Gaussians from now on; none are removed. Not part of the state."""
+        """Set the maximum number of Gaussians from now on; existing ones stay. Not part of the
+        state."""
 
     def state(self) -> dict[str, Tensor]:
         return {}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore the state that ``state()`` returned."""
+        """Restore a state that ``state()`` returned."""
 
 
 class DefaultDensifier(Densifier):
-    """Clone, split and prune by the mean norm of the 2D mean's gradient over the views that saw a
-    Gaussian (3DGS).
+    """Clone, split and prune by the mean 2D gradient norm over the views that see a Gaussian
+    (3DGS).
 
-    Small Gaussians with a large gradient are copied, large ones replaced by two samples of
-    themselves, transparent and (later) huge ones removed; opacities are lowered now and then. At
-    least one Gaussian is always left. Where the cap ``max_gaussians`` leaves no room for all, those
-    with the largest gradients go first.
+    Small Gaussians with a large gradient are cloned, large ones split in two. Transparent and,
+    after the first reset, too large ones are pruned. Opacities are reset at intervals. At least
+    one Gaussian remains. If ``max_gaussians`` is reached, the largest gradients are served first.
 
-    What is large is judged by the reach of a Gaussian: the scene extent, or of what is ``FAR`` its
-    distance from ``center`` (3,), the mean of the cameras. 3DGS takes the extent for all, and so
-    removes sky and far hills, which need Gaussians as large as they are far.
+    Sizes are relative to a reference length: the scene extent, or the distance from ``center``
+    (3,), the mean camera position, for Gaussians beyond ``FAR`` extents. 3DGS uses the extent for
+    all Gaussians and so prunes sky and distant hills.
     """
 
     def __init__(
         self, options: DefaultStrategy, schedule: DensifySchedule, extent: float, center: Tensor
     ) -> None:
         self.options, self.schedule, self.extent, self.center = options, schedule, extent, center
-        # (2, N) sums of the gradient norms, and numbers of views: of the steps since the last edit,
-        # and of this step
+        # (2, N) sums of gradient norms and numbers of views: since the last edit, and of this
+        # step.
         self.sums = torch.zeros(2, 0, device="cpu")
         self._step_sums = self.sums
 
@@ -118,25 +117,25 @@ class DefaultDensifier(Densifier):
     ) -> None:
         if not self.needs_gradient(step):
             return
-        self._begin_step(probe_grad.shape[1], probe_grad.device)
+        self._reset_step(probe_grad.shape[1], probe_grad.device)
         grad = probe_grad[..., 2:] if self.options.absgrad else probe_grad[..., :2]
         x = grad[..., 0] * (0.5 * size[0])
         y = grad[..., 1] * (0.5 * size[1])
         length = torch.hypot(x, y)
-        # a view without a usable gradient says nothing
+        # views with a non-finite gradient are ignored
         counts = (radii > 0).all(-1) & length.isfinite()
         self._step_sums += torch.stack([torch.where(counts, length, 0.0).sum(0), counts.sum(0)])
 
     def tallies(self, step: int, count: int) -> list[Tensor]:
         if not self.needs_gradient(step):
             return []
-        self._begin_step(count, self._step_sums.device)
+        self._reset_step(count, self._step_sums.device)
         return [self._step_sums]
 
     def edit(
         self, step: int, parameters: Gaussians, generator: torch.Generator
     ) -> EditResult | None:
-        self._take_in_step()
+        self._accumulate_step()
         resets = step in self.schedule.resets
         parameters = parameters.detach()
         if self.schedule.densifies_at(step) and self.sums.shape[1] == len(parameters):
@@ -146,9 +145,9 @@ class DefaultDensifier(Densifier):
             result = EditResult(None)
         else:
             return None
-        return _with_lowered_opacities(result, parameters.logit_opacities) if resets else result
+        return _with_opacity_reset(result, parameters.logit_opacities) if resets else result
 
-    def place(self, device: torch.device) -> None:
+    def move_to(self, device: torch.device) -> None:
         self.sums = self.sums.to(device)
         self.center = self.center.to(device)
 
@@ -156,22 +155,22 @@ class DefaultDensifier(Densifier):
         self.options = self.options.model_copy(update={"max_gaussians": max_gaussians})
 
     def state(self) -> dict[str, Tensor]:
-        self._take_in_step()
+        self._accumulate_step()
         return {"grad_sum": self.sums[0], "seen": self.sums[1]}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        count = len(state.get("seen", ()))  # none of a run that was edited after its end
+        count = len(state.get("seen", ()))  # 0 if the run was edited after its end
         names = ("grad_sum", "seen") if count else ()
-        found = [require_tensor(name, state[name], (count,)) for name in names]
-        self.sums = torch.stack(found) if found else self.sums[:, :0]
+        sums = [require_tensor(name, state[name], (count,)) for name in names]
+        self.sums = torch.stack(sums) if sums else self.sums[:, :0]
         self._step_sums = self.sums[:, :0]
 
-    def _begin_step(self, count: int, device: torch.device) -> None:
+    def _reset_step(self, count: int, device: torch.device) -> None:
         if self._step_sums.shape[1] != count:
             self._step_sums = torch.zeros(2, count, device=device)
 
-    def _take_in_step(self) -> None:
-        """Add what the views of a step have said to what those before it have."""
+    def _accumulate_step(self) -> None:
+        """Accumulate the 2D gradient norms of this step."""
         if not self._step_sums.shape[1]:
             return
         same = self.sums.shape == self._step_sums.shape
@@ -180,10 +179,12 @@ class DefaultDensifier(Densifier):
 
     def _densify(self, step: int, parameters: Gaussians, generator: torch.Generator) -> EditResult:
         distance = (parameters.means - self.center).norm(dim=1)
-        reach = torch.where(distance > FAR * self.extent, distance, self.extent)
-        max_scale = PRUNE_SCALE * reach if step > self.schedule.prune_scale_after else math.inf
+        reference_length = torch.where(distance > FAR * self.extent, distance, self.extent)
+        max_scale = (
+            PRUNE_SCALE * reference_length if step > self.schedule.prune_scale_after else math.inf
+        )
         score = self.sums[0] / self.sums[1].clamp_min(1)
-        masks = plan_edit(parameters, score, self.options, reach, max_scale)
+        masks = plan_edit(parameters, score, self.options, reference_length, max_scale)
         kept, cloned, split = (torch.nonzero(mask)[:, 0] for mask in masks)
         source = torch.cat([kept, cloned, split, split])
         is_new = torch.ones(len(source), dtype=torch.bool, device=source.device)
@@ -202,9 +203,9 @@ class DefaultDensifier(Densifier):
 
 
 class EditPlan(NamedTuple):
-    """Masks (N,) bool of the old Gaussians that stay as they are, are copied, and are split in two.
+    """Masks (N,) bool of the Gaussians that are kept, cloned and split.
 
-    A copied Gaussian is also kept, a split one is not; those in none of the three are removed.
+    A cloned Gaussian is also kept, a split one is not. Gaussians in no mask are pruned.
     """
 
     kept: Tensor
@@ -216,26 +217,29 @@ def plan_edit(
     parameters: Gaussians,
     score: Tensor,
     options: DefaultStrategy,
-    reach: float | Tensor,
+    reference_length: float | Tensor,
     max_scale: float | Tensor,
 ) -> EditPlan:
-    """Return the plan of one densification.
+    """Plan one densification step.
 
     Args:
-        reach: (N,) or of all, world units, see ``DefaultDensifier``.
-        max_scale: (N,) or of all, world units; larger Gaussians are removed.
+        score: (N,) mean 2D gradient norm.
+        reference_length: (N,) or one for all, world units, see ``DefaultDensifier``.
+        max_scale: (N,) or one for all, world units; larger Gaussians are pruned.
     """
     scale = parameters.log_scales.amax(1).exp()
     opaque = parameters.opacities >= options.prune_opacity
     survives = opaque & (scale <= max_scale)
     wanted = opaque & (score >= options.grad_threshold)
-    large = scale > DENSE_FRACTION * reach
+    large = scale > DENSE_FRACTION * reference_length
     wanted = wanted if options.grow else torch.zeros_like(wanted)
     split = wanted & large & (scale / SPLIT_SHRINK <= max_scale)
     cloned = wanted & ~large & survives
-    # A candidate adds one Gaussian; a split one that would otherwise have been removed adds two.
+    # A candidate adds one Gaussian. Splitting one that would otherwise be pruned adds two.
     cost = torch.where(split & ~survives, 2, 1)
-    chosen = _best_within(split | cloned, score, cost, options.max_gaussians - int(survives.sum()))
+    chosen = _select_within_budget(
+        split | cloned, score, cost, options.max_gaussians - int(survives.sum())
+    )
     split = split & chosen
     cloned = cloned & chosen
     kept = survives & ~split
@@ -244,9 +248,11 @@ def plan_edit(
     return EditPlan(kept, cloned, split)
 
 
-def _best_within(candidates: Tensor, score: Tensor, cost: Tensor, room: int) -> Tensor:
-    """Return (N,) bool: the candidates of highest score whose costs add up to at most ``room``;
-    ties by index."""
+def _select_within_budget(candidates: Tensor, score: Tensor, cost: Tensor, room: int) -> Tensor:
+    """Select the candidates of highest score whose total cost is at most ``room``; ties by index.
+
+    Returns (N,) bool.
+    """
     indices = torch.nonzero(candidates)[:, 0]
     if int(cost[indices].sum()) <= room:
         return candidates
@@ -256,9 +262,8 @@ def _best_within(candidates: Tensor, score: Tensor, cost: Tensor, room: int) -> 
     return chosen
 
 
-def _with_lowered_opacities(result: EditResult, logit_opacities: Tensor) -> EditResult:
-    """Return ``result`` followed by an opacity reset: at most 0.01 everywhere, its moments at
-    zero."""
+def _with_opacity_reset(result: EditResult, logit_opacities: Tensor) -> EditResult:
+    """Add an opacity reset to an edit: opacities of at most 0.01 and zero moments."""
     moved = logit_opacities if result.edit is None else result.edit.apply(logit_opacities)
     lowered = moved.clamp_max(math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
     changes = {**result.changes, "logit_opacities": lowered}
@@ -269,16 +274,14 @@ MAX_COPIES = 50
 NOISE_STEEPNESS = 100.0
 NOISE_OPACITY = 0.005
 NOISE_MAX_OPACITY = 0.3
-"""More opaque Gaussians would move by less than 1e-12 of the published noise; nothing is drawn for
-them."""
+"""Above this opacity the published noise moves a Gaussian by less than 1e-12; no noise is drawn."""
 
 
 class McmcDensifier(Densifier):
-    """Moves dead Gaussians onto living ones, grows the set up to a cap, and shakes the nearly
-    transparent ones.
+    """3DGS-MCMC: relocate dead Gaussians, grow up to a cap, add noise to nearly transparent ones.
 
-    Relocation keeps the composited appearance, so there is no threshold on gradients, no opacity
-    reset, no pruning.
+    Relocation preserves the rendered image, so there is no gradient threshold, opacity reset or
+    pruning.
     """
 
     def __init__(self, options: McmcStrategy, schedule: DensifySchedule, growth: float) -> None:
@@ -301,16 +304,16 @@ class McmcDensifier(Densifier):
         source = torch.arange(n, device=opacities.device)
         is_new = ~alive
         if len(dead) > 0:
-            picks = _drawn(torch.where(alive, opacities, 0.0), len(dead), generator)
-            opacities, log_scales, shared = self._fraction(opacities, log_scales, picks)
+            picks = _sample_indices(torch.where(alive, opacities, 0.0), len(dead), generator)
+            opacities, log_scales, shared = self._split_into_copies(opacities, log_scales, picks)
             source[dead] = picks
             opacities[dead] = opacities[picks]
             log_scales[dead] = log_scales[picks]
             is_new = is_new | shared
         added = max(0, int(min(self.max_gaussians, (1 + self.growth) * n)) - n)
         if added > 0:
-            picks = _drawn(opacities, added, generator)
-            opacities, log_scales, shared = self._fraction(opacities, log_scales, picks)
+            picks = _sample_indices(opacities, added, generator)
+            opacities, log_scales, shared = self._split_into_copies(opacities, log_scales, picks)
             is_new = torch.cat(
                 [is_new | shared, torch.ones(added, dtype=torch.bool, device=opacities.device)]
             )
@@ -333,7 +336,7 @@ class McmcDensifier(Densifier):
         }
 
     def perturb(self, parameters: Gaussians, lr_means: float, generator: torch.Generator) -> None:
-        """Add noise * lr * sigmoid(100 (0.005 - o)) * Sigma eta to the means, with eta standard
+        """Add noise * lr * sigmoid(100 (0.005 - o)) * Sigma eta to the means; eta is standard
         normal."""
         if self.options.noise == 0:
             return
@@ -349,7 +352,7 @@ class McmcDensifier(Densifier):
         variances = (2 * log_scales).clamp_max(MAX_LOG_VARIANCE).exp()
         inverse = quats * torch.tensor([1.0, -1.0, -1.0, -1.0], device=quats.device)
         shake = rotate(quats, rotate(inverse, eta) * variances)
-        # unlike sigmoid, the same on any number of threads
+        # sigmoid would depend on the number of threads
         opacities = torch.nn.functional.logsigmoid(logits).exp()
         weight = 1 / (1 + (NOISE_STEEPNESS * (opacities - NOISE_OPACITY)).exp())
         parameters.means.detach().index_add_(
@@ -359,11 +362,13 @@ class McmcDensifier(Densifier):
     def limit(self, max_gaussians: int) -> None:
         self.max_gaussians = max_gaussians
 
-    def _fraction(
+    def _split_into_copies(
         self, opacities: Tensor, log_scales: Tensor, picks: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return opacities, log scales and a mask of changed rows after each picked row has become
-        several copies."""
+        """Split each picked row into several coincident copies.
+
+        Returns opacities, log scales and a mask of the changed rows.
+        """
         copies = torch.bincount(picks, minlength=len(opacities)) + 1
         shared = copies > 1
         opacities = opacities.clone()
@@ -376,9 +381,9 @@ class McmcDensifier(Densifier):
         return opacities, log_scales, shared
 
 
-def _drawn(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Return ``count`` indices drawn with ``weights`` (N,), with repetition; the generator is one
-    of the CPU."""
+def _sample_indices(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Sample ``count`` indices with ``weights`` (N,), with replacement; ``generator`` is on the
+    CPU."""
     return torch.multinomial(weights.cpu(), count, replacement=True, generator=generator).to(
         weights.device
     )
@@ -387,15 +392,15 @@ def _drawn(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
 def compute_relocation(
     opacities: Tensor, copies: Tensor, min_opacity: float = 0.005
 ) -> tuple[Tensor, Tensor]:
-    """Return the opacities and scale factors of N coincident copies that composite to one Gaussian
-    of opacity o.
+    """Compute opacities and scale factors of N coincident copies of a Gaussian of opacity o
+    (3DGS-MCMC).
 
-    o' = 1 - (1 - o)^(1/N); the scale factor keeps the integral of the composited 1-D profile:
-    o / sum_{j=1..N} C(N, j) (-1)^(j-1) o'^j / sqrt(j), which is the published double sum with its
-    inner binomials added up.
+    o' = 1 - (1 - o)^(1/N). The scale factor preserves the integral of the composited 1D profile: o
+    / sum_{j=1..N} C(N, j) (-1)^(j-1) o'^j / sqrt(j), the published double sum with its inner
+    binomials summed.
 
     Args:
-        min_opacity: lower bound of o'; where it acts, the integral is not kept.
+        min_opacity: lower bound of o'; where it applies, the integral is not preserved.
 
     Returns:
         o' (n,) and the factor (n,), float64.
@@ -411,7 +416,7 @@ def compute_relocation(
         * torch.where(j % 2 == 1, 1.0, -1.0)
         / j.sqrt()
     )
-    powers = (thinner.log()[:, None] * j).exp()  # torch.pow depends on the number of threads
+    powers = (thinner.log()[:, None] * j).exp()  # torch.pow would depend on the number of threads
     return thinner, opacities / (profile * powers).sum(1)
 
 

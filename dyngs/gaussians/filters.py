@@ -1,5 +1,4 @@
-"""Mip-Splatting's 3D smoothing filter: no Gaussian is smaller than what the training cameras can
-resolve."""
+"""3D smoothing filter of Mip-Splatting: limits Gaussians to what the training cameras resolve."""
 
 from __future__ import annotations
 
@@ -14,19 +13,18 @@ from dyngs.core.state import Role, State, StateTensor
 from dyngs.core.tensor_checks import require_tensor
 from dyngs.gaussians import Gaussians
 
-FILTER_VARIANCE = 0.2  # Variance of the filter in squared sampling intervals
+FILTER_VARIANCE = 0.2  # variance of the filter, in squared sampling intervals
 NEAR = 0.2
-# Cameras count as seeing what lies within the image enlarged by this fraction on each side
+# A camera sees points inside the image enlarged by this fraction on each side.
 MARGIN = 0.15
 
 
 def filter_std(means: Tensor, cameras: Sequence[Cameras]) -> Tensor:
-    """Return (N,) standard deviation of the 3D filter in world units: sqrt(0.2) * nearest depth /
-    largest focal length.
+    """Return the standard deviation (N,) of the 3D filter in world units.
 
-    The nearest depth is over the cameras that see a Gaussian at depth > 0.2; a Gaussian that none
-    sees gets the largest nearest depth of the others (1 where there are no others). Constant with
-    respect to gradients.
+    sqrt(0.2) * nearest depth / largest focal length. The nearest depth is over the cameras that
+    see a Gaussian at a depth above 0.2. Gaussians that no camera sees get the largest nearest
+    depth (1 if there is none). Constant with respect to gradients.
     """
     means = means.detach()
     nearest = torch.full((len(means),), torch.inf, device=means.device)
@@ -44,8 +42,8 @@ def filter_std(means: Tensor, cameras: Sequence[Cameras]) -> Tensor:
 def _visible_depth(
     means: Tensor, pose: Tensor, intrinsics: Tensor, width: int, height: int
 ) -> Tensor:
-    """Return (N,) depth in one camera, infinite where it does not see the point."""
-    # Not a matrix product, whose sums may depend on the number of threads.
+    """Return the depth (N,) in one camera; infinite for points that it does not see."""
+    # A matrix product would depend on the number of threads.
     rotation = pose[:3, :3]
     translation = pose[:3, 3]
     x, y, z = (
@@ -63,16 +61,16 @@ def _visible_depth(
 
 
 def fuse_filter(gaussians: Gaussians, std: Tensor) -> Gaussians:
-    """Return Gaussians convolved with the filter: s' = sqrt(s^2 + f^2), o' = o * prod_k s_k / s'_k;
-    differentiable.
+    """Convolve Gaussians with the filter: s' = sqrt(s^2 + f^2), o' = o * prod_k s_k / s'_k.
 
-    All in logarithms, one axis at a time, because products of scales underflow: log o' / (1 - o')
-    is taken from log o' and 1 - o' = (1 - o) + o (1 - prod), both sums of positive terms.
+    Differentiable. Computed in logarithms per axis, because products of scales underflow. The
+    logit of o' is taken from log o' and 1 - o' = (1 - o) + o (1 - prod), both sums of positive
+    terms.
     """
     log_scales = torch.logaddexp(2 * gaussians.log_scales, 2 * std.log()[:, None]) / 2
     log_ratio = (gaussians.log_scales - log_scales).sum(1).clamp_max(0)
     logits = gaussians.logit_opacities
-    # and not sigmoid, whose last bit depends on the number of threads
+    # The last bit of sigmoid depends on the number of threads.
     log_opacity = logsigmoid(logits)
     missing = logsigmoid(-logits).exp() - log_opacity.exp() * torch.expm1(log_ratio)
     fused = log_opacity + log_ratio - missing.clamp_min(torch.finfo(missing.dtype).tiny).log()
@@ -80,18 +78,17 @@ def fuse_filter(gaussians: Gaussians, std: Tensor) -> Gaussians:
 
 
 def apply_filter(gaussians: Gaussians, std: Tensor | None) -> Gaussians:
-    """Return the Gaussians fused with their 3D filter (N,); unchanged where that is None."""
+    """Apply the 3D filter (N,) to the Gaussians; None: return them unchanged."""
     return gaussians if std is None else fuse_filter(gaussians, std)
 
 
 def filter_state(std: Tensor | None) -> State:
-    """Return the state of a 3D filter, empty without one."""
+    """Return the state of a 3D filter; empty without one."""
     return {} if std is None else {"filter_std": StateTensor(std, Role.PER_GAUSSIAN)}
 
 
 def restore_filter(tensors: Mapping[str, Tensor], count: int) -> Tensor | None:
-    """Return the 3D filter (N,) of a state, None without one. Raises ValueError for one that does
-    not fit N."""
+    """Return the 3D filter (N,) in a state, or None. Raises ValueError if it does not match N."""
     std = tensors.get("filter_std")
     if std is not None and bool((require_tensor("filter_std", std, (count,)) < 0).any()):
         raise ValueError("'filter_std' holds negative numbers")
@@ -99,17 +96,17 @@ def restore_filter(tensors: Mapping[str, Tensor], count: int) -> Tensor | None:
 
 
 class FilterUpdate:
-    """Recomputation of Mip-Splatting's 3D filter at given steps.
+    """Recomputes the 3D filter of Mip-Splatting at given steps, and after every topology edit.
 
     Args:
-        cameras: the training cameras; none: there is no filter.
-        steps: steps after which it is, besides those that change the set of Gaussians.
+        cameras: the training cameras; empty: no filter.
+        steps: steps after which the filter is recomputed.
     """
 
     def __init__(self, cameras: Sequence[Cameras] = (), steps: range = range(0)) -> None:
         self.cameras, self.steps = cameras, steps
 
-    def of(self, gaussians: Gaussians) -> Tensor | None:
+    def compute(self, gaussians: Gaussians) -> Tensor | None:
         return filter_std(gaussians.means, self.cameras) if self.cameras else None
 
     def is_due(self, step: int, edited: bool) -> bool:

@@ -1,4 +1,4 @@
-"""The Gaussians, colours, strategy and 3D filter that training starts from."""
+"""Initial Gaussians, colour training, densification strategy and 3D filter of a run."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from dyngs.core.conventions import SH_C0, num_sh_terms
 from dyngs.data.capture import Capture, View
 from dyngs.data.scene_space import (
     MIN_VIEWS,
-    cube_half_side,
     camera_extent,
+    cube_half_side,
     cube_mismatch_reason,
     sample_points_in_frusta,
 )
@@ -48,24 +48,25 @@ from dyngs.models.kind import StartContext
 from dyngs.models.views import training_cameras
 
 START_OPACITY = 0.1
-# Opacity, and scale in distances to neighbours, that 3DGS-MCMC begins with
+# Initial opacity, and scale relative to the neighbour distance, of 3DGS-MCMC.
 MCMC_OPACITY, MCMC_SCALE = 0.5, 0.1
 MIN_SQUARED_DISTANCE = 1e-7
-# Random points that are drawn per one that is taken, where what the cameras see decides
-CANDIDATES = 4
+# Candidates per random point that is sampled from the view frusta.
+CANDIDATES_PER_POINT = 4
 
 
 @dataclass(frozen=True)
 class InitialValues:
-    """Scales and opacities of the first Gaussians, by strategy."""
+    """Initial scales and opacities of a strategy."""
 
     opacity: float = START_OPACITY  # in (0, 1)
     scale_factor: float = 1.0  # multiplies the distance to the nearest neighbours
-    max_gaussians: int = 3_000_000  # more points than this are thinned at random
+    max_gaussians: int = 3_000_000  # more points are subsampled at random
 
     @staticmethod
     def for_strategy(strategy: Strategy) -> InitialValues:
-        """Return the published start of ``strategy`` (3DGS-MCMC: more opaque and smaller)."""
+        """Return the published initial values of ``strategy`` (3DGS-MCMC: more opaque and
+        smaller)."""
         match strategy:
             case McmcStrategy():
                 return InitialValues(MCMC_OPACITY, MCMC_SCALE, strategy.max_gaussians)
@@ -77,12 +78,12 @@ class InitialValues:
 
 @dataclass(frozen=True)
 class SceneGeometry:
-    """Cameras and extent of a scene before training, in scene units."""
+    """Cameras, points and extent of a capture, in scene units."""
 
     views: Sequence[View]
     points: np.ndarray | None = None  # (P, 3) sparse points, or None
     points_rgb: np.ndarray | None = None
-    # by convention the scene lies around the origin (Blender scenes), where the cameras look there
+    # By the convention of its format the scene lies around the origin (Blender scenes).
     around_origin: bool = False
     world_scale: float = 1.0  # as ``Capture.world_scale``
 
@@ -93,16 +94,15 @@ class SceneGeometry:
 
     @property
     def extent(self) -> float:
-        """1.1 x the largest distance of a camera's centre to the mean centre.
+        """1.1 times the largest distance of a camera to the mean camera position.
 
-        Learning rates and size thresholds are relative to it. Where all cameras share one centre it
-        is 1.
+        Learning rates and size thresholds are relative to it. 1 if all cameras share one position.
         """
         return camera_extent(self.camera_centers) or 1.0
 
 
 def scene_geometry(capture: Capture) -> SceneGeometry:
-    """Return the properties of a capture that initialisation needs."""
+    """Return the scene geometry of a capture."""
     points = capture.points
     return SceneGeometry(
         views=capture.splits["train"],
@@ -120,12 +120,11 @@ def initial_gaussians(
     sh_degree: int,
     generator: torch.Generator,
 ) -> Gaussians:
-    """Return the first Gaussians of a run: isotropic, as large as the distance to the three nearest
-    neighbours.
+    """Create isotropic Gaussians whose scale is the distance to their three nearest neighbours.
 
-    ``RandomInit`` draws a cube around the origin. ``PointsInit`` takes the finite ones of the
-    scene's points; where there are none it draws that cube if the scene may lie in it by
-    convention, else what the cameras see together.
+    ``RandomInit`` samples a cube around the origin. ``PointsInit`` uses the finite sparse points.
+    Without points it samples that cube, if the format places scenes around the origin, else the
+    view frusta.
     """
     if options.kind != "random" and scene.points is not None and scene.points_rgb is not None:
         finite = np.isfinite(scene.points).all(axis=1)
@@ -140,9 +139,9 @@ def initial_gaussians(
             xyz = xyz[chosen]
             base = base[chosen]
         if len(xyz) > 0:
-            return _isotropic(xyz, base, start, sh_degree)
+            return _create_isotropic(xyz, base, start, sh_degree)
     xyz, base = _random_points(scene, options, start.max_gaussians, generator)
-    return _isotropic(xyz, base, start, sh_degree)
+    return _create_isotropic(xyz, base, start, sh_degree)
 
 
 def _random_points(
@@ -151,7 +150,8 @@ def _random_points(
     max_points: int,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Positions (N, 3) float64, and base colour coefficients (N, 3) just above mid grey (3DGS)."""
+    """Sample positions (N, 3) float64 and base colour coefficients (N, 3) just above mid grey
+    (3DGS)."""
     count = min(options.num_random, max_points)
     half_extent = cube_half_side(options.half_extent, scene.views, scene.world_scale)
     if options.kind == "random" or (
@@ -161,30 +161,29 @@ def _random_points(
             torch.rand((count, 3), generator=generator, dtype=torch.float64, device="cpu") * 2 - 1
         ) * half_extent
     else:
-        xyz = _seen_together(scene.views, count, generator)
+        xyz = _sample_frusta(scene.views, count, generator)
     return xyz, torch.rand((count, 3), generator=generator, dtype=torch.float64, device="cpu") / 255
 
 
-def _seen_together(views: Sequence[View], count: int, generator: torch.Generator) -> Tensor:
-    """Return ``count`` random points (N, 3) float64 in what the cameras see together, see
-    ``points_in_frusta``.
+def _sample_frusta(views: Sequence[View], count: int, generator: torch.Generator) -> Tensor:
+    """Sample ``count`` points (N, 3) float64 from the view frusta, see ``points_in_frusta``.
 
-    A candidate is taken with a chance proportional to the square of the number of views that see
-    it; those that fewer than ``MIN_VIEWS`` see come last. So most points lie where most cameras
-    look, some wherever depth can be told.
+    The probability of a candidate is proportional to the square of the number of views that see
+    it. Candidates seen by fewer than ``MIN_VIEWS`` views come last. Most points thus lie where
+    most cameras look, and some wherever depth can be triangulated.
     """
     unit = torch.rand(
-        (CANDIDATES * count, 5), generator=generator, dtype=torch.float64, device="cpu"
+        (CANDIDATES_PER_POINT * count, 5), generator=generator, dtype=torch.float64, device="cpu"
     ).numpy()
     xyz, seen = sample_points_in_frusta(views, unit[:, :4])
-    # The largest of u^(1 / weight) are a weighted sample without replacement (Efraimidis and
-    # Spirakis 2006).
+    # The largest u^(1 / weight) are a weighted sample without replacement (Efraimidis and Spirakis
+    # 2006).
     order = np.log(np.maximum(unit[:, 4], 1e-300)) / np.maximum(seen, 1) ** 2
     order[seen < min(MIN_VIEWS, len(views))] -= 1e6
     return torch.from_numpy(xyz[np.sort(np.argsort(-order, kind="stable")[:count])])
 
 
-def _isotropic(xyz: Tensor, base: Tensor, start: InitialValues, sh_degree: int) -> Gaussians:
+def _create_isotropic(xyz: Tensor, base: Tensor, start: InitialValues, sh_degree: int) -> Gaussians:
     log_scale = 0.5 * mean_squared_neighbour_distance(xyz).log() + math.log(start.scale_factor)
     logit = math.log(start.opacity / (1 - start.opacity))
     sizes = log_scale.float()[:, None]
@@ -192,10 +191,10 @@ def _isotropic(xyz: Tensor, base: Tensor, start: InitialValues, sh_degree: int) 
 
 
 def mean_squared_neighbour_distance(xyz: Tensor) -> Tensor:
-    """Return (N,) mean squared distance to the three nearest other points, at least 1e-7; ``xyz``
-    is (N, 3).
+    """Return the mean squared distance (N,) to the three nearest other points, at least 1e-7.
 
-    With fewer than four points the mean is over those there are; a single point gets 1e-2.
+    ``xyz`` is (N, 3). With fewer than four points the mean is over the existing neighbours; a
+    single point gets 1e-2.
     """
     from scipy.spatial import KDTree
 
@@ -210,16 +209,17 @@ def mean_squared_neighbour_distance(xyz: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class InitialGaussians:
-    """Gaussians of a scene that a run goes on from, and which of them (N,) bool stay as they are;
-    None: none."""
+    """Gaussians of an existing scene that a run continues from.
+
+    ``frozen`` (N,) bool: Gaussians that are frozen during training; None: none.
+    """
 
     gaussians: Gaussians
     frozen: Tensor | None = None
 
 
 def load_or_create_gaussians(run: StartContext) -> Gaussians:
-    """Return the Gaussians of the scene to go on from, at the points of the capture, or at
-    random."""
+    """Return the Gaussians of the scene that the run continues from, or new initial Gaussians."""
     if run.first is not None:
         return run.first.gaussians
     config = run.config
@@ -231,7 +231,7 @@ def load_or_create_gaussians(run: StartContext) -> Gaussians:
 def build_colour_training(
     run: StartContext, gaussians: Gaussians, *, uses_time: bool
 ) -> ColourTraining:
-    """Return how colours are trained."""
+    """Build the training of colours for ``colour.kind``."""
     colour = run.config.colour
     steps = run.config.train.steps
     match colour:
@@ -247,7 +247,7 @@ def build_colour_training(
 
 
 def build_densifier(run: StartContext) -> Densifier:
-    """Return the strategy of the run."""
+    """Build the densification strategy."""
     strategy = run.config.strategy
     steps = run.config.train.steps
     on_white = run.background == "white"
@@ -272,7 +272,7 @@ def build_densifier(run: StartContext) -> Densifier:
 
 
 def build_filter_update(run: StartContext) -> FilterUpdate:
-    """Return when the 3D filter of the model is computed anew."""
+    """Build the schedule of the 3D filter."""
     config = run.config
     cameras = (
         training_cameras(run.capture.splits["train"], config.data) if config.model.filter_3d else []

@@ -1,12 +1,11 @@
-"""Levels of detail of still Gaussians: a tree of blocks, coarser ones of merged Gaussians, and what
-a camera needs.
+"""Levels of detail of static Gaussians: a tree of blocks of merged Gaussians.
 
-Gaussians are put into the order of a k-d tree of places and sizes (Bentley 1975). Four neighbours
-each are merged into one of the next level, and so on; ``BLOCK`` of them that follow each other are
-a block, whose children are the four blocks of the level below that it merges. A cut through this
-tree is a whole scene, as fine as a camera can see.
+Gaussians are sorted in the order of a k-d tree of positions and sizes (Bentley 1975). Four
+neighbours are merged into one Gaussian of the next level, repeatedly. ``BLOCK`` consecutive
+Gaussians form a block; its children are the four blocks that it merges. A cut through this tree is
+a complete scene at the resolution that a camera needs.
 
-Local letters: N Gaussians, C that are merged into one, B blocks.
+Local letters: N Gaussians, C Gaussians that are merged into one, B blocks.
 """
 
 from __future__ import annotations
@@ -34,36 +33,36 @@ from dyngs.models.renderable import (
 )
 from dyngs.ops.quaternions import quats_from_matrices, rotation_matrices
 
-MERGED = 4  # Gaussians in one of the next level, and blocks below one
-BLOCK = 4096  # Gaussians of a block; a power of ``MERGED``
-# Standard deviation, on the image, of what a merged Gaussian stands for, up to which it does
-PIXELS = 0.5
+MERGED = 4  # Gaussians merged into one, and children of a block
+BLOCK = 4096  # Gaussians per block; a power of ``MERGED``
+# A block is fine enough if its Gaussians stand for a spread of at most this many pixels (std).
+MAX_SPREAD_PX = 0.5
 LARGEST_OPACITY = 0.999
-_AT_ONCE = 1 << 16  # Merged Gaussians that are computed at once, for memory
-# Exponent of Thomsen's formula for the area of an ellipsoid (2004), good to 1.1 %
-_ELLIPSOID = 1.6075
+_CHUNK = 1 << 16  # merged Gaussians computed at once, to limit memory
+# Exponent of Thomsen's formula for the surface of an ellipsoid (2004), accurate to 1.1 %.
+_THOMSEN_EXPONENT = 1.6075
 
 Block = tuple[int, int]
-"""Level, 0 being the finest, and place in it."""
+"""level (0 is the finest) and index in it"""
 
 
 @dataclass(frozen=True)
 class Levels:
-    """Gaussians in several degrees of detail.
+    """Gaussians in several levels of detail.
 
     Attributes:
-        levels: level 0 holds the Gaussians themselves, in the order of the tree; the last one at
-            most ``BLOCK``.
-        blocks: by level (B, 5) float64: centre and radius of a ball around a block's Gaussians, to
-            three standard deviations; its spread: the standard deviation, in place and size, of
-            what one of them stands for, root mean square, world units; 0 at level 0.
+        levels: level 0 holds the Gaussians in tree order; the last level has at most ``BLOCK``.
+        blocks: per level (B, 5) float64: centre and radius of a sphere around the block's
+            Gaussians at three standard deviations, and its spread: RMS standard deviation, in
+            position and size, of the Gaussians that one of them stands for, world units; 0 at
+            level 0.
     """
 
     levels: tuple[Gaussians, ...]
     blocks: tuple[np.ndarray, ...]
 
-    def of_block(self, block: Block) -> Gaussians:
-        """Return the at most ``BLOCK`` Gaussians of a block."""
+    def block_gaussians(self, block: Block) -> Gaussians:
+        """Return the Gaussians of a block, at most ``BLOCK``."""
         level, place = block
         return Gaussians(
             **{
@@ -73,24 +72,26 @@ class Levels:
         )
 
     def count(self, block: Block) -> int:
-        """Return their number."""
+        """Return the number of Gaussians of a block."""
         level, place = block
         return min(BLOCK, len(self.levels[level]) - place * BLOCK)
 
     def children(self, block: Block) -> list[Block]:
-        """Return the blocks that a block merges; none at level 0."""
+        """Return the child blocks; empty at level 0."""
         level, place = block
         below = len(self.blocks[level - 1]) if level else 0
         return [(level - 1, i) for i in range(MERGED * place, min(MERGED * (place + 1), below))]
 
-    def cut(self, camera: Cameras, most: int | None = None, pixels: float = PIXELS) -> list[Block]:
-        """Return the blocks that show the scene to ``camera`` (one), in ascending order.
+    def cut(
+        self, camera: Cameras, max_gaussians: int | None = None, pixels: float = MAX_SPREAD_PX
+    ) -> list[Block]:
+        """Return the blocks that show the scene to one ``camera``, in ascending order.
 
-        Blocks are replaced by their children, those first whose spread is largest on the image,
-        until none is larger than ``pixels``, or the next would make it more than ``most``
-        Gaussians. What is not in the image stays coarse.
+        Blocks with the largest spread on the image are replaced by their children until no spread
+        exceeds ``pixels`` or the number of Gaussians would exceed ``max_gaussians``. Blocks
+        outside the image stay coarse.
         """
-        sizes = [sizes_on_image(balls, camera) for balls in self.blocks]
+        sizes = [spreads_on_image(spheres, camera) for spheres in self.blocks]
         top: Block = (len(self.levels) - 1, 0)
         cut: set[Block] = {top}
         drawn = self.count(top)
@@ -99,7 +100,11 @@ class Levels:
             size, block = heapq.heappop(waiting)
             children = self.children(block)
             drawn += sum(self.count(child) for child in children) - self.count(block)
-            if -size <= pixels or not children or (most is not None and drawn > most):
+            if (
+                -size <= pixels
+                or not children
+                or (max_gaussians is not None and drawn > max_gaussians)
+            ):
                 break
             cut.remove(block)
             cut.update(children)
@@ -107,19 +112,23 @@ class Levels:
                 heapq.heappush(waiting, (-float(sizes[child[0]][child[1]]), child))
         return sorted(cut)
 
-    def seen_by(
-        self, camera: Cameras, most: int | None = None, pixels: float = PIXELS
+    def select_gaussians(
+        self, camera: Cameras, max_gaussians: int | None = None, pixels: float = MAX_SPREAD_PX
     ) -> Gaussians:
         """Return the Gaussians of ``cut``."""
-        return Gaussians.joined([self.of_block(block) for block in self.cut(camera, most, pixels)])
+        return Gaussians.joined(
+            [self.block_gaussians(block) for block in self.cut(camera, max_gaussians, pixels)]
+        )
 
 
-def sizes_on_image(balls: np.ndarray, camera: Cameras) -> np.ndarray:
-    """Return (B,) spreads of blocks (B, 5) on an image, px, where they are nearest to it; -1
-    outside of it."""
+def spreads_on_image(spheres: np.ndarray, camera: Cameras) -> np.ndarray:
+    """Return the spread (B,) of blocks (B, 5) on the image in pixels, at their nearest point.
+
+    -1 for blocks outside the image.
+    """
     pose, k = (x[0].double().cpu().numpy() for x in (camera.cam_from_world, camera.intrinsics))
-    places = balls[:, :3] @ pose[:3, :3].T + pose[:3, 3]
-    radii = balls[:, 3]
+    places = spheres[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+    radii = spheres[:, 3]
     depths = places[:, 2]
     seen = places[:, 2] > -radii
     for axis, side in ((0, camera.width), (1, camera.height)):
@@ -128,12 +137,11 @@ def sizes_on_image(balls: np.ndarray, camera: Cameras) -> np.ndarray:
         for slope, offset in ((focal, middle), (-focal, side - middle)):
             seen &= slope * places[:, axis] + offset * depths > -radii * np.hypot(slope, offset)
     nearest = np.maximum(np.linalg.norm(places, axis=1) - radii, 1e-9)
-    return np.where(seen, max(k[0, 0], k[1, 1]) * balls[:, 4] / nearest, -1.0)
+    return np.where(seen, max(k[0, 0], k[1, 1]) * spheres[:, 4] / nearest, -1.0)
 
 
 def build_levels(gaussians: Gaussians) -> Levels:
-    """Return the tree of N Gaussians, equal ones for equal Gaussians. Raises DyngsError where there
-    are none."""
+    """Build the tree of N Gaussians; deterministic. Raises DyngsError if there are no Gaussians."""
     if not len(gaussians):
         raise DyngsError("a scene without Gaussians has no levels of detail")
     gaussians = gaussians.detach().to(device="cpu", dtype=torch.float32)
@@ -145,24 +153,22 @@ def build_levels(gaussians: Gaussians) -> Levels:
     points = points[order]
     spreads = level.means.new_zeros(len(order), dtype=torch.float64)  # variances
     levels = [level]
-    blocks = [_balls(level, spreads)]
+    blocks = [_bounding_spheres(level, spreads)]
     while len(level) > BLOCK:
         level, points, spreads = _next_level(level, points, spreads)
         levels.append(level)
-        blocks.append(_balls(level, spreads))
+        blocks.append(_bounding_spheres(level, spreads))
     return Levels(tuple(levels), tuple(blocks))
 
 
 def merge_gaussians(gaussians: Gaussians, count: int) -> tuple[Gaussians, Tensor]:
-    """Return N Gaussians merged from ``count`` each, and the shares (N, count) in their masses,
-    whose rows sum to 1.
+    """Merge groups of ``count`` Gaussians; return N Gaussians and the mass fractions (N, count).
 
-    They keep mass, mean, covariance and mean colours of their mixtures. The mass of a Gaussian is
-    its opacity times the area of the ellipsoid of its standard deviations, four times what is seen
-    of it on average (Cauchy 1841). More mass than an opacity of ``LARGEST_OPACITY`` holds lies one
-    behind the other, and is lost.
+    Mass, mean, covariance and mean colour of each group are preserved. The mass of a Gaussian is
+    its opacity times the surface of its ellipsoid, four times its mean projected area (Cauchy
+    1841). Mass above an opacity of ``LARGEST_OPACITY`` would be occluded and is dropped.
 
-    ``gaussians``: N * count of them, float64, those of one in turn.
+    ``gaussians``: N * count Gaussians in float64, group by group.
     """
     mass = (gaussians.opacities * _areas(gaussians.log_scales)).clamp_min(1e-300).reshape(-1, count)
     shares = mass / mass.sum(1, keepdim=True)
@@ -185,23 +191,27 @@ def merge_gaussians(gaussians: Gaussians, count: int) -> tuple[Gaussians, Tensor
 def _next_level(
     level: Gaussians, points: Tensor, spreads: Tensor
 ) -> tuple[Gaussians, Tensor, Tensor]:
-    """Return the next level, mean places and sizes (N, 4) of what its Gaussians stand for, and
-    their variances (N,)."""
+    """Return the next level with, per Gaussian, mean position and size (N, 4) and variance (N,) of
+    its group."""
     parts: list[Gaussians] = []
-    told: list[Tensor] = []
+    spreads_of_parts: list[Tensor] = []
     count = -(-len(level) // MERGED)
-    for first in range(0, count, _AT_ONCE):
-        rows = torch.arange(MERGED * first, MERGED * min(first + _AT_ONCE, count), device="cpu")
-        own = rows.clamp_max(len(level) - 1)
-        several = level.select(own).to(dtype=torch.float64)
+    for first in range(0, count, _CHUNK):
+        rows = torch.arange(MERGED * first, MERGED * min(first + _CHUNK, count), device="cpu")
+        rows_of_part = rows.clamp_max(len(level) - 1)
+        several = level.select(rows_of_part).to(dtype=torch.float64)
         several.logit_opacities[rows >= len(level)] = -torch.inf
         part, shares = merge_gaussians(several, MERGED)
-        below = points[own].unflatten(0, shares.shape)
+        below = points[rows_of_part].unflatten(0, shares.shape)
         means = (shares[..., None] * below).sum(1)
-        variances = spreads[own].reshape(shares.shape) + (below - means[:, None]).square().sum(2)
+        variances = spreads[rows_of_part].reshape(shares.shape) + (
+            below - means[:, None]
+        ).square().sum(2)
         parts.append(part.to(dtype=torch.float32))
-        told.append(torch.cat([means, (shares * variances).sum(1, keepdim=True)], dim=1))
-    both = torch.cat(told)
+        spreads_of_parts.append(
+            torch.cat([means, (shares * variances).sum(1, keepdim=True)], dim=1)
+        )
+    both = torch.cat(spreads_of_parts)
     return Gaussians.joined(parts), both[:, :4], both[:, 4]
 
 
@@ -211,30 +221,35 @@ def _covariances(gaussians: Gaussians) -> Tensor:
 
 
 def _areas(log_scales: Tensor) -> Tensor:
-    """Return (N,) areas of ellipsoids with these logarithms of half axes (N, 3)."""
-    a, b, c = (log_scales * _ELLIPSOID).exp().unbind(1)
-    return 4 * torch.pi * ((a * b + a * c + b * c) / 3) ** (1 / _ELLIPSOID)
+    """Return the surfaces (N,) of ellipsoids with log half axes (N, 3)."""
+    a, b, c = (log_scales * _THOMSEN_EXPONENT).exp().unbind(1)
+    return 4 * torch.pi * ((a * b + a * c + b * c) / 3) ** (1 / _THOMSEN_EXPONENT)
 
 
-def _balls(level: Gaussians, variances: Tensor) -> np.ndarray:
-    """Return the balls of ``Levels.blocks``."""
+def _bounding_spheres(level: Gaussians, variances: Tensor) -> np.ndarray:
+    """Return the bounding spheres and spreads of ``Levels.blocks``."""
     count = -(-len(level) // BLOCK)
-    balls = np.zeros((count, 5))
+    spheres = np.zeros((count, 5))
     for i in range(count):
-        own = slice(i * BLOCK, (i + 1) * BLOCK)
-        means = level.means[own].double()
+        rows_of_part = slice(i * BLOCK, (i + 1) * BLOCK)
+        means = level.means[rows_of_part].double()
         center = (means.amin(0) + means.amax(0)) / 2
-        reach = (means - center).norm(dim=1) + 3 * level.log_scales[own].double().amax(1).exp()
-        balls[i] = [*center.tolist(), float(reach.max()), float(variances[own].mean().sqrt())]
-    return balls
+        reach = (means - center).norm(dim=1) + 3 * level.log_scales[rows_of_part].double().amax(
+            1
+        ).exp()
+        spheres[i] = [
+            *center.tolist(),
+            float(reach.max()),
+            float(variances[rows_of_part].mean().sqrt()),
+        ]
+    return spheres
 
 
 def _tree_order(points: np.ndarray) -> np.ndarray:
-    """Return (N,) indices of ``points`` (N, D) of which each 2^k, from a multiple of 2^k on, are a
-    box of a k-d tree.
+    """Return indices (N,) that sort ``points`` (N, D) in k-d tree order.
 
-    Boxes are halved at the median of their longest side, ties by index; the last box of each size
-    may hold fewer.
+    Every 2^k rows from a multiple of 2^k on are one box. Boxes are halved at the median of their
+    longest side, ties by index. The last box of each size may hold fewer rows.
     """
     count, _ = points.shape
     size = 1 << (count - 1).bit_length()
@@ -243,9 +258,9 @@ def _tree_order(points: np.ndarray) -> np.ndarray:
         whole = count // size * size
         for part in (order[:whole].reshape(-1, size), order[whole:].reshape(1, -1)):
             if part.size > size // 2:
-                own = points[part]
-                axes = (own.max(1) - own.min(1)).argmax(1)
-                keys = np.take_along_axis(own, axes[:, None, None], 2)[..., 0]
+                rows_of_part = points[part]
+                axes = (rows_of_part.max(1) - rows_of_part.min(1)).argmax(1)
+                keys = np.take_along_axis(rows_of_part, axes[:, None, None], 2)[..., 0]
                 part[:] = np.take_along_axis(part, keys.argsort(1, kind="stable"), 1)
         size //= 2
     return order
@@ -253,33 +268,35 @@ def _tree_order(points: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class LevelScene(Renderable):
-    """Gaussians in levels of detail, drawn as ``scene`` is.
+    """A scene of Gaussians in levels of detail.
 
     Attributes:
-        scene: without a 3D filter, which the levels have in them.
-        most: so many Gaussians are drawn at most, but for those of the coarsest level; None: all
-            that are needed.
+        scene: static scene without 3D filter; the levels include it.
+        max_gaussians: most Gaussians to render per camera, except those of the coarsest level;
+            None: as many as needed.
     """
 
     scene: StaticScene
     levels: Levels
-    most: int | None = None
+    max_gaussians: int | None = None
 
     @staticmethod
-    def of(scene: Renderable, most: int | None = None) -> LevelScene:
-        """Return the levels of a still scene. Raises DyngsError for any other one."""
-        still = require_gaussians(scene, "the scene")
-        if not isinstance(still, StaticScene):
+    def from_scene(scene: Renderable, max_gaussians: int | None = None) -> LevelScene:
+        """Build the levels of a static scene. Raises DyngsError for any other scene."""
+        static = require_gaussians(scene, "the scene")
+        if not isinstance(static, StaticScene):
             raise DyngsError(
-                "levels of detail are for still scenes; export one time of it as .ply, and take that"
+                "levels of detail need a static scene; export one time step as .ply first"
             )
-        if still.sides is not None:
+        if static.sides is not None:
             raise DyngsError(
-                "levels of detail are for scenes that look the same from all sides; this one has a surface each"
+                "levels of detail need one set of Gaussians; this scene has one per viewing direction"
             )
-        gaussians = still.at(None)
+        gaussians = static.at(None)
         return LevelScene(
-            replace(still, gaussians=gaussians, filter_std=None), build_levels(gaussians), most
+            replace(static, gaussians=gaussians, filter_std=None),
+            build_levels(gaussians),
+            max_gaussians,
         )
 
     @property
@@ -310,14 +327,13 @@ class LevelScene(Renderable):
         options: Any = None,
         background: Tensor | None = None,
     ) -> Rendering:
-        """Return images as ``Renderable.render``, each of the cut that its camera needs; not
-        differentiable."""
+        """Render each camera from its own cut; not differentiable, see ``Renderable.render``."""
         images = []
         for one, behind in single_views(
             cameras, self.background if background is None else background
         ):
             seen = self.scene.with_gaussians(
-                self.levels.seen_by(one, self.most).to(device=self.device)
+                self.levels.select_gaussians(one, self.max_gaussians).to(device=self.device)
             )
             images.append(seen.render(one, options=options, background=behind))
         return concatenate_renderings([Rendering(x.rgb, x.transmittance, x.depth) for x in images])

@@ -1,5 +1,4 @@
-"""Gaussians in training: the one owner of their values, of the state of Adam, and of what is stored
-per Gaussian."""
+"""Training of Gaussian scenes: owns the Gaussians, the Adam state and all per-Gaussian state."""
 
 from __future__ import annotations
 
@@ -39,13 +38,14 @@ S = TypeVar("S", bound=GaussianScene)
 
 
 class SceneTraining(Generic[S]):
-    """Training of a kind of scene: of all that it learns next to the Gaussians and their colours,
-    here nothing.
+    """Training of one kind of Gaussian scene: its parameters other than Gaussians and colours.
+
+    This base class has no such parameters.
 
     Attributes:
-        moves_by: name of what moves the Gaussians and the configuration section of its learning
-            rates, for messages.
-        colour_loss: how colours are compared with true ones; None: by L1 and D-SSIM.
+        moves_by: name of the part that moves Gaussians, and the config section of its learning
+            rates.
+        colour_loss: image loss; None: L1 and D-SSIM.
     """
 
     deformation_name: tuple[str, str] = ("", "")
@@ -58,46 +58,43 @@ class SceneTraining(Generic[S]):
         return 0.0, 1.0
 
     def extend(self, scene: S, seen: tuple[float, float], step: int) -> None:
-        """Continue motion learned for the times in ``seen`` to those that are trained on at
-        ``step``."""
+        """Extrapolate motion trained on the times in ``seen`` to the window of ``step``."""
 
     def time_step(self, scene: S, image: Image, step: int) -> GaussianTimeStep:
-        """Return the Gaussians drawn for ``image`` in ``step``, with the penalties."""
+        """Return the Gaussians at the time of ``image``, with regularisers."""
         return scene.time_step(image.time)
 
     def optimize(self, scene: S, step: int) -> Count:
-        """Update, in place, what the scene learns; return the number of rows left out for bad
-        gradients."""
+        """Update the parameters in place; return the number of skipped rows (bad gradients)."""
         return 0
 
     def leaves(self, scene: S) -> Sequence[Tensor]:
-        """Return what the scene learns next to the Gaussians and their colours."""
+        """Return the trained tensors other than Gaussians and colours."""
         return ()
 
     def skip_unseen_rows(self, scene: S) -> Tensor | None:
-        """Return the indices of the Gaussians that stay as they are in steps that do not show them;
-        None: of none."""
+        """Return indices of Gaussians that are updated only in steps that render them; None: no
+        Gaussian."""
         return None
 
     def frozen_mask(self) -> FrozenMask | None:
-        """Return what stays as it is, whatever the images say."""
+        """Return the parameters that are frozen during training."""
         return None
 
     def after_step(self, scene: S, step: int, edited: bool) -> S:
-        """Return the scene for the next step: filters brought up to date, motion extended, static
-        Gaussians frozen."""
+        """Return the scene for the next step: 3D filter updated, motion extrapolated, Gaussians
+        frozen."""
         return scene
 
     def edit_scene(self, scene: S, step: int) -> tuple[S, EditResult] | None:
-        """Return the scene as its kind changes it after ``step``, and the edit of its Gaussians;
-        None: it does not."""
+        """Return the scene and the edit of its Gaussians after ``step``; None if nothing changes."""
         return None
 
-    def follow(self, edit: TopologyEdit) -> None:
-        """Let what the training itself keeps per Gaussian follow a change of the set."""
+    def apply_edit(self, edit: TopologyEdit) -> None:
+        """Update per-Gaussian training state after a topology edit."""
 
     def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> S:
-        """Return the scene of a checkpoint, and take over the training's state."""
+        """Return the scene in a checkpoint and restore the training state."""
         raise NotImplementedError
 
     def state(self) -> State:
@@ -105,16 +102,16 @@ class SceneTraining(Generic[S]):
 
 
 class GaussianModel(Model[GaussianScene]):
-    """A scene of Gaussians in training.
+    """A Gaussian scene in training.
 
     Args:
-        scene: before the first step, or predicted; its Gaussians become leaf tensors.
-        training: how its kind is trained.
-        densifier: the strategy, which adds and removes Gaussians.
-        colours: how they are trained.
+        scene: initial or predicted scene; its Gaussians become leaf tensors.
+        training: training of this kind of scene.
+        densifier: densification strategy.
+        colours: training of the colours.
 
     Attributes:
-        options: how training images are drawn.
+        options: render options of training images.
     """
 
     def __init__(
@@ -129,13 +126,13 @@ class GaussianModel(Model[GaussianScene]):
         self._config, self.densifier, self.colours = config, densifier, colours
         self._run = run
         self._generator = run.generator
-        self._rates, self._course = learning_rates(config), rate_schedule(config)
+        self._rates, self._rate_schedule = learning_rates(config), rate_schedule(config)
         self.options = training_options(run)
         self.start_from(scene, training)
 
     def start_from(self, scene: GaussianScene, training: SceneTraining[Any]) -> None:
-        """Begin with this scene, a predicted one for instance, and learn it so; nothing is learned
-        yet."""
+        """Replace the scene before the first step, for example with a predicted one; reset the
+        optimiser."""
         config = self._config
         self.training, self._optimizer = training, GaussianOptimizer(scene.gaussians, self._rates)
         behind = evaluation_background(config.data.background, self._run.capture.has_alpha)[1]
@@ -168,13 +165,13 @@ class GaussianModel(Model[GaussianScene]):
 
     @property
     def leaves(self) -> Sequence[Tensor]:
-        found = [*self._optimizer.parameters.tensors().values()]
-        found += (
+        leaves = [*self._optimizer.parameters.tensors().values()]
+        leaves += (
             []
             if self.colours.network_parameters is None
             else self.colours.network_parameters.leaves
         )
-        return [*found, *self.training.leaves(self._scene)]
+        return [*leaves, *self.training.leaves(self._scene)]
 
     def draw(
         self, image: Image, step: int, background: Tensor, *, depth: bool = False
@@ -196,7 +193,7 @@ class GaussianModel(Model[GaussianScene]):
         def after_backward() -> None:
             if probe is not None and probe.grad is not None:
                 size = (image.cameras.width, image.cameras.height)
-                # Fewer Gaussians suit small images: a gradient counts for less there.
+                # Small images need fewer Gaussians, so their gradients count less.
                 signal = probe.grad / image_divisor(self._config.train, step)
                 densifier.after_backward(step, signal, rendering.radii, size)
 
@@ -229,7 +226,7 @@ class GaussianModel(Model[GaussianScene]):
     def update(self, step: int) -> UpdateResult:
         before = self._optimizer.parameters
         generator = self._generator
-        lr_means = means_rate(self._rates, self._course.progress(step), self._run.extent)
+        lr_means = means_rate(self._rates, self._rate_schedule.progress(step), self._run.extent)
         frozen = self.colours.frozen_harmonics()
         skip_unseen_rows = self.training.skip_unseen_rows(self._scene)
         frozen_mask = self.training.frozen_mask()
@@ -245,23 +242,23 @@ class GaussianModel(Model[GaussianScene]):
         if result is not None:
             if frozen_mask is not None:
                 result = frozen_mask.exclude_from_edit(result, self._optimizer.parameters)
-            self._apply(self._in_memory_order(result))
+            self._apply(self._sort_by_morton_code(result))
         self._perturb(lr_means)
         self._scene = self.training.after_step(self._scene, step, result is not None)
         scene_edit = self.training.edit_scene(self._scene, step)
         if scene_edit is not None:
             scene, result = scene_edit
             self._apply(result, scene)
-        findings = (
-            self._measured_harmonics(step),
+        messages = (
+            self._measure_harmonics(step),
             None if scene_edit is None else scene_edit[1].message,
         )
-        self._scene.changed()
-        text = "; ".join(text for text in findings if text) or None
+        self._scene.clear_caches()
+        text = "; ".join(text for text in messages if text) or None
         return UpdateResult(bad, text, self._optimizer.parameters is not before)
 
     def _perturb(self, lr_means: float) -> None:
-        """Let the strategy shake the Gaussians, but for those that stay as they are."""
+        """Add the noise of the strategy to the means, except those of frozen Gaussians."""
         frozen_mask = self.training.frozen_mask()
         means = self._optimizer.parameters.means
         kept = (
@@ -274,35 +271,35 @@ class GaussianModel(Model[GaussianScene]):
             means.detach()[frozen_mask.rows] = kept
 
     def replace_scene(self, scene: GaussianScene) -> None:
-        """Go on with ``scene``: the same Gaussians, moved, masked or drawn in another way."""
+        """Continue with ``scene``: the same Gaussians with other motion, masks or render options."""
         self._scene = scene.with_gaussians(self._optimizer.parameters)
-        self._scene.changed()
+        self._scene.clear_caches()
 
-    def keep(self, kept: Tensor, done: int) -> None:
-        """Leave only the Gaussians where ``kept`` (N,) is true, after step ``done``."""
+    def select_gaussians(self, kept: Tensor, done: int) -> None:
+        """Keep only the Gaussians where ``kept`` (N,) is true, after step ``done``."""
         self._apply(EditResult(TopologyEdit.select(kept)))
         self._scene = self.training.after_step(self._scene, done, True)
-        self._scene.changed()
+        self._scene.clear_caches()
 
     def stop_growing(self) -> None:
-        """Leave the set of Gaussians as it is from now on."""
+        """Stop densification and pruning."""
         self.densifier = Densifier()
 
     def drop_harmonics(self, dropped: Tensor, offsets: Tensor) -> None:
-        """Replace the harmonics of the Gaussians ``dropped`` (N,) for good by their base, with
-        ``offsets`` (N, 3)."""
+        """Replace the SH of the Gaussians ``dropped`` (N,) by their base colour plus ``offsets``
+        (N, 3)."""
         base = self._scene.gaussians.sh.detach()[:, 0] + offsets / SH_C0
         self._optimizer.drop_harmonics(base, dropped)
         self.replace_scene(self._scene)
 
     def freeze_plain_harmonics(self, plain: Tensor, colour: AutoColour) -> None:
-        """Leave the harmonics of the Gaussians ``plain`` (N,) zero from now on."""
+        """Keep the SH above degree 0 of the Gaussians ``plain`` (N,) at zero from now on."""
         colours = AutoTraining(colour, self._config.train.steps, len(self._run.images))
         colours.freeze(plain)
         self.colours = colours
 
     def set_render_options(self, model: SceneModel) -> None:
-        """Draw with the settings of another section of the same kind from now on."""
+        """Use the render options of another config section of the same kind."""
         options = self._render_options(model)
         self.options = replace(self.options, alpha_min=options.alpha_min)
         self._scene = replace(self._scene, options=options)
@@ -316,7 +313,7 @@ class GaussianModel(Model[GaussianScene]):
         gaussians = Gaussians.stored(checkpoint.part("gaussians"))
         optimizer = self._optimizer.with_state(gaussians, checkpoint.tensors)
         colour = checkpoint.part("model.colour")
-        restore_colour_network(colour)  # raises where its tensors do not fit together
+        restore_colour_network(colour)  # raises for inconsistent tensors
         self.colours.restore(colour, len(gaussians))
         scene = self.training.restore(optimizer.parameters, checkpoint.part("model"))
         if checkpoint.info.step >= self._config.train.steps:
@@ -332,32 +329,35 @@ class GaussianModel(Model[GaussianScene]):
         if self._scene.device == device:
             return
         self._optimizer = self._optimizer.to(device)
-        self.colours.place(device)
-        self.densifier.place(device)
+        self.colours.move_to(device)
+        self.densifier.move_to(device)
         scene: GaussianScene = self._scene.to(device)
         scene = scene.with_gaussians(self._optimizer.parameters)
         self._scene = replace(scene, colour=self.colours.network)
 
     def _options(self, step: int) -> RenderOptions:
         degree = self._scene.gaussians.sh_degree
-        if not isinstance(self._config.init, SceneInit):  # whose harmonics are there already
+        # an existing scene already has trained SH
+        if not isinstance(self._config.init, SceneInit):
             degree = active_sh_degree(self._config.train, step, degree)
         return replace(self.options, sh_degree=degree)
 
     def _apply(self, result: EditResult, edited: GaussianScene | None = None) -> None:
-        """Change the set of Gaussians, and everything that is stored per Gaussian with it;
-        ``edited``: is already."""
+        """Apply an edit to the Gaussians, the optimiser and all per-Gaussian state.
+
+        ``edited``: the scene after the edit, if it already exists.
+        """
         self._optimizer.apply(result)
         if edited is None:
             edited = self._scene if result.edit is None else self._scene.apply_edit(result.edit)
         self._scene = edited.with_gaussians(self._optimizer.parameters)
         if result.edit is not None:
-            self.colours.follow(result.edit)
-            self.training.follow(result.edit)
+            self.colours.apply_edit(result.edit)
+            self.training.apply_edit(result.edit)
 
-    def _in_memory_order(self, result: EditResult) -> EditResult:
-        """Return the same change with neighbours in space next to each other: kernels read rows
-        that are in a cache."""
+    def _sort_by_morton_code(self, result: EditResult) -> EditResult:
+        """Sort the rows of an edit in Morton order, so that kernels read neighbours from the
+        cache."""
         edit = result.edit
         if edit is None:
             return result
@@ -366,18 +366,17 @@ class GaussianModel(Model[GaussianScene]):
         changes = {name: x[order] for name, x in result.changes.items()}
         return replace(result, edit=edit.in_order(order), changes=changes)
 
-    def _measured_harmonics(self, step: int) -> str | None:
-        """Drop harmonics that do not pay, if it is time to measure that; return a line about what
-        was found."""
+    def _measure_harmonics(self, step: int) -> str | None:
+        """Drop SH that do not improve held-out views, if it is the step for it; return a message."""
         if not self._scene.gaussians.sh_degree:
             return None
-        found = self.colours.measure_harmonics(step, lambda: self._looks(step))
-        if found is None:
+        result = self.colours.measure_harmonics(step, lambda: self._measurement_views(step))
+        if result is None:
             return None
-        self.drop_harmonics(~found.kept_harmonics, found.offsets)
-        return str(found)
+        self.drop_harmonics(~result.kept_harmonics, result.offsets)
+        return str(result)
 
-    def _looks(self, step: int) -> MeasurementViews:
+    def _measurement_views(self, step: int) -> MeasurementViews:
         images = self._run.images
         colour = background_colour(self._run.background).to(self._scene.device)
 
@@ -396,7 +395,7 @@ class GaussianModel(Model[GaussianScene]):
 
 
 def training_options(run: StartContext) -> RenderOptions:
-    """Return how the training images of a run are drawn."""
+    """Return the render options for training images."""
     strategy = run.config.strategy
     absgrad = isinstance(strategy, DefaultStrategy) and strategy.absgrad
     options = render_options(run.config.model, run.extent, run.capture.world_scale)

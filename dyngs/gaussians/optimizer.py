@@ -1,4 +1,4 @@
-"""Named tensors trained by Adam, and the optimiser of Gaussians with its schedules."""
+"""Adam for named tensors, and the optimiser of Gaussians."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from dyngs.gaussians import EditResult, Gaussians, TopologyEdit
 from dyngs.ops.adam import AdamUpdate, Count, adam_steps_, seen_rows
 
 MOMENTS = "exp_avg", "exp_avg_sq"
-"""Prefixes of the moments' names in a state."""
+"""Prefixes of the moments in a state dict."""
 
 
 @dataclass
 class AdamState:
-    """First and second moments of named tensors."""
+    """First and second Adam moments of named tensors."""
 
     exp_avg: dict[str, Tensor]
     exp_avg_sq: dict[str, Tensor]
 
     @staticmethod
     def zero(tensors: Mapping[str, Tensor]) -> AdamState:
-        """Return the moments before the first update of ``tensors``."""
+        """Return zero moments for ``tensors``."""
         return AdamState(
             *({name: torch.zeros_like(x.detach()) for name, x in tensors.items()} for _ in MOMENTS)
         )
 
     @staticmethod
     def from_state(stored: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> AdamState:
-        """Return the moments of ``tensors`` from what ``state`` returned."""
+        """Return the moments of ``tensors`` from a state that ``state`` returned."""
         return AdamState(
             *(
                 {name: _stored(stored, f"{part}.{name}", x) for name, x in tensors.items()}
@@ -52,8 +52,7 @@ class AdamState:
         eps: float = 1e-15,
         rows: Tensor | None = None,
     ) -> Count:
-        """As ``steps_`` of one tensor, of which only the ``rows`` (N,) bool are updated; None:
-        all."""
+        """Apply ``steps_`` to one tensor; ``rows`` (N,) bool: rows to update, None: all."""
         return self.steps_([self.update(name, x, lr, rows)], step=step, eps=eps)
 
     def steps_(
@@ -64,11 +63,11 @@ class AdamState:
         eps: float = 1e-15,
         betas: tuple[float, float] = (0.9, 0.999),
     ) -> Count:
-        """Do the ``updates`` in place, those that are None left out, and return the number of rows
-        left out.
+        """Apply ``updates`` in place (None entries are ignored); return the number of skipped
+        rows.
 
-        Rows whose gradient is not finite are left out. ``step``: the number of this update, from 1,
-        for the bias correction.
+        Rows with a non-finite gradient are skipped. ``step`` counts from 1, for the bias
+        correction.
         """
         wanted = [x for x in updates if x is not None]
         return adam_steps_(wanted, step=step, eps=eps, betas=betas) if wanted else 0
@@ -82,11 +81,11 @@ class AdamState:
         *,
         along_last_axis: bool = False,
     ) -> AdamUpdate | None:
-        """Return the update of the leaf tensor ``x`` (N, ...), and drop its gradient; None where it
-        has none.
+        """Return the update of the leaf tensor ``x`` (N, ...) and clear its gradient; None without
+        gradient.
 
-        With ``along_last_axis`` only the values along the last axis are a row, so that little is
-        left out of a large array.
+        With ``along_last_axis`` a row is a slice along the last axis, so that one bad value skips
+        little of a large array.
         """
         grad = x.grad
         x.grad = None
@@ -100,8 +99,7 @@ class AdamState:
     def map(
         self, function: Callable[[Tensor], Tensor], names: Iterable[str] | None = None
     ) -> AdamState:
-        """Return the moments with ``function`` applied to those of the named tensors; None: of
-        all."""
+        """Apply ``function`` to the moments of the named tensors; None: all."""
         chosen = set(self.exp_avg if names is None else names)
         return AdamState(
             *(
@@ -123,8 +121,10 @@ class AdamState:
 def _stored(
     tensors: Mapping[str, Tensor], name: str, like: Tensor, rows: int | None = None
 ) -> Tensor:
-    """Return a copy of a stored tensor of the shape (but for the number of ``rows``), type and
-    device of ``like``."""
+    """Return a copy of a stored tensor with the shape, dtype and device of ``like``.
+
+    ``rows``: number of rows, if it differs from ``like``.
+    """
     shape = like.shape if rows is None else (rows, *like.shape[1:])
     return require_tensor(name, tensors[name], tuple(shape), like.dtype).to(like.device).clone()
 
@@ -133,11 +133,12 @@ Roles = Role | Mapping[str, Role]
 
 
 class Parameters:
-    """Leaf tensors that receive gradients, optimised in place by Adam.
+    """Leaf tensors that Adam optimises in place.
 
     Args:
-        decay: last over first rate; log-linear between. 0: rates fall linearly to 0.
-        roles: of the tensors, one for all or by name.
+        decay: ratio of the last to the first learning rate, log-linear between. 0: linear decay to
+            0.
+        roles: role of all tensors, or of each by name.
     """
 
     def __init__(
@@ -170,17 +171,16 @@ class Parameters:
         return sum(x.numel() for x in self._tensors.values())
 
     def step(self, step: int, progress: float) -> Count:
-        """Update all tensors, drop the gradients, and return the number of rows left out for bad
-        gradients.
+        """Update all tensors and clear the gradients; return the number of skipped rows.
 
         Args:
-            progress: 0 at the first update, 1 at the last; decides the rates.
+            progress: 0 at the first update, 1 at the last; sets the learning rates.
         """
         progress = min(progress, 1.0)
         return self.update(step, self.decay**progress if self.decay > 0 else 1 - progress)
 
     def update(self, step: int, factor: float) -> Count:
-        """As ``step``, with all rates multiplied by ``factor``."""
+        """Update all tensors with their learning rates times ``factor``; see ``step``."""
         updates = [
             self._update_of(name, x, self.rates[name] * factor) for name, x in self._tensors.items()
         ]
@@ -192,13 +192,13 @@ class Parameters:
         return self._adam.update(name, x, lr, None if x.grad is None else seen_rows(x.grad))
 
     def apply_edit(self, role: Role, edit: TopologyEdit) -> Parameters:
-        """Return the parameters after an edit of the Gaussians that ``role`` speaks of."""
+        """Return the parameters after a topology edit of the rows with this ``role``."""
         names = [name for name, own in self._roles.items() if own is role]
         moved = {name: edit.apply(self._tensors[name].detach()) for name in names}
         return self._with(moved, edit.apply_moments) if names else self
 
     def reorder(self, values: Mapping[str, Tensor], source: Tensor, is_new: Tensor) -> Parameters:
-        """Return the parameters with other values for some tensors, and the moments of the old rows
+        """Return the parameters with new ``values`` for some tensors and moments gathered from
         ``source``."""
         return self._with(values, lambda x: _moments_of(x, source, is_new))
 
@@ -213,38 +213,37 @@ class Parameters:
     def with_state(
         self, tensors: Mapping[str, Tensor], rows: Mapping[str, int] | None = None
     ) -> Parameters:
-        """Return what ``state`` returned as parameters like these, on their device.
+        """Return these parameters with the values and moments in ``tensors``, on the same device.
 
-        Where no moments are stored, as in files for drawing, they are 0.
+        Moments that are not stored (files for rendering only) are 0.
 
         Args:
-            rows: names of the tensors that have another number of rows than now, and what it must
-                be.
+            rows: required number of rows by tensor name, where it differs from the current one.
         """
         lengths = rows or {}
         values = {
             name: _stored(tensors, name, x, lengths.get(name)) for name, x in self._tensors.items()
         }
-        found = Parameters(values, self.rates, self.decay, self._roles)
+        restored = Parameters(values, self.rates, self.decay, self._roles)
         if any(name.startswith(MOMENTS) for name in tensors):
-            found._adam = AdamState.from_state(tensors, values)
-        return found
+            restored._adam = AdamState.from_state(tensors, values)
+        return restored
 
     def to(self, device: torch.device | str) -> Parameters:
-        found = Parameters(
+        moved = Parameters(
             move_to_device(self.values(), device), self.rates, self.decay, self._roles
         )
-        found._adam = self._adam.to(device)
-        return found
+        moved._adam = self._adam.to(device)
+        return moved
 
     def _with(
         self, values: Mapping[str, Tensor], moments: Callable[[Tensor], Tensor]
     ) -> Parameters:
-        """Return the parameters with other ``values``, and their moments changed by ``moments``."""
-        found = Parameters({}, self.rates, self.decay, self._roles)
-        found._tensors = self._tensors | {name: _leaf(x) for name, x in values.items()}
-        found._adam = self._adam.map(moments, values)
-        return found
+        """Return the parameters with new ``values`` and their moments mapped by ``moments``."""
+        changed = Parameters({}, self.rates, self.decay, self._roles)
+        changed._tensors = self._tensors | {name: _leaf(x) for name, x in values.items()}
+        changed._adam = self._adam.map(moments, values)
+        return changed
 
 
 def _leaf(x: Tensor) -> Tensor:
@@ -252,8 +251,8 @@ def _leaf(x: Tensor) -> Tensor:
 
 
 def _moments_of(x: Tensor, source: Tensor, is_new: Tensor) -> Tensor:
-    """Return the moments ``x`` of rows ``source``; those of new rows, whose source need not exist,
-    are 0."""
+    """Gather moments ``x`` from rows ``source``; those of new rows are 0, their source may not
+    exist."""
     moved = x.new_zeros(len(source), *x.shape[1:])
     moved[~is_new] = x[source[~is_new]]
     return moved
@@ -264,15 +263,17 @@ ADAM_EPS = 1e-15
 
 @dataclass(frozen=True)
 class FrozenMask:
-    """What training leaves as it is: Gaussians (N,) bool, None: none; with ``shapes`` all but the
-    colours of all."""
+    """Parameters that are frozen during training.
+
+    ``rows`` (N,) bool: frozen Gaussians; None: none. With ``shapes`` everything but colour is
+    frozen.
+    """
 
     rows: Tensor | None = None
     shapes: bool = False
 
     def exclude_from_edit(self, result: EditResult, parameters: Gaussians) -> EditResult:
-        """Return a change of the set without what it does to Gaussians that stay: they come last,
-        as they were."""
+        """Remove frozen Gaussians from an edit; they are appended unchanged after the other rows."""
         if self.rows is None:
             return result
         old = parameters.tensors()
@@ -290,10 +291,10 @@ class FrozenMask:
 
 
 class GaussianOptimizer:
-    """The parameters of N Gaussians and their Adam moments.
+    """Optimiser of N Gaussians.
 
     Attributes:
-        parameters: leaf tensors that receive gradients; exchanged for new ones by ``apply``.
+        parameters: leaf tensors; ``apply`` replaces them.
     """
 
     def __init__(self, gaussians: Gaussians, options: OptimConfig) -> None:
@@ -310,15 +311,14 @@ class GaussianOptimizer:
         skip_unseen_rows: Tensor | None = None,
         frozen_mask: FrozenMask | None = None,
     ) -> Count:
-        """Update the parameters, drop the gradients, and return the number of rows left out for bad
-        gradients.
+        """Update the parameters and clear the gradients; return the number of skipped rows.
 
         Args:
-            frozen_rest: (N,) bool, Gaussians of whose harmonics only the base colour is updated;
-                None: none.
-            resting: (M,) indices of Gaussians that are only updated if they received a gradient;
-                None: none.
-            still: what keeps parameters and moments whatever it receives.
+            frozen_harmonics: (N,) bool, Gaussians of which only the base colour is updated; None:
+                none.
+            skip_unseen_rows: (M,) indices of Gaussians that are updated only if they received a
+                gradient; None: none.
+            frozen_mask: parameters that are not updated at all.
         """
         rows = None if frozen_mask is None or frozen_mask.rows is None else ~frozen_mask.rows
         if skip_unseen_rows is not None:
@@ -339,14 +339,13 @@ class GaussianOptimizer:
             for name, x in self.parameters.tensors().items()
         ]
         if frozen_mask is not None and frozen_mask.shapes:
-            updates = updates[-1:]  # of the harmonics
+            updates = updates[-1:]  # only the SH coefficients
         return self._adam.steps_(updates, step=step, eps=ADAM_EPS)
 
     def apply(self, result: EditResult) -> None:
-        """Change the set of Gaussians: parameters and moments of survivors move along, new rows
-        start without moments.
+        """Apply a topology edit: parameters and moments are gathered, new rows get zero moments.
 
-        All parameters become new leaf tensors; gradients are dropped.
+        All parameters become new leaf tensors without gradients.
         """
         edit = result.edit
         moved = self.parameters.detach().tensors()
@@ -358,8 +357,10 @@ class GaussianOptimizer:
         self.parameters = _as_leaves(moved | result.changes)
 
     def drop_harmonics(self, base: Tensor, frozen_harmonics: Tensor) -> None:
-        """Replace harmonics by a base colour, for good: rest and moments become zero; if they do
-        for all, they go."""
+        """Replace SH by a base colour: higher coefficients and their moments become 0.
+
+        If that holds for all Gaussians, the coefficients are removed.
+        """
         sh = self.parameters.sh.detach().clone()
         count = 1 if bool(frozen_harmonics.all()) else sh.shape[1]
         sh[frozen_harmonics, 0] = base[frozen_harmonics]
@@ -381,23 +382,24 @@ class GaussianOptimizer:
         return self._adam.state()
 
     def with_state(self, parameters: Gaussians, tensors: Mapping[str, Tensor]) -> GaussianOptimizer:
-        """Return an optimizer of copies of ``parameters`` with the moments that ``state``
-        returned."""
-        # steps change them in place, and a checkpoint may share its memory with another trainer
+        """Return an optimiser of copies of ``parameters`` with the moments in ``tensors``."""
+        # Steps update in place, and a checkpoint may share memory with another trainer.
         copies = Gaussians(**{name: x.detach().clone() for name, x in parameters.tensors().items()})
         optimizer = GaussianOptimizer(copies, self.options)
         optimizer._adam = AdamState.from_state(tensors, parameters.tensors())
         return optimizer
 
     def _harmonics_rates(self) -> Tensor:
-        """Return (K * 3,) one rate per coefficient, on the CPU."""
+        """Return (K * 3,) learning rates, one per SH coefficient and channel, on the CPU."""
         rates = torch.full((self.parameters.sh.shape[1], 3), self.options.lr_sh_rest, device="cpu")
         rates[0] = self.options.lr_sh_dc
         return rates.reshape(-1)
 
     def _rows_with_gradient(self) -> Tensor:
-        """Return (N,) bool; opacity or position: a Gaussian at full opacity gets no gradient on its
-        opacity alone."""
+        """Return (N,) bool, Gaussians with a gradient by opacity or mean.
+
+        Opacity alone does not suffice: its gradient vanishes at full opacity.
+        """
         opacity_grad = self.parameters.logit_opacities.grad
         means_grad = self.parameters.means.grad
         assert opacity_grad is not None

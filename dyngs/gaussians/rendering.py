@@ -1,4 +1,4 @@
-"""Rendering of Gaussians: images, and what each Gaussian contributes to them."""
+"""Rendering of Gaussians, and the contribution of each Gaussian to images."""
 
 from __future__ import annotations
 
@@ -35,35 +35,34 @@ from dyngs.ops.rasterization import (
 from dyngs.ops.registration import check_choice, check_count, check_finite, finite_rows
 
 Shader = Callable[[Gaussians, Cameras, Tensor], Tensor]
-"""Function of Gaussians, cameras and radii (V, N, 2) that returns colours (V, N, 3): for colour
-models other than harmonics. Gaussians with radius 0 are not drawn; their colours are ignored, but
-must be finite."""
+"""Computes colours (V, N, 3) from Gaussians, cameras and radii (V, N, 2), instead of SH.
+
+Gaussians with radius 0 are not drawn; their colours are ignored but must be finite.
+"""
 
 
 @dataclass(frozen=True)
 class RenderOptions(DrawOptions):
-    """Settings of a render, next to those of ``DrawOptions``.
+    """Render options of Gaussians, in addition to those of ``DrawOptions``.
 
-    Example::
+    Example:
 
         import dyngs
 
         sharp = dyngs.RenderOptions(eps2d=0.1, mode="antialiased", depth="expected")
 
     Attributes:
-        far: centres beyond are culled, as those nearer than ``near`` are, world units.
+        far: Gaussians with a centre beyond are culled, world units.
         eps2d: 2D low-pass variance, px^2 (3DGS: 0.3; Mip-Splatting: 0.1).
         mode: classic, or antialiased (opacity compensated for the low-pass).
         sh_degree: highest degree used; None = that of the Gaussians.
         alpha_min, alpha_max, transmittance_min: see ``BlendOptions``.
         absgrad: fill the absolute part of the probe's gradient.
-        nonfinite: NaN or infinite input is an ``error``, or its Gaussians are left out (``skip``),
-            or it is not looked for (``trust``; the trainer does this, because its optimizer never
-            writes such values).
+        nonfinite: NaN or infinite input raises (``error``), its Gaussians are skipped (``skip``), or
+            the check is omitted (``trust``, for inputs known to be finite, as in training).
 
     Raises:
-        DyngsError: a number that is negative, NaN or beyond its range, or a choice that does not
-            exist.
+        DyngsError: a number out of range or NaN, or an unknown choice.
     """
 
     far: float = 1e10
@@ -82,7 +81,7 @@ class RenderOptions(DrawOptions):
         check_choice("nonfinite", self.nonfinite, ("error", "skip", "trust"))
         if self.sh_degree is not None:
             check_count("sh_degree", self.sh_degree, 0, MAX_SH_DEGREE)
-        _ = self.projection, self.blending  # making them checks the numbers
+        _ = self.projection, self.blending  # construction validates the numbers
 
     @property
     def projection(self) -> ProjectionOptions:
@@ -98,7 +97,7 @@ class RenderOptions(DrawOptions):
 
 @dataclass(frozen=True)
 class GaussianRendering(Rendering):
-    """V rendered images of N Gaussians."""
+    """Rendering of V images of N Gaussians."""
 
     radii: Tensor  # (V, N, 2) int32 half extents in px, 0 = not drawn
 
@@ -112,12 +111,12 @@ def render(
     probe: Tensor | None = None,
     shader: Shader | None = None,
 ) -> GaussianRendering:
-    """Return images of the Gaussians from every camera (Kerbl et al. 2023).
+    """Render the Gaussians from every camera (Kerbl et al. 2023).
 
     Differentiable in the Gaussians, the poses and intrinsics of the cameras, the background, the
-    probe and what the shader computes.
+    probe and the shader.
 
-    Example::
+    Example:
 
         import torch
 
@@ -136,29 +135,29 @@ def render(
         cameras: V cameras, on the device of the Gaussians.
         background: (3,) or (V, 3) colour; None = black.
         probe: (V, N, 4) zeros whose gradient is the densification signal, see ``rasterize``.
-        shader: gives the colours; None: the Gaussians' harmonics do.
+        shader: computes the colours; None: from the SH coefficients.
 
     Raises:
         DyngsError: NaN or infinite input (names the argument and the count), focal lengths that are
             not positive, a background or probe of another shape, cameras on another device than the
             Gaussians, or a render too large for memory.
     """
-    gaussians, cameras = _checked(gaussians, cameras, background, options)
+    gaussians, cameras = _validate_inputs(gaussians, cameras, background, options)
     if probe is not None and probe.shape != (len(cameras), len(gaussians), 4):
         raise DyngsError(
             f"probe must be ({len(cameras)}, {len(gaussians)}, 4), got {tuple(probe.shape)}"
         )
     projection, opacities = _project(gaussians, cameras, options)
     colors = _colors(gaussians, cameras, projection.radii, options, shader)
-    # they may overflow though all that they come from is finite
+    # colours may overflow although all inputs are finite
     if options.nonfinite == "error":
         check_finite({"colors": colors}, "lower sh, or the weights of the network that colours")
     elif options.nonfinite == "skip":
         colors = colors.nan_to_num(0, 0, 0)
     if background is not None:
         background = background.to(colors).expand(len(cameras), 3)
-    # alpha is summed from the weights, one more channel to blend, where it would have fewer than four
-    # digits as 1 - transmittance
+    # With a low alpha_min, 1 - transmittance has fewer than four digits. The weights are then
+    # summed in one more channel.
     needs_weights = options.depth == "expected" and options.alpha_min < 1 / 255
     if options.depth != "none":
         depths = projection.depths[..., None]
@@ -188,10 +187,9 @@ def render(
 def contributions(
     gaussians: Gaussians, cameras: Cameras, options: RenderOptions = RenderOptions()
 ) -> Tensor:
-    """Return the (V, N) sums over pixels of each Gaussian's blending weight: its fraction of every
-    image.
+    """Return the sums (V, N) over pixels of each Gaussian's blending weight, in pixels.
 
-    Example::
+    Example:
 
         import torch
 
@@ -210,9 +208,8 @@ def contributions(
 def depths_and_contributions(
     gaussians: Gaussians, cameras: Cameras, options: RenderOptions = RenderOptions()
 ) -> tuple[BlendedImages, Tensor]:
-    """Return images (V, H, W, 1) of the depth, summed times the weight, and the (V, N)
-    ``contributions``."""
-    gaussians, cameras = _checked(gaussians.detach(), cameras, None, options)
+    """Return weighted depth images (V, H, W, 1) and the ``contributions`` (V, N)."""
+    gaussians, cameras = _validate_inputs(gaussians.detach(), cameras, None, options)
     projection, opacities = _project(gaussians, cameras, options)
     size = (cameras.width, cameras.height)
     depths = projection.depths[..., None]
@@ -227,11 +224,11 @@ def sensitivities(
     background: Tensor | None = None,
     shader: Shader | None = None,
 ) -> Tensor:
-    """Return the (V, N) sums over pixels of (dI/dG)^2 (Tu et al. 2026).
+    """Return the sums (V, N) over pixels of (dI/dG)^2 (Tu et al. 2026).
 
-    I is the sum of a pixel's channels, G the value of the 2D Gaussian there.
+    I is the sum of a pixel's channels, G the value of the 2D Gaussian at the pixel.
     """
-    gaussians, cameras = _checked(gaussians.detach(), cameras, background, options)
+    gaussians, cameras = _validate_inputs(gaussians.detach(), cameras, background, options)
     projection, opacities = _project(gaussians, cameras, options)
     colors = _colors(gaussians, cameras, projection.radii, options, shader)
     if background is not None:
@@ -273,10 +270,10 @@ def _project(
     return projection, per_view
 
 
-def _checked(
+def _validate_inputs(
     gaussians: Gaussians, cameras: Cameras, background: Tensor | None, options: RenderOptions
 ) -> tuple[Gaussians, Cameras]:
-    """Return both in one dtype, with NaN and infinity dealt with as ``options`` say."""
+    """Validate the inputs and convert them to one dtype; handle non-finite values per ``options``."""
     check_background(background, len(cameras))
     if cameras.cam_from_world.device != gaussians.means.device:
         devices = f"the cameras are on {cameras.cam_from_world.device}, the Gaussians on {gaussians.means.device}"
@@ -286,44 +283,43 @@ def _checked(
     cameras = cameras.to(dtype=dtype)
     if options.nonfinite != "trust":
         check_views(cameras, background)
-        gaussians = _deal_with_nonfinite(gaussians, options.nonfinite)
+        gaussians = _handle_nonfinite(gaussians, options.nonfinite)
     return gaussians, cameras
 
 
-def _deal_with_nonfinite(gaussians: Gaussians, policy: str) -> Gaussians:
-    # log_scales can be finite and the scales not: from 88.8 in float32
-    watched = {**gaussians.tensors(), "exp(log_scales)": gaussians.scales.detach()}
+def _handle_nonfinite(gaussians: Gaussians, policy: str) -> Gaussians:
+    # exp(log_scales) overflows float32 from 88.8 on
+    tensors_to_check = {**gaussians.tensors(), "exp(log_scales)": gaussians.scales.detach()}
     if policy == "error":
         check_finite(
-            watched, 'clean the input, or render with nonfinite="skip" to leave these Gaussians out'
+            tensors_to_check,
+            'clean the input, or render with nonfinite="skip" to leave these Gaussians out',
         )
         return gaussians
-    keep = finite_rows(list(watched.values()))
+    keep = finite_rows(list(tensors_to_check.values()))
     if bool(keep.all()):
         return gaussians
     cleaned: dict[str, Tensor] = {}
     for name, x in gaussians.tensors().items():
         mask = keep.view(-1, *[1] * (x.ndim - 1))
         cleaned[name] = torch.where(mask, x, torch.zeros_like(x))
-    # opacity exactly 0: culled, no gradient
+    # opacity exactly 0: culled, without gradient
     hidden = torch.full_like(gaussians.logit_opacities, -1e4)
     cleaned["logit_opacities"] = torch.where(keep, cleaned["logit_opacities"], hidden)
     return Gaussians(**cleaned)
 
 
 def splat_options(splat: SplatFile) -> RenderOptions:
-    """Return the render options stated in a splat file: its mode, and its low-pass filter if
-    any."""
+    """Return the render options stored in a splat file: its mode, and its low-pass filter if any."""
     options = RenderOptions(mode=splat.mode)
     return options if splat.eps2d is None else replace(options, eps2d=splat.eps2d)
 
 
 def file_render_options(splat: SplatFile) -> RenderOptions:
-    """Return ``splat_options`` with a near plane that suits the size of the scene."""
+    """Return ``splat_options`` with a near plane for the size of the scene."""
     means = splat.gaussians.means.double().numpy()
     distances = np.linalg.norm(means - np.median(means, axis=0), axis=1)
-    # About the extent of cameras around it. The median ignores a far background, which must not
-    # push the plane away.
+    # Approximates the extent of cameras around the scene; the median ignores a far background.
     extent = 2 * float(np.median(distances))
     return (
         replace(splat_options(splat), near=near_plane(extent)) if extent else splat_options(splat)

@@ -1,8 +1,8 @@
-"""Scenes that can be trained and drawn: N Gaussians with their motion and colours.
+"""Scenes of Gaussians: N Gaussians with their motion and colours.
 
-There is one class per kind of model: ``gaussians.static_scene.StaticScene``, ``deform.scene.DynamicScene``
-and ``human.avatar.scene.HumanScene``. In training, loaded from a file or watched half-way it is the
-same class. How it is trained is the business of ``gaussians.model``.
+Each kind of model has one class: ``gaussians.static_scene.StaticScene``,
+``deform.scene.DynamicScene`` and ``human.avatar.scene.HumanScene``. It is the same class in
+training, after loading and in the viewer. ``gaussians.model`` trains it.
 """
 
 from __future__ import annotations
@@ -39,8 +39,9 @@ class GaussianTimeStep(TimeStep):
 
     gaussians: Gaussians
     time: float | None = None
-    rest_pose: RestPose | None = None  # where the Gaussians are at rest, if colours follow a body
-    # differentiable regularizers, weighted, by name; empty outside training
+    # pose that the colour network is evaluated in, if it follows a body
+    rest_pose: RestPose | None = None
+    # Differentiable weighted regularisation terms by name; empty outside training.
     penalties: dict[str, Tensor] = field(default_factory=dict)
 
 
@@ -48,7 +49,7 @@ class GaussianTimeStep(TimeStep):
 class GaussianScene(Renderable):
     """N Gaussians at any time.
 
-    Example::
+    Example:
 
         import dyngs
 
@@ -56,11 +57,9 @@ class GaussianScene(Renderable):
         gaussians = scene.at(0.5)
 
     Attributes:
-        gaussians: as stored: canonical, or at rest. In training they are the optimizer's leaf
-            tensors.
-        colour: network that colours them; None: their harmonics do.
-        masks: which Gaussians are seen around a time; None: all may be, at all times. Only where a
-            field moves some.
+        gaussians: canonical Gaussians, or in the rest pose. In training the optimiser's leaf tensors.
+        colour: colour network; None: SH coefficients give the colours.
+        masks: visibility over time, only with a deformation field; None: all are always visible.
     """
 
     gaussians: Gaussians
@@ -79,8 +78,7 @@ class GaussianScene(Renderable):
 
     @property
     def bounds(self) -> Tensor:
-        """(2, 3) box of the finite centres at the first time; of a point at the origin where there
-        are none."""
+        """Box (2, 3) of the finite means at the first time; zero if there are none."""
         means = self.at(None).means
         means = means[means.isfinite().all(1)]
         return torch.stack([means.amin(0), means.amax(0)]) if len(means) else means.new_zeros(2, 3)
@@ -88,7 +86,7 @@ class GaussianScene(Renderable):
     @property
     @abstractmethod
     def rows(self) -> Tensor:
-        """(M,) ascending indices of the Gaussians that move."""
+        """Ascending indices (M,) of the Gaussians that move."""
 
     @property
     def num_moving(self) -> int:
@@ -100,19 +98,18 @@ class GaussianScene(Renderable):
 
     @property
     def offset_rows(self) -> Tensor:
-        """(M',) ascending indices of the Gaussians whose axes or attributes a field changes one by
-        one."""
+        """Ascending indices (M',) of the Gaussians whose shape or attributes a field changes
+        individually."""
         return torch.zeros(0, dtype=torch.long, device=self.gaussians.means.device)
 
     @property
     def num_motion_values(self) -> int:
-        """Number of values stored for motion, next to the Gaussians and their colours."""
+        """Number of stored values that describe motion."""
         return 0
 
     @property
     def num_colour_values(self) -> int:
-        """Number of values stored for colours: base, network, and the rest of Gaussians where it is
-        not all zero."""
+        """Number of stored colour values: base colours, non-zero SH coefficients and the network."""
         sh = self.gaussians.sh
         with_rest = int((sh[:, 1:] != 0).flatten(1).any(1).sum())
         network = 0 if self.colour is None else self.colour.num_values
@@ -124,15 +121,15 @@ class GaussianScene(Renderable):
 
     @abstractmethod
     def time_step(self, time: float | None) -> GaussianTimeStep:
-        """Return the Gaussians at ``time``, clamped to [0, 1]; None is the first."""
+        """Return the Gaussians at ``time``, clamped to [0, 1]; None is the first time."""
 
     def at(self, time: float | None) -> Gaussians:
-        """Return the Gaussians at ``time``, as ``time_step`` has them, without gradients."""
+        """Return the Gaussians of ``time_step`` without gradients."""
         with torch.no_grad():
             return self.time_step(time).gaussians
 
     def shader(self, now: GaussianTimeStep) -> Shader | None:
-        """Return the shader of the Gaussians of a time; None where harmonics give the colours."""
+        """Return the shader at a time step; None if SH coefficients give the colours."""
         return None if self.colour is None else self.colour.shader(now.time, now.rest_pose)
 
     def render(
@@ -144,19 +141,19 @@ class GaussianScene(Renderable):
         background: Tensor | None = None,
         probe: Tensor | None = None,
     ) -> GaussianRendering:
-        """Return images of the scene; differentiable where gradients are enabled.
+        """Render the scene; differentiable where gradients are enabled.
 
         Args:
             cameras: V cameras, on any device.
-            time: in [0, 1], or the Gaussians at a time, so that they are not computed again.
-            options: how to draw; None: as the scene is to be drawn.
+            time: in [0, 1], or a time step of this scene, which avoids computing it again.
+            options: render options; None: those of the scene.
             background: (3,) or (V, 3) colour; None: that of the scene.
             probe: (V, N, 4) zeros whose gradient is the densification signal.
 
         Raises:
             DyngsError: as ``dyngs.gaussians.rendering.render``.
         """
-        now = time if isinstance(time, GaussianTimeStep) else self.time_step(_number(time))
+        now = time if isinstance(time, GaussianTimeStep) else self.time_step(_time_value(time))
         behind = self.background if background is None else background
         how = self.options if options is None else options
         device = now.gaussians.means.device
@@ -168,33 +165,32 @@ class GaussianScene(Renderable):
 
     @abstractmethod
     def apply_edit(self: S, edit: TopologyEdit) -> S:
-        """Return the scene after a change of the set of Gaussians; everything stored per Gaussian
-        follows it."""
+        """Return the scene after a topology edit, with all per-Gaussian state."""
 
     def select(self: S, index: Tensor) -> S:
         """Return the scene with only the Gaussians at ``index`` (long or bool)."""
         return self.apply_edit(TopologyEdit.select(index))
 
     def part(self, which: Literal["moving", "still"]) -> GaussianScene:
-        """Return only the Gaussians that move, or only those that do not."""
+        """Return the scene with only the moving, or only the static Gaussians."""
         moves = torch.zeros(len(self), dtype=torch.bool, device=self.gaussians.means.device)
         if not self.is_static:
             moves[self.rows] = True
         return self.without_masks().select(moves if which == "moving" else ~moves)
 
     def without_masks(self: S) -> S:
-        """Return the scene with all Gaussians drawn at all times."""
+        """Return the scene without visibility masks."""
         return replace(self, masks=None)
 
     def with_gaussians(self: S, gaussians: Gaussians) -> S:
-        """Return the scene with other values, or other leaf tensors, for the same Gaussians."""
+        """Return the scene with new values, or new leaf tensors, of the same Gaussians."""
         return replace(self, gaussians=gaussians)
 
     def on_background(self: S, colour: Tensor) -> S:
         return replace(self, background=colour)
 
-    def changed(self) -> None:
-        """Drop caches derived from tensors that have been changed in place."""
+    def clear_caches(self) -> None:
+        """Clear caches after tensors were changed in place."""
         self._derived.clear()
 
     def state(self) -> State:
@@ -208,29 +204,29 @@ class GaussianScene(Renderable):
 
     @abstractmethod
     def _model_state(self) -> State:
-        """Return the state of this kind of scene next to its Gaussians and colours."""
+        """Return the state of this kind of scene, except Gaussians and colours."""
 
 
 def require_gaussians(scene: Renderable, what: str) -> GaussianScene:
-    """Return ``scene`` if it is made of Gaussians."""
+    """Return ``scene`` if it is made of Gaussians; raise DyngsError otherwise."""
     if not isinstance(scene, GaussianScene):
         raise DyngsError(
-            f"{what}: is not made of Gaussians, which this needs; it can be evaluated, drawn and viewed"
+            f"{what}: this needs a scene of Gaussians; other scenes can be evaluated, rendered and viewed"
         )
     return scene
 
 
 def restore_scene(checkpoint: Checkpoint, model: ModelSection) -> GaussianScene:
-    """Return the scene of a checkpoint of ``model``; see ``restored_model``."""
+    """Return the scene in a checkpoint of ``model``; see ``restored_model``."""
     return require_gaussians(restore_model(checkpoint, model), checkpoint.name)
 
 
-def _number(time: float | TimeStep | None) -> float | None:
+def _time_value(time: float | TimeStep | None) -> float | None:
     return time.time if isinstance(time, TimeStep) else time
 
 
 def restore_appearance(scene: S, model: SceneModel, checkpoint: Checkpoint) -> S:
-    """Return a restored scene with the colours of the checkpoint, drawn as the model is."""
+    """Add the colours, render options and background of the checkpoint to a restored scene."""
     info = checkpoint.info
     colour = restore_colour_network(checkpoint.part("model.colour"))
     options = render_options(model, info.extent, info.world_scale)

@@ -1,5 +1,4 @@
-"""Everything of Gaussians that depends on the step, scaled from 30,000 steps to the length of the
-run."""
+"""Schedules of Gaussian training, scaled from 30,000 steps to the length of the run."""
 
 from __future__ import annotations
 
@@ -13,36 +12,37 @@ from dyngs.gaussians.densify import DensifySchedule
 from dyngs.models.kind import HasGaussians, capability
 from dyngs.models.schedule import PUBLISHED_STEPS, scale_step
 
-MIN_START = 100  # Densification never starts earlier: the first gradients say little
-# Steps that opacities need to recover from a reset (at a rate of 0.05 from logit -4.6)
+MIN_START = 100  # densification never starts earlier: the first gradients are noise
+# Steps that opacities need to recover from a reset (learning rate 0.05, from logit -4.6).
 MIN_RESET_GAP = 400
-RESET_FRACTION = 0.2  # Fraction of a short run between opacity resets
-MOST_BETWEEN_CHANGES, CHANGE_FRACTION = 100, 0.05
-"""Steps between changes of the set, at most and as a fraction of the run: a short run has ten of
-them, too."""
+RESET_FRACTION = 0.2  # opacity reset interval, as a fraction of a short run
+MAX_INTERVAL, INTERVAL_FRACTION = 100, 0.05
+"""Steps between densifications: at most, and as a fraction of a short run."""
 MEANS_POWER = 1 / 2
-POWER = 1 / 3
+OTHERS_POWER = 1 / 3
 SHORTEST = 500
-"""Powers of 30,000 / steps that learning rates of positions, and all others, are multiplied by
-(docs/benchmarks.md); those of runs shorter than the last are its own."""
+"""Exponents of 30,000 / steps in the learning rate factors of means and of all other parameters.
+
+Runs shorter than ``SHORTEST`` use the factors of ``SHORTEST`` (docs/benchmarks/index.md).
+"""
 GROWTH, MAX_GROWTH = 0.05, 0.25
-"""Fraction of Gaussians that MCMC adds per change in 30,000 steps, and most in a shorter run."""
+"""Fraction of Gaussians that MCMC adds per change in 30,000 steps, and the maximum in shorter
+runs."""
 FILTER_EVERY = 100
 REWIND = 0.3
-"""Fraction of training whose rates fine-tuning goes back to, to fall again (Renda et al. 2020)."""
+"""Fraction of training to which fine-tuning rewinds the learning rates (Renda et al. 2020)."""
 
 
 @dataclass(frozen=True)
 class RateSchedule:
-    """The course of all learning rates that fall over a run."""
+    """Progress of the learning rates that decay over a run."""
 
     steps: int
-    # steps of a stage after that, with fewer Gaussians, whose rates begin at ``REWIND``
+    # Fine-tuning steps after pruning; their rates start at ``REWIND``.
     tuning: int = 0
 
     def progress(self, step: int, since: int = 0) -> float:
-        """Return 0 up to step ``since``, rising to 1 at the end: the progress of rates that fall
-        from ``since`` on."""
+        """Return 0 up to step ``since``, then rising linearly to 1 at the end of the run."""
         at = float(step)
         if step > self.steps:
             tuned = min((step - self.steps) / max(self.tuning, 1), 1.0)
@@ -51,29 +51,28 @@ class RateSchedule:
 
 
 def rate_schedule(config: Config) -> RateSchedule:
-    """Return the course of the learning rates of a run."""
+    """Return the learning rate schedule of a run."""
     return RateSchedule(config.train.steps, config.prune.steps)
 
 
 def rate_factors(config: Config) -> tuple[float, float]:
-    """Return the factors on the learning rates of positions and of all else, where the published
-    ones have 1.
+    """Return the learning rate factors of means and of all other parameters; 1 in 30,000 steps.
 
-    In fewer steps what is learned has to come as far. ``optim.rate_factor`` decides; else the
-    length of the run does, for static scenes: in a moving one, Gaussians that learn as fast repaint
-    each image instead of following it.
+    Short runs need larger rates. ``optim.rate_factor`` takes precedence. Otherwise only static
+    scenes use a factor: in moving scenes, faster Gaussians repaint each image instead of following
+    the motion.
     """
-    asked = config.optim.rate_factor
+    requested = config.optim.rate_factor
     short = PUBLISHED_STEPS / max(SHORTEST, min(config.train.steps, PUBLISHED_STEPS))
-    if asked is not None:
-        return asked, asked
+    if requested is not None:
+        return requested, requested
     kind = capability(config.model, HasGaussians)
     speeds_up = kind is not None and kind.speeds_up_short_runs
-    return (short**MEANS_POWER, short**POWER) if speeds_up else (1.0, 1.0)
+    return (short**MEANS_POWER, short**OTHERS_POWER) if speeds_up else (1.0, 1.0)
 
 
 def learning_rates(config: Config) -> OptimConfig:
-    """Return ``config.optim`` with the rates of this run: those given, times their factors."""
+    """Return ``config.optim`` with all learning rates multiplied by the factors of this run."""
     given, (of_means, of_others) = config.optim, rate_factors(config)
     rates = {
         name: getattr(given, name) for name in OptimConfig.model_fields if name.startswith("lr_")
@@ -85,32 +84,31 @@ def learning_rates(config: Config) -> OptimConfig:
 
 
 def means_rate(options: OptimConfig, progress: float, extent: float) -> float:
-    """Return the learning rate of the means, world units: log-linear in ``progress`` in [0, 1],
-    times the extent."""
+    """Return the learning rate of the means in world units: log-linear in ``progress``, times the
+    extent."""
     return extent * math.exp(
         (1 - progress) * math.log(options.lr_means) + progress * math.log(options.lr_means_final)
     )
 
 
 def active_sh_degree(options: TrainConfig, step: int, max_degree: int) -> int:
-    """Return the SH degree drawn at ``step``: one more each ``sh_every`` (scaled) steps."""
+    """Return the SH degree at ``step``: one more every ``sh_every`` (scaled) steps."""
     return min(max_degree, step // scale_step(options.sh_every, options.steps))
 
 
 def densify_schedule(
     strategy: DefaultStrategy | McmcStrategy, steps: int, white_background: bool
 ) -> DensifySchedule:
-    """Return the steps at which ``strategy`` changes the set of Gaussians in a run of ``steps``.
+    """Return the densification schedule of ``strategy`` in a run of ``steps``.
 
-    Opacities need as many steps to recover from a reset in a short run as in a long one. So resets
-    are a fifth of the run apart, within [``MIN_RESET_GAP``, the published 3000], and the last is
-    one period before densification stops (at 30,000: 3000, 6000, 9000, 12,000; at 7,000: 1400). On
-    a white background the published schedule has one more at the start, which clears white
-    floaters; in shorter runs it costs more than it brings.
+    Opacities need the same number of steps to recover from a reset in short and long runs. Resets
+    are therefore a fifth of the run apart, within [``MIN_RESET_GAP``, the published 3000]. The
+    last reset is one period before densification stops. Full-length runs on a white background
+    have one more reset at the start, as published, which removes white floaters.
     """
     start = max(scale_step(strategy.start, steps), min(strategy.start, MIN_START))
     stop = scale_step(strategy.stop, steps)
-    every = steps_between_changes(strategy, steps)
+    every = densify_interval(strategy, steps)
     match strategy:
         case McmcStrategy():
             return DensifySchedule(start, stop, every)
@@ -128,16 +126,16 @@ def densify_schedule(
             assert_never(strategy)
 
 
-def steps_between_changes(strategy: DefaultStrategy | McmcStrategy, steps: int) -> int:
-    """Return the steps between changes of the set of Gaussians in a run of ``steps``."""
-    return strategy.every or max(1, min(MOST_BETWEEN_CHANGES, round(CHANGE_FRACTION * steps)))
+def densify_interval(strategy: DefaultStrategy | McmcStrategy, steps: int) -> int:
+    """Return the steps between densifications in a run of ``steps``."""
+    return strategy.every or max(1, min(MAX_INTERVAL, round(INTERVAL_FRACTION * steps)))
 
 
 def grad_threshold(strategy: DefaultStrategy, steps: int) -> float:
-    """Return the gradient norm from which Gaussians are cloned or split in a run of ``steps``.
+    """Return the gradient threshold of cloning and splitting in a run of ``steps``.
 
-    A short run has fewer changes; a lower threshold makes up for it. The fourth root was measured
-    on lego: +0.5 dB at 2,000 steps, +0.3 dB at 7,000.
+    Short runs densify less often, which a lower threshold compensates. The fourth root was tuned
+    on lego.
     """
     return strategy.grad_threshold * min(1.0, steps / PUBLISHED_STEPS) ** 0.25
 
@@ -145,15 +143,14 @@ def grad_threshold(strategy: DefaultStrategy, steps: int) -> float:
 def growth_per_change(steps: int) -> float:
     """Return the fraction of Gaussians that MCMC adds per change.
 
-    A short run has fewer changes; each then adds more, up to a quarter, and the count follows the
-    same curve.
+    Short runs have fewer changes, so each adds more, up to ``MAX_GROWTH``.
     """
     rate = math.log1p(GROWTH) * max(PUBLISHED_STEPS / steps, 1.0)
     return max(GROWTH, math.expm1(min(rate, math.log1p(MAX_GROWTH))))
 
 
 def filter_steps(strategy: Strategy, steps: int) -> range:
-    """Return the steps after which Mip-Splatting's 3D filter is recomputed: each 100 after
-    densification ends."""
+    """Return the steps after which the 3D filter is recomputed: every 100 after densification
+    stops."""
     first = -(-scale_step(strategy.stop, steps) // FILTER_EVERY) * FILTER_EVERY
     return range(first, steps - FILTER_EVERY + 1, FILTER_EVERY)

@@ -1,4 +1,4 @@
-"""Static scenes of Gaussians, and scenes whose Gaussians are each drawn for the nearest cameras."""
+"""Static scenes of Gaussians, optionally with one set of Gaussians per viewing direction."""
 
 from __future__ import annotations
 
@@ -19,65 +19,69 @@ from dyngs.gaussians.rendering import GaussianRendering, RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep, restore_times, times_state
 from dyngs.models.renderable import TimeStep, clamp_time, concatenate_renderings, single_views
 
-_UNSEEN = -30.0  # Logit of an opacity that is never drawn
+_UNSEEN = -30.0  # logit of an opacity that is never drawn
 
 
 @dataclass(frozen=True)
 class ViewSides:
-    """To which of S sides each of N Gaussians belongs."""
+    """Assignment of N Gaussians to S viewing directions; each camera renders one of them."""
 
-    of: Tensor  # (N,) int64
-    toward: Tensor  # (S, 3) unit vectors from the middle to where a side is seen from
-    middle: Tensor  # (3,) of what is seen, in the world
+    side_ids: Tensor  # (N,) int64 viewing direction of each Gaussian
+    directions: Tensor  # (S, 3) unit vectors from ``center`` towards the viewpoints
+    center: Tensor  # (3,) centre of the Gaussians, world
 
     @staticmethod
-    def joined(parts: Sequence[Gaussians], centers: Sequence[Tensor]) -> ViewSides:
-        """Return those of ``parts`` one after another; ``centers``: (3,) where each is seen from,
-        on average."""
-        device = centers[0].device
-        middle = Gaussians.joined(parts).means.mean(0)
+    def joined(parts: Sequence[Gaussians], viewpoints: Sequence[Tensor]) -> ViewSides:
+        """Build the assignment for concatenated ``parts``; ``viewpoints``: (3,) mean of each."""
+        device = viewpoints[0].device
+        center = Gaussians.joined(parts).means.mean(0)
         sizes = torch.tensor([len(part) for part in parts], device=device)
-        of = torch.arange(len(parts), dtype=torch.int64, device=device).repeat_interleave(sizes)
-        return ViewSides(of, normalize(torch.stack([*centers]) - middle, dim=1), middle)
+        side_ids = torch.arange(len(parts), dtype=torch.int64, device=device)
+        directions = normalize(torch.stack([*viewpoints]) - center, dim=1)
+        return ViewSides(side_ids.repeat_interleave(sizes), directions, center)
 
-    def seen_by(self, camera: Cameras, gaussians: Gaussians) -> Gaussians:
-        """Return the Gaussians as one camera is to see them: those of other sides are
-        transparent."""
-        side = (self.toward @ normalize(camera.centers[0] - self.middle, dim=0)).argmax()
+    def visible_from(self, camera: Cameras, gaussians: Gaussians) -> Gaussians:
+        """Hide the Gaussians of all viewing directions but the one nearest to the camera."""
+        side = (self.directions @ normalize(camera.centers[0] - self.center, dim=0)).argmax()
         return gaussians.replace(
-            logit_opacities=gaussians.logit_opacities.where(self.of == side, _UNSEEN)
+            logit_opacities=gaussians.logit_opacities.where(self.side_ids == side, _UNSEEN)
         )
 
     def apply_edit(self, edit: TopologyEdit) -> ViewSides:
-        return ViewSides(edit.apply(self.of), self.toward, self.middle)
+        return ViewSides(edit.apply(self.side_ids), self.directions, self.center)
 
     def state(self) -> State:
-        shared = {"toward": self.toward, "middle": self.middle}
-        return {"sides.of": StateTensor(self.of, Role.PER_GAUSSIAN)} | {
+        shared = {"toward": self.directions, "middle": self.center}
+        return {"sides.of": StateTensor(self.side_ids, Role.PER_GAUSSIAN)} | {
             f"sides.{name}": StateTensor(x, Role.SHARED) for name, x in shared.items()
         }
 
     @staticmethod
     def from_state(tensors: Mapping[str, Tensor], count: int) -> ViewSides | None:
-        """Return those of a state for N = ``count``, None without. Raises KeyError, ValueError:
-        they do not fit."""
+        """Return the assignment in a state for N = ``count``, or None.
+
+        Raises KeyError or ValueError if the tensors do not match.
+        """
         if "sides.of" not in tensors:
             return None
-        toward = require_tensor("toward", tensors["sides.toward"], (None, 3))
-        of = require_indices("of", tensors["sides.of"], (count,), len(toward), torch.int64)
-        return ViewSides(of, toward, require_tensor("middle", tensors["sides.middle"], (3,)))
+        directions = require_tensor("toward", tensors["sides.toward"], (None, 3))
+        side_ids = require_indices(
+            "of", tensors["sides.of"], (count,), len(directions), torch.int64
+        )
+        center = require_tensor("middle", tensors["sides.middle"], (3,))
+        return ViewSides(side_ids, directions, center)
 
 
 @dataclass(frozen=True, kw_only=True)
 class StaticScene(GaussianScene):
-    """The same N Gaussians at every time; with ``sides`` each camera sees those of the side nearest
-    to it."""
+    """N static Gaussians; with ``sides`` each camera renders the Gaussians of its viewing
+    direction."""
 
     has_levels: ClassVar[bool] = True
     filter_std: Tensor | None = None
     sides: ViewSides | None = None
-    # distinct training times in [0, 1], ascending, where a dynamic model was asked for and nothing
-    # moves
+    # Distinct training times in [0, 1], ascending, if the capture has times but the scene is
+    # static.
     training_times: tuple[float, ...] = ()
 
     @staticmethod
@@ -103,10 +107,10 @@ class StaticScene(GaussianScene):
 
     @property
     def num_moving(self) -> int:
-        return 0  # asked for at every step
+        return 0  # constant, because it is read at every step
 
     def time_step(self, time: float | None) -> GaussianTimeStep:
-        """Return the Gaussians, fused with their 3D filter if there is one."""
+        """Return the Gaussians with their 3D filter applied."""
         return GaussianTimeStep(apply_filter(self.gaussians, self.filter_std), clamp_time(time))
 
     def render(
@@ -124,16 +128,16 @@ class StaticScene(GaussianScene):
             )
         now = time if isinstance(time, GaussianTimeStep) else self.time_step(None)
         cameras = cameras.to(device=self.device, dtype=now.gaussians.means.dtype)
-        found = []
+        renderings = []
         for i, (camera, behind) in enumerate(
             single_views(cameras, self.background if background is None else background)
         ):
-            own = GaussianTimeStep(self.sides.seen_by(camera, now.gaussians), now.time)
+            own = GaussianTimeStep(self.sides.visible_from(camera, now.gaussians), now.time)
             signal = None if probe is None else probe[i : i + 1]
-            found.append(
+            renderings.append(
                 super().render(camera, own, options=options, background=behind, probe=signal)
             )
-        return concatenate_renderings(found)
+        return concatenate_renderings(renderings)
 
     def apply_edit(self, edit: TopologyEdit) -> StaticScene:
         std = None if self.filter_std is None else edit.apply(self.filter_std)

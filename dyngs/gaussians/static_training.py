@@ -32,118 +32,136 @@ from dyngs.models.kind import StartContext
 from dyngs.models.schedule import scale_step
 from dyngs.models.views import training_cameras
 
-# Training views, evenly spaced, in which a Gaussian is looked for before it is removed
-SURVEYED = 200
+# Evenly spaced training views in which contributions are measured before pruning.
+MEASURED_VIEWS = 200
 
 
 @dataclass(frozen=True)
 class SmallGaussianPruning:
-    """Removal, once, of Gaussians that amount to less than ``pixels`` in every one of some views.
+    """One-time pruning of Gaussians that contribute less than ``pixels`` to every measured view.
 
-    What a Gaussian amounts to is its blending weight, summed over an image: 1 for a pixel that
-    shows nothing else.
+    The contribution is the blending weight summed over an image: 1 for a pixel that shows only
+    this Gaussian.
     """
 
-    step: int = 0  # after which that happens; 0: it does not
+    step: int = 0  # step after which Gaussians are pruned; 0: never
     pixels: float = 0.0
     cameras: Sequence[Cameras] = ()
 
-    def edit(self, scene: StaticScene, stays: Tensor | None = None) -> EditResult | None:
-        """Return the removal; None where all Gaussians, or none, amount to that much; ``stays``
-        (N,) bool: these do."""
+    def edit(self, scene: StaticScene, protected: Tensor | None = None) -> EditResult | None:
+        """Return the pruning edit, or None if all or no Gaussians contribute enough.
+
+        ``protected`` (N,) bool: Gaussians that are never pruned.
+        """
         drawn = scene.time_step(None).gaussians
-        most = torch.zeros(len(scene), device=scene.device)
+        max_contribution = torch.zeros(len(scene), device=scene.device)
         for cameras in self.cameras:
-            found = contributions(drawn, cameras.to(device=scene.device), scene.options)
-            most = torch.maximum(most, found.amax(0))
-        kept = most >= self.pixels if stays is None else (most >= self.pixels) | stays
+            weights = contributions(drawn, cameras.to(device=scene.device), scene.options)
+            max_contribution = torch.maximum(max_contribution, weights.amax(0))
+        kept = (
+            max_contribution >= self.pixels
+            if protected is None
+            else (max_contribution >= self.pixels) | protected
+        )
         if bool(kept.all()) or not bool(kept.any()):
             return None
         text = (
-            f"{len(scene) - int(kept.sum()):,} of {len(scene):,} Gaussians are removed: each makes up less than "
-            f"{self.pixels:g} px of every training view (strategy.prune_pixels)"
+            f"pruned {len(scene) - int(kept.sum()):,} of {len(scene):,} Gaussians that cover less than "
+            f"{self.pixels:g} px in every training view (strategy.prune_pixels)"
         )
         return EditResult(TopologyEdit.select(kept), message=text)
 
 
 def build_small_pruning(run: StartContext) -> SmallGaussianPruning:
-    """Return when and by which views Gaussians of a run are removed: when no more are added."""
+    """Build the pruning of small Gaussians, due when densification stops."""
     config = run.config
     strategy = run.config.strategy
     if not (isinstance(strategy, DefaultStrategy) and strategy.prune_pixels > 0):
         return SmallGaussianPruning()
     views = run.capture.splits["train"]
-    cameras = training_cameras([views[i] for i in evenly_spaced(len(views), SURVEYED)], config.data)
+    cameras = training_cameras(
+        [views[i] for i in evenly_spaced(len(views), MEASURED_VIEWS)], config.data
+    )
     return SmallGaussianPruning(
         scale_step(strategy.stop, config.train.steps), strategy.prune_pixels, cameras
     )
 
 
 class StaticTraining(SceneTraining[StaticScene]):
-    """See ``SceneTraining``; nothing is learned next to the Gaussians and their colours.
+    """Training of a static scene, see ``SceneTraining``.
 
-    ``still``: what stays as it is.
+    ``frozen_mask``: parameters that are frozen.
     """
 
     def __init__(
         self,
         update: FilterUpdate,
-        removal: SmallGaussianPruning = SmallGaussianPruning(),
+        build_pruning_edit: SmallGaussianPruning = SmallGaussianPruning(),
         frozen_mask: FrozenMask | None = None,
     ) -> None:
-        self._update, self._removal, self._still = update, removal, frozen_mask
+        self._update, self._pruning, self._build_frozen_mask = (
+            update,
+            build_pruning_edit,
+            frozen_mask,
+        )
 
     def frozen_mask(self) -> FrozenMask | None:
-        return self._still
+        return self._build_frozen_mask
 
-    def follow(self, edit: TopologyEdit) -> None:
-        if self._still is not None and self._still.rows is not None:
-            self._still = replace(self._still, rows=edit.apply(self._still.rows))
+    def apply_edit(self, edit: TopologyEdit) -> None:
+        if self._build_frozen_mask is not None and self._build_frozen_mask.rows is not None:
+            self._build_frozen_mask = replace(
+                self._build_frozen_mask, rows=edit.apply(self._build_frozen_mask.rows)
+            )
 
     def state(self) -> State:
-        rows = None if self._still is None else self._still.rows
+        rows = None if self._build_frozen_mask is None else self._build_frozen_mask.rows
         return {} if rows is None else {"frozen": StateTensor(rows, Role.TRAINING)}
 
     def first_scene(self, gaussians: Gaussians) -> StaticScene:
-        return StaticScene(gaussians=gaussians, filter_std=self._update.of(gaussians))
+        return StaticScene(gaussians=gaussians, filter_std=self._update.compute(gaussians))
 
     def after_step(self, scene: StaticScene, step: int, edited: bool) -> StaticScene:
         if self._update.is_due(step, edited):
-            return replace(scene, filter_std=self._update.of(scene.gaussians))
+            return replace(scene, filter_std=self._update.compute(scene.gaussians))
         return scene
 
     def edit_scene(self, scene: StaticScene, step: int) -> tuple[StaticScene, EditResult] | None:
-        rows = None if self._still is None else self._still.rows
-        result = self._removal.edit(scene, rows) if step == self._removal.step else None
+        rows = None if self._build_frozen_mask is None else self._build_frozen_mask.rows
+        result = self._pruning.edit(scene, rows) if step == self._pruning.step else None
         if result is None or result.edit is None:
             return None
         return scene.apply_edit(result.edit), result
 
     def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
-        if self._still is not None and "frozen" in tensors:
+        if self._build_frozen_mask is not None and "frozen" in tensors:
             frozen = require_tensor("frozen", tensors["frozen"], (len(gaussians),), torch.bool)
-            self._still = replace(self._still, rows=frozen.to(gaussians.means.device))
+            self._build_frozen_mask = replace(
+                self._build_frozen_mask, rows=frozen.to(gaussians.means.device)
+            )
         return StaticScene.from_state(gaussians, tensors)
 
 
-def _still(run: StartContext) -> FrozenMask | None:
+def _build_frozen_mask(run: StartContext) -> FrozenMask | None:
     init = run.config.init
     rows = None if run.first is None else run.first.frozen
     return FrozenMask(rows, init.trainable == "colour") if isinstance(init, SceneInit) else None
 
 
 def start(run: StartContext) -> GaussianModel:
-    """Return the model of a static scene before its first step."""
+    """Create the model of a static scene before its first step."""
     gaussians = load_or_create_gaussians(run)
     colours = build_colour_training(run, gaussians, uses_time=False)
-    training = StaticTraining(build_filter_update(run), build_small_pruning(run), _still(run))
+    training = StaticTraining(
+        build_filter_update(run), build_small_pruning(run), _build_frozen_mask(run)
+    )
     return GaussianModel(
         run, training.first_scene(gaussians), training, build_densifier(run), colours
     )
 
 
 def restore(model: SceneModel, checkpoint: Checkpoint) -> StaticScene:
-    """Return the scene of a checkpoint."""
+    """Return the scene in a checkpoint."""
     scene = StaticScene.from_state(
         Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
     )

@@ -1,4 +1,4 @@
-"""The surface that Gaussians show: depths of several views averaged on a grid, and simplified."""
+"""Surface extraction from Gaussians: TSDF fusion of rendered depths, and mesh simplification."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.renderable import Surface
 
-OPAQUE = 0.5  # Of a pixel that shows a surface
+MIN_OPACITY = 0.5  # opacity of a pixel from which it shows a surface
 
 
 @dataclass(frozen=True)
 class DepthView:
-    """What one camera sees."""
+    """Rendered depth, opacity and colour of one camera."""
 
     camera: Cameras
     depth: Tensor  # (H, W) z
@@ -30,7 +30,7 @@ class DepthView:
 
 @dataclass(frozen=True)
 class Mesh:
-    """Flat triangles."""
+    """Triangle mesh."""
 
     vertices: np.ndarray  # (V, 3)
     faces: np.ndarray  # (F, 3)
@@ -44,12 +44,12 @@ def fuse_depths(
     *,
     unseen_is_solid: bool = True,
 ) -> Mesh | None:
-    """Return the surface in the box from ``low`` to ``high`` (3,); None where there is none.
+    """Fuse depth views into a mesh in the box from ``low`` to ``high`` (3,); None if it is empty.
 
     Args:
         cells: along the longest side of the box.
-        unseen_is_solid: what no view sees into counts as inside, which closes the back of things;
-            else the surface ends where what is seen does.
+        unseen_is_solid: unobserved space counts as inside, which closes the back of objects;
+            otherwise the surface ends at the border of the observed space.
     """
     from scipy.ndimage import minimum_filter
     from skimage.measure import marching_cubes
@@ -57,33 +57,37 @@ def fuse_depths(
     size = float((high - low).max()) / cells
     counts = ((high - low) / size).ceil().long() + 1
     x, y, z = (low[i] + size * torch.arange(int(counts[i]), device="cpu") for i in range(3))
-    # two million points at once, for memory
+    # two million points at once, to limit memory
     slabs = x.split(max((1 << 21) // (len(y) * len(z)), 1))
     means, known = zip(
-        *(_averages(seen, torch.cartesian_prod(slab, y, z), size) for slab in slabs), strict=True
+        *(_signed_distances(seen, torch.cartesian_prod(slab, y, z), size) for slab in slabs),
+        strict=True,
     )
     grid, is_known = (torch.cat(x).view(*counts.tolist()).numpy() for x in (means, known))
-    # marching cubes asks at the last of the eight corners of a cell
+    # marching_cubes reads the mask at the last of the eight corners of a cell
     mask: np.ndarray = is_known | True if unseen_is_solid else minimum_filter(is_known, 2)
     looked_at = grid[mask]
     if not looked_at.size or not looked_at.min() < 0 < looked_at.max():
         return None
     vertices, faces, _, _ = marching_cubes(grid, 0.0, mask=mask)
-    # its rows are stored backwards
+    # the rows of ``faces`` have negative strides
     return Mesh(vertices * size + low.numpy(), np.ascontiguousarray(faces))
 
 
-def _averages(seen: Sequence[DepthView], points: Tensor, size: float) -> tuple[Tensor, Tensor]:
-    """Return (N,) mean signed distances of ``points`` (N, 3) before what the views show, at most 1,
-    -1 where none sees them, and (N,) bool, where one does.
+def _signed_distances(
+    seen: Sequence[DepthView], points: Tensor, size: float
+) -> tuple[Tensor, Tensor]:
+    """Return truncated signed distances (N,) of ``points`` (N, 3) and a mask (N,) of observed
+    points.
 
-    A view sees up to three cells behind a surface, which are the unit of distances.
+    Distances are averaged over views, positive in front of the surface, in units of three cells,
+    clamped to 1; -1 for unobserved points. A view observes up to three cells behind a surface.
     """
     total = torch.zeros(len(points), device="cpu")
     weight = torch.zeros(len(points), device="cpu")
     for one in seen:
-        column, row, z, inside = _pixels(one.camera, points)
-        opaque = one.opacity[row, column] > OPAQUE
+        column, row, z, inside = _project_to_pixels(one.camera, points)
+        opaque = one.opacity[row, column] > MIN_OPACITY
         distance = torch.where(opaque, (one.depth[row, column] - z) / (3 * size), 1.0).clamp(max=1)
         counted = inside & (distance > -1)
         total += torch.where(counted, distance, 0.0)
@@ -91,9 +95,11 @@ def _averages(seen: Sequence[DepthView], points: Tensor, size: float) -> tuple[T
     return torch.where(weight > 0, total / weight.clamp_min(1), -1.0), weight > 0
 
 
-def _pixels(camera: Cameras, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return columns, rows, and z of ``points`` (N, 3), and which of them lie in the image; others
-    have pixel 0."""
+def _project_to_pixels(camera: Cameras, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return columns, rows and depths of ``points`` (N, 3), and a mask of those inside the image.
+
+    Points outside get pixel 0.
+    """
     pose = camera.cam_from_world[0]
     inner = camera.intrinsics[0]
     x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
@@ -106,43 +112,45 @@ def _pixels(camera: Cameras, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Te
 
 
 def sample_colours(seen: Sequence[DepthView], points: Tensor, tolerance: float) -> Tensor:
-    """Return (N, 3) mean colours of surface ``points`` (N, 3) in the views that show them; grey
-    where none does.
+    """Return mean colours (N, 3) of surface ``points`` (N, 3) in the views that see them; else
+    grey.
 
     Args:
-        tolerance: how far behind what a view shows a point may be, world units.
+        tolerance: distance behind the visible surface up to which a point is visible, world units.
     """
     total = torch.full((len(points), 3), 5e-4, device="cpu")
     weight = torch.full((len(points), 1), 1e-3, device="cpu")
     for one in seen:
-        column, row, z, inside = _pixels(one.camera, points)
+        column, row, z, inside = _project_to_pixels(one.camera, points)
         shown = (
-            inside & (one.opacity[row, column] > OPAQUE) & (z < one.depth[row, column] + tolerance)
+            inside
+            & (one.opacity[row, column] > MIN_OPACITY)
+            & (z < one.depth[row, column] + tolerance)
         )
         total += torch.where(shown[:, None], one.colour[row, column], 0.0)
         weight += shown[:, None]
     return total / weight
 
 
-def simplify_mesh(mesh: Mesh, most: int) -> Mesh:
-    """Return a mesh of about ``most`` faces, no more, whose vertices are joined within cells."""
-    if len(mesh.faces) <= most:
+def simplify_mesh(mesh: Mesh, max_faces: int) -> Mesh:
+    """Simplify a mesh to at most ``max_faces`` faces by vertex clustering."""
+    if len(mesh.faces) <= max_faces:
         return mesh
     coarse = float(np.ptp(mesh.vertices, axis=0).max())
     fine = coarse / 1024
     for _ in range(10):
         size = (fine * coarse) ** 0.5
-        if len(_joined(mesh, size)[1]) <= most:
+        if len(_cluster_vertices(mesh, size)[1]) <= max_faces:
             coarse = size
         else:
             fine = size
-    labels, faces = _joined(mesh, coarse)
-    return Mesh(_meeting_points(mesh, labels, coarse), faces)
+    labels, faces = _cluster_vertices(mesh, coarse)
+    return Mesh(_quadric_vertices(mesh, labels, coarse), faces)
 
 
-def _joined(mesh: Mesh, size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return (V,) number of the cell that each vertex is in, and (F, 3) faces between cells, each
-    once."""
+def _cluster_vertices(mesh: Mesh, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the cell (V,) of each vertex, and the distinct non-degenerate faces (F, 3) between
+    cells."""
     cells = np.floor((mesh.vertices - mesh.vertices.min(0)) / size)
     labels = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
     faces = labels[mesh.faces]
@@ -151,9 +159,9 @@ def _joined(mesh: Mesh, size: float) -> tuple[np.ndarray, np.ndarray]:
     return labels, faces[np.sort(first)]
 
 
-def _meeting_points(mesh: Mesh, labels: np.ndarray, size: float) -> np.ndarray:
-    """Return (L, 3): per label of vertices where the planes of their faces meet, within ``size`` of
-    their mean."""
+def _quadric_vertices(mesh: Mesh, labels: np.ndarray, size: float) -> np.ndarray:
+    """Return a vertex (L, 3) per cell that minimises the quadric error, within ``size`` of the
+    mean."""
     count = int(labels.max()) + 1
 
     def summed(labels: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -172,7 +180,7 @@ def _meeting_points(mesh: Mesh, labels: np.ndarray, size: float) -> np.ndarray:
         left += summed(label, areas * squares)
         right += summed(label, areas * heights * normals)
     planes = left.reshape(-1, 3, 3)
-    # towards the mean where planes do not say where they meet
+    # pull towards the mean where the planes do not determine the point
     stiff = 0.02 * np.trace(planes, axis1=1, axis2=2)[:, None, None] + 1e-30
     moved = np.linalg.solve(planes + stiff * np.eye(3), right[:, :, None])[:, :, 0]
     return means + moved.clip(-size, size)
@@ -187,24 +195,23 @@ def extract_surface(
     *,
     cells: int | None = None,
 ) -> Surface:
-    """Return the surface at ``time`` that ``cameras``, one view each, see in ``box``, two corners
-    (3,) in the world.
+    """Extract the surface at ``time`` from depth maps of ``cameras`` (one view each) in ``box``.
 
-    Where nothing is seen the surface ends, and pieces with less than a fiftieth of the faces of the
-    largest are left out.
+    ``box``: two corners (3,), world. The surface ends where no view observes it. Components with
+    fewer than a fiftieth of the faces of the largest are dropped.
 
     Args:
         cells: along the longest side of the box; None: 192.
 
     Raises:
-        DyngsError: no view shows anything solid there.
+        DyngsError: no view shows an opaque surface in the box.
     """
     cells = cells or 192
     seen = [render_depth_view(scene, camera, time) for camera in cameras]
     mesh = fuse_depths(seen, *box, cells, unseen_is_solid=False)
     if mesh is None:
         raise DyngsError(
-            "no surface: none of the views shows anything solid where the Gaussians are"
+            "no surface found: no view shows an opaque surface in the box of the Gaussians"
         )
     mesh = keep_largest_components(mesh)
     size = float((box[1] - box[0]).max()) / cells
@@ -215,36 +222,34 @@ def extract_surface(
 def render_depth_view(
     scene: GaussianScene, camera: Cameras, time: float | None = None
 ) -> DepthView:
-    """Return what one camera sees of a scene; colours are those of what is there, without the
-    background."""
+    """Render depth, opacity and colour without background for one camera."""
     options = replace(scene.options, depth="expected")
     drawn = scene.render(camera, time, options=options, background=torch.zeros(3, device="cpu"))
     assert drawn.depth is not None
     opacity = 1 - drawn.transmittance[0]
     return DepthView(
-        camera, drawn.depth[0], opacity, drawn.rgb[0] / opacity.clamp_min(OPAQUE)[..., None]
+        camera, drawn.depth[0], opacity, drawn.rgb[0] / opacity.clamp_min(MIN_OPACITY)[..., None]
     )
 
 
 def opaque_box(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
-    """Return the corners of the box around opaque Gaussians, but for half a percent of them on
-    either side."""
+    """Return the corners of the box of opaque Gaussians, without the outer half percent on each
+    side."""
     means = gaussians.means.detach()
     opaque = gaussians.logit_opacities.detach() > 0
     opaque = opaque if bool(opaque.any()) else torch.ones_like(opaque)
-    # sorted, as quantiles of torch take 16 million numbers at most
+    # torch.quantile takes 16 million numbers at most
     ordered = means[opaque].sort(dim=0).values
     last = len(ordered) - 1
     low, high = (ordered[round(fraction * last)] for fraction in (0.005, 0.995))
     usual = gaussians.log_scales.detach()[opaque].amax(1).median().exp()
-    # of the size of the scene, and in standard deviations of a usual Gaussian
+    # Margins relative to the scene size and to the median standard deviation.
     margin = 0.02 * (high - low).max() + 2.5 * usual
     return low - margin, high + margin
 
 
 def keep_largest_components(mesh: Mesh) -> Mesh:
-    """Return the mesh without pieces of less than a fiftieth of the faces of the largest, and
-    without vertices that no face has."""
+    """Drop components with fewer than a fiftieth of the faces of the largest, and unused vertices."""
     from trimesh.graph import connected_component_labels
 
     faces = mesh.faces
@@ -257,7 +262,7 @@ def keep_largest_components(mesh: Mesh) -> Mesh:
 
 
 def count_holes(surface: Surface) -> int:
-    """Return how many closed lines of edges have a face on one side only."""
+    """Return the number of boundary loops of a surface."""
     from trimesh import Trimesh
     from trimesh.graph import connected_components
     from trimesh.grouping import group_rows

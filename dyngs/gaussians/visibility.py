@@ -1,5 +1,4 @@
-"""Visibility of Gaussians over time: bits at key times (the temporal filter of 4DGS-1K, Yuan et al.
-2025).
+"""Visibility of Gaussians over time: bit masks at key times (4DGS-1K, Yuan et al. 2025).
 
 Local letters: K key times, A Gaussians active at a time.
 """
@@ -37,13 +36,12 @@ class VisibilityMasks:
         return _unpacked(self.bits, self.count)
 
     def interval(self, time: float) -> int:
-        """Return k with ``time`` between key times k and k + 1, the nearest two where it lies
-        outside all."""
+        """Return k such that ``time`` lies between key times k and k + 1; clamped to the first or
+        last pair."""
         return min(max(bisect_right(self.times, time) - 1, 0), len(self.times) - 2)
 
     def active(self, interval: int) -> Tensor:
-        """Return (A,) ascending indices of the Gaussians seen at one end of an interval at
-        least."""
+        """Return ascending indices (A,) of the Gaussians visible at either end of an interval."""
         either = self.bits[interval] | self.bits[interval + 1]
         return torch.nonzero(_unpacked(either[None], self.count)[0])[:, 0]
 
@@ -57,7 +55,7 @@ class VisibilityMasks:
 
     @staticmethod
     def from_state(state: Mapping[str, Tensor], count: int | None = None) -> VisibilityMasks | None:
-        """Return the masks of a state that ``state()`` returned; None of an empty one."""
+        """Return the masks in a state that ``state()`` returned; None for an empty state."""
         if not state:
             return None
         times = state["times"]
@@ -66,18 +64,18 @@ class VisibilityMasks:
         ascends = times.ndim == 1 and len(times) > 1 and bool((times[1:] > times[:-1]).all())
         of_all = bits.dtype == torch.uint8 and bits.shape == (times.numel(), -(-count // BITS))
         if not (ascends and of_all and state["count"].tolist() == [count]):
-            raise ValueError("the masks are not those of the Gaussians")
+            raise ValueError("the visibility masks do not match the Gaussians")
         return VisibilityMasks(tuple(times.tolist()), bits, count)
 
 
 def intersect_sorted(rows: Tensor, active: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return the positions of common indices in ``rows`` and in ``active``, both ascending indices
-    below ``count``."""
+    """Return positions of the common indices in ``rows`` and in ``active`` (both ascending, <
+    ``count``)."""
     place = torch.full((count,), -1, device=rows.device)
     place[rows] = torch.arange(len(rows), device=rows.device)
-    found = place[active]
-    places = torch.nonzero(found >= 0)[:, 0]
-    return found[places], places
+    matches = place[active]
+    places = torch.nonzero(matches >= 0)[:, 0]
+    return matches[places], places
 
 
 def _unpacked(bits: Tensor, count: int) -> Tensor:

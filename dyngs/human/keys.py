@@ -9,7 +9,7 @@ from pydantic import Field
 
 from dyngs.core.section import Positive, SceneModel
 
-NO_BODY = "has no body parameters, which model.kind=human needs; see docs/human.md"
+NO_BODY = "has no body parameters, which model.kind=human needs; see `dyngs docs people`"
 
 
 class _OnTemplate(SceneModel):
@@ -28,11 +28,11 @@ class _OnTemplate(SceneModel):
 
 class HumanModel(_OnTemplate):
     """A person: Gaussians on the texels of a body template, moved by its skeleton
-    (docs/human.md)."""
+    (docs/guides/people.md)."""
 
     kind: Literal["human"] = Field(
         default="human",
-        description="one person: Gaussians on a body template, moved by its skeleton (docs/human.md)",
+        description="one person: Gaussians on a body template, moved by its skeleton (`dyngs docs people`)",
     )
     fit: bool = Field(
         default=True,
@@ -66,11 +66,11 @@ class HumanModel(_OnTemplate):
 
 class HumanPredictorModel(_OnTemplate):
     """A network that predicts people from a few images, trained on others
-    (docs/people_network.md)."""
+    (docs/guides/people.md)."""
 
     kind: Literal["human_predictor"] = Field(
         default="human_predictor",
-        description="a network that predicts people from a few images, after GHG (docs/people_network.md)",
+        description="a network that predicts people from a few images, after GHG (`dyngs docs people`)",
     )
     scaffold_heights: tuple[float, ...] = Field(
         default=(0.0, 0.02, 0.04),

@@ -39,7 +39,7 @@ def is_archive(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES and path.is_file()
 
 
-def unpacked(path: Path) -> Path:
+def unpack_archive(path: Path) -> Path:
     """Return the folder in the cache with the files of an archive; the same archive is unpacked
     once.
 
@@ -84,16 +84,15 @@ def _checked_members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.
         name = info.filename.replace("\\", "/")
         parts = PurePosixPath(name).parts
         if name.startswith("/") or any(_BAD_PART.fullmatch(part) for part in parts):
-            raise DyngsError(
-                f"{path}: holds the file {name!r:.80}, which is no name below its folder; pack it anew"
-            )
+            raise DyngsError(f"{path}: unsafe file name {name!r:.80} in the archive; pack it again")
         if name.endswith("/") or any(part.startswith(_JUNK) for part in parts):
             continue
         is_link = stat.S_ISLNK(info.external_attr >> 16)
         is_plain = info.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
         if is_link or not is_plain or info.flag_bits & 1:
             raise DyngsError(
-                f"{path}: {name!r:.80} is a link, encrypted, or not packed by deflate; unpack it and give the folder"
+                f"{path}: {name!r:.80} is a link, encrypted, or compressed by an unsupported "
+                "method; unpack it and give the folder"
             )
         found[name] = info
     total = sum(info.file_size for info in found.values())

@@ -45,32 +45,32 @@ def restrict_paths_to(root: Path, follow_links: bool = False) -> AbstractContext
     return _set(_boundary, None if follow_links else (root, os.path.realpath(root)))
 
 
-def allow_run_links(allowed: bool) -> AbstractContextManager[None]:
+def allow_run_links(is_allowed: bool) -> AbstractContextManager[None]:
     """Set whether ``data.follow_links`` holds for runs that are opened in the block.
 
     The user decides this on the command line: the config.yaml of a run may be that of a stranger.
     """
-    return _set(_links_of_runs, allowed)
+    return _set(_links_of_runs, is_allowed)
 
 
 def run_links_allowed() -> bool:
-    """Return whether the innermost block of ``following_links_of_runs`` allows it."""
+    """Return whether the innermost block of ``allow_run_links`` allows it."""
     return _links_of_runs.get()
 
 
-def inside(path: Path) -> Path:
+def check_inside(path: Path) -> Path:
     """Return ``path`` if it may be opened; outside a block of ``staying_within`` any path may."""
     boundary = _boundary.get()
     if boundary is not None and not _is_below(real := os.path.realpath(path), boundary[1]):
         raise DyngsError(
-            f"{path}: leads to {real}, which lies outside the capture {boundary[0]}; "
-            "copy the file into the capture, or, if you trust it to name files of yours, set data.follow_links=true"
+            f"{path}: points to {real}, outside the capture {boundary[0]}; copy the file into "
+            "the capture or, if you trust the capture, set data.follow_links=true"
         )
     require_regular_file(path)
     return path
 
 
-def allowed(most: int) -> int:
+def scaled_limit(most: int) -> int:
     """Return ``most`` times the value of the environment variable ``DYNGS_LIMITS``, 1 if it is not
     set."""
     text = os.environ.get(LIMITS_VARIABLE, "1")
@@ -80,7 +80,7 @@ def allowed(most: int) -> int:
         factor = 0.0
     if not 1 <= factor <= 1e6:
         raise DyngsError(
-            f"{LIMITS_VARIABLE}={text:.20} must be a number from 1 to 1e6: how many times the usual limits hold"
+            f"{LIMITS_VARIABLE}={text:.20} must be a factor from 1 to 1e6 for the default limits"
         )
     return int(most * factor)
 
@@ -88,12 +88,12 @@ def allowed(most: int) -> int:
 def require_at_most(where: Path | str, amount: int, most: int, what: str) -> None:
     """Check that a file asks for at most ``most`` of ``what`` (plural), a limit that
     ``DYNGS_LIMITS`` may raise."""
-    if amount > most and amount > allowed(most):
+    if amount > most and amount > scaled_limit(most):
         shown = f"{amount:,}" if amount < 10**18 else "over 10^18"
         factor = math.ceil(amount / most) if amount < 10**18 else "N"
         raise DyngsError(
-            f"{where}: asks for {shown} {what}, of which {allowed(most):,} are read at most; if you trust the file, "
-            f"set the environment variable {LIMITS_VARIABLE}={factor}"
+            f"{where}: {shown} {what} exceed the limit of {scaled_limit(most):,}; "
+            f"if you trust the file, set the environment variable {LIMITS_VARIABLE}={factor}"
         )
 
 
@@ -105,7 +105,7 @@ def check_size(path: Path, width: int, height: int, channels: int = 4) -> None:
 
 def max_decoded_mb() -> int:
     """Return the 2^20 bytes that the largest allowed image takes with four channels of floats."""
-    return allowed(MAX_PIXELS) * 16 // 2**20
+    return scaled_limit(MAX_PIXELS) * 16 // 2**20
 
 
 def find_escaping_links(root: Path) -> list[tuple[Path, str]]:

@@ -12,7 +12,7 @@ from typing import Any, TextIO, TypeGuard
 import numpy as np
 
 from dyngs.core.errors import DyngsError, require_regular_file, wrap_read_errors
-from dyngs.io.containment import inside, require_at_most
+from dyngs.io.containment import check_inside, require_at_most
 
 MOST_TEXT_BYTES = 1 << 26
 """Largest JSON or text file: 64 MiB hold the cameras of 100,000 images."""
@@ -46,24 +46,24 @@ def read_json(path: Path) -> Any:
     """Read the JSON in ``path``, UTF-8, 16 or 32. Raises DyngsError."""
     with wrap_read_errors(path, "it must be a JSON file; copy or export it again"):
         try:
-            return json.loads(read_limited(inside(path)))
+            return json.loads(read_limited(check_inside(path)))
         except json.JSONDecodeError as error:
             where = f"{path}, line {error.lineno} column {error.colno}"
             raise DyngsError(
-                f"{where}: broken JSON ({error.msg}); copy or export it again"
+                f"{where}: invalid JSON ({error.msg}); copy or export it again"
             ) from error
 
 
 def read_text(path: Path) -> str:
     """Return the text of a file within the limit on its size, UTF-8 or, as its first bytes show,
     UTF-16 or UTF-32."""
-    data = read_limited(inside(path))
+    data = read_limited(check_inside(path))
     return data.decode(json.detect_encoding(data))
 
 
 def open_text(path: Path) -> TextIO:
     """Open a text file for reading, UTF-8 or, as its first bytes show, UTF-16 or UTF-32."""
-    with inside(path).open("rb") as file:
+    with check_inside(path).open("rb") as file:
         start = file.read(4)
     return path.open(encoding=json.detect_encoding(start))
 
@@ -73,7 +73,7 @@ def is_number(value: object) -> TypeGuard[int | float]:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def matrix_of(where: str, key: str, value: object) -> np.ndarray:
+def parse_matrix(where: str, key: str, value: object) -> np.ndarray:
     """Return the numbers of a 4x4 matrix in a JSON file as float64; shape and values are not
     checked."""
     array = as_float_array(value)
@@ -82,7 +82,7 @@ def matrix_of(where: str, key: str, value: object) -> np.ndarray:
     return array
 
 
-def entry(where: object, fields: object, key: str) -> Any:
+def require_key(where: object, fields: object, key: str) -> Any:
     """Return ``fields[key]`` of a dictionary from a file."""
     if not isinstance(fields, dict):
         raise DyngsError(f"{where}: must be a dictionary with the key '{key}'; export it again")

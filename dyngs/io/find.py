@@ -9,7 +9,7 @@ import re
 import unicodedata
 from pathlib import Path, PureWindowsPath
 
-from dyngs.io.containment import inside
+from dyngs.io.containment import check_inside
 
 
 def normalize_name(name: str) -> str:
@@ -58,7 +58,7 @@ class FileFinder:
         None."""
         if folder not in self._listings:
             entries: dict[str, list[str]] = {}
-            for name in os.listdir(folder) if inside(folder).is_dir() else ():
+            for name in os.listdir(folder) if check_inside(folder).is_dir() else ():
                 entries.setdefault(normalize_name(name), []).append(name)
             self._listings[folder] = entries
         alike = self._listings[folder].get(normalize_name(part), [])

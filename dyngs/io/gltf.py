@@ -77,7 +77,8 @@ class GltfFile:
             accessor = self.json["accessors"][index]
             if accessor["type"] != kind:
                 raise self.error(
-                    f"accessor {index} must hold {kind}, not {accessor['type']!r:.20}; export it again"
+                    f"accessor {index} must hold {kind}, not {accessor['type']!r:.20}; export it "
+                    "again"
                 )
             if "sparse" in accessor:
                 raise self.error(f"accessor {index} is sparse; export it with plain accessors")
@@ -124,7 +125,9 @@ class GltfFile:
         beside = self.path.parent / name
         is_outside = not parts or parts[0] == "/" or ".." in parts or set(name) & {":", "\\", "\0"}
         if is_outside or not beside.is_file():
-            raise self.error(f"its buffer {name[:60]!r} is not a file beside it; export it as .glb")
+            raise self.error(
+                f"its buffer {name[:60]!r} is not a file next to it; export it as .glb"
+            )
         return beside.read_bytes()
 
 
@@ -142,7 +145,7 @@ def _chunks(path: Path) -> tuple[bytes, bytes]:
         found.setdefault(kind, content[start + 8 : start + 8 + size])
         start += 8 + size
     if b"JSON" not in found or start > len(content):
-        raise DyngsError(f"{path}: is cut off, or no glTF 2.0; copy or export it again")
+        raise DyngsError(f"{path}: truncated, or not glTF 2.0; copy or export it again")
     require_at_most(path, len(found[b"JSON"]), _MOST_DOCUMENT_BYTES, "bytes of JSON")
     return found[b"JSON"], found.get(b"BIN\0", b"")
 

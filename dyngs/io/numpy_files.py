@@ -13,8 +13,8 @@ from typing import IO, Any
 import numpy as np
 
 from dyngs.core.errors import DyngsError, wrap_read_errors
-from dyngs.io.containment import check_size, inside
-from dyngs.io.fields import entry, require_at_most
+from dyngs.io.containment import check_inside, check_size
+from dyngs.io.fields import require_at_most, require_key
 
 MOST_BYTES = 1 << 29
 """Limit on the arrays of one file, each number counted as at least 8 bytes; SMPL-X takes half of
@@ -32,8 +32,8 @@ def read_arrays(
             than ``MOST_BYTES``.
     """
     if path.exists() and not path.is_file():
-        raise DyngsError(f"{path}: is no file; name a .npz")
-    advice = "it is not a .npz, or a damaged one: copy it again"
+        raise DyngsError(f"{path}: not a file; give a .npz")
+    advice = "not a .npz, or damaged; copy it again"
     with wrap_read_errors(path, advice), path.open("rb") as file, zipfile.ZipFile(file) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         picked = {name: members[name] for name in choose(members)}
@@ -58,7 +58,7 @@ def read_npy(path: Path) -> np.ndarray:
     # NumPy reads the header as Python text; a damaged one raises nearly anything.
     with (
         wrap_read_errors(path, "it must be a NumPy array of numbers; copy it again"),
-        inside(path).open("rb") as file,
+        check_inside(path).open("rb") as file,
     ):
         return np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
 
@@ -66,14 +66,14 @@ def read_npy(path: Path) -> np.ndarray:
 def read_map(path: Path, key: str) -> np.ndarray:
     """Read the numbers of a ``.npy``, or the array ``key`` or else the only one of a ``.npz``, as
     float64."""
-    if not inside(path).is_file():
+    if not check_inside(path).is_file():
         raise DyngsError(f"{path}: no such file; restore it or remove it from the capture")
     if path.suffix.lower() != ".npz":
         return read_npy(path)
     found = read_arrays(path, lambda names: [key] if key in names or len(names) != 1 else names)
     values = next(iter(found.values()))
     if values.dtype.kind not in "biuf":
-        raise DyngsError(f"{path}: holds no numbers but {values.dtype}; export it again")
+        raise DyngsError(f"{path}: must contain numbers, got {values.dtype}; export it again")
     return values.astype(np.float64)
 
 
@@ -82,20 +82,20 @@ def read_npz(
 ) -> dict[str, np.ndarray]:
     """Read the arrays ``keys`` of a ``.npz`` file, and those of ``optional`` that exist; Python
     objects are refused."""
-    if not inside(path).is_file():
+    if not check_inside(path).is_file():
         raise DyngsError(
             f"{path}: no such file; it should hold the body parameters {', '.join(keys)}"
         )
     found = read_arrays(path, lambda names: [name for name in (*keys, *optional) if name in names])
     for key in keys:
-        entry(path, found, key)
+        require_key(path, found, key)
     return found
 
 
 def require_text(raw: bytes | bytearray, dtype: np.dtype) -> None:
     """Check that the bytes of an array of text are valid characters; raises ValueError."""
     if dtype.kind == "U" and (np.frombuffer(raw, dtype.byteorder + "u4") > 0x10FFFF).any():
-        raise ValueError("an array of text in it holds what is no text")
+        raise ValueError("an array of text contains invalid characters")
 
 
 def array_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
@@ -114,7 +114,7 @@ def _array(stream: IO[bytes], before: int, path: Path) -> np.ndarray:
     require_at_most(path, before + _weight(shape, dtype), MOST_BYTES, "bytes of arrays")
     raw = bytearray(stream.read())  # not more than the archive states; a checksum is compared
     if min(shape, default=0) < 0 or len(raw) < math.prod(shape) * dtype.itemsize:
-        raise ValueError("it is shorter than its shape")
+        raise ValueError("its size does not match its shape")
     require_text(raw[: math.prod(shape) * dtype.itemsize], dtype)
     flat = np.frombuffer(raw, dtype, math.prod(shape))
     return flat.reshape(shape, order="F" if by_columns else "C")
@@ -142,7 +142,7 @@ def _hdf5(path: Path, key: str, rows: int | EllipsisType | None) -> Any:
         raise DyngsError(
             f"{path}: HDF5 files need the package h5py; run pip install 'dyngs[people]'"
         ) from None
-    if not inside(path).is_file():
+    if not check_inside(path).is_file():
         raise DyngsError(f"{path}: no such file; restore it")
     advice = f"'{key}' must be a data set in an HDF5 file; copy the file again"
     with wrap_read_errors(path, advice), h5py.File(path, "r") as file:

@@ -44,7 +44,7 @@ def suggest_command(path: Path, *, captures: bool = True) -> str | None:
     where = quote_path(path)
     static = f"`dyngs train static data.root={where}`"
     dynamic = f"`dyngs train dynamic data.root={where}`"
-    either = f"make a scene of it with {static}, or {dynamic} if things move"
+    either = f"train it with {static}, or {dynamic} if the scene moves"
     if path.is_file():
         return f"it is a video, {either}" if path.suffix.lower() in VIDEO_SUFFIXES else None
     if not path.is_dir():
@@ -60,10 +60,10 @@ def suggest_command(path: Path, *, captures: bool = True) -> str | None:
     suffixes = [one.suffix.lower() for one in found]
     videos = sum(x in VIDEO_SUFFIXES for x in suffixes)
     if sum(x in PHOTO_SUFFIXES for x in suffixes) >= 3:
-        return f"it holds photos, make a scene of them with {static}"
+        return f"it is a folder of photos, train it with {static}"
     if videos > 1:
-        return f"it holds {videos} videos, make a scene of them with {dynamic}"
-    return "it holds one video; give that" if videos else None
+        return f"it is a folder of {videos} videos, train it with {dynamic}"
+    return "it is a folder with one video; give the video itself" if videos else None
 
 
 SOURCES_NAME = "sources.json"
@@ -103,7 +103,9 @@ class Inputs:
             for folder in (place, *place.parents):
                 if folder in self.paths:
                     where = "" if folder == place else f" in {folder}"
-                    raise DyngsError(f"{out}: exists{where}, which is read; give another output")
+                    raise DyngsError(
+                        f"{out}: exists{where}, which is an input; choose another output"
+                    )
                 if (folder / _RUN_MARK).is_file():
                     break
 
@@ -115,7 +117,8 @@ def require_within_run(out: Path) -> None:
             place = out if out.is_dir() else out.parent
             if not place.resolve().is_relative_to(run.resolve()):
                 raise DyngsError(
-                    f"{out}: a link leads to {place.resolve()}, out of the run; give another output"
+                    f"{out}: is a link to {place.resolve()}, outside the run folder; choose "
+                    "another output"
                 )
             return
 
@@ -124,11 +127,13 @@ def require_new_folder(out: Path) -> None:
     """Check that ``out`` does not exist or is an empty folder. Raises DyngsError if it holds
     something or is a file."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise DyngsError(f"{out} exists already; name a new folder")
+        raise DyngsError(f"{out} exists already; choose a new folder")
 
 
 @contextmanager
-def atomic_folder(out: Path, require: Callable[[Path], None] = require_new_folder) -> Iterator[Path]:
+def atomic_folder(
+    out: Path, require: Callable[[Path], None] = require_new_folder
+) -> Iterator[Path]:
     """Yield a hidden folder next to ``out`` that gets its name when the block ends well, and is
     removed otherwise.
 
@@ -185,7 +190,7 @@ class InUseError(DyngsError):
 
 
 @contextmanager
-def writing(folder: Path) -> Iterator[bool]:
+def lock_folder(folder: Path) -> Iterator[bool]:
     """Yield whether no other process writes into the folder in the block, which is not known where
     its file system has no locks.
 
@@ -201,7 +206,8 @@ def writing(folder: Path) -> Iterator[bool]:
     links = find_escaping_links(folder)
     if links:
         raise DyngsError(
-            f"{links[0][0]}: is a link to {links[0][1]}, out of {folder}, which is written to; remove it"
+            f"{links[0][0]}: is a link to {links[0][1]}, outside the output folder {folder}; "
+            "remove it"
         )
     made = _made(folder)
     try:
@@ -233,7 +239,7 @@ def make_once(
             file, _ = _locked(path)
         except InUseError:
             if not is_told:
-                log(f"{folder}: {_owner(path)}; its result is waited for")
+                log(f"{folder}: {_owner(path)}; waiting for its result")
             is_told = True
             time.sleep(_WAIT)
             continue
@@ -255,7 +261,7 @@ def _made(folder: Path) -> list[Path]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
-        raise DyngsError(f"{folder}: is not a folder; give another one") from None
+        raise DyngsError(f"{folder}: is not a folder; choose another one") from None
     except OSError as error:
         raise DyngsError(f"cannot write {folder}: {error.strerror or error}") from error
     return missing
@@ -276,15 +282,15 @@ def _locked(path: Path) -> tuple[int, bool]:
         except OSError as error:
             if error.errno in _WITHOUT_LOCKS:
                 log_warning(
-                    f"{folder}: this file system has no locks ({error.strerror}); "
-                    "see to it that no two commands write into that folder at once"
+                    f"{folder}: this file system has no file locks ({error.strerror}); "
+                    "do not run two commands on that folder at the same time"
                 )
                 return file, False
             os.close(file)
             if error.errno not in _HELD:
                 raise DyngsError(f"cannot lock {path}: {error.strerror or error}") from error
             raise InUseError(
-                f"{folder}: {_owner(path)}; wait until it has ended, or give another folder"
+                f"{folder}: {_owner(path)}; wait until it has finished, or choose another folder"
             ) from None
         if _is_the_same(file, path):  # its last owner may have removed it after we had opened it
             break

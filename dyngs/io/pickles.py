@@ -40,12 +40,12 @@ _BYTES_PER_BYTE = 16
 _VALUES = (
     "NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT STRING "
     "BINSTRING SHORT_BINSTRING BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8 UNICODE BINUNICODE "
-    "SHORT_BINUNICODE BINUNICODE8 EMPTY_TUPLE APPEND APPENDS SETITEM SETITEMS POP POP_MARK DUP GET "
-    "BINGET LONG_BINGET GLOBAL STACK_GLOBAL BUILD PROTO FRAME STOP"
+    "SHORT_BINUNICODE BINUNICODE8 EMPTY_TUPLE APPEND APPENDS SETITEM SETITEMS POP POP_MARK DUP "
+    "GET BINGET LONG_BINGET GLOBAL STACK_GLOBAL BUILD PROTO FRAME STOP"
 )
 _CONTAINERS = (
-    "EMPTY_LIST EMPTY_DICT LIST DICT TUPLE TUPLE1 TUPLE2 TUPLE3 MARK PUT BINPUT LONG_BINPUT MEMOIZE "
-    "REDUCE NEWOBJ"
+    "EMPTY_LIST EMPTY_DICT LIST DICT TUPLE TUPLE1 TUPLE2 TUPLE3 MARK PUT BINPUT LONG_BINPUT "
+    "MEMOIZE REDUCE NEWOBJ"
 )
 """Names of the instructions that are read; these are counted."""
 _LAYOUTS = {
@@ -109,7 +109,7 @@ def _unpickled(path: Path, is_array: bool) -> object:
         content = path.read_bytes()
         file = io.BytesIO(content)
         if is_array and array_header(file)[2].kind != "O":
-            raise ValueError("an array of Python objects was expected")
+            raise ValueError("expected an array of Python objects")
         return _Unpickler(path, file, len(content)).load()
 
 
@@ -122,7 +122,7 @@ class _Dtype:
 
     def __init__(self, text: object) -> None:
         if not isinstance(text, str) or not re.fullmatch(r"[<>|=]?[biufcSUO]\d{0,9}", text):
-            raise ValueError("an array in it is of a type that is not read")
+            raise ValueError("unsupported array type")
         self.value = np.dtype(text)
 
 
@@ -169,13 +169,13 @@ class _Unpickler(_PythonUnpickler):
         for old, new in _OLD_NAMES:
             key = re.sub(rf"\A{old}", new, key)
         if key not in _LAYOUTS and key not in _OTHER_NAMES:
-            raise ValueError(f"it holds {key!r:.80}, but only numbers, text and arrays are read")
+            raise ValueError(f"{key!r:.80} is not supported, only numbers, text and arrays")
         return _Name(key)
 
     def load_put(self) -> None:
         index = int(self.readline())
         if not 0 <= index < 2 * _LARGEST_KEY:
-            raise ValueError("it remembers a value under a number that is too large")
+            raise ValueError("memo index too large")
         self.memo[index] = self.stack[-1]
 
     def load_dict(self) -> None:
@@ -194,7 +194,7 @@ class _Unpickler(_PythonUnpickler):
         """Put keys and values in turn into the dictionary on top."""
         target = self.stack[-1]
         if type(target) is not dict:
-            raise ValueError("it sets items of what is no dictionary")
+            raise ValueError("items set on an object that is not a dictionary")
         for key, value in zip(items[::2], items[1::2], strict=True):
             target[_checked_key(key)] = value
 
@@ -209,7 +209,7 @@ class _Unpickler(_PythonUnpickler):
     def _called(self, name: object, arguments: object) -> object:
         """Return the object that a call stands for."""
         if not isinstance(name, _Name) or not isinstance(arguments, tuple):
-            raise ValueError("it calls what is no function")
+            raise ValueError("call of an object that is not a function")
         if name in _LAYOUTS:
             return _unfilled(_LAYOUTS[name])
         match name, arguments:
@@ -235,21 +235,19 @@ class _Unpickler(_PythonUnpickler):
                 return {}
             case "collections.OrderedDict", (list() as pairs,):
                 return {_checked_key(key): value for key, value in pairs}
-        raise ValueError(
-            f"it makes a {str(name)!r:.40}, but only numbers, text and arrays are read"
-        )
+        raise ValueError(f"{str(name)!r:.40} is not supported, only numbers, text and arrays")
 
     def _build(self, target: object, state: Any) -> None:
         """Set the state of ``target``, made by ``_called``."""
         if isinstance(target, _Dtype):
             _, order, *structure = state[:5]
             if any(part is not None for part in structure):
-                raise ValueError("arrays with named fields are not read")
+                raise ValueError("structured arrays are not supported")
             if order in ("<", ">"):
                 target.value = target.value.newbyteorder(order)
             return
         if not isinstance(target, _Array) or target.layout is None:
-            raise ValueError("it sets the state of what has none")
+            raise ValueError("state set on an object without state")
         layout = target.layout
         target.layout = None
         if layout == "plain":
@@ -263,23 +261,23 @@ class _Unpickler(_PythonUnpickler):
         """Count bytes that are copied; raises ValueError: too many for the size of the file."""
         self._bytes_left -= count
         if self._bytes_left < 0:
-            raise ValueError("it makes many large arrays out of the same bytes")
+            raise ValueError("too many large arrays made from the same bytes")
 
     def _fill(self, target: _Array, shape: Any, dtype: object, fortran: object, raw: Any) -> None:
         if not isinstance(dtype, _Dtype):
-            raise ValueError("an array in it has no proper type and shape")
+            raise ValueError("an array has an invalid type or shape")
         is_list = dtype.value.kind == "O"
         wanted = _count(shape) * (1 if is_list else dtype.value.itemsize)
         if isinstance(raw, str):  # bytes of Python 2
             raw = raw.encode("latin-1")
         if not isinstance(raw, list if is_list else bytes) or len(raw) != wanted:
-            raise ValueError("an array in it is shorter or longer than its shape")
+            raise ValueError("the size of an array does not match its shape")
         self._charge(8 * wanted if is_list else wanted)
         if not is_list:
             require_text(bytes(raw), dtype.value)
         # NumPy frees arrays of objects in each other by recursion.
         elif any(isinstance(x, _Array) and (x.layout or x.dtype.kind == "O") for x in raw):
-            raise ValueError("arrays in it lie too deep in each other")
+            raise ValueError("arrays of objects are nested too deeply")
         target.__setstate__((1, tuple(shape), dtype.value, bool(fortran), raw))  # type: ignore[arg-type]
 
     def _become(self, target: _Array, array: np.ndarray) -> None:
@@ -292,7 +290,7 @@ class _Unpickler(_PythonUnpickler):
         shape = state["shape"]
         dtype = state["dtype"]
         if not isinstance(dtype, _Dtype) or dtype.value.kind == "O":
-            raise ValueError("an array in it does not hold numbers")
+            raise ValueError("an array does not contain numbers")
         if state.get("numpy_array_alignment_bytes") is not None:
             self._file.read(self._file.read(1)[0])
         raw = self._file.read(min(_count(shape) * dtype.value.itemsize, self._size))
@@ -317,7 +315,7 @@ class _Unpickler(_PythonUnpickler):
 
     def _from_bytes(self, raw: object, dtype: object, shape: object, order: object) -> np.ndarray:
         if not isinstance(dtype, _Dtype) or dtype.value.kind == "O":
-            raise ValueError("an array in it does not hold numbers")
+            raise ValueError("an array does not contain numbers")
         array = _unfilled()
         self._fill(array, shape, dtype, order == "F", raw)
         return array
@@ -339,7 +337,7 @@ class _Unpickler(_PythonUnpickler):
                 return 1
             if id(value) not in weights:
                 if depth > _DEEPEST:
-                    raise ValueError("it is nested too deeply")
+                    raise ValueError("nested too deeply")
                 weights[id(value)] = None
                 parts = value.ravel(order="K").tolist() if isinstance(value, np.ndarray) else value
                 total = 1 + sum(weight(part, depth + 1) for part in parts)
@@ -349,7 +347,7 @@ class _Unpickler(_PythonUnpickler):
                 weights[id(value)] = total
             known = weights[id(value)]
             if known is None:
-                raise ValueError("it contains itself")
+                raise ValueError("it contains a reference to itself")
             return known
 
         weight(found, 0)
@@ -383,20 +381,20 @@ def _checked_key(key: object) -> Any:
     is_short = isinstance(key, (str, bytes)) and len(key) <= _LONGEST_KEY
     is_small = isinstance(key, (int, np.integer)) and abs(int(key)) < _LARGEST_KEY
     if not (is_short or is_small or key is None):
-        raise ValueError(f"a key in it is a {type(key).__name__}, or too long")
+        raise ValueError(f"a dictionary key is a {type(key).__name__}, or too long")
     return key
 
 
 def _count(shape: Any) -> int:
     """Return the number of entries of an array of that shape."""
     if not isinstance(shape, (tuple, list)) or len(shape) > 32:
-        raise ValueError("an array in it has no proper type and shape")
+        raise ValueError("an array has an invalid type or shape")
     if not all(isinstance(n, (int, np.integer)) and 0 <= n < 1 << 48 for n in shape):
-        raise ValueError("an array in it has no proper type and shape")
+        raise ValueError("an array has an invalid type or shape")
     return math.prod(int(n) for n in shape)
 
 
 def _numbers(array: object) -> np.ndarray:
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
-        raise ValueError("an array in it does not hold numbers")
+        raise ValueError("an array does not contain numbers")
     return array

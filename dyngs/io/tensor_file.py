@@ -77,7 +77,7 @@ def read_tensors(
         if isinstance(error, OSError | MemoryError) or "allocate memory" in str(error):
             # not the file's fault
             is_there = not isinstance(error, FileNotFoundError)
-            advice = "; the file itself may be whole: keep it, try again" if is_there else ""
+            advice = "; the file may be intact: keep it and try again" if is_there else ""
         raise DyngsError(
             f"{path}: cannot be read as {kind.what} ({describe_error(error)}){advice}"
         ) from error
@@ -85,7 +85,7 @@ def read_tensors(
         raise DyngsError(f"{path}: not {kind.what} of dyngs{advice}")
     if header["format"] != kind.version:
         raise DyngsError(
-            f"{path}: written by another version of dyngs; use that version or train anew"
+            f"{path}: written by another version of dyngs; use that version or train again"
         )
     if header.pop("digest", None) != _digest(tensors, header):
         raise DyngsError(f"{path}: damaged or altered, its checksum differs{advice}")

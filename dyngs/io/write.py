@@ -171,9 +171,7 @@ def require_replaceable(path: Path) -> None:
         mode = os.stat(path).st_mode
         is_file = is_file and (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
     if not is_file:
-        raise DyngsError(
-            f"cannot write {path}: it is a device, a pipe or the like; give the name of a file"
-        )
+        raise DyngsError(f"cannot write {path}: not a regular file; give a file name")
 
 
 def _flush(path: Path, flags: int) -> None:

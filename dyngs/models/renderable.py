@@ -92,7 +92,7 @@ class DrawOptions:
 class Rendering:
     """V rendered images.
 
-    Example::
+    Example:
 
         import torch
 

@@ -1,5 +1,4 @@
-"""Adam in place on arrays of rows, for all rows or only some: in float32 on the CPU one native pass
-over the memory."""
+"""Adam in place on rows of arrays; one fused native pass in float32."""
 
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 # pyright: reportUnknownArgumentType=false
@@ -19,7 +18,7 @@ from torch import Tensor
 from dyngs.ops.device import copy_async
 from dyngs.ops.registration import InPlace, has_kernel, launch, register
 
-# a number, or a tensor () of one that may still be on a GPU, where int waits for it
+# A number, or a tensor () that may still be computed on a GPU; int() waits for it.
 Count: TypeAlias = int | Tensor
 
 
@@ -46,8 +45,8 @@ def _adam_steps(
 
 
 adam_steps_op = register("adam_steps_", _adam_steps, mutates=("params", "exp_avgs", "exp_avg_sqs"))
-"""Update arrays in place, each with rates (C,) and rows (size / C,) bool; returns the number () of
-rows skipped."""
+"""Update arrays in place with learning rates (C,) and row masks (size / C,); return the skipped
+rows."""
 
 
 def _seen_rows(grads: Tensor) -> Tensor:
@@ -61,10 +60,10 @@ seen_rows_op = register("seen_rows", _seen_rows)
 
 @dataclass(frozen=True)
 class AdamUpdate:
-    """An update of ``param`` (N, ...): N rows of C numbers.
+    """An Adam update of ``param`` (N, ...): N rows of C numbers.
 
-    ``grad`` and the moments have its shape; ``lr``: a rate, or (C,) rates, better on the CPU;
-    ``rows`` (N,) bool: the rows to update, None: all. All but ``grad`` contiguous.
+    ``grad`` and the moments have the same shape. ``lr``: one rate, or (C,) rates, preferably on
+    the CPU. ``rows`` (N,) bool: rows to update, None: all. All but ``grad`` are contiguous.
     """
 
     param: Tensor
@@ -87,7 +86,7 @@ def adam_step_(
     betas: tuple[float, float] = (0.9, 0.999),
     rows: Tensor | None = None,
 ) -> Tensor:
-    """As ``adam_steps_`` of one array."""
+    """Apply ``adam_steps_`` to one array."""
     return adam_steps_(
         [AdamUpdate(param, grad, exp_avg, exp_avg_sq, lr, rows)], step=step, eps=eps, betas=betas
     )
@@ -101,13 +100,12 @@ def adam_steps_(
     eps: float = 1e-15,
     betas: tuple[float, float] = (0.9, 0.999),
 ) -> Tensor:
-    """Update arrays of one dtype and device in place; return the number () int64 of rows skipped
-    for a bad gradient.
+    """Update arrays of one dtype and device in place; return the number () of skipped rows.
 
-    Kingma and Ba 2015, equal to ``torch.optim.Adam``; the bias correction follows the global
-    ``step`` (from 1) also for rows skipped before. A gradient is bad if it is NaN, infinite, or so
-    large that its square is not safely finite (2^63 in float32, 2^511 in float64). At least one
-    update.
+    Equal to ``torch.optim.Adam`` (Kingma and Ba 2015). Bias correction uses the global ``step``,
+    from 1, also for rows skipped before. Rows are skipped if their gradient is NaN, infinite, or
+    its square would not be finite (2^63 in float32, 2^511 in float64). At least one update is
+    required.
     """
     like = updates[0].param
     wanted = [x for x in updates if x.param.numel()]
@@ -126,8 +124,7 @@ def adam_steps_(
 
 @torch.no_grad()
 def seen_rows(grads: Tensor) -> Tensor:
-    """Return (N,) bool: the rows of ``grads`` (N, ...) with an element other than zero; NaN counts
-    as one."""
+    """Return (N,) bool: rows of ``grads`` (N, ...) with a non-zero or NaN element."""
     if grads.numel() == 0:
         return torch.zeros(len(grads), dtype=torch.bool, device=grads.device)
     flat = grads.detach().reshape(len(grads), -1)
@@ -146,13 +143,13 @@ def _torch_adam_step(
     eps: float,
     step: int,
 ) -> Tensor:
-    """Return the number of rows skipped, as ``adam_steps_op``, in plain torch: for other dtypes and
-    devices."""
+    """Plain torch version of ``adam_steps_op``, for other dtypes and devices; return the skipped
+    rows."""
     param, grad, exp_avg, exp_avg_sq = (
         x.reshape(len(x), -1) for x in (param, grad, exp_avg, exp_avg_sq)
     )
     too_large = 2.0 ** (math.frexp(torch.finfo(grad.dtype).max)[1] // 2 - 1)
-    usable = (grad.abs() < too_large).all(dim=1)  # NaN is not
+    usable = (grad.abs() < too_large).all(dim=1)  # False for NaN
     wanted = torch.ones_like(usable) if rows is None else rows
     active = (wanted & usable)[:, None]
     new_avg = exp_avg.lerp(grad, 1 - betas[0])
@@ -165,12 +162,12 @@ def _torch_adam_step(
 
 
 def _column_rates(lr: float | Tensor, param: Tensor) -> Tensor:
-    """(C,) learning rates in the dtype and on the device of ``param``."""
+    """Return learning rates (C,) in the dtype and on the device of ``param``."""
     values = tuple(lr.detach().reshape(-1).tolist()) if isinstance(lr, Tensor) else (lr,)
     return _rates(values, param.numel() // len(param), param.dtype, param.device)
 
 
-@lru_cache(maxsize=256)  # most rates are those of the last step, and lie on the GPU by then
+@lru_cache(maxsize=256)  # most rates repeat from the previous step and are already on the GPU
 def _rates(
     values: tuple[float, ...], row_size: int, dtype: torch.dtype, device: torch.device
 ) -> Tensor:

@@ -41,51 +41,52 @@ most that of ``sh``.
 
 
 class _Dimmed(torch.autograd.Function):
-    """See ``dimmed``."""
+    """``dim_harmonics`` for autograd."""
 
     @staticmethod
-    def forward(ctx: Any, sh: Tensor, left: Tensor, few: Tensor, every: int) -> Tensor:
-        ctx.save_for_backward(sh, left)
-        ctx.every = every
-        found = sh * left[:, None, None]
-        found[:, 0] += (left - 1)[:, None] * (0.5 / SH_C0)
+    def forward(
+        ctx: Any, sh: Tensor, fractions: Tensor, fraction_samples: Tensor, stride: int
+    ) -> Tensor:
+        ctx.save_for_backward(sh, fractions)
+        ctx.stride = stride
+        found = sh * fractions[:, None, None]
+        found[:, 0] += (fractions - 1)[:, None] * (0.5 / SH_C0)
         return found
 
     @staticmethod
-    @once_differentiable  # whose type hides the name of ctx
+    @once_differentiable  # its type hides the name ctx
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        (sh, left), (grad,) = ctx.saved_tensors, grads
-        part = grad[:: ctx.every]
-        by_few = (part * sh[:: ctx.every]).sum((1, 2)) + part[:, 0].sum(1) * (0.5 / SH_C0)
-        return grad * left[:, None, None], None, by_few, None
+        (sh, fractions), (grad,) = ctx.saved_tensors, grads
+        part = grad[:: ctx.stride]
+        by_few = (part * sh[:: ctx.stride]).sum((1, 2)) + part[:, 0].sum(1) * (0.5 / SH_C0)
+        return grad * fractions[:, None, None], None, by_few, None
 
 
-def dim_harmonics(sh: Tensor, left: Tensor, few: Tensor, every: int) -> Tensor:
-    """Return harmonics (N, K, 3) whose colours are the parts ``left`` (N,) of those of ``sh``.
+def dim_harmonics(sh: Tensor, fractions: Tensor, fraction_samples: Tensor, stride: int) -> Tensor:
+    """Scale the colours of SH coefficients (N, K, 3) by ``left`` (N,).
 
-    Differentiable once, in ``sh`` and in ``few``, which is every so many-th of ``left``: enough to
-    learn few numbers.
+    Differentiable once, in ``sh`` and in ``few``, every ``every``-th entry of ``left``. That
+    suffices for gradients of few parameters.
     """
-    return cast(Any, _Dimmed).apply(sh, left, few, every)
+    return cast(Any, _Dimmed).apply(sh, fractions, fraction_samples, stride)
 
 
 def light_harmonics(directions: Tensor) -> Tensor:
-    """Return the harmonics (N, 8) of degree 1 and 2, not normalised, in unit directions (N, 3).
+    """Return unnormalised harmonics (N, 8) of degrees 1 and 2 for unit directions (N, 3).
 
-    Diffuse light on what faces these directions has hardly any finer detail (Ramamoorthi and
-    Hanrahan 2001).
+    Diffuse shading has hardly any finer detail (Ramamoorthi and Hanrahan 2001).
     """
     return torch.stack(_light_terms(directions.T), dim=1)
 
 
 def _light_terms(directions: Tensor) -> list[Tensor]:
-    """Return the eight harmonics (N,) each in unit directions (3, N)."""
+    """Return the eight harmonics (N,) for unit directions (3, N)."""
     x, y, z = directions.unbind(0)
     return [x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1]
 
 
 def _light_terms_vjp(directions: Tensor, by_terms: Tensor) -> Tensor:
-    """Return the gradient (3, N) by the directions, of that by the harmonics (8, N)."""
+    """Return the gradient (3, N) by the directions, given that by the harmonics (8, N)."""
     x, y, z = directions.unbind(0)
     products = by_terms[3:6]  # of each coordinate with the next
     by_directions = (
@@ -98,8 +99,8 @@ def _light_terms_vjp(directions: Tensor, by_terms: Tensor) -> Tensor:
 
 
 class _Lit(torch.autograd.Function):
-    """See ``lit``. Numbers of one kind lie side by side: sums over rows of three are slow in
-    torch."""
+    """``shade_harmonics`` for autograd; component-major layout, because row sums of three are slow
+    in torch."""
 
     @staticmethod
     def forward(ctx: Any, sh: Tensor, linear: Tensor, normals: Tensor, factors: Tensor) -> Tensor:
@@ -130,25 +131,24 @@ class _Lit(torch.autograd.Function):
         return grad * light[:, None], by_linear, by_normals, terms @ by_light.T
 
 
-_SHORTEST = 1e-12  # length below which a normal has no direction
+_SHORTEST = 1e-12  # shorter normals have no direction
 
 
 def lit(sh: Tensor, linear: Tensor, normals: Tensor, factors: Tensor) -> Tensor:
-    """Return harmonics (N, K, 3) with their colours times 1 + y A, differentiable once in
-    everything.
+    """Multiply the colours of SH coefficients (N, K, 3) by 1 + y A; differentiable once in all
+    inputs.
 
-    y are the ``light_harmonics`` of the normals (N, 3), of any length, as the maps ``linear`` (N,
-    3, 3) move them; ``factors`` A (8, 3) are those of red, green and blue.
+    y are the ``light_harmonics`` of the ``normals`` (N, 3), of any norm, transformed by ``linear``
+    (N, 3, 3). ``factors`` A (8, 3): light per channel.
     """
     return cast(Any, _Lit).apply(sh, linear, normals, factors)
 
 
 def harmonics_basis(directions: Tensor, degree: int) -> Tensor:
-    """Return (..., K) real spherical harmonics of unit directions (..., 3), from the associated
-    Legendre recursion.
+    """Return real spherical harmonics (..., K) of unit directions (..., 3).
 
-    Independent of the kernels' polynomials; signs as in 3DGS (Condon-Shortley phase included).
-    Slow.
+    From the associated Legendre recursion, independent of the kernels' polynomials. Signs as in
+    3DGS (with Condon-Shortley phase). Slow.
     """
     x, y, z = directions.unbind(-1)
     azimuth = torch.complex(x, y)
@@ -171,8 +171,7 @@ def _factorial_ratio(order: int, m: int) -> float:
 
 
 def _legendre_without_sine(order: int, m: int, z: Tensor) -> Tensor:
-    """Return the associated Legendre function P_order^m(z) / sin(theta)^m, with the Condon-Shortley
-    phase (-1)^m."""
+    """Return P_order^m(z) / sin(theta)^m with the Condon-Shortley phase (-1)^m."""
     current = torch.ones_like(z)
     for k in range(1, m + 1):
         current = current * -(2 * k - 1)

@@ -1,9 +1,8 @@
-"""Features from a multiresolution hash grid (Müller et al. 2022, Instant Neural Graphics
-Primitives), differentiable.
+"""Features from a multiresolution hash grid (Instant-NGP, Müller et al. 2022), differentiable.
 
-M points, L levels, F features of each. A level has samples at (g - 0.5) / scale along each
-axis, clamped at its last. Where all fit, each has a row of its own; else they share rows by a hash
-of their index.
+Local letters: M points, L levels, F features per level. Grid point g lies at (g - 0.5) / scale per
+axis, clamped at the last one. Levels with few points have one row per point; others share rows by
+a hash of the index.
 """
 
 from __future__ import annotations
@@ -19,8 +18,7 @@ from dyngs.ops.registration import Backward, empty_like, launch, register
 
 @dataclass(frozen=True)
 class HashLevels:
-    """Scale, samples along an axis, and rows of each level; rows of all levels lie one after the
-    other in one table."""
+    """Scales, sizes and rows of the levels; their rows are concatenated in one table."""
 
     scales: tuple[float, ...]
     sizes: tuple[int, ...]
@@ -28,10 +26,10 @@ class HashLevels:
 
     @staticmethod
     def geometric(num_levels: int, coarsest: int, finest: int, most_rows: int) -> HashLevels:
-        """Return levels whose resolution grows by the same factor each time; ``most_rows`` of each
-        is a power of two.
+        """Return levels of geometrically growing resolution (published formula).
 
-        The published formula: scale_l = coarsest b^l - 1, size_l = ceil(scale_l) + 1.
+        scale_l = coarsest b^l - 1, size_l = ceil(scale_l) + 1. ``most_rows`` per level is a power
+        of two.
         """
         growth = math.log(finest / coarsest) / max(num_levels - 1, 1)
         scales = tuple(coarsest * math.exp(growth * level) - 1 for level in range(num_levels))
@@ -70,19 +68,18 @@ hash_grid_op = register("hash_grid", _hash_grid, _hash_grid_backward, "table")
 
 
 def hash_features(coords: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
-    """Return (M, L * F) features of points (M, 3) in the unit cube, interpolated between rows of
-    ``table``.
+    """Interpolate features (M, L * F) at points (M, 3) in the unit cube.
 
-    Differentiable once, in the table. What lies outside of the cube counts as on its surface; a
-    coordinate that is no finite number gives features of NaN. The same bits on any number of
-    threads. Raises DyngsError: shapes or dtypes that do not fit.
+    Differentiable once, in ``table``. Points outside are clamped to the cube; non-finite
+    coordinates give NaN. Deterministic on any number of threads. Raises DyngsError for mismatched
+    shapes or dtypes.
     """
     return hash_grid_op(
         coords.contiguous(), table, list(levels.scales), list(levels.sizes), list(levels.rows)
     )
 
 
-def _known(
+def _select(
     features: Tensor,
     which: Tensor,
     coords: Tensor,
@@ -94,21 +91,21 @@ def _known(
     return features.index_select(0, which)
 
 
-def _known_backward(x: Backward) -> Sequence[Tensor]:
+def _select_backward(x: Backward) -> Sequence[Tensor]:
     return _hash_grid_backward(x._replace(inputs=x.inputs[2:]))
 
 
-known_features_op = register("known_features", _known, _known_backward, "table")
+select_features_op = register("known_features", _select, _select_backward, "table")
 
 
 def select_features(
     features: Tensor, which: Tensor, coords: Tensor, table: Tensor, levels: HashLevels
 ) -> Tensor:
-    """Return the rows ``which`` (K,) of ``features``, as ``hash_features`` of the points ``coords``
-    (K, 3) gives them.
+    """Return rows ``which`` (K,) of ``features`` that ``hash_features`` computed at ``coords`` (K,
+    3).
 
-    Differentiable in the table as if they had been looked up again.
+    The gradient by the table is computed as if they had been interpolated again.
     """
-    return known_features_op(
+    return select_features_op(
         features, which, coords, table, list(levels.scales), list(levels.sizes), list(levels.rows)
     )

@@ -1,7 +1,7 @@
-"""Fused L1 + SSIM loss of one image, and SSIM as a measure.
+"""Fused L1 + SSIM loss, and SSIM as a metric.
 
-In float32 the value and its gradient come from one native call; in other dtypes, and on devices
-without an implementation, from the plain torch formula, which is also the reference of the tests.
+In float32 one native call computes value and gradient. Other dtypes and devices use a plain torch
+version, which is also the reference of the tests.
 """
 
 from __future__ import annotations
@@ -36,8 +36,10 @@ def _backward(x: Backward) -> Sequence[Tensor]:
 
 
 l1_ssim_op = register("l1_ssim", _l1_ssim, _backward, "rendered", keeps=[1], constant=[1])
-"""The loss () and its gradient by ``rendered`` (H, W, 3), which is empty if not asked for; float32,
-contiguous."""
+"""Return the loss () and its gradient by ``rendered`` (H, W, 3), empty unless requested.
+
+float32, contiguous.
+"""
 
 
 def l1_ssim_loss(
@@ -68,16 +70,15 @@ def l1_ssim_loss(
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Return the mean SSIM () of two (H, W, 3) images in [0, 1], differentiable in ``a``; see
-    `l1_ssim_loss`."""
+    """Return the mean SSIM () of two images (H, W, 3) in [0, 1], differentiable in ``a``."""
     return 1 - l1_ssim_loss(a, b, ssim_weight=1.0)
 
 
 def reference_l1_ssim(
     rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None
 ) -> Tensor:
-    """Return `l1_ssim_loss` computed in plain torch: any floating dtype and device, differentiable
-    in every tensor."""
+    """Plain torch version of ``l1_ssim_loss``: any dtype and device, differentiable in all
+    tensors."""
     weight = torch.ones_like(rendered[..., 0]) if mask is None else mask
     total = 3 * weight.sum()
     total = torch.where(total == 0, 1, total)
@@ -90,9 +91,9 @@ def reference_l1_ssim(
 
 
 def _ssim_map(x: Tensor, y: Tensor) -> Tensor:
-    """Return the (H, W, 3) structural similarity of two images (Wang et al. 2004).
+    """Return the SSIM map (H, W, 3) of two images (Wang et al. 2004).
 
-    Computed in float64, because the difference of second moments that gives a variance cancels.
+    Computed in float64, because variances from second moments cancel.
     """
     dtype = x.dtype
     x = x.double()

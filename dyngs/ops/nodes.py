@@ -1,6 +1,6 @@
-"""What control nodes do at a time, along uniform cubic B-splines, and penalties of their motion.
+"""Motion of control nodes on uniform cubic B-splines, and regularisers of the motion.
 
-S nodes, P control points, B neighbours of a node.
+Local letters: S nodes, P control points, B neighbours of a node.
 """
 
 from __future__ import annotations
@@ -15,15 +15,14 @@ from dyngs.ops.registration import Backward, empty_like, launch, register
 
 T = TypeVar("T", float, Tensor)
 
-SPAN = 4  # Control points that a value depends on
+SPAN = 4  # control points that a value depends on
 HEAD_SIZES = (3, 4, 3, 1, 3)
-"""Number of values of each head: means, quaternions less the identity, log scales, opacity logits,
-colours."""
+"""Values per head: means, quaternion offsets, log scales, opacity logits, colours."""
 
 
 def cubic_fractions(place: T) -> tuple[T, T, T, T]:
-    """Return the weights of the control points of a piece of a uniform cubic B-spline, at ``place``
-    in [0, 1]."""
+    """Return the four control point weights of a uniform cubic B-spline piece at ``place`` in [0,
+    1]."""
     rest = 1 - place
     return (
         rest**3 / 6,
@@ -33,7 +32,7 @@ def cubic_fractions(place: T) -> tuple[T, T, T, T]:
     )
 
 
-def _place(points: int, time: float) -> tuple[int, float, float, float, float]:
+def _spline_weights(points: int, time: float) -> tuple[int, float, float, float, float]:
     """Return the first control point that ``time`` depends on, and the weights of four."""
     pieces = points - SPAN + 1
     place = min(max(time, 0.0), 1.0) * pieces
@@ -53,14 +52,14 @@ def _nodes_at(
     width = sum(x.shape[2] for x in heads[1:] if x is not None)
     motion = means.new_empty(means.shape[0], 7)
     values = means.new_empty(means.shape[0], width)
-    launch(means, "nodes_at", heads, _place(means.shape[1], time), motion, values)
+    launch(means, "nodes_at", heads, _spline_weights(means.shape[1], time), motion, values)
     return motion, values
 
 
 def _nodes_at_backward(x: Backward) -> Sequence[Tensor | None]:
     *heads, time = x.inputs
     results = [None if head is None else empty_like(head) for head in heads]
-    place = _place(heads[0].shape[1], time)
+    place = _spline_weights(heads[0].shape[1], time)
     launch(heads[0], "nodes_at_backward", heads, place, *x.grads, results)
     return results
 
@@ -71,13 +70,11 @@ nodes_at_op = register(
 
 
 def spline_motion(heads: Sequence[Tensor | None], time: float) -> tuple[Tensor, Tensor]:
-    """Return what nodes do at ``time`` in [0, 1]: motion (S, 7) as ``blend_skinning`` takes it, and
-    values (S, D).
+    """Evaluate node motion (S, 7), as for ``blend_skinning``, and other values (S, D) at ``time``.
 
-    Differentiable once. ``heads``: control points (S, P, size) of uniform cubic B-splines, P at
-    least 4, for each of ``HEAD_SIZES``; the first is there, others may be None. Motion: means, then
-    the identity plus quaternions. Values: of all heads that are there but the first, one after the
-    other.
+    Differentiable once. ``heads``: control points (S, P, size) of uniform cubic B-splines, P >= 4,
+    for each of ``HEAD_SIZES``; all but the first may be None. Motion: shifts, then quaternions
+    (identity plus offset). Values: the other heads, concatenated.
     """
     means, quats, log_scales, logits, colors = heads
     assert means is not None
@@ -116,18 +113,17 @@ node_penalties_op = register(
     keeps=[1, 2],
     constant=[1, 2],
 )
-"""The penalties (2,), and the gradients of the second by motion and of the first by paths."""
+"""The penalties (2,), the gradient of the second by motion, and of the first by paths."""
 
 
 def node_penalties(
     positions: Tensor, radii: Tensor, neighbours: Tensor, motion: Tensor, paths: Tensor
 ) -> Tensor:
-    """Return two penalties (2,) in squared ``radii``: the nodes' acceleration, and their deviation
-    from rigid motion.
+    """Return the acceleration and rigidity penalties (2,) of nodes, in squared ``radii``.
 
-    The mean square of the second differences of ``paths`` (S, P, 3), control points of means, P at
-    least 4; and the mean of |d_j - d_i - (R_i - I) (p_j - p_i)|^2 over ``neighbours`` (S, B) j of
-    nodes i at ``positions`` (S, 3) with ``motion`` (S, 7) of shift d and quaternion of R (Sorkine
-    and Alexa 2007). Differentiable once in motion and paths.
+    Acceleration: mean square of the second differences of ``paths`` (S, P, 3), P >= 4. Rigidity:
+    mean of |d_j - d_i - (R_i - I) (p_j - p_i)|^2 over ``neighbours`` (S, B) j of node i at
+    ``positions`` (S, 3) with ``motion`` (S, 7): shift d, quaternion of R (Sorkine and Alexa 2007).
+    Differentiable once in ``motion`` and ``paths``.
     """
     return node_penalties_op(positions, radii, neighbours, motion, paths)[0]

@@ -1,8 +1,7 @@
-"""A small multilayer perceptron over many rows, fused.
+"""Fused evaluation of small multilayer perceptrons over many rows.
 
-Each layer of a few features would go through memory once per step and direction; the kernel runs
-all layers of a hundred rows while they are in the cache, on a GPU in shared memory. Results do not
-depend on the number of threads.
+The kernel evaluates all layers for a hundred rows while they are in the cache (shared memory on a
+GPU). Results are independent of the number of threads.
 """
 
 from __future__ import annotations
@@ -19,11 +18,9 @@ from dyngs.ops.native import core_for
 from dyngs.ops.registration import Backward, empty_like, has_kernel, launch, register
 
 KEPT_BYTES = 2**30
-"""The backward pass computes activations again where keeping them would take more memory than this,
-and on a GPU."""
+"""Activations are recomputed in the backward pass if they would take more memory, and on a GPU."""
 GPU_LAYERS, GPU_WIDTH = 16, 256
-"""Networks of more layers, or with more features anywhere, are computed by torch's operators on a
-GPU."""
+"""Larger networks use torch's operators on a GPU."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +32,7 @@ class Layer:
 
 
 def _empty_kept(x: Tensor, widths: list[int], skip: int, keep: bool) -> Tensor:
-    """Return room for the activations between the layers; empty unless asked for, and if they would
-    take too much."""
+    """Allocate memory for activations between layers; empty unless requested and small enough."""
     if not keep or x.device.type != "cpu":
         return x.new_empty(0)
     size = x.shape[0] * core_for(x).perceptron_kept_per_row(widths, skip)
@@ -95,8 +91,7 @@ def perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -
 
 
 def reference_perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -> Tensor:
-    """Return the value of `perceptron` in plain torch: any floating dtype and device, any order of
-    derivatives."""
+    """Plain torch version of ``perceptron``: any dtype, device and order of derivatives."""
     h = x
     for i, layer in enumerate(layers):
         h = linear(torch.cat([h, x], dim=1) if i == skip else h, layer.weight, layer.bias)

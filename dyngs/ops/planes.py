@@ -1,8 +1,7 @@
-"""Features from factored space-time grids, and the penalties that keep the grids smooth,
-differentiable.
+"""Features from factored space-time planes (HexPlane) and their regularisers, differentiable.
 
-HexPlane (Cao and Johnson 2023) and K-Planes (Fridovich-Keil et al. 2023) in the form of 4DGS (Wu et
-al. 2024). M points, L levels, C channels, R samples along an axis of space and T along time.
+HexPlane (Cao and Johnson 2023) and K-Planes (Fridovich-Keil et al. 2023) in the form of 4DGS (Wu
+et al. 2024). M points, L levels, C channels, R samples per spatial axis, T along time.
 """
 
 from __future__ import annotations
@@ -75,17 +74,17 @@ def _penalty_backward(x: Backward) -> Sequence[list[Tensor]]:
 
 
 plane_penalty_op = register("plane_penalty", _plane_penalty, _penalty_backward, "planes")
-"""The penalty ()."""
+"""The regularisation term ()."""
 
 
 def hexplane_features(coords: Tensor, time: float, levels: Sequence[PlaneLevel]) -> Tensor:
-    """Return (M, L * C) features of points (M, 3) at one time in [0, 1]: the product of the six
-    planes, by level.
+    """Interpolate features (M, L * C) of points (M, 3) at one time in [0, 1]: products of six
+    planes.
 
-    Bilinear: sample 0 lies at coordinate -1 or time 0, the last one at 1. What lies outside is
-    clamped, without gradient; NaN coordinates give NaN features. Differentiable once, in
-    coordinates and planes; the same bits on any number of threads. Raises DyngsError: shapes or
-    dtypes that do not fit each other, no levels, or a time that is no number.
+    Bilinear; the first sample lies at coordinate -1 or time 0, the last at 1. Points outside are
+    clamped, without gradient; NaN coordinates give NaN. Differentiable once, in coordinates and
+    planes. Deterministic on any number of threads. Raises DyngsError for mismatched shapes or
+    dtypes, no levels, or a non-finite time.
     """
     return hexplane_op(coords, _tensors(levels), time)[0]
 

@@ -1,7 +1,6 @@
-"""Skinning by joints: Gaussians of a body moved to a pose, means and covariances, differentiable
-(Loper et al. 2015).
+"""Linear blend skinning of Gaussians by joints: means and covariances, differentiable.
 
-N Gaussians, J joints.
+After SMPL (Loper et al. 2015). N Gaussians, J joints.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from dyngs.ops.registration import Backward, launch, register
 
-_KEPT = 12  # numbers per Gaussian that the forward pass keeps for the backward pass
+_KEPT = 12  # numbers per Gaussian kept for the backward pass
 
 
 _Results = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
@@ -56,18 +55,18 @@ posing_op = register(
     keeps=range(5),
     constant=[4],
 )
-"""Moved means, quaternions and log scales, the blended transforms, and what the backward pass needs
-(N, 12)."""
+"""Posed means, quaternions, log scales, blended transforms, and state of the backward pass (N,
+12)."""
 
 
 @dataclass(frozen=True)
 class PosedGaussians:
-    """Gaussians in a pose."""
+    """Posed Gaussians."""
 
     means: Tensor  # (N, 3)
     quats: Tensor  # (N, 4) wxyz, of unit length, the largest component positive
     log_scales: Tensor  # (N, 3)
-    transforms: Tensor  # (N, 3, 4) blended, by which each was moved
+    transforms: Tensor  # (N, 3, 4) blended transform of each Gaussian
 
 
 def pose_by_joints(

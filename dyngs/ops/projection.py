@@ -25,15 +25,15 @@ from dyngs.ops.registration import (
 
 @dataclass(frozen=True)
 class ProjectionOptions:
-    """Limits of the projection."""
+    """Options of the projection."""
 
     eps2d: float = 0.3  # low-pass variance added to the 2D covariance, px^2
-    # ``near, far``: Gaussians whose centre is not strictly between are culled, world units
+    # Gaussians with a centre outside [near, far] are culled, world units.
     near: float = 0.2
     far: float = 1e10
-    alpha_min: float = 1 / 255  # pixels with less alpha are not drawn; sets the extent of a splat
+    alpha_min: float = 1 / 255  # smallest rendered alpha; sets the extent of a splat
     radius_clip: float = 0.0  # splats with no larger half extent are culled, px
-    antialiased: bool = False  # the extent uses the compensated opacity
+    antialiased: bool = False  # compute the extent from the compensated opacity
 
     def __post_init__(self) -> None:
         check_number("eps2d", self.eps2d, 0)
@@ -128,14 +128,14 @@ def project(
     cameras: Cameras,
     options: ProjectionOptions = ProjectionOptions(),
 ) -> Projection:
-    """Return the splats of the Gaussians in every camera (EWA splatting; Zwicker et al. 2001, Kerbl
-    et al. 2023).
+    """Project the Gaussians to splats in every camera (EWA splatting; Zwicker et al. 2001).
 
-    Differentiable in means, quats, scales and cameras. ``quats`` (N, 4) wxyz, any norm; zero means
-    identity; ``scales`` (N, 3) standard deviations; ``opacities`` (N,) in [0, 1] only set the
-    extents. Raises DyngsError: an image with sides above 2^23 px, or more splats than memory holds.
+    Differentiable in means, quats, scales and cameras. ``quats`` (N, 4) wxyz of any norm, zero is
+    the identity; ``scales`` (N, 3) standard deviations; ``opacities`` (N,) in [0, 1] only set the
+    extents. Raises DyngsError for images with sides above 2^23 px, or splats that do not fit in
+    memory.
     """
-    check_size(cameras.width, cameras.height)  # before torch, which takes no integers from 2^63 on
+    check_size(cameras.width, cameras.height)  # before torch, which rejects integers from 2^63 on
     limits = [options.eps2d, options.near, options.far, options.alpha_min, options.radius_clip]
     outputs = project_op(
         means,

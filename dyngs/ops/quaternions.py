@@ -1,7 +1,6 @@
-"""Quaternions wxyz of any length: unit quaternions, products, rotations of vectors, rotation
-matrices and back.
+"""Quaternions wxyz of any norm: normalisation, products, rotations and matrices.
 
-Unit quaternions are made as the kernels make them (``normalize`` in csrc/math/quaternion.hpp).
+Normalisation equals that of the kernels (``normalize`` in csrc/math/quaternion.hpp).
 """
 
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
@@ -15,36 +14,32 @@ import torch
 from torch import Tensor
 
 SHORTEST = 1e-12
-"""Size of the largest entry below which the gradient grows no further; the value is exact down to
-denormals."""
+"""Largest entry below which the gradient is limited; the value is exact down to denormals."""
 
 
 def unit_quats(quats: Tensor) -> Tensor:
-    """Return the unit quaternions (..., 4) along ``quats`` of any length; the identity for zero,
-    with zero gradient.
+    """Normalise quaternions (..., 4) of any norm; zero gives the identity with zero gradient.
 
-    Divided by the largest entry first, so that no square leaves the range of floats. NaN and
-    infinity give NaN.
+    Divides by the largest entry first, to avoid overflow. NaN and infinity give NaN.
     """
     largest = quats.detach().abs().amax(-1, keepdim=True)
     zero = largest == 0
     scaled = quats / largest.clamp_min(SHORTEST)
     exact = quats.detach() / torch.where(zero, 1, largest)
-    # another value where a quaternion is short, the gradient as it was
+    # exact value for short quaternions, with the limited gradient
     scaled = scaled + (exact - scaled).detach()
     scaled = torch.where(zero, identity_quat(quats), scaled)
     return scaled / scaled.norm(dim=-1, keepdim=True)
 
 
 def identity_quat(like: Tensor) -> Tensor:
-    """Return the quaternion (4,) of no rotation, in the dtype and on the device of ``like``."""
-    # numbers from a list would wait for a GPU
+    """Return the identity quaternion (4,) in the dtype and on the device of ``like``."""
+    # creation from a list would synchronise with the GPU
     return torch.arange(4, device=like.device).eq(0).to(like.dtype)
 
 
 def quat_product(left: Tensor, right: Tensor) -> Tensor:
-    """Return the Hamilton products (..., 4): the rotation ``right`` followed by ``left``, not
-    normalised."""
+    """Return the Hamilton products (..., 4), not normalised: ``right`` is applied first."""
     w1, x1, y1, z1 = left.unbind(-1)
     w2, x2, y2, z2 = right.unbind(-1)
     return torch.stack(
@@ -59,8 +54,7 @@ def quat_product(left: Tensor, right: Tensor) -> Tensor:
 
 
 def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
-    """Return ``vectors`` (..., 3) rotated by ``quats`` (..., 4) of any length; zero rotates
-    nothing."""
+    """Rotate ``vectors`` (..., 3) by ``quats`` (..., 4) of any norm; zero rotates nothing."""
     unit = unit_quats(quats)
     w = unit[..., :1]
     axis = unit[..., 1:]
@@ -69,8 +63,7 @@ def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """Return the rotation matrices (..., 3, 3) of ``quats`` (..., 4) of any length; the identity
-    for zero."""
+    """Return rotation matrices (..., 3, 3) of ``quats`` (..., 4) of any norm; identity for zero."""
     w, x, y, z = unit_quats(quats).unbind(-1)
     xx = 2 * x * x
     yy = 2 * y * y
@@ -96,11 +89,11 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 
 
 def quats_from_matrices(matrices: Tensor) -> Tensor:
-    """Return the unit quaternions wxyz (..., 4) of rotations (..., 3, 3), with their largest
-    component positive.
+    """Return unit quaternions wxyz (..., 4) of rotations (..., 3, 3), the largest component
+    positive.
 
-    Differentiable, at half turns too: the column of 4 q q^T with the largest diagonal entry,
-    normalised (Shepperd 1978). Matrices that are not quite rotations still give unit quaternions.
+    Differentiable, also at half turns: the column of 4 q q^T with the largest diagonal entry,
+    normalised (Shepperd 1978). Approximate rotations still give unit quaternions.
     """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = matrices.reshape(-1, 9).T.contiguous().unbind()
     wx = zy - yz
@@ -123,8 +116,7 @@ def quats_from_matrices(matrices: Tensor) -> Tensor:
 
 
 def align_quat_signs(quats: np.ndarray) -> np.ndarray:
-    """Return quaternions (F, ..., 4), their signs so that interpolated numbers go the shorter
-    way."""
+    """Choose signs of quaternions (F, ..., 4) so that interpolation takes the shorter way."""
     turned = (quats[1:] * quats[:-1]).sum(-1, keepdims=True) < 0
     signs = np.where(np.cumsum(turned, axis=0) % 2 == 1, -1.0, 1.0)
     return np.concatenate([quats[:1], quats[1:] * signs])

@@ -33,20 +33,19 @@ TILE = 16
 MAX_CHANNELS = 40
 MAX_ENTRIES = 2**31 - 1
 LARGEST_ALPHA = 1 - 2.0**-20
-"""Beyond it nothing of what lies behind would be left in float32, from which the backward pass
-restores the rest."""
-# that the backward pass holds per (Gaussian, tile) pair, next to the gradients of colours
+"""Largest alpha for which float32 keeps enough transmittance to restore it in the backward pass."""
+# Values per (Gaussian, tile) pair in the backward pass, besides colour gradients.
 MOMENTS = 6
 
 
 @dataclass(frozen=True)
 class BlendOptions:
-    """Thresholds of the blending (3DGS): set the minima to 0 for exact comparisons."""
+    """Thresholds of alpha blending (3DGS); minima of 0 give exact blending."""
 
-    alpha_min: float = 1 / 255  # a pixel skips Gaussians with less alpha
-    alpha_max: float = 0.99  # alpha is clamped here, and the clamp stops the gradient
-    transmittance_min: float = 1e-4  # a pixel stops before the Gaussian that would take it below
-    absgrad: bool = False  # also sum the absolute gradients of the 2D means into the probe
+    alpha_min: float = 1 / 255  # Gaussians with less alpha are skipped at a pixel
+    alpha_max: float = 0.99  # alpha is clamped to this value, without gradient beyond
+    transmittance_min: float = 1e-4  # blending stops before the transmittance falls below
+    absgrad: bool = False  # also sum absolute gradients of the 2D means into the probe
 
     def __post_init__(self) -> None:
         check_number("alpha_min", self.alpha_min, 0, 1)
@@ -60,13 +59,13 @@ class BlendOptions:
 
 @dataclass(frozen=True)
 class TileEntries:
-    """E pairs of a tile and a splat that meets it, sorted by view, tile, depth, index."""
+    """The E pairs of tiles and overlapping splats, sorted by view, tile, depth and index."""
 
-    tile_offsets: Tensor  # (V T + 1,) int64: where each tile's pairs begin
-    # (2 V N,) int32: begin and end of each splat's slots in a buffer of E records
+    tile_offsets: Tensor  # (V T + 1,) int64, first pair of each tile
+    # (2 V N,) int32, begin and end of each splat's slots in a buffer of E records
     slot_ranges: Tensor
-    gaussians: Tensor  # (E,) int32: view * N + Gaussian
-    slots: Tensor  # (E,) int32: the pair's own slot
+    gaussians: Tensor  # (E,) int32, view * N + Gaussian
+    slots: Tensor  # (E,) int32, slot of the pair
 
     def tensors(self) -> list[Tensor]:
         return [self.tile_offsets, self.slot_ranges, self.gaussians, self.slots]
@@ -83,7 +82,7 @@ class BlendedImages:
     """V blended images of D channels."""
 
     color: Tensor  # (V, H, W, D), background composited
-    # (V, H, W) in [0, 1], the fraction of the background that is seen; alpha is 1 minus it
+    # (V, H, W) in [0, 1], visible fraction of the background; 1 - alpha
     transmittance: Tensor
 
 
@@ -116,7 +115,7 @@ def _bin_tiles(
 
 
 def _unknown_entries(depths: Tensor, size: list[int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the shapes of entries whose number is known only once they are found."""
+    """Return the shapes for tracing, with an unknown number of pairs."""
     entries = torch.library.get_ctx().new_dynamic_size()
     tiles = ((size[0] + TILE - 1) // TILE) * ((size[1] + TILE - 1) // TILE)
     views, n = depths.shape
@@ -230,8 +229,8 @@ def bin_tiles(
     size: tuple[int, int],
     options: BlendOptions = BlendOptions(),
 ) -> TileEntries:
-    """Return the splats of each 16x16 tile, nearest first; arguments as for ``rasterize``."""
-    check_size(*size)  # before torch, which takes no integers from 2^63 on
+    """Sort the splats of each 16x16 tile by depth; arguments as for ``rasterize``."""
+    check_size(*size)  # before torch, which rejects integers from 2^63 on
     with torch.no_grad():
         splats = [projection.means2d, projection.factors, opacities, projection.radii]
         return TileEntries(*bin_tiles_op(splats, projection.depths, list(size), options.thresholds))
@@ -248,14 +247,14 @@ def rasterize(
     options: BlendOptions = BlendOptions(),
     entries: TileEntries | None = None,
 ) -> BlendedImages:
-    """Return the splats blended front to back into V images of D channels.
+    """Blend the splats front to back into V images of D channels.
 
     Differentiable in means2d, factors, opacities, colors and background. ``opacities`` (V, N),
-    compensated already if wanted; ``colors`` (V, N, D), D up to 40; ``background`` (V, D), None:
-    black; ``probe`` (V, N, 4) zeros, whose gradient is that of the 2D means in px, then (with
-    ``absgrad``) the sum over pixels of its absolute values; ``entries``: what ``bin_tiles``
-    returned for the same. Raises DyngsError: too many channels, sides above 2^23 px, more
-    (Gaussian, tile) pairs than memory holds, or ``entries`` that do not fit.
+    already compensated; ``colors`` (V, N, D), D up to 40; ``background`` (V, D), None: black.
+    ``probe`` (V, N, 4) zeros, whose gradient is that of the 2D means in px and, with ``absgrad``,
+    the sum of its absolute values over pixels. ``entries``: result of ``bin_tiles`` for the same
+    splats. Raises DyngsError for too many channels, sides above 2^23 px, too many (Gaussian, tile)
+    pairs, or mismatched ``entries``.
     """
     if not 1 <= colors.shape[-1] <= MAX_CHANNELS:
         raise DyngsError(
@@ -284,14 +283,14 @@ def rasterize(
 
 
 class Tally(IntEnum):
-    """Quantities that ``tally`` sums per Gaussian; numbers as in csrc/core/api.hpp."""
+    """Per-Gaussian sums that ``tally`` computes; values as in csrc/core/api.hpp."""
 
     WEIGHTS = 1
-    """alpha times transmittance: its fraction of the image"""
+    """blending weights, alpha times transmittance"""
     PIXELS = 2
-    """pixels that it was blended into"""
+    """pixels that the Gaussian was blended into"""
     LANES = 3
-    """pixels that were computed for it, blended or not"""
+    """pixels evaluated for the Gaussian"""
     SQUARED_SLOPES = 4
     """squares of the derivative of the image, its channels added up, with respect to G, the value
     of the 2D Gaussian there (Tu et al. 2026)"""

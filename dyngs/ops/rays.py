@@ -24,7 +24,7 @@ class Space:
     """Nested cubes around a centre, each twice the one inside it, all cut into as many cells along
     an axis.
 
-    Example::
+    Example:
 
         Space((0.0, 0.0, 0.0), half=1.5, cascades=1, cells=128)  # one cube: nothing lies outside of
         it

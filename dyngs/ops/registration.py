@@ -1,4 +1,4 @@
-"""Registration of ops with torch, and checks of their tensors."""
+"""Registration of ops with torch, calls of the compiled core, and validation of tensors."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _LIBRARY = torch.library.Library("dyngs", "FRAGMENT")
 
 
 class Backward(NamedTuple):
-    """Inputs of the implementation of a gradient."""
+    """Arguments of the backward implementation of an op."""
 
     inputs: Sequence[Any]  # of the forward pass
-    outputs: Sequence[Tensor]  # those of the forward pass that are kept
+    outputs: Sequence[Tensor]  # kept outputs of the forward pass
     grads: Sequence[Tensor]  # by the differentiable outputs
-    needs: Sequence[bool]  # whether each of the gradients is asked for
+    needs: Sequence[bool]  # whether each gradient is requested
 
 
 def register(
@@ -57,7 +57,7 @@ def register(
         mutates: arguments that it writes to.
     """
     schema = torch.library.infer_schema(kernel, mutates_args=mutates)
-    op = _defined(name, schema, kernel)
+    op = _define_op(name, schema, kernel)
     if backward is None:
         return cast(Callable[P, R], op)
     places = [i for i, x in enumerate(signature(kernel).parameters) if x in by.split()]
@@ -69,14 +69,14 @@ def register(
 
     arguments = schema[1 : schema.index(") ->")]
     extra = "Tensor[] outputs, Tensor[] grads, bool[] needs"
-    backward_op = _defined(f"{name}_backward", f"({arguments}, {extra}) -> Tensor[]", run)
+    backward_op = _define_op(f"{name}_backward", f"({arguments}, {extra}) -> Tensor[]", run)
 
     def below(keys: Any, inputs: Iterable[Any]) -> Any:
         with torch._C._AutoDispatchBelowAutograd():  # pyright: ignore[reportPrivateUsage]
             return op.redispatch(keys & torch._C._after_autograd_keyset, *inputs)  # pyright: ignore[reportPrivateUsage]
 
     class Recorded(torch.autograd.Function):
-        """The op in half the time that ``torch.library.register_autograd`` takes."""
+        """The op for autograd; half the overhead of ``torch.library.register_autograd``."""
 
         @staticmethod
         def forward(ctx: Any, keys: Any, inputs: Sequence[Any], *tensors: Tensor) -> Any:
@@ -89,7 +89,7 @@ def register(
 
         @staticmethod
         def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-            if torch.is_grad_enabled():  # the native gradients have no derivative
+            if torch.is_grad_enabled():  # native gradients are not differentiable
                 raise DyngsError(f"dyngs::{name} is differentiable once, without create_graph")
             saved = iter(ctx.saved_tensors)
             inputs = [_with_tensors(x, saved) for x in ctx.inputs]
@@ -116,8 +116,8 @@ def register(
     return cast(Callable[P, R], op)
 
 
-def _defined(name: str, schema: str, kernel: Callable[..., object]) -> Any:
-    """Return the new op, implemented by ``kernel``."""
+def _define_op(name: str, schema: str, kernel: Callable[..., object]) -> Any:
+    """Define an op implemented by ``kernel``."""
     _LIBRARY.define(name + schema)
     torch.library.register_fake(f"dyngs::{name}", _shapes_of(kernel), lib=_LIBRARY)
     for device in ("CPU", "CUDA") if has_cuda_core() else ("CPU",):
@@ -126,7 +126,7 @@ def _defined(name: str, schema: str, kernel: Callable[..., object]) -> Any:
 
 
 def _tensors(values: Iterable[Any]) -> list[Tensor]:
-    """Return the tensors among ``values``, those of lists included."""
+    """Return the tensors among ``values``, including those in lists."""
     found: list[Tensor] = []
     for value in values:
         if isinstance(value, Tensor):
@@ -137,14 +137,14 @@ def _tensors(values: Iterable[Any]) -> list[Tensor]:
 
 
 def _without_tensors(value: Any) -> Any:
-    """Return an argument with the class ``Tensor`` in place of tensors."""
+    """Replace tensors in an argument by the class ``Tensor``."""
     if isinstance(value, list):
         return [_without_tensors(x) for x in cast("list[Any]", value)]
     return Tensor if isinstance(value, Tensor) else value
 
 
 def _with_tensors(value: Any, tensors: Iterator[Tensor]) -> Any:
-    """Return an argument with the next of ``tensors`` where ``_without_tensors`` took them out."""
+    """Undo ``_without_tensors`` with the next of ``tensors``."""
     if isinstance(value, list):
         return [_with_tensors(x, tensors) for x in cast("list[Any]", value)]
     return next(tensors) if value is Tensor else value
@@ -152,14 +152,14 @@ def _with_tensors(value: Any, tensors: Iterator[Tensor]) -> Any:
 
 @dataclass(frozen=True)
 class InPlace:
-    """A contiguous tensor that a kernel writes to, as an argument of ``launch``."""
+    """Argument of ``launch``: a contiguous tensor that the kernel writes to."""
 
     tensor: Tensor
 
 
 @dataclass(frozen=True)
 class Struct:
-    """An object of the core, of its class ``name``, as an argument of ``launch``."""
+    """Argument of ``launch``: an object of the core's class ``name``."""
 
     name: str
     fields: tuple[object, ...]
@@ -173,53 +173,51 @@ _mode = _Mode()
 
 
 def shapes_only() -> bool:
-    """Return whether an implementation is asked for the shapes of its results alone: its inputs
-    have no data."""
+    """Return whether an op is traced for shapes only; its inputs then have no data."""
     return _mode.shapes_only
 
 
 def launch(like: Tensor, name: str, *arguments: object) -> Any:
-    """Return the result of ``call_core`` with the number of threads as the last argument."""
+    """Run ``call_core`` with the number of threads as the last argument."""
     return call_core(like, name, *arguments, num_threads())
 
 
 def call_core(like: Tensor, name: str, *arguments: object) -> Any:
-    """Return what the function ``name`` of the core gives; None, without calling it, where only
-    shapes are needed.
+    """Call the function ``name`` of the compiled core; return None, without a call, while tracing
+    shapes.
 
-    ``arguments``: tensors, those written to included, are passed as arrays, also those in tuples
-    and lists. Raises DyngsError: the core refuses their shapes, types or indices.
+    ``arguments``: tensors, also in tuples and lists, are passed as arrays. Raises DyngsError if
+    the core rejects shapes, types or indices.
     """
     if _mode.shapes_only:
         return None
     core = core_for(like)
     try:
-        return getattr(core, name)(*(_passed(core, x) for x in arguments))
+        return getattr(core, name)(*(_to_core(core, x) for x in arguments))
     except (IndexError, TypeError, ValueError) as error:
         raise DyngsError(str(error).split(". ", 1)[0]) from None
 
 
 def empty_like(x: Tensor) -> Tensor:
-    """Return an uninitialised contiguous tensor like ``x``."""
+    """Allocate an uninitialised contiguous tensor like ``x``."""
     return torch.empty_like(x, memory_format=torch.contiguous_format)
 
 
-_PLAIN = frozenset({int, float, bool, type(None)})
+_PLAIN_TYPES = frozenset({int, float, bool, type(None)})
 
 
-def _passed(core: ModuleType, value: Any) -> Any:
-    """Return ``value`` as the core takes it; of the two hundred that a training step passes most
-    are plain."""
-    if type(value) in _PLAIN:
+def _to_core(core: ModuleType, value: Any) -> Any:
+    """Convert an argument for the core; most of the two hundred per training step are plain."""
+    if type(value) in _PLAIN_TYPES:
         return value
     if isinstance(value, Tensor):
         return array(value)
     if isinstance(value, (list, tuple)):
-        return tuple(_passed(core, x) for x in cast(Iterable[Any], value))
+        return tuple(_to_core(core, x) for x in cast(Iterable[Any], value))
     if isinstance(value, InPlace):
         return writable(value.tensor)
     if isinstance(value, Struct):
-        return getattr(core, value.name)(*(_passed(core, x) for x in value.fields))
+        return getattr(core, value.name)(*(_to_core(core, x) for x in value.fields))
     return value
 
 
@@ -235,23 +233,22 @@ def _shapes_of(kernel: Callable[P, R]) -> Callable[P, R]:
 
 
 def has_kernel(device: torch.device) -> bool:
-    """Return whether the ops are implemented on ``device``, for shapes alone on "meta"; elsewhere
-    plain torch may do."""
+    """Return whether ``device`` has native kernels ("meta": shapes only)."""
     return device.type in ("cpu", "meta") or (device.type == "cuda" and has_cuda_core())
 
 
-LARGEST = 3.4e38  # options are computed with in float32
+MAX_NUMBER = 3.4e38  # options are computed with in float32
 
 LARGEST_COUNT = 2**31 - 1
 MAX_SIDE: int = core.MAX_SIDE  # px; float32 has no pixel centres beyond 2^23
 
-UNASKED = 1 << 26  # bytes up to which the free memory is not asked for, because asking takes 0.1 ms
+UNCHECKED_BYTES = 1 << 26  # bytes below which free memory is not checked; the check takes 0.1 ms
 
 REMEDY = "lower the resolution, the scales or the number of views"
 
 
-def check_number(name: str, value: object, low: float, high: float = LARGEST) -> None:
-    """Raise an error unless ``value`` is a number from ``low`` to ``high``."""
+def check_number(name: str, value: object, low: float, high: float = MAX_NUMBER) -> None:
+    """Raise DyngsError unless ``value`` is a number from ``low`` to ``high``."""
     if not isinstance(value, (int, float)) or not low <= value <= high:
         raise DyngsError(f"{name} must be a number from {low:g} to {high:g}, got {value!r}")
 
@@ -261,8 +258,10 @@ def check_tensors(
     tensors: Mapping[str, tuple[Tensor, tuple[int, ...]]],
     dtype: torch.dtype | None = None,
 ) -> None:
-    """Raise an error unless the ``tensors`` of ``op`` have these shapes, one device, and ``dtype``
-    (None: floating point)."""
+    """Raise DyngsError unless the ``tensors`` have these shapes, one device, and ``dtype``.
+
+    None: any floating point dtype.
+    """
     first, device = next((name, x.device) for name, (x, _) in tensors.items())
     for name, (x, shape) in tensors.items():
         if tuple(x.shape) != shape:
@@ -275,19 +274,19 @@ def check_tensors(
 
 
 def check_count(name: str, value: object, low: int, high: int) -> None:
-    """Raise an error unless ``value`` is a whole number from ``low`` to ``high``."""
+    """Raise DyngsError unless ``value`` is an integer from ``low`` to ``high``."""
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
         raise DyngsError(f"{name} must be a whole number from {low} to {high}, got {value!r}")
 
 
 def check_choice(name: str, value: object, choices: Collection[str]) -> None:
-    """Raise an error unless ``value`` is one of the ``choices``."""
+    """Raise DyngsError unless ``value`` is one of the ``choices``."""
     if not isinstance(value, str) or value not in choices:
         raise DyngsError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
 
 
 def check_size(width: int, height: int) -> None:
-    """Raise an error unless images of this size can be drawn."""
+    """Raise DyngsError unless images of this size can be rendered."""
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise DyngsError(
             f"render refused: an image of {width}x{height} px; its sides can be 1 to {MAX_SIDE} px"
@@ -295,14 +294,12 @@ def check_size(width: int, height: int) -> None:
 
 
 def check_memory(size: int, what: str, like: Tensor) -> None:
-    """Raise an error unless ``size`` bytes for ``what`` fit what machine, control groups and
-    RLIMIT_AS leave free.
+    """Raise DyngsError unless ``size`` bytes for ``what`` fit in the available memory.
 
-    Only where ``like`` lies on the CPU: in a GPU's memory torch itself refuses what does not fit.
-    Raises DyngsError: with both figures. (Where the system does not say, more than 16 GiB at once
-    is refused.)
+    The limits are those of the machine, control groups and RLIMIT_AS. Only checked on the CPU:
+    torch itself reports exhausted GPU memory. Without system information, 16 GiB are available.
     """
-    if shapes_only() or like.device.type != "cpu" or size <= UNASKED:
+    if shapes_only() or like.device.type != "cpu" or size <= UNCHECKED_BYTES:
         return
     available = core.available_memory()
     if size > available:
@@ -324,8 +321,7 @@ count_nonfinite_op = register("count_nonfinite", _count_nonfinite)
 
 
 def check_finite(tensors: Mapping[str, Tensor], remedy: str = "clean the input") -> None:
-    """Raise an error unless every element of the ``tensors`` (float32 or float64, on one device) is
-    finite."""
+    """Raise DyngsError unless all elements of the ``tensors`` (on one device) are finite."""
     counts = count_nonfinite_op([x.detach() for x in tensors.values()])
     for (name, x), count in zip(tensors.items(), counts.cpu().numpy().tolist(), strict=True):
         if count:
@@ -336,7 +332,7 @@ def check_finite(tensors: Mapping[str, Tensor], remedy: str = "clean the input")
 
 
 def finite_rows(tensors: Sequence[Tensor]) -> Tensor:
-    """Return (N,) bool: the rows that are finite in all of the tensors (N, ...)."""
+    """Return (N,) bool: rows that are finite in all tensors (N, ...)."""
     keep = torch.ones(len(tensors[0]), dtype=torch.bool, device=tensors[0].device)
     for x in tensors:
         keep &= torch.isfinite(x.detach()).reshape(len(x), math.prod(x.shape[1:])).all(dim=1)

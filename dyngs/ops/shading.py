@@ -1,7 +1,6 @@
-"""Inputs of a colour network about each Gaussian that a camera sees, computed in one pass.
+"""Fused inputs of a colour network for the visible Gaussians of a camera.
 
-In plain torch this takes three times as long as the network itself: some thirty operations on
-narrow arrays.
+In plain torch, thirty operations on narrow arrays would take three times as long as the network.
 """
 
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
@@ -18,8 +17,7 @@ from dyngs.ops.registration import Backward, launch, register
 
 
 def num_inputs(*, uses_time: bool, uses_normals: bool) -> int:
-    """Return K, the width of the network's input: place, direction, base colour, and what else it
-    sees."""
+    """Return the number of network inputs K."""
     return 9 + 4 * uses_normals + uses_time
 
 

@@ -1,7 +1,6 @@
-"""Linear blend skinning of points by sparse control nodes (SC-GS: Huang et al. 2024), and offsets
-added to Gaussians.
+"""Linear blend skinning by sparse control nodes (SC-GS, Huang et al. 2024), and Gaussian offsets.
 
-M points, S nodes, B nodes that one point follows, D values of a node.
+Local letters: M points, S nodes, B nodes per point, D values per node.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ def _skinning_backward(x: Backward) -> Sequence[Tensor | None]:
 skinning_op = register(
     "skinning", _skinning, _skinning_backward, "points motion values", keeps=[2], constant=[2]
 )
-"""Offsets (M, 3), blended values (M, D), and the weights (M, B) of the nodes."""
+"""Offsets (M, 3), blended values (M, D) and weights (M, B)."""
 
 
 def blend_skinning(
@@ -113,8 +112,7 @@ def add_offsets_(
     harmonics; None but for the first: none. Raises DyngsError: no such row, or not contiguous.
     """
     changes = [None if x is None else x.detach().to(gaussians[0].dtype) for x in offsets]
-    # .data where nothing is added: a tensor that stays as it is must not count as changed for
-    # autograd
+    # Unchanged tensors are passed as .data, so that autograd does not count them as modified.
     own = [
         x.data.contiguous() if offset is None else x.detach()
         for x, offset in zip(gaussians, offsets, strict=True)

@@ -150,7 +150,7 @@ def open_export_folder(out: Path, run_dir: Path, config: Config) -> Iterator[Pat
         with atomic_folder(out, require_empty) as started:
             yield started
         return
-    with writing(out):
+    with lock_folder(out):
         if out.resolve() != run_dir.resolve():
             _require_export_of(config, out)
         yield out

@@ -81,7 +81,7 @@ def published_network(name: str) -> Path:
     """Return the file of the published weights ``name``. Raises DyngsError if not installed."""
     package = find_spec(PUBLISHED)
     if package is None:
-        advice = "install the package dyngs-people-weights, see docs/people_network.md, to use published weights"
+        advice = "install the package dyngs-people-weights, see `dyngs docs people`, to use published weights"
         raise DyngsError(
             f"{name}: no run and no file of weights; give the run of a network, or {advice}"
         )

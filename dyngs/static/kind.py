@@ -1,4 +1,4 @@
-"""The kind ``static``: still scenes of Gaussians."""
+"""Model kind ``static``: static scenes of Gaussians."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class StaticKind(HasSizeLimit):
-    """See the module."""
+    """Static scenes of Gaussians."""
 
     uses = HasSizeLimit.uses | {"init.scene"}
     speeds_up_short_runs = True

@@ -1,4 +1,4 @@
-"""Limits on the number of Gaussians, and what limits together are possible (docs/budget.md).
+"""Limits on the number of Gaussians and their combinations; see docs/reference/limits.md.
 
 A limit on the file's size is one on the number of Gaussians first: so few that they fit when stored
 as exactly as is usual.
@@ -15,7 +15,7 @@ from dyngs.models.kind import HasGaussians, HasSizeLimit, capability, find_kind
 RANDOM_FRACTION = 0.1
 SHAPE_BYTES, HARMONIC_BYTES, FIELD_BYTES = 16.0, 0.35, 1.0
 """Bytes per Gaussian, per value of its harmonics, per value of a field: a little more than in
-docs/storage.md."""
+docs/reference/formats.md."""
 FEWEST = 500  # Fewest Gaussians that a limit on the size must have room for
 
 

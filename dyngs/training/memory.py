@@ -136,7 +136,7 @@ def expected_gaussians(config: Config, now: int, longest_side: int = 400) -> int
         grown = now * (1 + growth_per_change(steps)) ** min(changes, 200)
     else:
         # photos of 400 px led to 250,000 Gaussians by the 34 changes of 7,000 steps
-        # (docs/benchmarks.md)
+        # (docs/benchmarks/index.md)
         factor = changes / 34
         factor = factor if factor < 1 else min(factor, 4.0) ** 0.5
         grown = 250_000 * min(longest_side / 400, 1.0) ** 0.5 * factor

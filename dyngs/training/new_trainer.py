@@ -40,7 +40,7 @@ MANY_ALIKE = 0.05
 their silhouettes."""
 # fraction of train.alpha_weight before other moving things, until their motion is followed
 EARLY_OPACITY = 0.2
-# fraction of the run; measured as the others, see docs/benchmarks.md#backgrounds
+# fraction of the run; measured as the others, see docs/benchmarks/index.md
 FULL_OPACITY_FROM = 0.6
 ALIKE_IMAGES = 12  # number of images in which colours are compared with the background
 
@@ -72,7 +72,10 @@ def build_trainer(
     generator = torch.Generator().manual_seed(config.run.seed)
     if images is None:
         images = ImageLoader(
-            capture.splits["train"], config.data, with_maps=True, decoding_threads=default_decoding_threads()
+            capture.splits["train"],
+            config.data,
+            with_maps=True,
+            decoding_threads=default_decoding_threads(),
         )
     priors = PriorLosses()
     kind = find_kind(config.model)
@@ -103,12 +106,12 @@ def build_trainer(
         if config.camera.refine == "always":
             refinement = CameraRefinement(views, extent, steps)
             correct_cameras = refinement.corrections.correct_cameras
-            images.corrected = lambda index, cameras: correct_cameras(views[index], cameras)
+            images.camera_correction = lambda index, cameras: correct_cameras(views[index], cameras)
         robust = None
         may_mask = "train.robust" in kind.uses and not isinstance(kind, HasMotion)
         if config.train.robust == "always" and may_mask:
             cameras = training_cameras(views, config.data)
-            robust = RobustMasks(images, cameras, steps, images.corrected)
+            robust = RobustMasks(images, cameras, steps, images.camera_correction)
         exposures = None
         if config.train.exposure == "always":
             exposures = ViewExposures(len(images), steps, images)

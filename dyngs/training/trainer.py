@@ -246,7 +246,7 @@ class Trainer(Generic[M]):
             model.replace_scene(model.scene.without_masks())
             model.stop_growing()
         if edit.kept is not None:
-            model.keep(edit.kept, self.done)
+            model.select_gaussians(edit.kept, self.done)
         if edit.masks is not None:
             model.replace_scene(replace(model.scene, masks=edit.masks))
 
@@ -338,13 +338,13 @@ class Trainer(Generic[M]):
 
     def _image(self, index: int, step: int) -> Image:
         """Return the image of view ``index`` for ``step``; those after it begin to be decoded."""
-        image = self.images.shrunk(index, image_divisor(self.config.train, step))
+        image = self.images.downscaled(index, image_divisor(self.config.train, step))
         if self.images.num_prefetched:
             batch = self.config.train.batch_size
             count = self.images.num_prefetched * self.processes.size
             fraction = self.processes.views_of_process(batch)
             upcoming = self.sampler.peek(count, self._wanted(step))
-            self.images.expect([view for i, view in enumerate(upcoming) if i % batch in fraction])
+            self.images.prefetch([view for i, view in enumerate(upcoming) if i % batch in fraction])
         return image
 
     def _wanted(self, step: int) -> Callable[[int], bool]:

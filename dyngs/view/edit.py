@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dyngs.api.edit import write_part
 from dyngs.core.errors import DyngsError, format_count
-from dyngs.data.geometry import look_at, perpendicular, with_poses
+from dyngs.data.geometry import cameras_at_poses, look_at, perpendicular
 from dyngs.export.edit.crop import Box, gaussians_in_region
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.formats.similarity import IDENTITY, Similarity
@@ -61,7 +61,9 @@ def pick_point(
         return None  # browsers may send anything
     forward = direction / length
     camera = camera_at((1, 0, 0, 0), origin, 2 * math.atan(0.5 * _SIZE * pixel), (_SIZE, _SIZE))
-    camera = with_poses(camera, look_at(origin, origin + forward, perpendicular(forward))[None])
+    camera = cameras_at_poses(
+        camera, look_at(origin, origin + forward, perpendicular(forward))[None]
+    )
     found = depth_of(opened, ViewRequest(camera, request.time, part=request.part))
     depth, alpha = (float(x[_SIZE // 2, _SIZE // 2]) for x in found)
     return origin + depth * forward if alpha >= _SOLID else None

@@ -100,7 +100,7 @@ def with_levels(opened: OpenedScene, most: int) -> OpenedScene:
     """Return a still scene of which at most ``most`` Gaussians are drawn while anything moves.
     Raises DyngsError."""
     opened = opened.noted(f"while anything moves, at most {most:,} Gaussians are drawn")
-    opened.once("levels", lambda: LevelScene.of(opened.renderable, most))
+    opened.once("levels", lambda: LevelScene.from_scene(opened.renderable, most))
     return opened
 
 

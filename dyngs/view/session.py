@@ -139,8 +139,10 @@ class Recording:
         return Cameras(pose, matrix, *size), time
 
     def document(self, size: tuple[int, int], fps: float, opened: OpenedScene) -> str:
-        """Return the path as JSON that ``dyngs render --path`` reads (docs/camera_paths.md), in the
-        coordinates of the capture; ``size`` of its images, px."""
+        """Return the path as JSON for ``dyngs render --path`` (docs/reference/camera-paths.md).
+
+        Coordinates are those of the capture; ``size`` is that of its images in px.
+        """
         keys: list[dict[str, Any]] = []
         start = 0.0
         for key in self.keyframes:

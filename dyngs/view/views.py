@@ -13,7 +13,7 @@ import torch
 from dyngs.config import DataConfig
 from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
-from dyngs.data.geometry import invert_rigid, estimate_focus, pinhole_matrix, world_from_cam
+from dyngs.data.geometry import estimate_focus, invert_rigid, pinhole_matrix, world_from_cam
 from dyngs.data.loader import ImageLoader
 from dyngs.export.choose_path import framing_points, orbit_cameras_around
 from dyngs.human.avatar.scene import as_human_scene

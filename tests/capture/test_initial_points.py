@@ -13,15 +13,15 @@ from room_surfaces import distances_to_surface
 import dyngs
 from dyngs.capture.initial_points import (
     ENOUGH,
+    create_initial_points,
     sample_points_in_silhouettes,
     triangulate_clip,
     triangulate_from_views,
     views_at_one_time,
-    create_initial_points,
 )
 from dyngs.config import DataConfig, PointsInit
 from dyngs.data.capture import Capture, PointCloud, View
-from dyngs.data.geometry import projected
+from dyngs.data.geometry import project_points
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import (
@@ -43,7 +43,7 @@ def test_real_points_are_used(shared: Path) -> None:
     capture = read_capture(shared / "clip_duck")
     begun, lines = begin(capture)
     assert begun.points is capture.points
-    assert lines == ["points.ply: 4,773 points, which the first Gaussians are made from"]
+    assert lines == ["points.ply: 4,773 points used as initial points"]
 
 
 RNG = np.random.default_rng(1)
@@ -59,7 +59,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[View], PointClo
     xyz = RNG.uniform((-1.5, -1.5, 0), (1.5, 1.5, 2), (6000, 3))
     near = np.argsort(distances_to_surface(xyz, views, views[0].time or 0.0))[:400]
     image = ImageLoader(views[:1])[0].rgb_premultiplied.numpy()
-    places, inside = projected(xyz[near], views[0])
+    places, inside = project_points(xyz[near], views[0])
     pixels = (places[inside] * 96).astype(int)
     rgb = (255 * image[pixels[:, 1], pixels[:, 0]]).astype(np.uint8)
     return views, PointCloud(xyz[near][inside], rgb)
@@ -126,7 +126,7 @@ def test_over_a_clip_what_stands_has_points_and_what_moves_has_none(
     assert np.mean(distances < 0.1) > 0.7
     on_patch = np.zeros(len(found.xyz))
     for view, corner in zip(views, corners, strict=False):
-        places, inside = projected(found.xyz, view)
+        places, inside = project_points(found.xyz, view)
         offset = 160 * places - corner
         on_patch += inside & (offset > 4).all(axis=1) & (offset < 44).all(axis=1)
     assert (on_patch >= len(views) - 2).mean() < 0.05
@@ -189,5 +189,5 @@ def test_a_still_blender_scene_begins_in_its_silhouettes(tmp_path: Path) -> None
     begun, lines = create_initial_points(capture, DataConfig(root=root), PointsInit())
     assert begun.points is not None
     assert lines == [
-        f"{len(begun.points.xyz):,} first points were drawn at random in the silhouettes of the images"
+        f"{len(begun.points.xyz):,} initial points sampled at random inside the silhouettes"
     ]

@@ -14,20 +14,20 @@ from stage_videos import camera, corner, write_videos
 from tiny_captures import opengl_pose
 
 from dyngs.capture.inspection import (
-    check_before_training,
     body_problems,
+    build_report,
+    check_before_training,
+    describe_masks,
     draw_cameras,
     format_report,
     inspect_capture,
-    masks_of,
-    build_report,
     video_facts,
     video_report,
 )
 from dyngs.capture.sfm.several_videos import open_video
 from dyngs.cli import main
 from dyngs.config import DataConfig
-from dyngs.data.body_frames import body_frames, share_body_across_splits
+from dyngs.data.body_frames import build_body_frames, share_body_across_splits
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import from_opengl_pose, pinhole_matrix
 from dyngs.data.read import read_capture
@@ -57,14 +57,14 @@ def with_points(capture: Capture, xyz: np.ndarray) -> Capture:
 def test_few_images_far_apart_are_ill_posed(count: int, degrees: float, says: bool) -> None:
     """Not those of a video, nor many that jump about as in D-NeRF."""
     lines = check_before_training(clip(count, degrees))
-    expected = "12 images, each at a time of its own, 31 degrees apart on average: what moves is seen from one side"
+    expected = "12 images at different times, 31 degrees apart on average: moving objects are seen from one side"
     assert [line.startswith(expected) for line in lines] == [True] * says
 
 
 def test_one_fixed_camera() -> None:
     capture = clip(12, 0.0)
     (line,) = check_before_training(capture)
-    assert "one camera that does not move saw all 12 times" in line
+    assert "a single fixed camera recorded all 12 times" in line
 
 
 def test_points_and_cameras_that_do_not_meet() -> None:
@@ -72,7 +72,10 @@ def test_points_and_cameras_that_do_not_meet() -> None:
     xyz = np.random.default_rng(0).normal(size=(300, 3)) * 0.3
     assert check_before_training(with_points(capture, xyz)) == []
     far = with_points(capture, np.concatenate([xyz, xyz[:150] + np.array([0, 0, 50.0])]))
-    assert any("33% of the points are in no camera's view" in line for line in check_before_training(far))
+    assert any(
+        "33% of the points are not visible in any view" in line
+        for line in check_before_training(far)
+    )
 
 
 @pytest.mark.parametrize(
@@ -118,7 +121,7 @@ def mask_of(kept: int, value: int = 255) -> np.ndarray:
 @pytest.mark.parametrize("mask", [mask_of(1), mask_of(7, 1)])
 def test_masks_that_ignore_nearly_everything(tmp_path: Path, mask: np.ndarray) -> None:
     capture = capture_with(tmp_path, mask)
-    (problem,) = masks_of(capture)[1]
+    (problem,) = describe_masks(capture)[1]
     assert problem.startswith("masks ignore ")
     assert str(tmp_path / "mask1.png") in problem
     assert problem in check_before_training(capture)
@@ -160,14 +163,19 @@ def test_sides_of_a_person_that_no_camera_sees(
         assert body_problems(Capture(root=tmp_path, format="x", splits={"train": ()})) == []
         return
     whole = None if turns is None else np.tile([0, np.radians(turns), 0], (len(sides), 1))
-    body = body_frames(tmp_path, range(len(sides)), poses, trans, np.zeros(10), turns=whole)
+    body = build_body_frames(
+        tmp_path, range(len(sides)), poses, trans, np.zeros(10), origin_rotations=whole
+    )
     capture = Capture(
-        root=tmp_path, format="x", splits={"train": tuple(views)}, body=share_body_across_splits(body)
+        root=tmp_path,
+        format="x",
+        splits={"train": tuple(views)},
+        body=share_body_across_splits(body),
     )
     found = body_problems(capture)
     unseen = {(0,): "back", (90,): "right side", (180,): "front", (270,): "left side"}
     unseen |= {(350, 10): "back", (80, 100): "right side"}
-    assert [line.split(" is never")[0] for line in found] == [
+    assert [line.split(" is in no image")[0] for line in found] == [
         f"the person's {side}" for key, side in unseen.items() if key == sides
     ]
     assert set(found) <= set(check_before_training(capture))
@@ -197,7 +205,7 @@ def test_a_good_capture_is_quiet(tmp_path: Path) -> None:
     report = build_report(_capture(tmp_path), deep=True)
     assert not report.problems, report.problems
     text = format_report(report)
-    for fact in ("5 train, 1 test", "32x24", "40 px", "43.6 degrees", "200", "nothing suspicious"):
+    for fact in ("5 train, 1 test", "32x24", "40 px", "43.6 degrees", "200", "no problems found"):
         assert fact in text, text
 
 
@@ -205,9 +213,9 @@ def test_a_good_capture_is_quiet(tmp_path: Path) -> None:
     ("changes", "line"),
     [
         ({"image_path": Path("nowhere.png")}, "nowhere.png"),
-        ({"width": 33}, "has 32x24 pixels, its camera says 33x24"),
+        ({"width": 33}, "has 32x24 pixels, but its camera is 33x24"),
         *(
-            ({"intrinsics": np.array([[fx, 0, cx], [0, fy, 12], [0, 0, 1]])}, "odd intrinsics")
+            ({"intrinsics": np.array([[fx, 0, cx], [0, fy, 12], [0, 0, 1]])}, "unusual intrinsics")
             for fx, fy, cx in ((40.0, 40.0, 99), (40.0, 80.0, 16), (4e4, 4e4, 16))
         ),
     ],
@@ -224,8 +232,8 @@ def test_scene_faults(tmp_path: Path) -> None:
     assert build_report(good.replace(warnings=("something odd",))).problems == ("something odd",)
     untested = good.replace(splits={"train": good.splits["train"][:2], "test": ()})
     assert [line.split(",")[0] for line in build_report(untested).problems] == [
-        "the split 'test' is empty",
-        "only 2 training views; a scene needs some 20 or more",
+        "no test views",
+        "only 2 training views; use at least 20",
     ]
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     turned = {
@@ -236,7 +244,7 @@ def test_scene_faults(tmp_path: Path) -> None:
         problems = build_report(good.replace(splits=turned, points=points)).problems
         assert any("look away" in line for line in problems), problems
     still = _with_view(good, cam_from_world=good.splits["test"][0].cam_from_world)
-    assert any("share their pose" in line for line in build_report(still).problems)
+    assert any("have the same pose" in line for line in build_report(still).problems)
 
 
 def _sequence(root: Path, cameras: int, times: int) -> Capture:
@@ -294,15 +302,15 @@ def test_links_that_leave_the_capture_are_reported(tmp_path: Path) -> None:
     report = inspect_capture(root)
     assert report.capture is not None
     assert report.problems == (
-        f"{root / 'notes'}: a link that leads out of the capture, to {tmp_path.resolve()}",
+        f"{root / 'notes'}: link to {tmp_path.resolve()}, outside the capture",
     )
     image = next((root / "train").iterdir())
     image.rename(tmp_path / "own.png")
     image.symlink_to(tmp_path / "own.png")
     report = inspect_capture(root)
     assert report.capture is None
-    assert "lies outside the capture" in report.problems[0]
-    assert any(f"{image}: a link that leads out" in line for line in report.problems[1:])
+    assert "outside the capture" in report.problems[0]
+    assert any(f"{image}: link to " in line for line in report.problems[1:])
     followed = inspect_capture(DataConfig(root=root, follow_links=True))
     assert followed.capture is not None
 
@@ -331,10 +339,10 @@ def test_a_camera_that_moves(tmp_path: Path) -> None:
 def test_cameras_that_stand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = tmp_path / "rig"
     write_videos(rig, {"a": 40.0, "b": 50.0}, {"a": 0.0, "b": 0.0}, 10.0, 8)
-    assert "shows no depth" in video_report(rig / "a.mp4")
+    assert "gives no depth" in video_report(rig / "a.mp4")
     assert main(["data", "inspect", str(rig)]) == 0
     shown = capsys.readouterr().out
-    assert "2 fixed cameras; offsets between them: found by sound" in shown
+    assert "2 fixed cameras; offsets between them: estimated from sound" in shown
     assert f"next: dyngs train dynamic data.root={rig}" in shown
     _turning(rig / "walk.mp4")
-    assert "next: take walk out" in video_report(rig)
+    assert "next: remove walk" in video_report(rig)

@@ -11,11 +11,11 @@ from scipy import ndimage
 
 from dyngs.capture.fixed_camera import read_fixed_camera
 from dyngs.capture.masks import (
-    background_of,
-    outlined,
-    person_mask,
-    separation,
     add_background_masks,
+    background_of,
+    measure_separation,
+    person_mask,
+    refine_outlines,
 )
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
@@ -61,7 +61,7 @@ def test_who_walks_by_is_cut_out(noise: float, shade: float, least: float) -> No
     background = background_of(images)
     found = np.stack([person_mask(background, image) for image in images])
     assert worst_iou(found, true) > least
-    assert separation(background, images, found).is_clear
+    assert measure_separation(background, images, found).is_clear
 
 
 def rough(masks: np.ndarray) -> np.ndarray:
@@ -78,7 +78,7 @@ def rough(masks: np.ndarray) -> np.ndarray:
 def test_a_detector_and_the_background_outline_better_than_each(speed: float) -> None:
     """Also of somebody whose median over time is not the background."""
     images, true = clip(speed)
-    found = outlined(images, rough(true))
+    found = refine_outlines(images, rough(true))
     assert found is not None
     assert worst_iou(found, true) > 0.96 > worst_iou(rough(true), true)
     background = background_of(images)
@@ -89,8 +89,8 @@ def test_a_detector_and_the_background_outline_better_than_each(speed: float) ->
 def test_a_moving_camera_has_no_outlines_and_nobody_no_mask() -> None:
     images, true = clip(6.0)
     moved = np.stack([np.roll(image, 6 * t, axis=1) for t, image in enumerate(images)])
-    assert outlined(moved, np.zeros_like(true)) is None
-    nobody = outlined(images, np.zeros_like(true))
+    assert refine_outlines(moved, np.zeros_like(true)) is None
+    nobody = refine_outlines(images, np.zeros_like(true))
     assert nobody is not None
     assert not nobody.any()
 
@@ -100,7 +100,7 @@ def test_who_stays_is_not(speed: float) -> None:
     images, _ = clip(speed)
     background = background_of(images)
     found = np.stack([person_mask(background, image) for image in images])
-    assert not separation(background, images, found).is_clear
+    assert not measure_separation(background, images, found).is_clear
 
 
 SIZE = (60, 90)
@@ -141,13 +141,11 @@ def iou_of(mask: np.ndarray, step: int, index: int) -> float:
 
 def test_who_walks_by_gets_masks(tmp_path: Path) -> None:
     said: list[str] = []
-    capture = add_background_masks(
-        moving_block(tmp_path / "c", 8), tmp_path / "m", log=said.append
-    )
+    capture = add_background_masks(moving_block(tmp_path / "c", 8), tmp_path / "m", log=said.append)
     assert capture.has_alpha
     assert all(iou_of(mask_of(capture, i), 8, i) > 0.9 for i in range(COUNT))
     assert len(said) == 1
-    assert "of the outlines lie on edges" in said[0]
+    assert "of the outlines lie on image edges" in said[0]
 
 
 def test_who_stays_needs_a_image_of_the_place(tmp_path: Path) -> None:
@@ -165,12 +163,12 @@ def test_who_stays_needs_a_image_of_the_place(tmp_path: Path) -> None:
 
 
 def test_a_camera_that_moves_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match="moves, so there is no background"):
+    with pytest.raises(DyngsError, match="moves, so its background is unknown"):
         add_background_masks(moving_block(tmp_path / "c", 8, turn=2), tmp_path / "m")
     capture = moving_block(tmp_path / "d", 8)
     views = list(capture.splits["train"])
     pose = views[3].cam_from_world.copy()
     pose[0, 3] = 0.1
     views[3] = replace(views[3], cam_from_world=pose)
-    with pytest.raises(DyngsError, match="moves, so there is no background"):
+    with pytest.raises(DyngsError, match="moves, so its background is unknown"):
         add_background_masks(capture.replace(splits={"train": tuple(views)}), tmp_path / "m")

@@ -12,8 +12,8 @@ import torch
 from dyngs.capture import initial_points
 from dyngs.capture.initial_points import create_initial_points
 from dyngs.capture.plane_sweep import (
-    sweep_dense_points,
     points_from_depth_maps,
+    sweep_dense_points,
 )
 from dyngs.config import DataConfig, PointsInit
 from dyngs.data.capture import Capture, View
@@ -124,13 +124,14 @@ def test_a_still_capture_without_any_points_is_swept(
     begun, lines = create_initial_points(capture, DataConfig(root=tmp_path), PointsInit(dense=2000))
     assert begun.points is not None
     assert len(begun.points.xyz) == 2000
-    assert lines == ["2,000 first points are from depth maps by plane sweep (init.dense)"]
+    assert lines == ["2,000 initial points from plane-sweep depth maps (init.dense)"]
     x, _, z = begun.points.xyz.T
     error = np.abs(z - SLOPE * x)
     assert np.median(error) < 0.01 * DISTANCE
     assert np.quantile(error, 0.9) < 0.05 * DISTANCE
     assert (
-        create_initial_points(capture, DataConfig(root=tmp_path), PointsInit(dense=0))[0].points is None
+        create_initial_points(capture, DataConfig(root=tmp_path), PointsInit(dense=0))[0].points
+        is None
     )
     timed = capture.replace(
         splits={"train": tuple(replace(view, time=0.1 * i) for i, view in enumerate(views))}

@@ -43,16 +43,14 @@ def test_a_file_is_converted_there_and_back(tmp_path: Path, capsys: Capture) -> 
     assert float((means - read_splats(plain).gaussians.means).abs().max()) < 1e-3
     assert main(["convert", str(plain), str(tmp_path / "d.splat"), "--up=keep"]) == 0
     captured = capsys.readouterr()
-    assert "harmonics above degree 0 are left out: splat holds no more" in captured.out
+    assert "SH coefficients above degree 0 are dropped: splat stores no more" in captured.out
     assert "visible differences" in captured.err
 
 
 def test_what_convert_refuses(tmp_path: Path, capsys: Capture) -> None:
     plain = write_splats(tmp_path / "a.ply", SplatFile(cloud(5))).path
-    assert "no suffix of a file of Gaussians; use one of" in refused(
-        capsys, "convert", plain, tmp_path / "b.xyz"
-    )
-    assert "exists, which is read" in refused(capsys, "convert", plain, plain)
+    assert "unknown file type; use one of" in refused(capsys, "convert", plain, tmp_path / "b.xyz")
+    assert "exists, which is an input" in refused(capsys, "convert", plain, plain)
     assert "no such file" in refused(capsys, "convert", tmp_path / "no.ply", tmp_path / "b.ply")
     assert "at most degree 0" in refused(
         capsys, "convert", plain, tmp_path / "b.splat", "--sh-degree", 3

@@ -48,6 +48,14 @@ def test_unknown_page_is_refused_with_a_similar_name(capsys: pytest.CaptureFixtu
     assert main(["docs", "../README"]) == 2
 
 
+def test_package_contains_all_pages() -> None:
+    project = (DOCS.parent / "pyproject.toml").read_text(encoding="utf-8")
+    packed = re.findall(r'^"docs/(\S+)" = "dyngs/docs/\1"', project, re.MULTILINE)
+    listed = (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8")
+    for page in re.findall(r": (\S+\.md)$", listed, re.MULTILINE):
+        assert page.split("/")[0] in packed, page
+
+
 def test_api_page_has_signatures_and_docstrings(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["docs", "reference/python"]) == 0
     shown = capsys.readouterr().out

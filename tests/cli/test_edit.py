@@ -54,7 +54,7 @@ def test_options_one_after_another(plain: Path, capsys: Capture) -> None:
     assert "next:    dyngs view a.ply" in said
     assert len(read_splats("a.ply").gaussians) > 400
     assert edit("a.ply", "--crop", "0,0,0", "1.5", "--outside", "--out", "b.spz") == 0
-    assert "spz cannot state how it was edited" in capsys.readouterr().out
+    assert "spz cannot store the edits" in capsys.readouterr().out
     assert edit("a.ply", "--undo", "--out=c.ply") == 0
     assert len(read_splats("c.ply").gaussians) == len(read_splats("a.ply").gaussians)
 
@@ -95,9 +95,9 @@ def test_what_is_refused(plain: Path, capsys: Capture) -> None:
     before = {path: path.read_bytes() for path in Path().iterdir()}
     refused = [
         (["--out", "a.xyz"], "edits end in a file of Gaussians"),
-        (["--out", "plain.ply"], "exists, which is read"),
-        (["--merge", "half.ply", "--out", "half.ply"], "exists, which is read"),
-        (["--geo", "line.csv", "--out", "line.csv"], "exists, which is read"),
+        (["--out", "plain.ply"], "exists, which is an input"),
+        (["--merge", "half.ply", "--out", "half.ply"], "exists, which is an input"),
+        (["--geo", "line.csv", "--out", "line.csv"], "exists, which is an input"),
         (["--crop", "open.obj"], "give two corners"),
         (["--crop", "50,50,50", "1"], "--crop leaves none"),
         (["--crop", "-1,0,0"], "give two corners"),

@@ -54,7 +54,7 @@ def test_only_the_command_line_lets_a_capture_name_files_elsewhere(
     image = next((tmp_path / "capture").rglob("*.png"))
     shutil.move(image, tmp_path / "private.png")
     image.symlink_to(tmp_path / "private.png")
-    refused = "lies outside the capture"
+    refused = "outside the capture"
     assert refused in error_line(capsys, "eval", run)
     assert refused in error_line(capsys, "eval", run, "data.follow_links=false")
     assert refused in error_line(capsys, "train", "--resume", run, "train.steps=9", begun=True)

@@ -94,7 +94,7 @@ def test_cameras_of_the_capture_are_not_written_over(
     refined: Path, still: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["export", str(refined), "--format", "cameras", "--out", str(still)]) == 2
-    assert "exists, which is read" in capsys.readouterr().err
+    assert "exists, which is an input" in capsys.readouterr().err
     assert (
         main(
             ["export", str(refined), "--format", "cameras", "--out", str(still / "transforms.json")]

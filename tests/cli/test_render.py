@@ -106,7 +106,9 @@ def test_render_at_times(moving_run: Path, tmp_path: Path, capsys: Capture) -> N
     assert images("clamped", "--time", "7") == 1
     assert "1 of 1 times lie outside [0, 1]" in capsys.readouterr().out
     few = ("--max-gaussians-drawn", 9, "--view", 0)
-    assert "for still scenes" in error_line(capsys, "render", moving_run, "--out", tmp_path, *few)
+    assert "need a static scene" in error_line(
+        capsys, "render", moving_run, "--out", tmp_path, *few
+    )
     assert "no view 'r_9'" in error_line(
         capsys, "render", moving_run, "--out", tmp_path, "--view", "r_9"
     )

@@ -21,7 +21,7 @@ from dyngs.api.budget import time as budget_time
 from dyngs.cli import main
 from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.evaluate.report import evaluate_run
-from dyngs.io.outputs import LOCK_NAME, writing
+from dyngs.io.outputs import LOCK_NAME, lock_folder
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.study import compare
 from dyngs.study.measure import TRUTH
@@ -269,7 +269,7 @@ def test_wrong_usage_of_tradeoff_ends_in_one_line(
 def test_two_sweeps_do_not_mix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = write_moving_run(tmp_path)
     out = tmp_path / "out"
-    with writing(out):
+    with lock_folder(out):
         assert main(["tradeoff", str(run), "--out", str(out), "--vary", "prune=0.5"]) == 2
         assert [path.name for path in out.iterdir()] == [LOCK_NAME]
     told = capsys.readouterr().err

@@ -83,6 +83,6 @@ def test_cameras_are_those_that_training_found(trainer: Trainer) -> None:
         pose[:, 2, 3] += 5.0 * (index == 0)
         return replace(cameras, cam_from_world=pose)
 
-    trainer.images.corrected = moved
+    trainer.images.camera_correction = moved
     assert bool(before[-1])
     assert not bool(find_floaters(trainer)[-1])

@@ -89,10 +89,12 @@ def write_metashape(
         f'<calibration type="{kind}" class="adjusted">{resolution}{parameters}</calibration>'
     )
     (root / "cameras.xml").write_text(
-        '<?xml version="1.0" encoding="UTF-8"?>\n<document version="2.0.0"><chunk label="Chunk 1">'
-        f'<sensors next_id="8"><sensor id="7" label="X-T4" type="{kind}">{resolution}{calibrations}</sensor></sensors>'
-        f'<components><component id="5">{transform if placement == "component" else ""}</component></components>'
-        f"<cameras>{''.join(cameras)}</cameras>{transform if placement == 'chunk' else ''}"
+        '<?xml version="1.0" encoding="UTF-8"?>\n<document version="2.0.0"><chunk label="Chunk '
+        '1"><sensors next_id="8"><sensor id="7" label="X-T4" '
+        f'type="{kind}">{resolution}{calibrations}</sensor></sensors><components><component '
+        f'id="5">{transform if placement == "component" else ""}</component></components>'
+        f"<cameras>{''.join(cameras)}</cameras>"
+        f"{transform if placement == 'chunk' else ''}"
         "<settings></settings></chunk></document>"
     )
     return root

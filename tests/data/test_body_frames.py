@@ -15,9 +15,9 @@ from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
 from dyngs.data.body_frames import (
+    attach_fitted_body,
+    build_body_frames,
     merge_root_rotation,
-    body_frames,
-    ensure_fitted_body,
 )
 from dyngs.data.capture import BodyFrames, Capture
 from dyngs.human.synthetic.capture import HumanOptions, write_human_capture
@@ -50,7 +50,7 @@ def random_body(seed: int, count: int = 3, turned: bool = True) -> BodyFrames:
         trans=rng.normal(size=(count, 3)),
         betas=np.zeros(10),
         scale=rng.uniform(0.2, 3, count),
-        turns=rng.normal(size=(count, 3)) * 2 if turned else None,
+        origin_rotations=rng.normal(size=(count, 3)) * 2 if turned else None,
     )
 
 
@@ -59,8 +59,8 @@ def in_world(
 ) -> np.ndarray:
     """Where the points of a template are, as ``BodyFrames`` says it."""
     at_rest = posed(points, joints, weights, body.poses[row])
-    if body.turns is not None:
-        at_rest = at_rest @ Rotation.from_rotvec(body.turns[row]).as_matrix().T
+    if body.origin_rotations is not None:
+        at_rest = at_rest @ Rotation.from_rotvec(body.origin_rotations[row]).as_matrix().T
     return body.scale[row] * at_rest + body.trans[row]
 
 
@@ -73,7 +73,7 @@ def test_turns_about_the_origin_become_turns_about_the_pelvis(seed: int) -> None
     weights = rng.dirichlet(np.ones(24), 8)
     body = random_body(seed)
     same = merge_root_rotation(body, joints[0])
-    assert same.turns is None
+    assert same.origin_rotations is None
     for row in range(3):
         expected = in_world(body, row, points, joints, weights)
         np.testing.assert_allclose(
@@ -84,7 +84,7 @@ def test_turns_about_the_origin_become_turns_about_the_pelvis(seed: int) -> None
 def test_rows_in_any_order_and_shape() -> None:
     poses = np.arange(3 * 165.0).reshape(3, 1, 165)
     trans = np.arange(9.0).reshape(3, 1, 3)
-    body = body_frames(FILE, [7, 2, 5], poses, trans, np.ones((3, 10)) * [[0], [1], [2]], 2.0)
+    body = build_body_frames(FILE, [7, 2, 5], poses, trans, np.ones((3, 10)) * [[0], [1], [2]], 2.0)
     assert (body.frames, body.kind, body.betas.tolist(), body.scale.tolist()) == (
         (2, 5, 7),
         "smplx",
@@ -95,7 +95,8 @@ def test_rows_in_any_order_and_shape() -> None:
     assert body.poses[:, 0, 0].tolist() == [165, 330, 0]
     assert body.trans[:, 0].tolist() == [3, 6, 0]
     kinds = [
-        body_frames(FILE, [0], np.zeros((1, w)), [[0, 0, 0]], [0.0]).kind for w in (72, 156, 165)
+        build_body_frames(FILE, [0], np.zeros((1, w)), [[0, 0, 0]], [0.0]).kind
+        for w in (72, 156, 165)
     ]
     assert kinds == ["smpl", "smplh", "smplx"]
 
@@ -114,7 +115,7 @@ GOOD: dict[str, Any] = {
     [
         (
             {"poses": np.zeros((4, 87))},
-            "'poses' has 87 numbers per frame; the known bodies have 72",
+            "'poses' has 87 numbers per frame; supported bodies: 72",
         ),
         ({"poses": np.zeros((4, 73))}, "'poses' has 73 numbers per frame"),
         ({"poses": np.zeros((3, 72))}, "'poses' must hold as many numbers for each of 4 frames"),
@@ -122,29 +123,32 @@ GOOD: dict[str, Any] = {
         ({"poses": [[0.0] * 72] * 3 + [[0.0]]}, "'poses' must hold as many numbers"),
         ({"poses": [["a"] * 72] * 4}, "'poses' must hold as many numbers"),
         ({"trans": np.zeros((4, 4))}, "'trans' has 4 numbers per frame instead of 3"),
-        ({"trans": np.full((4, 3), np.nan)}, "'trans' of frame 0 holds NaN"),
+        ({"trans": np.full((4, 3), np.nan)}, "'trans' of frame 0 contains NaN"),
         (
             {"trans": np.full((4, 3), 1e39)},
-            "'trans' of frame 0 holds NaN, infinite or huge numbers",
+            "'trans' of frame 0 contains NaN, infinite or huge values",
         ),
         (
             {"poses": np.where(np.arange(4)[:, None] == 2, np.inf, np.zeros(72))},
-            "'poses' of frame 2 holds NaN",
+            "'poses' of frame 2 contains NaN",
         ),
         ({"betas": [0, np.nan]}, "'betas' must hold finite numbers"),
         ({"betas": [0, 1e39]}, "'betas' must hold finite numbers"),
         ({"betas": np.zeros((3, 10))}, "'betas' must hold as many numbers"),
         ({"scale": -np.ones(4)}, "'scale' must be positive"),
         ({"scale": "big"}, "'scale' must hold as many numbers"),
-        ({"turns": np.zeros((4, 4))}, "'turns' has 4 numbers per frame instead of 3"),
-        ({"frames": [0, 1, 2, 1]}, "frame 1 has body parameters twice"),
-        ({"frames": []}, "holds no frame"),
+        (
+            {"origin_rotations": np.zeros((4, 4))},
+            "'origin_rotations' has 4 numbers per frame instead of 3",
+        ),
+        ({"frames": [0, 1, 2, 1]}, "frame 1 has two sets of body parameters"),
+        ({"frames": []}, "no frames found"),
     ],
 )
 def test_bad_parameters(change: dict[str, Any], line: str) -> None:
-    assert body_frames(FILE, **GOOD).frames == (0, 1, 2, 3)
+    assert build_body_frames(FILE, **GOOD).frames == (0, 1, 2, 3)
     with pytest.raises(DyngsError, match=line) as caught:
-        body_frames(FILE, **{**GOOD, **change})
+        build_body_frames(FILE, **{**GOOD, **change})
     assert "body.npz" in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -169,13 +173,13 @@ def write(path: Path, count: int = 3, **more: np.ndarray) -> Path:
 
 def test_a_fit_replaces_the_bodies_of_a_capture(capture: Capture, tmp_path: Path) -> None:
     write(tmp_path / "body_train.npz", surface_model_type=np.array("anny"))
-    found = ensure_fitted_body(capture, tmp_path)
+    found = attach_fitted_body(capture, tmp_path)
     assert found.body is not None
     assert found.body["train"].shape_space == "anny"
     assert found.body["test"] is found.body["train"]
     assert "pose" not in found.splits, "no parameters for the other clip"
     write(tmp_path / "body_pose.npz", count=2)
-    assert "pose" in ensure_fitted_body(capture, tmp_path).splits
+    assert "pose" in attach_fitted_body(capture, tmp_path).splits
 
 
 def test_a_capture_is_read_with_the_fit_that_the_options_name(
@@ -185,5 +189,5 @@ def test_a_capture_is_read_with_the_fit_that_the_options_name(
     found = read_capture(DataConfig(root=capture.root, body=tmp_path))
     assert found.body is not None
     assert found.body["train"].trans[:, 0].tolist() == [0, 1, 2]
-    with pytest.raises(DyngsError, match=r"body_train\.npz: no such file.* comes back by training"):
+    with pytest.raises(DyngsError, match=r"body_train\.npz: no such file.* to reuse a fit"):
         read_capture(DataConfig(root=capture.root, body=tmp_path / "elsewhere"))

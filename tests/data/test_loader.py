@@ -67,7 +67,7 @@ def test_a_shrunk_image_is_the_mean_of_its_pixels(tmp_path: Path) -> None:
     image = loader(views_of(tmp_path))[0]
     mask = torch.ones(8, 12)
     mask[5, 3] = 0
-    small = replace(image, mask=mask).shrunk(4)
+    small = replace(image, mask=mask).downscaled(4)
     assert (small.cameras.width, small.cameras.height) == (3, 2)
     assert image.alpha is not None
     assert small.alpha is not None
@@ -80,8 +80,8 @@ def test_a_shrunk_image_is_the_mean_of_its_pixels(tmp_path: Path) -> None:
     torch.testing.assert_close(
         small.cameras.intrinsics[0], torch.tensor([[5.0, 0, 1.625], [0, 5.25, 0.875], [0, 0, 1]])
     )
-    assert image.shrunk(1) is image
-    assert image.shrunk(100).rgb_premultiplied.shape == (1, 1, 3)
+    assert image.downscaled(1) is image
+    assert image.downscaled(100).rgb_premultiplied.shape == (1, 1, 3)
 
 
 @pytest.mark.parametrize("cache_mb", [0, 1e-3, 1])
@@ -90,8 +90,8 @@ def test_shrunk_images_are_the_same_cached_or_not(cache_mb: float, tmp_path: Pat
     images = loader(views_of(tmp_path, 4), cache_mb=cache_mb)
     for factor in (4, 2, 1, 2):
         for i in (0, 1, 0, 3, -1):
-            wanted = images[i].shrunk(factor)
-            found = images.shrunk(i, factor)
+            wanted = images[i].downscaled(factor)
+            found = images.downscaled(i, factor)
             assert found.name == wanted.name
             assert torch.equal(found.rgb_premultiplied, wanted.rgb_premultiplied)
             assert torch.equal(found.cameras.intrinsics, wanted.cameras.intrinsics)
@@ -100,7 +100,7 @@ def test_shrunk_images_are_the_same_cached_or_not(cache_mb: float, tmp_path: Pat
         (tmp_path / f"{i}.png").unlink()
     if cache_mb == 1:
         assert torch.equal(
-            images.shrunk(0, 2).rgb_premultiplied, images[0].shrunk(2).rgb_premultiplied
+            images.downscaled(0, 2).rgb_premultiplied, images[0].downscaled(2).rgb_premultiplied
         )
 
 
@@ -143,13 +143,13 @@ def test_images_decoded_ahead_are_the_same(cache_mb: float, tmp_path: Path) -> N
         (1, (0, 1, 2, 3, 4, 5)),
     ):
         for position, index in enumerate(order):
-            found = ahead.shrunk(index, factor)
-            wanted = plain.shrunk(index, factor)
+            found = ahead.downscaled(index, factor)
+            wanted = plain.downscaled(index, factor)
             assert torch.equal(found.rgb_premultiplied, wanted.rgb_premultiplied)
-            ahead.expect((*order[position + 1 : position + 4], 0))
+            ahead.prefetch((*order[position + 1 : position + 4], 0))
             assert ahead._on_cpu.num_bytes <= cache_mb * 1e6
     assert ahead.num_prefetched == (0 if cache_mb == 1 else 4)
-    ahead.rest()
+    ahead.stop_prefetching()
     assert not [x for x in enumerate_threads() if x.name.startswith("dyngs-images")]
 
 
@@ -179,11 +179,11 @@ def test_images_given_out_on_a_gpu_are_the_same(
             (1, (0, 1, 2, 3, 4, 5)),
         ):
             for position, index in enumerate(order):
-                found = there.shrunk(index, factor)
-                wanted = plain.shrunk(index, factor)
+                found = there.downscaled(index, factor)
+                wanted = plain.downscaled(index, factor)
                 assert found.rgb_premultiplied.device == found.cameras.intrinsics.device == GPU
                 assert torch.equal(found.rgb_premultiplied.cpu(), wanted.rgb_premultiplied)
-                there.expect((*order[position + 1 : position + 4], 0))
+                there.prefetch((*order[position + 1 : position + 4], 0))
                 assert there._on_cpu.num_bytes <= cache_mb * 1e6
                 assert there._cache.num_bytes <= there._cache.room
         assert there.num_prefetched == (0 if free is None else 2 * threads)
@@ -218,7 +218,7 @@ def test_missing_images_are_found_at_once(tmp_path: Path) -> None:
 
 def test_sizes_that_disagree(tmp_path: Path) -> None:
     views = views_of(tmp_path, 1)
-    with pytest.raises(DyngsError, match=r"0\.png: the image is 12x8, but its camera says 12x9"):
+    with pytest.raises(DyngsError, match=r"0\.png: the image is 12x8, but its camera is 12x9"):
         loader((replace(views[0], height=9),))
     write_image(tmp_path / "mask.png", np.full((4, 4, 1), 255, np.uint8))
     with pytest.raises(DyngsError, match=r"mask\.png: the mask is 4x4"):

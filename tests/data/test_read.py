@@ -81,7 +81,7 @@ def test_two_formats_in_one_folder(nerfstudio_root: Path) -> None:
     write_colmap(nerfstudio_root)
     both = read(nerfstudio_root)
     assert both.format == "nerfstudio"
-    assert "also a colmap capture" in both.warnings[0]
+    assert "a colmap capture is also there" in both.warnings[0]
     assert read(nerfstudio_root, format="colmap").format == "colmap"
 
 
@@ -104,7 +104,7 @@ def test_views_without_images_may_be_left_out(colmap_root: Path) -> None:
     capture = require_images(read(colmap_root, skip_missing=True))
     assert (names(capture, "test"), len(capture.splits["train"])) == (["left/05"], 6)
     assert any(
-        "2 of 9 images are missing" in line and line.endswith("left out")
+        "2 of 9 images are missing" in line and line.endswith("skipped")
         for line in capture.warnings
     )
     ImageLoader(capture.splits["train"], DataConfig.model_validate({"root": colmap_root}))
@@ -128,8 +128,8 @@ def test_times_are_stretched_to_the_span_of_all_splits(blender_root: Path) -> No
     assert sorted(view.time or 0.0 for view in capture.splits["train"]) == pytest.approx(
         [0.05 * i for i in range(16)]
     )
-    assert capture.warnings == ("times run from 0 to 0.06 and were scaled to [0, 1]",)
-    assert (capture.span, capture.seconds) == ((0.0, 0.06), None)
+    assert capture.warnings == ("times 0 to 0.06 scaled to [0, 1]",)
+    assert (capture.file_time_span, capture.seconds) == ((0.0, 0.06), None)
     assert dict(build_report(capture).facts)["times"] == "17 in 0 to 1 (0 to 0.06 in the files)"
 
 
@@ -167,7 +167,7 @@ def test_dynamic_formats_are_recognised_and_load(tmp_path: Path, form: str) -> N
         loader = ImageLoader(capture.splits["train"], DataConfig(root=tmp_path, downscale=2))
         assert loader[0].rgb_premultiplied.shape == (6, 8, 3)
         assert loader[0].time == capture.splits["train"][0].time
-    with pytest.raises(DyngsError, match=f"no colmap capture.*but there is a {form} capture"):
+    with pytest.raises(DyngsError, match=f"no colmap capture.*it contains a {form} capture"):
         read(tmp_path, format="colmap")
 
 
@@ -206,18 +206,22 @@ def test_maps_come_with_the_image(tmp_path: Path) -> None:
     assert [view.flow_to for view in images.views] == [None, "a", "b"]
     first = images[0]
     second = images[1]
-    assert first.moves is not None
+    assert first.motion_mask is not None
     assert first.depth is not None
-    assert second.moves is not None
+    assert second.motion_mask is not None
     assert second.flow is not None
-    assert first.moves.shape == first.depth.shape == (4, 6)
-    assert (float(first.moves.max()), float(second.moves.min()), float(first.depth.max())) == (
+    assert first.motion_mask.shape == first.depth.shape == (4, 6)
+    assert (
+        float(first.motion_mask.max()),
+        float(second.motion_mask.min()),
+        float(first.depth.max()),
+    ) == (
         0,
         1,
         2,
     )
     torch.testing.assert_close(second.flow, torch.full((4, 6, 2), 2.0))
-    small = second.shrunk(2)
+    small = second.downscaled(2)
     assert small.flow is not None
     assert small.depth is not None
     assert float(small.flow.max()) == 1

@@ -12,19 +12,19 @@ from tiny_captures import opengl_pose
 
 from dyngs.data.capture import Capture, PointCloud, View, all_views
 from dyngs.data.geometry import (
-    from_opengl_pose,
     camera_center,
-    validate_pose,
-    pinhole_matrix,
-    projected,
     count_visible_views,
+    from_opengl_pose,
+    pinhole_matrix,
+    project_points,
+    validate_pose,
 )
 from dyngs.data.scene_space import (
     FAR_PER_BASELINE,
     change_coordinates,
+    cube_mismatch_reason,
     depth_bounds,
     normalise_capture,
-    cube_mismatch_reason,
     sample_points_in_frusta,
 )
 
@@ -149,6 +149,6 @@ def test_candidates_lie_in_their_view_between_the_bounds() -> None:
     depths = np.stack(
         [xyz @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3] for view in views]
     )
-    shown = np.stack([projected(xyz, view)[1] for view in views])
+    shown = np.stack([project_points(xyz, view)[1] for view in views])
     fits = shown & (depths > near * 0.999) & (depths < far * 1.001)
     assert fits.any(axis=0).all()

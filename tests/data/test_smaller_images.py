@@ -70,8 +70,8 @@ def test_smallest_copy_that_is_large_enough(
     np.testing.assert_allclose(image.cameras.intrinsics[0], expected, rtol=1e-6)
     names = [view.name for view in capture.splits["train"]]
     assert names == [f"images/{i}" for i in range(COUNT)]
-    lines = [f"images_{factor} is read in place of images"] if factor > 1 else []
-    assert [line.partition(":")[0] for line in capture.warnings] == lines
+    lines = [f"images_{factor} is read instead of images"] if factor > 1 else []
+    assert [line.partition(",")[0] for line in capture.warnings] == lines
 
 
 @pytest.mark.parametrize("is_absent", [False, True])

@@ -17,16 +17,15 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Split, Splits, View, all_views
 from dyngs.data.times import (
     SECONDS_FILE,
-    clip_seconds,
     assign_camera_ids,
+    clip_seconds,
+    file_time_span,
+    normalize_times,
     parse_frames,
     read_seconds,
-    file_time_span,
     split_by_camera,
     split_by_frames,
     times_from_names,
-    normalize_times,
-    videos,
     write_seconds,
 )
 
@@ -68,7 +67,7 @@ def test_scaled_over_all_splits(times: list[float], cut: int) -> None:
         assert (found, notes) == (times, [])
     else:
         assert found == pytest.approx([(time - low) / (high - low) for time in times])
-        assert notes == [f"times run from {low:g} to {high:g} and were scaled to [0, 1]"]
+        assert notes == [f"times {low:g} to {high:g} scaled to [0, 1]"]
 
 
 @pytest.mark.parametrize(
@@ -90,7 +89,7 @@ def test_stretched_to_the_span_of_the_clip(times: list[float], mentioned: bool |
     else:
         span = max(times) - min(times)
         assert times_of(scaled) == pytest.approx([(time - min(times)) / span for time in times])
-        assert [f"times run from {min(times):g} to {max(times):g}" in note for note in notes] == [
+        assert [f"times {min(times):g} to {max(times):g}" in note for note in notes] == [
             True
         ] * mentioned
     assert normalize_times(ROOT, splits, stretch=False) == (splits, [])
@@ -146,7 +145,6 @@ def test_poses_that_repeat_at_the_same_times_are_cameras(noise: float, counts: l
         (v.name, v.camera_id) for v in all_views(rig(counts))
     ]
     assert len({v.cam_from_world.tobytes() for v in views}) == len(counts)
-    assert [len(x) for x in videos(views)] == [counts[v.camera_id] for v in views if v.time == 0.0]
     trained = split_by_camera(ROOT, numbered, (1,))["train"]
     assert len(trained) == counts[1]
 
@@ -174,23 +172,6 @@ def test_cameras_that_keep_their_numbers(case: str) -> None:
         "beside": {"train": tuple(walk), "test": rig([9])["test"]},
     }[case]
     assert assign_camera_ids(splits) is splits
-
-
-def test_videos_are_those_of_fixed_cameras_or_of_the_one_that_moves() -> None:
-    standing = [
-        view(f"{camera}{time}", time, camera) for time in (1.0, 0.0, 0.5) for camera in (0, 1)
-    ]
-    assert videos(standing) == [[2, 4, 0], [3, 5, 1]]
-    walk = [
-        view(f"{i}", (7 * i % 10) / 10, i, np.linalg.inv(opengl_pose(0.3 * (7 * i % 10))))
-        for i in range(10)
-    ]
-    assert videos(walk) == [sorted(range(10), key=lambda i: 7 * i % 10)]
-    jumps = [
-        view(f"{i}", i / 10, i, np.linalg.inv(opengl_pose(0.3 * (7 * i % 10)))) for i in range(10)
-    ]
-    assert videos(jumps) == []
-    assert videos([view(f"{i}", None, i) for i in range(5)]) == []
 
 
 def test_round_trip(tmp_path: Path) -> None:
@@ -232,7 +213,7 @@ def test_as_python_slices(
     expected = sorted(range(count)[start:stop:step])
     times = [i / max(count - 1, 1) for i in range(count)]
     if not expected:
-        with pytest.raises(DyngsError, match=f"picks none of the capture's {count} times"):
+        with pytest.raises(DyngsError, match=f"selects none of the {count} times"):
             split_by_frames(ROOT, splits(times, []), text)
         return
     kept, others = split_by_frames(ROOT, splits(times, times[:1]), text)
@@ -321,7 +302,7 @@ def test_folders_are_cameras_that_share_their_numbers() -> None:
 def test_other_names_are_in_natural_order() -> None:
     times, line = _times("shot9-a", "shot10-a", "shot1-a")
     assert times == {"shot1-a": 0, "shot9-a": 1, "shot10-a": 2}
-    assert "shot1-a first" in line
+    assert "starting with shot1-a" in line
 
 
 def test_a_frame_rate_makes_seconds_of_numbers() -> None:

@@ -12,7 +12,7 @@ from dyngs.api.train import train
 from dyngs.config.io import load_config
 from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
 from dyngs.deform.fixed_cameras.initial_motion import TimedGaussians
-from dyngs.deform.free import SHORTEST, FreeInitialization, FreePrimitives, initialize_free
+from dyngs.deform.free import MIN_SPAN, FreeInitialization, FreePrimitives, initialize_free
 from dyngs.deform.keys import FreeField
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians import TopologyEdit
@@ -49,7 +49,7 @@ def test_paths_are_straight_and_windows_follow_their_definition() -> None:
 
     shift, window = at(p["centers"], p["log_spans"], p["velocities"])
     torch.testing.assert_close(shift, p["velocities"] * (0.37 - p["origins"]))
-    spans = p["log_spans"].exp() + SHORTEST * GAP
+    spans = p["log_spans"].exp() + MIN_SPAN * GAP
     torch.testing.assert_close(window, (-((0.37 - p["centers"]) ** 2) / (2 * spans**2))[:, 0])
     assert torch.autograd.gradcheck(at, (p["centers"], p["log_spans"], p["velocities"]))
 

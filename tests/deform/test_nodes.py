@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tiny_fields import followed
 from torch import Tensor
 
-from dyngs.deform.control_nodes import Nodes, farthest_points, nodes_at
+from dyngs.deform.control_nodes import Nodes, build_nodes, farthest_points
 from dyngs.deform.field import Offsets
 
 
@@ -33,7 +33,7 @@ def matrix(rotation: Rotation) -> Tensor:
 
 def place_nodes(means: Tensor, count: int) -> Nodes:
     """Nodes spread over ``means``, which follow them."""
-    return nodes_at(means[farthest_points(means, count, NONE)], means)
+    return build_nodes(means[farthest_points(means, count, NONE)], means)
 
 
 NONE = torch.zeros(0, 3)

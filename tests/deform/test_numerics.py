@@ -1,4 +1,4 @@
-"""Dynamic scenes at the extremes: one test per row of the second table in docs/numerics.md."""
+"""Dynamic scenes at the extremes: one test per row of the second table in docs/contributing/numerics.md."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
     keep[trainer.model.scene.rows] = False
     assert not keep.all()
     trainer.model.densifier = build_trainer(trainer.config).model.densifier
-    trainer.model.keep(keep, trainer.done)
+    trainer.model.select_gaussians(keep, trainer.done)
     for _ in range(2):
         assert trainer.step().loss > 0
         assert trainer.num_moving == 0

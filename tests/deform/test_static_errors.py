@@ -214,7 +214,7 @@ def test_changing_brightness_is_no_motion_and_a_thing_that_comes_is() -> None:
 
 
 def masked_image(moves: torch.Tensor | None, mask: torch.Tensor | None = None) -> Image:
-    return Image("a", cameras_around(1), torch.zeros(18, 24, 3), None, mask, 0.0, moves=moves)
+    return Image("a", cameras_around(1), torch.zeros(18, 24, 3), None, mask, 0.0, motion_mask=moves)
 
 
 def left() -> torch.Tensor:
@@ -227,7 +227,7 @@ def test_the_fraction_of_each_gaussian_in_the_mask() -> None:
     """The left ball lies in the mask, the right one does not; a fraction of one half counts as
     ``sure``."""
     found = static_errors(
-        lambda _: two_balls(), [masked_image(left())], RenderOptions(), BLACK, sure=0.06
+        lambda _: two_balls(), [masked_image(left())], RenderOptions(), BLACK, mask_error=0.06
     )
     torch.testing.assert_close(found.peak, torch.tensor([0.12, 0.0]), rtol=0, atol=2e-3)
     torch.testing.assert_close(found.typical, found.peak)
@@ -239,6 +239,6 @@ def test_what_is_covered_at_times_only_is_not_usual() -> None:
         + [masked_image(torch.zeros(18, 24)) for _ in range(4)]
         + [masked_image(None)]
     )
-    found = static_errors(lambda _: two_balls(), images, RenderOptions(), BLACK, sure=0.06)
+    found = static_errors(lambda _: two_balls(), images, RenderOptions(), BLACK, mask_error=0.06)
     assert float(found.peak[0]) > 0.1
     assert float(found.typical.max()) == 0

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngs.deform.schedule import FRONTIER_VIEWS, MIN_VIEWS, TimeWindow
+from dyngs.deform.schedule import FRONTIER_VIEWS, MIN_WINDOW_VIEWS, TimeWindow
 
 OPENS, FULL = 10, 50
 ODD_STEPS = (OPENS + 1, 21, 35, FULL - 1)
@@ -28,7 +28,7 @@ def test_it_grows_to_everything_and_is_never_too_small(times: list[float], first
     before: list[float] = []
     for step in (*ODD_STEPS, FULL, FULL + 1, 10**6):
         now = held(window, times, step)
-        assert len(now) >= min(len(times), max(MIN_VIEWS, round(first * len(times))))
+        assert len(now) >= min(len(times), max(MIN_WINDOW_VIEWS, round(first * len(times))))
         assert [time for time in before if time not in now] == []
         low, high = window.bounds(step)
         assert low + high == pytest.approx(1.0)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dyngs.core.state import strip_roles
 from dyngs.deform.field import apply_offsets
-from dyngs.deform.fields import EDGE, OPEN, WindowedField, field_state, restore_field
+from dyngs.deform.fields import EDGE_WIDTH, OPEN_WINDOW, WindowedField, field_state, restore_field
 
 COUNT = 9
 
@@ -42,7 +42,9 @@ def test_windows_are_flat_inside_and_fall_off_outside() -> None:
     """log s((t - a) / e) + log s((b - t) / e) in float64, less that of an open one."""
 
     def window(a: float, b: float, time: float) -> float:
-        return -math.log1p(math.exp((a - time) / EDGE)) - math.log1p(math.exp((time - b) / EDGE))
+        return -math.log1p(math.exp((a - time) / EDGE_WIDTH)) - math.log1p(
+            math.exp((time - b) / EDGE_WIDTH)
+        )
 
     field = windowed(everything=False)
     means = cloud().means
@@ -50,7 +52,7 @@ def test_windows_are_flat_inside_and_fall_off_outside() -> None:
         found = field.offsets(means, time).logit_opacities
         assert found is not None
         for (a, b), x in zip(field.edges.tolist(), found.tolist(), strict=True):
-            assert x == pytest.approx(window(a, b, time) - window(*OPEN, time), abs=1e-4)
+            assert x == pytest.approx(window(a, b, time) - window(*OPEN_WINDOW, time), abs=1e-4)
 
 
 def test_windows_close_where_nothing_is_to_be_seen_and_open_no_further_than_they_began() -> None:

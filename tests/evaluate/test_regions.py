@@ -86,7 +86,7 @@ def test_motion_masks_come_first_and_empty_background_counts_nowhere() -> None:
     alpha = torch.zeros(SIDE, SIDE)
     moves[:, :12], alpha[:12] = 1.0, 1.0
     black = torch.zeros(SIDE, SIDE, 3)
-    image = replace(images_of_a_walk()[0], alpha=alpha, rgb_premultiplied=black, moves=moves)
+    image = replace(images_of_a_walk()[0], alpha=alpha, rgb_premultiplied=black, motion_mask=moves)
     regions = regions_of([image])
     truth = image.composite(WHITE)
     rendered = truth.clone()

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.data.geometry import look_at, estimate_focus, up_direction
+from dyngs.data.geometry import estimate_focus, look_at, up_direction
 from dyngs.export.orbits import frame_orbit_for_points, orbit_path, path_along, spiral_path
 
 ORIGIN = np.zeros(3)

@@ -51,7 +51,7 @@ from dyngs.export.splat_files import (
     write_tracks,
 )
 from dyngs.gaussians.rendering import render
-from dyngs.io.formats.formats import read_splats, upright, write_splats
+from dyngs.io.formats.formats import orient_to_axis, read_splats, write_splats
 from dyngs.io.formats.similarity import AXES, Similarity, rotation_between
 from dyngs.io.formats.splat_file import SplatFile
 from dyngs.io.gltf import GltfFile
@@ -168,7 +168,7 @@ def test_a_file_drawn_again_is_compared_with_its_run(near: OpenedScene, tmp_path
         # another time is seen as such
         assert compare_file_with_run(near, near.scene, 0.0, written.splat, read) < 40
     splat = SplatFile(cloud(300), up="z")
-    exact = write_splats(tmp_path / "a.ply", upright(splat, None, tmp_path / "a.ply"))
+    exact = write_splats(tmp_path / "a.ply", orient_to_axis(splat, None, tmp_path / "a.ply"))
     assert compare_file_with_source(splat, exact) > 80
     assert compare_file_with_source(splat, write_splats(tmp_path / "a.splat", splat)) < 30
 
@@ -306,7 +306,9 @@ def far_capture(still: Path) -> Capture:
     cloud = PointCloud(random.normal(size=(5, 3)), random.integers(0, 255, (5, 3)).astype(np.uint8))
     splits = {**found.splits, "train": tuple(views)}
     offset = np.array([10.0, 0, -20])
-    return replace(found, splits=splits, points=cloud, world_offset=offset, span=(2.0, 4.0))
+    return replace(
+        found, splits=splits, points=cloud, world_offset=offset, file_time_span=(2.0, 4.0)
+    )
 
 
 def test_a_written_capture_is_read_as_it_was(far_capture: Capture, tmp_path: Path) -> None:

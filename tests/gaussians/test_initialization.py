@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from dyngs.config import DefaultStrategy, McmcStrategy, PointsInit, RandomInit
 from dyngs.data.capture import View
-from dyngs.data.geometry import pinhole_matrix, count_visible_views
+from dyngs.data.geometry import count_visible_views, pinhole_matrix
 from dyngs.gaussians.initialization import (
     InitialValues,
     SceneGeometry,

@@ -58,7 +58,7 @@ def test_every_level_holds_the_one_below(count: int, small_blocks: None) -> None
     for i, balls in enumerate(levels.blocks):
         blocks = [(i, k) for k in range(len(balls))]
         assert sum(levels.count(block) for block in blocks) == len(levels.levels[i])
-        assert all(len(levels.of_block(block)) == levels.count(block) for block in blocks)
+        assert all(len(levels.block_gaussians(block)) == levels.count(block) for block in blocks)
         if i:
             below = [child for block in blocks for child in levels.children(block)]
             assert below == [(i - 1, k) for k in range(len(levels.blocks[i - 1]))]
@@ -91,7 +91,7 @@ def test_the_finest_cut_is_the_scene_to_the_bit(small_blocks: None) -> None:
     """Seen whole; equal depths, which no two here have, would be drawn in another order."""
     gaussians = cloud(300)
     levels = build_levels(gaussians)
-    seen = levels.seen_by(camera(), pixels=0.0)
+    seen = levels.select_gaussians(camera(), pixels=0.0)
     assert len(seen) == 300
     assert torch.equal(render(seen, camera()).rgb, render(gaussians, camera()).rgb)
 
@@ -123,7 +123,7 @@ def test_from_afar_fewer_look_the_same(small_blocks: None) -> None:
     truth = torch.nn.functional.avg_pool2d(
         render(gaussians, sharp).rgb.permute(0, 3, 1, 2), 8
     ).permute(0, 2, 3, 1)
-    seen = build_levels(gaussians).seen_by(far)
+    seen = build_levels(gaussians).select_gaussians(far)
     assert len(seen) < len(gaussians) / 5
     errors = [float((render(x, far).rgb - truth).square().mean()) for x in (seen, gaussians)]
     assert errors[0] < 1.02 * errors[1]

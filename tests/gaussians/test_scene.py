@@ -166,7 +166,7 @@ def test_a_changed_scene_is_drawn_as_it_is_now(kind: str) -> None:
     scene.gaussians.means.data += 0.25
     if isinstance(scene, HumanScene):
         scene.learned["weights"].data += torch.arange(float(scene.learned["weights"].shape[1]))
-    scene.changed()
+    scene.clear_caches()
     assert_alike(scene.at(0.37), restored(kind, scene.state()).at(0.37), atol=0.0)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.io.fields import parse_numbers, open_text, read_json_object
+from dyngs.io.fields import open_text, parse_numbers, read_json_object
 
 
 def test_numbers_in_another_shape() -> None:
@@ -31,7 +31,7 @@ def test_other_encodings(tmp_path: Path, encoding: str) -> None:
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (b'{"a": 1,\n "b": }', "line 2 column 7: broken JSON"),
+        (b'{"a": 1,\n "b": }', "line 2 column 7: invalid JSON"),
         (b"[1]", "lacks names"),
         (b"\xff\xfe{", "cannot be read"),
         (b"[" * 100_000, "cannot be read"),

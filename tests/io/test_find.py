@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from dyngs.core.errors import DyngsError
-from dyngs.io.containment import inside, restrict_paths_to
-from dyngs.io.find import FileFinder, images_folder, downscaled_image_folders
+from dyngs.io.containment import check_inside, restrict_paths_to
+from dyngs.io.find import FileFinder, downscaled_image_folders, images_folder
 
 FORMS = {form: unicodedata.normalize(form, "Gärten/é 1.png") for form in ("NFC", "NFD")}
 
@@ -75,7 +75,7 @@ def test_nothing_outside_is_found(tmp_path: Path, written: str) -> None:
     root.mkdir()
     (root / "link").symlink_to(tmp_path)
     with restrict_paths_to(root), suppress(DyngsError):
-        assert inside(FileFinder(root).find(written)).resolve() != secret
+        assert check_inside(FileFinder(root).find(written)).resolve() != secret
 
 
 def test_images_of_another_size(tmp_path: Path) -> None:

@@ -17,11 +17,11 @@ import pytest
 
 from dyngs.core.errors import DyngsError
 from dyngs.io import outputs
-from dyngs.io.outputs import LOCK_NAME, InUseError, make_once, atomic_folder, writing
+from dyngs.io.outputs import LOCK_NAME, InUseError, atomic_folder, lock_folder, make_once
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-HOLD = "import sys, time; from pathlib import Path; from dyngs.io.outputs import writing\n"
-HOLD += "with writing(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
+HOLD = "import sys, time; from pathlib import Path; from dyngs.io.outputs import lock_folder\n"
+HOLD += "with lock_folder(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
 
 
 @contextmanager
@@ -42,7 +42,7 @@ def test_the_second_is_told_who_holds_it(tmp_path: Path) -> None:
     with (
         _holder(tmp_path / "run") as process,
         pytest.raises(InUseError) as caught,
-        writing(tmp_path / "run"),
+        lock_folder(tmp_path / "run"),
     ):
         raise AssertionError("both have it")
     told = str(caught.value)
@@ -57,7 +57,7 @@ def test_a_killed_owner_frees_it(tmp_path: Path) -> None:
         process.send_signal(signal.SIGKILL)
         process.wait()
         assert json.loads((run / LOCK_NAME).read_text())["pid"] == process.pid
-        with writing(run) as alone:
+        with lock_folder(run) as alone:
             assert alone
             assert json.loads((run / LOCK_NAME).read_text())["pid"] == os.getpid()
     assert not run.exists() or not list(run.iterdir())
@@ -66,10 +66,10 @@ def test_a_killed_owner_frees_it(tmp_path: Path) -> None:
 def test_of_many_that_want_it_at_once_one_has_it(tmp_path: Path) -> None:
     """Also while the lock file is removed and made anew all the time."""
     code = HOLD.partition("\n")[0] + (
-        "\nfrom dyngs.core.errors import DyngsError\nfolder, count = Path(sys.argv[1]), 0\nwhile count < 30:\n"
-        "    try:\n        with writing(folder):\n            count += 1\n"
-        "            n = int((folder / 'n').read_text()); time.sleep(1e-4); (folder / 'n').write_text(str(n + 1))\n"
-        "    except DyngsError: time.sleep(1e-3)\n"
+        "\nfrom dyngs.core.errors import DyngsError\nfolder, count = Path(sys.argv[1]), 0\nwhile "
+        "count < 30:\n    try:\n        with lock_folder(folder):\n            count += 1\n      "
+        "      n = int((folder / 'n').read_text()); time.sleep(1e-4); (folder / "
+        "'n').write_text(str(n + 1))\n    except DyngsError: time.sleep(1e-3)\n"
     )
     (tmp_path / "n").write_text("0")
     processes = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) for _ in range(3)]
@@ -89,15 +89,15 @@ def test_nothing_is_written_through_links_of_a_run(name: str, tmp_path: Path) ->
     (tmp_path / "precious").mkdir()
     (run / name).symlink_to(tmp_path / "precious")
     with (
-        pytest.raises(DyngsError, match=rf"{name}: is a link to .*precious, out of .*run"),
-        writing(run),
+        pytest.raises(DyngsError, match=rf"{name}: is a link to .*precious, outside .*run"),
+        lock_folder(run),
     ):
         pytest.fail("it may be written to")
     assert list((tmp_path / "precious").iterdir()) == []
     (run / name).unlink()
     (run / "own").mkdir()
     (run / name).symlink_to(run / "own")
-    with writing(run):
+    with lock_folder(run):
         pass
 
 

@@ -71,7 +71,7 @@ def test_a_bomb_is_refused_before_it_is_unpacked(
     assert (tmp_path / "x.npz").stat().st_size < 1e6
     memory, _ = cost_of(lambda: refusal(tmp_path / "x.npz", "a"))
     assert memory < 10e6
-    assert "bytes of arrays, of which 67,108,864 are read" in refusal(tmp_path / "x.npz", "a")
+    assert "bytes of arrays exceed the limit of 67,108,864" in refusal(tmp_path / "x.npz", "a")
 
 
 @pytest.mark.parametrize(
@@ -79,8 +79,8 @@ def test_a_bomb_is_refused_before_it_is_unpacked(
     [
         ("(1000000000,)", "bytes of arrays"),
         ("(100000000000000000000000000, 100000000000000000)", "over 10^18 bytes of arrays"),
-        ("(3,)", "shorter than its shape"),
-        ("(-3, -3)", "shorter than its shape"),
+        ("(3,)", "does not match its shape"),
+        ("(-3, -3)", "does not match its shape"),
         ("(" * 5000, "must be an array of numbers"),
         ("x" * 20000, "must be an array of numbers"),
         ("None", "must be an array of numbers"),

@@ -27,13 +27,13 @@ def test_folders_around_and_within_a_capture(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(root)
     (root / "empty").mkdir()
     for out, reason in (
-        (root, "exists, which is read"),
-        (tmp_path / "link", "exists, which is read"),
-        (root / "images" / "..", "exists, which is read"),
-        (root / "images", "exists in .*, which is read"),
-        (root / "more", "exists, which is read"),
-        (root.parent / "photos" / "2.jpg", "exists in .*photos, which is read"),
-        (tmp_path / "link" / "points.ply", "exists in .*, which is read"),
+        (root, "exists, which is an input"),
+        (tmp_path / "link", "exists, which is an input"),
+        (root / "images" / "..", "exists, which is an input"),
+        (root / "images", "exists in .*, which is an input"),
+        (root / "more", "exists, which is an input"),
+        (root.parent / "photos" / "2.jpg", "exists in .*photos, which is an input"),
+        (tmp_path / "link" / "points.ply", "exists in .*, which is an input"),
     ):
         with pytest.raises(DyngsError, match=reason):
             inputs.require_output(out)
@@ -66,7 +66,7 @@ def test_a_new_folder_appears_complete_or_not_at_all(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["capture"]
     assert (out / "1.jpg").read_text() == "full"
     for taken in (out, out / "1.jpg"):
-        with pytest.raises(DyngsError, match="exists already; name a new folder"):
+        with pytest.raises(DyngsError, match="exists already; choose a new folder"):
             require_new_folder(taken)
 
 
@@ -84,7 +84,9 @@ def test_outputs_in_a_run_stay_there(tmp_path: Path) -> None:
         Inputs(()).require_output(run / name)
         (run / name).symlink_to(tmp_path / "precious")
         for out in (run / name, run / name / "frame_0000.ply", run / name / "new" / "a.png"):
-            with pytest.raises(DyngsError, match=r"a link leads to .*precious.*, out of the run"):
+            with pytest.raises(
+                DyngsError, match=r"is a link to .*precious.*, outside the run folder"
+            ):
                 Inputs(()).require_output(out)
     (run / "splats.ply").symlink_to(tmp_path / "precious.ply")
     Inputs(()).require_output(run / "splats.ply")  # an atomic file replaces the link itself

@@ -282,7 +282,7 @@ def test_pickled_arrays(tmp_path: Path) -> None:
     read: Any = read_pickled_array(path)
     np.testing.assert_array_equal(read["K"][0], np.eye(3))
     for array, line in (
-        (np.zeros(3), "Python objects was expected"),
+        (np.zeros(3), "expected an array of Python objects"),
         (np.array([{}, {}]), "must hold one dictionary"),
     ):
         np.save(path, array, allow_pickle=True)
@@ -355,7 +355,9 @@ def test_hostile_pickles_cost_little_and_end_in_one_line(tmp_path: Path, name: s
     path.write_bytes(OVERSIZED[name])
 
     def read() -> None:
-        with pytest.raises(DyngsError, match=r"a\.pkl: (cannot be read \(|asks for)") as caught:
+        with pytest.raises(
+            DyngsError, match=r"a\.pkl: (cannot be read \(|.* exceed the limit)"
+        ) as caught:
             read_pickle(path)
         assert "\n" not in str(caught.value)
 
@@ -372,7 +374,7 @@ def test_one_array_many_times(tmp_path: Path) -> None:
     )
     again = array(b"(I1\n(I1048576\ntg2\nI00\ng1\nt")
     path.write_bytes(raw + again * 100 + b"t.")
-    with pytest.raises(DyngsError, match="many large arrays out of the same bytes"):
+    with pytest.raises(DyngsError, match="many large arrays made from the same bytes"):
         read_pickle(path)
     path.write_bytes(raw + again + b"p3\n0(" + b"g3\n" * 100 + b"t.")
     with pytest.raises(DyngsError, match=r"entries .shared ones counted again"):

@@ -24,8 +24,8 @@ def _names(folder: Path) -> set[str]:
 def test_the_next_process_that_writes_there_cleans_up(tmp_path: Path) -> None:
     code = (
         "from dyngs.io.write import temporary_beside, temporary_folder_beside; "
-        "temporary_beside(folder / 'a.png').touch(); (temporary_folder_beside(folder / 'run') / 'inner').mkdir(); "
-        "os.kill(os.getpid(), signal.SIGKILL)"
+        "temporary_beside(folder / 'a.png').touch(); (temporary_folder_beside(folder / 'run') / "
+        "'inner').mkdir(); os.kill(os.getpid(), signal.SIGKILL)"
     )
     done = subprocess.run([sys.executable, "-c", f"{START} {code}", str(tmp_path)], check=False)
     assert done.returncode == -signal.SIGKILL

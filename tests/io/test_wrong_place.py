@@ -39,7 +39,7 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     [
         ("photos", "`dyngs train static data.root=photos`"),
         ("clip.mp4", "`dyngs train dynamic data.root=clip.mp4`"),
-        ("rig", "2 videos, make a scene of them with `dyngs train dynamic data.root=rig`"),
+        ("rig", "2 videos, train it with `dyngs train dynamic data.root=rig`"),
         ("run", "`dyngs eval run`"),
         ("capture", "`dyngs train static data.root=capture`"),
         ("single", "one video"),

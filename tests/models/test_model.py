@@ -169,7 +169,7 @@ def test_only_what_is_made_of_gaussians_passes_for_that(config: Config, trainer:
         assert require_gaussians(scene, "it") is scene
         return
     assert not isinstance(scene, GaussianScene)
-    with pytest.raises(DyngsError, match="it: is not made of Gaussians"):
+    with pytest.raises(DyngsError, match="it: this needs a scene of Gaussians"):
         require_gaussians(scene, "it")
 
 

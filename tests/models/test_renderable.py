@@ -45,7 +45,7 @@ def scene_of(kind: str) -> Renderable:
     if kind == "triangles":
         return TriangleScene(bent(), 1.0)
     if kind == "levels":
-        return LevelScene.of(StaticScene(gaussians=cloud()))
+        return LevelScene.from_scene(StaticScene(gaussians=cloud()))
     if kind == "sides":
         parts = [cloud(40), cloud(60)]
         eyes = [torch.tensor([4.0, 0.0, 1.5]), torch.tensor([-4.0, 0.0, 1.5])]

@@ -62,7 +62,7 @@ def test_a_gpu_that_can_be_used_is(machine: pytest.MonkeyPatch) -> None:
     assert gpu_status() == {
         "torch for": "CUDA 13.0",
         "kernels for GPUs": "built",
-        "driver": "there",
+        "driver": "found",
         "GPU": "GPU, 8 GB",
     }
 
@@ -70,7 +70,8 @@ def test_a_gpu_that_can_be_used_is(machine: pytest.MonkeyPatch) -> None:
 def test_a_torch_for_the_cpu_alone(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(torch.version, "cuda", None)
     assert re.search(
-        r"device cuda: this torch \(.*\) is built without CUDA: install a torch for CUDA", refused()
+        r"device cuda is not usable: this torch \(.*\) is built without CUDA: install a torch for CUDA",
+        refused(),
     )
     assert gpu_status()["GPU"] == "none"
 
@@ -96,7 +97,7 @@ def test_a_driver_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
     core = SimpleNamespace(runtime_version=lambda: 13000, driver_version=lambda: 12040)
     machine.setattr(device, "cuda_core", lambda: core)
     assert (
-        "built with CUDA 13.0, but the driver knows 12.4 at most: update the driver, or build"
+        "need CUDA 13.0, but the driver supports only 12.4: update the driver, or build"
         in refused()
     )
 
@@ -110,7 +111,7 @@ def test_auto_says_why_only_where_a_gpu_seems_to_be(machine: pytest.MonkeyPatch)
     machine.setattr(device, "has_cuda_core", lambda: False)
     line = cpu_fallback_reason("auto")
     assert line is not None
-    assert line.startswith("computing on the CPU: dyngs was built without")
+    assert line.startswith("training on the CPU: dyngs was built without")
     assert cpu_fallback_reason("cpu") is None
     machine.setattr(device, "has_nvidia_driver", lambda: False)
     assert cpu_fallback_reason("auto") is None

@@ -60,7 +60,7 @@ def test_the_newest_that_the_processor_runs_is_chosen(
             ("v4",),
             "v3",
             None,
-            "dyngs was compiled for processors with AVX-512, which this one lacks; install it again",
+            "dyngs was compiled for processors with AVX-512, which this one lacks; reinstall it",
         ),
         (
             ("v3", "v4"),
@@ -72,9 +72,9 @@ def test_the_newest_that_the_processor_runs_is_chosen(
             ("v2", "v3", "v4"),
             "v3",
             "v4",
-            "DYNGS_ISA=v4: here run v2, v3; unset the variable or choose one of these",
+            "DYNGS_ISA=v4 is not supported here; unset it or use v2, v3",
         ),
-        (("v4",), "v4", "v2", "DYNGS_ISA=v2: here run v4"),
+        (("v4",), "v4", "v2", "DYNGS_ISA=v2 is not supported here; unset it or use v4"),
     ],
 )
 def test_kernels_that_would_crash_are_refused(
@@ -85,7 +85,7 @@ def test_kernels_that_would_crash_are_refused(
 
 
 def test_an_unknown_instruction_set_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(DyngsError, match=r"^DYNGS_ISA=v9: here run v"):
+    with pytest.raises(DyngsError, match=r"^DYNGS_ISA=v9 is not supported here; unset it or use v"):
         imported_with("v9", monkeypatch)
 
 
@@ -193,12 +193,12 @@ def drawn_after_forks(threads: int) -> list[str]:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks")
-def test_a_fork_of_a_process_with_threads_draws_on_one_and_says_so() -> None:
+def test_fork_of_process_with_threads_uses_one_thread_and_warns() -> None:
     """It used to wait for ever for threads that only the parent has, the second one too, as the
     first fork ends the threads of OpenBLAS; without any, it may start some."""
     told = (
-        "True 1 1 dyngs and torch run on one thread: this process was forked from one that had started threads, which "
-        "it has not got; start processes with multiprocessing's 'spawn' method to use more"
+        "True 1 1 dyngs and torch use one thread: this process was forked from a process with "
+        "threads; use multiprocessing's 'spawn' start method for more threads"
     )
     assert drawn_after_forks(2) == ["True 2 4", told, told]
 

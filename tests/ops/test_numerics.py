@@ -1,5 +1,5 @@
 """Numbers at the extremes of the rasterizer's kernels, on every instruction set: more rows of
-docs/numerics.md."""
+docs/contributing/numerics.md."""
 
 from __future__ import annotations
 

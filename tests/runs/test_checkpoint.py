@@ -84,7 +84,7 @@ def test_nobody_is_told_to_delete_a_file_that_may_be_whole(
             raise error
 
         monkeypatch.setattr(tensor_file, "safe_open", failing)
-        with pytest.raises(DyngsError, match=r"keep it, try again$"):
+        with pytest.raises(DyngsError, match=r"keep it and try again$"):
             latest_checkpoint(tmp_path)
 
 

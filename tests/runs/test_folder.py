@@ -21,7 +21,7 @@ from dyngs.config import Config, DataConfig, RandomInit, RunConfig, TrainConfig
 from dyngs.config.io import load_resolved
 from dyngs.core.errors import DyngsError
 from dyngs.export.splat_files import write_run_sequence
-from dyngs.io.outputs import LOCK_NAME, InUseError, require_new_folder, writing
+from dyngs.io.outputs import LOCK_NAME, InUseError, lock_folder, require_new_folder
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import (
     KEEP_CHECKPOINTS,
@@ -204,7 +204,7 @@ def test_nothing_is_written_while_another_writes(
 ) -> None:
     out = tmp_path / "out"
     shutil.copytree(run_dir, out)
-    with writing(out):
+    with lock_folder(out):
         before = _contents(out)
         with pytest.raises(InUseError, match=f"process {os.getpid()} on "):
             COMMANDS[command](still, out if command == "export" else run_dir, out)

@@ -27,7 +27,7 @@ def test_near_it_is_the_scene_itself() -> None:
         background=torch.tensor([0.2, 0.5, 0.9]),
     )
     options = RenderOptions(depth="expected", mode="antialiased")  # type: ignore[arg-type]
-    one, other = (x.render(AROUND, options=options) for x in (still, LevelScene.of(still)))
+    one, other = (x.render(AROUND, options=options) for x in (still, LevelScene.from_scene(still)))
     assert one.depth is not None
     assert other.depth is not None
     for name in (
@@ -41,7 +41,7 @@ def test_near_it_is_the_scene_itself() -> None:
 def test_few_are_drawn_where_few_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(levels, "BLOCK", 16)
     still = StaticScene(gaussians=cloud(2000))
-    coarse = LevelScene.of(still, most=300).on_background(torch.ones(3))
+    coarse = LevelScene.from_scene(still, max_gaussians=300).on_background(torch.ones(3))
     image = coarse.render(AROUND).rgb
     truth = still.on_background(torch.ones(3)).render(AROUND).rgb
     assert not torch.equal(image, truth)
@@ -52,15 +52,15 @@ def test_colours_of_a_network_are_drawn_too() -> None:
     coloured = scene_of_kind("control_nodes")
     still = StaticScene(gaussians=coloured.at(0.5), colour=coloured.colour)
     image = still.render(onlooker()).rgb
-    assert torch.equal(LevelScene.of(still).render(onlooker()).rgb, image)
+    assert torch.equal(LevelScene.from_scene(still).render(onlooker()).rgb, image)
     assert not torch.equal(image, replace(still, colour=None).render(onlooker()).rgb)
 
 
 def test_other_scenes_are_refused() -> None:
-    with pytest.raises(DyngsError, match="for still scenes"):
-        LevelScene.of(moving_scene(sliding_nodes()))
+    with pytest.raises(DyngsError, match="need a static scene"):
+        LevelScene.from_scene(moving_scene(sliding_nodes()))
     sides = ViewSides(torch.zeros(400, dtype=torch.int64), torch.eye(3)[:2], torch.zeros(3))
-    with pytest.raises(DyngsError, match="look the same from all sides"):
-        LevelScene.of(StaticScene(gaussians=cloud(), sides=sides))
-    with pytest.raises(DyngsError, match="not made of Gaussians"):
-        LevelScene.of(TriangleScene(bent(2), 1.0, TriangleOptions(), torch.ones(3)))
+    with pytest.raises(DyngsError, match="one per viewing direction"):
+        LevelScene.from_scene(StaticScene(gaussians=cloud(), sides=sides))
+    with pytest.raises(DyngsError, match="needs a scene of Gaussians"):
+        LevelScene.from_scene(TriangleScene(bent(2), 1.0, TriangleOptions(), torch.ones(3)))

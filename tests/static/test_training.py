@@ -93,9 +93,7 @@ def test_what_no_view_shows_half_a_pixel_of_is_removed_once() -> None:
     assert result.edit is not None
     assert torch.equal(result.edit.apply(scene.gaussians.means), edited.gaussians.means)
     assert result.message is not None
-    assert result.message.startswith(
-        "2 of 4 Gaussians are removed: each makes up less than 2 px of every"
-    )
+    assert result.message.startswith("pruned 2 of 4 Gaussians that cover less than 2 px in every")
     assert training.edit_scene(edited, 7) is None, "all that is left is large enough"
     assert training.edit_scene(training.first_scene(_sized([1.0, 1.5])), 7) is None, (
         "something is left of every scene"

@@ -60,7 +60,7 @@ def test_sides_follow_their_gaussians_and_are_stored() -> None:
     tensors = {name.removeprefix("model."): x for name, x in strip_roles(scene.state()).items()}
     again = StaticScene.from_state(scene.gaussians, tensors)
     assert again.sides is not None
-    assert torch.equal(again.sides.of, (kept >= 40).long())
+    assert torch.equal(again.sides.side_ids, (kept >= 40).long())
     assert torch.equal(again.render(RING).rgb, scene.render(RING).rgb)
     assert not torch.equal(again.render(RING).rgb, replace(again, sides=None).render(RING).rgb)
     assert StaticScene.from_state(scene.gaussians, {}).sides is None

@@ -155,17 +155,17 @@ def test_what_has_begun_keeps_its_step() -> None:
     )
     config = Config(data=DataConfig(root=Path("x")), model=model, train=options)
     old = deform_schedule(model, RateSchedule(1000))
-    assert old.fine == 350
+    assert old.coarse_end == 350
     for done in (360, 500, 700, 1000):
         for steps in (done + 10, 1050, 9000):
             if steps == 9000 and done < 1000:
-                with pytest.raises(DyngsError, match="1,000 before anything moves"):
+                with pytest.raises(DyngsError, match="trains 1,000 static steps"):
                     extend_config(config, done, steps)
                 continue
             new = extend_config(config, done, steps)
             assert isinstance(new.model, DynamicModel)
             now = deform_schedule(new.model, RateSchedule(steps))
-            assert now.fine == (350 if steps < 9000 else 1000)
+            assert now.coarse_end == (350 if steps < 9000 else 1000)
             assert image_divisor(new.train, done) <= image_divisor(options, done)
             assert active_sh_degree(new.train, done, 3) >= active_sh_degree(options, done, 3)
             if done >= old.window_grows_from and steps < 9000:
@@ -189,4 +189,4 @@ def test_what_a_shorter_run_would_have_begun_by_now_begins_next() -> None:
     config = Config(data=DataConfig(root=Path("x")), model=model, train=TrainConfig(steps=10_000))
     new = extend_config(config, 4000, 5000)
     assert isinstance(new.model, DynamicModel)
-    assert deform_schedule(new.model, RateSchedule(5000)).fine == 4001
+    assert deform_schedule(new.model, RateSchedule(5000)).coarse_end == 4001

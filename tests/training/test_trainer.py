@@ -119,7 +119,7 @@ class _Lifted(SceneTraining[_LiftedScene]):
     def extend(self, scene: _LiftedScene, seen: tuple[float, float], step: int) -> None:
         raise NotImplementedError
 
-    def follow(self, edit: TopologyEdit) -> None: ...
+    def apply_edit(self, edit: TopologyEdit) -> None: ...
 
     def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> _LiftedScene:
         self.steps = tensors["steps"].tolist()

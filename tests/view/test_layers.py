@@ -82,7 +82,7 @@ def test_many_gaussians_are_drawn_in_levels_while_anything_moves(
     request = ViewRequest(camera(80, 56))
     moving = replace(request, is_moving=True)
     assert "at most 300 Gaussians" in opened.notes[-1]
-    few = render_frame(LevelScene.of(whole.renderable, 300), camera(80, 56), None).rgb
+    few = render_frame(LevelScene.from_scene(whole.renderable, 300), camera(80, 56), None).rgb
     coarse = draw(opened, moving)
     assert np.abs(coarse / 255.0 - few).max() <= 0.5 / 255 + 1e-6
     assert not np.array_equal(coarse, draw(whole, request))

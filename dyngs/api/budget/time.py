@@ -55,7 +55,7 @@ def fit_minutes(
             f"train.minutes={seconds / 60:g}: {format_count(steps, 'step')} would fit at {side} px, so images are "
             f"shrunk to {smaller} px (data.longest_side)"
         )
-        trainer.images.rest()
+        trainer.images.stop_prefetching()
         data = plan.resolved.data.model_copy(update={"longest_side": smaller})
         plan = replace(plan, resolved=plan.resolved.model_copy(update={"data": data}))
     resolved = with_steps(plan.resolved, max(steps, 1))

@@ -1,4 +1,4 @@
-"""The kinds ``nerf`` and ``ngp``: radiance fields, which draw some pixels of an image at a time."""
+"""Model kinds ``nerf`` and ``ngp``: radiance fields, trained on random pixels of an image."""
 
 from __future__ import annotations
 
@@ -15,29 +15,31 @@ if TYPE_CHECKING:
 
 
 class FieldModel(ModelSection):
-    """Keys of all fields."""
+    """Config keys of all radiance fields."""
 
-    time: bool = Field(default=False, description="time is an input, too: a moving scene (T-NeRF)")
+    time: bool = Field(
+        default=False, description="use time as a network input, for dynamic scenes (T-NeRF)"
+    )
     half_extent: float | None = Field(
         default=None,
         gt=0,
         le=1e9,
-        description="half the side of the cube that is resolved best, in the unit of the capture; null: what all "
-        "cameras frame of an object before a background, else where the cameras are",
+        description="half side of the innermost cube, in the unit of the capture; null: the region framed by all "
+        "cameras for objects, else the region of the cameras",
     )
     surroundings: Literal["auto", "never", "always"] = Field(
         default="auto",
-        description="whether anything lies outside of that cube, up to 64 times as far; auto: if images have no alpha",
+        description="model the surroundings of that cube, up to 64 times as far; auto: if images have no alpha",
     )
     sizes: Literal["tiny", "cpu", "published"] = Field(
         default="cpu",
-        description="sizes of networks, grids and batches: for a first try, for a CPU, or as published",
+        description="sizes of networks, grids and batches: for tests, for a CPU, or as published",
     )
     lr: float | None = Field(
         default=None,
         gt=0,
         le=1,
-        description="learning rate of Adam at its height; null: 1e-2 of ngp, 1e-3 of nerf (published: 5e-4)",
+        description="peak learning rate of Adam; null: 1e-2 for ngp, 1e-3 for nerf (published: 5e-4)",
     )
 
 
@@ -47,15 +49,15 @@ class NgpModel(FieldModel):
 
     kind: Literal["ngp"] = Field(
         default="ngp",
-        description="radiance field: hash grid and small networks (Instant-NGP; docs/family.md)",
+        description="radiance field: hash grid and small networks (Instant-NGP)",
     )
 
 
 class NerfModel(FieldModel):
-    """NeRF (Mildenhall et al. 2020): the slow reference."""
+    """NeRF (Mildenhall et al. 2020)."""
 
     kind: Literal["nerf"] = Field(
-        default="nerf", description="radiance field: two large networks (NeRF; docs/family.md)"
+        default="nerf", description="radiance field: two large networks (NeRF)"
     )
 
 

@@ -1,7 +1,6 @@
-"""Instant-NGP (Müller et al. 2022): a multiresolution hash grid, a density and a colour network,
-occupied cells.
+"""Instant-NGP (Müller et al. 2022): multiresolution hash grid, two small MLPs and occupied cells.
 
-Trained by the protocol of nerfacc's occupancy grid (Li et al. 2023).
+Training follows nerfacc's occupancy grid (Li et al. 2023).
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ from dyngs.baselines.fields.scene import (
     PUBLISHED_HALF,
     PUBLISHED_PIXELS,
     TIME,
-    Field,
+    RadianceField,
     RenderedRays,
     mlp,
-    restored_parameters,
+    restore_parameters,
     truncated_exp,
 )
 from dyngs.baselines.fields.training import FieldTraining
@@ -43,49 +42,49 @@ from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.hash_grid import HashLevels, hash_features, select_features
 from dyngs.ops.rays import MarchSteps, Rays, Space, composite, march
 
-# Features of hidden layers, and of the density network's output, whose first is the density
+# Width of hidden layers, and outputs of the density network (the first is the density).
 WIDTH, GEOMETRY = 64, 16
-# Of the harmonics of directions; Instant-NGP counts degrees from 1
+# Spherical harmonics of directions; Instant-NGP counts degrees from 1.
 DIRECTION_DEGREE, DIRECTION_TERMS = 3, 16
-# Least length of a sample where there are several cubes, in its distance over `across`: 1/256 as
-# published
+# With several cubes, samples are at least this fraction of their distance over ``across`` long.
 CONE = 4.0
 ACROSS = 1024 / PUBLISHED_PIXELS
 FINEST = 2.56
-"""For a CPU, per pixel of an image's longest side: samples along the diagonal of the innermost
-cube, as published, and cells of the finest level along an axis, half as published; twice as many
-where the innermost cube is half of all."""
-FIRST = 1e-4  # Rows of the grid begin within this of 0
-# Steps between updates; up to which step all cells are looked at where it is a power of two
+"""Per pixel of the longest image side, for a CPU: samples along the diagonal of the innermost
+cube, and cells of the finest level (half as published; twice as many if there are surroundings)."""
+FIRST = 1e-4  # initial features are uniform within this
+# Steps between updates of the occupancy grid; warm-up steps in which all cells are evaluated.
 EVERY, WARM_UP = 16, 256
 DECAY = 0.95
 THRESHOLD = 1e-2
-"""Opacity above which a cell counts as occupied, or the mean of its cube if that is less: of a
-sample as long as published, a 1,024th of the cube's diagonal."""
-CHUNK = 1 << 17  # Cells looked at together
-LOOKED_AT = 2  # Random cells looked at in an update of the occupied ones, per sample of a step
+"""Opacity above which a cell is occupied, or the mean of its cube if lower.
+
+Of a sample of published length, 1/1024 of the diagonal of the cube.
+"""
+CHUNK = 1 << 17  # cells evaluated at once
+RANDOM_CELLS_PER_SAMPLE = 2  # random cells per update and sample of a step
 RATE = 1e-2
-WEIGHT_DECAY = 1e-6  # L2 penalty of the networks' weights
-FIRST_SAMPLES = 256  # Samples that a ray is taken to need before any was counted
-MOST_RAYS = 1 << 15  # Of an image in a step
-RATE_RISES, FIRST_RATE = 100, 0.01  # Steps in which the rate rises from this fraction of itself
+WEIGHT_DECAY = 1e-6  # L2 penalty of the MLP weights
+FIRST_SAMPLES = 256  # assumed samples per ray before any were counted
+MOST_RAYS = 1 << 15  # per image and step
+RATE_RISES, FIRST_RATE = 100, 0.01  # warm-up steps of the learning rate, and its initial fraction
 DROPS = (0.5, 0.75, 0.9)
-DROP = 0.33  # Fractions of the run at which the rate falls by this factor
+DROP = 0.33  # factor on the learning rate after each of ``DROPS``
 
 
 @dataclass(frozen=True)
 class NgpSizes:
-    """Sizes of a field and of a step of its training."""
+    """Sizes of the field and of a training step."""
 
     num_levels: int
     features: int
-    log2_rows: int  # most rows of a level
-    log2_samples: int  # of a step
-    # cells of the occupancy grid along an axis; None: as suits the number of cubes
+    log2_rows: int  # maximum rows per level
+    log2_samples: int  # samples per step
+    # Cells of the occupancy grid along an axis; None: by the number of cubes.
     cells: int | None
-    # cells of the finest level along an axis; None: by the images, see ``FINEST``
+    # Cells of the finest level along an axis; None: by the image size, see ``FINEST``.
     finest: int | None
-    # samples along the diagonal of the innermost cube; None: by the images, see ``ACROSS``
+    # Samples along the diagonal of the innermost cube; None: by the image size, see ``ACROSS``.
     across: int | None
 
 
@@ -97,7 +96,7 @@ SIZES = {
 
 
 @dataclass(frozen=True)
-class NgpField(Field):
+class NgpField(RadianceField):
     """A hash grid with its two networks, and the cells in which anything is.
 
     Attributes:
@@ -116,8 +115,8 @@ class NgpField(Field):
         generator: torch.Generator,
         pixels: int = PUBLISHED_PIXELS,
     ) -> NgpField:
-        """Return a field that is nearly grey, hardly dense, occupied everywhere."""
-        own = shapes(model, space, pixels)
+        """Create a field that is nearly grey, of low density, and occupied everywhere."""
+        own = parameter_shapes(model, space, pixels)
         rows = torch.rand(own["table"], generator=generator, device="cpu")
         parameters = {"table": FIRST * (2 * rows - 1)}
         for name, (out, before) in own.items():
@@ -129,7 +128,7 @@ class NgpField(Field):
     @classmethod
     def from_state(cls, model: NgpModel, space: Space, stored: Mapping[str, Tensor]) -> NgpField:
         pixels = int(require_tensor("pixels", stored["pixels"], (1,), torch.int64))
-        parameters = restored_parameters(stored, shapes(model, space, pixels))
+        parameters = restore_parameters(stored, parameter_shapes(model, space, pixels))
         count = math.prod(space.shape)
         bits = require_tensor("occupied", stored["occupied"], (-(-count // 8),), torch.uint8)
         flat = np.unpackbits(bits.numpy(), count=count, bitorder="little").astype(bool)
@@ -138,7 +137,7 @@ class NgpField(Field):
 
     @property
     def num_random_values(self) -> int:
-        return 2  # where the samples of a ray lie, and which of those that hardly show are taken
+        return 2  # offset of the samples, and selection of samples with low weight
 
     def state(self) -> State:
         bits = np.packbits(self.occupied.cpu().numpy().ravel(), bitorder="little")
@@ -154,23 +153,23 @@ class NgpField(Field):
 
     @cached_property
     def across(self) -> int:
-        """Number of samples along the diagonal of the innermost cube."""
+        """Samples along the diagonal of the innermost cube."""
         own = SIZES[self.model.sizes].across
         return own or min(max(128, round(ACROSS * self.pixels)), 1024)
 
     @cached_property
     def step(self) -> float:
-        """Length of a sample, world units."""
+        """Sample length, world units."""
         return 2 * self.space.half * math.sqrt(3) / self.across
 
-    def seen(
+    def render_rays(
         self, rays: Rays, time: float, *, near: float, shifts: Tensor | None = None
     ) -> RenderedRays:
         steps = MarchSteps(near, self.step, CONE / self.across if self.space.cascades > 1 else 0.0)
         places = rays.origins.new_full((len(rays), 2), 0.5) if shifts is None else shifts
         marched = march(rays, places[:, 0].contiguous(), self.space, self.occupied, steps)
         table = self.parameters["table"]
-        with torch.no_grad():  # which samples are worth it takes their densities alone
+        with torch.no_grad():  # selection of samples needs densities only
             features = hash_features(marched.coords, table, self.levels)
             densities = self._density(self._geometry(features, time), marched.coords)
             if shifts is None:
@@ -189,7 +188,7 @@ class NgpField(Field):
         return self._density(self._geometry(self._features(coords), time), coords)
 
     def may_be_occupied(self, points: Tensor) -> Tensor:
-        """See ``Field``: what lies in occupied cells, or beyond the innermost cube."""
+        """Return true in occupied cells and beyond the innermost cube, see ``RadianceField``."""
         n = self.space.cells
         middle = points.new_tensor(self.space.centre)
         place = ((points - middle) / self.space.half + 1) * (n / 2)
@@ -210,31 +209,30 @@ class NgpField(Field):
         return self._network(self.with_time(features, time), "density")
 
     def _density(self, geometry: Tensor, coords: Tensor) -> Tensor:
-        """Return (M,) densities, per world unit; the published ones are per unit of a cube of half
+        """Return densities (M,) per world unit; the published ones are per unit of a cube of half
         side 1.5.
 
-        Outside of the innermost cube it is per unit of a cube on whose side the point lies, so that
-        a field which has learned nothing is as dense a mist in each.
+        Outside the innermost cube, densities are relative to the cube through the point, so that
+        an untrained field is equally dense in each cube.
         """
         found = truncated_exp(geometry[:, 0] - 1) * (PUBLISHED_HALF / self.space.half)
         if self.space.cascades == 1:
             return found
-        return found * (2 - 4 * (coords - 0.5).abs().amax(1)).clamp(max=1)  # 1 over the max-norm
+        return found * (2 - 4 * (coords - 0.5).abs().amax(1)).clamp(max=1)  # 1 / max-norm
 
     def _colours(self, geometry: Tensor, basis: Tensor) -> Tensor:
         return self._network(torch.cat([geometry, basis], 1), "colour").sigmoid()
 
 
 def hash_levels(model: NgpModel, space: Space, pixels: int) -> HashLevels:
-    """Return the levels of the hash grid for images with a longest side of ``pixels`` px."""
+    """Return the levels of the hash grid for images with a longest side of ``pixels``."""
     sizes = SIZES[model.sizes]
     finest = min(max(64, round(FINEST * pixels * min(space.cascades, 2))), 4096)
     return HashLevels.geometric(sizes.num_levels, 16, sizes.finest or finest, 1 << sizes.log2_rows)
 
 
-def shapes(model: NgpModel, space: Space, pixels: int) -> dict[str, tuple[int, int]]:
-    """Return the shapes of the parameters: the table of all levels, and the weights (out, in) of
-    the networks."""
+def parameter_shapes(model: NgpModel, space: Space, pixels: int) -> dict[str, tuple[int, int]]:
+    """Return the parameter shapes: hash table and MLP weights (out, in)."""
     sizes = SIZES[model.sizes]
     inputs = sizes.num_levels * sizes.features + (TIME if model.time else 0)
     widths = {
@@ -248,8 +246,7 @@ def shapes(model: NgpModel, space: Space, pixels: int) -> dict[str, tuple[int, i
 
 
 def cells_in_view(space: Space, views: Sequence[View]) -> Tensor:
-    """Return bool of ``space.shape``: cells of which a view sees a part, outside of the next
-    smaller cube."""
+    """Return a mask of ``space.shape``: cells that a view sees, outside the next smaller cube."""
     seen = np.zeros(space.shape, dtype=bool)
     axis = (np.arange(space.cells) + 0.5) * (2 / space.cells) - 1
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
@@ -263,8 +260,8 @@ def cells_in_view(space: Space, views: Sequence[View]) -> Tensor:
             else np.ones(len(middles), bool)
         )
         unseen = np.flatnonzero(outside)
-        for view in views:  # those seen once are not looked at again
-            hidden = ~_sees(
+        for view in views:  # visible cells are not tested again
+            hidden = ~_may_see(
                 view,
                 middles[unseen] * np.float32(half) + np.array(space.centre, np.float32),
                 radius,
@@ -274,9 +271,8 @@ def cells_in_view(space: Space, views: Sequence[View]) -> Tensor:
     return torch.from_numpy(seen)
 
 
-def _sees(view: View, points: np.ndarray, radius: float) -> np.ndarray:
-    """Return (P,) bool: whether the view sees anything of the balls of a radius around points (P,
-    3); errs on yes."""
+def _may_see(view: View, points: np.ndarray, radius: float) -> np.ndarray:
+    """Return a mask (P,) of spheres around ``points`` that may be visible; conservative."""
     pose = view.cam_from_world.astype(np.float32)
     k = view.intrinsics
     x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).T
@@ -286,15 +282,16 @@ def _sees(view: View, points: np.ndarray, radius: float) -> np.ndarray:
         (y, k[1, 2], k[1, 1], view.height),
     ):
         for side, edge in ((1, (size - middle) / focal), (-1, middle / focal)):
-            # the side of the frustum, a plane
+            # side plane of the frustum
             found &= side * across - edge * z < radius * (1 + edge * edge) ** 0.5
     return found
 
 
 class NgpTraining(FieldTraining):
-    """Training of Instant-NGP: rays per step by the number of samples, and the occupied cells.
+    """Training of Instant-NGP: rays per step adapt to the number of samples; updates occupied
+    cells.
 
-    The largest opacity of a sample found in each cell fades until it is found again.
+    The largest opacity found in each cell decays until it is found again.
     """
 
     betas = (0.9, 0.99)
@@ -306,11 +303,11 @@ class NgpTraining(FieldTraining):
         super().__init__(run, NgpField, sizes.cells, max(camera.width, camera.height))
         num_samples = 1 << sizes.log2_samples
         self._wanted = max(1, num_samples // self._batch)
-        # rays and samples of this step
+        # Rays and samples of this step.
         self._counted = torch.zeros(2, dtype=torch.float64, device="cpu")
         self._rays = max(1, self._wanted // FIRST_SAMPLES)
-        self._most_random = LOOKED_AT * num_samples
-        self._find_seen_cells()
+        self._most_random = RANDOM_CELLS_PER_SAMPLE * num_samples
+        self._find_cells_in_view()
         self._field.occupied.copy_(self._cells_of_views)
 
     @property
@@ -319,14 +316,14 @@ class NgpTraining(FieldTraining):
         assert isinstance(field, NgpField)
         return field
 
-    def _find_seen_cells(self) -> None:
-        """Find the cells that may be occupied at all; nothing was found in any yet."""
+    def _find_cells_in_view(self) -> None:
+        """Find the cells in view, which may be occupied; reset their opacities."""
         space = self._field.space
         seen = cells_in_view(space, self._run.capture.splits["train"])
         if not bool(seen.any()):
             raise DyngsError(
-                f"{self._run.config.data.root}: no training camera sees anything of the cube that the field lies in: "
-                "give model.half_extent, or model.surroundings=always"
+                f"{self._run.config.data.root}: no training camera sees the cube of the field; "
+                "set model.half_extent or model.surroundings=always"
             )
         self._cells_of_views = seen
         self._cells = seen.flatten().nonzero()[:, 0]
@@ -339,13 +336,13 @@ class NgpTraining(FieldTraining):
     def num_rays(self) -> int:
         return self._rays
 
-    def count(self, num_rays: int, num_samples: int) -> None:
+    def record_samples(self, num_rays: int, num_samples: int) -> None:
         self._counted += torch.tensor([num_rays, num_samples], dtype=torch.float64, device="cpu")
 
     def tallies(self, step: int) -> Sequence[Tensor]:
         return [self._counted]
 
-    def rate(self, step: int) -> float:
+    def learning_rate(self, step: int) -> float:
         rising = min(1.0, FIRST_RATE + (1 - FIRST_RATE) * (step - 1) / RATE_RISES)
         fallen = sum(step > fraction * self._run.config.train.steps for fraction in DROPS)
         return (self._model.lr or RATE) * rising * DROP**fallen
@@ -356,16 +353,16 @@ class NgpTraining(FieldTraining):
                 x.grad.add_(x.detach(), alpha=WEIGHT_DECAY)
         updated = super().update(step)
         if step > EVERY and step % EVERY == 0:
-            self._look_at_cells(step)
+            self._update_occupancy(step)
         rays, samples = self._counted.tolist()
         self._rays = max(1, min(MOST_RAYS, int(rays * self._wanted / max(samples, 1.0))))
         self._counted.zero_()
         return updated
 
     @torch.no_grad()
-    def _look_at_cells(self, step: int) -> None:
-        """Look at the densities at random places of cells, at a time of training."""
-        cells = self._looked_at(step)
+    def _update_occupancy(self, step: int) -> None:
+        """Evaluate densities at random points of cells and update the occupied cells."""
+        cells = self._select_cells(step)
         found = torch.cat([self._opacities_of(x) for x in cells.split(CHUNK)])
         self._opacities[cells] = torch.maximum(self._opacities[cells] * DECAY, found)
         seen = self._cells_of_views.flatten(1)
@@ -374,22 +371,24 @@ class NgpTraining(FieldTraining):
         occupied = cubes > means.clamp(max=THRESHOLD)[:, None]
         self._field.occupied.copy_(occupied.view(self._field.space.shape))
 
-    def _looked_at(self, step: int) -> Tensor:
-        """Return indices of cells: of all ever less often as it warms up, else random and occupied
-        ones.
+    def _select_cells(self, step: int) -> Tensor:
+        """Return cell indices to evaluate: all in powers of two during warm-up, else random and
+        occupied ones.
 
-        At most a quarter of all each.
+        At most a quarter of all cells each.
         """
         if step <= WARM_UP and step & (step - 1) == 0:
             return self._cells
-        most = -(-len(self._cells) // 4)
-        drawn = self._cells[self._drawn(len(self._cells), min(self._most_random, most))]
+        max_count = -(-len(self._cells) // 4)
+        drawn = self._cells[
+            self._random_indices(len(self._cells), min(self._most_random, max_count))
+        ]
         full = self._field.occupied.flatten().nonzero()[:, 0]
-        if len(full) > most:
-            full = full[self._drawn(len(full), most)]
+        if len(full) > max_count:
+            full = full[self._random_indices(len(full), max_count)]
         return torch.cat([drawn, full]).unique()
 
-    def _drawn(self, below: int, count: int) -> Tensor:
+    def _random_indices(self, below: int, count: int) -> Tensor:
         drawn = torch.randint(below, (count,), generator=self._run.generator, device="cpu")
         return copy_async(drawn, self._cells.device)
 
@@ -420,8 +419,8 @@ class NgpTraining(FieldTraining):
         before = self._field.space
         super().restore(checkpoint)
         stored = checkpoint.part("occupancy")
-        if self._field.space != before:  # to find what cameras see takes seconds
-            self._find_seen_cells()
+        if self._field.space != before:  # finding visible cells takes seconds
+            self._find_cells_in_view()
         shape = tuple(self._opacities.shape)
         self._opacities = require_tensor("values", stored["values"], shape).clone()
         rays = int(require_tensor("rays", stored["rays"], (1,), torch.int64))

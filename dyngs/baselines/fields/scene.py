@@ -1,5 +1,4 @@
-"""Radiance fields: the interface of a field, how it is drawn, where it lies in a capture, and its
-surface."""
+"""Radiance fields: interface, rendering, placement in a capture, and surface extraction."""
 
 from __future__ import annotations
 
@@ -38,50 +37,51 @@ from dyngs.models.volume import camera_rays
 from dyngs.ops.perceptron import Layer, perceptron
 from dyngs.ops.rays import Rays, Space
 
-NEAR = 0.05  # Nearest distance that is drawn, in units of half the side of the innermost cube
-CHUNK = 1 << 13  # Rays drawn together
-MOST_CASCADES = 7  # Cubes of surroundings: the outermost is 64 times the innermost
-# Along an axis of a single cube, and of each of several: looking at all takes a while
+NEAR = 0.05  # near plane, in half sides of the innermost cube
+CHUNK = 1 << 13  # rays rendered at once
+MAX_CASCADES = 7  # nested cubes of surroundings: the outermost is 64 times the innermost
+# Cells along an axis of a single cube, and of each of several.
 GRID, FAR_GRID = 128, 64
-BESIDE = 1.25
-"""Half the side of an innermost cube that holds the cameras, in the farthest distances of one from
-its middle."""
-SEEN_FAR = 0.02  # Fraction of the sparse points that may lie outside of the outermost cube
-CELLS = 192  # Along an axis of the innermost cube, unless asked otherwise
+CAMERA_MARGIN = 1.25
+"""Half side of an innermost cube around the cameras, in the largest camera distance from its
+centre."""
+OUTLIER_FRACTION = 0.02  # fraction of the sparse points that may lie outside the outermost cube
+CELLS = 192  # default cells along an axis of the innermost cube
 LEVEL = 25.0
-"""Density at the surface, unless asked otherwise, per unit of a world whose innermost cube has half
-side 1.5: half of the light is lost in a 36th of a unit."""
-POINTS = 1 << 17  # Points looked at together
+"""Default density at the surface, per unit of a world with an innermost cube of half side 1.5.
+
+A 36th of a unit at this density absorbs half of the light.
+"""
+POINTS = 1 << 17  # points evaluated at once
 LARGEST_EXPONENT = 15.0
 TIME_OCTAVES = 4
 TIME = 1 + 2 * TIME_OCTAVES
-"""Numbers that a time in [0, 1] is encoded in."""
+"""Size of the encoding of a time in [0, 1]."""
 PUBLISHED_HALF = 1.5
-"""Half the side of the cube of published figures: densities are per unit of a world in which the
-cube is as large."""
-PUBLISHED_PIXELS = 800  # Along a side of the images of published figures
+"""Half side of the cube of the published scenes; densities are per unit of that world."""
+PUBLISHED_PIXELS = 800  # image side of the published scenes
 
-F = TypeVar("F", bound="Field")
+F = TypeVar("F", bound="RadianceField")
 
 
 @dataclass(frozen=True)
 class RenderedRays:
-    """What R rays see, before black."""
+    """Rendering of R rays on black."""
 
     colour: Tensor  # (R, 3)
     transmittance: Tensor  # (R,)
-    depth: Tensor  # (R,) sum of weight times the distance along the ray
-    num_samples: int  # that were taken
-    coarse: RenderedRays | None = None  # by the coarse network, where there is one
+    depth: Tensor  # (R,) sum of weight times distance
+    num_samples: int  # number of samples
+    coarse: RenderedRays | None = None  # rendering of the coarse network, if any
 
 
 @dataclass(frozen=True)
-class Field(ABC):
-    """A radiance field.
+class RadianceField(ABC):
+    """Interface of radiance fields.
 
     Attributes:
-        space: where it has a density.
-        parameters: all that is learned, by name; leaves while it is trained.
+        space: nested cubes in which the field has a density.
+        parameters: trained tensors by name; leaves in training.
     """
 
     model: Any
@@ -97,69 +97,65 @@ class Field(ABC):
         generator: torch.Generator,
         pixels: int = PUBLISHED_PIXELS,
     ) -> F:
-        """Return a field before the first step; ``pixels``: of the longest side of the images."""
+        """Create a field before the first step; ``pixels``: longest side of the images."""
 
     @classmethod
     @abstractmethod
     def from_state(cls: type[F], model: Any, space: Space, stored: Mapping[str, Tensor]) -> F:
-        """Return the field in a state. Raises KeyError or ValueError where its tensors do not
-        fit."""
+        """Return the field in a state. Raises KeyError or ValueError for inconsistent tensors."""
 
     @property
     @abstractmethod
     def num_random_values(self) -> int:
-        """K: random numbers that a ray needs in training."""
+        """Number K of random values that a ray needs in training."""
 
     @abstractmethod
-    def seen(
+    def render_rays(
         self, rays: Rays, time: float, *, near: float, shifts: Tensor | None = None
     ) -> RenderedRays:
-        """Return what rays see at ``time``; differentiable in the parameters.
+        """Render rays at ``time``; differentiable in the parameters.
 
         Args:
-            near: what is nearer is not drawn, world units.
-            shifts: (R, K) random numbers in [0, 1) that place the samples, see ``num_shifts``;
-                None: evenly.
+            near: near plane, world units.
+            shifts: (R, K) random numbers in [0, 1) that place the samples, see
+                ``num_random_values``; None: evenly spaced.
         """
 
     @abstractmethod
     def densities(self, points: Tensor, time: float) -> Tensor:
-        """Return (M,) densities, per world unit, at points (M, 3) of the world."""
+        """Return densities (M,), per world unit, at world ``points`` (M, 3)."""
 
     @abstractmethod
     def colours(self, points: Tensor, directions: Tensor, time: float) -> Tensor:
-        """Return (M, 3) colours of points (M, 3) of the world, seen along unit directions (M,
-        3)."""
+        """Return colours (M, 3) at world ``points`` (M, 3) along unit view ``directions`` (M, 3)."""
 
     def may_be_occupied(self, points: Tensor) -> Tensor:
-        """Return (M,) bool: whether there may be anything at points (M, 3) of the world, before
-        looking."""
+        """Return a mask (M,) of world ``points`` (M, 3) whose density may not be 0; conservative."""
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
 
     def state(self) -> State:
-        """Return its tensors by name, with their role."""
+        """Return the parameters by name with their role."""
         return with_role({name: x.detach() for name, x in self.parameters.items()}, Role.SHARED)
 
     def with_time(self, x: Tensor, time: float) -> Tensor:
-        """Return the inputs (M, K) of a network, followed by the encoded ``time`` where the field
-        moves (T-NeRF)."""
+        """Append the encoded ``time`` to network inputs (M, K) of dynamic fields (T-NeRF)."""
         if not self.model.time:
             return x
         when = encode_frequencies(x.new_full((1, 1), time), TIME_OCTAVES)
         return torch.cat([x, when.expand(len(x), -1)], 1)
 
 
-def restored_parameters(
+def restore_parameters(
     stored: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]]
 ) -> dict[str, Tensor]:
-    """Return the parameters in a state. Raises KeyError or ValueError where they do not fit."""
+    """Return the parameters in a state. Raises KeyError or ValueError for inconsistent tensors."""
     return {
         name: require_tensor(name, stored[name], shape).clone() for name, shape in shapes.items()
     }
 
 
 class _TruncatedExp(torch.autograd.Function):
-    """exp, whose gradient is that of ``LARGEST_EXPONENT`` beyond it (Instant-NGP)."""
+    """exp with the gradient clamped to that at ``LARGEST_EXPONENT`` (Instant-NGP)."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
@@ -173,14 +169,13 @@ class _TruncatedExp(torch.autograd.Function):
 
 
 def truncated_exp(x: Tensor) -> Tensor:
-    """Return exp(x), whose gradient does not grow beyond exp(15)."""
+    """Return exp(x) with its gradient clamped to exp(15)."""
     result: Tensor = _TruncatedExp.apply(x)  # pyright: ignore[reportAssignmentType]
     return result
 
 
 def encode_frequencies(x: Tensor, octaves: int) -> Tensor:
-    """Return (M, D (1 + 2 octaves)): x, then the sines and cosines of 2^k x of each octave k,
-    without pi (NeRF)."""
+    """Encode x (M, D) as x, sin(2^k x), cos(2^k x) of each octave k, without pi (NeRF)."""
     parts = [x]
     for k in range(octaves):
         parts += [(2.0**k * x).sin(), (2.0**k * x).cos()]
@@ -188,15 +183,18 @@ def encode_frequencies(x: Tensor, octaves: int) -> Tensor:
 
 
 def mlp(x: Tensor, weights: Sequence[Tensor]) -> Tensor:
-    """Return (M, out) outputs of a perceptron without biases."""
+    """Return the outputs (M, out) of an MLP without biases."""
     return perceptron(x, [Layer(weight, weight.new_zeros(len(weight))) for weight in weights])
 
 
 @dataclass(frozen=True)
 class FieldScene(Renderable):
-    """A field; ``seen_at``: distinct training times in [0, 1], ascending, where it moves."""
+    """Scene of a radiance field.
 
-    field: Field
+    ``training_times``: distinct training times in [0, 1], ascending, of dynamic fields.
+    """
+
+    field: RadianceField
     training_times: tuple[float, ...] = ()
     options: DrawOptions = dataclasses.field(default_factory=DrawOptions)
     background: Tensor | None = None
@@ -252,13 +250,13 @@ class FieldScene(Renderable):
     def _view(
         self, camera: Cameras, time: float, options: DrawOptions
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return colours before black (H, W, 3), transmittance (H, W) and the sum of weight times z
+        """Return colours on black (H, W, 3), transmittance (H, W) and the sum of weight times z
         (H, W)."""
         rays, z = camera_rays(camera)
         parts = []
         for begin in range(0, len(rays), CHUNK):
             chosen = slice(begin, begin + CHUNK)
-            seen = self.field.seen(rays[chosen], time, near=options.near)
+            seen = self.field.render_rays(rays[chosen], time, near=options.near)
             parts.append((seen.colour, seen.transmittance, seen.depth * z[chosen]))
         colour, through, depth = (torch.cat(x) for x in zip(*parts, strict=True))
         shape = camera.height, camera.width
@@ -266,15 +264,14 @@ class FieldScene(Renderable):
 
 
 def restore_scene(
-    field_class: type[Field], model: FieldModel, checkpoint: Checkpoint
+    field_class: type[RadianceField], model: FieldModel, checkpoint: Checkpoint
 ) -> FieldScene:
-    """Return the scene of a checkpoint. Raises KeyError or ValueError where its tensors do not
-    fit."""
+    """Return the scene in a checkpoint. Raises KeyError or ValueError for inconsistent tensors."""
     stored = checkpoint.part("field")
     numbers = require_tensor("space", stored["space"], (6,), torch.float64).tolist()
     x, y, z, half, cascades, cells = numbers
     if not (half > 0 and cascades in range(1, 17) and cells in range(1, 1025)):
-        raise ValueError(f"'space' is no space: {numbers}")
+        raise ValueError(f"invalid 'space': {numbers}")
     space = Space((x, y, z), half, int(cascades), int(cells))
     field = field_class.from_state(model, space, stored)
     times = require_times("times", stored["times"]).tolist() if "times" in stored else ()
@@ -283,17 +280,17 @@ def restore_scene(
 
 
 def space_of(model: FieldModel, cells: int | None, capture: Capture) -> Space:
-    """Return the space of the field of ``capture``.
+    """Return the nested cubes of a field of ``capture``.
 
-    An object before a background lies in a cube around the point that the cameras look at, as large
-    as what all of them frame. So does the innermost cube of other captures, with others around it
-    for what is far away; where the cameras do not look at one point it holds the cameras.
+    For objects (images with alpha): one cube around the focus point of the cameras, as large as
+    the region framed by all. Otherwise the innermost cube is placed likewise, or around the
+    cameras if they have no common focus, with cubes of surroundings around it.
 
     Args:
-        cells: of each cube along an axis; None: as suits their number.
+        cells: along an axis of each cube; None: by the number of cubes.
 
     Raises:
-        DyngsError: nothing tells depth, or much lies too far away.
+        DyngsError: all cameras share one position.
     """
     views = capture.splits["train"]
     requested = None if model.half_extent is None else model.half_extent / capture.world_scale
@@ -302,22 +299,24 @@ def space_of(model: FieldModel, cells: int | None, capture: Capture) -> Space:
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     if not camera_extent(centres):
         raise DyngsError(
-            "the capture has a single camera position, from which a field cannot tell depth: give more images, or a "
-            "capture whose camera moves"
+            "all images have the same camera position, so that depth is unknown; "
+            "add images from other positions"
         )
     focus = focus_point(poses)
-    looked_at = focus if focus is not None and fraction_in_front(poses, focus) > 0.5 else None
+    focus_in_view = focus if focus is not None and fraction_in_front(poses, focus) > 0.5 else None
     far = model.surroundings == "always" or (model.surroundings == "auto" and not capture.has_alpha)
     if not far:
-        middle = centres.mean(axis=0) if looked_at is None else looked_at
-        return _space(middle, requested or _framed(views, middle), 1, cells)
+        middle = centres.mean(axis=0) if focus_in_view is None else focus_in_view
+        return _space(middle, requested or _framed_half_side(views, middle), 1, cells)
     middle = centres.mean(axis=0)
-    if looked_at is not None and np.linalg.norm(looked_at - middle) < 2 * spread:
-        middle = looked_at
-    beside = BESIDE * float(np.abs(centres - middle).max())
-    framed = beside if middle is not looked_at else min(beside, _framed(views, middle))
+    if focus_in_view is not None and np.linalg.norm(focus_in_view - middle) < 2 * spread:
+        middle = focus_in_view
+    beside = CAMERA_MARGIN * float(np.abs(centres - middle).max())
+    framed = (
+        beside if middle is not focus_in_view else min(beside, _framed_half_side(views, middle))
+    )
     half = requested or framed
-    return _space(middle, half, _cascades(capture, middle, half), cells)
+    return _space(middle, half, _num_cascades(capture, middle, half), cells)
 
 
 def _space(middle: np.ndarray, half: float, cascades: int, cells: int | None) -> Space:
@@ -325,9 +324,8 @@ def _space(middle: np.ndarray, half: float, cascades: int, cells: int | None) ->
     return Space((x, y, z), float(half), cascades, cells or (GRID if cascades == 1 else FAR_GRID))
 
 
-def _framed(views: Sequence[View], middle: np.ndarray) -> float:
-    """Return half the side of the cube around ``middle`` that images frame, the median over
-    views."""
+def _framed_half_side(views: Sequence[View], middle: np.ndarray) -> float:
+    """Return the half side of the cube around ``middle`` that images frame, median over views."""
     halves = []
     for view in views:
         x, y, z = view.cam_from_world[:3, :3] @ middle + view.cam_from_world[:3, 3]
@@ -336,28 +334,28 @@ def _framed(views: Sequence[View], middle: np.ndarray) -> float:
     return float(np.median(halves))
 
 
-def _cascades(capture: Capture, middle: np.ndarray, half: float) -> int:
-    """Return the number of cubes that hold the sparse points; all where there are none."""
+def _num_cascades(capture: Capture, middle: np.ndarray, half: float) -> int:
+    """Return the number of cubes that contain the sparse points; the maximum without points."""
     if capture.points is None or not len(capture.points.xyz):
-        return MOST_CASCADES
+        return MAX_CASCADES
     norms = np.abs(capture.points.xyz - middle).max(axis=1) / half
-    needed = 1 + math.ceil(math.log2(max(float(np.quantile(norms, 1 - SEEN_FAR)), 1.0)))
-    return min(max(needed + 1, 2), MOST_CASCADES)  # what is behind the points, too
+    needed = 1 + math.ceil(math.log2(max(float(np.quantile(norms, 1 - OUTLIER_FRACTION)), 1.0)))
+    return min(max(needed + 1, 2), MAX_CASCADES)  # includes space behind the points
 
 
 @torch.no_grad()
 def extract_surface(
     scene: FieldScene, time: float = 0.0, level: float | None = None, cells: int | None = None
 ) -> Surface:
-    """Return the surface in the innermost cube at ``time``.
+    """Extract the surface in the innermost cube at ``time``.
 
     Args:
-        level: density there, per unit of a world whose innermost cube has half side 1.5; None:
-            ``LEVEL``.
+        level: density at the surface, per unit of a world with an innermost cube of half side 1.5;
+            None: ``LEVEL``.
         cells: along an axis of the cube; None: ``CELLS``.
 
     Raises:
-        DyngsError: the density is nowhere, or everywhere, of that level.
+        DyngsError: no density, or all densities, are below the level.
     """
     from skimage.measure import marching_cubes
 
@@ -367,11 +365,10 @@ def extract_surface(
     grid = _densities(scene, time, cells) * (space.half / PUBLISHED_HALF)
     if not float(grid.min()) < level < float(grid.max()):
         raise DyngsError(
-            f"no surface: densities are from {float(grid.min()):.3g} to {float(grid.max()):.3g}, none of them "
-            f"{level:g}; give another --level"
+            f"no surface at density {level:g}: densities range from {float(grid.min()):.3g} to "
+            f"{float(grid.max()):.3g}; set another --level"
         )
-    # x is the first axis of the grid; a logarithm, because density rises by orders of magnitude
-    # within a cell
+    # x is the first axis. Logarithms, because density rises by orders of magnitude within a cell.
     found = marching_cubes(
         np.log(np.maximum(grid.numpy(), 1e-6)), np.log(level), gradient_direction="ascent"
     )
@@ -390,8 +387,8 @@ def extract_surface(
 
 
 def _densities(scene: FieldScene, time: float, cells: int) -> Tensor:
-    """Return densities, per world unit, at (cells + 1)^3 places, x the first axis; 0 on the sides
-    of the cube."""
+    """Return densities per world unit on a grid of (cells + 1)^3 points, x first; 0 on the
+    boundary."""
     space = scene.field.space
     axis = torch.linspace(-space.half, space.half, cells + 1, device="cpu")
     x, y, z = torch.meshgrid(*(axis + middle for middle in space.centre), indexing="ij")

@@ -1,4 +1,4 @@
-"""Radiance fields in training: rays of one image per view of a step, and Adam."""
+"""Training of radiance fields: random rays of one image per view, and Adam."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyngs.baselines.fields.scene import NEAR, Field, FieldScene, restore_scene, space_of
+from dyngs.baselines.fields.scene import NEAR, FieldScene, RadianceField, restore_scene, space_of
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import State, add_prefix
 from dyngs.data.loader import Image
@@ -26,7 +26,7 @@ from dyngs.ops.device import copy_async
 
 
 class ColourLoss(Loss):
-    """The mean over pixels that count of a ``function`` of rendered and true colours."""
+    """Mean over unmasked pixels of a ``function`` of rendered and true colours."""
 
     def __init__(self, function: Callable[[Tensor, Tensor], Tensor]) -> None:
         self._function = function
@@ -36,26 +36,26 @@ class ColourLoss(Loss):
 
 
 def masked_mean(error: Tensor, mask: Tensor | None) -> Tensor:
-    """Return the mean of (H, W, 3) errors over pixels where ``mask`` (H, W) is not 0."""
+    """Return the mean of the errors (H, W, 3) over pixels where ``mask`` (H, W) is not 0."""
     each = error.mean(-1)
     return each.mean() if mask is None else (each * mask).sum() / mask.sum().clamp_min(1)
 
 
 class FieldTraining(Model[FieldScene]):
-    """A field in training.
+    """A radiance field in training.
 
     Args:
-        cells: of each cube of its space along an axis; None: as suits their number.
-        pixels: of the longest side of the images.
+        cells: along an axis of each cube; None: by the number of cubes.
+        pixels: longest side of the images.
 
     Raises:
-        DyngsError: a capture that the field cannot hold.
+        DyngsError: the capture does not suit the field.
     """
 
-    betas = (0.9, 0.999)  # How slowly Adam forgets
+    betas = (0.9, 0.999)  # decay rates of the Adam moments
 
     def __init__(
-        self, run: StartContext, field_class: type[Field], cells: int | None, pixels: int
+        self, run: StartContext, field_class: type[RadianceField], cells: int | None, pixels: int
     ) -> None:
         self._run = run
         model: Any = run.config.model
@@ -70,8 +70,8 @@ class FieldTraining(Model[FieldScene]):
         times = tuple(sorted(set(training_times(run.capture)))) if model.time else ()
         if model.time and len(times) < 2:
             raise DyngsError(
-                f"{root}: model.time=true, but the images have no times, or only one: leave it out, or give "
-                "data.times=order if their names are in the order of time"
+                f"{root}: model.time=true needs images at several times; remove it, or set "
+                "data.times=order if the file names are in temporal order"
             )
         behind = evaluation_background(run.config.data.background, run.capture.has_alpha)[1]
         self._scene = FieldScene(field, times, DrawOptions(near=NEAR * space.half), behind)
@@ -96,17 +96,17 @@ class FieldTraining(Model[FieldScene]):
         return list(self._scene.field.parameters.values())
 
     def error(self, one: Tensor, other: Tensor) -> Tensor:
-        """Return the errors between rendered and true colours, whose mean is minimised."""
+        """Return the errors of rendered colours; their mean is minimised."""
         return (one - other).square()
 
     @property
     @abstractmethod
     def num_rays(self) -> int:
-        """Rays of the next image."""
+        """Rays per image in the next step."""
 
     @abstractmethod
-    def rate(self, step: int) -> float:
-        """Return the learning rate in ``step``."""
+    def learning_rate(self, step: int) -> float:
+        """Return the learning rate at ``step``."""
 
     def draw(
         self, image: Image, step: int, background: Tensor, *, depth: bool = False
@@ -115,17 +115,19 @@ class FieldTraining(Model[FieldScene]):
         device = background.device
         field = self._scene.field
         camera = image.cameras.to(device=device)
-        count = camera.width * camera.height
-        pixels = torch.randint(count, (self.num_rays,), generator=generator, device="cpu")
+        record_samples = camera.width * camera.height
+        pixels = torch.randint(record_samples, (self.num_rays,), generator=generator, device="cpu")
         shifts = torch.rand(
             (len(pixels), field.num_random_values), generator=generator, device="cpu"
         )
         pixels = copy_async(pixels, device)
         rays, z = camera_rays(camera, pixels)
         near = self._scene.options.near
-        seen = field.seen(rays, image.time or 0.0, near=near, shifts=copy_async(shifts, device))
-        self.count(len(rays), seen.num_samples)
-        part = part_of(image, pixels)
+        seen = field.render_rays(
+            rays, image.time or 0.0, near=near, shifts=copy_async(shifts, device)
+        )
+        self.record_samples(len(rays), seen.num_samples)
+        part = select_pixels(image, pixels)
         rgb = seen.colour + seen.transmittance[:, None] * background
         penalties: dict[str, Tensor] = {}
         if seen.coarse is not None:
@@ -138,16 +140,16 @@ class FieldTraining(Model[FieldScene]):
         rendering = Rendering(rgb[None, None], seen.transmittance[None, None], far)
         return RenderOutput(rendering, penalties, image=part)
 
-    def count(self, num_rays: int, num_samples: int) -> None:
-        """Note how many samples the rays of an image needed."""
+    def record_samples(self, num_rays: int, num_samples: int) -> None:
+        """Record the number of samples that the rays of an image needed."""
 
     def update(self, step: int) -> UpdateResult:
-        rate = self.rate(step)
+        learning_rate = self.learning_rate(step)
         updates = []
         for name, x in self._scene.field.parameters.items():
-            # rows of a hash grid that no sample touched stay as they are
+            # rows of the hash grid without samples are not updated
             rows = seen_rows(x.grad) if name == "table" and x.grad is not None else None
-            updates.append(self._adam.update(name, x, rate, rows))
+            updates.append(self._adam.update(name, x, learning_rate, rows))
         return UpdateResult(self._adam.steps_(updates, step=step, betas=self.betas))
 
     def state(self) -> State:
@@ -163,8 +165,8 @@ class FieldTraining(Model[FieldScene]):
         self._adam = self._adam.to(device)
 
 
-def part_of(image: Image, pixels: Tensor) -> Image:
-    """Return ``pixels`` (R,) of an image alone, (1, R), with the camera of the whole."""
+def select_pixels(image: Image, pixels: Tensor) -> Image:
+    """Return the ``pixels`` (R,) of an image as a (1, R) image with the same camera."""
 
     def taken(x: Tensor | None) -> Tensor | None:
         return None if x is None else x.flatten(0, 1)[pixels][None]

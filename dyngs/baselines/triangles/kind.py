@@ -1,4 +1,4 @@
-"""The kind ``bg_triangle``: curved triangles with sharp edges."""
+"""Model kind ``bg_triangle``: curved triangles with sharp edges."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ class BgTriangleModel(ModelSection):
 
     kind: Literal["bg_triangle"] = Field(
         default="bg_triangle",
-        description="curved triangles with sharp edges (BG-Triangle; docs/family.md)",
+        description="curved triangles with sharp edges (BG-Triangle)",
     )
     max_triangles: int = Field(
-        default=4000, ge=4, le=1_000_000, description="most triangles that a run ends with"
+        default=4000, ge=4, le=1_000_000, description="maximum number of triangles"
     )
     gaussian_steps: int = Field(
         default=800,
         ge=0,
         le=100_000,
-        description="steps of Gaussians whose surface triangles begin on; 0: they begin at the first points",
+        description="steps of Gaussian training whose surface initialises the triangles; 0: start at points",
     )
     sh_degree: int = Field(
         default=2,
         ge=0,
         le=4,
-        description="degree of the harmonics that a triangle's colours share; 0: none",
+        description="degree of the spherical harmonics of a triangle; 0: none",
     )
     texture: int = Field(
         default=3,
         ge=1,
         le=16,
-        description="segments of an edge of a triangle's texture, which is linear between them",
+        description="segments per edge of a triangle's texture, with linear interpolation",
     )
     supersampling: int = Field(
-        default=2, ge=1, le=4, description="pixels are drawn as the mean of its square"
+        default=2, ge=1, le=4, description="pixels are the mean of this number squared of samples"
     )
 
 
 class BgTriangleKind(ModelKind):
-    """See the module."""
+    """BG-Triangle."""
 
     uses = ModelKind.uses | {
         "init",

@@ -1,7 +1,7 @@
-"""Quadratic Bezier triangles: their surface and colours, how they are drawn, and as a mesh.
+"""Quadratic Bezier triangles: surface, colours, rendering and mesh export.
 
-They are drawn by a z-buffer whose edges are blended where they are. P triangles; K colours of each:
-at its six control points while ``texture`` is 0, else at the points of a lattice.
+Rendered by a z-buffer with blended edges. P triangles with K colours each: at the six control
+points while ``texture`` is 0, else at the points of a lattice.
 """
 
 from __future__ import annotations
@@ -51,20 +51,20 @@ from dyngs.ops.patches import (
 )
 
 CORNERS = (0, 3, 5)  # control points 200, 020, 002
-_EDGES = ((0, 3), (0, 5), (3, 5))  # corners that the points 110, 101, 011 lie between
+_EDGES = ((0, 3), (0, 5), (3, 5))  # corners around the control points 110, 101, 011
 _BETWEEN = (1, 2, 4)
-MOST_TEXTURE, MOST_DEGREE = 16, 4
+MAX_TEXTURE, MAX_DEGREE = 16, 4
 
 
 @dataclass(frozen=True)
 class Patches:
-    """P triangles."""
+    """P curved triangles."""
 
     points: Tensor  # (P, 6, 3) control points, world
-    colours: Tensor  # (P, K, 3) seen from the middle of all directions
-    # (P, T - 1, 3) of the direction from the camera, added to them; without the constant
+    colours: Tensor  # (P, K, 3) colours without harmonics
+    # (P, T - 1, 3) SH coefficients by view direction, without the constant term.
     harmonics: Tensor
-    texture: int = 0  # segments of the lattice of colours; 0: those of the control points
+    texture: int = 0  # segments of the colour lattice; 0: colours at the control points
 
     def __len__(self) -> int:
         return len(self.points)
@@ -75,20 +75,21 @@ class Patches:
 
     @property
     def num_values(self) -> int:
-        """Number of values that are learned."""
+        """Number of trained values."""
         return sum(x.numel() for x in self.tensors.values())
 
     @property
     def tensors(self) -> Mapping[str, Tensor]:
-        """All that is learned, by name; a row of each is a triangle."""
+        """Trained tensors by name; row i belongs to triangle i."""
         return {"points": self.points, "colours": self.colours, "harmonics": self.harmonics}
 
     def colours_at(self, ids: Tensor, uv: Tensor) -> Tensor:
-        """Return (N, 3) colours without harmonics of places (N, 2) on triangles (N,) int32."""
+        """Return colours (N, 3) without harmonics at ``uv`` (N, 2) on triangles ``ids`` (N,)
+        int32."""
         return patch_values(self.colours, ids, uv, self.texture)
 
     def with_texture(self, segments: int) -> Patches:
-        """Return them with the colours at the points of a lattice."""
+        """Resample the colours to a lattice of ``segments``."""
         places, _ = lattice(segments)
         return replace(
             self, colours=evaluate_patches(self.colours.detach(), places), texture=segments
@@ -101,26 +102,24 @@ class Patches:
 
     @staticmethod
     def from_state(stored: Mapping[str, Tensor]) -> Patches:
-        """Return the triangles in a state. Raises KeyError or ValueError where its tensors do not
-        fit."""
-        texture = int(require_indices("texture", stored["texture"], (1,), MOST_TEXTURE + 1))
+        """Return the triangles in a state. Raises KeyError or ValueError for inconsistent tensors."""
+        texture = int(require_indices("texture", stored["texture"], (1,), MAX_TEXTURE + 1))
         points = require_tensor("points", stored["points"], (None, NUM_POINTS, 3))
         count = len(points)
         size = lattice_size(texture) if texture else NUM_POINTS
         colours = require_tensor("colours", stored["colours"], (count, size, 3))
         harmonics = require_tensor("harmonics", stored["harmonics"], (count, None, 3))
         if count == 0 or harmonics.shape[1] + 1 not in {
-            num_sh_terms(n) for n in range(MOST_DEGREE + 1)
+            num_sh_terms(n) for n in range(MAX_DEGREE + 1)
         }:
             raise ValueError(
-                f"'points' and 'harmonics' are no triangles: {count}, {harmonics.shape[1]} terms"
+                f"invalid 'points' or 'harmonics': {count} triangles, {harmonics.shape[1]} terms"
             )
         return Patches(points.clone(), colours.clone(), harmonics.clone(), texture)
 
 
 def evaluate_patches(values: Tensor, places: Tensor) -> Tensor:
-    """Return (P, N, C): quadratic ``values`` (P, 6, C) of every triangle at the same ``places`` (N,
-    2)."""
+    """Evaluate quadratic ``values`` (P, 6, C) of every triangle at ``places`` (N, 2); (P, N, C)."""
     count = len(values)
     ids = torch.arange(count, dtype=torch.int32, device="cpu").repeat_interleave(len(places))
     uv = places.to(values.dtype).repeat(count, 1)
@@ -128,8 +127,8 @@ def evaluate_patches(values: Tensor, places: Tensor) -> Tensor:
 
 
 def subdivide(values: Tensor) -> Tensor:
-    """Return (4 P, 6, C): quadratic ``values`` (P, 6, C) on the parts that middles of edges cut a
-    triangle into."""
+    """Split each triangle at its edge middles; return the values (4 P, 6, C) of quadratic
+    ``values``."""
     places, faces = lattice(2)
     corners = places[faces]  # (4, 3, 2)
     middles = torch.stack(
@@ -146,26 +145,26 @@ def subdivide(values: Tensor) -> Tensor:
 
 
 def flat_triangles(corners: Tensor) -> Tensor:
-    """Return (P, 6, C) control points of flat triangles with ``corners`` (P, 3, C)."""
+    """Return control points (P, 6, C) of flat triangles with ``corners`` (P, 3, C)."""
     a, b, c = corners.unbind(1)
     return torch.stack([a, (a + b) / 2, (a + c) / 2, b, (b + c) / 2, c], 1)
 
 
-_ABOVE = 2.0  # Added to harmonics so that the kernel's clamp at 0 does not cut them
-NEAR = 0.05  # Near plane, in half sides of the scene
+_CLAMP_OFFSET = 2.0  # offset that keeps harmonics above the clamp at 0
+NEAR = 0.05  # near plane, in half sides of the scene
 
 
 @dataclass(frozen=True)
 class TriangleOptions(DrawOptions):
-    """How triangles are drawn."""
+    """Render options of triangles."""
 
-    segments: int = SEGMENTS  # of an edge: a triangle is drawn as their square
-    supersampling: int = 1  # a pixel is the mean of its square
+    segments: int = SEGMENTS  # per edge: a triangle is rendered as ``segments``^2 flat faces
+    supersampling: int = 1  # a pixel is the mean of this squared number of samples
 
 
 @dataclass(frozen=True)
 class TriangleScene(Renderable):
-    """Triangles; ``unit``: half the side of their scene, world units."""
+    """Scene of triangles; ``unit``: half side of the scene, world units."""
 
     patches: Patches
     unit: float
@@ -178,11 +177,10 @@ class TriangleScene(Renderable):
 
     @torch.no_grad()
     def own_surface(self, time: float, options: SurfaceOptions) -> Surface:
-        """Return the surface: of each triangle ``segments``^2 flat ones, with the colours without
-        harmonics.
+        """Return each triangle as ``segments``^2 flat faces, with colours without harmonics.
 
-        Triangles do not share vertices, as they do not in the scene. Without ``segments`` they are
-        as many as the scene is drawn with, or as its textures need.
+        Triangles do not share vertices. Default ``segments``: as rendered, or as the textures
+        need.
         """
         patches = self.patches
         count = options.segments or max(SEGMENTS, patches.texture)
@@ -246,12 +244,14 @@ class TriangleScene(Renderable):
         behind = self.background if background is None else background
         cameras = fixed_cameras(cameras, behind, self.patches.points)
         views = single_views(cameras, behind)
-        return concatenate_renderings([self.drawn(x, options, colour)[0] for x, colour in views])
+        return concatenate_renderings(
+            [self.render_view(x, options, colour)[0] for x, colour in views]
+        )
 
-    def drawn(
+    def render_view(
         self, camera: Cameras, options: TriangleOptions, background: Tensor | None = None
     ) -> tuple[Rendering, PatchSamples]:
-        """Return the image of one camera, differentiable, and what each drawn pixel shows."""
+        """Render one camera, differentiable; also return the samples of its pixels."""
         times = options.supersampling
         patches = self.patches
         camera = camera.to(device=self.device)
@@ -264,7 +264,7 @@ class TriangleScene(Renderable):
         )
         colours = patches.colours_at(places.ids, places.uv)
         if patches.harmonics.shape[1]:
-            colours = colours + self._by_direction(camera)[places.ids.long()]
+            colours = colours + self._view_dependent_colours(camera)[places.ids.long()]
         channels = colours.clamp_min(0)
         if options.depth != "none":
             channels = torch.cat([channels, at.depths[:, None]], 1)
@@ -276,27 +276,25 @@ class TriangleScene(Renderable):
         depth = image[..., 3] if options.depth != "none" else None
         return composite_background(image[..., :3], through, depth, options, background), places
 
-    def _by_direction(self, camera: Cameras) -> Tensor:
-        """Return (P, 3): what harmonics add to the colours of each triangle, seen from
-        ``camera``."""
+    def _view_dependent_colours(self, camera: Cameras) -> Tensor:
+        """Return the colours (P, 3) that harmonics add for ``camera``."""
         patches = self.patches
         middles = patches.points.detach()[:, CORNERS].mean(1)
-        constant = patches.harmonics.new_full((len(patches), 1, 3), _ABOVE / SH_C0)
+        constant = patches.harmonics.new_full((len(patches), 1, 3), _CLAMP_OFFSET / SH_C0)
         everywhere = torch.ones((1, len(patches), 2), dtype=torch.int32, device="cpu")
         sh = torch.cat([constant, patches.harmonics], 1)
         return evaluate_harmonics(middles, camera.centers, sh, everywhere, patches.sh_degree)[0] - (
-            _ABOVE + 0.5
+            _CLAMP_OFFSET + 0.5
         )
 
 
 def scene_options(model: BgTriangleModel, unit: float) -> TriangleOptions:
-    """Return how triangles of a scene of half side ``unit`` are drawn."""
+    """Return the render options of triangles in a scene of half side ``unit``."""
     return TriangleOptions(near=NEAR * unit, supersampling=model.supersampling)
 
 
 def restore_scene(model: BgTriangleModel, checkpoint: Checkpoint) -> TriangleScene:
-    """Return the scene of a checkpoint. Raises KeyError or ValueError where its tensors do not
-    fit."""
+    """Return the scene in a checkpoint. Raises KeyError or ValueError for inconsistent tensors."""
     stored = checkpoint.part("triangles")
     unit = require_tensor("unit", stored["unit"], (1,), torch.float64)
     half = float(require_positive("unit", unit))

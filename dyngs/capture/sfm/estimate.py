@@ -24,8 +24,8 @@ from dyngs.capture.sfm.colmap import (
     match_listed,
     quiet_colmap,
 )
-from dyngs.capture.sfm.frame_choice import STILL, chosen_frames, measured
-from dyngs.capture.sfm.photos import Photo, copied, gather_photos, prepare_colmap_images
+from dyngs.capture.sfm.frame_choice import MIN_CAMERA_MOTION, choose_frames, measure_frames
+from dyngs.capture.sfm.photos import Photo, copy_file, gather_photos, prepare_colmap_images
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count
 from dyngs.data.images.images import read_header
@@ -36,9 +36,9 @@ from dyngs.data.images.video import (
     read_frames,
     read_numbered_frames,
 )
-from dyngs.data.readers.transforms import find_masks, mask_of
+from dyngs.data.readers.transforms import find_mask, find_masks
 from dyngs.data.times import write_seconds
-from dyngs.io.containment import inside, restrict_paths_to
+from dyngs.io.containment import check_inside, restrict_paths_to
 from dyngs.io.fields import first_few
 from dyngs.io.outputs import atomic_folder
 from dyngs.io.write import write_image
@@ -54,7 +54,7 @@ _WELL = 30  # matches of a pair that is looked at
 _MOST_FITTED_PAIRS = 2000
 
 
-def agreement(model: pycolmap.Reconstruction, database: Path, longest_side: int) -> float:
+def pose_agreement(model: pycolmap.Reconstruction, database: Path, longest_side: int) -> float:
     """Return the fraction of well matched pairs, of images with a pose, whose verified matches fit
     the poses."""
     import pycolmap
@@ -90,7 +90,7 @@ def agreement(model: pycolmap.Reconstruction, database: Path, longest_side: int)
     return float(np.mean(fits)) if fits else 1.0
 
 
-def angles_deg(model: pycolmap.Reconstruction) -> np.ndarray:
+def triangulation_angles_deg(model: pycolmap.Reconstruction) -> np.ndarray:
     """Return the largest angle under which each of some 2,000 points is seen from two images, in
     degrees."""
     centres = {i: image.projection_center() for i, image in model.images.items() if image.has_pose}
@@ -104,7 +104,7 @@ def angles_deg(model: pycolmap.Reconstruction) -> np.ndarray:
     return np.array(angles)
 
 
-def flat_fraction(database: Path) -> float:
+def homography_fraction(database: Path) -> float:
     """Return the fraction of well matched pairs that a homography explains: all of them where the
     camera only rotated."""
     import pycolmap
@@ -156,11 +156,11 @@ class SfmResult:
     def summary(self) -> str:
         """The result as lines of text."""
         lines = [
-            f"{self.num_registered} of {self.num_images} images registered, {self.num_points} points, "
-            f"mean error {self.mean_error_px:.2f} px: {self.root}"
+            f"{self.num_registered} of {self.num_images} images registered, {self.num_points} "
+            f"points, mean error {self.mean_error_px:.2f} px: {self.root}"
         ]
         if self.unregistered:
-            lines.append("no pose for " + first_few(self.unregistered))
+            lines.append("not registered: " + first_few(self.unregistered))
         return "\n".join((*lines, *self.notes))
 
 
@@ -203,23 +203,25 @@ def _posed_in(
         photos, notes = gather_photos(source, capture / "images", out)
     if len(photos) < 3:
         found = "; ".join((f"{source} has {format_count(len(photos), 'image')}", *notes))
-        raise DyngsError(f"{found}; structure from motion needs at least 3, better 30")
+        raise DyngsError(f"{found}; structure from motion needs at least 3, ideally 30")
     with quiet_colmap():
         masks = options.masks
         with nullcontext() if masks is None else restrict_paths_to(masks, options.follow_links):
             task = _laid_out(capture, photos, source.is_file(), options, report)
         find_features(task)
         match_pairs(task, pairs_to_match(task))
-        if flat_fraction(task.database) > _FLAT:
+        if homography_fraction(task.database) > _FLAT:
             raise DyngsError(
-                "the images differ only as if the camera rotated on the spot (or all show one flat surface), which "
-                "gives no depth; walk sideways around the scene by about a quarter of its distance, and keep it in view"
+                "the camera only rotated, or all images show one flat surface, which gives no "
+                "depth; walk sideways around the scene by about a quarter of its distance, and "
+                "keep it in view"
             )
-        model = mapped(task)
+        model = run_mapping(task)
     if model is None:
         raise DyngsError(
-            f"no poses could be found for {len(task.names)} images: take sharper ones that overlap by two thirds, move "
-            "the camera sideways, do not only rotate it, avoid bare or moving surfaces, or try matching=exhaustive"
+            f"could not estimate poses for {len(task.names)} images: take sharper images that "
+            "overlap by two thirds, move the camera sideways, avoid textureless or moving "
+            "surfaces, or try matching=exhaustive"
         )
     _require_depth(model, task)
     own = dict(zip(task.names, (photo.name for photo in photos), strict=True))
@@ -245,15 +247,16 @@ def _laid_out(
     work.mkdir()
     found = {} if options.masks is None else find_masks(options.masks)
     masks = {
-        photo.name: mask for photo in photos if (mask := mask_of(photo.source, found)) is not None
+        photo.name: mask for photo in photos if (mask := find_mask(photo.source, found)) is not None
     }
     if options.masks is not None and not masks:
         raise DyngsError(
-            f"{options.masks}: no mask is named as an image is (a.jpg.png, a.jpg or a.png for a.jpg)"
+            f"{options.masks}: no mask is named after an image (a.jpg.png, a.jpg or a.png for "
+            "a.jpg)"
         )
     names = prepare_colmap_images(photos, folder, work / "images", masks)
     for name, mask in masks.items():
-        copied(inside(mask).resolve(), folder.with_name("masks") / (name + mask.suffix))
+        copy_file(check_inside(mask).resolve(), folder.with_name("masks") / (name + mask.suffix))
     used = work / "masks" if masks else None
     return SfmTask(
         work / "database.db", work / "images", names, photos, options, report, is_video, used
@@ -268,17 +271,18 @@ def _require_depth(model: SfmModel, task: SfmTask) -> None:
     """Check that points are seen from directions that differ, by a lens that there can be."""
     if not model.has_real_lens:
         raise DyngsError(
-            "no lens that there can be fits the matches: most of them are probably on something that moves, as a "
-            "person who fills much of the images; give masks of it (--masks), or film what stands"
+            "no plausible lens fits the matches: most of them are probably on a moving object, "
+            "such as a person who fills the image; give masks of it (--masks), or film a static "
+            "scene"
         )
-    angles = angles_deg(model.reconstruction)
+    angles = triangulation_angles_deg(model.reconstruction)
     angle = float(np.median(angles)) if len(angles) else 0.0
     if angle >= _SMALL_ANGLE_DEG:
         return
     raise DyngsError(
-        f"the camera hardly moved: half of the points are seen from directions less than {max(angle, 0.1):.1f} degrees "
-        f"apart, which gives no depth; {_film(task)} while walking sideways by about a quarter of the distance to the "
-        "scene"
+        f"the camera hardly moved: the median triangulation angle is {max(angle, 0.1):.1f} "
+        f"degrees, which gives no depth; {_film(task)} while walking sideways by about a quarter "
+        "of the distance to the scene"
     )
 
 
@@ -300,12 +304,12 @@ def _advice(unregistered: Sequence[str], blurred: Sequence[str], is_video: bool)
     if unregistered:
         more = "move slower there" if is_video else "take more photos around them"
         yield (
-            f"{len(unregistered)} images without a pose: {more}, unless things that move fill them, or the camera only "
-            "rotated there"
+            f"{len(unregistered)} images could not be registered: {more}, unless they show "
+            "mostly moving objects or the camera only rotated there"
         )
     if blurred:
-        more = "more light or a slower hand" if is_video else "take them again"
-        yield f"{len(blurred)} images are much less sharp than the others ({first_few(blurred)}): {more}"
+        more = "use more light or move slower" if is_video else "take them again"
+        yield f"{len(blurred)} images are blurred ({first_few(blurred)}): {more}"
 
 
 def _frames_of(
@@ -315,13 +319,13 @@ def _frames_of(
 
     Two passes, so that only one image is held in memory: the first one measures.
     """
-    measures = measured(read_frames(video))
-    numbers, blurred = chosen_frames(measures, options.num_frames or _NUM_FRAMES)
+    measures = measure_frames(read_frames(video))
+    numbers, blurred = choose_frames(measures, options.num_frames or _NUM_FRAMES)
     reach = measures.away.max(initial=0.0)
-    if len(measures) >= 3 and reach < STILL:
+    if len(measures) >= 3 and reach < MIN_CAMERA_MOTION:
         raise DyngsError(
-            f"{video}: the camera stands still (the image moves by {reach:.2%} of its width), which "
-            "gives no depth; film while walking sideways around the scene"
+            f"{video}: the camera does not move (the image shifts by {reach:.2%} of its width), "
+            "which gives no depth; film while walking sideways around the scene"
         )
     names = {index: f"frame_{index:05d}.png" for index in numbers}
     photos = []
@@ -334,7 +338,7 @@ def _frames_of(
     write_seconds(capture, {name: seconds[index] for index, name in names.items()})
     notes = [
         *colour_messages([probe_video(video)]),
-        f"{len(numbers)} of {len(measures)} frames taken, by motion and sharpness",
+        f"{len(numbers)} of {len(measures)} frames selected by motion and sharpness",
     ]
     return photos, notes, [names[index] for index in blurred]
 
@@ -531,7 +535,7 @@ class SfmModel:
         return float(self.reconstruction.compute_mean_reprojection_error())
 
 
-def mapped(task: SfmTask) -> SfmModel | None:
+def run_mapping(task: SfmTask) -> SfmModel | None:
     """Return the model with most images; None where none could be found.
 
     Global mapping for a video and incremental mapping for photos, where it is as fast and
@@ -546,7 +550,7 @@ def mapped(task: SfmTask) -> SfmModel | None:
     return (
         first
         if first is not None and not _needs_more(first, task)
-        else better(first, _found(task, order[1]))
+        else choose_better_model(first, _found(task, order[1]))
     )
 
 
@@ -561,7 +565,7 @@ def _needs_more(model: SfmModel, task: SfmTask) -> bool:
     return bad or model.error_px > GOOD_ERROR_PX * max(task.side, 1000) / 1000
 
 
-def better(first: SfmModel | None, second: SfmModel | None) -> SfmModel | None:
+def choose_better_model(first: SfmModel | None, second: SfmModel | None) -> SfmModel | None:
     """Return the model with more images whose pairs agree, then the clearly smaller error, else the
     first.
 
@@ -597,7 +601,7 @@ def _found(task: SfmTask, mapper: Mapper) -> SfmModel | None:
     if best is None or best.num_reg_images() < 2:
         return None
     task.report("poses, images", best.num_reg_images(), len(task.names))
-    return SfmModel(best, agreement(best, task.database, task.side))
+    return SfmModel(best, pose_agreement(best, task.database, task.side))
 
 
 def _most_images(models: Iterable[pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from dyngs.data.times import evenly_spaced
 
-STILL = 0.003
+MIN_CAMERA_MOTION = 0.003
 """Largest motion since the first frame, as a fraction of the image's width, below which the camera
 stands still."""
 _WIDTH = 96
@@ -42,14 +42,14 @@ class FrameMeasures:
         return len(self.sharpness)
 
 
-def measured(frames: Iterable[np.ndarray]) -> FrameMeasures:
+def measure_frames(frames: Iterable[np.ndarray]) -> FrameMeasures:
     """Measure all frames, (H, W, 3) uint8; three small images are held in memory."""
     sharpness = []
     motions = []
     away = []
     first = before = None
     for rgb in frames:
-        small = shrunk(rgb)
+        small = small_brightness(rgb)
         first = small if first is None else first
         sharpness.append(sharpness_of(rgb))
         motions.append((0.0, 0.0) if before is None else motion_between(before, small))
@@ -59,7 +59,7 @@ def measured(frames: Iterable[np.ndarray]) -> FrameMeasures:
     return FrameMeasures(np.array(sharpness), motion, most, np.array(away))
 
 
-def chosen_frames(measures: FrameMeasures, wanted: int) -> tuple[list[int], list[int]]:
+def choose_frames(measures: FrameMeasures, wanted: int) -> tuple[list[int], list[int]]:
     """Return the numbers of at most ``wanted`` frames, ascending, the sharpest in each of as many
     windows of equal motion, and those of them that are much less sharp than the others.
 
@@ -101,7 +101,7 @@ def sharpness_of(rgb: np.ndarray) -> float:
     return float(laplacian.var()) if laplacian.size else 0.0
 
 
-def shrunk(rgb: np.ndarray) -> np.ndarray:
+def small_brightness(rgb: np.ndarray) -> np.ndarray:
     """Return the brightness (h, w) float32 with about ``_WIDTH`` columns: means of whole blocks of
     pixels."""
     grey = rgb[..., 1]
@@ -139,7 +139,7 @@ def motion_between(before: np.ndarray, after: np.ndarray) -> tuple[float, float]
     return float(np.median(found)) / before.shape[1], max(found) / before.shape[1]
 
 
-STANDS = 0.002
+FIXED_CAMERA_LIMIT = 0.002
 """A camera is fixed if its image is never displaced by more than this fraction of its longer
 side."""
 SAMPLES = 16  # images that are compared with the median one

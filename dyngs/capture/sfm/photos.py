@@ -32,7 +32,7 @@ from dyngs.data.images.video import (
     ColourTags,
     to_srgb,
 )
-from dyngs.io.containment import check_size, inside
+from dyngs.io.containment import check_inside, check_size
 from dyngs.io.outputs import PHOTO_SUFFIXES
 from dyngs.io.write import atomic_file, write_image
 
@@ -58,7 +58,7 @@ def list_photos(folder: Path) -> list[Path]:
     return [path for path in _files_below(folder) if path.suffix.lower() in PHOTO_SUFFIXES]
 
 
-def digest_of(source: Path, files: Sequence[Path] | None = None) -> str:
+def digest_files(source: Path, files: Sequence[Path] | None = None) -> str:
     """Return 16 hexadecimal digits of names, sizes and times of change of files, and of the
     beginnings of videos.
 
@@ -94,8 +94,8 @@ def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], l
     heif = [file for file in taken if _is_heif(file)]
     if heif and find_spec("pillow_heif") is None:
         raise DyngsError(
-            f"{source}: {len(heif)} photos are HEIC, first {heif[0].name}, which needs the package pillow-heif: "
-            "pip install 'dyngs[heic]', or convert them to JPEG"
+            f"{source}: {len(heif)} HEIC photos, first {heif[0].name}, need the package "
+            "pillow-heif: pip install 'dyngs[heic]', or convert them to JPEG"
         )
     headers = {photo: _checked(photo) for photo in taken}
     names = _stored_names(
@@ -115,11 +115,11 @@ def gather_photos(source: Path, images: Path, out: Path) -> tuple[list[Photo], l
     left_out = len(files) - len(taken)
     if left_out:
         known = ", ".join(sorted(PHOTO_SUFFIXES))
-        notes.append(f"{format_count(left_out, 'file')} left out, no photos (photos are {known})")
+        notes.append(f"{format_count(left_out, 'file')} skipped, not photos ({known})")
     return photos, notes
 
 
-def copied(source: Path, target: Path) -> None:
+def copy_file(source: Path, target: Path) -> None:
     """Make ``target`` a copy of a file, atomically."""
     with atomic_file(target) as temporary:
         shutil.copyfile(source, temporary)
@@ -138,7 +138,10 @@ def prepare_colmap_images(
     images.mkdir(exist_ok=True)
     for index, photo in enumerate(photos):
         stored = stored_in / photo.name
-        lies = is_rotated_sideways(photo.header.orientation) and photo.header.upright_size != photo.header.size
+        lies = (
+            is_rotated_sideways(photo.header.orientation)
+            and photo.header.upright_size != photo.header.size
+        )
         is_written = lies or photo.header.format_name not in _FOR_COLMAP
         name = f"{index:06d}" + (".png" if is_written else _FOR_COLMAP[photo.header.format_name])
         names.append(name)
@@ -154,7 +157,7 @@ def prepare_colmap_images(
             target = images.with_name("masks") / f"{name}.png"
             write_image(
                 target,
-                np.where(read_mask(inside(mask)).numpy(), 255, 0).astype(np.uint8)[..., None],
+                np.where(read_mask(check_inside(mask)).numpy(), 255, 0).astype(np.uint8)[..., None],
             )
     return names
 
@@ -179,7 +182,7 @@ def _checked(photo: Path) -> ImageHeader | None:
 
 def _is_heif(photo: Path) -> bool:
     """Whether the content of a photo is HEIC; JPEG may be named ``.heic``."""
-    with wrap_read_errors(photo), inside(photo).open("rb") as file:
+    with wrap_read_errors(photo), check_inside(photo).open("rb") as file:
         begin = file.read(8)
     is_jpeg = begin.startswith(b"\xff\xd8")
     return begin[4:] == b"ftyp" or (photo.suffix.lower() in HEIF_SUFFIXES and not is_jpeg)
@@ -213,7 +216,7 @@ def _store(photo: Path, target: Path, header: ImageHeader | None) -> str:
     if header is None:
         return _convert_heif(photo, target)
     if not _is_converted(photo, header):
-        copied(photo.resolve(), target)
+        copy_file(photo.resolve(), target)
     else:
         pixels = read_image(photo, upright=True).numpy()
         is_opaque = pixels.shape[2] == 4 and bool((pixels[..., 3] == 255).all())

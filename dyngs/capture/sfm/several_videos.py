@@ -29,22 +29,22 @@ from dyngs.capture.sfm.colmap import (
     matching_options,
     quiet_colmap,
 )
-from dyngs.capture.sfm.frame_choice import STANDS, camera_displacement, shrunk
+from dyngs.capture.sfm.frame_choice import FIXED_CAMERA_LIMIT, camera_displacement, small_brightness
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.images.video import (
     VideoInfo,
     colour_messages,
     frame_seconds,
+    list_videos,
     open_video_container,
     probe_video,
     read_numbered_frames,
-    list_videos,
 )
 from dyngs.data.readers.camera_folders import MIN_CAMERAS_TO_HOLD_OUT
 from dyngs.data.readers.colmap import TEST_LIST
 from dyngs.data.times import evenly_spaced, write_seconds
-from dyngs.io.containment import inside, restrict_paths_to
+from dyngs.io.containment import check_inside, restrict_paths_to
 from dyngs.io.fields import first_few, is_number, read_json_object
 from dyngs.io.outputs import atomic_folder
 from dyngs.io.write import write_image, write_text
@@ -104,11 +104,12 @@ def poses_of_videos(
         out: a folder that does not exist, or is empty.
     """
     with atomic_folder(out) as work, restrict_paths_to(source, options.follow_links):
-        videos = [open_video(inside(path)) for path in list_videos(source)]
+        videos = [open_video(check_inside(path)) for path in list_videos(source)]
         names = [video.name for video in videos]
         if len(videos) < 2:
             raise DyngsError(
-                f"{source}: holds {len(videos)} videos, two or more are needed; give one video as the file itself"
+                f"{source}: holds {len(videos)} videos, but two or more are needed; give a "
+                "single video as the file itself"
             )
         starts, test = read_video_settings(source, names)
         lines = colour_messages(video.info for video in videos)
@@ -117,7 +118,7 @@ def poses_of_videos(
         if starts is None:
             starts, line = estimate_starts_by_sound(videos)
         else:
-            line = f"offsets between the cameras as given: {_described(starts)}"
+            line = f"camera offsets as given: {_described(starts)}"
         lines.append(line)
         model, line = _posed(work, images, options, report)
         lines.append(line)
@@ -161,7 +162,7 @@ def read_video_settings(
     fields: dict[str, Any] = read_json_object(path) if path.is_file() else {}
     starts = fields.get("starts")
     test = fields.get("test")
-    wrong = f"it may hold 'starts', and 'test', a list of some of the cameras {first_few(names)}"
+    wrong = f"it may contain 'starts' and 'test', a list of some of the cameras {first_few(names)}"
     with wrap_read_errors(path, wrong):
         if fields.keys() - {"starts", "test"} or not set(test or ()) < set(names):
             raise ValueError("an unknown key or camera, or no camera left to train on")
@@ -172,7 +173,8 @@ def read_video_settings(
     fits = isinstance(starts, dict) and starts.keys() == set(names)
     if not fits or not all(is_number(x) and abs(x) <= MAX_START for x in starts.values()):
         raise DyngsError(
-            f"{path}: give the second at which each video begins, for {first_few(names)}, got {starts!r:.80}"
+            f"{path}: give the start of each video in seconds, for {first_few(names)}, got "
+            f"{starts!r:.80}"
         )
     return {name: float(second) for name, second in starts.items()}, test
 
@@ -210,7 +212,7 @@ def estimate_starts_by_sound(videos: Sequence[CameraVideo]) -> tuple[dict[str, f
     """
     sounds: list[np.ndarray] = []
     for video in videos:
-        sound = onsets(video.path)
+        sound = loudness_onsets(video.path)
         if sound is None:
             raise _unknown(videos, f"{video.name} has no sound")
         sounds.append(sound)
@@ -231,21 +233,22 @@ def estimate_starts_by_sound(videos: Sequence[CameraVideo]) -> tuple[dict[str, f
     if count == 2:
         confirmed = deviations[0, 1] >= CERTAIN_DEVIATIONS
     if agree[middle].sum() < count - 1 or not confirmed:
-        raise _unknown(videos, f"the sound agrees for {agreeing} of {total} pairs only")
+        raise _unknown(videos, f"the sound of only {agreeing} of {total} pairs agrees")
     rate = min(max(video.rate for video in videos), MAX_RATE)
     frames = (shifts - shifts.min()) / SOUND_RATE * rate
     if np.abs(frames - np.round(frames)).max() <= WHOLE:
         frames = np.round(frames)
     starts = dict(zip([video.name for video in videos], (frames / rate).tolist(), strict=True))
     sure = f"{agreeing} of {total} pairs agree"
-    return starts, f"offsets between the cameras by the sound ({sure}): {_described(starts)}"
+    return starts, f"camera offsets estimated from sound ({sure}): {_described(starts)}"
 
 
 def _unknown(videos: Sequence[CameraVideo], reason: str) -> DyngsError:
     return DyngsError(
-        f"the offsets between the videos are not known: {reason}; give the second at which each video begins in "
-        f'{VIDEOS_FILE} beside them, {{"starts": {{"{videos[0].name}": 0, "{videos[1].name}": 0.5, ..}}}}, or '
-        '{"starts": 0} if all began at once'
+        f"the offsets between the videos are unknown: {reason}; give the start of each video in "
+        "seconds in "
+        f'{VIDEOS_FILE} next to them, {{"starts": {{"{videos[0].name}": 0, "{videos[1].name}": '
+        f'0.5, ..}}}}, or {{"starts": 0}} if all start at the same time'
     )
 
 
@@ -283,7 +286,7 @@ def estimate_shift(a: np.ndarray, b: np.ndarray) -> tuple[int, float, float]:
     return int(shifts[top]), float(values[top] * is_clear), float(values[top] / deviation)
 
 
-def onsets(path: Path) -> np.ndarray | None:
+def loudness_onsets(path: Path) -> np.ndarray | None:
     """Return (T, B) rises of loudness in B bands, ``SOUND_RATE`` per second from the first image
     on; None without sound.
 
@@ -359,19 +362,26 @@ def _static_images(
         most = max(MEDIAN_BYTES // frame_bytes, 3)
         wanted = evenly_spaced(len(video.seconds), min(MEDIAN_FRAMES, most))
         frames = np.stack([rgb for _, rgb in read_numbered_frames(video.path, wanted)])
-        displaced[video.name] = camera_displacement(np.stack([shrunk(rgb) for rgb in frames]))
+        displaced[video.name] = camera_displacement(
+            np.stack([small_brightness(rgb) for rgb in frames])
+        )
         frames.sort(axis=0)
         images[video.name] = frames[len(frames) // 2]
-        report("what stands, cameras", len(images), len(videos))
-    moving = [f"{name} (by {x:.1%} of its width)" for name, x in displaced.items() if x > STANDS]
+        report("static images, cameras", len(images), len(videos))
+    moving = [
+        f"{name} (by {x:.1%} of its width)"
+        for name, x in displaced.items()
+        if x > FIXED_CAMERA_LIMIT
+    ]
     if moving:
         raise DyngsError(
-            f"{source}: of several videos, cameras must stand still, but these move: {first_few(moving)}; remove them, "
-            "stabilise what only shakes, or train on one moving camera's video alone"
+            f"{source}: cameras of several videos must be fixed, but these move: "
+            f"{first_few(moving)}; remove them, stabilise shaky videos, or train on one moving "
+            "camera's video alone"
         )
     return images, (
-        f"{len(videos)} cameras stand still (images displaced by {max(displaced.values()):.2%} of their width at most, "
-        f"{STANDS:.1%} allowed)"
+        f"{len(videos)} cameras are fixed (image displacement at most "
+        f"{max(displaced.values()):.2%} of the width, {FIXED_CAMERA_LIMIT:.1%} allowed)"
     )
 
 
@@ -388,7 +398,7 @@ def _posed(
     for name, rgb in images.items():
         size = f"{rgb.shape[1]}x{rgb.shape[0]}"  # a folder has one lens where lenses are shared
         write_image(folder / "images" / size / f"{name}.png", rgb)
-    lens = "one lens for all of a size"
+    lens = "one lens per image size"
     with quiet_colmap():
         model = _mapped(folder, True, options.num_threads)
         report("poses of the cameras, attempts", 1, 2)
@@ -399,23 +409,23 @@ def _posed(
         ):
             lone = _mapped(folder, False, options.num_threads)
             if lone is not None and (model is None or _is_better(lone, model)):
-                model, lens = lone, "a lens each"
+                model, lens = lone, "one lens per camera"
         report("poses of the cameras, attempts", 2, 2)
     shutil.rmtree(folder)
     names = set() if model is None else _posed_images(model).keys()
     if model is None or len(names) < 2:
         raise DyngsError(
-            f"no poses could be found for {len(images)} cameras: neighbours must show much of the same, from "
-            "directions that differ by 30 degrees or less, with texture in what stands; add cameras between them, "
-            "or give the poses in cameras.json (docs/formats.md)"
+            f"could not estimate poses for {len(images)} cameras: neighbouring cameras must "
+            "overlap, with at most 30 degrees between them, and see textured static surfaces; "
+            "add cameras between them, or give the poses in cameras.json (docs/formats.md)"
         )
     line = (
-        f"{len(names)} of {len(images)} cameras have a pose, {model.num_points3D():,} points, mean error "
-        f"{model.compute_mean_reprojection_error():.2f} px ({lens})"
+        f"{len(names)} of {len(images)} cameras registered, {model.num_points3D():,} points, "
+        f"mean error {model.compute_mean_reprojection_error():.2f} px ({lens})"
     )
     left = [name for name in images if name not in names]
     if left:
-        line += f"; left out, they do not match the others: {first_few(left)}"
+        line += f"; not registered: {first_few(left)}"
     return model, line
 
 
@@ -538,14 +548,14 @@ def frames_at_steps(
     steps = clocks[slowest][(clocks[slowest] >= first - slack) & (clocks[slowest] <= last + slack)]
     if len(steps) < 2:
         raise DyngsError(
-            f"{where}: the videos share no two time steps: the last one begins at {first:.2f} s of one clock, the "
-            f"first one ends at {last:.2f} s; are all of them of one event?"
+            f"{where}: the videos do not overlap in time: the last one starts at {first:.2f} s, "
+            f"the first one ends at {last:.2f} s; check that all show the same event"
         )
     limit = max(min(MOST_STEPS, MOST_IMAGES // len(clocks)), 2) if most is None else most
     chosen = steps[evenly_spaced(len(steps), limit)]
-    line = f"{len(chosen)} time steps of {chosen[-1] - chosen[0]:.2f} s that all {len(clocks)} cameras show"
+    line = f"{len(chosen)} time steps over {chosen[-1] - chosen[0]:.2f} s seen by all {len(clocks)} cameras"
     if len(chosen) < len(steps):
-        line += f", of {len(steps)} (--frames of `dyngs data sfm` chooses)"
+        line += f", of {len(steps)} (choose with --frames of `dyngs data sfm`)"
     frames: list[dict[int, float]] = []
     for video, clock in zip(videos, clocks, strict=True):
         nearest = np.abs(clock[:, None] - chosen).argmin(axis=0)

@@ -9,20 +9,20 @@ from pathlib import Path
 
 from dyngs.capture.sfm.colmap import SfmOptions
 from dyngs.capture.sfm.estimate import estimate_poses
-from dyngs.capture.sfm.photos import digest_of, list_photos
+from dyngs.capture.sfm.photos import digest_files, list_photos
 from dyngs.capture.sfm.several_videos import VIDEOS_FILE, poses_of_videos
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info, quote_path, wrap_read_errors
 from dyngs.data.images.video import VIDEO_SUFFIXES, list_videos
 from dyngs.data.read import is_capture
-from dyngs.io.outputs import suggest_command, make_once, record_source
+from dyngs.io.outputs import make_once, record_source, suggest_command
 from dyngs.io.write import cache_folder
 
 FEWEST_PHOTOS = 3
 
 
-def with_poses(
+def ensure_poses(
     data: DataConfig,
     *,
     needs_times: bool = False,
@@ -47,33 +47,32 @@ def with_poses(
     videos = list_videos(source) if is_several_videos(source) else []
     if videos and not needs_times:
         raise DyngsError(
-            f"{source}: holds {len(videos)} videos, which a static scene cannot be made of; give `dyngs train dynamic "
-            f"data.root={quote_path(source)}`, or one video of a camera that moves"
+            f"{source}: holds {len(videos)} videos; a static scene needs one video of a moving "
+            f"camera, several need `dyngs train dynamic data.root={quote_path(source)}`"
         )
     if source.is_dir() and not videos and needs_times and data.times == "files":
         raise DyngsError(
-            f"{source}: photos have no times, so nothing can move; give data.times=order if their names are in the "
-            "order of time, a video, or train configs/static.yaml"
+            f"{source}: photos have no times, so a moving scene cannot be trained; set "
+            "data.times=order if their names are in temporal order, give a video, or use `dyngs "
+            "train static`"
         )
     files = (
         [*videos, *(path for path in [source / VIDEOS_FILE] if path.is_file())] if videos else None
     )
     beside = data.root / "masks"
     masks = beside if source != data.root and beside.is_dir() else None
-    digest = digest_of(source, files) + ("" if masks is None else digest_of(masks))
+    digest = digest_files(source, files) + ("" if masks is None else digest_files(masks))
     folder = cache_folder("poses") / f"{re.sub(r'[^A-Za-z0-9-]', '_', source.stem)[:40]}.{digest}"
 
     def estimate() -> None:
-        log(
-            f"{source} has no poses; they are estimated first, as by `dyngs data sfm`, into {folder}"
-        )
+        log(f"{source} has no poses; estimating them (as `dyngs data sfm` does) into {folder}")
         options = SfmOptions(masks=masks, follow_links=data.follow_links)
         if videos:
             log(poses_of_videos(source, folder, options, report))
         else:
             log(estimate_poses(source, folder, options, report).summary())
 
-    make_once(folder, estimate, log, f"{source} has no poses; those of before are in {folder}")
+    make_once(folder, estimate, log, f"{source} has no poses; using the poses cached in {folder}")
     record_source(folder, data.root)
     return data.model_copy(update={"root": folder})
 
@@ -93,13 +92,16 @@ def is_unposed(data: DataConfig) -> bool:
         return True
     videos = list_videos(root)
     if len(videos) == 1:
-        raise DyngsError(f"{root}: holds one video; give that: data.root={quote_path(videos[0])}")
-    photos = [] if videos or suggest_command(root, captures=False) is not None else list_photos(root)
+        raise DyngsError(
+            f"{root}: contains one video; give the video itself: data.root={quote_path(videos[0])}"
+        )
+    photos = (
+        [] if videos or suggest_command(root, captures=False) is not None else list_photos(root)
+    )
     if photos:
         raise DyngsError(
-            f"{root}: holds {format_count(len(photos), 'photo')} and no cameras; a scene needs "
-            f"at least {FEWEST_PHOTOS} "
-            "photos of it from different places, better 50, or a video"
+            f"{root}: holds {format_count(len(photos), 'photo')} but no cameras; a scene needs at "
+            f"least {FEWEST_PHOTOS} photos from different positions, ideally 50, or a video"
         )
     return bool(videos)
 

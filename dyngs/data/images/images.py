@@ -1,4 +1,5 @@
-"""Reading of images: PNG, JPEG, EXR (with its parts and layers), TIFF, HEIC, WebP."""
+"""Image files: PNG, JPEG, EXR (parts and layers), TIFF, HEIC, WebP; EXIF tags and area
+downscaling."""
 
 from __future__ import annotations
 
@@ -16,9 +17,9 @@ from torch import Tensor
 
 from dyngs.core.conventions import encode_srgb
 from dyngs.core.errors import DyngsError, wrap_read_errors
-from dyngs.io.containment import check_size, inside, max_decoded_mb
+from dyngs.io.containment import check_inside, check_size, max_decoded_mb
 from dyngs.io.fields import first_few
-from dyngs.io.write import read_lenient_text, image_error
+from dyngs.io.write import image_error, read_lenient_text
 
 if TYPE_CHECKING:
     import OpenImageIO
@@ -28,14 +29,14 @@ BEAUTY_NAMES = (
     "", "rgba", "rgb", "combined", "c", "ci", "beauty", "main", "image", "final", "color", "colour",
     "composite",
 )  # fmt: skip
-"""Last words of a layer's name that mean the beauty pass, best first; "": channels without a
+"""Last words of layer names that denote the beauty pass, best first; "" for channels without a
 layer."""
 _SHORT = {"red": "r", "green": "g", "blue": "b", "alpha": "a"}
 
 
 @dataclass(frozen=True)
 class ExrLayer:
-    """Channels of one layer: their index by name, in lower case, in the part with this number."""
+    """One EXR layer: the part that contains it, and channel indices by lower-case name."""
 
     name: str
     part: int
@@ -43,14 +44,16 @@ class ExrLayer:
 
     @property
     def colours(self) -> tuple[int, ...]:
-        """Indices of red, green and blue, or of luminance (Y without X); empty without them."""
+        """Indices of red, green and blue, or of luminance (Y without X); empty if there are
+        none."""
         names = "y" if "y" in self.channels and "x" not in self.channels else "rgb"
         found = tuple(self.channels[name] for name in names if name in self.channels)
         return found if len(found) == len(names) else ()
 
 
 def list_layers(parts: Sequence[tuple[str, Sequence[str]]]) -> list[ExrLayer]:
-    """Return the layers of a file by its parts, (name, names of channels such as ``layer.R``)."""
+    """Return the layers of an EXR, given its parts as (name, channel names such as
+    ``layer.R``)."""
     layers: dict[tuple[int, str], ExrLayer] = {}
     for number, (part, names) in enumerate(parts):
         for index, name in enumerate(names):
@@ -62,9 +65,9 @@ def list_layers(parts: Sequence[tuple[str, Sequence[str]]]) -> list[ExrLayer]:
 
 
 def find_beauty_pass(layers: Sequence[ExrLayer]) -> ExrLayer | None:
-    """Return the beauty pass; None if no layer has such a name, or several have.
+    """Return the beauty pass, None if no layer or several layers qualify.
 
-    Blender's compositor writes ``Composite.Combined`` beside the ``Combined`` of each view layer.
+    Blender's compositor writes ``Composite.Combined`` next to the ``Combined`` of each view layer.
     """
     ranked: dict[tuple[int, bool], list[ExrLayer]] = {}
     for layer in layers:
@@ -77,26 +80,26 @@ def find_beauty_pass(layers: Sequence[ExrLayer]) -> ExrLayer | None:
 
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36, 24)
 _FOCAL_RANGE = (0.1, 20.0)
-"""Plausible focal lengths in units of the image's longer side; others are taken for mistakes of a
-tag."""
+"""Plausible focal lengths in longer sides of the image; other values in tags are ignored."""
 
 
 def is_rotated_sideways(orientation: int) -> bool:
-    """Whether width and height are exchanged when an image of this orientation is rotated
-    upright."""
+    """Whether this EXIF orientation swaps width and height."""
     return orientation >= 5
 
 
 def rotate_upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Return the (H, W, D) image as the orientation of EXIF says it is to be shown; exact."""
+    """Return the (H, W, D) image rotated upright by its EXIF orientation; exact."""
     down = orientation in (3, 4, 6, 7)
     across = orientation in (2, 3, 7, 8)
     rotated = pixels[:: -1 if down else 1, :: -1 if across else 1]
-    return np.ascontiguousarray(rotated.swapaxes(0, 1) if is_rotated_sideways(orientation) else rotated)
+    return np.ascontiguousarray(
+        rotated.swapaxes(0, 1) if is_rotated_sideways(orientation) else rotated
+    )
 
 
 def _focal_px(spec: OpenImageIO.ImageSpec) -> float | None:
-    """Focal length from its equivalent for 35 mm film, by the diagonals."""
+    """Return the focal length from its 35 mm film equivalent, by the ratio of diagonals."""
     film = spec.get_float_attribute(
         "Exif:FocalLengthIn35mmFilm", spec.get_int_attribute("Exif:FocalLengthIn35mmFilm")
     )
@@ -125,17 +128,18 @@ class ImageHeader:
     """Header of an image file.
 
     Attributes:
-        width, height: as stored; of an EXR those of the display window.
-        channels: number of channels as stored.
-        colours, alpha: indices of the three colours that are read, and of alpha.
+        width, height: stored size; of an EXR the display window.
+        channels: number of stored channels.
+        colours, alpha: indices of the colour channels that are read, and of alpha.
         is_float: values are linear floats.
         is_premultiplied: colours are multiplied by alpha.
-        format_name: OpenImageIO's name of the format of the content.
-        layer: name of the beauty pass that was chosen among the layers of an EXR, else "".
-        orientation: by EXIF: 1 = upright, 2 to 4 = mirrored or upside down, 5 to 8 = lying.
-        focal_px: focal length in pixels of the stored image, None where EXIF does not say.
-        exposure: light let in: seconds of exposure x ISO / 100 / f-number squared, each factor 1
-            where its tag is missing; None without a time of exposure.
+        format_name: OpenImageIO's name of the format, from the content.
+        layer: name of the beauty pass chosen among several EXR layers, else "".
+        orientation: EXIF orientation: 1 = upright, 2 to 4 = mirrored or upside down, 5 to 8 =
+            sideways.
+        focal_px: focal length in pixels of the stored image, None without EXIF.
+        exposure: seconds x ISO / 100 / f-number squared, each factor 1 if its tag is missing; None
+            without an exposure time.
         camera: name of the camera model.
     """
 
@@ -155,20 +159,20 @@ class ImageHeader:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) as stored."""
+        """Stored (width, height)."""
         return self.width, self.height
 
     @property
     def upright_size(self) -> tuple[int, int]:
-        """(width, height) when it is shown as its EXIF tag says."""
+        """(width, height) after rotation by the EXIF orientation."""
         return (self.height, self.width) if is_rotated_sideways(self.orientation) else self.size
 
     def size_matching(self, described: tuple[int, int] | None) -> tuple[int, int]:
-        """Return the stored or the upright (width, height), that which has the shape of a camera's
-        ``described`` one.
+        """Return the stored or the upright (width, height), whichever has the orientation of
+        ``described``.
 
-        Programs that find poses take images as stored or upright, and their cameras say which.
-        Where both have that shape it is the stored one, which is what COLMAP takes.
+        Pose estimators use images as stored or upright, which the size of their cameras shows. If
+        both match, the stored size is returned, as in COLMAP.
         """
         if described is None:
             return self.upright_size
@@ -178,8 +182,8 @@ class ImageHeader:
 
 
 def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    """Return the files directly in a folder that end in one of the suffixes, by name; hidden files
-    are left out."""
+    """Return the files directly in a folder with one of the suffixes, by name, without hidden
+    files."""
     found = folder.iterdir() if folder.is_dir() else ()
     return sorted(
         path
@@ -189,7 +193,7 @@ def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
 
 
 def read_header(path: Path) -> ImageHeader:
-    """Read size and channels of an image without decoding it."""
+    """Read the size, channels and EXIF tags of an image without decoding it."""
     with _reading(path):
         reader, header = _open(path)
         reader.close()
@@ -197,12 +201,11 @@ def read_header(path: Path) -> ImageHeader:
 
 
 def try_read_header(path: Path) -> ImageHeader | None:
-    """Read the header of a capture's image; None where it is missing or damaged, which the loader
-    reports.
+    """Read the header of an image; None if it is missing or damaged, which the loader reports.
 
-    Raises DyngsError: the image lies outside the capture, or is too large.
+    Raises DyngsError if the image lies outside the capture, or is too large.
     """
-    inside(path)
+    check_inside(path)
     try:
         header = read_header(path)
     except DyngsError:
@@ -214,15 +217,15 @@ def try_read_header(path: Path) -> ImageHeader | None:
 def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool = False) -> Tensor:
     """Read an image as (H, W, 3) or, with alpha, (H, W, 4) uint8: sRGB, straight alpha.
 
-    8-bit files are returned bit for bit, 16-bit ones rounded. Floating-point files (EXR) are
-    linear: they are clamped to [0, 1] and encoded as sRGB. Premultiplied colours (EXR, TIFF with
+    8-bit files are returned bit for bit, 16-bit values are rounded. Float files (EXR) are linear:
+    they are clamped to [0, 1] and encoded as sRGB. Premultiplied colours (EXR, TIFF with
     associated alpha) are divided by alpha. Grey becomes RGB. Of an EXR with several layers, the
     beauty pass is read, in its display window.
 
     Args:
-        size: (width, height) of its camera; an image that has this shape only when it is rotated as
-            its EXIF tag says is rotated. None: as stored.
-        upright: rotate it as its EXIF tag says in any case.
+        size: (width, height) of its camera; the image is rotated by its EXIF tag if only then its
+            orientation matches. None: as stored.
+        upright: always rotate by the EXIF tag.
     """
     import OpenImageIO as oiio
 
@@ -238,13 +241,12 @@ def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool
 
 def _reading(path: Path) -> AbstractContextManager[None]:
     return wrap_read_errors(
-        path, "the image is damaged or of an unknown kind; copy or convert it again"
+        path, "the image is damaged or its format is not supported; copy or convert it again"
     )
 
 
 def read_raw(path: Path) -> tuple[np.ndarray, bool]:
-    """Read the numbers of an image as they are stored, (H, W, D) float32, and whether they are
-    whole numbers."""
+    """Read stored values as (H, W, D) float32, and whether they are integers."""
     with _reading(path):
         reader = _open_reader(path)
         spec = reader.spec()
@@ -252,13 +254,13 @@ def read_raw(path: Path) -> tuple[np.ndarray, bool]:
 
 
 def read_mask(path: Path) -> Tensor:
-    """Read a mask as (H, W) bool, true = keep: the mean of the colour channels is at least one
+    """Read a mask as (H, W) bool: true = used, where the mean of the colour channels is at least
     half."""
     return read_image(path)[..., :3].float().mean(dim=-1) >= 127.5
 
 
 def check_image(path: Path) -> ImageHeader:
-    """Read the header and check that the file is very likely complete: a JPEG without end marker is
+    """Read the header and check that the file is complete; a JPEG without end marker is
     decoded."""
     header = read_header(path)
     check_size(path, header.width, header.height, header.channels)
@@ -268,17 +270,15 @@ def check_image(path: Path) -> ImageHeader:
         is_complete = marker in file.read()
     if not is_complete and header.format_name == "jpeg":
         read_image(path)
-    elif not is_complete:  # not decoded: libpng would print lines of its own
-        raise DyngsError(
-            f"{path}: the image is truncated or damaged (its end is missing); copy it again"
-        )
+    elif not is_complete:  # not decoded, as libpng would print messages
+        raise DyngsError(f"{path}: the image is truncated; copy it again")
     return header
 
 
 def target_size(
     width: int, height: int, downscale: float = 1.0, longest_side: int | None = None
 ) -> tuple[int, int]:
-    """Return (width, height) divided by ``downscale`` and shrunk to at most ``longest_side``; never
+    """Return (width, height) divided by ``downscale`` and limited to ``longest_side``; never
     enlarged."""
     factor = max(1.0, downscale)
     if longest_side is not None:
@@ -287,21 +287,19 @@ def target_size(
 
 
 def area_downscale(pixels: Tensor, width: int, height: int) -> Tensor:
-    """Return a (height, width, D) image; each pixel is the exact mean of the area of ``pixels`` (H,
-    W, D) it covers.
+    """Downscale ``pixels`` (H, W, D) to (height, width, D) by exact area averages.
 
-    Floating point; colours must be premultiplied. Non-integer factors weight border pixels by the
-    covered fraction.
+    Floating point with premultiplied colours. For non-integer factors border pixels are weighted
+    by their covered fraction.
     """
     return _shrink_axis(_shrink_axis(pixels, 0, pixels.shape[0], height), 1, pixels.shape[1], width)
 
 
 def area_downscale_uint8(pixels: Tensor, width: int, height: int) -> Tensor:
-    """Return ``straight_uint8(area_downscale(premultiplied(pixels), width, height))``, a strip of
-    rows at a time.
+    """Downscale uint8 pixels with straight alpha by area averages, in strips of rows.
 
-    A photo of 12 megapixels takes 0.6 GB as floats with what is computed from them, and strips fit
-    into caches.
+    Equal to ``to_straight_uint8(area_downscale(premultiply(pixels), width, height))``, but needs
+    much less memory for large photos.
     """
     old = pixels.shape[0]
     step = max(1, _STRIP_PIXELS * height // (old * pixels.shape[1]))
@@ -310,15 +308,15 @@ def area_downscale_uint8(pixels: Tensor, width: int, height: int) -> Tensor:
         end = min(begin + step, height)
         first = begin * old // height
         last = min(-(-end * old // height), old)
-        rows = premultiplied(pixels[first:last])
+        rows = premultiply(pixels[first:last])
         part = _shrink_axis(rows, 0, old, height, (begin, end), first)
         parts.append(to_straight_uint8(_shrink_axis(part, 1, part.shape[1], width)))
     return torch.cat(parts)
 
 
-def premultiplied(pixels: Tensor) -> Tensor:
-    """Return (H, W, 3 or 4) float32 in [0, 1] with colours multiplied by alpha, from uint8 straight
-    alpha."""
+def premultiply(pixels: Tensor) -> Tensor:
+    """Return (H, W, 3 or 4) float32 in [0, 1], colours multiplied by alpha, from straight
+    uint8."""
     scaled = pixels.float() / 255
     if scaled.shape[-1] == 4:
         scaled[..., :3] *= scaled[..., 3:]
@@ -326,8 +324,8 @@ def premultiplied(pixels: Tensor) -> Tensor:
 
 
 def to_straight_uint8(pixels: Tensor) -> Tensor:
-    """Return (H, W, 3 or 4) uint8 with straight alpha from premultiplied floats; inverse of
-    ``premultiplied``."""
+    """Return (H, W, 3 or 4) uint8 with straight alpha from premultiplied floats; inverts
+    ``premultiply``."""
     if pixels.shape[-1] == 4:
         alpha = pixels[..., 3:].clamp(0, 1)
         rgb = torch.where(alpha > 0, pixels[..., :3] / alpha.clamp(min=1e-6), 0)
@@ -336,7 +334,7 @@ def to_straight_uint8(pixels: Tensor) -> Tensor:
 
 
 def _open(path: Path) -> tuple[OpenImageIO.ImageInput, ImageHeader]:
-    """Open an image at the part that is read, of an EXR with several layers the beauty pass."""
+    """Open an image at the part to be read, of an EXR with several layers the beauty pass."""
     reader = _open_reader(path)
     name = reader.format_name()
     layer = _exr_layer(path, reader) if name == "openexr" else None
@@ -384,30 +382,33 @@ def _open_reader(path: Path) -> OpenImageIO.ImageInput:
 
 
 def _exr_layer(path: Path, reader: OpenImageIO.ImageInput) -> ExrLayer | None:
-    """Go to the part of the beauty pass and return that layer; None if the file has a single
+    """Seek the part of the beauty pass and return that layer; None if the file has a single
     layer."""
     parts: list[tuple[str, Sequence[str]]] = []
     while reader.seek_subimage(len(parts), 0):
         spec = reader.spec()
         # Deep parts hold samples at several depths instead of pixels.
         names = () if spec.deep else spec.channelnames
-        parts.append((read_lenient_text(partial(spec.get_string_attribute, "oiio:subimagename")), names))
+        parts.append(
+            (read_lenient_text(partial(spec.get_string_attribute, "oiio:subimagename")), names)
+        )
     layers = list_layers(parts)
     if not layers:
-        raise DyngsError(f"{path}: the image is deep, which dyngs does not read; flatten it")
+        raise DyngsError(f"{path}: deep EXR images are not supported; flatten it")
     chosen = layers[0] if len(layers) == 1 else find_beauty_pass(layers)
     if chosen is None:
         raise DyngsError(
-            f"{path}: which layer is the image is not clear; name one rgba, Combined, C or beauty, or save it alone. "
-            f"The file has {first_few([layer.name or 'one without a name' for layer in layers])}"
+            f"{path}: cannot tell which layer is the image; name one rgba, Combined, C or "
+            "beauty, or save it alone. The file has "
+            f"{first_few([layer.name or 'an unnamed layer' for layer in layers])}"
         )
     reader.seek_subimage(chosen.part, 0)
     return chosen if len(layers) > 1 else None
 
 
 def _decoded(path: Path, reader: OpenImageIO.ImageInput, kind: OpenImageIO.TypeDesc) -> np.ndarray:
-    """Return the pixels (H, W, D) of a part, of an EXR in its display window: 0 outside the
-    data."""
+    """Return the pixels (H, W, D) of a part; for EXR the display window, 0 outside the data
+    window."""
     import OpenImageIO as oiio
 
     spec = reader.spec()
@@ -417,7 +418,7 @@ def _decoded(path: Path, reader: OpenImageIO.ImageInput, kind: OpenImageIO.TypeD
     pixels = reader.read_image(kind)
     message = image_error(reader)
     reader.close()
-    # Half a JPEG decodes to an image with a grey lower half and a message.
+    # A truncated JPEG decodes to an image with a grey lower part and a message.
     if pixels is None or "premature" in message.lower():
         reason = message or "the data ends early"
         raise DyngsError(f"{path}: the image is truncated or damaged ({reason}); copy it again")
@@ -433,7 +434,8 @@ def _decoded(path: Path, reader: OpenImageIO.ImageInput, kind: OpenImageIO.TypeD
 
 
 def _shown_size(reader: OpenImageIO.ImageInput) -> tuple[int, int]:
-    """(width, height) of the display window of an EXR, of other images as stored."""
+    """Return (width, height) of the display window of an EXR, or the stored size of other
+    images."""
     spec = reader.spec()
     if reader.format_name() == "openexr":
         return spec.full_width, spec.full_height
@@ -447,7 +449,7 @@ def _is_float(spec: OpenImageIO.ImageSpec) -> bool:
 
 
 def _straight_srgb(pixels: np.ndarray, header: ImageHeader) -> np.ndarray:
-    """Return (H, W, 3 or 4) uint8 sRGB with straight alpha; floats are linear, and encoded."""
+    """Return (H, W, 3 or 4) uint8 sRGB with straight alpha; linear floats are encoded."""
     channels = [*header.colours, *([] if header.alpha is None else [header.alpha])]
     if channels != list(range(pixels.shape[-1])):  # most files need no copy
         pixels = pixels[..., channels]
@@ -471,14 +473,17 @@ def _shrink_axis(
     outputs: tuple[int, int] | None = None,
     first_input: int = 0,
 ) -> Tensor:
-    """Return the ``outputs`` (None: all) of an axis that shrinks from ``old`` to ``size``, of
-    inputs from one on."""
+    """Shrink an axis from ``old`` to ``size``; compute only ``outputs`` (begin, end), None for
+    all.
+
+    ``pixels`` starts at index ``first_input`` of the axis.
+    """
     begin_at, end_at = outputs or (0, size)
     if size == old:
         return pixels
     if size > old:
         raise ValueError(f"area_downscale cannot enlarge {old} to {size}")
-    if old % size == 0:  # all taps of all outputs alike: no gathers, the same sums
+    if old % size == 0:  # integer factor: equal weights, no gathers, the same sums
         taps = pixels.narrow(
             axis, begin_at * old // size - first_input, (end_at - begin_at) * old // size
         )
@@ -496,6 +501,6 @@ def _shrink_axis(
         begin = torch.maximum(index * size, starts[:-1])
         end = torch.minimum((index + 1) * size, starts[1:])
         fraction = ((end - begin).clamp(min=0).double() / old).to(pixels.dtype).reshape(shape)
-        inside = (index - first_input).clamp(max=pixels.shape[axis] - 1)
-        total = total + pixels.index_select(axis, inside) * fraction
+        position = (index - first_input).clamp(max=pixels.shape[axis] - 1)
+        total = total + pixels.index_select(axis, position) * fraction
     return total

@@ -1,5 +1,5 @@
-"""Lens undistortion by resampling: from the stored image to a pinhole image of the same size,
-centre and focal length."""
+"""Lens undistortion: resampling of the stored image to a pinhole image of equal size and
+intrinsics."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _CLOSE_PX = 0.05
 
 @dataclass(frozen=True)
 class LensMap:
-    """Positions ``grid`` (H, W, 2) float32 of the pinhole image's pixels in the stored, distorted
-    image; on the CPU.
+    """Positions of the pinhole image's pixels in the stored, distorted image; on the CPU.
 
-    From -1 to 1, from outer edge to outer edge; ``valid`` (H, W) bool: the position lies inside.
+    ``grid`` (H, W, 2) float32 from -1 to 1 between outer edges; ``valid`` (H, W) bool: inside the
+    stored image.
     """
 
     grid: Tensor
@@ -30,13 +30,12 @@ class LensMap:
 
 
 def is_pinhole(lens: Lens) -> bool:
-    """Whether the lens needs no resampling. A fisheye with zero coefficients is not a pinhole."""
+    """Whether the lens needs no resampling; a fisheye with zero coefficients does."""
     return lens.model == "none" or (lens.model == "opencv" and not any(lens.params))
 
 
 def distort(lens: Lens, points: Tensor) -> Tensor:
-    """Return the (..., 2) distorted positions, in focal lengths, of ``points`` (..., 2) on plane
-    z = 1.
+    """Distort ``points`` (..., 2) on the plane z = 1.
 
     "opencv": Brown-Conrady, ``x (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)``
     plus the tangential terms. "fisheye": ``theta (1 + k1 theta^2 + .. + k4 theta^8)`` along the
@@ -58,11 +57,10 @@ def distort(lens: Lens, points: Tensor) -> Tensor:
 
 
 def undistort_points(lens: Lens, intrinsics: np.ndarray, points: Tensor) -> Tensor:
-    """Return the (..., 2) pixel positions in the pinhole image of ``points`` (..., 2) in the
-    stored, distorted one.
+    """Map pixel positions (..., 2) of the stored image to the pinhole image.
 
-    By iteration, in float64; NaN where it does not converge to ``_CLOSE_PX``, as far outside the
-    field of view, and where a point is NaN.
+    Solved iteratively in float64. NaN where the iteration does not converge to ``_CLOSE_PX``, as
+    far outside the field of view.
     """
     if is_pinhole(lens):
         return points
@@ -86,11 +84,10 @@ def undistort_points(lens: Lens, intrinsics: np.ndarray, points: Tensor) -> Tens
 
 
 def undistort_map(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -> LensMap:
-    """Return the map that undistorts images of this size; the pinhole image has the same size and
-    intrinsics.
+    """Return the undistortion map for images of this size.
 
-    Computed in float64. Where the distortion is no longer monotonic (far outside the field of
-    view), nothing is valid: otherwise the inside of the image would appear there a second time.
+    Computed in float64. Positions beyond the range where the distortion is monotonic are not
+    valid, as the image would repeat there.
     """
     k = np.asarray(intrinsics, np.float64)
     center, focal, size = torch.as_tensor(
@@ -113,7 +110,7 @@ def undistort_map(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -
 
 def undistort(pixels: Tensor, lens_map: LensMap) -> Tensor:
     """Return the pinhole image of ``pixels`` (H, W, D) float in [0, 1], premultiplied; zero where
-    it is not valid."""
+    invalid."""
     resampled = torch.nn.functional.grid_sample(
         pixels.permute(2, 0, 1)[None],
         lens_map.grid[None],
@@ -130,7 +127,7 @@ def _fisheye_series(lens: Lens, angle: Tensor) -> Tensor:
 
 
 def _radius_limit(lens: Lens, intrinsics: np.ndarray, width: int, height: int) -> float:
-    """Radius on z = 1 up to which the distortion is monotonic, searched up to the image's
+    """Return the radius on z = 1 up to which the distortion is monotonic, searched up to the
     corners."""
     corners = np.array([[0, 0], [width, 0], [0, height], [width, height]], dtype=np.float64)
     corners = (corners - intrinsics[:2, 2]) / np.diag(intrinsics)[:2]

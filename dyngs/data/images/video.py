@@ -1,4 +1,5 @@
-"""Decoding of video files, through PyAV, their colours, and the cache of their frames."""
+"""Video files: decoding with PyAV, colour conversion to sRGB, and a cache of frames as image
+files."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ from dyngs.core.conventions import decode_srgb, encode_srgb
 from dyngs.core.errors import DyngsError, describe_error, format_count, wrap_read_errors
 from dyngs.data.capture import VideoFrame
 from dyngs.data.images.images import list_files, rotate_upright
-from dyngs.io.containment import allowed, check_size, inside, require_at_most
+from dyngs.io.containment import check_inside, check_size, require_at_most, scaled_limit
 from dyngs.io.fields import read_limited
 from dyngs.io.outputs import VIDEO_SUFFIXES as VIDEO_SUFFIXES
 from dyngs.io.write import cache_folder, write_image, write_text
@@ -51,7 +52,7 @@ _TO_BT709 = {
         (-0.019638, -0.078636, 1.098274),
     ),
 }
-"""Linear RGB of BT.709 from that of other primaries with the same white."""
+"""Matrices from linear RGB of other primaries (same white point) to BT.709."""
 
 _REFERENCE_WHITE = 203.0  # cd/m2 of diffuse white in PQ, by BT.2408
 _HLG_WHITE = 0.75  # signal of diffuse white in HLG, by BT.2408
@@ -61,7 +62,7 @@ _ROWS = 32  # rows that are converted at a time: they fit into caches
 
 @dataclass(frozen=True)
 class ColourTags:
-    """Code points of ITU-T H.273 for the colours of an image, and whether its range is full."""
+    """Colour tags of an image: code points of ITU-T H.273, and whether its range is full."""
 
     primaries: int = UNSPECIFIED
     transfer: int = UNSPECIFIED
@@ -69,7 +70,7 @@ class ColourTags:
     is_full_range: bool = False
 
     def or_else(self, other: ColourTags) -> ColourTags:
-        """Return these tags, and those of ``other`` where they are unspecified."""
+        """Return these tags with unspecified ones taken from ``other``."""
         return ColourTags(
             other.primaries if self.primaries == UNSPECIFIED else self.primaries,
             other.transfer if self.transfer == UNSPECIFIED else self.transfer,
@@ -79,13 +80,13 @@ class ColourTags:
 
     @property
     def gamut(self) -> int:
-        """The primaries; those of HDR are BT.2020 unless tagged."""
+        """The primaries; BT.2020 for untagged HDR."""
         is_hdr = self.transfer in (_PQ, _HLG)
         return BT2020 if is_hdr and self.primaries == UNSPECIFIED else self.primaries
 
     @property
     def conversion(self) -> str:
-        """A line on how ``to_srgb`` converts these colours; "" if they are sRGB already."""
+        """Description of the conversion by ``to_srgb``; "" if the colours are sRGB already."""
         if self.transfer == _HLG:
             return f"HLG is tone-mapped to SDR (white: {_HLG_WHITE:.0%} of the signal; brighter is clipped)"
         if self.transfer == _PQ:
@@ -97,10 +98,10 @@ class ColourTags:
 
 
 def to_srgb(pixels: np.ndarray, tags: ColourTags, white: int = _LEVELS) -> np.ndarray:
-    """Return (H, W, 3) uint8 sRGB of (H, W, 3) uint16 RGB, whose levels are 0 to ``white``.
+    """Convert (H, W, 3) uint16 RGB with levels from 0 to ``white`` to uint8 sRGB.
 
-    Light above diffuse white is clipped. The system gamma of HLG is left out, as in the mapping of
-    scene light of BT.2408: SDR images that were encoded as HLG are restored.
+    Values above diffuse white are clipped. The system gamma of HLG is not applied, as in the
+    scene-light mapping of BT.2408, so SDR images that were encoded as HLG are restored.
     """
     matrix = _LEVELS * np.array(_TO_BT709.get(tags.gamut, np.eye(3)), np.float32).T
     encoded = np.empty(pixels.shape, np.uint8)
@@ -125,7 +126,7 @@ def _linear_table(transfer: int, white: int) -> np.ndarray:
 
 
 def _hlg_linear(signal: np.ndarray) -> np.ndarray:
-    """Scene light by the inverse OETF of HLG, BT.2100 table 5."""
+    """Inverse OETF of HLG (BT.2100 table 5): scene light."""
     a = 0.17883277
     b = 0.28466892
     c = 0.55991073
@@ -133,7 +134,7 @@ def _hlg_linear(signal: np.ndarray) -> np.ndarray:
 
 
 def _pq_linear(signal: np.ndarray) -> np.ndarray:
-    """Light in 10,000 cd/m2 by the EOTF of PQ, BT.2100 table 4."""
+    """EOTF of PQ (BT.2100 table 4): light in 10,000 cd/m2."""
     power = signal ** (1 / 78.84375)
     return (np.maximum(power - 0.8359375, 0.0) / (18.8515625 - 18.6875 * power)) ** (
         1 / 0.1593017578125
@@ -150,11 +151,11 @@ MAX_FRAMES = 1_000_000  # limit on the frames of one video: ten hours
 _CONTAINERS = (
     "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,m4v,flv,ogg,asf,dv,mxf,h264,hevc"
 )
-"""FFmpeg's names for files that hold images themselves, whatever their suffix says."""
+"""FFmpeg's names of containers that hold the images themselves, whatever the file suffix."""
 
 
 DECODER_VERSION = b"2"
-"""Changes when frames are converted in another way, so that frames cached before are not used."""
+"""Version of the frame conversion; a change invalidates cached frames."""
 _FULL_RANGE = 2  # FFmpeg's number of a range from 0 to the largest level
 BT709_MATRIX, BT601_MATRIX, BT2020_MATRIX = 1, 5, 9
 SUPPORTED_MATRICES = (0, BT709_MATRIX, UNSPECIFIED, 4, BT601_MATRIX, 6, 7, BT2020_MATRIX, 10)
@@ -163,9 +164,9 @@ SUPPORTED_MATRICES = (0, BT709_MATRIX, UNSPECIFIED, 4, BT601_MATRIX, 6, 7, BT202
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """Size of a video's frames, upright, their number, and their mean rate, 0 if unknown.
+    """Size, length and frame rate of a video, 0 if unknown.
 
-    ``colours`` is a line on how its colours are converted or assumed, "" if they are as tagged.
+    ``colours`` describes how its colours are converted or assumed, "" if they are used as tagged.
     """
 
     width: int
@@ -176,9 +177,9 @@ class VideoInfo:
 
 
 def list_videos(folder: Path) -> list[Path]:
-    """Return the videos directly in a folder, by name; hidden files are left out.
+    """Return the videos directly in a folder, by name, without hidden files.
 
-    Raises DyngsError: two with the same name but for the suffix.
+    Raises DyngsError if two differ only in the suffix.
     """
     with wrap_read_errors(folder, "choose another folder or change its permissions"):
         videos = list_files(folder, VIDEO_SUFFIXES)
@@ -186,26 +187,27 @@ def list_videos(folder: Path) -> list[Path]:
     for path in videos:
         if names.setdefault(path.stem, path) != path:
             raise DyngsError(
-                f"{folder}: {names[path.stem].name} and {path.name} are one camera; remove one of them"
+                f"{folder}: {names[path.stem].name} and {path.name} have the same camera name; "
+                "remove one of them"
             )
     return videos
 
 
 def read_frames(path: Path) -> Iterator[np.ndarray]:
-    """Yield the frames of a video in order, (H, W, 3) uint8, rotated as its rotation tag says.
+    """Yield the frames of a video in order, (H, W, 3) uint8, rotated by the rotation tag.
 
-    Raises DyngsError: no such file, no video in it, or damage (at the damaged place).
+    Raises DyngsError if there is no video, or at damaged data.
     """
     for _, frame, tags in _decoded(path, "AUTO"):
         yield _rotated_rgb(path, frame, tags)
 
 
 def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield the frames of these ``numbers``, counted from 0, in ascending order, as ``read_frames``
+    """Yield the frames with these ``numbers`` (from 0) in ascending order, as ``read_frames``
     does.
 
-    One image is in memory at a time. Nothing behind the last one is decoded; others before it are
-    (each image builds on others), but not converted.
+    Frames in between are decoded, as frames depend on each other, but not converted. One image is
+    in memory at a time.
     """
     requested = set(numbers)
     last = max(numbers, default=-1)
@@ -222,42 +224,41 @@ def read_numbered_frames(path: Path, numbers: Collection[int]) -> Iterator[tuple
 
 
 def probe_video(path: Path) -> VideoInfo:
-    """Read size, length and frame rate of a video; the first frame is decoded, and the packets are
-    counted."""
+    """Read size, length and frame rate of a video: decodes the first frame and counts packets."""
     decoded = next(_decoded(path), None)
     if decoded is None:
-        raise _broken(path, 0, "it holds no image")
+        raise _broken(path, 0, "it contains no frame")
     _, first, tags = decoded
     height, width = _rotated_rgb(path, first, tags).shape[:2]
     with _reading(path), open_video_container(path) as container:
         stream = container.streams.video[0]
         fps = float(stream.average_rate or 0)
         hidden = [packet.is_discard for packet in _packets(container)]
-        # of a truncated file, what the header promises is what there should be
+        # A truncated file still states its full length in the header.
         count = max(stream.frames, len(hidden)) - sum(hidden)
     if count > MAX_FRAMES:
         raise DyngsError(
-            f"{path}: the video has {count:,} frames, of which {MAX_FRAMES:,} are read at most; cut it up"
+            f"{path}: the video has {count:,} frames, more than the limit of {MAX_FRAMES:,}; "
+            "split it"
         )
     note = tags.conversion
     is_untagged = {tags.primaries, tags.transfer, tags.matrix} == {UNSPECIFIED}
     if is_untagged and _matrix_of(first, tags) == BT709_MATRIX:
-        note = "HD without colour tags is read as BT.709"
+        note = "HD without colour tags, assumed to be BT.709"
     return VideoInfo(width, height, count, fps if math.isfinite(fps) else 0.0, note)
 
 
 def colour_messages(videos: Iterable[VideoInfo]) -> list[str]:
-    """Return a line for each of the different ``VideoInfo.colours`` of the videos of a capture."""
+    """Return a message for each kind of colour conversion among the videos of a capture."""
     counts = Counter(video.colours for video in videos if video.colours)
     return [f"{format_count(count, 'video')}: {note}" for note, count in counts.items()]
 
 
 def frame_seconds(path: Path, num_frames: int) -> list[float]:
-    """Return the second at which each of the first ``num_frames`` frames is shown, the first one at
-    0.
+    """Return the presentation time of each of the first ``num_frames`` frames, in seconds from 0.
 
-    Phones do not keep an even rate, so the time stamps of the file count. Where they are missing or
-    too few, the mean rate does, and 30 frames per second where the file names none either.
+    Uses the time stamps, as phones have variable frame rates; the mean rate (30 if unknown) if
+    they are missing or too few.
     """
     stamps: list[float] = []
     with _reading(path), open_video_container(path) as container:
@@ -272,8 +273,8 @@ def frame_seconds(path: Path, num_frames: int) -> list[float]:
 
 
 def _packets(container: InputContainer) -> Iterator[av.Packet]:
-    """Yield the packets of frames, up to where the file is cut off; discarded ones, by an edit
-    list, are not shown."""
+    """Yield the packets of frames up to a truncation; packets discarded by an edit list are not
+    shown."""
     from av.error import FFmpegError
 
     with suppress(FFmpegError):
@@ -285,10 +286,9 @@ def _packets(container: InputContainer) -> Iterator[av.Packet]:
 def _decoded(
     path: Path, threads: Literal["AUTO", "SLICE"] = "SLICE"
 ) -> Iterator[tuple[int, av.VideoFrame, ColourTags]]:
-    """Yield number, frame and colour tags, in order; damage is an error that names the frame.
+    """Yield number, frame and colour tags, in order; damage raises an error that names the frame.
 
-    With "AUTO", which is faster, several frames are decoded at once, and damage takes those before
-    it along.
+    "AUTO" decodes several frames at once, which is faster, but loses frames before damaged data.
     """
     from av.error import FFmpegError
 
@@ -300,7 +300,7 @@ def _decoded(
             with open_video_container(path) as container:
                 stream = container.streams.video[0]
                 stream.thread_type = threads
-                # Decoders of HEVC and ProRes overwrite what the container says, even by
+                # Decoders of HEVC and ProRes overwrite the tags of the container, even with
                 # "unspecified".
                 container_tags = _tags_of(stream.codec_context)
                 for frame in container.decode(stream):
@@ -318,12 +318,11 @@ def _decoded(
 
 @contextmanager
 def open_video_container(path: Path) -> Iterator[InputContainer]:
-    """Open the file for PyAV, which must contain the video itself: playlists, which name other
-    files, are refused.
+    """Open a video with PyAV; playlists, which refer to other files, are refused.
 
     Raises:
         DyngsError: no video in it, or one that is too large.
-        FFmpegError: damage.
+        FFmpegError: damaged data.
     """
     import av
 
@@ -343,15 +342,15 @@ def _reading(path: Path) -> AbstractContextManager[None]:
 
 def _broken(path: Path, index: int, why: str) -> DyngsError:
     return DyngsError(
-        f"the video {path} breaks at frame {index} ({why}); copy it again, or choose data.frames without that part"
+        f"cannot decode the video {path} at frame {index} ({why}); copy it again, or exclude "
+        "that part with data.frames"
     )
 
 
 def orientation_of(frame: av.VideoFrame) -> int:
-    """Return how a frame is to be shown, as EXIF numbers it: 1 upright, 2 mirrored, 3 by 180
-    degrees, and so on to 8.
+    """Return the EXIF orientation (1 to 8) of a frame from its display matrix.
 
-    By its display matrix, which maps (x, y) to (a x + c y, b x + d y), rounded to quarter turns.
+    The matrix maps (x, y) to (a x + c y, b x + d y); it is rounded to quarter turns.
     """
     found: list[Any] = list(frame.side_data)
     matrix = next((bytes(x) for x in found if x.type.name == "DISPLAYMATRIX"), b"")
@@ -371,7 +370,8 @@ def _tags_of(context: VideoCodecContext) -> ColourTags:
 
 
 def _matrix_of(frame: av.VideoFrame, tags: ColourTags) -> int:
-    """Return the matrix of a frame; without a tag that of the primaries, else of the size."""
+    """Return the YCbCr matrix of a frame; if untagged, by the primaries, else by the frame
+    size."""
     if tags.matrix != UNSPECIFIED or frame.format.is_rgb:
         return tags.matrix
     if tags.gamut == BT2020:
@@ -384,8 +384,8 @@ def _rotated_rgb(path: Path, frame: av.VideoFrame, tags: ColourTags) -> np.ndarr
     matrix = _matrix_of(frame, tags)
     if matrix not in SUPPORTED_MATRICES:  # as that of Dolby Vision without a base layer
         raise DyngsError(
-            f"{path}: its colours have the matrix {matrix} of ITU-T H.273, which dyngs cannot convert; "
-            "export the video as SDR, HLG or HDR10"
+            f"{path}: its colours have the matrix {matrix} of ITU-T H.273, which is not "
+            "supported; export the video as SDR, HLG or HDR10"
         )
     # The nearest sample of chroma, as swscale takes it for 8 bits: filters mix colours at edges,
     # which the curves of HDR amplify.
@@ -414,15 +414,15 @@ def _rotated_rgb(path: Path, frame: av.VideoFrame, tags: ColourTags) -> np.ndarr
 # Cache of frames as image files, found again by the content of the video
 
 MAX_CACHED_BYTES = 4 * 10**9  # of the frames of one capture, times ``DYNGS_LIMITS``
-_KEPT_SECONDS = 3 * 86_400  # frames used since then may be those of a running training
+_KEPT_SECONDS = 3 * 86_400  # frames used more recently may belong to a running training
 _WHOLE_BYTES = 2**30  # larger videos are compared by their beginning and modification time only
 _MARK_NAME = "video.json"
 
 
 @dataclass(frozen=True)
 class VideoFrames:
-    """Image files of the frames of the video ``source``, in order; ``decode_frames`` writes those
-    that are missing."""
+    """Image files of the frames of the video ``source``, in order; ``decode_frames`` writes
+    missing ones."""
 
     info: VideoInfo
     source: Path
@@ -430,12 +430,12 @@ class VideoFrames:
 
 
 def locate_cached_frames(video: Path) -> VideoFrames:
-    """Return the frames of ``video`` and where they are cached; nothing is written.
+    """Return the frames of ``video`` and the files they are cached in; nothing is written.
 
-    They lie in ``CACHE/frames/NAME.DIGEST/frame_000000.png`` and so on; ``video.json`` next to them
-    holds the ``VideoInfo`` and marks the folder as ours.
+    The files are ``CACHE/frames/NAME.DIGEST/frame_000000.png`` and so on; ``video.json`` next to
+    them stores the ``VideoInfo`` and marks the folder as part of the cache.
     """
-    with wrap_read_errors(inside(video), "check the path and its permissions"):
+    with wrap_read_errors(check_inside(video), "check the path and its permissions"):
         status = video.stat()
         digest = _digest(video, status.st_size, status.st_mtime_ns)
     label = re.sub(r"[^A-Za-z0-9-]", "_", video.stem)[:40]
@@ -448,11 +448,11 @@ def locate_cached_frames(video: Path) -> VideoFrames:
 
 
 def decode_frames(root: Path, frames: Mapping[Path, VideoFrame]) -> None:
-    """Decode the frames whose image is missing; every file is written atomically.
+    """Decode the frames whose image files are missing; every file is written atomically.
 
-    The total size is estimated from the frames written so far, so that too much is refused early.
-    The least recently used frames of other captures are removed to make room. Raises DyngsError: a
-    damaged video (names it and the frame), or more than the limit.
+    The total size is extrapolated from the frames written so far, to fail early. Least recently
+    used frames of other captures are removed to make room. Raises DyngsError for a damaged video,
+    or if the limit is exceeded.
     """
     videos = {path.parent: frame.video for path, frame in frames.items()}
     missing: dict[Path, list[int]] = {folder: [] for folder in videos}
@@ -487,13 +487,14 @@ def _make_room(kept: Collection[Path], total: int) -> None:
     for mark in sorted(others, key=lambda mark: mark.stat().st_mtime, reverse=True):
         total += _num_bytes(mark.parent)
         is_old = mark.stat().st_mtime < time.time() - _KEPT_SECONDS
-        if total > allowed(MAX_CACHED_BYTES) and is_old:
+        if total > scaled_limit(MAX_CACHED_BYTES) and is_old:
             shutil.rmtree(mark.parent, ignore_errors=True)
 
 
 @lru_cache(maxsize=4096)
 def _digest(video: Path, size: int, changed_ns: int) -> bytes:
-    """SHA-256 of size and bytes; for huge files of size, modification time and the beginning."""
+    """Return a SHA-256 of size and content; for huge files of size, modification time and
+    beginning."""
     digest = hashlib.sha256(str(size).encode())
     if size > _WHOLE_BYTES:
         digest.update(str(changed_ns).encode())
@@ -506,7 +507,7 @@ def _digest(video: Path, size: int, changed_ns: int) -> bytes:
 
 
 def _stored_info(folder: Path) -> VideoInfo | None:
-    """Return what the mark of ``folder`` says about the video, None without a mark of ours."""
+    """Return the stored info of a cached video, None if there is no valid one."""
     try:
         return VideoInfo(**json.loads(read_limited(folder / _MARK_NAME)))
     except (DyngsError, OSError, ValueError, TypeError):

@@ -1,2 +1,2 @@
-"""Readers of captures, one module per format; each declares its ``FORMAT``, listed in
-``dyngs.data.read``."""
+"""Capture readers, one module per layout. Each defines a ``FORMAT``; ``dyngs.data.read`` lists
+them."""

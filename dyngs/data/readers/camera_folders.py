@@ -1,5 +1,5 @@
-"""Readers for sequences of fixed cameras, a folder or a video each: cameras.json, and LLFF's
-poses_bounds.npy (N3V)."""
+"""Readers for fixed cameras with a folder or video each: cameras.json, and LLFF's poses_bounds.npy
+(N3V)."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, CaptureFormat, Splits, VideoFrame, View
 from dyngs.data.geometry import (
     OPENGL_FROM_OPENCV,
-    validate_pose,
     to_opengl_pose,
+    validate_pose,
 )
 from dyngs.data.images.images import SUFFIXES, list_files
-from dyngs.data.images.video import VideoFrames, colour_messages, locate_cached_frames, list_videos
+from dyngs.data.images.video import VideoFrames, colour_messages, list_videos, locate_cached_frames
 from dyngs.data.readers.transforms import MAX_FPS, FrameEntry, FrameFile, read_views
-from dyngs.io.fields import first_few, is_number, matrix_of, read_json_object
+from dyngs.io.fields import first_few, is_number, parse_matrix, read_json_object
 from dyngs.io.numpy_files import read_npy
 
 MIN_CAMERAS_TO_HOLD_OUT = 3
-"""From this number on, the first camera is for testing where the capture names none."""
+"""From this number on, the first camera is held out if the capture defines no test cameras."""
 
 
 @dataclass(frozen=True)
 class CameraSource:
-    """Frame number to image file of the camera ``name``; those of a ``video`` may have to be
-    decoded first."""
+    """Images of the camera ``name`` by frame number; those of a ``video`` may still have to be
+    decoded."""
 
     name: str
     images: dict[int, Path]
@@ -38,11 +38,10 @@ class CameraSource:
 
 
 def find_cameras(root: Path) -> dict[str, Path]:
-    """Map camera names, sorted, to folders of images, or to video files where there is no such
-    folder.
+    """Map camera names, sorted, to folders of images or, failing that, to video files.
 
-    Images lie in the folder itself or in ``images`` below it. Raises DyngsError: two videos for one
-    camera.
+    Images are in the folder itself or in ``images`` below it. Raises DyngsError for two videos of
+    one camera.
     """
     found = {path.stem: path for path in list_videos(root)}
     for path in sorted(root.iterdir()):
@@ -54,10 +53,10 @@ def find_cameras(root: Path) -> dict[str, Path]:
 
 
 def open_camera(name: str, path: Path) -> CameraSource:
-    """List the images of the camera that ``find_cameras`` found at ``path``.
+    """List the images of a camera folder or video.
 
-    Raises DyngsError: an image without a number, two with the same one, or a video that cannot be
-    opened.
+    Raises DyngsError for images without frame number or with the same one, and for unreadable
+    videos.
     """
     if path.is_file():
         planned = locate_cached_frames(path)
@@ -67,12 +66,14 @@ def open_camera(name: str, path: Path) -> CameraSource:
         digits = re.findall(r"\d+", image.stem)
         if not digits:
             raise DyngsError(
-                f"{image}: no frame number in its name; call it frame_0000{image.suffix} or the like"
+                f"{image}: no frame number in its name; rename it, for example to "
+                f"frame_0000{image.suffix}"
             )
         other = images.setdefault(int(digits[-1]), image)
         if other != image:
             raise DyngsError(
-                f"{path}: {other.name} and {image.name} have the same frame number; remove one of them"
+                f"{path}: {other.name} and {image.name} have the same frame number; remove one "
+                "of them"
             )
     return CameraSource(name, images)
 
@@ -80,8 +81,8 @@ def open_camera(name: str, path: Path) -> CameraSource:
 def sequence_views(
     path: Path, cameras: Sequence[CameraSource], calibrations: Mapping[str, dict[str, object]]
 ) -> tuple[dict[str, tuple[View, ...]], list[str]]:
-    """Return the views of each camera, and warnings; times run from 0 at the lowest frame number to
-    1 at the highest.
+    """Return the views of each camera, and warnings. Times are 0 at the lowest frame number and 1
+    at the highest.
 
     Args:
         path: the calibration file in the capture's folder.
@@ -116,7 +117,7 @@ def sequence_views(
 
 
 def video_fps(cameras: Sequence[CameraSource]) -> float | None:
-    """Return the frame rate of the first video that has one, None if none has."""
+    """Return the frame rate of the first video that has one, else None."""
     return next(
         (camera.video.info.fps for camera in cameras if camera.video and camera.video.info.fps > 0),
         None,
@@ -127,12 +128,12 @@ CALIBRATION = "cameras.json"
 
 
 def read_camera_folders(root: Path) -> Capture:
-    """Read ``cameras.json`` and the folders or videos named like its cameras.
+    """Read ``cameras.json`` and the folders or videos named after its cameras.
 
-    The file holds ``{"cameras": {NAME: {"fl_x", "fl_y", "cx", "cy", "w", "h", "k1", ..,
+    The file contains ``{"cameras": {NAME: {"fl_x", "fl_y", "cx", "cy", "w", "h", "k1", ..,
     "transform_matrix" (OpenGL camera-to-world) or "cam_from_world" (OpenCV)}}, "fps": .., "test":
-    [NAME, ..]}``. Without ``test`` the first camera is held out where there are three or more.
-    Times run from the first frame number to the last one.
+    [NAME, ..]}``. Without ``test`` the first of three or more cameras is held out. Time 0 is the
+    first frame number, time 1 the last one.
     """
     path = root / CALIBRATION
     calibrated, fps, test = _read_calibration(path)
@@ -140,10 +141,10 @@ def read_camera_folders(root: Path) -> Capture:
     names = [name for name in sorted(calibrated) if name in found]
     if not names:
         raise DyngsError(
-            f"{path}: no folder or video is named like its cameras ({first_few(sorted(calibrated))})"
+            f"{path}: no folder or video is named after a camera ({first_few(sorted(calibrated))})"
         )
     warnings = [
-        f"{path.name}: {kind} for {first_few(sorted(some.keys() - others.keys()))}, left out"
+        f"{path.name}: {kind} for {first_few(sorted(some.keys() - others.keys()))}, skipped"
         for kind, some, others in (
             ("no folder or video", calibrated, found),
             ("no calibration", found, calibrated),
@@ -164,7 +165,7 @@ def read_camera_folders(root: Path) -> Capture:
 
 
 def _read_calibration(path: Path) -> tuple[dict[str, object], float | None, object]:
-    """Return camera name to calibration, frames per second, and ``test`` as written."""
+    """Return calibrations by camera name, frames per second, and ``test`` as written."""
     wrong = "must be an object whose 'cameras' maps camera names to calibrations"
     fields = read_json_object(path, wrong)
     cameras = fields.get("cameras")
@@ -185,12 +186,12 @@ def _calibration(value: object, where: str) -> dict[str, object]:
     own = {str(key): field for key, field in value.items()}
     if ("transform_matrix" in own) == ("cam_from_world" in own):
         raise DyngsError(
-            f"{where}: give either transform_matrix (OpenGL, camera-to-world) or cam_from_world (OpenCV), not "
-            f"{'both' if 'cam_from_world' in own else 'neither'}"
+            f"{where}: give either transform_matrix (OpenGL, camera-to-world) or cam_from_world "
+            f"(OpenCV), not {'both' if 'cam_from_world' in own else 'neither'}"
         )
     if "cam_from_world" not in own:
         return own
-    pose, _ = validate_pose(matrix_of(where, "cam_from_world", own.pop("cam_from_world")), where)
+    pose, _ = validate_pose(parse_matrix(where, "cam_from_world", own.pop("cam_from_world")), where)
     own["transform_matrix"] = to_opengl_pose(pose).tolist()
     return own
 
@@ -198,20 +199,21 @@ def _calibration(value: object, where: str) -> dict[str, object]:
 def _splits(
     path: Path, test: object, views: dict[str, tuple[View, ...]]
 ) -> tuple[Splits, list[str]]:
-    """Hold out the cameras that ``test`` lists, else the first one if there are enough; return
-    splits and warnings."""
+    """Hold out the cameras in ``test``, else the first of enough cameras; return splits and
+    warnings."""
     notes = []
     if test is None:
         if len(views) < MIN_CAMERAS_TO_HOLD_OUT:
             return {"train": _held_out(views, [])["train"]}, []
         test = [min(views)]
-        notes = [f"{path.name} names no 'test' cameras: the first one, {test[0]}, is held out"]
+        notes = [f"{path.name} lists no 'test' cameras; the first one, {test[0]}, is held out"]
     elif not isinstance(test, list) or not all(isinstance(name, str) for name in test):
         raise DyngsError(f"{path}: 'test' must be a list of camera names")
     unknown = sorted(set(test) - views.keys())
     if unknown:
         raise DyngsError(
-            f"{path}: 'test' names {first_few(unknown)}, but the cameras are {first_few(sorted(views))}"
+            f"{path}: 'test' names {first_few(unknown)}, but the cameras are "
+            f"{first_few(sorted(views))}"
         )
     return _held_out(views, test), notes
 
@@ -232,14 +234,14 @@ POSES = "poses_bounds.npy"
 
 
 def read_llff(root: Path) -> Capture:
-    """Read ``poses_bounds.npy`` and one video ``camNN.mp4`` or folder ``camNN`` per camera, sorted
-    by name.
+    """Read ``poses_bounds.npy`` and one video ``camNN.mp4`` or folder ``camNN`` per camera, by
+    name.
 
-    Each row holds a 3x5 matrix, row by row, and the near and far bounds (not used). Its columns:
-    the camera's down, right and backward axes and its position in the world, then height, width and
-    focal length of the full image in pixels (Mildenhall et al. 2019). The first camera is the test
-    view, as in N3V. Raises DyngsError: an unreadable file, rows and cameras that differ in number,
-    bad poses, images or videos.
+    Each row contains a 3x5 matrix, row by row, and near and far bounds (unused). Its columns are
+    the camera's down, right and backward axes, its position, and height, width and focal length of
+    the full image in pixels (Mildenhall et al. 2019). The first camera is the test view, as in
+    N3V. Raises DyngsError for an unreadable file, differing numbers of rows and cameras, and
+    invalid poses, images or videos.
     """
     path = root / POSES
     rows = _read_rows(path)
@@ -251,8 +253,8 @@ def read_llff(root: Path) -> Capture:
     names = list(found)
     if len(names) != len(rows):
         raise DyngsError(
-            f"{path}: has poses of {len(rows)} cameras, but {len(names)} videos or folders of frames are there "
-            f"({first_few(names)}); make them the same"
+            f"{path}: has {len(rows)} poses, but there are {len(names)} videos or folders of "
+            f"frames ({first_few(names)}); make the numbers equal"
         )
     cameras = [open_camera(name, found[name]) for name in names]
     calibrations = {name: _llff_calibration(row) for name, row in zip(names, rows, strict=True)}

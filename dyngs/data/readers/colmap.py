@@ -1,4 +1,5 @@
-"""COLMAP models, binary or text: cameras, poses of images, points, masks; no observations."""
+"""Reader of COLMAP models, binary or text: cameras, poses, points and masks, without
+observations."""
 
 from __future__ import annotations
 
@@ -18,18 +19,18 @@ from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.data.capture import Capture, CaptureFormat, Lens, PointCloud, Splits, View
 from dyngs.data.geometry import (
     ROTATION_TOLERANCE,
-    validate_pose,
     match_intrinsics_to_image,
     pinhole_matrix,
     repair_warning,
     rescale_warning,
+    validate_pose,
 )
 from dyngs.data.images.images import try_read_header
-from dyngs.data.readers.transforms import find_masks, mask_of, missing_mask_warning, view_name
+from dyngs.data.readers.transforms import find_mask, find_masks, missing_mask_warning, view_name
 from dyngs.data.times import read_seconds
-from dyngs.io.containment import inside
+from dyngs.io.containment import check_inside
 from dyngs.io.fields import open_text, read_text
-from dyngs.io.find import FileFinder, normalize_name, images_folder
+from dyngs.io.find import FileFinder, images_folder, normalize_name
 
 NUM_PARAMS = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
@@ -45,7 +46,7 @@ _POINTS_2D = re.compile(r"(?:[-+.\deEnaif]+\s+[-+.\deEnaif]+\s+-?\d+(?:\s+|$))+"
 
 @dataclass(frozen=True)
 class ModelCamera:
-    """A camera: COLMAP's model, (width, height) of its images in pixels, parameters of the lens."""
+    """A COLMAP camera: model name, (width, height) of its images in pixels, parameters."""
 
     model: str
     size: tuple[int, int]
@@ -54,7 +55,7 @@ class ModelCamera:
 
 @dataclass(frozen=True)
 class ModelImage:
-    """A registered image: name as written, number of its camera, and its ``cam_from_world``: wxyz,
+    """A registered image: name as written, camera id, and ``cam_from_world`` as wxyz and
     translation."""
 
     name: str
@@ -63,18 +64,17 @@ class ModelImage:
 
 
 def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], PointCloud]:
-    """Read the cameras, by number, the images, by name, and the points, by id, of the model in a
-    folder.
+    """Read the cameras (by id), images (by name) and points (by id) of the model in a folder.
 
-    Raises DyngsError: a file is missing, truncated or damaged; names it.
+    Raises DyngsError if a file is missing, truncated or damaged.
     """
     is_binary = (folder / "cameras.bin").is_file()
     stems = ("cameras", "images", "points3D")
     paths = [folder / f"{stem}{'.bin' if is_binary else '.txt'}" for stem in stems]
     for path in paths:
-        if not inside(path).is_file():
+        if not check_inside(path).is_file():
             raise DyngsError(
-                f"{path}: the COLMAP model lacks this file; export the whole model again"
+                f"{path}: file missing from the COLMAP model; export the whole model again"
             )
     if is_binary:
         cameras = _binary_entries(paths[0], _next_camera)
@@ -88,7 +88,8 @@ def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], 
     lost = next((image for image in images if image.camera not in known), None)
     if lost is not None:
         raise DyngsError(
-            f"{paths[1]}: {lost.name} is of camera {lost.camera}, which {paths[0].name} lacks"
+            f"{paths[1]}: {lost.name} refers to camera {lost.camera}, which is not in "
+            f"{paths[0].name}"
         )
     table = np.array(points, np.float64).reshape(-1, 7)
     table = table[np.argsort(table[:, 0], kind="stable")]
@@ -123,7 +124,7 @@ def _text_entries(path: Path, entry_of: Callable[[str], Entry]) -> list[Entry]:
     """Parse a text file of a model, one entry per line.
 
     In images.txt the second line of an image, its 2D points, may be empty or missing. Raises
-    DyngsError: a damaged line, or fewer entries than the header ``# Number of ..: N`` announces.
+    DyngsError for a damaged line, or fewer entries than ``# Number of ..: N`` in the header.
     """
     entries: list[Entry] = []
     announced = 0
@@ -147,7 +148,8 @@ def _text_entries(path: Path, entry_of: Callable[[str], Entry]) -> list[Entry]:
                 may_skip = path.stem == "images"
     if len(entries) < announced:
         raise DyngsError(
-            f"{path}: truncated, holds {len(entries)} of {announced} entries; copy or export it again"
+            f"{path}: truncated after {len(entries)} of {announced} entries; copy or export it "
+            "again"
         )
     return entries
 
@@ -157,19 +159,21 @@ def _binary_entries(path: Path, next_entry: Callable[[_Binary], Entry]) -> list[
         file = _Binary(path.read_bytes())
         entries = [next_entry(file) for _ in range(file.unpack("<Q")[0])]
         if file.at != len(file.data):
-            raise ValueError(f"its entries end at byte {file.at}, the file at {len(file.data)}")
+            raise ValueError(
+                f"entries end at byte {file.at}, but the file has {len(file.data)} bytes"
+            )
     return entries
 
 
 @dataclass
 class _Binary:
-    """The content of a binary model file, and the place of the next byte that is read."""
+    """Content of a binary model file, and the position of the next byte."""
 
     data: bytes
     at: int = 0
 
     def unpack(self, layout: str) -> tuple:
-        """Return the numbers of the next bytes."""
+        """Return the next values."""
         numbers = struct.unpack_from(layout, self.data, self.at)
         self.at += struct.calcsize(layout)
         return numbers
@@ -199,9 +203,9 @@ def _next_point(file: _Binary) -> array[float]:
 
 
 TEST_LIST = "test.txt"
-"""Names of the images for testing, a line each, in the model's folder (as 3DGS has it)."""
+"""File in the model folder with one test image name per line, as in 3DGS."""
 MODEL_FOLDERS = ("sparse", ".", "colmap/sparse", "colmap", "distorted/sparse")
-"""Folders of models; each may hold several, in folders 0, 1, ... of their own."""
+"""Folders of models; each may contain several, in subfolders 0, 1, ..."""
 FILES = "cameras.bin or cameras.txt in sparse/0, sparse, colmap/sparse/0, distorted/sparse/0 or ."
 # Number of focal lengths and the formula, per camera model. COLMAP orders the coefficients as
 # OpenCV does.
@@ -214,7 +218,8 @@ _LENSES: dict[str, tuple[int, Literal["none", "opencv", "fisheye"]]] = {
 
 
 def model_folders(root: Path) -> list[Path]:
-    """Return the folders of the models of a capture: several are parts that are not connected."""
+    """Return the model folders of a capture; several are unconnected components of one
+    reconstruction."""
     for name in MODEL_FOLDERS:
         base = root / name
         numbered = (
@@ -230,7 +235,8 @@ def model_folders(root: Path) -> list[Path]:
 
 
 def find_model(root: Path) -> tuple[Path | None, list[str]]:
-    """Return the folder of the largest model, by its file of images, and a warning if there are others."""
+    """Return the folder of the largest model (by its images file), and a warning if there are
+    others."""
     folders = model_folders(root)
     if len(folders) < 2:
         return (folders or [None])[0], []
@@ -238,8 +244,8 @@ def find_model(root: Path) -> tuple[Path | None, list[str]]:
         folders, key=lambda folder: max(x.stat().st_size for x in folder.glob("images.*"))
     )
     line = (
-        f"{largest.parent}: of {len(folders)} models that are not connected, {largest.name} is read, which is the "
-        "largest; to read another one, move it out of the capture"
+        f"{largest.parent}: {len(folders)} separate models found; using the largest, "
+        f"{largest.name} (to use another one, move it out of the capture)"
     )
     return largest, [line]
 
@@ -250,8 +256,8 @@ def is_colmap(root: Path) -> bool:
 
 
 def _is_chosen(root: Path) -> bool:
-    """Whether a folder is a COLMAP capture; nerfstudio's keep the model that their JSON is made
-    from."""
+    """Whether a folder is a COLMAP capture, and not a nerfstudio one that contains its source
+    model."""
     folders = model_folders(root)
     return bool(folders) and not (
         (root / "transforms.json").is_file() and folders[0].is_relative_to(root / "colmap")
@@ -263,15 +269,15 @@ def _holds_model(folder: Path) -> bool:
 
 
 def read_colmap(root: Path) -> Capture:
-    """Read a COLMAP model with images below ``images/``, and with ``masks/`` and ``times.json``
-    where they are.
+    """Read a COLMAP model with images below ``images/`` and, if present, ``masks/`` and
+    ``times.json``.
 
-    Registered images become training views, but for those that ``test.txt`` in the model's folder
-    lists; distorted camera models are kept as ``View.lens``.
+    Registered images become training views, except those listed in ``test.txt`` of the model
+    folder. Distortion is kept in ``View.lens``.
     """
     folder, warnings = find_model(root)
     if folder is None:
-        raise DyngsError(f"{root}: holds no COLMAP model ({FILES})")
+        raise DyngsError(f"{root}: no COLMAP model found ({FILES})")
     cameras, listed, points = read_model(folder)
     images = _images_of(root, folder)
     finder = FileFinder(images)
@@ -290,14 +296,18 @@ def read_colmap(root: Path) -> Capture:
         intrinsics, lens = pinhole_and_lens(camera, where)
         header = try_read_header(path)
         stored = None if header is None else header.size_matching(camera.size)
-        intrinsics, size, changed = match_intrinsics_to_image(intrinsics, camera.size, stored, where)
+        intrinsics, size, changed = match_intrinsics_to_image(
+            intrinsics, camera.size, stored, where
+        )
         if changed:
             rescaled.append(where)
         view = View(view_name(path, images), path, pose, intrinsics, *size, lens, image.camera)
         exposure = None if header is None else header.exposure
         name = Path(os.path.relpath(path, images)).as_posix()
         views.append(
-            replace(view, mask_path=mask_of(name, masks), time=seconds.get(name), exposure=exposure)
+            replace(
+                view, mask_path=find_mask(name, masks), time=seconds.get(name), exposure=exposure
+            )
         )
     warnings += [
         *repair_warning(repaired),
@@ -307,12 +317,12 @@ def read_colmap(root: Path) -> Capture:
     splits, notes = _splits(folder, [image.name for image in listed], views)
     cloud = points if len(points.xyz) else None
     return Capture(
-        root, "colmap", splits, cloud, in_seconds=bool(seconds), warnings=(*warnings, *notes)
+        root, "colmap", splits, cloud, times_in_seconds=bool(seconds), warnings=(*warnings, *notes)
     )
 
 
 def _images_of(root: Path, model: Path) -> Path:
-    """Return the folder of the images; 3DGS has those of its distorted model in ``input``."""
+    """Return the image folder; 3DGS keeps the images of its distorted model in ``input``."""
     if model.is_relative_to(root / "distorted") and (root / "input").is_dir():
         return root / "input"
     folder = images_folder(root)
@@ -333,7 +343,8 @@ def _poses(folder: Path, images: list[ModelImage]) -> tuple[list[np.ndarray], di
         length = float(np.linalg.norm((w, x, y, z)))
         if not abs(length - 1) <= ROTATION_TOLERANCE:  # zeros would be taken for no rotation
             raise DyngsError(
-                f"{where}: the quaternion of its rotation has length {length:.6g}, not 1; export it again"
+                f"{where}: its rotation quaternion has length {length:.6g} instead of 1; export "
+                "it again"
             )
         rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
         pose, repaired[where] = validate_pose(np.column_stack([rotation, translation]), where)
@@ -342,11 +353,11 @@ def _poses(folder: Path, images: list[ModelImage]) -> tuple[list[np.ndarray], di
 
 
 def pinhole_and_lens(camera: ModelCamera, where: str) -> tuple[np.ndarray, Lens]:
-    """Return the (3, 3) matrix and the lens of a COLMAP camera, whose model OpenCV's formulas must
-    express."""
+    """Return the (3, 3) intrinsics and the lens of a COLMAP camera, if its model is supported."""
     if camera.model not in _LENSES:
         raise DyngsError(
-            f"{where}: camera model {camera.model} is not supported; run `colmap image_undistorter` first"
+            f"{where}: camera model {camera.model} is not supported; run `colmap "
+            "image_undistorter` first"
         )
     values = camera.params
     num_focal, kind = _LENSES[camera.model]
@@ -354,7 +365,8 @@ def pinhole_and_lens(camera: ModelCamera, where: str) -> tuple[np.ndarray, Lens]
     fy = values[num_focal - 1]
     if not np.isfinite(values).all() or min(fx, fy) <= 0 or min(camera.size) < 1:
         raise DyngsError(
-            f"{where}: its camera needs a positive size and focal length, and finite numbers; export it again"
+            f"{where}: camera size and focal length must be positive and all parameters finite; "
+            "export it again"
         )
     cx, cy, *coefficients = values[num_focal:]
     if kind == "none" or (kind == "opencv" and not any(coefficients)):
@@ -365,12 +377,12 @@ def pinhole_and_lens(camera: ModelCamera, where: str) -> tuple[np.ndarray, Lens]
 
 
 def _splits(folder: Path, names: list[str], views: list[View]) -> tuple[Splits, list[str]]:
-    """Return the views, those listed in ``test.txt`` for testing, and warnings; ``names`` are those
-    of the images."""
+    """Return the splits by ``test.txt`` and warnings; ``names`` are the image names of the
+    views."""
     path = folder / TEST_LIST
     if not path.is_file():
         return {"train": tuple(views)}, []
-    with wrap_read_errors(path, "it must list names of images, a line each; repair or remove it"):
+    with wrap_read_errors(path, "it must list one image name per line; repair or remove it"):
         text = read_text(path)
     listed = {normalize_name(line.strip()) for line in text.splitlines() if line.strip()}
     unknown = sorted(listed - set(map(normalize_name, names)))

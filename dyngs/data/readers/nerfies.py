@@ -1,4 +1,4 @@
-"""Reader for Nerfies and HyperNeRF captures: ``dataset.json``, ``metadata.json``, ``camera/`` and
+"""Reader for Nerfies and HyperNeRF: ``dataset.json``, ``metadata.json``, ``camera/`` and
 ``rgb/Nx/``."""
 
 from __future__ import annotations
@@ -15,18 +15,17 @@ from dyngs.data.capture import Capture, CaptureFormat, PointCloud, Splits
 from dyngs.data.geometry import OPENGL_FROM_OPENCV
 from dyngs.data.images.images import SUFFIXES, list_files
 from dyngs.data.readers.transforms import FrameEntry, FrameFile, read_views
-from dyngs.io.fields import entry, parse_numbers, read_json_object
+from dyngs.io.fields import parse_numbers, read_json_object, require_key
 from dyngs.io.numpy_files import read_npy
 
 
 def read_nerfies(root: Path) -> Capture:
-    """Read the capture, in the world scaled as ``scene.json`` says, with the largest images that
-    exist.
+    """Read a capture in the scaled world of ``scene.json``, with the largest available images.
 
     Training and test views are ``train_ids`` and ``val_ids`` (without ``val_ids`` every n-th
-    image); the time is ``warp_id`` (or ``time_id``) over the largest one; ``points.npy`` (P, 3), if
-    present, are the sparse points, grey. Cameras (Park et al. 2021): ``orientation`` has the
-    camera's OpenCV axes as rows, ``position`` is its centre.
+    image). The time is ``warp_id`` (or ``time_id``) over the largest one. ``points.npy`` (P, 3)
+    are sparse points, in grey. Cameras (Park et al. 2021): the rows of ``orientation`` are the
+    camera's OpenCV axes, ``position`` is its centre.
     """
     path = root / "dataset.json"
     dataset = read_json_object(path)
@@ -81,13 +80,13 @@ def _ids(path: Path, dataset: dict[str, object], key: str) -> list[str]:
 
 
 def _metadata(path: Path, names: list[str]) -> dict[str, dict[str, Any]]:
-    """Return the entry of each image; its number is checked."""
+    """Return the validated metadata entry of each image."""
     fields: dict[str, Any] = read_json_object(path) if path.is_file() else {}
     found: dict[str, dict[str, Any]] = {}
     for name in names:
         where = f"{path}, '{name}'"
         with wrap_read_errors(where, "give its warp_id and camera_id"):
-            found[name] = entry(path, fields, name) if fields else {}
+            found[name] = require_key(path, fields, name) if fields else {}
             number = found[name].get("warp_id", found[name].get("time_id", 0))
             if number < 0 or number % 1 != 0:
                 raise DyngsError(f"{where}: warp_id must be a whole number >= 0, got {number}")
@@ -95,16 +94,17 @@ def _metadata(path: Path, names: list[str]) -> dict[str, dict[str, Any]]:
 
 
 def _numbers(path: Path, fields: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray:
-    return parse_numbers(f"{path}: '{key}'", entry(path, fields, key), shape)
+    return parse_numbers(f"{path}: '{key}'", require_key(path, fields, key), shape)
 
 
 def _image_folder(root: Path) -> Path:
-    """Return the folder of the largest images: ``1x`` if it holds any, else ``2x`` and so on."""
+    """Return the folder of the largest images: ``1x`` if it contains any, else ``2x`` and so
+    on."""
     found = [path for path in root.glob("*x") if re.fullmatch(r"[1-9]\d{0,3}x", path.name)]
     for folder in sorted(found, key=lambda path: int(path.name[:-1])):
         if list_files(folder, SUFFIXES):
             return folder
-    raise DyngsError(f"{root}: no images in 1x, 2x, 4x or the like; restore one of these folders")
+    raise DyngsError(f"{root}: no images in 1x, 2x, 4x, ...; restore one of these folders")
 
 
 def _camera(path: Path, factor: int, center: np.ndarray, scale: float) -> dict[str, object]:

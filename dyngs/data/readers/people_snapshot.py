@@ -1,5 +1,5 @@
-"""Reader for PeopleSnapshot folders: a video of a rotating person, ``camera.pkl``, masks and poses
-in HDF5 files."""
+"""Reader for PeopleSnapshot: a video of a rotating person, ``camera.pkl``, masks and poses in
+HDF5."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from dyngs.core.errors import DyngsError
-from dyngs.data.body_frames import body_frames, share_body_across_splits
+from dyngs.data.body_frames import build_body_frames, share_body_across_splits
 from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette
 from dyngs.data.geometry import to_opengl_pose
 from dyngs.data.images.images import list_files
 from dyngs.data.images.maps import MASKS
 from dyngs.data.images.video import VIDEO_SUFFIXES
 from dyngs.data.readers.camera_folders import open_camera, sequence_views, video_fps
-from dyngs.io.containment import inside
-from dyngs.io.fields import entry, parse_numbers
+from dyngs.io.containment import check_inside
+from dyngs.io.fields import parse_numbers, require_key
 from dyngs.io.numpy_files import hdf5_length, read_hdf5
 from dyngs.io.pickles import read_pickle
 
@@ -27,14 +27,14 @@ POSE_FILE = "reconstructed_poses.hdf5"
 
 
 def read_people_snapshot(root: Path) -> Capture:
-    """Read the capture of one static camera (Alldieck et al. 2018): frame n of the video is row n
-    of masks and poses.
+    """Read the capture of one fixed camera (Alldieck et al. 2018); frame n is row n of masks and
+    poses.
 
     ``camera.pkl``: camera_f, camera_c (2,) px, camera_k (5,) OpenCV, camera_rt axis-angle and
     camera_t of cam_from_world, width, height. ``masks.hdf5``: masks (F, H, W), 0 is background.
     ``reconstructed_poses.hdf5``: SMPL pose (F, 72), trans (F, 3), betas (10,), in metres. Frames
-    without a mask or parameters are left out. Raises DyngsError: h5py is not installed; anything
-    missing, broken or inconsistent; names the file.
+    without a mask or parameters are skipped. Raises DyngsError if h5py is not installed, or a file
+    is missing, damaged or inconsistent.
     """
     camera = open_camera((video := _video(root)).stem, video)
     body = _body(root / POSE_FILE)
@@ -42,7 +42,8 @@ def read_people_snapshot(root: Path) -> Capture:
     images = {number: path for number, path in camera.images.items() if number in usable}
     if not images:
         raise DyngsError(
-            f"{root}: no frame of {video.name} has both a mask and body parameters; restore the HDF5 files"
+            f"{root}: no frame of {video.name} has both a mask and body parameters; restore the "
+            "HDF5 files"
         )
     views, warnings = sequence_views(
         root / CAMERA, [replace(camera, images=images)], {camera.name: _calibration(root / CAMERA)}
@@ -54,7 +55,8 @@ def read_people_snapshot(root: Path) -> Capture:
     lost = len(camera.images) - len(images)
     if lost:
         warnings.append(
-            f"{video.name}: {lost} of {len(camera.images)} frames lack a mask or a pose and are left out"
+            f"{video.name}: {lost} of {len(camera.images)} frames have no mask or no pose and "
+            "are skipped"
         )
     own = share_body_across_splits(body)
     fps = video_fps([camera])
@@ -63,22 +65,22 @@ def read_people_snapshot(root: Path) -> Capture:
 
 
 def _video(root: Path) -> Path:
-    """Find the only video of the folder, or the one named like the folder."""
+    """Return the only video of the folder, or the one named after the folder."""
     found = list_files(root, VIDEO_SUFFIXES)
     named = [path for path in found if path.stem == root.resolve().name] or found
     if len(named) != 1:
         what = f"{len(found)} videos" if found else "no video"
-        raise DyngsError(f"{root}: {what} in it; keep one, called {root.resolve().name}.mp4")
+        raise DyngsError(f"{root}: found {what}; keep one, named {root.resolve().name}.mp4")
     return named[0]
 
 
 def _calibration(path: Path) -> dict[str, object]:
     from scipy.spatial.transform import Rotation  # late: other captures need none of scipy
 
-    fields = read_pickle(inside(path))
+    fields = read_pickle(check_inside(path))
 
     def numbers(key: str, count: int) -> np.ndarray:
-        return parse_numbers(f"{path}: '{key}'", entry(path, fields, key), (count,))
+        return parse_numbers(f"{path}: '{key}'", require_key(path, fields, key), (count,))
 
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_rotvec(numbers("camera_rt", 3)).as_matrix()
@@ -91,14 +93,14 @@ def _calibration(path: Path) -> dict[str, object]:
 
 
 def _body(path: Path) -> BodyFrames:
-    """Body parameters of the fitted frames; rows that are all zero were not fitted."""
+    """Return the body parameters of the fitted frames; rows of zeros were not fitted."""
     poses, trans, betas = (read_hdf5(path, key) for key in ("pose", "trans", "betas"))
     if len(poses) != len(trans):
         raise DyngsError(
             f"{path}: 'pose' has {len(poses)} rows but 'trans' {len(trans)}; export it again"
         )
     fitted = np.flatnonzero([x.any() or y.any() for x, y in zip(poses, trans, strict=True)])
-    return body_frames(path, fitted.tolist(), poses[fitted], trans[fitted], betas)
+    return build_body_frames(path, fitted.tolist(), poses[fitted], trans[fitted], betas)
 
 
 FORMAT = CaptureFormat(

@@ -1,6 +1,5 @@
-"""Readers for cameras that photogrammetry programs export: Metashape, RealityCapture (RealityScan)
-and ODM.
-"""
+"""Readers for exported cameras: Metashape, RealityCapture (RealityScan), ODM, Polycam and
+Record3D."""
 
 from __future__ import annotations
 
@@ -18,8 +17,8 @@ from dyngs.data.capture import Capture, CaptureFormat, PointCloud
 from dyngs.data.geometry import OPENGL_FROM_OPENCV, to_opengl_pose
 from dyngs.data.images.images import SUFFIXES, list_files, read_header
 from dyngs.data.readers.transforms import FrameEntry, FrameFile, training_capture
-from dyngs.io.containment import inside
-from dyngs.io.fields import entry, first_few, parse_numbers, read_json_object
+from dyngs.io.containment import check_inside
+from dyngs.io.fields import first_few, parse_numbers, read_json_object, require_key
 
 _HEAD_BYTES = 4096
 _ADVICE = "export it again"
@@ -28,8 +27,8 @@ _Fields = dict[str, Any]
 
 
 def _photos_of(root: Path) -> dict[str, Path]:
-    """Return the photos of a capture by name, with and without suffix: those in ``images``, else
-    anywhere below its folder."""
+    """Return the photos of a capture by name and by stem: those in ``images``, else below the
+    root."""
     folder = root / "images" if (root / "images").is_dir() else root
     found: dict[str, Path] = {}
     for path in sorted(folder.rglob("*"), key=lambda path: len(path.parts)):
@@ -40,7 +39,7 @@ def _photos_of(root: Path) -> dict[str, Path]:
 
 
 def _find(photos: dict[str, Path], name: str) -> Path | None:
-    """Return the photo that a program calls ``name``, with or without its folder and suffix."""
+    """Return the photo of this name, with or without folder and suffix."""
     path = PureWindowsPath(name)
     return photos.get(path.name, photos.get(path.stem))
 
@@ -52,8 +51,8 @@ def _capture(
     photos: dict[str, Path],
     cameras: Sequence[tuple[str, _Fields]],
 ) -> Capture:
-    """Return a capture of the cameras, each the name of a photo and its fields, which lack a pose
-    if it has none."""
+    """Return a capture of (photo name, fields); fields without a pose are skipped, with a
+    warning."""
     frames: list[FrameEntry] = []
     left_out: list[str] = []
     for name, fields in cameras:
@@ -66,17 +65,17 @@ def _capture(
             )
     if not frames:
         raise DyngsError(
-            f"{path}: no photo in {root} has the name of a camera with a pose; put the photos there"
+            f"{path}: no photo in {root} is named after a posed camera; copy the photos there"
         )
     count = f"{len(left_out)} of {format_count(len(cameras), 'camera')}"
-    line = f"{path.name}: {count} have no pose or no photo and are left out: {first_few(left_out)}"
+    line = f"{path.name}: {count} have no pose or no photo and are skipped: {first_few(left_out)}"
     return training_capture(
         root, format, FrameFile(root / path.name, frames), *([line] if left_out else [])
     )
 
 
 def _exports(root: Path, suffix: str, mark: bytes) -> list[Path]:
-    """Return the files of a program: those with ``mark`` in their beginning."""
+    """Return the files that contain ``mark`` near their beginning."""
     found: list[Path] = []
     for path in list_files(root, (suffix,)):
         with path.open("rb") as file:
@@ -87,8 +86,8 @@ def _exports(root: Path, suffix: str, mark: bytes) -> list[Path]:
 
 def _only(files: Sequence[Path]) -> Path:
     if len(files) > 1:
-        raise DyngsError(f"{files[0]} and {files[1].name} both hold cameras; move one elsewhere")
-    return inside(files[0])
+        raise DyngsError(f"{files[0]} and {files[1].name} both contain cameras; move one elsewhere")
+    return check_inside(files[0])
 
 
 def _radial(coefficients: Sequence[float]) -> _Fields:
@@ -96,29 +95,26 @@ def _radial(coefficients: Sequence[float]) -> _Fields:
 
 
 def _brown(where: str, k: Sequence[float]) -> _Fields:
-    """Return the radial distortion 1 + k1 r^2 + .. + k3 r^6 in OpenCV's terms, which have no term
-    of r^8."""
+    """Return the radial distortion 1 + k1 r^2 + .. + k3 r^6 for OpenCV, which has no r^8 term."""
     if k[3] != 0:
         raise DyngsError(
-            f"{where}: its distortion with k4={k[3]:g} cannot be expressed; export undistorted photos"
+            f"{where}: its distortion with k4={k[3]:g} is not supported; export undistorted photos"
         )
     return _radial(k[:3])
 
 
 def read_metashape(root: Path) -> Capture:
-    """Read the cameras that Metashape exports as .xml, and the photos in its folder.
+    """Read cameras exported from Metashape as .xml, and the photos in the folder.
 
-    ``transform`` of a camera maps OpenCV axes to the chunk; that of its component, or of the chunk,
-    maps to the world.
+    ``transform`` of a camera maps OpenCV axes to the chunk; that of its component, or of the
+    chunk, maps to the world.
     """
     path = _only(_exports(root, ".xml", b"<chunk"))
     cameras: list[tuple[str, _Fields]] = []
     with wrap_read_errors(path, _ADVICE):
         content = path.read_bytes()
         if b"<!ENTITY" in content:
-            raise DyngsError(
-                f"{path}: defines entities, which no export of cameras needs; {_ADVICE}"
-            )
+            raise DyngsError(f"{path}: XML entities are not allowed; {_ADVICE}")
         chunk = next(ElementTree.fromstring(content).iter("chunk"))
         sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
         placements: dict[str | None, ElementTree.Element | None] = {}
@@ -139,7 +135,8 @@ def read_metashape(root: Path) -> Capture:
 
 
 def _placed(transform: ElementTree.Element | None, pose: np.ndarray) -> np.ndarray:
-    """Return a pose in the world: rotated, scaled and shifted as ``transform`` of a chunk says."""
+    """Return a pose in the world, given the ``transform`` (rotation, scale, translation) of its
+    chunk."""
     if transform is None:
         return pose
     rotation = np.array(
@@ -153,16 +150,16 @@ def _placed(transform: ElementTree.Element | None, pose: np.ndarray) -> np.ndarr
 
 
 def _metashape_lens(path: Path, sensor: ElementTree.Element) -> _Fields:
-    """Return the intrinsics of a sensor in px, ``cx`` and ``cy`` from the middle; its p1 and p2 are
-    OpenCV's p2, p1."""
+    """Return the intrinsics of a sensor in px. Its cx, cy are offsets from the centre; its p1, p2
+    are OpenCV's p2, p1."""
     where = f"{path}, sensor {sensor.get('label')}"
     calibrations = sensor.findall("calibration")
     kind = sensor.get("type")
     if kind not in ("frame", "fisheye") or not calibrations:
         raise DyngsError(
-            f"{where}: is of type {kind} with {format_count(len(calibrations), 'calibration')}; "
-            "only calibrated frame and "
-            "fisheye sensors are read: convert its photos to those of a frame camera in Metashape"
+            f"{where}: is of type {kind} with {format_count(len(calibrations), 'calibration')}; only "
+            "calibrated frame and fisheye sensors are read: convert its photos to those of a "
+            "frame camera in Metashape"
         )
     adjusted = [
         calibration for calibration in calibrations if calibration.get("class") == "adjusted"
@@ -198,16 +195,16 @@ METASHAPE_FORMAT = CaptureFormat(
 
 _REALITYCAPTURE_MARK = b"#name,x,y,alt,"
 _RENAMED = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}
-"""Columns of RealityScan 2, and what RealityCapture calls them."""
+"""Columns of RealityScan 2, and their names in RealityCapture."""
 
 
 def read_realitycapture(root: Path) -> Capture:
-    """Read RealityCapture's .csv of "internal/external camera parameters", and the photos in its
+    """Read RealityCapture's .csv of "internal/external camera parameters", and the photos in the
     folder.
 
     x points east, y north. Heading is clockwise from north, pitch up from straight down, in
-    degrees. ``f`` is for 36 mm wide film, ``px`` and ``py`` are from the middle, in longer sides.
-    ``t1`` and ``t2`` are OpenCV's p2 and p1.
+    degrees. ``f`` is for 36 mm wide film; ``px`` and ``py`` are offsets from the centre in longer
+    sides. ``t1`` and ``t2`` are OpenCV's p2 and p1.
     """
     path = _only(_exports(root, ".csv", _REALITYCAPTURE_MARK))
     photos = _photos_of(root)
@@ -266,26 +263,27 @@ _ODM_LENSES = {
     "fisheye": "OPENCV_FISHEYE",
     "fisheye_opencv": "OPENCV_FISHEYE",
 }
-"""Projections of OpenSfM, and their names in transforms files."""
+"""Projection types of OpenSfM, and camera models of transforms files."""
 
 
 def read_odm(root: Path) -> Capture:
     """Read ``reconstruction.json`` of ODM or OpenSfM, else ``odm_report/shots.geojson`` and
     ``cameras.json``.
 
-    Rotations are axis-angle, from the world to OpenCV axes. In ``shots.geojson`` the translation is
-    the camera's place.
+    Rotations are axis-angle, from the world to OpenCV axes. In ``shots.geojson`` the translation
+    is the camera position.
     """
     path = next(root / name for name in _ODM_FILES if (root / name).is_file())
     points = None
     warnings: list[str] = []
     with wrap_read_errors(path, _ADVICE):
-        content = json.loads(inside(path).read_text(encoding="utf-8-sig"))
+        content = json.loads(check_inside(path).read_text(encoding="utf-8-sig"))
         if path.suffix == ".json":
             model = max(content, key=lambda model: len(model["shots"]))
             if len(content) > 1:
                 warnings = [
-                    f"{path.name}: the largest of {len(content)} models is read, {len(model['shots'])} photos"
+                    f"{path.name}: using the largest of {len(content)} models "
+                    f"({len(model['shots'])} photos)"
                 ]
             lenses = model["cameras"]
             shots = model["shots"]
@@ -297,7 +295,7 @@ def read_odm(root: Path) -> Capture:
                 table = parse_numbers(f"{path}: points", listed, (len(listed), 6))
                 points = PointCloud(table[:, :3], table[:, 3:].clip(0, 255).astype(np.uint8))
         else:
-            lenses = json.loads(inside(root / "cameras.json").read_text(encoding="utf-8-sig"))
+            lenses = json.loads(check_inside(root / "cameras.json").read_text(encoding="utf-8-sig"))
             shots = {
                 feature["properties"]["filename"]: feature["properties"]
                 for feature in content["features"]
@@ -313,13 +311,14 @@ def _odm_camera(path: Path, name: str, shot: _Fields, lenses: dict[str, _Fields]
     where = f"{path}, {name}"
     if "camera" not in shot and len(lenses) > 1:
         raise DyngsError(
-            f"{where}: which of {len(lenses)} cameras took it is not stated; add {_ODM_FILES[0]}"
+            f"{where}: which of {len(lenses)} cameras took this photo is not recorded; add "
+            f"{_ODM_FILES[0]}"
         )
     lens = lenses[shot.get("camera", next(iter(lenses)))]
     kind = lens["projection_type"]
     if kind not in _ODM_LENSES:
         raise DyngsError(
-            f"{where}: photos of projection {kind!r:.40} are not read, only {', '.join(_ODM_LENSES)}"
+            f"{where}: projection {kind!r:.40} is not supported, only {', '.join(_ODM_LENSES)}"
         )
     width = lens["width"]
     height = lens["height"]
@@ -368,11 +367,11 @@ _INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width",
 
 
 def read_polycam(root: Path) -> Capture:
-    """Read ``keyframes`` of Polycam's raw data: an image, a camera and, if there, a depth map of
-    the same name each.
+    """Read ``keyframes`` of Polycam's raw data: images, cameras and optional depth maps of the
+    same names.
 
-    Poses are OpenGL camera-to-world, y up. Corrected images have no distortion, corrected cameras
-    closed loops.
+    Poses are OpenGL camera-to-world, y up. Corrected images are undistorted, corrected cameras
+    have loop closure.
     """
     images, cameras = _existing(root, _POLYCAM)[0]
     frames: list[FrameEntry] = []
@@ -380,11 +379,12 @@ def read_polycam(root: Path) -> Capture:
         path = cameras / f"{image.stem}.json"
         fields = read_json_object(path)
         own: dict[str, object] = {
-            key: entry(path, fields, name) for key, name in _INTRINSICS.items()
+            key: require_key(path, fields, name) for key, name in _INTRINSICS.items()
         }
         own |= _depth_of(root / "keyframes" / "depth" / f"{image.stem}.png")
         own["transform_matrix"] = [
-            [entry(path, fields, f"t_{row}{column}") for column in range(4)] for row in range(3)
+            [require_key(path, fields, f"t_{row}{column}") for column in range(4)]
+            for row in range(3)
         ]
         frames.append(FrameEntry(str(path), own | {"file_path": str(image)}, image=image))
     return training_capture(root, "polycam", FrameFile(root / "keyframes", frames))
@@ -395,8 +395,7 @@ def _depth_of(path: Path) -> dict[str, object]:
 
 
 def _existing(root: Path, places: Sequence[tuple[str, str]]) -> list[tuple[Path, Path]]:
-    """Return the folders that hold images, each with its file or folder of cameras, in the order of
-    ``places``."""
+    """Return the (image folder, cameras) pairs among ``places`` that exist, in this order."""
     pairs = [(root / images, root / cameras) for images, cameras in places]
     return [
         (images, cameras)
@@ -414,18 +413,20 @@ POLYCAM_FORMAT = CaptureFormat(
 
 
 def read_record3d(root: Path) -> Capture:
-    """Read ``metadata.json`` and the images ``rgb/NUMBER.jpg`` of Record3D, or those of an unpacked
+    """Read ``metadata.json`` and the images ``rgb/NUMBER.jpg`` of Record3D, or of an unpacked
     ``.r3d``.
 
-    Poses are OpenGL camera-to-world: a quaternion xyzw and the position. ``K`` is written column by
+    Poses are OpenGL camera-to-world: a quaternion xyzw and the position. ``K`` is stored column by
     column.
     """
     from scipy.spatial.transform import Rotation  # late: other captures do not need it
 
     images, path = _existing(root, _RECORD3D)[0]
     fields = read_json_object(path)
-    poses = parse_numbers(f"{path}: poses", entry(path, fields, "poses"), None).reshape(-1, 7)
-    fx, _, _, _, fy, _, cx, cy, _ = parse_numbers(f"{path}: K", entry(path, fields, "K"), (9,))
+    poses = parse_numbers(f"{path}: poses", require_key(path, fields, "poses"), None).reshape(-1, 7)
+    fx, _, _, _, fy, _, cx, cy, _ = parse_numbers(
+        f"{path}: K", require_key(path, fields, "K"), (9,)
+    )
     lenses = np.tile((fx, fy, cx, cy), (len(poses), 1))
     own_lenses = fields.get("perFrameIntrinsicCoeffs")
     if own_lenses:
@@ -437,7 +438,8 @@ def read_record3d(root: Path) -> Capture:
         number = int(image.stem)
         if number >= len(poses):
             raise DyngsError(
-                f"{image}: has no pose, {path} has {len(poses)}, from number 0 on; export it again"
+                f"{image}: has no pose: {path} has {len(poses)} poses, numbered from 0; export "
+                "it again"
             )
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat(poses[number, :4]).as_matrix()

@@ -1,4 +1,5 @@
-"""Transforms files (Blender, nerfstudio, instant-ngp): frames, views, and coloured point clouds."""
+"""Readers of transforms files (Blender, nerfstudio, instant-ngp), bodies next to them, and .ply
+points."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from dyngs.core.errors import DyngsError, wrap_read_errors
-from dyngs.data.body_frames import read_body_file, rows_of
+from dyngs.data.body_frames import match_frames, read_body_file
 from dyngs.data.capture import (
     BodyFrames,
     Capture,
@@ -32,15 +33,15 @@ from dyngs.data.capture import (
 from dyngs.data.geometry import (
     MAX_SIDE,
     from_opengl_pose,
-    validate_pose,
     match_intrinsics_to_image,
     pinhole_matrix,
     repair_warning,
     rescale_warning,
+    validate_pose,
 )
-from dyngs.data.images.images import SUFFIXES, ImageHeader, try_read_header, read_header
-from dyngs.io.containment import inside
-from dyngs.io.fields import is_number, matrix_of, read_json_object
+from dyngs.data.images.images import SUFFIXES, ImageHeader, read_header, try_read_header
+from dyngs.io.containment import check_inside
+from dyngs.io.fields import is_number, parse_matrix, read_json_object
 from dyngs.io.find import FileFinder, normalize_name
 
 GREY = 128
@@ -52,8 +53,8 @@ _NAMES = (
 
 
 def point_colours(columns: Mapping[str, np.ndarray], count: int) -> np.ndarray:
-    """Return (P, 3) uint8 colours of ``count`` points, grey where ``columns`` (by property name)
-    hold none."""
+    """Return (P, 3) uint8 colours of ``count`` points from ``columns`` by property name, else
+    grey."""
     known = {
         name.lower(): np.ravel(column)
         for name, column in columns.items()
@@ -66,7 +67,7 @@ def point_colours(columns: Mapping[str, np.ndarray], count: int) -> np.ndarray:
 
 
 def _as_bytes(values: np.ndarray) -> np.ndarray:
-    """Return colours as bytes, from the range that their type and their largest value suggest."""
+    """Return colours as bytes; the value range is inferred from type and maximum."""
     if values.dtype == np.uint8:
         return values
     largest = values[np.isfinite(values)].max(initial=0)
@@ -81,7 +82,7 @@ def _as_bytes(values: np.ndarray) -> np.ndarray:
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 MAX_FPS = 1e6
-"""Higher frame rates are taken for mistakes."""
+"""Higher frame rates are ignored as mistakes."""
 _LARGEST = 1e300
 _LARGEST_INTEGER = 2**53
 _FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
@@ -89,14 +90,13 @@ _FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 
 @dataclass(frozen=True)
 class FrameEntry:
-    """One entry of ``frames``: its ``own`` fields; keys that it lacks are looked up in those of the
-    file, ``shared``.
+    """One entry of ``frames``: its ``own`` fields, with those of the file (``shared``) as
+    defaults.
 
     Attributes:
         where: file and index, for messages.
-        image: the image if ``file_path`` does not name it.
-        video: the video frame that the image is decoded from, if any, and ``stored``, its (width,
-            height).
+        image: the image, if ``file_path`` does not name it.
+        video: the video frame of the image, if any, and ``stored``, its (width, height).
     """
 
     where: str
@@ -111,8 +111,7 @@ class FrameEntry:
         return _number(self.own.get(key, self.shared.get(key)), key, self.where)
 
     def integer(self, key: str) -> int | None:
-        """Return the whole number at ``key`` of this frame alone, None if absent or no whole
-        number."""
+        """Return the integer at ``key`` of this frame alone, None if absent or not an integer."""
         value = self.own.get(key)
         if not is_number(value):
             return None
@@ -136,7 +135,7 @@ class FrameFile:
 
     @property
     def fps(self) -> float | None:
-        """Frames per second as the file says, None where it does not."""
+        """Frames per second stated in the file, else None."""
         fps = self.fields.get("fps")
         return float(fps) if is_number(fps) and 0 < fps < MAX_FPS else None
 
@@ -160,10 +159,10 @@ def read_frame_file(path: Path) -> FrameFile:
 
 
 def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
-    """Return views by ``file_path`` as written in the file, in its order, and warnings.
+    """Return views by ``file_path``, in the order of the file, and warnings.
 
-    Raises DyngsError: missing or wrong fields, impossible poses, sizes that disagree, the same
-    image twice.
+    Raises DyngsError for missing or invalid fields, invalid poses, inconsistent sizes and
+    duplicate images.
     """
     root = file.path.parent
     files = FileFinder(root)
@@ -190,14 +189,14 @@ def read_views(file: FrameFile) -> tuple[dict[str, View], list[str]]:
     return _with_flow_targets(views), repair_warning(repaired) + rescale_warning(rescaled)
 
 
-def tracks_path_of(file: FrameFile) -> Path | None:
-    """Return the file of 2D tracks that ``tracks_file_path`` names, None without one."""
+def find_tracks_file(file: FrameFile) -> Path | None:
+    """Return the file of 2D tracks given by ``tracks_file_path``, else None."""
     frame = FrameEntry(str(file.path), {}, file.fields)
     return _named_file(FileFinder(file.path.parent), frame, "tracks_file_path")
 
 
 def view_name(path: Path, root: Path) -> str:
-    """Name of a view: the image's path below ``root`` without extension, safe as a relative file
+    """Return a view name: the image path below ``root`` without extension, safe as a relative file
     name."""
     relative = PurePosixPath(os.path.relpath(path, root).replace(os.sep, "/")).with_suffix("")
     return "/".join(part for part in relative.parts if part not in ("..", "/"))
@@ -210,7 +209,7 @@ def _view(
     header: ImageHeader | None,
     common: tuple[int, int] | None,
 ) -> tuple[View, float, bool]:
-    """Return a view, by how much its rotation was repaired, and whether its intrinsics were
+    """Return a view, the repair error of its rotation, and whether its intrinsics were
     rescaled."""
     described = _described_size(frame)
     stored = header.size_matching(described) if header else frame.stored
@@ -222,7 +221,7 @@ def _view(
     )
     if frame.own.get("transform_matrix") is None:
         raise DyngsError(f"{frame.where}: the key 'transform_matrix' is missing")
-    matrix = matrix_of(frame.where, "transform_matrix", frame.own["transform_matrix"])
+    matrix = parse_matrix(frame.where, "transform_matrix", frame.own["transform_matrix"])
     pose, error = validate_pose(matrix, frame.where)
     motion_mask = _named_file(files, frame, "motion_mask_path")
     labels = _named_file(files, frame, "instance_mask_path")
@@ -252,8 +251,7 @@ def _view(
 
 
 def _with_flow_targets(views: dict[str, View]) -> dict[str, View]:
-    """Return the views of a file with the next view of the same camera in ``flow_to`` where they
-    have flow."""
+    """Set ``flow_to`` of views with flow to the next view of the same camera."""
     if all(view.flow_path is None for view in views.values()):
         return views
     ordered = sorted(
@@ -283,13 +281,14 @@ def _below(files: FileFinder, written: str, where: str) -> Path:
     path = files.find(written)
     if not path.name or path == Path(os.path.normpath(files.root)) or "\0" in written:
         raise DyngsError(
-            f"{where}: {written!r:.80} names no file; write the way to it from the capture's folder"
+            f"{where}: {written!r:.80} is not a file path; give the path relative to the capture "
+            "folder"
         )
     return path
 
 
 def _image_path(files: FileFinder, frame: FrameEntry) -> Path:
-    """Return the image's file; extensions are tried where none is written, PNG first."""
+    """Return the image file; without an extension the known ones are tried, PNG first."""
     if frame.image is not None:
         return frame.image
     written = frame.own.get("file_path")
@@ -320,7 +319,7 @@ def _intrinsics(frame: FrameEntry, width: int, height: int) -> np.ndarray:
     focal_y = _focal(source, "y", height, frame.where) or focal_x
     if focal_y is None:
         raise DyngsError(
-            f"{frame.where}: no focal length; give fl_x (px) or camera_angle_x (radians)"
+            f"{frame.where}: focal length missing; add fl_x (px) or camera_angle_x (radians)"
         )
     cx = frame.number("cx")
     cy = frame.number("cy")
@@ -364,11 +363,12 @@ def _lens(frame: FrameEntry) -> Lens:
         return Lens()
     if model not in ("OPENCV", "FULL_OPENCV", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE"):
         raise DyngsError(
-            f"{frame.where}: camera_model {model} is not supported; use PINHOLE, OPENCV or OPENCV_FISHEYE"
+            f"{frame.where}: camera_model {model} is not supported; use PINHOLE, OPENCV or "
+            "OPENCV_FISHEYE"
         )
     if k4 and not (k5 or k6 or model == "FULL_OPENCV"):
         raise DyngsError(
-            f"{frame.where}: k4 has no agreed meaning for {model}; use FULL_OPENCV or set it to 0"
+            f"{frame.where}: k4 is ambiguous for {model}; use FULL_OPENCV or set it to 0"
         )
     params = (k1, k2, p1, p2, k3, k4, k5, k6)
     while len(params) > 4 and not params[-1]:
@@ -377,24 +377,21 @@ def _lens(frame: FrameEntry) -> Lens:
 
 
 USUAL_NAMES = ("points3d.ply", "points3D.ply", "fused.ply", "points.ply")
-"""Names that 4DGaussians, COLMAP and nerfstudio give to first points, in the order in which they
-are looked for."""
+"""File names of initial points in 4DGaussians, COLMAP and nerfstudio, in order of priority."""
 KEY = "ply_file_path"
 
 
 def find_points(file: FrameFile) -> tuple[PointCloud | None, Path | None, list[str]]:
-    """Return the points that belong to a transforms file, the file that they are from, and
-    warnings.
+    """Return the points that belong to a transforms file, their file, and warnings.
 
-    Those of its key ``ply_file_path``; else of the first of ``USUAL_NAMES`` that is in its folder;
-    else of the only ``.ply`` there. A file that is named nowhere and cannot be read is left out,
-    with a warning. Raises DyngsError: the file that the key names is missing, unreadable, or
-    outside the capture.
+    The file is that of ``ply_file_path``, else the first of ``USUAL_NAMES`` in the folder, else
+    the only ``.ply`` there. An unreadable file that is not named explicitly is ignored with a
+    warning. Raises DyngsError if the named file is missing, unreadable, or outside the capture.
     """
     root = file.path.parent
     written = file.fields.get(KEY)
     if isinstance(written, str) and written:
-        path = inside(FileFinder(root).find(written))
+        path = check_inside(FileFinder(root).find(written))
         return read_points(path), path, []
     usual = [root / name for name in USUAL_NAMES if (root / name).is_file()]
     there = [path for path in root.iterdir() if path.suffix.lower() == ".ply" and path.is_file()]
@@ -402,15 +399,14 @@ def find_points(file: FrameFile) -> tuple[PointCloud | None, Path | None, list[s
         return None, None, []
     path = (usual or there)[0]
     try:
-        points = read_points(inside(path))
+        points = read_points(check_inside(path))
     except DyngsError as error:
-        return None, None, [f"not used as points: {error}"]
+        return None, None, [f"initial points not read: {error}"]
     return (points, path, []) if len(points.xyz) else (None, None, [])
 
 
 def read_points(path: Path) -> PointCloud:
-    """Read the points of a ``.ply`` file (through trimesh), with colours as ``point_colours`` finds
-    them."""
+    """Read the points of a ``.ply`` file with trimesh; colours as in ``point_colours``."""
     import trimesh
 
     if not path.is_file():
@@ -430,9 +426,9 @@ def read_points(path: Path) -> PointCloud:
 
 
 def find_masks(folder: Path) -> dict[str, Path]:
-    """Map paths below ``folder``, ``folded``, with and without the last extension, to masks."""
+    """Map the normalised paths of masks below ``folder``, with and without extension, to files."""
     found: dict[str, Path] = {}
-    for path in sorted(inside(folder).rglob("*")) if folder.is_dir() else ():
+    for path in sorted(check_inside(folder).rglob("*")) if folder.is_dir() else ():
         if path.suffix.lower() in SUFFIXES:
             relative = path.relative_to(folder)
             found[normalize_name(relative.as_posix())] = path
@@ -440,8 +436,8 @@ def find_masks(folder: Path) -> dict[str, Path]:
     return found
 
 
-def mask_of(image_name: str, masks: Mapping[str, Path]) -> Path | None:
-    """Find the mask of ``a/b.jpg``: ``a/b.jpg.png`` or the like, else ``a/b.jpg``, ``a/b.png`` or
+def find_mask(image_name: str, masks: Mapping[str, Path]) -> Path | None:
+    """Find the mask of ``a/b.jpg``: ``a/b.jpg.png``, ``a/b.jpg``, ``a/b.png`` or
     ``a/b.mask.png``."""
     stem = image_name.rpartition(".")[0]
     names = (f"{image_name}.png", image_name, stem, f"{stem}.mask")
@@ -449,8 +445,7 @@ def mask_of(image_name: str, masks: Mapping[str, Path]) -> Path | None:
 
 
 def missing_mask_warning(views: list[View], has_masks: bool) -> list[str]:
-    """Return a line about the images that have no mask although others have, none if there are
-    none."""
+    """Return a warning on images without a mask, if other images have one."""
     without = [view.name for view in views if view.mask_path is None]
     return (
         [f"{len(without)} images have no mask, first {without[0]}"] if has_masks and without else []
@@ -458,12 +453,12 @@ def missing_mask_warning(views: list[View], has_masks: bool) -> list[str]:
 
 
 def read_blender(root: Path) -> Capture:
-    """Read ``transforms_{train,val,test}.json`` with OpenGL camera-to-world poses; val and test are
-    optional.
+    """Read ``transforms_{train,val,test}.json`` with OpenGL camera-to-world poses; val and test
+    are optional.
 
     Intrinsics: ``camera_angle_x``, or ``w, h, fl_x, fl_y, cx, cy`` of the file or the frame.
-    Points: see ``find_points``. Masks: ``mask_path`` of the frames, else those in ``masks/`` that
-    are named as images.
+    Points: see ``find_points``. Masks: ``mask_path`` of the frames, else files in ``masks/`` named
+    after the images.
     """
     splits: Splits = {}
     warnings: list[str] = []
@@ -476,14 +471,14 @@ def read_blender(root: Path) -> Capture:
         splits[name] = tuple(views.values())
         warnings += [f"{path.name}: {note}" for note in notes]
         if not views:
-            warnings.append(f"{path.name}: lists no frames")
+            warnings.append(f"{path.name}: no frames listed")
     splits, notes = _with_masks(root, splits)
     return _capture_of(root, "blender", train, splits, [*warnings, *notes])
 
 
 def _with_masks(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
-    """Return the views with masks of ``masks/`` where the files name none, and a line about views
-    without one."""
+    """Add masks from ``masks/`` if the files name none; also return a warning on views without
+    one."""
     views = all_views(splits)
     has_people = any(view.silhouette for view in views) or any(root.glob("body_*.npz"))
     if has_people or any(view.mask_path for view in views):
@@ -493,7 +488,7 @@ def _with_masks(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
 
     def with_mask(view: View) -> View:
         found = (
-            mask_of(os.path.relpath(view.image_path, folder), masks) for folder in (images, root)
+            find_mask(os.path.relpath(view.image_path, folder), masks) for folder in (images, root)
         )
         return replace(view, mask_path=next(filter(None, found), None))
 
@@ -505,7 +500,7 @@ def _capture_of(
     root: Path, format: str, file: FrameFile, splits: Splits, warnings: list[str]
 ) -> Capture:
     points, path, notes = find_points(file)
-    tracks = tracks_path_of(file)
+    tracks = find_tracks_file(file)
     lines = (*warnings, *notes)
     return Capture(
         root, format, splits, points, path, fps=file.fps, tracks_path=tracks, warnings=lines
@@ -527,12 +522,12 @@ FORMAT = CaptureFormat(
 
 
 def read_nerfstudio(root: Path) -> Capture:
-    """Read ``transforms.json`` with OpenGL camera-to-world poses and, if there, a ``.ply`` file of
+    """Read ``transforms.json`` with OpenGL camera-to-world poses and an optional ``.ply`` of
     points.
 
-    The lists ``train_filenames``, ``val_filenames`` and ``test_filenames`` decide the splits; a val
-    list without a test list is used for testing. Points and poses are read as they stand:
-    ``applied_transform`` has been applied to both.
+    ``train_filenames``, ``val_filenames`` and ``test_filenames`` define the splits; a val list
+    without a test list becomes test. Points and poses are used as stored: ``applied_transform`` is
+    already applied to both.
     """
     file = read_frame_file(root / "transforms.json")
     views, warnings = read_views(file)
@@ -542,7 +537,8 @@ def read_nerfstudio(root: Path) -> Capture:
 
 
 def _nerfstudio_splits(file: FrameFile, views: dict[str, View]) -> tuple[Splits, list[str]]:
-    """Splits by the lists in the file, all views for training where it has none; and warnings."""
+    """Return splits by the lists in the file (all views for training without lists), and
+    warnings."""
     listed = {name: file.fields.get(f"{name}_filenames") for name in SPLITS}
     if all(value is None for value in listed.values()):
         return {"train": tuple(views.values())}, []
@@ -561,7 +557,9 @@ def _nerfstudio_splits(file: FrameFile, views: dict[str, View]) -> tuple[Splits,
     if "test" not in splits and "val" in splits:
         splits["test"] = splits.pop("val")
     used = {view.name for kept in splits.values() for view in kept}
-    notes = [f"{len(unknown)} listed images have no frame, first {unknown[0]}"] if unknown else []
+    notes = (
+        [f"{len(unknown)} listed images are not in 'frames', first {unknown[0]}"] if unknown else []
+    )
     if len(used) < len(views):
         notes.append(f"{len(views) - len(used)} frames are in no split and are ignored")
     return splits, notes
@@ -576,15 +574,15 @@ NERFSTUDIO_FORMAT = CaptureFormat(
 
 
 def read_body_json(root: Path) -> Capture:
-    """Read ``transforms_{train,val,test,pose}.json`` with body parameters; all but the first file
-    are optional.
+    """Read ``transforms_{train,val,test,pose}.json`` with body parameters; all but the first are
+    optional.
 
-    Each split has the parameters of its ``body_SPLIT.npz``: poses (T, 72, 156 or 165), trans (T,
-    3), betas and, if there, scale; row n is for the frame whose ``frame`` is n. Without such a
-    file, val and test show the frames of train. ``surface_model_type`` "anny" says that betas are
-    of the free template's shape space. ``pose`` is another clip, with frame numbers, times and
-    parameters of its own. Parameters and cameras share one world; unlike with AMASS files nothing
-    is rotated to make it y up.
+    The parameters of a split are in ``body_SPLIT.npz``: poses (T, 72, 156 or 165), trans (T, 3),
+    betas and optionally scale; row n belongs to the frame whose ``frame`` is n. Without such a
+    file, val and test use those of train. ``surface_model_type`` "anny" marks betas of the free
+    template's shape space. ``pose`` is a separate clip, with its own frame numbers, times and
+    parameters. Parameters and cameras share one world; unlike AMASS files nothing is rotated to y
+    up.
     """
     capture = read_blender(root)  # its points are not used: people begin on a template
     splits = dict(capture.splits)
@@ -612,10 +610,11 @@ def _body_of(root: Path, split: Split, views: tuple[View, ...], train: BodyFrame
     path = root / f"body_{split}.npz"
     if not path.is_file() and split == "pose":
         raise DyngsError(
-            f"{path}: no such file; transforms_pose.json shows another clip, which needs its own parameters"
+            f"{path}: no such file; transforms_pose.json is a separate clip and needs its own "
+            "body parameters"
         )
     body = read_body_file(path) if path.is_file() and split != "train" else train
-    rows_of(path if path.is_file() else root / "body_train.npz", body, views)
+    match_frames(path if path.is_file() else root / "body_train.npz", body, views)
     return body
 
 

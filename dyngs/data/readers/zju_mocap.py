@@ -1,4 +1,4 @@
-"""Reader for ZJU-MoCap folders: ``annots.npy`` of several cameras, or ``cameras.pkl`` and
+"""Reader for ZJU-MoCap: ``annots.npy`` of several cameras, or ``cameras.pkl`` and
 ``mesh_infos.pkl`` of one."""
 
 from __future__ import annotations
@@ -12,35 +12,39 @@ from typing import Any
 import numpy as np
 
 from dyngs.core.errors import DyngsError, wrap_read_errors
-from dyngs.data.body_frames import body_frames, parse_frame_number, share_body_across_splits, rows_of
+from dyngs.data.body_frames import (
+    build_body_frames,
+    match_frames,
+    parse_frame_number,
+    share_body_across_splits,
+)
 from dyngs.data.capture import BodyFrames, Capture, CaptureFormat, Silhouette, Splits
-from dyngs.data.geometry import validate_pose, to_opengl_pose
+from dyngs.data.geometry import to_opengl_pose, validate_pose
 from dyngs.data.readers.camera_folders import MIN_CAMERAS_TO_HOLD_OUT
 from dyngs.data.readers.transforms import FrameEntry, FrameFile, read_views
-from dyngs.io.containment import inside
-from dyngs.io.fields import entry, parse_numbers
+from dyngs.io.containment import check_inside
+from dyngs.io.fields import parse_numbers, require_key
 from dyngs.io.pickles import read_pickle, read_pickled_array
 
 ANNOTATIONS = "annots.npy"
 CAMERAS = "cameras.pkl"
 MESHES = "mesh_infos.pkl"
-FIRST_HELD_OUT = "no camera is named for testing: the first one is held out"
+FIRST_HELD_OUT = "no test camera given; the first camera is held out"
 
 
 def read_zju_mocap(root: Path) -> Capture:
-    """Read the capture of a person by several calibrated static cameras or by one; units are
-    metres.
+    """Read the capture of a person by one or several calibrated fixed cameras; units are metres.
 
-    ``annots.npy`` (Peng et al. 2021) holds ``cams`` (K, D, R, T in mm, per camera) and ``ims``
-    (images of all cameras per frame); SMPL parameters lie in ``new_params/N.npy`` or
-    ``params/N.npy``, N being the number in the image's name; masks (labels, 0 is background) in
-    ``mask_cihp``, ``mask`` or ``masks`` under the images' names. Of three cameras or more the first
-    one is for testing. ``cameras.pkl`` and ``mesh_infos.pkl`` (Weng et al. 2022) hold the same per
-    image of ``images/``, in metres; masks (white) lie in ``masks/``.
+    ``annots.npy`` (Peng et al. 2021) contains ``cams`` (K, D, R, T in mm, per camera) and ``ims``
+    (images of all cameras per frame). SMPL parameters are in ``new_params/N.npy`` or
+    ``params/N.npy``, where N is the number in the image name; masks (labels, 0 is background) in
+    ``mask_cihp``, ``mask`` or ``masks`` under the image names. Of three cameras or more the first
+    one is for testing. ``cameras.pkl`` and ``mesh_infos.pkl`` (Weng et al. 2022) contain the same
+    per image of ``images/``, in metres; masks (white) are in ``masks/``.
 
-    Parameters: v = Rh LBS(x; poses) + Th, about the template's origin: kept as
-    ``BodyFrames.turns``. OpenCV calibrated these cameras, with pixel centres at whole numbers: half
-    a pixel is added to the principal point.
+    Parameters: v = Rh LBS(x; poses) + Th, about the template's origin; Rh becomes
+    ``BodyFrames.origin_rotations``. The cameras were calibrated with OpenCV, whose pixel centres
+    are integers, so half a pixel is added to the principal point.
     """
     shots: list[Any]
     if (root / ANNOTATIONS).is_file():
@@ -50,7 +54,7 @@ def read_zju_mocap(root: Path) -> Capture:
         numbers = sorted({shot.own["frame"] for shot in shots})
         found = next((x for x in (root / "new_params", root / "params") if x.is_dir()), root)
         files = [found / f"{number}.npy" for number in numbers]
-        body = _body(found, numbers, [(str(x), read_pickled_array(inside(x))) for x in files])
+        body = _body(found, numbers, [(str(x), read_pickled_array(check_inside(x))) for x in files])
         kind, folders = "nonzero", ("mask_cihp", "mask", "masks")
     else:
         path = root / CAMERAS
@@ -70,7 +74,7 @@ def read_zju_mocap(root: Path) -> Capture:
     for shot in shots:
         shot.own["time"] = (shot.own["frame"] - first) / max(last - first, 1)
     read, warnings = read_views(FrameFile(path, shots))
-    rows_of(found, body, list(read.values()))
+    match_frames(found, body, list(read.values()))
     people = []
     without = []
     for view, shot in zip(read.values(), shots, strict=True):
@@ -88,12 +92,14 @@ def read_zju_mocap(root: Path) -> Capture:
             "test": tuple(view for view in people if view.camera_id == 0),
         }
         warnings.append(FIRST_HELD_OUT)
-    return Capture(root, "zju_mocap", splits, body=share_body_across_splits(body), warnings=tuple(warnings))
+    return Capture(
+        root, "zju_mocap", splits, body=share_body_across_splits(body), warnings=tuple(warnings)
+    )
 
 
 def _annotated_shots(path: Path) -> list[FrameEntry]:
-    """Return the frames of all cameras that ``annots.npy`` lists."""
-    fields: Any = read_pickled_array(inside(path))
+    """Return the frames of all cameras in ``annots.npy``."""
+    fields: Any = read_pickled_array(check_inside(path))
     cams = fields["cams"]
     calibrations = []
     for k, d, r, t in zip(*(cams[key] for key in ("K", "D", "R", "T")), strict=True):
@@ -114,13 +120,15 @@ def _annotated_shots(path: Path) -> list[FrameEntry]:
 
 
 def _single_shots(path: Path) -> list[FrameEntry]:
-    """Return the frames of the one camera in ``cameras.pkl``."""
+    """Return the frames of the camera in ``cameras.pkl``."""
     shots = []
     for name, own in sorted(_by_name(path).items()):
         where = f"{path}, {name}"
-        pose = parse_numbers(f"{where}: 'extrinsics'", entry(where, own, "extrinsics"), (4, 4))
+        pose = parse_numbers(
+            f"{where}: 'extrinsics'", require_key(where, own, "extrinsics"), (4, 4)
+        )
         lens = own.get("distortions", np.zeros(5))
-        calibration = _calibration(where, entry(where, own, "intrinsics"), lens, pose)
+        calibration = _calibration(where, require_key(where, own, "intrinsics"), lens, pose)
         frame = parse_frame_number(path, name)
         fields = calibration | {"file_path": f"images/{name}", "camera": 0, "frame": frame}
         shots.append(FrameEntry(where, fields))
@@ -128,22 +136,24 @@ def _single_shots(path: Path) -> list[FrameEntry]:
 
 
 def _body(path: Path, numbers: list[int], rows: Sequence[tuple[str, Any]]) -> BodyFrames:
-    """Return the parameters of one dictionary per frame, each with a name for messages."""
+    """Return the body parameters, given a dictionary per frame and its name for messages."""
     names = [key for key in ("betas", "shapes") if all(key in own for _, own in rows)]
     betas = _column(rows, names[0]) if names else np.zeros(10)
     poses = _column(rows, "poses")
     trans = _column(rows, "Th", 3)
     turns = _column(rows, "Rh", 3)
-    return body_frames(path, numbers, poses, trans, betas, turns=turns)
+    return build_body_frames(path, numbers, poses, trans, betas, origin_rotations=turns)
 
 
 def _column(
     rows: Sequence[tuple[str, object]], key: str, width: int | None = None
 ) -> list[np.ndarray]:
-    """Finite numbers at ``key`` of each of the named dictionaries, ``width`` of them unless that is
-    None."""
+    """Return the finite numbers at ``key`` of each dictionary, ``width`` of them if given."""
     shape = None if width is None else (width,)
-    return [parse_numbers(f"{where}: '{key}'", entry(where, own, key), shape) for where, own in rows]
+    return [
+        parse_numbers(f"{where}: '{key}'", require_key(where, own, key), shape)
+        for where, own in rows
+    ]
 
 
 def _calibration(
@@ -153,7 +163,8 @@ def _calibration(
     values = parse_numbers(f"{where}: the distortion", lens, None).tolist()
     if len(values) not in (4, 5, 8):
         raise DyngsError(
-            f"{where}: the distortion must have 4, 5 or 8 coefficients, got {len(values)}; export it again"
+            f"{where}: the distortion must have 4, 5 or 8 coefficients, got {len(values)}; "
+            "export it again"
         )
     pose, _ = validate_pose(cam_from_world, where)
     return {
@@ -168,8 +179,8 @@ def _calibration(
 
 
 def _mask(root: Path, file: str, folders: Sequence[str]) -> Path | None:
-    """Find the mask ``FOLDER/a/b.png`` of ``a/b.jpg`` or ``images/a/b.jpg``, in the first folder
-    that has it."""
+    """Find the mask ``FOLDER/a/b.png`` of ``a/b.jpg`` or ``images/a/b.jpg`` in the first folder
+    with one."""
     name = PurePosixPath(file.replace("\\", "/")).with_suffix("")
     below = [f"{name}.png", f"{name}.png".removeprefix("images/")]
     candidates = [root / folder / path for folder in folders for path in below]
@@ -177,10 +188,10 @@ def _mask(root: Path, file: str, folders: Sequence[str]) -> Path | None:
 
 
 def _by_name(path: Path) -> dict[str, dict[str, object]]:
-    fields: Any = read_pickle(inside(path))
+    fields: Any = read_pickle(check_inside(path))
     for name in fields:
         if not re.fullmatch(r"[\w-]+", name):
-            raise DyngsError(f"{path}: {name!r:.80} is no name of an image; export it again")
+            raise DyngsError(f"{path}: {name!r:.80} is not an image name; export it again")
     return fields
 
 

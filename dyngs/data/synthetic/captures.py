@@ -35,7 +35,9 @@ _LAMP_SIZE = 0.9
 _SKY = (0.46, 0.50, 0.56)
 _GROUND = (0.20, 0.17, 0.15)
 _LAMPLIGHT = (0.80, 0.74, 0.66)
-_SURFACE = 3e-3  # world units by which a surface may seem to lie before one of its own points
+_SURFACE_TOLERANCE = (
+    3e-3  # world units by which a surface may seem to lie before one of its own points
+)
 
 
 @dataclass(frozen=True)
@@ -62,11 +64,11 @@ class PaintedBall:
         """(R, 3) surface points in the paint's axes."""
         return self.normals(points) @ f32(self.turn)
 
-    def placed(self, local: np.ndarray) -> np.ndarray:
+    def to_world(self, local: np.ndarray) -> np.ndarray:
         """(R, 3) surface points, of those in the paint's axes: the inverse of ``local``."""
         return np.float32(self.radius) * local @ f32(self.turn).T + f32(self.center)
 
-    def sampled(self, count: int, random: np.random.Generator) -> np.ndarray:
+    def sample_surface(self, count: int, random: np.random.Generator) -> np.ndarray:
         """(R, 3) points spread evenly over the surface, in the paint's axes."""
         return _unit(random.normal(size=(count, 3))).astype(np.float32)
 
@@ -114,10 +116,10 @@ class PaintedBox:
         turned = (points - f32(self.center)) @ self._axes().T
         return turned / f32(self.half_extents)
 
-    def placed(self, local: np.ndarray) -> np.ndarray:
+    def to_world(self, local: np.ndarray) -> np.ndarray:
         return (local * f32(self.half_extents)) @ self._axes() + f32(self.center)
 
-    def sampled(self, count: int, random: np.random.Generator) -> np.ndarray:
+    def sample_surface(self, count: int, random: np.random.Generator) -> np.ndarray:
         half = np.asarray(self.half_extents)
         areas = half.prod() / half
         local = random.uniform(-1.0, 1.0, (count, 3))
@@ -147,18 +149,18 @@ class Scene:
     """Primitives, z up, lit by a sky and one square lamp, whose size softens the shadows.
 
     Attributes:
-        faint: a neighbour that hides no more than this fraction of a point's sky hides nothing,
+        occlusion_threshold: a neighbour that hides no more than this fraction of a point's sky hides nothing,
             which leaves what is far from a moving thing exactly as it is.
         num_static: the first so many primitives stand still; None: all do.
     """
 
     primitives: tuple[Primitive, ...]
     lamp: tuple[float, float, float] = (2.2, -2.6, 4.4)
-    faint: float = 0.0
+    occlusion_threshold: float = 0.0
     num_static: int | None = None
 
     @property
-    def movers(self) -> range:
+    def moving_indices(self) -> range:
         """Indices of the primitives that move."""
         return range(
             len(self.primitives) if self.num_static is None else self.num_static,
@@ -203,17 +205,17 @@ def render_motion_labels(
     nearest, distance = nearest_primitives(scene, f32(world_from_cam[:3, 3]), directions)
     things = np.where(np.isfinite(distance), nearest, -1).reshape(samples**2, -1)
     nothing = np.zeros(size * size, np.int64)
-    counts = [nothing, *((things == index).sum(axis=0) for index in scene.movers)]
+    counts = [nothing, *((things == index).sum(axis=0) for index in scene.moving_indices)]
     return np.argmax(counts, axis=0).astype(np.uint8).reshape(size, size)
 
 
-def is_seen(scene: Scene, points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
+def is_visible(scene: Scene, points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
     """(R,) bool: points (R, 3) on surfaces that a camera sees, somewhere in its image or not."""
     origin = world_from_cam[:3, 3]
     offset = points - origin
     distance = np.sqrt(_dot(offset, offset))
     _, nearest = nearest_primitives(scene, f32(origin), f32(offset / distance[:, None]))
-    return nearest > distance - _SURFACE
+    return nearest > distance - _SURFACE_TOLERANCE
 
 
 def nearest_primitives(
@@ -262,8 +264,8 @@ def _shade(
     open_sky = np.ones(len(points), np.float32)
     for other in scene.primitives:
         if other is not primitive:
-            hidden = np.maximum(other.occlusion(points, normals) - scene.faint, 0.0)
-            open_sky *= 1.0 - hidden / (1.0 - scene.faint)
+            hidden = np.maximum(other.occlusion(points, normals) - scene.occlusion_threshold, 0.0)
+            open_sky *= 1.0 - hidden / (1.0 - scene.occlusion_threshold)
             seen = np.flatnonzero(lit)
             lit[seen] = np.isinf(other.intersect(above[seen], to_lamp[seen]))
     upward = (0.5 + 0.5 * normals[:, 2:]).astype(np.float32)
@@ -306,8 +308,8 @@ SceneName = Literal["spin", "room", "roll"]
 
 Rgb = tuple[float, float, float]
 
-_FAINT = 0.05
-"""``Scene.faint`` of the moving scenes: a ball occludes the sky for what is nearer than about four
+_OCCLUSION_THRESHOLD = 0.05
+"""``Scene.occlusion_threshold`` of the moving scenes: a ball occludes the sky for what is nearer than about four
 radii."""
 
 _PLATE_TOP = -0.34
@@ -379,7 +381,7 @@ def _spin(time: float) -> Scene:
                 turn=_rolled(-path_radius * azimuth / radius, azimuth),
             ),
         ),
-        faint=_FAINT,
+        occlusion_threshold=_OCCLUSION_THRESHOLD,
         num_static=2,
     )
 
@@ -430,7 +432,7 @@ def _room(time: float) -> Scene:
             ),
             ball,
         ),
-        faint=_FAINT,
+        occlusion_threshold=_OCCLUSION_THRESHOLD,
         num_static=7,
     )
 
@@ -455,7 +457,11 @@ def _roll(time: float) -> Scene:
         gloss=0.4,
         turn=_rolled(-angle, azimuth),
     )
-    return Scene((_plate((0.74, 0.74, 0.72), (0.22, 0.20, 0.26)), ball), faint=_FAINT, num_static=1)
+    return Scene(
+        (_plate((0.74, 0.74, 0.72), (0.22, 0.20, 0.26)), ball),
+        occlusion_threshold=_OCCLUSION_THRESHOLD,
+        num_static=1,
+    )
 
 
 def _rolled(angle: float, azimuth: float) -> np.ndarray:
@@ -701,7 +707,7 @@ def write_dynamic_capture(
     style = options.style or ("fixed" if name == "room" else "teleport")
     if name == "room" and style == "teleport":
         raise DyngsError(
-            "the walls of the room would hide it from cameras all around; choose --style fixed or moving"
+            "the room's walls block cameras all around it; choose --style fixed or moving"
         )
     splits = _fixed_shots(options) if style == "fixed" else _single_shots(options, style)
     with atomic_folder(out) as started:
@@ -855,17 +861,20 @@ def true_tracks(
     times = sorted(set(moments))
     scenes = [scene_of(time) for time in times]
     random = np.random.default_rng(seed)
-    local = {i: scenes[0].primitives[i].sampled(POINTS_PER_THING, random) for i in scenes[0].movers}
+    local = {
+        i: scenes[0].primitives[i].sample_surface(POINTS_PER_THING, random)
+        for i in scenes[0].moving_indices
+    }
     points = np.stack(
         [
-            np.concatenate([scene.primitives[i].placed(x) for i, x in local.items()])
+            np.concatenate([scene.primitives[i].to_world(x) for i, x in local.items()])
             for scene in scenes
         ]
     ).astype(np.float32)
     rows = [times.index(time) for time in moments]
     visible = [
         is_in_image(points[row], shot.world_from_cam)
-        & is_seen(scenes[row], points[row], shot.world_from_cam)
+        & is_visible(scenes[row], points[row], shot.world_from_cam)
         for row, shot in zip(rows, shots, strict=True)
     ]
     return TrueTracks(

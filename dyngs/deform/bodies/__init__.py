@@ -1,2 +1,1 @@
-"""Things that move rigidly, found in the images of one moving camera: where they are, and how they
-turn."""
+"""Rigid bodies in the images of one moving camera: detection, trajectories and rotations."""

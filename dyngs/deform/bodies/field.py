@@ -1,5 +1,4 @@
-"""Rigid bodies that move along splines, within another field: the smallest motion that explains
-what turns.
+"""Deformation field of rigid bodies that move along splines, around another field.
 
 Local letters: M moving Gaussians, B bodies, P control points.
 """
@@ -22,28 +21,27 @@ from dyngs.ops.harmonics import dim_harmonics, light_harmonics
 from dyngs.ops.nodes import SPAN, spline_motion
 from dyngs.ops.quaternions import identity_quat, rotate
 
-START = 0.15, 0.1, 0.0, 0.0
-"""Parts of direct light and of that from all around that a ball takes; logarithms of the shadow's
-size and softness."""
-# Radii in which the edge of a shadow, and its beginning at the ball, fall by e
+INITIAL_SHADE = 0.15, 0.1, 0.0, 0.0
+"""Initial fractions of direct and ambient light that a sphere blocks, log size and log softness of
+the shadow."""
+# Radii over which the edge of a shadow, and its start at the sphere, fall by e.
 PENUMBRA, GRAZING = 0.2, 0.3
 
 
 def light_fraction(
     points: Tensor, labels: Tensor, places: Tensor, radii: Tensor, sun: Tensor, shade: Tensor
 ) -> Tensor:
-    """Return the (N,) parts of the light that reach ``points`` (N, 3) around balls; differentiable
-    in the last two.
+    """Return the fraction of light (N,) that reaches ``points`` (N, 3) in the shadow of spheres.
 
-    A ball hides direct light from what lies behind it, near its axis, and of that from all around
-    as much as it fills of the view: the square of its radius (B,) over the distance from its place
-    (B, 3). The ball of ``labels`` (N,) that a point is a part of, -1 for none, throws no shadow on
-    it. Direct light comes from ``sun`` (3,), of any length; ``shade`` (4,) is as ``START``.
+    A sphere blocks direct light behind it, near its axis, and ambient light by its solid angle:
+    its squared radius (B,) over the squared distance from ``places`` (B, 3). A point casts no
+    shadow on itself: ``labels`` (N,) is the sphere it belongs to, or -1. Light comes from ``sun``
+    (3,), of any norm. ``shade`` (4,) is as ``START``. Differentiable in ``sun`` and ``shade``.
     """
     direct, around = shade[:2].clamp(0.0, 0.95)
     size, softness = shade[2:].exp()
     way = torch.nn.functional.normalize(sun, dim=0)
-    left = points.new_ones(len(points))
+    light = points.new_ones(len(points))
     for ball in range(len(places)):
         to = (places[ball] - points) / radii[ball]
         along = to @ way
@@ -52,51 +50,58 @@ def light_fraction(
             along / GRAZING
         )
         view = to.square().sum(1).clamp_min(1.0).reciprocal()
-        left = left * torch.where(labels == ball, 1.0, (1 - direct * hidden) * (1 - around * view))
-    return left
+        light = light * torch.where(
+            labels == ball, 1.0, (1 - direct * hidden) * (1 - around * view)
+        )
+    return light
 
 
-RATES = {"places": 3e-4, "quats": 3e-3, "light": 1e-2, "albedo": 5e-3, "sun": 1e-2, "shade": 1e-2}
-"""Learning rates; that of places times the scene extent."""
+LEARNING_RATES = {
+    "places": 3e-4,
+    "quats": 3e-3,
+    "light": 1e-2,
+    "albedo": 5e-3,
+    "sun": 1e-2,
+    "shade": 1e-2,
+}
+"""Learning rates; that of ``places`` is times the scene extent."""
 LR_DECAY = 0.05
-TEACHES = 8  # Every so many-th Gaussian says what the few numbers of shadows should be
+GRADIENT_STRIDE = 8  # every so many-th Gaussian gives gradients to the few parameters of shadows
 
 
 @dataclass(frozen=True)
 class BodyRestPose:
-    """Where bodies lie when they are at rest, and which Gaussians are theirs."""
+    """Bodies in their rest pose, and their Gaussians."""
 
     centers: Tensor  # (B, 3)
     radii: Tensor  # (B,)
-    labels: Tensor  # (M,) body of each Gaussian, -1 for none
+    labels: Tensor  # (M,) body of each Gaussian, -1: none
 
 
 class BodyField(OuterField):
-    """The offsets of ``others``, but for the Gaussians of bodies: these move rigidly, and take
-    colours alone from it.
+    """A field that moves the Gaussians of rigid bodies; all others follow the inner field.
 
-    A body turns about its own centre, x' = R(t) (x - c) + p(t), along uniform cubic B-splines of
-    the place p and of the quaternion of R; the Gaussians turn with it, into the light and out of
-    it: their colours change by their albedo times the light on what faces the way that they lie
-    from the centre (``light_harmonics``). All else is in their shadow (``light_left``).
+    A body moves as x' = R(t) (x - c) + p(t), along uniform cubic B-splines of the position p and
+    of the quaternion of R. The colours of its Gaussians change with the light: albedo times the
+    light on the outward direction from the centre (``light_harmonics``). All other Gaussians lie
+    in its shadow (``light_fraction``). Colour offsets of the inner field apply to bodies, too.
     """
 
     def __init__(
         self, inner_field: DeformationField, rest: BodyRestPose, learned: Mapping[str, Tensor]
     ) -> None:
-        """Take the control points ``places`` (B, P, 3) and ``quats`` (B, P, 4) of the bodies'
-        splines, and others.
+        """Build the field from control points ``places`` (B, P, 3) and ``quats`` (B, P, 4).
 
-        These may be missing: ``albedo`` (M, 3), in units of the harmonic of degree 0; ``light`` (8,
-        3); ``sun`` (3,) and ``shade`` (4,), see ``light_left``.
+        ``learned`` may also hold ``albedo`` (M, 3), in units of the degree-0 SH basis, ``light``
+        (8, 3), and ``sun`` (3,) and ``shade`` (4,) of ``light_fraction``.
         """
         super().__init__(inner_field)
         self.rest = rest
         like = rest.centers
         blank = {"albedo": like.new_zeros(len(rest.labels), 3), "light": like.new_zeros(8, 3)}
-        blank |= {"sun": like.new_tensor([0.0, 0.0, 1.0]), "shade": like.new_tensor(START)}
-        rates = RATES | {"places": RATES["places"] * self.setup.extent}
-        roles = dict.fromkeys(RATES, Role.SHARED) | {"albedo": Role.PER_MOVING}
+        blank |= {"sun": like.new_tensor([0.0, 0.0, 1.0]), "shade": like.new_tensor(INITIAL_SHADE)}
+        rates = LEARNING_RATES | {"places": LEARNING_RATES["places"] * self.setup.extent}
+        roles = dict.fromkeys(LEARNING_RATES, Role.SHARED) | {"albedo": Role.PER_MOVING}
         self.parameters = Parameters(blank | dict(learned), rates, LR_DECAY, roles)
 
     @property
@@ -104,35 +109,35 @@ class BodyField(OuterField):
         return super().num_values + sum(x.numel() for x in vars(self.rest).values())
 
     def poses(self, time: float) -> tuple[Tensor, Tensor]:
-        """Return (B, 3) places of the bodies' centres and (B, 4) quaternions, of any length."""
+        """Return positions (B, 3) and quaternions (B, 4), of any norm, of the bodies at ``time``."""
         motion, quats = spline_motion(
             [self.parameters["places"], self.parameters["quats"], None, None, None], time
         )
         return motion[:, :3], quats
 
-    def changed(self, found: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
+    def modify(self, offsets: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
         labels = select_rows(self.rest.labels, rows)
         means = select_rows(means, rows)
-        own = torch.nonzero(labels >= 0)[:, 0]
-        body = labels[own]
+        body_rows = torch.nonzero(labels >= 0)[:, 0]
+        body = labels[body_rows]
         places, quats = (x.index_select(0, body) for x in self.poses(time))
         quats = torch.nn.functional.normalize(quats, dim=1)
-        arms = rotate(quats, means[own] - self.rest.centers[body])
-        moved = arms + places - means[own]
+        arms = rotate(quats, means[body_rows] - self.rest.centers[body])
+        moved = arms + places - means[body_rows]
         facing = torch.nn.functional.normalize(arms.detach(), dim=1)
-        lit = (light_harmonics(facing) @ self.parameters["light"]) * select_rows(
+        light_change = (light_harmonics(facing) @ self.parameters["light"]) * select_rows(
             self.parameters["albedo"], rows
-        )[own]
-        turned = found.quats if found.quats is not None else means.new_zeros(len(means), 4)
-        scales = found.log_scales
+        )[body_rows]
+        quats_out = offsets.quats if offsets.quats is not None else means.new_zeros(len(means), 4)
+        scales = offsets.log_scales
         return Offsets(
-            found.means.index_copy(0, own, moved),
-            turned.index_copy(0, own, quats - identity_quat(quats)),
-            None if scales is None else scales.index_fill(0, own, 0.0),
-            found.logit_opacities,
-            (means.new_zeros(len(means), 3) if found.colors is None else found.colors).index_add(
-                0, own, lit
-            ),
+            offsets.means.index_copy(0, body_rows, moved),
+            quats_out.index_copy(0, body_rows, quats - identity_quat(quats)),
+            None if scales is None else scales.index_fill(0, body_rows, 0.0),
+            offsets.logit_opacities,
+            (
+                means.new_zeros(len(means), 3) if offsets.colors is None else offsets.colors
+            ).index_add(0, body_rows, light_change),
         )
 
     def apply_shading(
@@ -145,18 +150,19 @@ class BodyField(OuterField):
         places = self.poses(time)[0].detach()
         balls = places, self.rest.radii, self.parameters["sun"], self.parameters["shade"]
         with torch.no_grad():
-            left = light_fraction(means, labels, *balls)
-        few = light_fraction(means[::TEACHES], labels[::TEACHES], *balls)
-        return super().apply_shading(
-            gaussians.replace(sh=dim_harmonics(gaussians.sh, left, few, TEACHES)), rows, which, time
-        )
+            light = light_fraction(means, labels, *balls)
+        strided = slice(None, None, GRADIENT_STRIDE)
+        light_for_gradient = light_fraction(means[strided], labels[strided], *balls)
+        sh = dim_harmonics(gaussians.sh, light, light_for_gradient, GRADIENT_STRIDE)
+        return super().apply_shading(gaussians.replace(sh=sh), rows, which, time)
 
     def zero_gradients_outside_(self, window: tuple[float, float]) -> None:
         super().zero_gradients_outside_(window)
         for points in (self.parameters["places"], self.parameters["quats"]):
             pieces = points.shape[1] - SPAN + 1
             first = math.ceil(window[0] * pieces) + 1
-            last = math.floor(window[1] * pieces) + 1  # by where they peak
+            # by the times at which control points have their largest weight
+            last = math.floor(window[1] * pieces) + 1
             if points.grad is not None and window != (0.0, 1.0):
                 points.grad[:, :first], points.grad[:, last + 1 :] = 0, 0
 
@@ -172,7 +178,8 @@ class BodyField(OuterField):
 
     @staticmethod
     def from_state(inner_field: DeformationField, tensors: Mapping[str, Tensor]) -> BodyField:
-        """Return the field of a state within the restored ``others``; raises as ``restored``."""
+        """Return the bodies in a state around the restored ``inner_field``; errors as for
+        ``with_state``."""
         centers = require_tensor("centers", tensors["centers"], (None, 3))
         radii = require_positive(
             "radii", require_tensor("radii", tensors["radii"], (len(centers),))
@@ -200,7 +207,7 @@ class BodyField(OuterField):
 
 
 def find_body_field(field: DeformationField | None) -> BodyField | None:
-    """Return the field of bodies among ``field`` and those within it; None where there is none."""
+    """Return the body field among ``field`` and its inner fields, or None."""
     while isinstance(field, OuterField) and not isinstance(field, BodyField):
         field = field.inner_field
     return field if isinstance(field, BodyField) else None

@@ -1,10 +1,10 @@
-"""Paths of things that move before one moving camera, from where the static model fails.
+"""Trajectories of objects in front of one moving camera, from the residual of a static model.
 
-A thing is a ball here: a disc in every image. Three discs in nearby images fix a straight piece of
-a path; the pieces are linked over time, and each image then adds the ray on which the thing must
-lie, to a smooth path through all.
+An object is modelled as a ball, a disc in every image. Three discs in nearby images determine a
+straight segment. Segments are linked over time. Then each image adds a ray that the ball lies on,
+and a smooth path is fitted to all rays.
 
-Local letters: T images, n candidates, K peaks, S sizes of discs.
+Local letters: T images, n candidates, K peaks, S disc sizes.
 """
 
 from __future__ import annotations
@@ -25,29 +25,28 @@ from dyngs.deform.fixed_cameras.hulls import detect_shadows
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, Shader, render
 
-LONGEST_SIDE = 160  # Pixels; larger images are shrunk
+LONGEST_SIDE = 160  # pixels; larger images are downscaled
 
-TOLERANCE = 0.12  # Difference of colours, mean over channels, that counts in full
+TOLERANCE = 0.12  # colour difference (mean over channels) with full weight
 ALPHA_TOLERANCE = 0.5
-SHADE = 0.25  # Weight of differences that a shadow would make
-NEVER = 1e9  # Depth where the static model shows nothing solid
-SOLID = 0.6  # Opacity from which it hides what lies behind
+SHADOW_WEIGHT = 0.25  # weight of differences that a shadow could explain
+NO_DEPTH = 1e9  # depth where the static model is transparent
+OPAQUE = 0.6  # opacity from which the static model occludes
 
 
 @dataclass(frozen=True)
 class FrameStack:
-    """T images of distinct times, in order, the static model's in the same places, and pinhole
-    cameras."""
+    """T images at distinct ascending times, renderings of the static model, and pinhole cameras."""
 
     times: np.ndarray  # (T,) ascending, in [0, 1]
     images: np.ndarray  # (T, H, W, 3) float32
-    static: np.ndarray  # (T, H, W, 3) float32, as the static model has them
-    alphas: np.ndarray  # (T, H, W) of the images; of the static model where they have none
+    static: np.ndarray  # (T, H, W, 3) float32, renderings of the static model
+    alphas: np.ndarray  # (T, H, W) of the images, or of the static model for images without alpha
     static_alphas: np.ndarray  # (T, H, W) of the static model
-    depths: np.ndarray  # (T, H, W) of the static model, ``NEVER`` where it is not solid
-    poses: np.ndarray  # (T, 4, 4) world to camera
+    depths: np.ndarray  # (T, H, W) of the static model, ``NEVER`` where it is transparent
+    poses: np.ndarray  # (T, 4, 4) cam_from_world
     intrinsics: np.ndarray  # (T, 3, 3)
-    centers: np.ndarray = field(init=False)  # (T, 3) of the cameras
+    centers: np.ndarray = field(init=False)  # (T, 3) camera positions
 
     def __post_init__(self) -> None:
         rotations = self.poses[:, :3, :3]
@@ -64,20 +63,19 @@ class FrameStack:
 
     @property
     def focal(self) -> np.ndarray:
-        """(T,) pixels."""
+        """Focal lengths (T,), pixels."""
         return self.intrinsics[:, 0, 0]
 
     def project(self, which: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (n, 2) pixels and (n,) depths of ``points`` (n, 3) in the images ``which``
-        (n,)."""
+        """Project ``points`` (n, 3) into the images ``which`` (n,): pixels (n, 2) and depths (n,)."""
         seen = np.einsum("nij,nj->ni", self.poses[which, :3, :3], points) + self.poses[which, :3, 3]
         depths = np.maximum(seen[:, 2], 1e-6)
         scale = self.intrinsics[which][:, [0, 1], [0, 1]]
         return scale * seen[:, :2] / depths[:, None] + self.intrinsics[which, :2, 2], depths
 
     def rays(self, which: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """Return (n, 3) unit directions in the world through ``pixels`` (n, 2) of the images
-        ``which`` (n,)."""
+        """Return unit directions (n, 3), world, through ``pixels`` (n, 2) of the images ``which``
+        (n,)."""
         scale = self.intrinsics[which][:, [0, 1], [0, 1]]
         seen = np.concatenate(
             [(pixels - self.intrinsics[which, :2, 2]) / scale, np.ones((len(pixels), 1))], axis=1
@@ -86,25 +84,28 @@ class FrameStack:
         return ways / np.linalg.norm(ways, axis=1, keepdims=True)
 
     def differences(self) -> np.ndarray:
-        """Return (T, H, W) in [0, 1]: where an image differs from the static model, moved by up to
-        one pixel.
+        """Return the residual (T, H, W) in [0, 1] in colour or alpha, up to a shift of one pixel.
 
-        In colour or in alpha. What is darker alike in all channels may be a shadow and counts less.
+        Pixels that are darker in all channels alike may be shadows and get less weight.
         """
         weight = np.where(
-            detect_shadows(self.images, self.static), np.float32(SHADE), np.float32(1)
+            detect_shadows(self.images, self.static), np.float32(SHADOW_WEIGHT), np.float32(1)
         )
-        colors = np.clip(_apart(self.images, self.static) / TOLERANCE, 0, 1) * weight
-        outlines = _apart(self.alphas[..., None], self.static_alphas[..., None]) / ALPHA_TOLERANCE
+        colors = np.clip(_shifted_differences(self.images, self.static) / TOLERANCE, 0, 1) * weight
+        outlines = (
+            _shifted_differences(self.alphas[..., None], self.static_alphas[..., None])
+            / ALPHA_TOLERANCE
+        )
         return np.maximum(colors, np.clip(outlines, 0, 1))
 
     def ball_pixels(
         self, index: int, center: np.ndarray, radius: float, reach: float = 0.92
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return rows, columns and (n, 3) outward normals of the pixels of one image that see a
+        """Return rows, columns and outward normals (n, 3) of the pixels of one image that see a
         ball.
 
-        Not those that the static model hides. Args: ``reach``: of the disc looked at, in radii.
+        Pixels where the static model occludes the ball are excluded. ``reach``: used part of the
+        disc, in radii.
         """
         (pixel,), (depth,) = self.project(np.array([index]), center[None])
         around = radius * self.focal[index] / depth + 1
@@ -124,23 +125,20 @@ class FrameStack:
         return rows[seen], columns[seen], ((offset + along) / radius)[seen]
 
 
-def _apart(images: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the (T, H, W) differences, mean over channels, from ``others`` moved by up to one
-    pixel."""
+def _shifted_differences(images: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the smallest mean differences (T, H, W) over shifts of ``others`` by up to one pixel."""
     height, width = images.shape[1:3]
     around = np.pad(others, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge")
-    found = np.full(images.shape[:3], np.inf, np.float32)
+    smallest = np.full(images.shape[:3], np.inf, np.float32)
     for y in range(3):
         for x in range(3):
-            np.minimum(
-                found, np.abs(images - around[:, y : y + height, x : x + width]).mean(-1), out=found
-            )
-    return found
+            difference = np.abs(images - around[:, y : y + height, x : x + width]).mean(-1)
+            np.minimum(smallest, difference, out=smallest)
+    return smallest
 
 
-def one_camera(views: Sequence[View]) -> list[int] | None:
-    """Return the order in time of views that one moving camera may have taken, each at a time of
-    its own; else None."""
+def order_moving_camera(views: Sequence[View]) -> list[int] | None:
+    """Return the temporal order of views of one moving camera; None if cameras or times coincide."""
     times = [view.time for view in views]
     if None in times or len(set(times)) < len(times) or static_cameras(views):
         return None
@@ -155,21 +153,20 @@ def render_frame_stack(
     background: Tensor,
     shader_at: Callable[[float], Shader | None] = lambda _: None,
 ) -> FrameStack:
-    """Return ``images``, in order of time, with what ``still`` shows, at most ``LONGEST_SIDE``
-    pixels wide or high.
+    """Render the static Gaussians for ``images`` (in temporal order, of one size) and stack both.
 
-    All have one size. Masked pixels are as the static model has them.
+    Images are downscaled to ``LONGEST_SIDE``. Masked pixels are taken from the rendering.
     """
     parts: dict[str, list[np.ndarray]] = {}
     options = replace(options, depth="expected")
     for image in images:
         size = max(image.cameras.width, image.cameras.height)
-        small = image.shrunk(math.ceil(size / LONGEST_SIDE))
+        small = image.downscaled(math.ceil(size / LONGEST_SIDE))
         shader = shader_at(image.time or 0.0)
         drawn = render(static, small.cameras, options, background=background, shader=shader)
         assert drawn.depth is not None
         alpha = drawn.alpha.reshape(small.cameras.height, small.cameras.width)
-        depth = torch.where(alpha > SOLID, drawn.depth.reshape(alpha.shape), NEVER)
+        depth = torch.where(alpha > OPAQUE, drawn.depth.reshape(alpha.shape), NO_DEPTH)
         rgb = small.composite(background)
         own_alpha = alpha if small.alpha is None else small.alpha
         if small.mask is not None:
@@ -192,32 +189,35 @@ def render_frame_stack(
     return FrameStack(**{name: np.stack(x) for name, x in parts.items()})
 
 
-# Radii of discs: number, least in pixels, greatest in image widths
+# Disc radii: number, smallest in pixels, largest in image widths.
 SIZES, SMALLEST, LARGEST = 9, 3.0, 0.2
-PEAKS, LEAST_PEAK = 6, 0.08
-HALF = 3  # Images on either side that a straight path is tried on
-TRIPLES = 1500  # Candidates per middle image
-KEPT, SKIPPED = 10, 14  # Straight paths around an image, and images after which the next may follow
-FOLLOWED = 4  # Chains of straight paths
-# Of looking for the ball around its path, that many radii away
+PEAKS, MIN_PEAK = 6, 0.08
+HALF_WINDOW = 3  # images on either side that a segment is fitted to
+TRIPLES = 1500  # candidates per middle image
+SEGMENTS_PER_IMAGE, MAX_GAP = (
+    10,
+    14,
+)  # segments kept per image; images within which the next may follow
+NUM_CHAINS = 4  # chains of segments that are refined
+# Rounds of the search for the ball around its path, and search radius in ball radii.
 ROUNDS, REACH, REACH_NEW = 8, 0.5, 0.7
-LOOKS = 8  # Places on either side that are looked at there
-# Second difference of a path in radii that counts in full, and rounds of weighting
-KINK, REWEIGHTED = 0.03, 4
-LEAST_SUPPORT = 0.28  # Contrast of a disc with its ring, mean over images, from which it is a thing
+SEARCH_STEPS = 8  # search positions on either side
+# Second difference of a path, in radii, with full weight; rounds of reweighting.
+KINK, REWEIGHTING_ROUNDS = 0.03, 4
+MIN_SUPPORT = 0.28  # mean contrast of discs with their ring that an object needs
 STIFFNESS = 3.0
 
 
 @dataclass(frozen=True)
 class Path:
-    """A ball of ``radius`` at T times."""
+    """Trajectory of a ball at T times."""
 
     centers: np.ndarray  # (T, 3)
     radius: float
     support: float  # mean contrast
 
     def is_like(self, other: Path) -> bool:
-        """Whether both are of one thing at about one size."""
+        """Return whether both paths follow the same object at a similar size."""
         apart = np.median(np.linalg.norm(self.centers - other.centers, axis=1))
         return bool(
             apart < 0.5 * min(self.radius, other.radius)
@@ -225,9 +225,8 @@ class Path:
         )
 
 
-class Discs:
-    """Mean of a map in a disc less that in the ring around it, for discs of all sizes at all pixels
-    of T images."""
+class DiscContrast:
+    """Contrast of discs with their surrounding ring, for all sizes and pixels of T images."""
 
     def __init__(self, maps: np.ndarray) -> None:
         from scipy.fft import irfft2, next_fast_len, rfft2
@@ -247,14 +246,14 @@ class Discs:
         # (T, S, H, W)
         self.values: np.ndarray = np.empty((len(maps), SIZES, height, width), np.float32)
         for values, one in zip(self.values, maps, strict=True):
-            found = np.asarray(
+            response = np.asarray(
                 irfft2(np.asarray(rfft2(one.astype(np.float32), shape)) * kernels, shape)
             )
-            values[:] = found[:, :height, :width]
+            values[:] = response[:, :height, :width]
 
     def at(self, which: np.ndarray, pixels: np.ndarray, radii: np.ndarray) -> np.ndarray:
-        """Return the (n,) values at ``pixels`` (n, 2) for discs of ``radii`` (n,) pixels, -0.2 out
-        of the images."""
+        """Return the contrast (n,) at ``pixels`` (n, 2) for ``radii`` (n,) px; -0.2 outside the
+        images."""
         from scipy.ndimage import map_coordinates
 
         _, sizes, height, width = self.values.shape
@@ -268,13 +267,14 @@ class Discs:
             | (level > sizes + 0.2)
         )
         x, y = pixels.T - 0.5
-        found = map_coordinates(
+        values = map_coordinates(
             self.values, [which, level, y, x], order=1, mode="nearest", output=np.float64
         )
-        return np.where(out, -0.2, found)
+        return np.where(out, -0.2, values)
 
     def peaks(self, index: int) -> np.ndarray:
-        """Return the (K, 3) x, y and radius of the most marked discs of one image, in pixels."""
+        """Return x, y and radius in pixels (K, 3) of the discs of one image with the largest
+        contrast."""
         values = self.values[index]
         greatest = values.copy()
         for axis, reach in (0, 1), (1, 2), (2, 2):
@@ -283,39 +283,38 @@ class Discs:
             for i in range(1, reach + 1):
                 np.maximum(line[i:], before[:-i], out=line[i:])
                 np.maximum(line[:-i], before[i:], out=line[:-i])
-        k, y, x = np.nonzero((values == greatest) & (values > LEAST_PEAK))
+        k, y, x = np.nonzero((values == greatest) & (values > MIN_PEAK))
         best = np.argsort(-values[k, y, x] * np.sqrt(self.radii[k]), kind="stable")[:PEAKS]
         return np.stack([x[best] + 0.5, y[best] + 0.5, self.radii[k[best]]], axis=1)
 
 
 def find_paths(frame_stack: FrameStack, maps: np.ndarray) -> list[Path]:
-    """Return paths that things may move along where ``maps`` (T, H, W) are marked, the most likely
-    first.
+    """Find trajectories in the residual ``maps`` (T, H, W), the most likely first.
 
-    No two are of the same thing at the same size; which are things is for their turning to tell.
+    No two follow the same object at the same size. Rotations decide later which are rigid bodies.
     """
-    if len(frame_stack) <= 2 * HALF:
+    if len(frame_stack) <= 2 * HALF_WINDOW:
         return []
-    discs = Discs(maps)
-    chains = _chains(
-        _straight_pieces(frame_stack, discs, np.random.default_rng(0)), len(frame_stack)
+    discs = DiscContrast(maps)
+    chains = _link_chains(
+        _fit_segments(frame_stack, discs, np.random.default_rng(0)), len(frame_stack)
     )
     followed = [
         path
-        for path in (_followed(frame_stack, discs, chain) for chain in chains)
-        if path.support > LEAST_SUPPORT
+        for path in (_track_path(frame_stack, discs, chain) for chain in chains)
+        if path.support > MIN_SUPPORT
     ]
-    found: list[Path] = []
+    distinct: list[Path] = []
     for path in sorted(
-        followed, key=lambda path: _unsteadiness(frame_stack, discs, path) - path.support
+        followed, key=lambda path: _colour_variation(frame_stack, discs, path) - path.support
     ):
-        if not any(path.is_like(other) for other in found):
-            found.append(path)
-    return found
+        if not any(path.is_like(other) for other in distinct):
+            distinct.append(path)
+    return distinct
 
 
 def clear_path_(maps: np.ndarray, frame_stack: FrameStack, path: Path) -> None:
-    """Set ``maps`` (T, H, W) to 0 where the thing on ``path`` is seen, and a little around it."""
+    """Set ``maps`` (T, H, W) to 0 at and around the object on ``path``."""
     for i, center in enumerate(path.centers):
         rows, columns, _ = frame_stack.ball_pixels(i, center, 1.2 * path.radius, 1.0)
         maps[i, rows, columns] = 0
@@ -324,21 +323,19 @@ def clear_path_(maps: np.ndarray, frame_stack: FrameStack, path: Path) -> None:
 def _colors(
     frame_stack: FrameStack, which: np.ndarray, centers: np.ndarray, radius: np.ndarray
 ) -> np.ndarray:
-    """Return the (n, 3) mean colours in the middle of balls with ``centers`` (n, 3) in the images
-    ``which`` (n,)."""
+    """Return mean colours (n, 3) at the middle of balls with ``centers`` (n, 3) in ``which`` (n,)."""
     height, width = frame_stack.size
     pixels, depths = frame_stack.project(which, centers)
     grid = np.array([-0.5, 0.0, 0.5])
     around = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
-    found = pixels[:, None] + around * (radius * frame_stack.focal[which] / depths)[:, None, None]
-    x, y = np.moveaxis(np.clip(found, 0, np.array([width, height]) - 1).astype(int), -1, 0)
+    samples = pixels[:, None] + around * (radius * frame_stack.focal[which] / depths)[:, None, None]
+    x, y = np.moveaxis(np.clip(samples, 0, np.array([width, height]) - 1).astype(int), -1, 0)
     return frame_stack.images[which[:, None], y, x].mean(1)
 
 
-def _unsteadiness(frame_stack: FrameStack, discs: Discs, path: Path) -> float:
-    """Return the standard deviation of a path's colours over time: that of what goes on as another
-    thing is large."""
-    which = np.nonzero(_contrast(frame_stack, discs, path.centers, path.radius) > LEAST_PEAK)[0]
+def _colour_variation(frame_stack: FrameStack, discs: DiscContrast, path: Path) -> float:
+    """Return the standard deviation of colours along a path; large if it switches between objects."""
+    which = np.nonzero(_contrast(frame_stack, discs, path.centers, path.radius) > MIN_PEAK)[0]
     if len(which) < 2:
         return 0.0
     colors = _colors(frame_stack, which, path.centers[which], np.full(len(which), path.radius))
@@ -346,7 +343,7 @@ def _unsteadiness(frame_stack: FrameStack, discs: Discs, path: Path) -> float:
 
 
 def _contrast(
-    frame_stack: FrameStack, discs: Discs, centers: np.ndarray, radius: float
+    frame_stack: FrameStack, discs: DiscContrast, centers: np.ndarray, radius: float
 ) -> np.ndarray:
     which = np.arange(len(frame_stack))
     pixels, depths = frame_stack.project(which, centers)
@@ -354,44 +351,44 @@ def _contrast(
 
 
 @dataclass(frozen=True)
-class Pieces:
-    """Straight paths of n things for a few images around one, the most marked first."""
+class PathSegments:
+    """Straight segments of n objects around one image, sorted by contrast."""
 
     middle: int
     scores: np.ndarray  # (n,) contrast
     centers: np.ndarray  # (n, 3) at the middle image
-    steps: np.ndarray  # (n, 3) per image
+    steps: np.ndarray  # (n, 3) velocity per image
     radii: np.ndarray  # (n,)
     colors: np.ndarray  # (n, 3) mean
 
 
 @dataclass(frozen=True)
-class Start:
-    """Where a ball is in the images from ``first`` to ``last``."""
+class PathStart:
+    """Positions of a ball in the images from ``first`` to ``last``; refinement starts there."""
 
-    centers: np.ndarray  # (T, 3); those of other images say nothing
+    centers: np.ndarray  # (T, 3), valid from ``first`` to ``last``
     radius: float
     first: int
     last: int
 
 
-def _straight_pieces(
-    frame_stack: FrameStack, discs: Discs, random: np.random.Generator
-) -> list[Pieces]:
-    """Return straight paths through the most marked discs, around every other image."""
+def _fit_segments(
+    frame_stack: FrameStack, discs: DiscContrast, random: np.random.Generator
+) -> list[PathSegments]:
+    """Fit straight segments to the discs of largest contrast, around every other image."""
     peaks = [discs.peaks(i) for i in range(len(frame_stack))]
-    found = []
+    fitted = []
     counts = np.array([len(one) for one in peaks])
     table = np.stack([np.resize(one, (PEAKS, 3)) for one in peaks])
-    for middle in range(HALF, len(frame_stack) - HALF, 2):
-        near = [t for t in range(middle - HALF, middle + HALF + 1) if counts[t]]
+    for middle in range(HALF_WINDOW, len(frame_stack) - HALF_WINDOW, 2):
+        near = [t for t in range(middle - HALF_WINDOW, middle + HALF_WINDOW + 1) if counts[t]]
         if len(near) < 3:
             continue
         which = random.permuted(np.tile(near, (TRIPLES, 1)), axis=1)[:, :3]
         picked = table[which, random.integers(0, counts[which])]
-        centers, steps, radii = _through(frame_stack, which, middle, picked)
+        centers, steps, radii = _fit_lines(frame_stack, which, middle, picked)
         values = []
-        for t in range(middle - HALF, middle + HALF + 1):
+        for t in range(middle - HALF_WINDOW, middle + HALF_WINDOW + 1):
             pixels, depths = frame_stack.project(
                 np.full(len(centers), t), centers + (t - middle) * steps
             )
@@ -401,54 +398,61 @@ def _straight_pieces(
         scores = np.sort(np.array(values), axis=0)[1:].mean(0)
         kept = []
         for i in np.argsort(-scores, kind="stable"):
-            if len(kept) < KEPT and all(
+            if len(kept) < SEGMENTS_PER_IMAGE and all(
                 np.linalg.norm(centers[i] - centers[k]) > radii[k] / 2 for k in kept
             ):
                 kept.append(i)
         if kept:
             scores, centers, steps, radii = (x[kept] for x in (scores, centers, steps, radii))
-            times = np.arange(middle - HALF, middle + HALF + 1)
+            times = np.arange(middle - HALF_WINDOW, middle + HALF_WINDOW + 1)
             shown = [
                 _colors(frame_stack, np.full(len(kept), t), centers + (t - middle) * steps, radii)
                 for t in times
             ]
-            found.append(Pieces(middle, scores, centers, steps, radii, np.mean(shown, axis=0)))
-    return found
+            fitted.append(
+                PathSegments(middle, scores, centers, steps, radii, np.mean(shown, axis=0))
+            )
+    return fitted
 
 
-def _chains(pieces: list[Pieces], count: int) -> list[Start]:
-    """Return where chains of pieces lead, and where their best piece alone does; no two chains
-    share a piece."""
-    left = [piece.scores.copy() for piece in pieces]
-    found = []
+def _link_chains(segments: list[PathSegments], count: int) -> list[PathStart]:
+    """Link segments into chains; return the start of each chain and of its best segment.
+
+    No two chains share a segment.
+    """
+    left = [piece.scores.copy() for piece in segments]
+    starts = []
     near = [
-        [i for i in range(j) if pieces[j].middle - pieces[i].middle <= SKIPPED]
-        for j in range(len(pieces))
+        [i for i in range(j) if segments[j].middle - segments[i].middle <= MAX_GAP]
+        for j in range(len(segments))
     ]
-    partings = [
-        {i: _parting(pieces[i], pieces[j]) for i in before} for j, before in enumerate(near)
+    transition_costs = [
+        {i: _transition_costs(segments[i], segments[j]) for i in before}
+        for j, before in enumerate(near)
     ]
-    while len(found) < 2 * FOLLOWED and any(np.isfinite(scores).any() for scores in left):
-        chain = _best_chain(partings, left)
+    while len(starts) < 2 * NUM_CHAINS and any(np.isfinite(scores).any() for scores in left):
+        chain = _find_best_chain(transition_costs, left)
         best = max(chain, key=lambda at: left[at[0]][at[1]])
-        found += [_along([(pieces[i], k) for i, k in part], count) for part in (chain, [best])]
+        starts += [
+            _interpolate_chain([(segments[i], k) for i, k in part], count)
+            for part in (chain, [best])
+        ]
         for i, k in chain:
             left[i][k] = -np.inf
-    return found
+    return starts
 
 
-def _best_chain(
-    partings: list[dict[int, np.ndarray]], scores: list[np.ndarray]
+def _find_best_chain(
+    transition_costs: list[dict[int, np.ndarray]], scores: list[np.ndarray]
 ) -> list[tuple[int, int]]:
-    """Return which pieces, in order of time, have the most of ``scores`` in all less what parts
-    them (Viterbi 1967).
+    """Return the chain of segments with the largest score minus transition costs (Viterbi 1967).
 
-    Pieces must meet, but may change direction where they do, as what hops. ``partings`` holds, for
-    the pieces around each middle image, the costs of coming from those around earlier ones.
+    Segments must meet, but may change direction, as bouncing objects do. ``transition_costs``
+    holds the costs from earlier segments, by middle image.
     """
     totals = [x.copy() for x in scores]
     before: list[list[tuple[int, int] | None]] = [[None] * len(x) for x in scores]
-    for j, costs in enumerate(partings):
+    for j, costs in enumerate(transition_costs):
         for i, cost in costs.items():
             reached = totals[i][:, None] - cost + scores[j]
             best = reached.argmax(0)
@@ -463,24 +467,24 @@ def _best_chain(
     return chain[::-1]
 
 
-def _along(chain: list[tuple[Pieces, int]], count: int) -> Start:
-    """Return where a thing moves along straight pieces."""
+def _interpolate_chain(chain: list[tuple[PathSegments, int]], count: int) -> PathStart:
+    """Interpolate positions along a chain of segments."""
     middles = np.array([piece.middle for piece, _ in chain])
     places = np.array([piece.centers[k] for piece, k in chain])
     centers = np.stack([np.interp(np.arange(count), middles, x) for x in places.T], axis=1)
-    first = int(middles[0]) - HALF
-    last = int(middles[-1]) + HALF
+    first = int(middles[0]) - HALF_WINDOW
+    last = int(middles[-1]) + HALF_WINDOW
     for (piece, k), times in zip(
         (chain[0], chain[-1]),
         (np.arange(first, middles[0]), np.arange(middles[-1] + 1, last + 1)),
         strict=True,
     ):
         centers[times] += (times - piece.middle)[:, None] * piece.steps[k]
-    return Start(centers, float(np.median([piece.radii[k] for piece, k in chain])), first, last)
+    return PathStart(centers, float(np.median([piece.radii[k] for piece, k in chain])), first, last)
 
 
-def _parting(first: Pieces, later: Pieces) -> np.ndarray:
-    """Return the (n, m) costs of going from each of the pieces ``first`` to each of ``later``."""
+def _transition_costs(first: PathSegments, later: PathSegments) -> np.ndarray:
+    """Return the costs (n, m) of transitions from each segment of ``first`` to each of ``later``."""
     apart = np.full((len(first.scores), len(later.scores)), np.inf)
     for t in range(first.middle, later.middle + 1):
         one = first.centers + (t - first.middle) * first.steps
@@ -493,11 +497,13 @@ def _parting(first: Pieces, later: Pieces) -> np.ndarray:
     return 2 * (apart / radii) ** 2 + 0.3 * np.minimum(bends, 1) + 2 * sizes + colors
 
 
-def _through(
+def _fit_lines(
     frame_stack: FrameStack, which: np.ndarray, middle: int, picked: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return centres (n, 3), steps (n, 3) and radii (n,) of paths through three discs each, where
-    these agree."""
+    """Fit straight paths through three discs each; return the consistent ones.
+
+    Returns centres (n, 3), velocities (n, 3) and radii (n,).
+    """
     count = len(which)
     flat = which.ravel()
     ways = frame_stack.rays(flat, picked[..., :2].reshape(-1, 2))
@@ -526,10 +532,10 @@ def _through(
     return centers[agree], steps[agree], radii[agree]
 
 
-def _followed(frame_stack: FrameStack, discs: Discs, start: Start) -> Path:
-    """Return the smooth path through all images of the ball that begins as ``start`` says.
+def _track_path(frame_stack: FrameStack, discs: DiscContrast, start: PathStart) -> Path:
+    """Extend ``start`` to a smooth path over all images.
 
-    Followed outwards from there image by image, then looked for in all images at once.
+    The path is tracked outwards image by image and then refined in all images at once.
     """
     count = len(frame_stack)
     radius = start.radius
@@ -538,7 +544,7 @@ def _followed(frame_stack: FrameStack, discs: Discs, start: Start) -> Path:
     weights = np.zeros(count)
 
     def looked(which: np.ndarray, reach: float) -> np.ndarray:
-        ways[which], weights[which] = _sighted(
+        ways[which], weights[which] = _search_discs(
             frame_stack, discs, which, centers[which], radius, reach
         )
         return _smooth(frame_stack, ways, weights, radius)
@@ -565,19 +571,18 @@ def _followed(frame_stack: FrameStack, discs: Discs, start: Start) -> Path:
     return Path(centers, radius, float(_contrast(frame_stack, discs, centers, radius).mean()))
 
 
-def _sighted(
+def _search_discs(
     frame_stack: FrameStack,
-    discs: Discs,
+    discs: DiscContrast,
     which: np.ndarray,
     centers: np.ndarray,
     radius: float,
     reach: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return in ``which`` (n,) images (n, 3) directions and (n,) weights of discs up to ``reach``
-    radii from balls."""
+    """Search discs within ``reach`` radii of balls; return directions (n, 3) and weights (n,)."""
     pixels, depths = frame_stack.project(which, centers)
     sizes = radius * frame_stack.focal[which] / depths
-    side = np.linspace(-1, 1, 2 * LOOKS + 1)
+    side = np.linspace(-1, 1, 2 * SEARCH_STEPS + 1)
     grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     looked = pixels[:, None] + grid * np.maximum(1.0, reach * sizes)[:, None, None]
     images, radii = (np.repeat(x, len(grid)) for x in (which, sizes))
@@ -590,11 +595,11 @@ def _sighted(
 def _smooth(
     frame_stack: FrameStack, ways: np.ndarray, weights: np.ndarray, radius: float
 ) -> np.ndarray:
-    """Return the (T, 3) places nearest to the rays along ``ways``, with small second differences
-    but at kinks.
+    """Fit positions (T, 3) to the rays along ``ways`` with small second differences except at
+    kinks.
 
-    Reweighted least squares: second differences above ``KINK`` radii count by their length. Images
-    of weight 0 have no ray, and the path goes straight on there.
+    Reweighted least squares: second differences above ``KINK`` radii count linearly. Images of
+    weight 0 have no ray; the path is straight there.
     """
     from scipy.linalg import solveh_banded
 
@@ -602,19 +607,22 @@ def _smooth(
     stiffness = STIFFNESS * float(np.median(weights[weights > 0])) if (weights > 0).any() else 1.0
     across = weights[:, None, None] * (np.eye(3) - ways[:, :, None] * ways[:, None])
     right = np.einsum("tij,tj->ti", across, frame_stack.centers).ravel()
-    rays = np.zeros((7, 3 * count))  # upper bands: entry (i, j) lies in row 6 + i - j, column j
+    rays = np.zeros((7, 3 * count))  # upper bands: entry (i, j) is in row 6 + i - j, column j
     for i in range(3):
         for j in range(i, 3):
             rays[6 + i - j, j::3] += across[:, i, j]
     rays[6] += 1e-9
     stiff = np.ones(count - 2)
-    for _ in range(REWEIGHTED):
+    for _ in range(REWEIGHTING_ROUNDS):
         full = rays.copy()
         for gap, taps in enumerate(([1, 4, 1], [-2, -2], [1])):
-            # of the squares of second differences
+            # squares of second differences
             full[6 - 3 * gap, 3 * gap :] += np.repeat(stiffness * np.convolve(stiff, taps), 3)
-        found = solveh_banded(full, right).reshape(count, 3)
+        positions = solveh_banded(full, right).reshape(count, 3)
         stiff = np.minimum(
-            1, KINK * radius / np.maximum(np.linalg.norm(np.diff(found, 2, axis=0), axis=1), 1e-12)
+            1,
+            KINK
+            * radius
+            / np.maximum(np.linalg.norm(np.diff(positions, 2, axis=0), axis=1), 1e-12),
         )
-    return found
+    return positions

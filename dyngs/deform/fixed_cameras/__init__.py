@@ -1,1 +1,1 @@
-"""Motion before cameras that stand still: changes in their images, hulls, and tracks over time."""
+"""Motion in front of fixed cameras: changes in the images, visual hulls, and tracks over time."""

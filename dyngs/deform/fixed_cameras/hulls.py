@@ -1,7 +1,7 @@
-"""Visual hulls of what changes, one set per time (Laurentini 1994), from cameras that stand still.
+"""Visual hulls of changed regions per time (Laurentini 1994), from fixed cameras.
 
-Cubes that project onto changes are divided again and again until they are about a pixel large.
-Things may be hidden behind still ones in some cameras: where many see a place, not all need agree.
+Cubes that project onto changes are subdivided until they cover about a pixel. Static objects may
+occlude the motion in some cameras: where many cameras see a place, not all need to agree.
 
 Local letters: C cubes, T images of one camera.
 """
@@ -19,49 +19,54 @@ from torch import Tensor
 from dyngs.core.camera import Cameras
 from dyngs.data.loader import Image
 
-LONGEST_SIDE, IMAGES = 200, 2000
-"""Pixels; larger images are shrunk: silhouettes need no more, and noise averages out. Of more
-images than that, each is smaller, so that all of them together take as much memory."""
-SMALLEST_CHANGE = 0.05  # Least difference in a channel, of 1, that counts as a change
+LONGEST_SIDE, MAX_FULL_IMAGES = 200, 2000
+"""Longest side in pixels after downscaling, and number of images up to which it holds.
+
+More images are downscaled further, so that all of them take the same memory.
+"""
+SMALLEST_CHANGE = 0.05  # smallest change of a channel in [0, 1]
 NOISE_MULTIPLE = 5.0
-"""Differences below so many standard deviations of the noise, as estimated from the median, are no
-change."""
-# A change must reach this multiple of its threshold somewhere, as in hysteresis thresholding (Canny
-# 1986)
-SURE = 2.0
-FEWEST_PIXELS = 6
+"""Smallest change in standard deviations of the noise, which is estimated from the median."""
+# A region must exceed its threshold by this factor somewhere (hysteresis, Canny 1986).
+HYSTERESIS = 2.0
+MIN_PIXELS = 6
 DARKEST_SHADOW = 0.35
 SHADOW_TINT = 0.14
-"""A shadow leaves at least that fraction of the light and changes no channel by more than this
-share beyond the others."""
+"""A shadow leaves at least ``DARKEST_SHADOW`` of the light, and its channels differ by at most
+this."""
 _MAD_TO_STD = 1.4826
-_DARK = 0.03  # Added to colours before they are divided
+_DARK = 0.03  # added to colours before division
 
 
 @dataclass(frozen=True)
 class FixedCameraClip:
-    """Images of one camera that stands still, and what changes in them."""
+    """Images of one fixed camera, and the changes in them."""
 
-    camera: Cameras  # (V = 1) of the images' size
+    camera: Cameras  # (V = 1), with the size of the images
     times: tuple[float, ...]  # T, ascending
     images: np.ndarray  # (T, H, W, 3) uint8
-    # (T, H, W) bool: shows something that is elsewhere, or not there, at most other times
+    # (T, H, W) bool, pixels that differ from the static background.
     changed: np.ndarray
-    counted: np.ndarray  # (T, H, W) bool; False where the image is masked out
-    median: np.ndarray  # (H, W, 3) uint8, what is still
+    counted: np.ndarray  # (T, H, W) bool; False where the image is masked
+    median: np.ndarray  # (H, W, 3) uint8, static background
 
 
 def build_fixed_camera_clip(
     images: Iterable[Image], background: Tensor, total: int = 1
 ) -> FixedCameraClip:
-    """Return the frames of one camera that stands still, on the CPU."""
-    longest = LONGEST_SIDE * min(1.0, (IMAGES / max(total, 1)) ** 0.5)
+    """Build the clip of one fixed camera, on the CPU.
+
+    ``total``: number of images of all cameras.
+    """
+    longest = LONGEST_SIDE * min(1.0, (MAX_FULL_IMAGES / max(total, 1)) ** 0.5)
     shown = []
     counted = []
     times = []
     camera: Cameras | None = None
     for image in images:
-        small = image.shrunk(math.ceil(max(image.cameras.width, image.cameras.height) / longest))
+        small = image.downscaled(
+            math.ceil(max(image.cameras.width, image.cameras.height) / longest)
+        )
         rgb = small.composite(background).clamp(0, 1)
         shown.append((255 * rgb).round().to(torch.uint8).cpu().numpy())
         counted.append(
@@ -74,85 +79,85 @@ def build_fixed_camera_clip(
     stack = np.stack(shown)
     valid = np.stack(counted)
     median = np.median(stack, axis=0).astype(np.uint8)
-    return FixedCameraClip(camera, tuple(times), stack, changes(stack) & valid, valid, median)
+    return FixedCameraClip(
+        camera, tuple(times), stack, detect_changes(stack) & valid, valid, median
+    )
 
 
 def median_image(images: Sequence[Tensor]) -> Tensor:
-    """Return the median (H, W, 3) over ``images`` of a camera in place: what is still, as it is."""
+    """Return the median (H, W, 3) over ``images`` of a fixed camera: the static background."""
     return torch.stack(list(images)).median(0).values
 
 
-def changes(images: np.ndarray) -> np.ndarray:
-    """Return (T, H, W) bool: where ``images`` (T, H, W, 3), uint8, differ from their median,
-    shadows left out.
+def detect_changes(images: np.ndarray) -> np.ndarray:
+    """Return a mask (T, H, W) where ``images`` (T, H, W, 3), uint8, differ from their median.
 
-    The threshold of a pixel is the largest of ``SMALLEST_CHANGE`` and a multiple of the noise, that
-    of all pixels and its own; both are estimated by the median absolute deviation, which what moves
-    does not affect. Of what lies above, connected parts without a pixel far above, and specks, are
-    dropped; holes, as shadows leave them, are filled.
+    The threshold per pixel is the largest of ``SMALLEST_CHANGE`` and a multiple of the noise, of
+    all pixels and of its own. Noise is estimated by the median absolute deviation, which is robust
+    to motion. Shadows, weak regions and specks are dropped; holes are filled.
     """
     from scipy import ndimage
 
     values = images.astype(np.float32) / 255
     median = np.median(values, axis=0).astype(np.float32)
-    apart = np.abs(values - median).max(-1)
-    own = _MAD_TO_STD * np.median(apart, axis=0)
+    difference_maps = np.abs(values - median).max(-1)
+    own = _MAD_TO_STD * np.median(difference_maps, axis=0)
     threshold = np.maximum(
-        SMALLEST_CHANGE, NOISE_MULTIPLE * np.maximum(own, _MAD_TO_STD * float(np.median(apart)))
+        SMALLEST_CHANGE,
+        NOISE_MULTIPLE * np.maximum(own, _MAD_TO_STD * float(np.median(difference_maps))),
     )
-    found = np.zeros(apart.shape, bool)
-    for i, (difference, image) in enumerate(zip(apart, values, strict=True)):
+    masks = np.zeros(difference_maps.shape, bool)
+    for i, (difference, image) in enumerate(zip(difference_maps, values, strict=True)):
         differs = (difference > threshold) & ~detect_shadows(image, median)
         differs = ndimage.binary_closing(np.pad(differs, 2), iterations=1)[2:-2, 2:-2]
-        found[i] = _without_specks(
+        masks[i] = _drop_specks(
             np.asarray(ndimage.binary_fill_holes(differs)), difference / threshold
         )
-    return found
+    return masks
 
 
-def _without_specks(differs: np.ndarray, certainty: np.ndarray) -> np.ndarray:
-    """Return ``differs`` (H, W) without small parts, and those in which ``certainty`` is below
-    ``SURE`` all over."""
+def _drop_specks(differs: np.ndarray, certainty: np.ndarray) -> np.ndarray:
+    """Drop small regions, and regions where ``certainty`` is below ``SURE`` everywhere."""
     from skimage.measure import label
 
     labels: np.ndarray = np.asarray(label(differs, connectivity=1))
     sizes = np.bincount(labels.ravel())
     peaks = np.zeros(len(sizes))
     np.maximum.at(peaks, labels.ravel(), certainty.ravel())
-    kept = (sizes >= FEWEST_PIXELS) & (peaks > SURE)
+    kept = (sizes >= MIN_PIXELS) & (peaks > HYSTERESIS)
     kept[0] = False
     return kept[labels]
 
 
 def detect_shadows(image: np.ndarray, static: np.ndarray) -> np.ndarray:
-    """Return (..., H, W) bool: as ``still`` but darker, all channels alike (after Horprasert et al.
-    1999)."""
+    """Return a mask (..., H, W) of shadows: darker than ``static`` in all channels alike.
+
+    After Horprasert et al. 1999.
+    """
     left = (image + _DARK) / (static + _DARK)
     tint = left.max(-1) - left.min(-1)
     return (left.max(-1) < 1) & (left.min(-1) > DARKEST_SHADOW) & (tint < SHADOW_TINT)
 
 
-FIRST_CUBES = 16  # Cubes along the longest side of the box that carving begins with
-MAX_CUBES = 300_000  # Carving stops to divide cubes at this number
-LARGEST_PX = 2.0  # Pixels that a side covers, in most cameras, when cubes are no longer divided
+FIRST_CUBES = 16  # cubes along the longest side of the box at first
+MAX_CUBES = 300_000  # subdivision stops at this number
+LARGEST_PX = 2.0  # subdivision stops at this side length in pixels
 MAX_LEVELS = 8
 MISSING_FRACTION = 0.25
-"""Fraction of the cameras that see a place which may not see the thing there, because something
-still hides it."""
-ENOUGH_VIEWS = 3  # Cameras that must see a change at a place, or all there are
-FEWEST_CUBES = 12
+"""Fraction of the cameras that see a place in which the object may be occluded."""
+ENOUGH_VIEWS = 3  # cameras that must see a change, or all there are
+MIN_CUBES = 12
 SOLID_FRACTION = 0.3
-"""Of a blob, the cubes that most cameras agree on are kept, as long as they are this fraction of
-all."""
+"""Smallest part of a blob that is kept of the cubes that most cameras agree on."""
 NEAR = 1e-3
 
 
 @dataclass(frozen=True)
 class Blob:
-    """A connected part of a visual hull at one time."""
+    """A connected component of the visual hull at one time."""
 
     center: np.ndarray  # (3,) mean of the cubes
-    radius: float  # of a ball of that volume, world units
+    radius: float  # of a ball of the same volume, world units
     cubes: np.ndarray  # (C, 3) centres
     side: float
     color: np.ndarray  # (3,) mean colour in the images, 0 to 1
@@ -160,14 +165,14 @@ class Blob:
 
 @dataclass(frozen=True)
 class ChangedRegion:
-    """Change that one camera sees at one time."""
+    """Changed pixels of one camera at one time."""
 
-    projection: np.ndarray  # (3, 4) matrix from the world to homogeneous pixels
+    projection: np.ndarray  # (3, 4) projection matrix
     image: np.ndarray  # (H, W, 3) uint8
-    # changed, counted: (H, W) bool, see ``FixedCameraClip``
+    # (H, W) bool, see ``FixedCameraClip``.
     changed: np.ndarray
     counted: np.ndarray
-    # sums, masked: (H + 1, W + 1) summed areas of ``changed``, and of what is not counted
+    # Integral images (H + 1, W + 1) of ``changed`` and of masked pixels.
     sums: np.ndarray
     masked: np.ndarray
 
@@ -186,14 +191,14 @@ class ChangedRegion:
         return float(self.projection[0, :3] @ self.projection[2, :3])
 
     def pixels(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (C, 2) pixel coordinates and (C,) depths of ``points`` (C, 3); those behind the
-        camera have none."""
+        """Project ``points`` (C, 3) to pixels (C, 2) and depths (C,); pixels are 0 behind the
+        camera."""
         u, v, depth = self.projection[:, :3] @ points.T + self.projection[:, 3:]
         safe = np.where(depth > NEAR, depth, np.inf)
         return np.stack([u / safe, v / safe], -1), depth
 
-    def seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (C,) bool, whether ``points`` lie in the image, and whether it changes there."""
+    def sample(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return masks (C,): whether ``points`` are in the image, and whether it changes there."""
         place, depth = self.pixels(points)
         height, width = self.changed.shape
         x, y = (
@@ -206,11 +211,11 @@ class ChangedRegion:
         inside &= self.counted[y, x]
         return inside, inside & self.changed[y, x]
 
-    def touched(
+    def classify_cubes(
         self, centers: np.ndarray, side: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return (C,) bool of cubes: part of it may be in the image, all of it is, and part of it
-        may change."""
+        """Classify cubes; return masks (C,): partly in the image, wholly in it, and touching a
+        change."""
         place, depth = self.pixels(centers)
         reach = 0.5 * np.sqrt(3.0) * side
         spread = self.focal * reach / np.maximum(depth - reach, NEAR) + 1.0
@@ -231,8 +236,8 @@ class ChangedRegion:
 
 
 def silhouettes_at(clips: Sequence[FixedCameraClip], time: float) -> list[ChangedRegion]:
-    """Return what the cameras that took an image at ``time`` saw to change then."""
-    found: list[ChangedRegion] = []
+    """Return the changed regions of the cameras that took an image at ``time``."""
+    regions: list[ChangedRegion] = []
     for one in clips:
         if time not in one.times:
             continue
@@ -243,15 +248,14 @@ def silhouettes_at(clips: Sequence[FixedCameraClip], time: float) -> list[Change
             np.pad(x.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
             for x in (one.changed[i], ~one.counted[i])
         )
-        found.append(
+        regions.append(
             ChangedRegion(projection, one.images[i], one.changed[i], one.counted[i], sums, masked)
         )
-    return found
+    return regions
 
 
 def extract_blobs(views: Sequence[ChangedRegion], low: np.ndarray, high: np.ndarray) -> list[Blob]:
-    """Return the connected parts of the visual hull of what ``views`` see to change, in the box
-    ``low`` to ``high``."""
+    """Carve the visual hull of ``views`` in the box ``low`` to ``high``; return its components."""
     if len(views) < 2:
         return []
     side = float((high - low).max()) / FIRST_CUBES
@@ -259,7 +263,7 @@ def extract_blobs(views: Sequence[ChangedRegion], low: np.ndarray, high: np.ndar
     cubes = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), -1).reshape(-1, 3)
     for level in range(MAX_LEVELS):
         centers = low + (cubes + 0.5) * side
-        cubes = cubes[_may_hold(views, centers, side)]
+        cubes = cubes[_may_contain(views, centers, side)]
         if not len(cubes):
             return []
         if (
@@ -272,38 +276,38 @@ def extract_blobs(views: Sequence[ChangedRegion], low: np.ndarray, high: np.ndar
         cubes = (2 * cubes[:, None] + halves).reshape(-1, 3)
         side = side / 2
     centers = low + (cubes + 0.5) * side
-    agreeing, kept = _agreed(views, centers)
+    agreeing, kept = _agreement(views, centers)
     cubes = cubes[kept]
     centers = centers[kept]
     agreeing = agreeing[kept]
     labels = _components(cubes)
     order = np.argsort(labels, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1) if len(order) else []
-    parts = [_solid(group, agreeing) for group in groups if len(group) >= FEWEST_CUBES]
+    parts = [_most_agreed(group, agreeing) for group in groups if len(group) >= MIN_CUBES]
     return [_blob(views, centers[part], side) for part in parts]
 
 
-def _may_hold(views: Sequence[ChangedRegion], centers: np.ndarray, side: float) -> np.ndarray:
-    """Return (C,) bool: whether any part of a cube may satisfy ``_agreed``."""
+def _may_contain(views: Sequence[ChangedRegion], centers: np.ndarray, side: float) -> np.ndarray:
+    """Return a mask (C,) of the cubes that may contain a point accepted by ``_agreement``."""
     seeing, whole, agreeing = np.zeros((3, len(centers)), int)
     for view in views:
-        partly, wholly, changes = view.touched(centers, side)
+        partly, wholly, changing = view.classify_cubes(centers, side)
         seeing += partly
-        whole += wholly & ~changes
-        agreeing += changes
+        whole += wholly & ~changing
+        agreeing += changing
     return (agreeing >= min(ENOUGH_VIEWS, len(views))) & (
         whole <= np.floor(MISSING_FRACTION * seeing)
     )
 
 
-def _agreed(views: Sequence[ChangedRegion], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (C,) numbers of cameras that see a change at ``points``, and whether they are
-    enough."""
+def _agreement(views: Sequence[ChangedRegion], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number of cameras (C,) that see a change at ``points``, and whether that
+    suffices."""
     seeing, agreeing = np.zeros((2, len(points)), int)
     for view in views:
-        inside, changes = view.seen(points)
+        inside, changing = view.sample(points)
         seeing += inside
-        agreeing += changes
+        agreeing += changing
     enough = (agreeing >= min(ENOUGH_VIEWS, len(views))) & (
         seeing - agreeing <= np.floor(MISSING_FRACTION * seeing)
     )
@@ -311,8 +315,7 @@ def _agreed(views: Sequence[ChangedRegion], points: np.ndarray) -> tuple[np.ndar
 
 
 def _largest_px(views: Sequence[ChangedRegion], centers: np.ndarray, side: float) -> float:
-    """Return the pixels that ``side`` covers in the middle of ``centers``: the median over the
-    cameras."""
+    """Return the size of ``side`` in pixels at the median of ``centers``, median over the cameras."""
     middle = np.median(centers, axis=0)
     depths = [max(float(view.pixels(middle[None])[1][0]), NEAR) for view in views]
     return float(
@@ -321,7 +324,7 @@ def _largest_px(views: Sequence[ChangedRegion], centers: np.ndarray, side: float
 
 
 def _components(cubes: np.ndarray) -> np.ndarray:
-    """Return (C,) labels of ``cubes`` (C, 3), integers: those that share a face are alike."""
+    """Return labels (C,) of face-connected components of the integer ``cubes`` (C, 3)."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -345,13 +348,15 @@ def _components(cubes: np.ndarray) -> np.ndarray:
     return np.asarray(labels)
 
 
-def _solid(group: np.ndarray, agreeing: np.ndarray) -> np.ndarray:
-    """Return the part of ``group`` that most cameras agree on: tolerance for hidden views makes
-    hulls too large."""
+def _most_agreed(group: np.ndarray, agreeing: np.ndarray) -> np.ndarray:
+    """Return the part of ``group`` that most cameras agree on.
+
+    Tolerance for occlusion makes hulls too large.
+    """
     own = agreeing[group]
     for least in range(int(own.max()), 0, -1):
         part: np.ndarray = group[own >= least]
-        if len(part) >= max(SOLID_FRACTION * len(group), FEWEST_CUBES):
+        if len(part) >= max(SOLID_FRACTION * len(group), MIN_CUBES):
             return part
     return group
 
@@ -359,33 +364,34 @@ def _solid(group: np.ndarray, agreeing: np.ndarray) -> np.ndarray:
 def _blob(views: Sequence[ChangedRegion], points: np.ndarray, side: float) -> Blob:
     colors: list[np.ndarray] = []
     for view in views:
-        _, changes = view.seen(points)
-        if changes.any():
-            x, y = np.floor(view.pixels(points[changes])[0]).astype(int).T
+        _, changing = view.sample(points)
+        if changing.any():
+            x, y = np.floor(view.pixels(points[changing])[0]).astype(int).T
             colors.append(view.image[y, x].mean(0) / 255)
     color = np.mean(colors, axis=0) if colors else np.full(3, 0.5)
     radius = float((len(points) * side**3 * 3 / (4 * np.pi)) ** (1 / 3))
     return Blob(points.mean(0), radius, points, side, color)
 
 
-MAX_GAP = 3  # Times in a row at which a thing may be lost
-FEWEST_TIMES = 4  # Times at which a thing must be found
-# Radii within which a thing whose velocity is not known is looked for at the next time
+MAX_GAP = 3  # times in a row at which a track may be lost
+MIN_TIMES = 4  # times at which an object must be found
+# Search radius in object radii while the velocity is unknown.
 FIRST_REACH = 6.0
 REACH, SPEED_REACH = 3.0, 1.5
-"""Radii, and fractions of the last displacement, by which a thing may be away from where its
-velocity takes it."""
+"""Search radius in object radii, and in fractions of the last displacement."""
 COLOR_REACH, SIZE_REACH = 0.35, 1.2
-"""Differences of colour, and of the logarithm of the radius, at which a blob is another thing."""
-FEWEST_STEPS = 2
-SAME_WAY = -0.2
-"""Steps of at least a radius that a thing which travels makes, and the least correlation of each
-with the next: what hops turns back, too, but less often than noise does."""
+"""Differences of colour and log radius from which a blob belongs to another object."""
+MIN_STEPS = 2
+MIN_CORRELATION = -0.2
+"""Least number of steps of a travelling object, and least correlation of successive steps.
+
+Bouncing objects turn back, too, but less often than noise.
+"""
 
 
 @dataclass(frozen=True)
 class Track:
-    """A thing followed over time."""
+    """An object tracked over time."""
 
     times: tuple[float, ...]
     blobs: tuple[Blob, ...]
@@ -400,10 +406,10 @@ class Track:
 
     @property
     def is_travelling(self) -> bool:
-        """Whether it goes on and on: what turns or bends in place is no track to start from.
+        """True if the object travels; rotation or deformation in place is not a track to start
+        from.
 
-        Of places a radius apart or more, in the order of time, successive steps must not mostly
-        turn back.
+        Between positions at least a radius apart, successive steps must not mostly turn back.
         """
         centers = self.centers
         places = [centers[0]]
@@ -411,9 +417,9 @@ class Track:
             if np.linalg.norm(center - places[-1]) >= self.radius:
                 places.append(center)
         steps: np.ndarray = np.diff(np.stack(places), axis=0)
-        if len(steps) < FEWEST_STEPS:
+        if len(steps) < MIN_STEPS:
             return False
-        return float((steps[1:] * steps[:-1]).sum()) > SAME_WAY * float((steps**2).sum())
+        return float((steps[1:] * steps[:-1]).sum()) > MIN_CORRELATION * float((steps**2).sum())
 
     def predict(self, time: float) -> np.ndarray:
         last = self.blobs[-1].center
@@ -427,35 +433,34 @@ class Track:
 
 
 def link_tracks(times: Sequence[float], blobs: Sequence[Sequence[Blob]]) -> list[Track]:
-    """Return the tracks among the ``blobs`` of each of ``times`` (ascending), longest first.
+    """Link the ``blobs`` of all ``times`` (ascending) into tracks, longest first.
 
-    Blobs are assigned to the tracks so far by the least total cost (Kuhn 1955), each within a gate
-    around where constant velocity takes a track. A track may miss some times in a row; those found
-    too rarely are left out.
+    Blobs are assigned to tracks by the least total cost (Kuhn 1955), within a gate around the
+    position at constant velocity. A track may miss a few times in a row; short tracks are dropped.
     """
     from scipy.optimize import linear_sum_assignment
 
     done: list[Track] = []
     open_: list[Track] = []
-    for i, (time, found) in enumerate(zip(times, blobs, strict=True)):
+    for i, (time, current) in enumerate(zip(times, blobs, strict=True)):
         oldest = times[max(i - MAX_GAP - 1, 0)]
         done += [track for track in open_ if track.times[-1] < oldest]
         open_ = [track for track in open_ if track.times[-1] >= oldest]
-        cost = np.full((len(open_), len(found)), np.inf)
+        cost = np.full((len(open_), len(current)), np.inf)
         for row, track in enumerate(open_):
-            cost[row] = [_cost(track, time, blob) for blob in found]
+            cost[row] = [_cost(track, time, blob) for blob in current]
         rows, columns = linear_sum_assignment(np.minimum(cost, 1e3))
         taken = {int(c): int(r) for r, c in zip(rows, columns, strict=True) if cost[r, c] < np.inf}
-        fresh = [Track((time,), (blob,)) for j, blob in enumerate(found) if j not in taken]
+        fresh = [Track((time,), (blob,)) for j, blob in enumerate(current) if j not in taken]
         for column, row in taken.items():
-            open_[row] = open_[row].append(time, found[column])
+            open_[row] = open_[row].append(time, current[column])
         open_ += fresh
-    kept = [track for track in done + open_ if len(track.times) >= FEWEST_TIMES]
+    kept = [track for track in done + open_ if len(track.times) >= MIN_TIMES]
     return sorted(kept, key=lambda track: -len(track.times))
 
 
 def _cost(track: Track, time: float, blob: Blob) -> float:
-    """Return the cost of taking ``blob`` for the next of ``track``; infinite where it cannot be."""
+    """Return the cost of appending ``blob`` to ``track``; infinite if impossible."""
     last = track.blobs[-1]
     reach = FIRST_REACH * last.radius
     if len(track.blobs) > 1:

@@ -15,7 +15,7 @@ from dyngs.core.errors import DyngsError, format_one_line
 from dyngs.data.capture import all_views
 from dyngs.data.scene_space import MAX_DISTANCE
 from dyngs.io.fields import read_limited
-from dyngs.io.formats.similarity import AXES, Similarity, similarity_from_matrix, rotation_between
+from dyngs.io.formats.similarity import AXES, Similarity, rotation_between, similarity_from_matrix
 from dyngs.runs.opened import OpenedScene
 
 _FACTORS = (1e-9, 1e9)

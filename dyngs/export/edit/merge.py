@@ -12,7 +12,7 @@ from dyngs.core.errors import DyngsError, format_count
 from dyngs.export.splat_files import find_up_direction, splats_at
 from dyngs.gaussians.rendering import splat_options
 from dyngs.io.formats.formats import format_to_read, read_splats
-from dyngs.io.formats.similarity import Similarity, parse_axis, joined, rotation_between
+from dyngs.io.formats.similarity import Similarity, join_gaussians, parse_axis, rotation_between
 from dyngs.io.formats.splat_file import SplatFile, with_sh_degree
 from dyngs.runs.opened import open_scene
 
@@ -36,7 +36,9 @@ def merge_scenes(
             between = splat.frame.after(Similarity(shift=(x, y, z))).after(other.frame.inverse())
             gaussians = between.gaussians(gaussians)
         elif up is not None and direction is not None:
-            gaussians = Similarity(rotation_between(tuple(direction), tuple(up))).gaussians(gaussians)
+            gaussians = Similarity(rotation_between(tuple(direction), tuple(up))).gaussians(
+                gaussians
+            )
         if splat_options(other) != splat_options(splat):
             tell(
                 f"{file}: was trained for another low-pass filter ({other.mode.value}); it is drawn as the rest is"
@@ -44,7 +46,9 @@ def merge_scenes(
         tell(f"{file}: {format_count(len(gaussians), 'Gaussian')} added")
         parts.append(gaussians.detach())
     degree = max(part.sh_degree for part in parts)
-    return replace(splat, gaussians=joined([with_sh_degree(part, degree) for part in parts]))
+    return replace(
+        splat, gaussians=join_gaussians([with_sh_degree(part, degree) for part in parts])
+    )
 
 
 def _still(file: Path) -> tuple[SplatFile, Sequence[float] | None]:

@@ -116,7 +116,7 @@ def write_page_folder(
     require_new_folder(folder)
     lists = PackedArrays(chunked=True)
     if most is not None or opened.renderable.has_levels:
-        levelled = LevelScene.of(opened.renderable, most)
+        levelled = LevelScene.from_scene(opened.renderable, most)
         colour = levelled.scene.colour
         header = add_levels(levelled.levels, colour, lists) | _drawn(levelled.options)
         header["levels"]["most"] = most

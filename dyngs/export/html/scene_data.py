@@ -23,12 +23,12 @@ from torch import Tensor
 from dyngs.core.gaussians import storage_order
 from dyngs.deform.control_nodes import FOLLOWED, ControlNodes, spline_basis
 from dyngs.deform.field import DeformationField, Offsets
-from dyngs.deform.fields import EDGE, OPEN, WindowedField
+from dyngs.deform.fields import EDGE_WIDTH, OPEN_WINDOW, WindowedField
 from dyngs.deform.free import FreePrimitives
 from dyngs.deform.scene import DynamicScene, field_scene_of
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.colour.network import ColourNetwork
-from dyngs.gaussians.levels import BLOCK, MERGED, PIXELS, Block, Levels
+from dyngs.gaussians.levels import BLOCK, MAX_SPREAD_PX, MERGED, Block, Levels
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.posing import frame_pose, pose_blend_offsets
 from dyngs.human.avatar.scene import HumanScene, as_human_scene
@@ -132,7 +132,7 @@ def add_levels(levels: Levels, colour: ColourNetwork | None, lists: PackedArrays
     lists.exact("blocks", np.concatenate(levels.blocks).astype(np.float32))
     coarsest = block_numbers(levels, (len(levels.levels) - 1, 0), with_rest=colour is None)
     sizes = [len(level) for level in levels.levels]
-    known = {"sizes": sizes, "block": BLOCK, "merged": MERGED, "pixels": PIXELS}
+    known = {"sizes": sizes, "block": BLOCK, "merged": MERGED, "pixels": MAX_SPREAD_PX}
     degree = levels.levels[0].sh_degree if colour is None else 0
     told: dict[str, Any] = {"count": sizes[0], "frames": 0, "moves": False, "degree": degree}
     told["levels"] = known | {"layout": coarsest.layout}
@@ -142,7 +142,7 @@ def add_levels(levels: Levels, colour: ColourNetwork | None, lists: PackedArrays
 def block_numbers(levels: Levels, block: Block, *, with_rest: bool) -> PackedArrays:
     """Return the lists of a block, ``BLOCK`` rows each; the last ones of a block that has fewer are
     never seen."""
-    gaussians = levels.of_block(block)
+    gaussians = levels.block_gaussians(block)
     rows = torch.arange(BLOCK, device="cpu").clamp_max(len(gaussians) - 1)
     padded = gaussians.select(rows)
     padded.logit_opacities[len(gaussians) :] = -MAX_LOGIT
@@ -225,7 +225,7 @@ def _add_curves(curves: MotionSplines, order: Tensor, lists: PackedArrays) -> di
         lists.exact("shares", _fractions(curves.fractions[order]))
     if curves.windows is not None:
         lists.quantised("windows", _numpy(curves.windows[order]), 16)
-        told |= {"edge": EDGE, "open": OPEN}
+        told |= {"edge": EDGE_WIDTH, "open": OPEN_WINDOW}
     return told
 
 

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from dyngs.core.camera import Cameras
-from dyngs.data.geometry import look_at, with_poses
+from dyngs.data.geometry import cameras_at_poses, look_at
 from dyngs.export.rigged.texture import SEEN, BakedTexels
 from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions, render
@@ -126,7 +126,9 @@ def _cameras(vertices: Tensor) -> Cameras:
     )
     ways = [np.array([math.sin(angle), 0.0, math.cos(angle)]) for angle in _ANGLES]
     up = np.array([0.0, 1.0, 0.0])
-    return with_poses(first, np.stack([look_at(middle + distance * w, middle, up) for w in ways]))
+    return cameras_at_poses(
+        first, np.stack([look_at(middle + distance * w, middle, up) for w in ways])
+    )
 
 
 def _agreement(vertices: Tensor, body: BodyTemplate, cameras: Cameras, shown: np.ndarray) -> float:

@@ -1,2 +1,1 @@
-"""Colour that costs only what it shows: a shared network in place of harmonics, and harmonics only
-where they pay."""
+"""Compact colour: a shared colour network, and SH coefficients only where they improve images."""

@@ -1,4 +1,4 @@
-"""Colour networks, and affine colour changes by exposure and white balance."""
+"""Colour networks, baking into spherical harmonics, and affine colour correction of renderings."""
 
 from __future__ import annotations
 
@@ -22,30 +22,29 @@ from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.perceptron import Layer, perceptron
 from dyngs.ops.shading import num_inputs, shading_inputs
 
-SATURATED = 254.5 / 255  # A channel this bright may have been any brighter
+SATURATED = 254.5 / 255  # a channel of at least this value may be clipped
 GAIN_RIDGE, MIXING_RIDGE = 1e-5, 1e-2
-"""Weights of squared deviations from the identity, of gains and of all else, against the mean
-squared error.
+"""Ridge weights of the affine fit: on the gains (diagonal), and on all other entries.
 
-They decide what the pixels do not: the channels of most images are so alike that mixtures of them
-can mean anything. With 3e-4 for the latter, halves of the cup in docs/benchmarks.md had 2 dB less
-after the fit than before it.
+Both pull towards the identity, relative to the mean squared error. The channels of most images are
+highly correlated, so that pixels alone do not determine the mixing of channels.
 """
-# Fits in turn, each without the saturated channels that the one before shows brighter still
+# Passes of the affine fit; each leaves out the clipped channels that the previous one predicts
+# above 1.
 ROUNDS = 3
 
-Shown = tuple[Image, Rendering]  # An image, and the rendering of its one view
+Shown = tuple[Image, Rendering]  # an image and the rendering of its only view
 
 
 def apply_affine_colour(
     affine: Tensor, image: Image, rendering: Rendering, background: Tensor
 ) -> Tensor:
-    """Return (H, W, 3) a rendering as the camera of ``image`` would have made it.
+    """Return the rendering (H, W, 3) with the affine colour transform of its camera applied.
 
-    Where the image has alpha, the background was not in front of the camera and keeps its colour.
+    Where the image has alpha, the background is not transformed.
 
     Args:
-        affine: (3, 4) M.
+        affine: (3, 4) matrix on (r, g, b, 1).
     """
     rgb = rendering.rgb[0]
     background = background.to(rgb.device)
@@ -66,12 +65,13 @@ def apply_affine_colour(
 def fit_affine_colour(
     shown: Sequence[Shown], background: Tensor, counts: Tensor | None = None
 ) -> Tensor:
-    """Return (3, 4) M, one for all, that brings renderings closest to their images: least squares
-    in float64.
+    """Fit one affine colour transform (3, 4) that maps renderings to their images.
+
+    Least squares in float64 with a ridge towards the identity.
 
     Args:
-        shown: one or more; masked pixels do not count.
-        counts: (H, W) weights next to the masks; None: 1.
+        shown: one or more images with their renderings; masked pixels are ignored.
+        counts: (H, W) pixel weights on top of the masks; None: 1.
     """
     background = background.to(shown[0][1].rgb.device)
     identity = torch.eye(3, 4, dtype=torch.float64, device=background.device)
@@ -89,7 +89,7 @@ def fit_affine_colour(
             one.edge_weight * (one.saturated & (one.edge[:, :4] @ affine.T > 1)) for one in sums
         ]
         if before and all(torch.equal(x, y) for x, y in zip(left_out, before, strict=True)):
-            break  # the same equations again
+            break  # converged: the same equations again
         products = torch.stack([one.products for one in sums]).sum(0).expand(3, 4, 7)
         for one, weights in zip(sums, left_out, strict=True):
             products = products - torch.einsum("pi,pc,pj->cij", one.edge[:, :4], weights, one.edge)
@@ -99,22 +99,20 @@ def fit_affine_colour(
 
 
 class _Sums(NamedTuple):
-    """Sums over the pixels of an image, float64, and the B of its pixels that have a saturated
-    channel.
+    """Normal equations of one image in float64, and its B pixels with a clipped channel.
 
-    Rows of seven numbers: the four that M is applied to, and what should come out less the first
-    three of them.
+    A row has seven numbers: the input (r, g, b, 1) and the target residual (truth minus input).
     """
 
-    weight: Tensor  # () of all pixels
-    products: Tensor  # (4, 7) weighted products of the four with all
-    edge: Tensor  # (B, 7) rows of the saturated
+    weight: Tensor  # () sum of the pixel weights
+    products: Tensor  # (4, 7) weighted products of the input with the row
+    edge: Tensor  # (B, 7) rows of the pixels with a clipped channel
     edge_weight: Tensor  # (B, 1)
-    saturated: Tensor  # (B, 3) bool, which channels are
+    saturated: Tensor  # (B, 3) bool, clipped channels
 
 
 def _sums(image: Image, rendering: Rendering, background: Tensor, counts: Tensor | None) -> _Sums:
-    """Return the sums of the pixels that count."""
+    """Accumulate the normal equations over the unmasked pixels."""
     rgb = rendering.rgb[0]
     truth = image.composite(background)
     ones = torch.ones_like(rgb[..., :1])
@@ -142,21 +140,22 @@ def _sums(image: Image, rendering: Rendering, background: Tensor, counts: Tensor
 
 @dataclass(frozen=True)
 class RestPose:
-    """Rest pose of a moving body, which its colours follow."""
+    """Rest pose of a moving body; the colour network is evaluated in it."""
 
-    means: Tensor  # (N, 3) centres of the drawn Gaussians at rest
-    rotation: Tensor  # (3, 3) rotation of the body from rest to the world
+    means: Tensor  # (N, 3) means in the rest pose
+    rotation: Tensor  # (3, 3) rotation of the body, world from rest
 
 
 @dataclass(frozen=True)
 class ColourNetwork:
-    """F: what is added to the base colour of a Gaussian, by place, direction, normal and time."""
+    """A network that adds to each Gaussian's base colour, given position, direction, normal and
+    time."""
 
     layers: tuple[Layer, ...]
     box: Tensor  # (2, 3) centre and half sides of the scene, world units
     uses_time: bool
-    # the cosine between the shortest axis of the Gaussian and the direction, and the direction
-    # mirrored at that axis, are inputs
+    # The normal is the shortest axis of the Gaussian. Its cosine with the view direction and the
+    # mirrored direction are inputs.
     uses_normals: bool
 
     @property
@@ -175,19 +174,21 @@ class ColourNetwork:
         return with_role(tensors, Role.SHARED)
 
     def shader(self, time: float | None, rest_pose: RestPose | None = None) -> Shader:
-        """Return the shader at ``time`` (clamped to [0, 1], None is 0); ``frame`` for Gaussians on
-        a body."""
+        """Return the shader at ``time`` (clamped to [0, 1], None is 0).
+
+        ``rest_pose``: pose of the body that carries the Gaussians, if any.
+        """
 
         def colors(gaussians: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
             views = [
-                self._seen_from(gaussians, center, shown[:, 0] > 0, time, rest_pose)
+                self._colours_from(gaussians, center, shown[:, 0] > 0, time, rest_pose)
                 for center, shown in zip(cameras.centers, radii, strict=True)
             ]
             return torch.stack(views) if views else gaussians.means.new_empty(0, len(gaussians), 3)
 
         return colors
 
-    def _seen_from(
+    def _colours_from(
         self,
         gaussians: Gaussians,
         center: Tensor,
@@ -195,8 +196,7 @@ class ColourNetwork:
         time: float | None,
         rest_pose: RestPose | None,
     ) -> Tensor:
-        """Return (N, 3) colours seen from ``center``; zero, and not computed, for those that are
-        not ``drawn`` (N,)."""
+        """Return colours (N, 3) seen from ``center``; rows where ``drawn`` (N,) is false are zero."""
         rows = torch.nonzero(drawn)[:, 0]
         dtype = gaussians.means.dtype
         moment = min(max(0.0 if time is None else time, 0.0), 1.0)
@@ -219,8 +219,10 @@ class ColourNetwork:
 
 
 def robust_bounding_box(means: Tensor) -> Tensor:
-    """Return (2, 3) centre and half sides of the box of ``means`` (N, 3) but their outer percent;
-    no side is zero."""
+    """Return (2, 3) centre and half sizes of the box of the central 98 % of ``means`` (N, 3).
+
+    No half size is zero.
+    """
     if not len(means):
         return torch.stack(
             [torch.zeros(3, device=means.device), torch.ones(3, device=means.device)]
@@ -236,8 +238,7 @@ def robust_bounding_box(means: Tensor) -> Tensor:
 
 
 def restore_colour_network(state: Mapping[str, Tensor]) -> ColourNetwork | None:
-    """Return the network of a checkpoint, from the state of its colours; None where there is
-    none."""
+    """Return the colour network in a state, or None if the state has none."""
     count = sum(name.startswith("weight") for name in state)
     if not count:
         return None
@@ -256,15 +257,14 @@ def restore_colour_network(state: Mapping[str, Tensor]) -> ColourNetwork | None:
     return ColourNetwork(tuple(layers), state["box"], uses_time, uses_normals)
 
 
-DIRECTIONS = 96  # Number of directions from which colours are sampled; degree 3 has 16 terms
+DIRECTIONS = 96  # sampled directions; degree 3 has 16 terms
 
-_FAR = 1e4  # Distance of the camera, in largest distances of a Gaussian from the origin
+_FAR = 1e4  # camera distance, in units of the largest distance of a Gaussian from the origin
 
 
 @dataclass(frozen=True)
 class BakedHarmonics:
-    """Gaussians with harmonics, and the root mean squared error of their colours over all
-    directions."""
+    """Gaussians with SH coefficients, and the RMS colour error of the fit over all directions."""
 
     gaussians: Gaussians
     error: float
@@ -272,13 +272,12 @@ class BakedHarmonics:
 
 @torch.no_grad()
 def bake_harmonics(gaussians: Gaussians, shader: Shader, degree: int = 3) -> BakedHarmonics:
-    """Return the Gaussians with the harmonics of ``degree`` that come nearest to the colours of
-    ``shader``.
+    """Bake the colours of ``shader`` into SH coefficients of ``degree``.
 
-    Least squares over directions that are evenly spread on the sphere, those included from which no
-    image was taken.
+    Least squares over directions that cover the whole sphere, including those without training
+    views.
     """
-    directions = sphere(DIRECTIONS).to(gaussians.means.dtype)
+    directions = fibonacci_sphere(DIRECTIONS).to(gaussians.means.dtype)
     basis = harmonics_basis(directions, degree)
     solver = torch.linalg.pinv(basis)
     shown = torch.ones(1, len(gaussians), 2, dtype=torch.int32, device=gaussians.means.device)
@@ -286,10 +285,10 @@ def bake_harmonics(gaussians: Gaussians, shader: Shader, degree: int = 3) -> Bak
     sh = gaussians.sh.new_zeros(len(gaussians), num_sh_terms(degree), 3)
     squares = 0.0
     for weights, direction in zip(solver.T, directions, strict=True):
-        colors = shader(gaussians, _eye(-far * direction), shown)[0] - 0.5
+        colors = shader(gaussians, _camera_at(-far * direction), shown)[0] - 0.5
         sh += weights[:, None] * colors[:, None]
         squares += float(colors.double().square().sum())
-    # What least squares leaves is orthogonal to what it explains.
+    # The residual of least squares is orthogonal to the fitted part.
     explained = torch.einsum("nkc,kl,nlc->", sh.double(), (basis.T @ basis).double(), sh.double())
     error = math.sqrt(
         max(squares - float(explained), 0.0) / max(3 * DIRECTIONS * len(gaussians), 1)
@@ -297,15 +296,15 @@ def bake_harmonics(gaussians: Gaussians, shader: Shader, degree: int = 3) -> Bak
     return BakedHarmonics(gaussians.replace(sh=sh), error)
 
 
-def sphere(count: int) -> Tensor:
-    """Return (count, 3) unit vectors spread evenly over all directions: a Fibonacci lattice."""
+def fibonacci_sphere(count: int) -> Tensor:
+    """Return (count, 3) evenly spread unit vectors: a Fibonacci lattice."""
     z = 1 - (2 * torch.arange(count, dtype=torch.float64, device="cpu") + 1) / count
     angle = math.pi * (3 - math.sqrt(5)) * torch.arange(count, dtype=torch.float64, device="cpu")
     radius = (1 - z * z).sqrt()
     return torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1)
 
 
-def _eye(center: Tensor) -> Cameras:
+def _camera_at(center: Tensor) -> Cameras:
     pose = torch.eye(4, dtype=center.dtype, device=center.device)
     pose[:3, 3] = -center
     return Cameras(pose[None], torch.eye(3, dtype=center.dtype, device=center.device)[None], 1, 1)

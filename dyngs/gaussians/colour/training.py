@@ -1,4 +1,4 @@
-"""Training of colours: one class per ``colour.kind``, and the choice of the Gaussians that keep harmonics."""
+"""Training of colours, one class per ``colour.kind``, and selection of Gaussians that keep SH."""
 
 from __future__ import annotations
 
@@ -26,37 +26,36 @@ from dyngs.ops.harmonics import evaluate_harmonics
 from dyngs.ops.perceptron import Layer
 from dyngs.ops.shading import num_inputs
 
-_LIFT = 64.0  # Added to colours so that none is clamped; float32 keeps 4e-6 of them
+_CLAMP_OFFSET = 64.0  # offset that keeps colours above the clamp at 0; float32 still resolves 4e-6
 
 
 @dataclass(frozen=True)
 class MeasuredView:
-    """One training image and the N Gaussians that are drawn for it."""
+    """A training image and the N Gaussians at its time."""
 
-    gaussians: Gaussians  # at its time
+    gaussians: Gaussians
     camera: Cameras
-    truth: Tensor  # (H, W, 3) on the background
+    truth: Tensor  # (H, W, 3) image on the background
     mask: Tensor | None
 
 
 @dataclass(frozen=True)
 class ViewDependence:
-    """The Gaussians whose view dependence is worth its cost."""
+    """Gaussians whose view-dependent colour improves held-out views enough to be stored."""
 
-    kept_harmonics: Tensor  # (N,) bool, Gaussians whose harmonics stay
-    offsets: Tensor  # (N, 3) colour to add to the base of the others
-    # worth_all, worth_kept: dB on the held-out views that the harmonics of all, of the kept ones
-    # bring
+    kept_harmonics: Tensor  # (N,) bool, Gaussians that keep their SH coefficients
+    offsets: Tensor  # (N, 3) colour added to the base colour of the others
+    # PSNR gain in dB on held-out training views with the SH of all, and of the selected Gaussians.
     gain_all: float
     gain_kept: float
 
     def __str__(self) -> str:
         fraction = float(self.kept_harmonics.float().mean()) if len(self.kept_harmonics) else 0.0
         if fraction == 0:
-            return f"view dependence does not pay ({self.gain_all:+.2f} dB on held-out training views): none is stored"
+            return f"view-dependent colour removed: it changes held-out views by {self.gain_all:+.2f} dB"
         return (
-            f"view dependence pays for {fraction:.0%} of the Gaussians: {self.gain_kept:+.2f} dB on held-out training "
-            f"views (for all of them: {self.gain_all:+.2f} dB)"
+            f"view-dependent colour kept for {fraction:.0%} of the Gaussians: {self.gain_kept:+.2f} dB "
+            f"on held-out views ({self.gain_all:+.2f} dB with all)"
         )
 
 
@@ -67,8 +66,12 @@ def find_view_dependent(
     background: Tensor,
     tolerance: float,
 ) -> ViewDependence:
-    """Return the Gaussians whose harmonics are worth their cost, and the colours of the others."""
-    means, changes = _mean_and_change(seen, options)
+    """Select the Gaussians that keep their SH coefficients, and the base colours of the others.
+
+    ``seen``: views that the mean view-dependent colour is measured on. ``held_out``: views that
+    decide. ``tolerance``: PSNR in dB that may be given up, see ``select_worthwhile``.
+    """
+    means, changes = _view_dependence_statistics(seen, options)
     errors = []
     worths = torch.zeros(len(changes), device=changes.device)
     everywhere = torch.ones(len(changes), device=changes.device)
@@ -90,17 +93,21 @@ def find_view_dependent(
         for x in held_out
     )
     return ViewDependence(
-        kept_harmonics, means, _decibels(without, with_all), _decibels(without, kept)
+        kept_harmonics, means, _psnr_gain(without, with_all), _psnr_gain(without, kept)
     )
 
 
 def select_worthwhile(changes: Tensor, worths: Tensor, without: float, tolerance: float) -> Tensor:
-    """Return (N,) bool, the fewest rows, by descending ``changes``, that bring all but
-    ``tolerance`` of the gain.
+    """Select the fewest rows, ranked by ``changes``, that keep the gain within ``tolerance``.
 
     Args:
-        tolerance: dB by which the error may be above the lowest along the ranking; none is chosen
-            if that suffices.
+        changes: (N,) variation of the view-dependent colour; larger ones are selected first.
+        worths: (N,) predicted reduction of the squared error by each row.
+        without: squared error with no row selected.
+        tolerance: dB by which the error may exceed the lowest error along the ranking.
+
+    Returns:
+        (N,) bool.
     """
     order = changes.argsort(descending=True, stable=True)
     errors = without - torch.cat(
@@ -112,14 +119,16 @@ def select_worthwhile(changes: Tensor, worths: Tensor, without: float, tolerance
     return kept_harmonics
 
 
-def _mean_and_change(seen: Iterable[MeasuredView], options: RenderOptions) -> tuple[Tensor, Tensor]:
-    """Return (N, 3) mean of what the harmonics add to the base colour in the views, and (N,) how
-    much that varies."""
-    # scalars may be added to what lies on any device
+def _view_dependence_statistics(
+    seen: Iterable[MeasuredView], options: RenderOptions
+) -> tuple[Tensor, Tensor]:
+    """Return the mean (N, 3) and the summed variance (N,) of the view-dependent colour over the
+    views."""
+    # 0-d CPU tensors can be added to tensors on any device
     weight = total = squares = torch.zeros((), device="cpu")
     for view in seen:
         fraction = contributions(view.gaussians, view.camera, options)[0]
-        added = _added(view.gaussians, view.camera, fraction, options)
+        added = _view_dependent_colour(view.gaussians, view.camera, fraction, options)
         weight = weight + fraction[:, None]
         total = total + fraction[:, None] * added
         squares = squares + fraction * added.square().sum(1)
@@ -127,13 +136,12 @@ def _mean_and_change(seen: Iterable[MeasuredView], options: RenderOptions) -> tu
     return means, (squares - weight[:, 0] * means.square().sum(1)).clamp_min(0)
 
 
-def _added(
+def _view_dependent_colour(
     gaussians: Gaussians, camera: Cameras, fraction: Tensor, options: RenderOptions
 ) -> Tensor:
-    """Return (N, 3) what the harmonics beyond the constant add to the colours; 0 where nothing is
-    seen."""
+    """Return the colour (N, 3) that SH above degree 0 add; 0 for Gaussians without contribution."""
     lifted = gaussians.sh.clone()
-    lifted[:, 0] = _LIFT / SH_C0
+    lifted[:, 0] = _CLAMP_OFFSET / SH_C0
     degree = (
         gaussians.sh_degree
         if options.sh_degree is None
@@ -141,14 +149,14 @@ def _added(
     )
     radii = (fraction > 0).int()[None, :, None].expand(1, -1, 2).contiguous()
     colors = evaluate_harmonics(gaussians.means, camera.centers, lifted, radii, degree)[0]
-    return torch.where(fraction[:, None] > 0, colors - _LIFT - 0.5, 0.0)
+    return torch.where(fraction[:, None] > 0, colors - _CLAMP_OFFSET - 0.5, 0.0)
 
 
 def _squared_error(
     view: MeasuredView, means: Tensor, fractions: Tensor, options: RenderOptions, background: Tensor
 ) -> Tensor:
-    """Return the squared error with the share ``shares[i]`` of the harmonics of Gaussian i;
-    differentiable in these."""
+    """Return the squared error with the SH of Gaussian i scaled by ``fractions[i]``;
+    differentiable."""
     base = view.gaussians.sh[:, 0] + (1 - fractions)[:, None] * means / SH_C0
     rest = fractions[:, None, None] * view.gaussians.sh[:, 1:]
     mixed = view.gaussians.replace(sh=torch.cat([base[:, None], rest], dim=1))
@@ -158,37 +166,37 @@ def _squared_error(
     return error.sum() if view.mask is None else (error * view.mask[..., None]).sum()
 
 
-def _decibels(before: float, after: float) -> float:
+def _psnr_gain(before: float, after: float) -> float:
     return 10 * math.log10(max(before, 1e-12) / max(after, 1e-12))
 
 
-WARM_UP = 100  # Steps in which the network's rate is reached
+WARM_UP = 100  # linear warm-up steps of the network's learning rate
 _MILESTONES = (1 / 6, 1 / 2, 5 / 6)
-"""Fractions of a run after which the network's rate is divided by 3 (MEGA: 5k, 15k and 25k of 30k
-steps)."""
+"""Fractions of the run after which the network's learning rate is divided by 3 (MEGA)."""
 HELD_OUT_EVERY = 8
-_HELD_OUT = 5  # Index, in each eight views, of the one that is held out
+_HELD_OUT = 5  # index of the held-out view among each eight
 
 
 @dataclass(frozen=True)
 class MeasurementViews:
-    """The training views as the scene is drawn for them now."""
+    """Training views that ``measure_harmonics`` renders at the current step."""
 
-    indices: Sequence[int]  # of the views that may be trained on
-    views: Callable[[Sequence[int]], Iterator[MeasuredView]]  # those of some indices, one at a time
+    indices: Sequence[int]  # training views inside the time window
+    # yields the views with these indices, one at a time
+    views: Callable[[Sequence[int]], Iterator[MeasuredView]]
     options: RenderOptions
     background: Tensor
 
 
 class ColourTraining:
-    """Harmonics as they are stored: nothing to learn next to them."""
+    """Training of plain SH colours; base class of the other colour models."""
 
     def __init__(self, options: ColourSection) -> None:
         self.entropy_weight = options.opacity_entropy
 
     @property
     def network(self) -> ColourNetwork | None:
-        """The colour network; None where the harmonics give the colours."""
+        """Colour network, or None if SH coefficients give the colours."""
         return None
 
     @property
@@ -201,40 +209,39 @@ class ColourTraining:
         return {"opacity entropy": self.entropy_weight * opacity_entropy(gaussians.logit_opacities)}
 
     def is_held_out(self, index: int, step: int) -> bool:
-        """Return whether training view ``index`` must not be trained on in ``step``."""
+        """Return whether training view ``index`` is held out at ``step``."""
         return False
 
     def measure_harmonics(
-        self, step: int, looks: Callable[[], MeasurementViews]
+        self, step: int, get_views: Callable[[], MeasurementViews]
     ) -> ViewDependence | None:
-        """Measure, if due after ``step``, whose harmonics improve images; the others are dropped."""
+        """Select the Gaussians that keep SH if ``step`` is the step for it; None otherwise."""
         return None
 
     def frozen_harmonics(self) -> Tensor | None:
-        """Return (N,) bool, Gaussians whose harmonics stay zero but for the base colour; None: of
-        none."""
+        """Return (N,) bool, Gaussians whose SH above degree 0 stay zero; None: no Gaussian."""
         return None
 
-    def follow(self, edit: TopologyEdit) -> None:
-        """Follow a change of the set of Gaussians."""
+    def apply_edit(self, edit: TopologyEdit) -> None:
+        """Update per-Gaussian state after a topology edit."""
 
     def optimize(self, step: int) -> Count:
-        """Update what is learned next to the harmonics, and return the number of rows left out for
-        bad gradients."""
+        """Update the colour parameters in place; return the number of skipped rows (bad
+        gradients)."""
         return 0
 
-    def place(self, device: torch.device) -> None:
-        """Go on on ``device``."""
+    def move_to(self, device: torch.device) -> None:
+        """Move the state to ``device``."""
 
     def state(self) -> State:
         return {}
 
     def restore(self, tensors: Mapping[str, Tensor], count: int) -> None:
-        """Take over the state of the scene's colours and of ``state``, for N Gaussians."""
+        """Restore the state for N = ``count`` Gaussians."""
 
 
 class NetworkTraining(ColourTraining):
-    """A network that all Gaussians share, learned by Adam."""
+    """A colour network shared by all Gaussians, trained with Adam."""
 
     def __init__(
         self,
@@ -266,7 +273,7 @@ class NetworkTraining(ColourTraining):
     def optimize(self, step: int) -> Count:
         return self.parameters.update(step, rate_factor(step, self.steps))
 
-    def place(self, device: torch.device) -> None:
+    def move_to(self, device: torch.device) -> None:
         self.box, self.parameters = self.box.to(device), self.parameters.to(device)
 
     def state(self) -> State:
@@ -278,8 +285,7 @@ class NetworkTraining(ColourTraining):
 
 
 class AutoTraining(ColourTraining):
-    """Harmonics for all Gaussians at first, later only for those where they are measured to improve
-    images."""
+    """SH for all Gaussians at first, later only for those where they improve held-out views."""
 
     def __init__(self, options: AutoColour, steps: int, num_views: int) -> None:
         super().__init__(options)
@@ -289,15 +295,15 @@ class AutoTraining(ColourTraining):
         self._frozen: Tensor | None = None
 
     def is_held_out(self, index: int, step: int) -> bool:
-        """Return true for every eighth view, until the harmonics are measured on them."""
+        """Return true for every eighth view until ``measure_harmonics`` has used them."""
         return step <= self.measurement_step and index in self.held_out
 
     def measure_harmonics(
-        self, step: int, looks: Callable[[], MeasurementViews]
+        self, step: int, get_views: Callable[[], MeasurementViews]
     ) -> ViewDependence | None:
         if step != self.measurement_step or not self.held_out:
             return None
-        views = looks()
+        views = get_views()
         seen = [i for i in views.indices if i not in self.held_out]
         held_out = [i for i in views.indices if i in self.held_out]
         if not seen or not held_out:
@@ -310,17 +316,17 @@ class AutoTraining(ColourTraining):
         return found
 
     def freeze(self, frozen: Tensor) -> None:
-        """Keep the harmonics of the Gaussians ``frozen`` (N,) zero from now on."""
+        """Keep the SH above degree 0 of the Gaussians ``frozen`` (N,) at zero from now on."""
         self._frozen = None if bool(frozen.all()) else frozen
 
     def frozen_harmonics(self) -> Tensor | None:
         return self._frozen
 
-    def follow(self, edit: TopologyEdit) -> None:
+    def apply_edit(self, edit: TopologyEdit) -> None:
         if self._frozen is not None:
             self._frozen = edit.apply(self._frozen)
 
-    def place(self, device: torch.device) -> None:
+    def move_to(self, device: torch.device) -> None:
         self._frozen = None if self._frozen is None else self._frozen.to(device)
 
     def state(self) -> State:
@@ -334,11 +340,10 @@ class AutoTraining(ColourTraining):
 
 
 def opacity_entropy(logits: Tensor) -> Tensor:
-    """Return the mean of -o ln o over opacities o with ``logits`` (N,), of which there may be none
-    (Zhang et al. 2024).
+    """Return the mean of -o ln o over opacities o = sigmoid(``logits``) (N,) (Zhang et al. 2024).
 
-    It is largest at o = 1/e: what is fainter is pushed towards 0, what is more opaque towards 1.
-    The gradient by a logit, -(ln o + 1) o (1 - o), is finite everywhere.
+    The maximum is at o = 1/e: lower opacities are pushed towards 0, higher ones towards 1. The
+    gradient by a logit, -(ln o + 1) o (1 - o), is finite everywhere. N may be 0.
     """
     if not len(logits):
         return logits.sum()
@@ -346,15 +351,15 @@ def opacity_entropy(logits: Tensor) -> Tensor:
 
 
 def rate_factor(step: int, steps: int) -> float:
-    """Return the factor on the rate of ``step``, from 1: a linear warm-up, then a third after each
+    """Return the learning rate factor at ``step``: linear warm-up, then a third after each
     milestone."""
     passed = sum(step > fraction * steps for fraction in _MILESTONES)
     return min(1.0, step / WARM_UP) / 3**passed
 
 
 def _start_values(widths: list[int], generator: torch.Generator) -> dict[str, Tensor]:
-    """Return Glorot weights and zero biases; the last layer is all zero, so that nothing is added
-    at first."""
+    """Return Glorot weights and zero biases; the last layer is zero, so that the colours start
+    unchanged."""
     values: dict[str, Tensor] = {}
     for i, (fan_in, fan_out) in enumerate(pairwise(widths)):
         weight = glorot(fan_in, fan_out, generator)

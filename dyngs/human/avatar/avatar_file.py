@@ -38,8 +38,7 @@ _LONGEST_NAME = 200
 
 
 def write_avatar(person: Renderable, model: ModelSection, info: CheckpointInfo, path: Path) -> Path:
-    """Write a person, upright and at rest at the place of the capture (docs/formats.md); return
-    ``path``.
+    """Write an avatar in the rest pose and return ``path``; see docs/reference/bodies.md.
 
     Raises DyngsError: the scene is not that of a person, its template is missing, or the file cannot
     be written.

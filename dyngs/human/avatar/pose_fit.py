@@ -302,7 +302,7 @@ class PoseRefit:
             or not self.applies_to(scene)
         ):
             return None
-        scene.changed()
+        scene.clear_caches()
         if since[-1] > 0:
             return self.refit_frame(scene, since[-1] - 1), ""
         gain, move = self.measure_gain(scene)

@@ -335,12 +335,12 @@ class HumanTraining(SceneTraining[HumanScene]):
         message = line if hardly >= PARAMS.min_reported_fraction else None
         return replace(scene, seen=trust), EditResult(None, changes, message=message)
 
-    def follow(self, edit: TopologyEdit | None = None) -> None:
+    def apply_edit(self, edit: TopologyEdit | None = None) -> None:
         """Find out anew who the neighbours are."""
         self._neighbours = self._mirror_images = None
 
     def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
-        self.follow()
+        self.apply_edit()
         if "refines_from" in tensors:  # the run may have become longer since
             self._has_refined = True
             self.refines_from = min(self.refines_from, int(tensors["refines_from"]))

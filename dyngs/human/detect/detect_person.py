@@ -17,8 +17,8 @@ import numpy as np
 from scipy import ndimage
 
 from dyngs.capture.fixed_camera import is_image_sequence, read_fixed_camera
-from dyngs.capture.masks import resize_mask, outlined
-from dyngs.capture.sfm.photos import digest_of
+from dyngs.capture.masks import refine_outlines, resize_mask
+from dyngs.capture.sfm.photos import digest_files
 from dyngs.config import DataConfig
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info
@@ -198,7 +198,7 @@ def detect_person(
                 masks[row] = own.mask > 127
                 scale = views[row].width / size[0]
                 points[views[row].name] = own.keypoints * np.array([scale, scale, 1.0])
-        better = outlined(images, masks) if heights else None
+        better = refine_outlines(images, masks) if heights else None
         if better is not None:
             common = (better & masks).sum() / max(int((better | masks).sum()), 1)
             log(
@@ -210,7 +210,7 @@ def detect_person(
     if not points:
         raise DyngsError(
             f"{capture.root}: {detector.name} finds nobody in {format_count(sum(map(len, cameras)), 'image')}; look at "
-            "them, or give masks of another program to `dyngs data fit` (docs/person.md)"
+            "them, or give masks of another program to `dyngs data fit` (`dyngs docs people`)"
         )
     _write_keypoints(folder / "keypoints.json", points)
     return FitInputs(keypoints=folder / "keypoints.json", masks=folder / "masks")
@@ -245,7 +245,11 @@ def write_detected_person(
     cameras. Raises DyngsError: see ``detect_person`` and ``write_fitted_capture``.
     """
     require_new_folder(out)
-    clip = options.format == "auto" and not is_capture(options.root) and is_image_sequence(options.root)
+    clip = (
+        options.format == "auto"
+        and not is_capture(options.root)
+        and is_image_sequence(options.root)
+    )
     folder = temporary_folder_beside(out.with_name(f"{out.name}.found"))
     try:
         capture = read_fixed_camera(options) if clip else read_capture(options)
@@ -268,7 +272,7 @@ def ensure_detected_person(
     """
     name = re.sub(r"[^A-Za-z0-9-]", "_", data.root.stem)[:40]
     chosen = hashlib.sha256(repr(data.frames).encode()).hexdigest()[:8]
-    folder = cache_folder("people") / f"{name}.{digest_of(data.root)}{chosen}"
+    folder = cache_folder("people") / f"{name}.{digest_files(data.root)}{chosen}"
 
     def find() -> None:
         detector = MediaPipe()

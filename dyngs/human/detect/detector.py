@@ -83,7 +83,7 @@ INSTALL_HINT = (
     f"`python -m venv ENV && ENV/bin/pip install {MEDIAPIPE_PACKAGE}` (Python 3.9 to 3.12), "
     f"then give --mediapipe ENV/bin/python or set {MEDIAPIPE_VARIABLE} to it"
 )
-MASKS_HINT = "or give masks of another program to `dyngs data fit` (docs/person.md)"
+MASKS_HINT = "or give masks of another program to `dyngs data fit` (`dyngs docs people`)"
 LANDMARKS = (0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)
 """Rows of MediaPipe's landmarks that are the key points of COCO, in their order."""
 _SECONDS_PER_IMAGE, _SECONDS_TO_START = 10.0, 120.0

@@ -21,7 +21,7 @@ from dyngs.config import DataConfig
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import ProgressCallback, RasterizeMode, ignore_progress
 from dyngs.core.errors import DyngsError
-from dyngs.data.body_frames import frame_number, numbered
+from dyngs.data.body_frames import assign_frame_numbers, frame_number
 from dyngs.data.capture import Capture, Split, View
 from dyngs.data.images.images import area_downscale
 from dyngs.data.images.maps import silhouette_box
@@ -899,9 +899,9 @@ def fit_capture(
     """
     if not capture.has_alpha:
         raise DyngsError(
-            f"{capture.root}: the images have no silhouettes; add masks of the person (docs/human.md)"
+            f"{capture.root}: the images have no silhouettes; add masks of the person (`dyngs docs people`)"
         )
-    capture = capture.replace(splits=numbered(capture.splits))
+    capture = capture.replace(splits=assign_frame_numbers(capture.splits))
     views = capture.splits["train"]
     if capture.body is None:
         motion = _unposed(views, body.joints)
@@ -1067,12 +1067,12 @@ def crop_views(
     if float(np.mean([_border_covered(images[i]) for i in shown])) > 0.6:
         raise DyngsError(
             f"{capture.root}: the silhouettes cover the borders of the images; white is the person: are the masks "
-            "inverted? (docs/human.md)"
+            "inverted? (`dyngs docs people`)"
         )
     side = longest_box_side(images[i] for i in shown)
     if side < 8:
         raise DyngsError(
-            f"{capture.root}: nobody is seen in the silhouettes; check the masks (docs/human.md)"
+            f"{capture.root}: nobody is seen in the silhouettes; check the masks (`dyngs docs people`)"
         )
     size = min(effort.side, 2 * (side // 2))
     marked = {

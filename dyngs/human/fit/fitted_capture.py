@@ -21,12 +21,12 @@ from dyngs.capture.fixed_camera import (
     silhouettes_of,
 )
 from dyngs.capture.masks import add_background_masks
-from dyngs.capture.sfm.photos import digest_of
+from dyngs.capture.sfm.photos import digest_files
 from dyngs.config import DataConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info, wrap_read_errors
-from dyngs.data.body_frames import frame_number, numbered, read_body_file
+from dyngs.data.body_frames import assign_frame_numbers, frame_number, read_body_file
 from dyngs.data.capture import BodyFrames, Capture, Split, View
 from dyngs.data.geometry import to_opengl_pose
 from dyngs.data.images.images import to_straight_uint8
@@ -49,7 +49,7 @@ from dyngs.human.fit.capture_fit import (
 from dyngs.human.fit.keypoints import read_joints, read_keypoints
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import CapturedMotion
-from dyngs.io.outputs import make_once, atomic_folder
+from dyngs.io.outputs import atomic_folder, make_once
 from dyngs.io.write import atomic_file, cache_folder, write_image, write_text
 
 _BODY = "body_train.npz"
@@ -114,7 +114,7 @@ def write_fitted_capture(
     with atomic_folder(out) as folder:
         masks = folder / ".masks"
         capture = read_person_capture(options, given, masks)
-        capture = capture.replace(splits=numbered(capture.splits))
+        capture = capture.replace(splits=assign_frame_numbers(capture.splits))
         views = capture.splits["train"]
         # The fit begins with the shape of a known person, or with that of the capture.
         first = person
@@ -559,7 +559,7 @@ def ensure_fitted_body(
         if given is None:
             raise DyngsError(
                 f"{data.root}: has neither silhouettes nor body parameters, so no person can be found; add masks of "
-                "the person (docs/person.md)"
+                "the person (`dyngs docs people`)"
             )
         log(f"{data.root}: no silhouettes, so the body parameters are taken as given")
         return data
@@ -595,4 +595,4 @@ def _digest(data: DataConfig) -> str:
     )
     options = data.model_dump(mode="json", include=set(names.split()))
     chosen = hashlib.sha256(repr(sorted(options.items())).encode()).hexdigest()[:8]
-    return f"{digest_of(root, files)}{chosen}"
+    return f"{digest_files(root, files)}{chosen}"

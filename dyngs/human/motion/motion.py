@@ -19,11 +19,11 @@ from torch import Tensor
 
 from dyngs.core.errors import DyngsError
 from dyngs.core.state import move_fields_to
-from dyngs.data.body_frames import merge_root_rotation, rows_of
+from dyngs.data.body_frames import match_frames, merge_root_rotation
 from dyngs.data.capture import BodyFrames, View
 from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.human.body.skinning import axis_angle_to_matrix
-from dyngs.io.containment import LIMITS_VARIABLE, allowed
+from dyngs.io.containment import LIMITS_VARIABLE, scaled_limit
 
 UpAxis = Literal["auto", "y", "z"]
 MAX_JOINT_POSES = 5_000_000
@@ -75,7 +75,7 @@ def require_frame_count(path: Path, frames: float, joints: int) -> None:
     Raises DyngsError: it exceeds ``MAX_JOINT_POSES``.
     """
     count = max(joints, len(JOINT_NAMES))
-    most = allowed(MAX_JOINT_POSES)
+    most = scaled_limit(MAX_JOINT_POSES)
     if not frames * count <= most:
         raise DyngsError(
             f"{path}: {frames:.0f} frames of {count} joints are too many; at most {most:,} poses of joints are read; "
@@ -265,7 +265,7 @@ def captured_motion(
     1] by frame number. Raises DyngsError: a view without parameters.
     """
     found = merge_root_rotation(given, joints[0].double().cpu().numpy())
-    rows = rows_of(where, found, views)
+    rows = match_frames(where, found, views)
     last = max(len(found.frames) - 1, 1)
     times = {
         row: row / last if view.time is None else view.time

@@ -31,7 +31,7 @@ class KeypointNerfModel(FieldPredictorModel):
     kind: Literal["keypoint_nerf"] = Field(
         default="keypoint_nerf",
         description="a network that predicts a field of a person, placed by key points (KeypointNeRF; "
-        "docs/people_network.md)",
+        "`dyngs docs people`)",
     )
 
 
@@ -41,7 +41,7 @@ class EgHumanNerfModel(FieldPredictorModel):
     kind: Literal["eg_human_nerf"] = Field(
         default="eg_human_nerf",
         description="a network that predicts a field of a person from few samples around a body (EG-HumanNeRF; "
-        "docs/people_network.md)",
+        "`dyngs docs people`)",
     )
 
 
@@ -58,12 +58,12 @@ class PredictedFieldModel(ModelSection):
 
 
 class GpsModel(SceneModel):
-    """A network that predicts people from pairs of neighbouring views (docs/people_network.md)."""
+    """A network that predicts people from pairs of neighbouring views (docs/guides/people.md)."""
 
     kind: Literal["gps"] = Field(
         default="gps",
         description="a network that predicts people from two neighbouring views, after GPS-Gaussian "
-        "(docs/people_network.md)",
+        "(`dyngs docs people`)",
     )
     person_px: int = Field(
         default=256,

@@ -117,7 +117,7 @@ def captured_person(capture: Capture, template: BodyTemplate, images: ImageLoade
     if capture.body is None or not capture.has_alpha:
         missing = "silhouettes" if capture.body is not None else "body parameters"
         raise DyngsError(
-            f"{capture.root}: has no {missing}, which a prediction needs; see docs/human.md"
+            f"{capture.root}: has no {missing}, which a prediction needs; see `dyngs docs people`"
         )
     given = capture.body["train"]
     vertices, joints = rest_shape(template, given)

@@ -24,7 +24,7 @@ def read_antimatter(path: Path) -> SplatFile:
     size = path.stat().st_size
     if size % _ROW.itemsize:
         raise DyngsError(
-            f"{path}: is truncated: its {size:,} bytes are not a multiple of {_ROW.itemsize} (a .splat)"
+            f"{path}: truncated: {size:,} bytes are not a multiple of {_ROW.itemsize} (.splat)"
         )
     require_at_most(path, size // _ROW.itemsize, MAX_GAUSSIANS, "Gaussians")
     rows = np.fromfile(path, _ROW)

@@ -29,7 +29,7 @@ def read_checkpoint(path: Path) -> SplatFile:
     names = _NERFSTUDIO if _NERFSTUDIO[0] in found else _GSPLAT
     if not {*_SHAPES, *names} <= found.keys():
         raise DyngsError(
-            f"{path}: holds no Gaussians as nerfstudio's splatfacto and gsplat store them; {_HINT}"
+            f"{path}: no Gaussians of nerfstudio's splatfacto or gsplat found; {_HINT}"
         )
     count = len(found["means"])
     require_at_most(path, count, MAX_GAUSSIANS, "Gaussians")
@@ -38,7 +38,7 @@ def read_checkpoint(path: Path) -> SplatFile:
     )
     base, rest = (found[name].detach().float().reshape(count, -1, 3) for name in names)
     if rest.shape[1] + 1 not in [num_sh_terms(degree) for degree in range(MAX_SH_DEGREE + 1)]:
-        raise ValueError(f"{rest.shape[1] + 1} harmonics are of no degree that is known")
+        raise ValueError(f"{rest.shape[1] + 1} SH coefficients do not match any supported degree")
     if not rest.shape[1] and names == _NERFSTUDIO:  # then splatfacto stores logits of colours
         base = (base.sigmoid() - 0.5) / SH_C0
     gaussians = Gaussians(
@@ -48,7 +48,7 @@ def read_checkpoint(path: Path) -> SplatFile:
         logit_opacities=opacities[:, 0],
         sh=torch.cat([base, rest], dim=1),
     )
-    note = "in the frame of its training, which the program may have turned and scaled; z is taken for up"
+    note = "coordinates are those of its training, which may be rotated and scaled; z is assumed to be up"
     return SplatFile(gaussians, notes=(note,))
 
 
@@ -57,7 +57,7 @@ def _load(path: Path) -> object:
     or needs code."""
     if not zipfile.is_zipfile(path):
         raise DyngsError(
-            f"{path}: is no file of torch.save (a zip, since torch 1.6), or is cut off; copy it again"
+            f"{path}: not a torch.save file (torch 1.6 or newer), or truncated; copy it again"
         )
     try:
         return torch.load(path, map_location="cpu", mmap=True, weights_only=True)
@@ -65,7 +65,7 @@ def _load(path: Path) -> object:
         raise
     except Exception as error:  # a damaged pickle may raise any; the text of torch misleads
         raise DyngsError(
-            f"{path}: is damaged, or holds objects that only code could restore; {_HINT}"
+            f"{path}: damaged, or contains Python objects, which are not loaded; {_HINT}"
         ) from error
 
 

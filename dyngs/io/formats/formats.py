@@ -26,7 +26,7 @@ from dyngs.io.formats.sog import read_sog, write_sog
 from dyngs.io.formats.splat_file import (
     Nonfinite,
     SplatFile,
-    drawable,
+    make_renderable,
     move_to_origin,
     offset_notes,
     require_writable,
@@ -81,7 +81,7 @@ def format_for_path(path: Path) -> Format:
     of them."""
     found = find_format(path)
     if found is None:
-        raise DyngsError(f"{path}: no suffix of a file of Gaussians; use one of {all_suffixes()}")
+        raise DyngsError(f"{path}: unknown file type; use one of {all_suffixes()}")
     return found
 
 
@@ -106,7 +106,7 @@ def format_by_name(name: str) -> Format:
     """Return the format called ``name``. Raises DyngsError if there is none."""
     known = {candidate.name: candidate for candidate in FORMATS}
     if name not in known:
-        raise DyngsError(f"no format {name!r:.30} of Gaussians; use one of {', '.join(known)}")
+        raise DyngsError(f"unknown format {name!r:.30}; use one of {', '.join(known)}")
     return known[name]
 
 
@@ -132,10 +132,12 @@ def read_splats(path: Path | str, *, nonfinite: Nonfinite = "error") -> SplatFil
         splat = own.read(path)
         if splat.up is None:
             splat = replace(splat, up=own.up)
-        return drawable(move_to_origin(splat), path, nonfinite)
+        return make_renderable(move_to_origin(splat), path, nonfinite)
 
 
-def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = None) -> WrittenFile:
+def write_splats(
+    path: Path | str, splat: SplatFile, *, sh_degree: int | None = None
+) -> WrittenFile:
     """Write a file of Gaussians, into which any 3D filter is fused, atomically; its suffix names
     the format.
 
@@ -145,7 +147,7 @@ def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = 
     """
     path = Path(path)
     own = format_for_path(path)
-    whole, notes = fitted(path, own, splat, sh_degree)
+    whole, notes = limit_to_format(path, own, splat, sh_degree)
     with atomic_file(path) as temporary:
         assert own.write is not None
         try:
@@ -156,7 +158,7 @@ def write_splats(path: Path | str, splat: SplatFile, *, sh_degree: int | None = 
     return WrittenFile(path, whole, notes)
 
 
-def fitted(
+def limit_to_format(
     path: Path, own: Format, splat: SplatFile, sh_degree: int | None
 ) -> tuple[SplatFile, tuple[str, ...]]:
     """Return what a format can hold of a scene, on the CPU, and a line about each thing that it
@@ -169,26 +171,28 @@ def fitted(
     require_writable(path, gaussians)
     if sh_degree is not None and sh_degree > own.max_degree:
         raise DyngsError(
-            f"{path}: harmonics of degree {sh_degree}? {own.name} holds at most degree {own.max_degree}"
+            f"{path}: SH degree {sh_degree} is not supported; {own.name} stores at most degree "
+            f"{own.max_degree}"
         )
     degree = min(gaussians.sh_degree, own.max_degree) if sh_degree is None else sh_degree
     if degree < gaussians.sh_degree and bool(gaussians.sh[:, (degree + 1) ** 2 :].any()):
-        why = f"{own.name} holds no more" if sh_degree is None else "as asked for"
-        notes.append(f"harmonics above degree {degree} are left out: {why}")
+        why = f"{own.name} stores no more" if sh_degree is None else "as requested"
+        notes.append(f"SH coefficients above degree {degree} are dropped: {why}")
     if splat.mode is RasterizeMode.ANTIALIASED and not own.stores_render_mode:
         notes.append(
-            f"the scene is antialiased, which {own.name} cannot say: viewers draw thin parts thicker"
+            f"{own.name} cannot store that the scene is antialiased; viewers draw thin parts too "
+            "thick"
         )
     notes += offset_notes(
-        splat, "the file states it" if own.stores_comments else f"{own.name} cannot state it"
+        splat, "stored in the file" if own.stores_comments else f"{own.name} cannot store it"
     )
     if splat.edited != IDENTITY and not own.stores_comments:
-        notes.append(f"{own.name} cannot state how it was edited: this file cannot be undone")
+        notes.append(f"{own.name} cannot store the edits, so they cannot be undone")
     gaussians = with_sh_degree(gaussians.replace(quats=unit_rotations(gaussians.quats)), degree)
     return replace(splat, gaussians=gaussians), tuple(notes)
 
 
-def upright(splat: SplatFile, up: str | None, path: Path) -> SplatFile:
+def orient_to_axis(splat: SplatFile, up: str | None, path: Path) -> SplatFile:
     """Return the contents turned so that what points up in them points along the axis ``up`` of a
     file.
 

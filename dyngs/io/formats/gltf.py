@@ -17,14 +17,14 @@ import numpy as np
 from dyngs.core.conventions import SH_C0, decode_srgb, num_sh_terms
 from dyngs.core.gaussians import Gaussians
 from dyngs.io.fields import require_at_most
-from dyngs.io.formats.similarity import joined, similarity_from_matrix
+from dyngs.io.formats.similarity import join_gaussians, similarity_from_matrix
 from dyngs.io.formats.splat_file import (
     MAX_GAUSSIANS,
     SplatFile,
-    described,
+    comments_from_json,
     from_linear,
     header_comments,
-    comments_from_json,
+    parse_comments,
 )
 from dyngs.io.gltf import VERTICES, GlbDocument, GltfFile
 
@@ -52,14 +52,14 @@ def read_gltf(path: Path) -> SplatFile:
         place = similarity_from_matrix(world)
         if place is None:
             raise file.error(
-                "a node distorts or mirrors its Gaussians; apply its transform before exporting"
+                "a node transform shears or mirrors its Gaussians; apply it before exporting"
             )
         own = _gaussians(file, primitive)
         found.append(place.gaussians(own.replace(means=own.means.double())))
     if not found:
-        raise file.error(f"holds no Gaussians ({EXTENSION})")
+        raise file.error(f"no Gaussians found ({EXTENSION})")
     comments = comments_from_json(file.json["asset"].get("extras"))
-    return described(SplatFile(joined(found), comments=comments))
+    return parse_comments(SplatFile(join_gaussians(found), comments=comments))
 
 
 def write_gltf(path: Path, splat: SplatFile) -> None:
@@ -113,7 +113,7 @@ def _primitives(file: GltfFile) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
         visited += 1
         if depth > _MOST_DEPTH or visited > _MOST_NODES:
             raise file.error(
-                f"has more than {_MOST_NODES} nodes or {_MOST_DEPTH} of them above one another"
+                f"has more than {_MOST_NODES} nodes, or nodes nested deeper than {_MOST_DEPTH}"
             )
         node = nodes[index]
         world = above @ _matrix(node)
@@ -143,7 +143,7 @@ def _gaussians(file: GltfFile, primitive: dict[str, Any]) -> Gaussians:
     own = primitive["extensions"][EXTENSION]
     if own.get("extensions"):
         raise file.error(
-            f"its Gaussians need {', '.join(own['extensions']):.80}, which is not read"
+            f"its Gaussians need {', '.join(own['extensions']):.80}, which is not supported"
         )
     for key in ("kernel", "colorSpace"):
         if own.get(key) != _PROPERTIES[key]:

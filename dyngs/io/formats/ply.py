@@ -36,8 +36,8 @@ from dyngs.io.formats.splat_file import (
     MAX_GAUSSIANS,
     MAX_LOG_SCALE,
     SplatFile,
-    described,
     header_comments,
+    parse_comments,
     unit_rotations,
 )
 
@@ -69,12 +69,12 @@ def read_ply(path: Path) -> SplatFile:
     """
     elements, comments = read_elements(path)
     if "vertex" not in elements:
-        raise ValueError("it has no vertices, or list properties in or before them")
+        raise ValueError("it has no vertices, or unsupported list properties")
     vertices = elements["vertex"]
     require_at_most(path, len(vertices), MAX_GAUSSIANS, "Gaussians")
     is_compressed = "packed_position" in (vertices.dtype.names or ())
     gaussians = _unpacked(elements) if is_compressed else _gaussians(vertices)
-    return described(SplatFile(gaussians, comments=comments))
+    return parse_comments(SplatFile(gaussians, comments=comments))
 
 
 def write_ply(
@@ -112,9 +112,9 @@ def _gaussians(rows: np.ndarray) -> Gaussians:
     missing = [name for name in _REQUIRED if name not in present]
     if missing or count not in _DEGREE_OF_REST:
         raise ValueError(
-            f"it is no 3DGS .ply: its vertices have no {' '.join(missing[:6])}"
+            f"not a 3DGS .ply: vertices have no {' '.join(missing[:6])}"
             if missing
-            else f"{count} f_rest properties are of no degree that is known"
+            else f"{count} f_rest properties do not match any supported SH degree"
         )
     names = ["opacity", *_SCALE, *_ROT, *_DC, *(f"f_rest_{i}" for i in range(count))]
     with np.errstate(over="ignore"):
@@ -166,7 +166,7 @@ def _rest(table: np.ndarray) -> np.ndarray:
     """Return the harmonics (N, K - 1, 3) of the element sh."""
     names = [f"f_rest_{i}" for i in range(len(table.dtype.names or ()))]
     if _DEGREE_OF_REST.get(len(names), 4) > 3:
-        raise ValueError(f"its element sh has {len(names)} numbers in a row")
+        raise ValueError(f"its element 'sh' has {len(names)} values per row")
     coded = np.stack([table[name].astype(np.float32) for name in names], axis=1)
     fraction = np.where(coded == 0, 0, np.where(coded == 255, 1, (coded + 0.5) / 256))
     rest = ((fraction - 0.5) * _SH_RANGE).reshape(len(table), 3, -1)
@@ -263,7 +263,7 @@ def read_elements(path: Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
                 case ["format", "binary_little_endian", _] | []:
                     pass
                 case _:
-                    raise ValueError(f"its header line {line!r:.60} is not read")
+                    raise ValueError(f"unsupported header line {line!r:.60}")
         size = os.fstat(file.fileno()).st_size
         for name, count, properties in elements:
             row = np.dtype(properties)

@@ -126,7 +126,7 @@ def similarity_from_numbers(numbers: Sequence[float]) -> Similarity:
     if not (
         np.isfinite(numbers).all() and scale > 0 and abs(a * a + b * b + c * c + d * d - 1) < 1e-3
     ):
-        raise ValueError(f"{numbers} are no similarity")
+        raise ValueError(f"{numbers} is not a similarity transform")
     return Similarity((a, b, c, d), scale, (x, y, z))
 
 
@@ -172,13 +172,13 @@ def origin_offset(points: np.ndarray, detail: float) -> np.ndarray:
     return step * np.round(middle / step)
 
 
-def joined(parts: Sequence[Gaussians]) -> Gaussians:
+def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
     """Return the Gaussians of all parts, with harmonics of the least degree among them."""
     terms = num_sh_terms(min(part.sh_degree for part in parts))
     return Gaussians.joined([part.replace(sh=part.sh[:, :terms]) for part in parts])
 
 
-def mirrored(gaussians: Gaussians) -> Gaussians:
+def mirror_gaussians(gaussians: Gaussians) -> Gaussians:
     """Return the mirror image of Gaussians, x becoming -x."""
     flip = torch.tensor([-1.0, 1.0, 1.0], dtype=gaussians.means.dtype, device="cpu")
     turn = torch.tensor([1.0, 1.0, -1.0, -1.0], dtype=gaussians.quats.dtype, device="cpu")

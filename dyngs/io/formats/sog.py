@@ -23,18 +23,18 @@ from dyngs.core.gaussians import Gaussians, morton_order
 from dyngs.io.fields import require_at_most
 from dyngs.io.formats.packing import (
     codebook,
-    split_largest,
     logit,
     nearest_entries,
     palette,
     restore_largest,
+    split_largest,
 )
 from dyngs.io.formats.splat_file import (
     MAX_GAUSSIANS,
     SplatFile,
-    described,
-    header_comments,
     comments_from_json,
+    header_comments,
+    parse_comments,
 )
 
 _META = "meta.json"
@@ -150,10 +150,12 @@ def _member(path: Path, archive: zipfile.ZipFile, name: str, most: int) -> bytes
 def _read(path: Path, archive: zipfile.ZipFile) -> SplatFile:
     meta = json.loads(_member(path, archive, _META, _MOST_META_BYTES))
     if meta.get("version", 1) != 2:
-        raise ValueError(f"it is a .sog of version {meta.get('version', 1)!r:.20}, only 2 is known")
+        raise ValueError(
+            f"it is a .sog of version {meta.get('version', 1)!r:.20}, only version 2 is supported"
+        )
     n = meta["count"]
     if type(n) is not int or n < 1:
-        raise ValueError("its count is no number of Gaussians")
+        raise ValueError("its 'count' is not a positive integer")
     require_at_most(path, n, MAX_GAUSSIANS, "Gaussians")
 
     def pixels(part: str, index: int = 0) -> np.ndarray:
@@ -165,7 +167,7 @@ def _read(path: Path, archive: zipfile.ZipFile) -> SplatFile:
     def table(part: str) -> np.ndarray:
         found = np.array(meta[part]["codebook"], np.float32)
         if found.shape != (256,) or not np.isfinite(found).all():
-            raise ValueError(f"the codebook of its {part} is not 256 numbers")
+            raise ValueError(f"the codebook of {part!r} must have 256 values")
         return found
 
     lower, upper = (pixels("means", i)[:, :3].astype(np.uint16) for i in (0, 1))
@@ -175,7 +177,7 @@ def _read(path: Path, archive: zipfile.ZipFile) -> SplatFile:
         means = (np.sign(far) * np.expm1(np.abs(far))).astype(np.float32)
     coded = pixels("quats")
     if int(coded[:, 3].min()) < _MODE:
-        raise ValueError("it names entries of rotations that do not exist")
+        raise ValueError("it contains invalid rotations")
     others = (coded[:, :3].astype(np.float32) / 255 - 0.5) / _HALF_ROOT
     base = pixels("sh0")
     sh = table("sh0")[base[:, :3]][:, None]
@@ -185,7 +187,7 @@ def _read(path: Path, archive: zipfile.ZipFile) -> SplatFile:
         image = _image(path, archive, meta["shN"]["files"][0])
         labels = pixels("shN", 1).astype(np.int64)
         if image.shape[1] != _PER_ROW * terms:
-            raise ValueError(f"its harmonics are not {_PER_ROW} rows of {terms} terms side by side")
+            raise ValueError(f"its SH image must have {_PER_ROW} x {terms} columns")
         rows = table("shN")[image[..., :3]].reshape(-1, terms, 3)
         sh = np.concatenate([sh, rows[labels[:, 0] | labels[:, 1] << 8]], axis=1)
     gaussians = Gaussians(
@@ -198,7 +200,7 @@ def _read(path: Path, archive: zipfile.ZipFile) -> SplatFile:
     mode = RasterizeMode.ANTIALIASED if meta.get("antialias") else RasterizeMode.CLASSIC
     asset = meta.get("asset")
     comments = comments_from_json(asset.get("comments") if isinstance(asset, dict) else None)
-    return described(SplatFile(gaussians, mode, comments=comments))
+    return parse_comments(SplatFile(gaussians, mode, comments=comments))
 
 
 def _image(path: Path, archive: zipfile.ZipFile, name: str) -> np.ndarray:

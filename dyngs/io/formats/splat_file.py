@@ -16,7 +16,13 @@ from dyngs.core.conventions import RasterizeMode, num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.gaussians import Gaussians
 from dyngs.io.formats.packing import logit
-from dyngs.io.formats.similarity import AXES, IDENTITY, Similarity, origin_offset, similarity_from_numbers
+from dyngs.io.formats.similarity import (
+    AXES,
+    IDENTITY,
+    Similarity,
+    origin_offset,
+    similarity_from_numbers,
+)
 from dyngs.ops.registration import finite_rows
 
 Nonfinite = Literal["error", "skip"]
@@ -78,7 +84,7 @@ def move_to_origin(splat: SplatFile) -> SplatFile:
     if not offset.any():
         return replace(splat, gaussians=gaussians)
     x, y, z = offset.tolist()
-    note = f"the scene is far from the origin: {x:.12g} {y:.12g} {z:.12g} is subtracted from its positions"
+    note = f"the scene is far from the origin: {x:.12g} {y:.12g} {z:.12g} is subtracted from all positions"
     near = replace(splat, gaussians=gaussians, file_offset=(x, y, z), notes=(*splat.notes, note))
     if splat.edited != IDENTITY:
         return replace(near, edited=Similarity(shift=(-x, -y, -z)).after(splat.edited))
@@ -96,11 +102,11 @@ def offset_notes(splat: SplatFile, remark: str) -> tuple[str, ...]:
         return ()
     offset = " ".join(f"{x:.12g}" for x in splat.frame.points(np.array(splat.world_offset)))
     return (
-        f"the scene is far from the origin: {offset} is subtracted from its positions ({remark})",
+        f"the scene is far from the origin: {offset} is subtracted from all positions ({remark})",
     )
 
 
-def drawable(splat: SplatFile, path: Path, nonfinite: Nonfinite) -> SplatFile:
+def make_renderable(splat: SplatFile, path: Path, nonfinite: Nonfinite) -> SplatFile:
     """Return the contents with values that can be drawn; see ``read_splats``.
 
     Raises DyngsError: no Gaussians, or none that can be drawn, or ``nonfinite`` is "error" and some
@@ -121,9 +127,9 @@ def drawable(splat: SplatFile, path: Path, nonfinite: Nonfinite) -> SplatFile:
         if nonfinite == "error":
             raise DyngsError(f"{path}: {bad} have non-finite values (NaN or Inf)")
         gaussians = gaussians.select(good)
-        notes += (f"{bad} are left out: they have non-finite values (NaN or Inf)",)
+        notes += (f"{bad} dropped: non-finite values (NaN or Inf)",)
     if len(gaussians) == 0:
-        raise DyngsError(f"{path}: holds no Gaussians" + (" with finite values" if total else ""))
+        raise DyngsError(f"{path}: no Gaussians" + (" with finite values" if total else ""))
     return replace(splat, gaussians=gaussians, notes=notes)
 
 
@@ -220,7 +226,7 @@ def comments_from_json(value: object) -> tuple[str, ...]:
     return tuple(x for x in value if isinstance(x, str)) if isinstance(value, list) else ()
 
 
-def described(splat: SplatFile) -> SplatFile:
+def parse_comments(splat: SplatFile) -> SplatFile:
     """Return the contents of a file with what its comments say about them.
 
     Raises ValueError: a comment of ours holds no such values, or names a render mode that does not

@@ -21,8 +21,8 @@ from dyngs.core.conventions import MAX_SH_DEGREE, RasterizeMode, num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.core.gaussians import Gaussians
 from dyngs.io.fields import require_at_most
-from dyngs.io.formats.packing import split_largest, logit, restore_largest
-from dyngs.io.formats.similarity import Similarity, mirrored, quat_from_matrix
+from dyngs.io.formats.packing import logit, restore_largest, split_largest
+from dyngs.io.formats.similarity import Similarity, mirror_gaussians, quat_from_matrix
 from dyngs.io.formats.splat_file import MAX_GAUSSIANS, SplatFile, unit_rotations
 
 _MAGIC = b"NGSP"
@@ -49,9 +49,9 @@ def read_spz(path: Path) -> SplatFile:
     head = _inflated(data, _HEADER.size) if is_gzip else data[: _HEADER.size]
     magic, version, count, degree, bits, flags, streams = _HEADER.unpack(head)
     if magic != _MAGIC or version not in ((2, 3) if is_gzip else (4,)):
-        raise ValueError("it is no .spz of version 2 to 4")
+        raise ValueError("not a .spz file of version 2 to 4")
     if degree > MAX_SH_DEGREE or bits > _MOST_FRACTION_BITS:
-        raise ValueError(f"it states harmonics of degree {degree}, and {bits} bits after the point")
+        raise ValueError(f"unsupported SH degree {degree} or {bits} fractional bits")
     rows = {"means": 9, "alphas": 1, "colours": 3, "scales": 3, "quats": 3 if version < 3 else 4}
     rows["sh"] = 3 * (num_sh_terms(degree) - 1)
     total = count * sum(rows.values())
@@ -79,7 +79,7 @@ def _inflated(data: bytes, most: int) -> bytes:
     stream = zlib.decompressobj(31)
     content = stream.decompress(data, most)
     if not stream.decompress(stream.unconsumed_tail, 1) and not stream.eof:
-        raise ValueError("it is truncated: its gzip stream does not end")
+        raise ValueError("truncated gzip stream")
     return content
 
 
@@ -116,7 +116,7 @@ def write_spz(path: Path, splat: SplatFile) -> None:
         22 - octave, max(_FRACTION_BITS, _FRACTION_BITS - octave), _MOST_FRACTION_BITS
     )
     if fraction_bits < 0:
-        raise DyngsError(f"a .spz holds positions up to 8e6, these reach {extent:.2g}")
+        raise DyngsError(f".spz stores positions up to 8e6, but the scene reaches {extent:.2g}")
     fixed = np.clip(np.round(means * (1 << fraction_bits)), -(1 << 23) + 1, (1 << 23) - 1).astype(
         "<i4"
     )
@@ -149,7 +149,7 @@ def _standard_axes(splat: SplatFile, extensions: bytes) -> SplatFile:
         value = extensions[start + 8 : start + 8 + size]
         start += 8 + size
         if start > len(extensions):
-            raise ValueError("it is damaged in its extensions")
+            raise ValueError("its extensions are damaged")
         if kind == _COORDINATE_SYSTEM:
             return _from_system(splat, int.from_bytes(value, "little"))
     return splat
@@ -163,7 +163,7 @@ def _from_system(splat: SplatFile, number: int) -> SplatFile:
     vertical axis, and the third bit is y to the back.
     """
     if number > 16:
-        raise ValueError(f"it states coordinate system {number}, but only 1 to 16 exist")
+        raise ValueError(f"unknown coordinate system {number}, must be 1 to 16")
     if number in (0, _STANDARD):
         return splat
     right, up, front, is_z_vertical = ((number - 1) >> bit & 1 for bit in range(4))
@@ -172,11 +172,13 @@ def _from_system(splat: SplatFile, number: int) -> SplatFile:
         axes = axes[:, [0, 2, 1]]
     gaussians = splat.gaussians
     if np.linalg.det(axes) < 0:
-        gaussians = mirrored(gaussians)
+        gaussians = mirror_gaussians(gaussians)
         axes[:, 0] *= -1
-    note = "it states other axes than right, up and back: turned to those"
+    note = "rotated from the axes stated in the file to right, up, back"
     return replace(
-        splat, gaussians=Similarity(quat_from_matrix(axes)).gaussians(gaussians), notes=(*splat.notes, note)
+        splat,
+        gaussians=Similarity(quat_from_matrix(axes)).gaussians(gaussians),
+        notes=(*splat.notes, note),
     )
 
 

@@ -23,8 +23,8 @@ from dyngs.core.gaussians import Gaussians
 from dyngs.io.child import python_command
 from dyngs.io.fields import require_at_most
 from dyngs.io.formats import usd_child
-from dyngs.io.formats.similarity import joined, similarity_from_matrix
-from dyngs.io.formats.splat_file import SplatFile, described, from_linear, header_comments
+from dyngs.io.formats.similarity import join_gaussians, similarity_from_matrix
+from dyngs.io.formats.splat_file import SplatFile, from_linear, header_comments, parse_comments
 
 _SECONDS = 600.0  # of wall time; the child has less of processor time
 _NAMES = ("means", "scales", "opacities", "quats", "sh", "degree", "world")
@@ -58,16 +58,18 @@ def read_usd(path: Path) -> SplatFile:
             raise DyngsError(f"{path}: {done.stdout.strip().splitlines()[-1]:.200}")
         if done.returncode or not out.is_file():
             raise DyngsError(
-                f"{path}: the USD library cannot read it, or not in bounded memory; export it again"
+                f"{path}: the USD library cannot read it within the memory limit; export it again"
             )
         with np.load(out, allow_pickle=False) as arrays:
             read = {name: arrays[name] for name in arrays.files}
     count = int(read["count"])
     if not count:
-        raise DyngsError(f"{path}: holds no Gaussians ({usd_child.PRIM})")
+        raise DyngsError(f"{path}: no Gaussians found ({usd_child.PRIM})")
     found = [_gaussians({name: read[f"{i}.{name}"] for name in _NAMES}) for i in range(count)]
     up = _UP.get(str(read["up"]), "y")
-    return described(SplatFile(joined(found), up=up, comments=tuple(read["comments"].tolist())))
+    return parse_comments(
+        SplatFile(join_gaussians(found), up=up, comments=tuple(read["comments"].tolist()))
+    )
 
 
 def write_usd(path: Path, splat: SplatFile) -> None:
@@ -101,7 +103,7 @@ def write_usd(path: Path, splat: SplatFile) -> None:
     with suppress(RuntimeError):  # its own, of many lines
         if layer.Export(str(path)):
             return
-    raise OSError("the USD library could not write it; the disk may be full")
+    raise OSError("the USD library failed to write it; the disk may be full")
 
 
 def _packages(path: Path) -> tuple[Any, Any, Any, Any]:
@@ -121,11 +123,11 @@ def _gaussians(arrays: Mapping[str, np.ndarray]) -> Gaussians:
     """Return the Gaussians of a prim, in the axes of the stage."""
     degree = int(arrays["degree"])
     if not 0 <= degree <= MAX_SH_DEGREE:
-        raise ValueError(f"harmonics of degree {degree}, only 0 to {MAX_SH_DEGREE} are known")
+        raise ValueError(f"SH degree {degree} is not supported, only 0 to {MAX_SH_DEGREE}")
     means = arrays["means"]
     sh = arrays["sh"].reshape(len(means), num_sh_terms(degree), 3)
     found = from_linear(means, arrays["quats"], arrays["scales"], arrays["opacities"], sh)
     place = similarity_from_matrix(arrays["world"])
     if place is None:
-        raise ValueError("a prim distorts or mirrors its Gaussians; apply its transform first")
+        raise ValueError("a prim transform shears or mirrors its Gaussians; apply it first")
     return place.gaussians(found.replace(means=found.means.double()))

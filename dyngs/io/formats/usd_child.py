@@ -50,7 +50,7 @@ def arrays_of(path: Path) -> dict[str, np.ndarray]:
     try:
         layer = sdf.Layer.OpenAsAnonymous(str(path))
         if layer is None:
-            raise RefusedError("is no USD file; export it again")
+            raise RefusedError("not a USD file; export it again")
         others = layer.GetCompositionAssetDependencies()
         if others:
             raise RefusedError(

@@ -9,7 +9,7 @@ import pytest
 
 from dyngs.baselines.fields.ngp import cells_in_view
 from dyngs.data.capture import View
-from dyngs.data.geometry import projected
+from dyngs.data.geometry import project_points
 from dyngs.ops.rays import Space
 
 
@@ -39,7 +39,7 @@ def test_all_that_a_camera_sees_may_be_occupied(cells: int) -> None:
         np.floor((offsets / 2.0 ** cascade[:, None] + 1) * cells / 2).astype(int).clip(0, cells - 1)
     )
     may = seen.numpy()[cascade, cell[:, 2], cell[:, 1], cell[:, 0]]
-    in_image = projected(points, VIEWS[0])[1] | projected(points, VIEWS[1])[1]
+    in_image = project_points(points, VIEWS[0])[1] | project_points(points, VIEWS[1])[1]
     assert 0.1 < in_image.mean() < 0.5
     assert may[in_image].all()
     assert may.mean() < in_image.mean() + 0.35, "not much more than that"

@@ -108,7 +108,7 @@ def test_what_does_not_go_is_refused(
         (["train.exposure=always"], "has no effect with model.kind=ngp"),
         (["camera.refine=always"], "has no effect with model.kind=ngp"),
         (["budget.max_gaussians=10"], "has no effect with model.kind=ngp"),
-        (["model.time=true"], "the images have no times"),
+        (["model.time=true"], "model.time=true needs images at several times"),
         (["model.sizes=huge"], "one of tiny, cpu, published"),
     ],
 )
@@ -135,4 +135,4 @@ def test_one_camera_position_is_refused(
     meta["frames"] = [frame | {"file_path": f"./train/{i}"} for i in range(3)]
     (one / "transforms_train.json").write_text(json.dumps(meta), encoding="utf-8")
     assert main(["train", f"data.root={one}", f"run.dir={tmp_path / 'run'}", *NGP]) == 2
-    assert "single camera position" in capsys.readouterr().err
+    assert "the same camera position" in capsys.readouterr().err

@@ -26,7 +26,7 @@ def test_rays_see_a_slab_of_even_density() -> None:
         rays = Rays(
             torch.tensor([[-4.0, 0, 0], [-4, 9, 0]]), torch.tensor([[1.0, 0, 0], [0, 1, 0]])
         )
-        seen = field.seen(rays, 0.0, near=0.1)
+        seen = field.render_rays(rays, 0.0, near=0.1)
     colour = torch.tensor([1.0, 0.0, -1.0]).sigmoid()
     assert seen.coarse is not None
     for found in (seen, seen.coarse):
@@ -49,7 +49,7 @@ def test_all_that_is_learned_gets_gradients_and_none_is_of_rounding() -> None:
         * 4
     )
     shifts = torch.rand(50, 24, generator=torch.Generator().manual_seed(2))
-    seen = field.seen(Rays(origins, -origins / 4), 0.0, near=0.1, shifts=shifts)
+    seen = field.render_rays(Rays(origins, -origins / 4), 0.0, near=0.1, shifts=shifts)
     assert seen.coarse is not None
     (seen.colour + seen.coarse.colour).mean().backward()
     grads = [x.grad for name, x in field.parameters.items() if "weight" in name]

@@ -37,7 +37,7 @@ def test_rays_see_what_places_along_them_are(time: bool) -> None:
     field = field_of(SMALL.model_copy(update={"time": time}))
     rays = rays_towards_it()
     with torch.no_grad():
-        seen = field.seen(rays, 0.3, near=0.1)
+        seen = field.render_rays(rays, 0.3, near=0.1)
         for r in range(len(rays)):
             # from the camera on, nearly as the samples lie
             at = 0.5 * field.step + torch.arange(3000) * field.step

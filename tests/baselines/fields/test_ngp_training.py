@@ -52,7 +52,7 @@ def test_views_that_were_held_out_are_learned(capture: Path) -> None:
         24 * 24, (trainer.model.num_rays,), generator=torch.Generator().manual_seed(0)
     )
     rays, _ = camera_rays(image.cameras, which)
-    samples = field.seen(rays, 0.0, near=0.1).num_samples
+    samples = field.render_rays(rays, 0.0, near=0.1).num_samples
     assert 0.4 < samples / 2**12 < 2.5, "rays fill a step, about"
 
 
@@ -85,7 +85,7 @@ def test_a_cube_that_no_camera_sees_is_refused(capture: Path) -> None:
     views = [
         replace(view, cam_from_world=away @ view.cam_from_world) for view in read.splits["train"]
     ]
-    with pytest.raises(DyngsError, match="no training camera sees anything of the cube"):
+    with pytest.raises(DyngsError, match="no training camera sees the cube of the field"):
         build_trainer(config, replace(read, splits={**read.splits, "train": views}))
 
 

@@ -11,7 +11,7 @@ import torch
 from small_fields import config_of
 
 from dyngs.baselines.fields.kind import NgpModel
-from dyngs.baselines.fields.scene import MOST_CASCADES, space_of
+from dyngs.baselines.fields.scene import MAX_CASCADES, space_of
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, PointCloud
@@ -50,13 +50,13 @@ def test_a_real_capture_has_cubes_up_to_its_points(still: Capture) -> None:
     )
     assert near.outermost >= 2 * 3.0
     assert far.outermost > 60
-    assert space_of(NgpModel(), 16, real(still, None)).cascades == MOST_CASCADES
+    assert space_of(NgpModel(), 16, real(still, None)).cascades == MAX_CASCADES
     assert space_of(NgpModel(surroundings="never"), 16, real(still, None)).cascades == 1
 
 
 def test_one_camera_position_tells_no_depth(still: Capture) -> None:
     one = replace(still, splits={"train": still.splits["train"][:1] * 3})
-    with pytest.raises(DyngsError, match="single camera position"):
+    with pytest.raises(DyngsError, match="the same camera position"):
         space_of(NgpModel(), 16, one)
 
 

@@ -52,7 +52,7 @@ def test_every_suffix_is_taken_or_said_to_be_left_out(tmp_path: Path) -> None:
     assert names == {x: x for x in ("a.jpg", "b.JPEG", "c.png", "d.tif", "e.bmp", "f.webp")} | {
         "g.gif": "g.png"
     }
-    assert notes[0].startswith("4 files left out, no photos (photos are .bmp, ")
+    assert notes[0].startswith("4 files skipped, not photos (.bmp, ")
     assert read_image(tmp_path / "images" / "g.png").shape == (24, 32, 3), (
         "an opaque GIF has no alpha"
     )
@@ -103,7 +103,9 @@ def test_heic_without_its_package_names_it(tmp_path: Path, monkeypatch: pytest.M
     _save(tmp_path / "photos" / "a.jpg")
     (tmp_path / "photos" / "b.heic").write_bytes(b"photo")
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    with pytest.raises(DyngsError, match=r"1 photos? .*first b\.heic.*pip install 'dyngs\[heic\]'"):
+    with pytest.raises(
+        DyngsError, match=r"1 HEIC photos?, first b\.heic.*pip install 'dyngs\[heic\]'"
+    ):
         _gather(tmp_path)
 
 

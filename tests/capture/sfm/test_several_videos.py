@@ -16,12 +16,12 @@ from dyngs.capture.sfm.colmap import SfmOptions
 from dyngs.capture.sfm.several_videos import (
     VIDEOS_FILE,
     CameraVideo,
+    estimate_shift,
+    estimate_starts_by_sound,
     frames_at_steps,
     open_video,
     poses_of_videos,
     read_video_settings,
-    estimate_shift,
-    estimate_starts_by_sound,
 )
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import all_views
@@ -40,7 +40,7 @@ def capture_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_videos(folder / "rig", AZIMUTHS, STARTS, 10.0, 24)
     (folder / "rig" / "videos.json").write_text(json.dumps({"starts": STARTS}))
     said = poses_of_videos(folder / "rig", folder / "out", SfmOptions(num_threads=1))
-    assert "4 of 4 cameras have a pose" in said
+    assert "4 of 4 cameras registered" in said
     assert "as given" in said
     return folder / "out"
 
@@ -49,7 +49,7 @@ def test_silent_videos_without_offsets_are_refused(tmp_path: Path) -> None:
     write_videos(tmp_path / "rig", {"a": 40.0, "b": 50.0}, {"a": 0.0, "b": 0.2}, 10.0, 6)
     with pytest.raises(
         DyngsError,
-        match=r'a has no sound; give the second .* in videos\.json beside them, {"starts"',
+        match=r'a has no sound; give the start .* in videos\.json next to them, {"starts"',
     ):
         poses_of_videos(tmp_path / "rig", tmp_path / "out", SfmOptions(num_threads=1))
     assert not (tmp_path / "out").exists()
@@ -73,12 +73,12 @@ def test_the_capture_has_seconds_in_one_clock_and_a_camera_for_testing(capture_r
     views = all_views(capture.splits)
     assert {view.name.split("/")[0] for view in capture.splits["test"]} == {"left"}
     assert len({view.camera_id for view in views}) == len(static_cameras(views)) == 4
-    assert capture.in_seconds
+    assert capture.times_in_seconds
     # all of them run from the last start, 0.37 s, to the first end, 2.3 s
     assert capture.seconds == pytest.approx(1.93, abs=0.16)
     written = json.loads((capture_root / "times.json").read_text())["seconds"]
     assert sorted(written) == sorted(f"{view.name}.png" for view in views)
-    assert capture.span == pytest.approx((min(written.values()), max(written.values())))
+    assert capture.file_time_span == pytest.approx((min(written.values()), max(written.values())))
 
 
 def test_a_camera_that_moves_is_refused(tmp_path: Path) -> None:
@@ -86,7 +86,9 @@ def test_a_camera_that_moves_is_refused(tmp_path: Path) -> None:
     with video_writer(tmp_path / "rig" / "walking.mp4", fps=10) as add:
         for i in range(8):
             add(corner(camera(30.0 + 2 * i), 0.0))
-    with pytest.raises(DyngsError, match=r"cameras must stand still, but these move: walking"):
+    with pytest.raises(
+        DyngsError, match=r"cameras of several videos must be fixed, but these move: walking"
+    ):
         poses_of_videos(tmp_path / "rig", tmp_path / "out", SfmOptions(num_threads=1))
     assert not (tmp_path / "out").exists()
 
@@ -108,7 +110,7 @@ def test_starts_and_test_cameras(tmp_path: Path) -> None:
     ("value", "message"),
     [
         *(
-            ({"starts": starts}, r"give the second at which each video begins, for left, right")
+            ({"starts": starts}, r"give the start of each video in seconds, for left, right")
             for starts in (
                 3,
                 {"left": 0},
@@ -186,7 +188,7 @@ def test_offsets_of_recordings_with_noise_of_their_own(tmp_path: Path) -> None:
     films = [open_video(_write(tmp_path / f"{i}.mp4", sound)) for i, sound in enumerate(noisy)]
     seconds, line = estimate_starts_by_sound(films)
     assert list(seconds.values()) == pytest.approx(starts, abs=0.015)
-    assert "by the sound (3 of 3 pairs agree" in line
+    assert "from sound (3 of 3 pairs agree" in line
 
 
 def _smooth_noise(rng: np.random.Generator, length: int, bins: int = 6) -> np.ndarray:
@@ -205,7 +207,9 @@ def _shown(signal: np.ndarray, begin: float, length: int) -> np.ndarray:
 @pytest.mark.parametrize("shift", [0.0, 7.0, -12.4])
 def test_a_shift_is_found_to_half_a_sample(shift: float) -> None:
     signal = _smooth_noise(np.random.default_rng(0), 600)
-    samples, peak, deviations = estimate_shift(_shown(signal, 30, 420), _shown(signal, 30 + shift, 400))
+    samples, peak, deviations = estimate_shift(
+        _shown(signal, 30, 420), _shown(signal, 30 + shift, 400)
+    )
     assert samples == pytest.approx(shift, abs=0.5)
     assert peak > 0.9
     assert deviations > 6
@@ -232,7 +236,7 @@ def test_frames_of_time_steps() -> None:
         == list(frames[1].values())
         == pytest.approx(0.5 + np.arange(25) / 10)
     )
-    assert "25 time steps of 2.40 s" in line
+    assert "25 time steps over 2.40 s" in line
     together = {"0": 0.0, "1": 0.0}
     frames, _ = frames_at_steps(Path("rig"), _videos((50, 100), (25, 50)), together)
     assert list(frames[0]) == list(range(0, 100, 2))
@@ -241,5 +245,5 @@ def test_frames_of_time_steps() -> None:
     frames, line = frames_at_steps(Path("rig"), _videos((30, 3000), (30, 3000)), together)
     assert len(frames[0]) == 300
     assert "of 3000" in line
-    with pytest.raises(DyngsError, match="share no two time steps"):
+    with pytest.raises(DyngsError, match="do not overlap in time"):
         frames_at_steps(Path("rig"), _videos((10, 20), (10, 20)), {"0": 0.0, "1": 5.0})

@@ -11,7 +11,7 @@ from tiny_captures import write_colmap
 from dyngs.capture.sfm import unposed
 from dyngs.capture.sfm.colmap import SfmOptions
 from dyngs.capture.sfm.estimate import SfmResult
-from dyngs.capture.sfm.unposed import with_poses
+from dyngs.capture.sfm.unposed import ensure_poses
 from dyngs.cli import main
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import save_config
@@ -34,7 +34,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     def several(source: Path, out: Path, options: SfmOptions, report: object) -> str:
         sources.append(source)
         write_colmap(out)
-        return "4 of 4 cameras have a pose"
+        return "4 of 4 cameras registered"
 
     monkeypatch.setattr(unposed, "estimate_poses", estimate)
     monkeypatch.setattr(unposed, "poses_of_videos", several)
@@ -57,15 +57,15 @@ def _videos(folder: Path, count: int) -> Path:
 def test_photos_get_poses_once(tmp_path: Path, asked: list[Path]) -> None:
     said: list[str] = []
     data = DataConfig(root=_photos(tmp_path / "photos"))
-    first = with_poses(data, log=said.append)
+    first = ensure_poses(data, log=said.append)
     assert cache_folder("poses") in first.root.parents
-    assert "estimated first" in said[0]
+    assert "has no poses; estimating them" in said[0]
     assert "3 of 3 images" in said[1]
-    assert with_poses(data, log=said.append) == first
+    assert ensure_poses(data, log=said.append) == first
     assert asked == [tmp_path / "photos"]
     assert "of before" in said[-1]
     write_image(tmp_path / "photos" / "photo_1.png", np.zeros((4, 8, 3), np.uint8))
-    assert with_poses(data, log=said.append).root != first.root, "a photo has changed"
+    assert ensure_poses(data, log=said.append).root != first.root, "a photo has changed"
     assert len(asked) == 2
 
 
@@ -78,12 +78,12 @@ def test_no_output_replaces_the_video_that_a_run_is_made_of(
         add(np.zeros((16, 16, 3), np.uint8))
     before = video.read_bytes()
     for _ in ("estimated", "of before"):
-        data = with_poses(DataConfig(root=video), log=lambda _: None)
+        data = ensure_poses(DataConfig(root=video), log=lambda _: None)
         save_config(Config(data=data), tmp_path / "run" / "config.yaml")
         assert (
             main(["render", str(tmp_path / "run"), "--path", "along", "--video", str(video)]) == 2
         )
-        assert "clip.mp4: exists, which is read" in capsys.readouterr().err
+        assert "clip.mp4: exists, which is an input" in capsys.readouterr().err
         (data.root / SOURCES_NAME).unlink()  # as a run killed at just that moment leaves it
     assert video.read_bytes() == before
 
@@ -93,15 +93,17 @@ def test_what_cannot_work_is_said_before_poses_are_estimated(
 ) -> None:
     photos = DataConfig(root=_photos(tmp_path / "photos"))
     with pytest.raises(DyngsError, match=r"no times.*data\.times=order"):
-        with_poses(photos, needs_times=True)
+        ensure_poses(photos, needs_times=True)
     with pytest.raises(DyngsError, match=r"2 videos.*dyngs train dynamic"):
-        with_poses(DataConfig(root=_videos(tmp_path / "rig", 2)))
-    with pytest.raises(DyngsError, match=r"one video; give that: data\.root=.*cam0\.mp4"):
-        with_poses(DataConfig(root=_videos(tmp_path / "single", 1)), needs_times=True)
+        ensure_poses(DataConfig(root=_videos(tmp_path / "rig", 2)))
     with pytest.raises(
-        DyngsError, match=r"two: holds 2 photos and no cameras; a scene needs at least 3 photos"
+        DyngsError, match=r"one video; give the video itself: data\.root=.*cam0\.mp4"
     ):
-        with_poses(DataConfig(root=_photos(tmp_path / "two", 2)))
+        ensure_poses(DataConfig(root=_videos(tmp_path / "single", 1)), needs_times=True)
+    with pytest.raises(
+        DyngsError, match=r"two: holds 2 photos but no cameras; a scene needs at least 3 photos"
+    ):
+        ensure_poses(DataConfig(root=_photos(tmp_path / "two", 2)))
     assert asked == []
     ordered = photos.model_copy(update={"times": "order"})
-    assert with_poses(ordered, needs_times=True, log=lambda _: None).root != photos.root
+    assert ensure_poses(ordered, needs_times=True, log=lambda _: None).root != photos.root

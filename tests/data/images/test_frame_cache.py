@@ -100,7 +100,7 @@ def test_the_limit_is_refused_at_once(root: Path, monkeypatch: pytest.MonkeyPatc
     decode_frames(root, some(frames, 0))
     one = next(iter(frames)).stat().st_size
     monkeypatch.setattr(video, "MAX_CACHED_BYTES", 3 * one)
-    with pytest.raises(DyngsError, match=r"asks for .* bytes of video frames.*DYNGS_LIMITS="):
+    with pytest.raises(DyngsError, match=r"bytes of video frames exceed the limit.*DYNGS_LIMITS="):
         decode_frames(root, frames)
     assert len(cached()) <= 2, "the estimate is made from the first frame"
 

@@ -18,8 +18,8 @@ from dyngs.data.images.maps import (
     nearest_positions,
     read_depth,
     read_flow,
-    silhouette_box,
     sample_nearest,
+    silhouette_box,
 )
 
 
@@ -58,7 +58,7 @@ def test_all_three_kinds_of_files_hold_the_same(tmp_path: Path) -> None:
 
 def test_sizes_are_checked_before_memory_is_allocated(tmp_path: Path) -> None:
     (tmp_path / "a.flo").write_bytes(flo(2**30, 2**30, np.zeros(2)))
-    with pytest.raises(DyngsError, match="pixels, of which"):
+    with pytest.raises(DyngsError, match="pixels exceed"):
         read_flow(tmp_path / "a.flo")
 
 
@@ -76,7 +76,10 @@ INTRINSICS = np.array([[40.0, 0, 16], [0, 42.0, 12], [0, 0, 1]])
 def test_nothing_is_averaged() -> None:
     values = torch.arange(24.0).reshape(4, 6, 1)
     torch.testing.assert_close(sample_nearest(values, nearest_positions(6, 4)), values)
-    assert sample_nearest(values, nearest_positions(3, 2))[..., 0].tolist() == [[7, 9, 11], [19, 21, 23]]
+    assert sample_nearest(values, nearest_positions(3, 2))[..., 0].tolist() == [
+        [7, 9, 11],
+        [19, 21, 23],
+    ]
 
 
 def test_flow_through_a_lens_ends_where_the_pinhole_sees_the_point() -> None:
@@ -90,6 +93,4 @@ def test_flow_through_a_lens_ends_where_the_pinhole_sees_the_point() -> None:
     stored = (lens_map.grid[8, 20] + 1) / 2 * torch.tensor([32.0, 24.0])
     end = undistort_points(lens, INTRINSICS, stored + torch.tensor([3.0, 0.0]))
     torch.testing.assert_close(found[8, 20], end - start, rtol=0, atol=1e-3)
-    torch.testing.assert_close(
-        undistort_points(lens, INTRINSICS, stored), start, rtol=0, atol=1e-2
-    )
+    torch.testing.assert_close(undistort_points(lens, INTRINSICS, stored), start, rtol=0, atol=1e-2)

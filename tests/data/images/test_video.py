@@ -69,7 +69,7 @@ def test_video_damaged_in_the_middle(video: Path) -> None:
         data[place : place + size] = b"\xa5" * size
     broken.write_bytes(data)
     assert [number for number, _ in read_numbered_frames(broken, [0])] == [0]
-    with pytest.raises(DyngsError, match=r"broken\.mp4 breaks at frame [1-6]"):
+    with pytest.raises(DyngsError, match=r"broken\.mp4 at frame [1-6]"):
         list(read_numbered_frames(broken, range(9)))
 
 
@@ -201,5 +201,5 @@ def test_untagged_video_is_bt601_in_sd_and_bt709_in_hd(
     rgb = np.full((*size, 3), (0.2, 0.7, 0.3))
     write_clip(path, rgb, (UNSPECIFIED, UNSPECIFIED, UNSPECIFIED), matrix=matrix, bits=bits)
     assert levels_off(path, rgb) < 2.5
-    note = "HD without colour tags is read as BT.709" if matrix == BT709 else ""
+    note = "HD without colour tags, assumed to be BT.709" if matrix == BT709 else ""
     assert probe_video(path).colours == note

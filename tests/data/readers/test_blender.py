@@ -13,7 +13,7 @@ from tiny_captures import edit_json, opengl_pose, pixel_of, random_pixels, write
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
-from dyngs.data.body_frames import merge_root_rotation, rows_of
+from dyngs.data.body_frames import match_frames, merge_root_rotation
 from dyngs.data.capture import BodyFrames, Capture, Lens, Silhouette, View, all_views
 from dyngs.data.images.images import read_image
 from dyngs.data.readers.transforms import (
@@ -148,7 +148,7 @@ def test_broken_json_names_line_and_column(blender_root: Path) -> None:
     path = blender_root / "transforms_train.json"
     path.write_text(json.dumps(json.loads(path.read_text()), indent=1)[:700])
     with pytest.raises(
-        DyngsError, match=r"transforms_train\.json, line \d+ column \d+: broken JSON"
+        DyngsError, match=r"transforms_train\.json, line \d+ column \d+: invalid JSON"
     ):
         read_blender(blender_root)
 
@@ -424,7 +424,7 @@ def test_other_splits_may_lack(root: Path) -> None:
 def test_missing_files(root: Path) -> None:
     (root / "body_pose.npz").unlink()
     with pytest.raises(
-        DyngsError, match=r"body_pose\.npz: no such file; transforms_pose\.json shows another clip"
+        DyngsError, match=r"body_pose\.npz: no such file; transforms_pose\.json is a separate clip"
     ):
         read_body_json(root)
     write_body(root / "body_pose.npz", 2)
@@ -446,10 +446,10 @@ def test_missing_files(root: Path) -> None:
             {"trans": np.zeros((2, 3))},
             r"body_train\.npz: 'trans' must hold as many numbers for each of 3 frames",
         ),
-        ({"trans": np.full((3, 3), np.nan)}, r"body_train\.npz: 'trans' of frame 0 holds NaN"),
+        ({"trans": np.full((3, 3), np.nan)}, r"body_train\.npz: 'trans' of frame 0 contains NaN"),
         ({"scale": -1.0}, r"body_train\.npz: 'scale' must be positive"),
         ({"betas": None}, r"body_train\.npz: the key 'betas' is missing"),
-        ({"poses": np.zeros(()), "trans": np.zeros(())}, r"body_train\.npz: holds no frame"),
+        ({"poses": np.zeros(()), "trans": np.zeros(())}, r"body_train\.npz: no frames found"),
         (
             {"poses": np.zeros((2, 165)), "trans": np.zeros((2, 3))},
             r"no body parameters for 1 frames .*\(2\)",
@@ -486,20 +486,22 @@ def test_the_pelvis_lies_inside_the_person(shared: Path, name: str) -> None:
     for split, body in bodies(capture).items():
         views: tuple[View, ...] = dict(capture.splits).get(split, ())[::11]  # type: ignore[call-overload]
         places = merge_root_rotation(body, pelvis)
-        for view, row in zip(views, rows_of(capture.root, body, views), strict=True):
+        for view, row in zip(views, match_frames(capture.root, body, views), strict=True):
             x, y = pixel_of(view, places.scale[row] * pelvis + places.trans[row])
             assert read_image(view.image_path)[int(y), int(x), 3] == 255, view.name
 
 
 def test_frames_are_held_out_where_no_other_clip_was_filmed(root: Path) -> None:
-    with pytest.raises(DyngsError, match=r"data\.pose_frames=2:: is for people without a clip"):
+    with pytest.raises(
+        DyngsError, match=r"data\.pose_frames=2:: only applies to captures of people"
+    ):
         read_capture(DataConfig(root=root, pose_frames="2::"))
     for name in ("transforms_pose.json", "body_pose.npz"):
         (root / name).unlink()
     capture = read_capture(DataConfig(root=root, pose_frames="2::"))
     assert [view.name for view in capture.splits["pose"]] == ["images/test/f2_c2"]
     (root / "body_train.npz").unlink()
-    with pytest.raises(DyngsError, match="is for people without a clip"):
+    with pytest.raises(DyngsError, match="only applies to captures of people"):
         read_capture(DataConfig(root=root, pose_frames="2::"))
 
 

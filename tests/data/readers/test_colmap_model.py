@@ -84,14 +84,15 @@ def test_image_of_an_unknown_camera(tmp_path: Path) -> None:
     path = root / "sparse/0/images.txt"
     path.write_text(path.read_text().replace(" 2 left/01.jpg", " 77 left/01.jpg"))
     with pytest.raises(
-        DyngsError, match=r"images\.txt: left/01\.jpg is of camera 77, which cameras\.txt lacks"
+        DyngsError,
+        match=r"images\.txt: left/01\.jpg refers to camera 77, which is not in cameras\.txt",
     ):
         read_colmap(root)
 
 
 def test_missing_files_of_the_model(colmap_root: Path) -> None:
     (colmap_root / "sparse/0/points3D.bin").unlink()
-    with pytest.raises(DyngsError, match=r"points3D\.bin: the COLMAP model lacks this file"):
+    with pytest.raises(DyngsError, match=r"points3D\.bin: file missing from the COLMAP model"):
         read_colmap(colmap_root)
 
 

@@ -84,9 +84,7 @@ def test_points_are_in_the_frame_of_the_poses(root: Path) -> None:
     assert capture.points is not None
     assert capture.points.xyz == pytest.approx(np.array([[0.0, 0, 0], [1, 0, 0]]))
     assert (capture.points.rgb == 128).all()
-    assert capture.warnings == (
-        "1 points hold NaN, infinite or far too large numbers and are ignored",
-    )
+    assert capture.warnings == ("1 points with NaN, infinite or huge coordinates are ignored",)
 
 
 def test_lens_and_aspect(root: Path) -> None:

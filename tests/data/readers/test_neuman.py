@@ -109,7 +109,7 @@ def test_bodies_are_brought_into_the_models_world(root: Path) -> None:
 def test_refined_parameters_come_first(root: Path) -> None:
     write_aligned(root)
     body = body_of(read_neuman(root))
-    assert (body.turns, body.scale.tolist(), body.trans[:, 0].tolist()) == (
+    assert (body.origin_rotations, body.scale.tolist(), body.trans[:, 0].tolist()) == (
         None,
         [0.7] * COUNT,
         list(range(COUNT)),
@@ -135,7 +135,7 @@ def test_splits(root: Path) -> None:
     capture = read_neuman(root)
     frames = {name: [view.frame for view in views] for name, views in capture.splits.items()}
     assert frames == {"train": [0, 2, 3], "val": [4], "test": [1]}
-    assert capture.warnings == ("1 images of the splits have no pose and are left out: 99.jpg",)
+    assert capture.warnings == ("1 images of the splits have no pose and are skipped: 99.jpg",)
     (root / "train_split.txt").unlink()
     assert [view.frame for view in read_neuman(root).splits["train"]] == [0, 2, 3, 5, 6, 7, 8]
     (root / "test_split.txt").write_bytes(b"\xff\xfe")
@@ -187,8 +187,8 @@ def test_bad_fits(root: Path, person: object, line: str) -> None:
     [
         (None, "the key '04.jpg' is missing"),
         (np.zeros((4, 4)), r"04\.jpg must hold 4x3 finite numbers"),
-        (np.zeros((4, 3)), r"04\.jpg: the alignment is no similarity"),
-        (-np.eye(4)[:, :3], r"04\.jpg: the alignment is no similarity"),
+        (np.zeros((4, 3)), r"04\.jpg: the alignment is not a similarity"),
+        (-np.eye(4)[:, :3], r"04\.jpg: the alignment is not a similarity"),
         (np.eye(4)[:, :3] * [1, 2, 3], r"04\.jpg: the pose is not a rotation"),
     ],
 )

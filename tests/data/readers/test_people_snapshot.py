@@ -15,7 +15,7 @@ from tiny_captures import HEIGHT, WIDTH, pixel_of, write_video
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
-from dyngs.data.images.maps import cut_out
+from dyngs.data.images.maps import apply_silhouette
 from dyngs.data.readers.people_snapshot import FORMAT, read_people_snapshot
 
 h5py = pytest.importorskip("h5py", reason="needs dyngs[people]")
@@ -79,14 +79,16 @@ def test_frames_masks_and_parameters_go_together(root: Path) -> None:
     body: Any = capture.body
     assert body["train"].frames == tuple(range(FRAMES))
     assert body["train"].trans[:, 0].tolist() == [1, 2, 3, 4, 5, 6]
-    assert (body["train"].kind, body["train"].turns, body["train"].betas.tolist()) == (
+    assert (body["train"].kind, body["train"].origin_rotations, body["train"].betas.tolist()) == (
         "smpl",
         None,
         [1] * 10,
     )
     for frame, view in enumerate(views):
         assert view.silhouette is not None
-        alpha = cut_out(torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8), view.silhouette)[..., 3]
+        alpha = apply_silhouette(torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8), view.silhouette)[
+            ..., 3
+        ]
         assert alpha.nonzero().tolist() == [[2, frame]]
 
 
@@ -110,7 +112,7 @@ def test_frames_without_mask_or_fit_are_left_out(root: Path) -> None:
     capture = read_people_snapshot(root)
     assert [view.frame for view in capture.splits["train"]] == [0, 2, 3]
     assert capture.warnings == (
-        "female-3-casual.mp4: 3 of 6 frames lack a mask or a pose and are left out",
+        "female-3-casual.mp4: 3 of 6 frames have no mask or no pose and are skipped",
     )
 
 
@@ -118,18 +120,18 @@ def test_smaller_video(root: Path) -> None:
     write_camera(root, width=2 * WIDTH, height=2 * HEIGHT)
     capture = read_people_snapshot(root)
     assert capture.splits["train"][0].intrinsics[0, 0] == 10
-    assert "another size than their intrinsics" in capture.warnings[0]
+    assert "differ in size from their intrinsics" in capture.warnings[0]
 
 
 def test_videos(root: Path) -> None:
     write_video(root / "other.mp4", 2)
     assert len(read_people_snapshot(root).splits["train"]) == FRAMES
     (root / "female-3-casual.mp4").rename(root / "another.mp4")
-    with pytest.raises(DyngsError, match=r"2 videos in it; keep one, called female-3-casual\.mp4"):
+    with pytest.raises(DyngsError, match=r"found 2 videos; keep one, named female-3-casual\.mp4"):
         read_people_snapshot(root)
     (root / "another.mp4").unlink()
     (root / "other.mp4").unlink()
-    with pytest.raises(DyngsError, match="no video in it"):
+    with pytest.raises(DyngsError, match="found no video"):
         read_people_snapshot(root)
 
 
@@ -150,7 +152,7 @@ def test_missing_files(root: Path) -> None:
     [
         ({"pose": None}, "'pose' must be a data set"),
         ({"pose": np.ones((3, 72))}, "'pose' has 3 rows but 'trans' 7"),
-        ({"pose": np.zeros((7, 72)), "trans": np.zeros((7, 3))}, "holds no frame"),
+        ({"pose": np.zeros((7, 72)), "trans": np.zeros((7, 3))}, "no frames found"),
     ],
 )
 def test_bad_parameters(root: Path, change: dict[str, Any], line: str) -> None:

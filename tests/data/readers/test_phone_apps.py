@@ -127,7 +127,10 @@ def test_depth_maps_of_record3d(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"K": [1, 2, 3]}, r"metadata\.json: K must hold 9 finite numbers"),
-        ({"poses": [[0, 0, 0, 1, 0, 0, 0]]}, r"1\.jpg: has no pose, .*has 1, from number 0 on"),
+        (
+            {"poses": [[0, 0, 0, 1, 0, 0, 0]]},
+            r"1\.jpg: has no pose: .*has 1 poses, numbered from 0",
+        ),
         ({"poses": [["x"] * 7]}, r"poses must hold finite numbers"),
         ({"perFrameIntrinsicCoeffs": [[1, 2, 3, 4]]}, "perFrameIntrinsicCoeffs must hold 11x4"),
         ({"w": 99}, r"pose 0: the image is 16x12 but its intrinsics are for 99x12"),

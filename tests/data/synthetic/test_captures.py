@@ -75,7 +75,7 @@ def test_visible_points_lie_where_something_moving_is_seen(name: SceneName) -> N
         for i, (time, pose) in enumerate(zip(times, poses, strict=True))
     ]
     tracks = true_tracks(lambda time: scene_at(name, time), shots)
-    things = len(scene_at(name, 1.0).movers)
+    things = len(scene_at(name, 1.0).moving_indices)
     assert tracks.points.shape == (5, POINTS_PER_THING * things, 3)
     assert tracks.views.tolist() == ["v0", "v1", "v2", "v3", "v4"]
     np.testing.assert_array_equal(tracks.times, times)
@@ -88,6 +88,6 @@ def test_visible_points_lie_where_something_moving_is_seen(name: SceneName) -> N
         nearest, _ = nearest_primitives(scene_at(name, time), pose[:3, 3], rays)
         labels = np.pad(nearest.reshape(SIZE, SIZE), 1)
         x, y = projected(tracks.points[k][seen], pose).astype(int).T
-        own = scene_at(name, time).movers[0] + np.flatnonzero(seen) // POINTS_PER_THING
+        own = scene_at(name, time).moving_indices[0] + np.flatnonzero(seen) // POINTS_PER_THING
         near = np.any([labels[y + dy, x + dx] == own for dy in range(3) for dx in range(3)], axis=0)
         assert near.all(), "where its own thing is or, at an outline, next to it"

@@ -15,7 +15,7 @@ from tiny_fields import cloud
 from dyngs.core.camera import Cameras
 from dyngs.data.capture import View
 from dyngs.data.loader import Image
-from dyngs.deform.bodies.paths import FrameStack, one_camera, render_frame_stack
+from dyngs.deform.bodies.paths import FrameStack, order_moving_camera, render_frame_stack
 from dyngs.gaussians.rendering import RenderOptions
 
 
@@ -55,10 +55,10 @@ def test_one_camera_shows_each_time_once() -> None:
         replace(view, time=time, cam_from_world=pose)
         for time, pose in zip((0.5, 0.0, 1.0), poses, strict=True)
     ]
-    assert one_camera(views) == [1, 0, 2]
-    assert one_camera([*views, views[0]]) is None
-    assert one_camera([replace(view, time=None)]) is None
-    assert one_camera([replace(v, cam_from_world=np.eye(4)) for v in views]) is None
+    assert order_moving_camera(views) == [1, 0, 2]
+    assert order_moving_camera([*views, views[0]]) is None
+    assert order_moving_camera([replace(view, time=None)]) is None
+    assert order_moving_camera([replace(v, cam_from_world=np.eye(4)) for v in views]) is None
 
 
 def test_masked_pixels_are_as_the_static_model_has_them() -> None:

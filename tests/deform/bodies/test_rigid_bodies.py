@@ -20,7 +20,7 @@ def test_a_rolling_ball_begins_on_its_way() -> None:
     found = find_bodies(frame_stack, 400, 4)
     assert found is not None
     assert found.explains_all_motion
-    assert found.message.startswith("1 body turns by ")
+    assert found.message.startswith("found 1 rigid body rotating by ")
     (seeds,) = found.seeds
     assert 100 < len(seeds) <= 400
     middle = len(frame_stack) // 2
@@ -28,7 +28,7 @@ def test_a_rolling_ball_begins_on_its_way() -> None:
     assert np.linalg.norm(arms, axis=1).max() < 1.3 * 0.28
     others = 5
     setup = FieldSetup(torch.zeros(3), torch.ones(3), len(frame_stack), others + len(seeds), 1.0)
-    field = found.within(create_field(tiny_options("control_nodes"), setup, torch.Generator()))
+    field = found.build_field(create_field(tiny_options("control_nodes"), setup, torch.Generator()))
     assert field.rest.labels.tolist() == [-1] * others + [0] * len(seeds)
     means = torch.cat([torch.zeros(others, 3), seeds.means])
     for t in (0, 5, middle, len(frame_stack) - 1):

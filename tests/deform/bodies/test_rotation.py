@@ -29,7 +29,7 @@ def test_a_rolling_ball_is_followed_in_its_rotation() -> None:
     errors = errors_deg(rotation.rotations, truth)
     assert np.median(errors) < 4
     assert errors.max() < 12
-    assert rotation.disagreement < 0.4 * rotation.standing
+    assert rotation.disagreement < 0.4 * rotation.disagreement_without_rotation
 
 
 def test_two_turns_about_any_axis_are_followed() -> None:
@@ -44,4 +44,4 @@ def test_what_slides_does_not_turn() -> None:
     frame_stack, centers, _ = rolling(turns=False)
     rotation = estimate_rotation(frame_stack, Path(centers, RADIUS, 1.0))
     assert angles_deg(rotation.rotations).max() < 10
-    assert rotation.disagreement > 0.85 * rotation.standing
+    assert rotation.disagreement > 0.85 * rotation.disagreement_without_rotation

@@ -9,7 +9,7 @@ import torch
 from static_balls import BLACK, Ball, cameras, drawn, filmed
 
 from dyngs.data.loader import Image
-from dyngs.deform.fixed_cameras.hulls import LONGEST_SIDE, build_fixed_camera_clip, changes
+from dyngs.deform.fixed_cameras.hulls import LONGEST_SIDE, build_fixed_camera_clip, detect_changes
 
 TIMES = tuple(i / 8 for i in range(9))
 
@@ -45,9 +45,9 @@ def test_a_ball_is_found_where_it_is(noise: float) -> None:
 def test_a_shadow_is_none_of_it() -> None:
     """All channels darker alike; but a coloured or a brighter patch is a thing, and so is a black
     one."""
-    assert not changes(with_patch((0.6, 0.62, 0.65))).any()
+    assert not detect_changes(with_patch((0.6, 0.62, 0.65))).any()
     for factor in ((0.9, 0.4, 0.4), (1.4, 1.4, 1.4), (0.05, 0.05, 0.05)):
-        found = changes(with_patch(factor, 3))
+        found = detect_changes(with_patch(factor, 3))
         assert found[3, 21:39, 21:39].all()
         assert found.sum() < 1.2 * 20 * 20
 

@@ -24,7 +24,7 @@ def crossing(time: float) -> tuple[float, float, float]:
 def test_one_ball_begins_at_each_time() -> None:
     found = started(lambda t: [Ball(crossing(t))])
     assert found.message is not None
-    assert "found at 12 of 12 times" in found.message
+    assert "found moving objects at 12 of 12 times" in found.message
     for time in TIMES:
         now = [one for one in found.timed_gaussians if one.time == time]
         center = torch.cat([one.gaussians.means for one in now]).median(0).values

@@ -11,7 +11,7 @@ from scaled_files import FAR
 from splat_scenes import cameras_turned, cloud, seen
 
 from dyngs.export.edit.merge import merge_scenes
-from dyngs.io.formats.formats import upright, write_splats
+from dyngs.io.formats.formats import orient_to_axis, write_splats
 from dyngs.io.formats.similarity import Similarity
 from dyngs.io.formats.splat_file import SplatFile
 
@@ -20,7 +20,7 @@ def test_files_and_runs_are_added(tmp_path: Path) -> None:
     """The degree is that of the richest one; a scene turned for a format is turned back."""
     first = SplatFile(cloud(40, 1), up="-y")
     other = SplatFile(cloud(30, 3, seed=1), up="-y")
-    path = write_splats(tmp_path / "a.ply", upright(other, "y", tmp_path / "a.ply")).path
+    path = write_splats(tmp_path / "a.ply", orient_to_axis(other, "y", tmp_path / "a.ply")).path
     run = write_moving_run(tmp_path, moves=False)
     told: list[str] = []
     both = merge_scenes(first, (0.0, -1.0, 0.0), (path, run), told.append)

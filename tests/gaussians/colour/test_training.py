@@ -94,7 +94,7 @@ def test_the_frozen_follow_the_set_and_go_round() -> None:
     colours = AutoTraining(AutoColour(), 100, 20)
     assert colours.frozen_harmonics() is None
     colours.freeze(torch.tensor([True, False, True]))
-    colours.follow(TopologyEdit(torch.tensor([1, 2, 2]), torch.tensor([False, False, True])))
+    colours.apply_edit(TopologyEdit(torch.tensor([1, 2, 2]), torch.tensor([False, False, True])))
     assert colours.frozen_harmonics() is not None
     other = AutoTraining(AutoColour(), 100, 20)
     other.restore(strip_roles(colours.state()), 3)
@@ -198,7 +198,7 @@ def test_harmonics_that_do_not_pay_are_dropped(seven_views: Path, name: str) -> 
     sh = trainer.model.scene.gaussians.sh
     frozen = trainer.model.colours.frozen_harmonics()
     if name == "none pays":
-        assert "does not pay" in messages[MEASURED_AFTER]
+        assert "view-dependent colour removed" in messages[MEASURED_AFTER]
         assert sh.shape[1] == 1
     else:
         assert dropped is not None

@@ -12,7 +12,7 @@ import torch
 from dyngs.capture.fixed_camera import FORMAT
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError
-from dyngs.data.body_frames import moved, read_body_file
+from dyngs.data.body_frames import read_body_file, transform_body
 from dyngs.data.images.images import read_image
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
@@ -210,6 +210,6 @@ def test_a_fit_far_from_the_origin_is_written_exactly(data: DataConfig, tmp_path
     offset = np.array([500_000.0, 4_600_000.0, 120.0])
     far = capture.replace(world_offset=offset, world_scale=0.25)
     write_body_file(tmp_path / "body.npz", clip, body, np.zeros(10), far)
-    near = moved(read_body_file(tmp_path / "body.npz"), offset, 4.0)
+    near = transform_body(read_body_file(tmp_path / "body.npz"), offset, 4.0)
     np.testing.assert_allclose(near.trans, clip.clip.trans.numpy(), rtol=0, atol=1e-8)
     np.testing.assert_array_equal(near.scale, clip.clip.scale.numpy())

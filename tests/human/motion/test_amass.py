@@ -312,7 +312,7 @@ NAN = np.full((FRAMES, 3), np.nan)
         ),
         (
             {"up_axis": np.frombuffer(b"\xff" * 4, "<U1")},
-            "'up_axis': cannot be read .*what is no text",
+            "'up_axis': cannot be read .*invalid characters",
         ),
         ({"up_axis": ["y", "z"]}, "'up_axis' must be 'y' or 'z', not"),
         ({"up_axis": "x"}, "'up_axis' must be 'y' or 'z', not 'x'"),

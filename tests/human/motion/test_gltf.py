@@ -301,7 +301,7 @@ def test_buffers_elsewhere_are_not_touched(tmp_path: Path, uri: str) -> None:
     (tmp_path / "secret.bin").write_bytes(glb.data)
     document = {**glb.json, "buffers": [{"byteLength": len(glb.data), "uri": uri}]}
     (folder / "x.gltf").write_text(json.dumps(document))
-    with pytest.raises(DyngsError, match="is not a file beside it"):
+    with pytest.raises(DyngsError, match="is not a file next to it"):
         read_gltf(folder / "x.gltf")
 
 
@@ -320,8 +320,8 @@ HOSTILE: dict[str, tuple[Callable[[Glb], object], str]] = {
         "too many",
     ),
     "joints": (lambda g: g.json["skins"][0].update(joints=[0] * 5000), "5,000 joints"),
-    "one sampler": (_shared_sampler, "asks for .* numbers"),
-    "a count": (lambda g: g.json["accessors"][1].update(count=2**62), "asks for"),
+    "one sampler": (_shared_sampler, "numbers exceed the limit"),
+    "a count": (lambda g: g.json["accessors"][1].update(count=2**62), "exceed the limit"),
 }
 
 

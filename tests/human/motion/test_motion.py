@@ -14,7 +14,7 @@ from motion_files import random_motion
 from scipy.spatial.transform import Rotation
 
 from dyngs.core.errors import DyngsError
-from dyngs.data.body_frames import body_frames
+from dyngs.data.body_frames import build_body_frames
 from dyngs.data.capture import BodyFrames, View
 from dyngs.human.body.joints import SMPLX_ROWS
 from dyngs.human.motion.motion import (
@@ -134,7 +134,9 @@ WHERE = Path("capture")
 def bodies(frames: list[int], joints: int = 55) -> BodyFrames:
     rows = len(frames)
     poses = np.random.default_rng(0).uniform(-1, 1, (rows, joints * 3))
-    return body_frames(WHERE, frames, poses, np.arange(3 * rows).reshape(rows, 3), np.zeros(10))
+    return build_body_frames(
+        WHERE, frames, poses, np.arange(3 * rows).reshape(rows, 3), np.zeros(10)
+    )
 
 
 def view(frame: int, time: float | None) -> View:

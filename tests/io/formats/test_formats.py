@@ -24,10 +24,10 @@ from dyngs.io.containment import LIMITS_VARIABLE
 from dyngs.io.formats.formats import (
     FORMATS,
     Format,
-    transform_file,
+    orient_to_axis,
     read_splats,
+    transform_file,
     undo_transforms,
-    upright,
     write_splats,
 )
 from dyngs.io.formats.similarity import IDENTITY, Similarity
@@ -73,11 +73,13 @@ def test_what_pointed_up_points_up_in_the_viewers_of_the_format(
 ) -> None:
     scene = cloud(degree=min(3, kind.max_degree))
     path = file_of(kind, tmp_path)
-    back = read_splats(write_splats(path, upright(SplatFile(scene, up="z"), None, path)).path)
+    back = read_splats(
+        write_splats(path, orient_to_axis(SplatFile(scene, up="z"), None, path)).path
+    )
     assert back.up == kind.up
-    turn = upright(SplatFile(scene, up="z"), None, path).turned
+    turn = orient_to_axis(SplatFile(scene, up="z"), None, path).turned
     assert psnr(seen(back.gaussians, cameras_turned(turn)), seen(scene)) > LEAST_PSNR[kind.name]
-    assert upright(SplatFile(scene, up="z"), "keep", path).gaussians is scene
+    assert orient_to_axis(SplatFile(scene, up="z"), "keep", path).gaussians is scene
 
 
 @every
@@ -86,7 +88,7 @@ def test_what_the_format_cannot_say_is_said(kind: Format, tmp_path: Path) -> Non
         file_of(kind, tmp_path), SplatFile(cloud(30, 4), RasterizeMode.ANTIALIASED)
     )
     said = " ".join(written.notes)
-    assert (f"harmonics above degree {kind.max_degree} are left out" in said) == (
+    assert (f"SH coefficients above degree {kind.max_degree} are dropped" in said) == (
         kind.max_degree < 4
     )
     assert ("antialiased" in said) == (not kind.stores_render_mode)
@@ -134,7 +136,7 @@ def test_counts_beyond_the_file_cost_nothing(
     monkeypatch.delenv(LIMITS_VARIABLE, raising=False)
     head = struct.pack("<4sIIBBBB", b"NGSP", 3, 4_000_000_000, 3, 12, 0, 0)
     (tmp_path / "a.spz").write_bytes(gzip.compress(head + bytes(1000)))
-    with pytest.raises(DyngsError, match="asks for 4,000,000,000 Gaussians"):
+    with pytest.raises(DyngsError, match="4,000,000,000 Gaussians exceed"):
         read_splats(tmp_path / "a.spz")
     bomb = struct.pack("<4sIIBBBB", b"NGSP", 3, 10, 0, 12, 0, 0) + bytes(200 * 1000 * 1000)
     (tmp_path / "b.spz").write_bytes(gzip.compress(bomb, 1))
@@ -147,14 +149,14 @@ def test_the_original_place_is_known_from_a_ply(tmp_path: Path) -> None:
         splat = SplatFile(
             cloud(20, 1), RasterizeMode.ANTIALIASED, 0.1, (1.0, 2.0, 3.0), ("mine",), "z"
         )
-        back = read_splats(write_splats(path, upright(splat, None, path)).path)
+        back = read_splats(write_splats(path, orient_to_axis(splat, None, path)).path)
         assert (back.mode, back.eps2d, back.world_offset, back.up) == (
             splat.mode,
             0.1,
             (1.0, 2.0, 3.0),
             "-y",
         )
-        assert back.turned == pytest.approx(upright(splat, None, path).turned)
+        assert back.turned == pytest.approx(orient_to_axis(splat, None, path).turned)
         assert "mine" in back.comments
         again = read_splats(
             write_splats(
@@ -172,9 +174,9 @@ def test_the_place_of_a_far_scene_is_stored_or_told(kind: Format, tmp_path: Path
     splat = SplatFile(cloud(20, 0), world_offset=FAR, up=kind.up, turned=turn.turn)
     written = write_splats(path, splat)
     line = " ".join(f"{x:.12g}" for x in turn.points(np.array(FAR)))
-    end = "the file states it" if kind.stores_comments else f"{kind.name} cannot state it"
+    end = "stored in the file" if kind.stores_comments else f"{kind.name} cannot store it"
     assert written.notes == (
-        f"the scene is far from the origin: {line} is subtracted from its positions ({end})",
+        f"the scene is far from the origin: {line} is subtracted from all positions ({end})",
     )
     back = read_splats(path)
     if kind.stores_comments:
@@ -192,8 +194,8 @@ def test_edits_are_stored_and_undone(kind: Format, tmp_path: Path) -> None:
         Similarity(shift=(1, 2, 3)),
         "-y",
     )
-    back = read_splats(write_splats(path, upright(edited, None, path)).path)
-    assert back.edited.numbers == pytest.approx(upright(edited, None, path).edited.numbers)
+    back = read_splats(write_splats(path, orient_to_axis(edited, None, path)).path)
+    assert back.edited.numbers == pytest.approx(orient_to_axis(edited, None, path).edited.numbers)
     undone = undo_transforms(back)
     assert (undone.up, undone.edited) == ("-y", IDENTITY)
     order = (before.gaussians.means[:, None] - undone.gaussians.means).norm(dim=2)
@@ -271,7 +273,9 @@ def test_an_spz_of_another_program(name: str) -> None:
 def test_an_spz_is_written_as_by_another_program(tmp_path: Path) -> None:
     """The same bytes for opacities, colours, scales and harmonics; centres have four more bits."""
     splat = SplatFile(three(), up="-y")
-    written = write_splats(tmp_path / "ours.spz", upright(splat, None, tmp_path / "ours.spz")).path
+    written = write_splats(
+        tmp_path / "ours.spz", orient_to_axis(splat, None, tmp_path / "ours.spz")
+    ).path
     ours, theirs = (gzip.decompress(path.read_bytes()) for path in (written, KNOWN / "three.spz"))
     assert ours[:12] == theirs[:12]
     assert (ours[13], theirs[13]) == (16, 12)

@@ -18,10 +18,10 @@ from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.io.formats.similarity import (
     AXES,
     Similarity,
-    parse_axis,
-    origin_offset,
-    mirrored,
+    mirror_gaussians,
     nearest_axis,
+    origin_offset,
+    parse_axis,
     rotation_between,
 )
 from dyngs.ops.quaternions import rotate
@@ -148,6 +148,6 @@ def test_a_mirrored_scene_is_seen_in_a_mirror(degree: int) -> None:
     pose = torch.eye(4)[None].clone()
     pose[0, 2, 3] = 4.0
     ahead = replace(camera, cam_from_world=pose)
-    got = seen(mirrored(scene), ahead)
+    got = seen(mirror_gaussians(scene), ahead)
     torch.testing.assert_close(got, seen(scene, ahead).flip(2), rtol=0, atol=3e-5)
     assert float((seen(scene, ahead) - got).abs().max()) > 0.1

@@ -64,7 +64,9 @@ def test_points_lie_where_the_coordinate_system_says(name: str, tmp_path: Path) 
     world = stored @ np.array([LETTERS[letter] for letter in name])
     np.testing.assert_allclose(back.gaussians.means.numpy(), world, atol=1e-6)
     assert back.up == "y"
-    assert ["it states other axes" in note for note in back.notes] == [True] * (name != "RUB")
+    assert ["rotated from the axes stated in the file" in note for note in back.notes] == [True] * (
+        name != "RUB"
+    )
 
 
 def test_extensions_that_are_unknown_or_damaged(tmp_path: Path) -> None:

@@ -258,10 +258,10 @@ def _at_size(image: Image, person_px: int) -> Image:
     ``person_px``."""
     if image.alpha is None or int((image.alpha > MIN_ALPHA).sum()) < _FEWEST:
         raise DyngsError(
-            f"{image.name}: shows no silhouette of a person; give it alpha or a mask of the person, see docs/human.md"
+            f"{image.name}: shows no silhouette of a person; add alpha or a mask of the person (`dyngs docs people`)"
         )
     rows = (image.alpha > MIN_ALPHA).any(1).nonzero()
-    return image.shrunk(max(1, int(rows.max() - rows.min() + 1) // person_px))
+    return image.downscaled(max(1, int(rows.max() - rows.min() + 1) // person_px))
 
 
 def _box(image: Image, turn: Tensor) -> Tensor:
@@ -360,7 +360,7 @@ def crop_image(image: Image, top: int, left: int, height: int, width: int) -> Im
     def part(x: Tensor) -> Tensor:
         return x[top : top + height, left : left + width].contiguous()
 
-    names = ("alpha", "mask", "depth", "moves", "labels", "flow")
+    names = ("alpha", "mask", "depth", "motion_mask", "labels", "flow")
     maps = {name: part(x) for name in names if (x := getattr(image, name)) is not None}
     return replace(
         image,

@@ -425,7 +425,7 @@ def _with_silhouettes(data: DataConfig) -> Capture:
     capture = read_capture(data)
     if not capture.has_alpha:
         raise DyngsError(
-            f"{data.root}: the images have no silhouettes; give them alpha, see docs/human.md"
+            f"{data.root}: the images have no silhouettes; give them alpha, see `dyngs docs people`"
         )
     return capture
 

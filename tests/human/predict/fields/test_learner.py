@@ -81,7 +81,7 @@ def test_a_prediction_is_a_run(
     report = evaluate_run(made.run_dir, "test", threads=1)
     assert report.psnr > 5
     assert report.notes == (), "nothing is left to train"
-    assert "is not made of Gaussians" in error_line(
+    assert "this needs a scene of Gaussians" in error_line(
         capsys, "export", str(made.run_dir), "--format", "ply"
     )
     assert "a predicted field is not trained" in error_line(

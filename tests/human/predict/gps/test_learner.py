@@ -113,7 +113,7 @@ def test_a_ring_is_seen_from_all_round(run: Path, folder: Path, tmp_path: Path) 
     found = load_run(all_round.run_dir).scene
     assert isinstance(found, StaticScene)
     assert found.sides is not None
-    assert len(found.sides.toward) == 12
+    assert len(found.sides.directions) == 12
     side = 3
     views = [
         v
@@ -126,8 +126,8 @@ def test_a_ring_is_seen_from_all_round(run: Path, folder: Path, tmp_path: Path) 
     )[side]
     names = tuple(views[i].name for i in pair)
     two = load_run(predict(run, person, tmp_path / "2", names).run_dir).scene
-    eye = (2 * found.sides.toward[side] + found.sides.middle).numpy()
-    middle = found.sides.middle.numpy()
+    eye = (2 * found.sides.directions[side] + found.sides.center).numpy()
+    middle = found.sides.center.numpy()
     between = cameras_at(look_at(eye, middle, UP)[None]).to(dtype=torch.float32)
     assert float(two.render(between).alpha.mean()) > 0.01
     torch.testing.assert_close(found.render(between).rgb, two.render(between).rgb)
