@@ -101,7 +101,7 @@ smaller of two models' errors is smallest."""
 SQUARES = 8  # The halves of an image are the two colours of a chess board of so many squares a side
 
 
-_TOO_SHORT = "not taken: too short a run, or too few views, to compare"
+_TOO_SHORT = "not used: the run is too short, or has too few views, for pilot runs"
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Choice:
 
     def __str__(self) -> str:
         return (
-            f"{self.setting} {'taken' if self.taken else 'not taken'}: {self.gain:+.2f} dB (standard error "
+            f"{self.setting} {'used' if self.taken else 'not used'}: {self.gain:+.2f} dB (standard error "
             f"{self.error:.2f}) to {self.without:.2f} dB on {format_count(self.views, 'view')} ({self.seconds:.0f} s)"
         )
 

@@ -1,4 +1,4 @@
-"""The stages that make the plan of a run before its first step."""
+"""Stages that build the plan of a run before its first step."""
 
 from __future__ import annotations
 
@@ -142,9 +142,9 @@ def find_first_gaussians(plan: RunPlan) -> tuple[RunPlan, str | None]:
     first = load_initial_gaussians(plan.resolved, plan.capture)
     assert first is not None
     frozen = 0 if first.frozen is None else int(first.frozen.sum())
-    held = f", of which {frozen:,} stay as they are" if frozen else ""
+    held = f", of which {frozen:,} are frozen" if frozen else ""
     count = format_count(len(first.gaussians), "Gaussian")
-    return replace(plan, first=first), f"begins with {count} of {init.scene}{held}"
+    return replace(plan, first=first), f"starting from {count} of {init.scene}{held}"
 
 
 def set_limits(plan: RunPlan) -> tuple[RunPlan, None]:

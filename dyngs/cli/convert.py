@@ -41,6 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     from dyngs.export.images import compare_file_with_source
     from dyngs.io.formats.formats import (
         format_for_path,
+        orient_to_axis,
         read_splats,
         write_splats,
     )
@@ -50,10 +51,10 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.from_up is not None:
         splat = replace(splat, up=arguments.from_up)
     rotated = orient_to_axis(splat, arguments.up, arguments.target)
-    said = f"up is {rotated.up} in the file" + (
-        f", it was {splat.up}" if rotated.up != splat.up else ", as it was"
-    )
-    print_notes((*splat.notes, f"{format_count(len(splat.gaussians), 'Gaussian')}; {said}"))
+    axis = f"up axis {rotated.up}"
+    if rotated.up != splat.up:
+        axis = f"up axis rotated from {splat.up} to {rotated.up}"
+    print_notes((*splat.notes, f"{format_count(len(splat.gaussians), 'Gaussian')}, {axis}"))
     written = write_splats(arguments.target, rotated, sh_degree=arguments.sh_degree)
     print_image_difference(written.notes, [compare_file_with_source(splat, written)])
     print_written(written.path)

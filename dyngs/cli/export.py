@@ -284,7 +284,7 @@ def _export_splats(
         write_run_sequence,
         write_run_splats,
     )
-    from dyngs.io.formats.formats import format_by_name, find_format, read_splats
+    from dyngs.io.formats.formats import find_format, format_by_name, read_splats
 
     own = format_by_name(kind)
     part = _part(arguments)

@@ -127,7 +127,7 @@ def amount(text: str) -> float:
 
 def run_compare(arguments: argparse.Namespace) -> int:
     """Train and compare the models, print the table and write the report; locks the folder."""
-    from dyngs.io.outputs import writing
+    from dyngs.io.outputs import lock_folder
     from dyngs.runs.folder import collect_inputs
     from dyngs.study.compare import ModelComparison
     from dyngs.study.report import Report, build_table, can_plot, page_views, plot_curves
@@ -193,7 +193,7 @@ def _print_report(report: Report, stem: Path, *, is_json: bool) -> None:
 
 def run_tradeoff(arguments: argparse.Namespace) -> int:
     """Measure, print and write the tables, and select a run; locks the folder."""
-    from dyngs.io.outputs import writing
+    from dyngs.io.outputs import lock_folder
 
     if not arguments.run_dir.is_dir():
         raise DyngsError(

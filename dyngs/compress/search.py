@@ -1,4 +1,4 @@
-"""The most that can be taken from a run for a given loss, found by bisection.
+"""Search for the strongest pruning within a given loss of PSNR, by bisection.
 
 Every candidate is fine-tuned equally long from the same checkpoint, with the same views in the same
 order. What it loses is the larger of two losses of mean PSNR: on views that the run and fine-tuning

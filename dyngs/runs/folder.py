@@ -22,7 +22,7 @@ from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.io.fields import read_limited
 from dyngs.io.formats.similarity import AXES, IDENTITY, Similarity, similarity_from_numbers
-from dyngs.io.outputs import LOCK_NAME, Inputs, atomic_folder, writing
+from dyngs.io.outputs import LOCK_NAME, Inputs, atomic_folder, lock_folder
 from dyngs.io.write import remove_leftovers, remove_quietly, temporary_folder_beside, write_text
 from dyngs.models.kind import PredictsScenes, capability
 from dyngs.runs.capture_record import RECORD_NAME, require_same_capture
@@ -135,7 +135,7 @@ def require_empty(folder: Path) -> None:
         and not folder.is_symlink()
         and [path.name for path in folder.iterdir()] == [LOCK_NAME]
     ):
-        with writing(folder):  # removes the stale lock file at its end
+        with lock_folder(folder):  # removes the stale lock file at its end
             pass
     if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
         raise DyngsError(f"{folder}: exists already; use another --out")

@@ -107,7 +107,7 @@ def test_what_is_refused(plain: Path, capsys: Capture) -> None:
         (["--geo", "line.csv"], "lie on one line"),
         (["--geo", "line.csv", "--up=y"], "--geo defines the whole coordinate frame; remove --up"),
         (["--undo", "--scale", "2"], "--undo defines the whole coordinate frame; remove --scale"),
-        (["--undo"], "nothing says that this was edited"),
+        (["--undo"], "was not changed by"),
         (["--outside"], "--outside requires --crop"),
         (["--max-loss", "1"], "--max-loss requires --clean"),
         (["--clean", "--max-loss", "-1"], "--max-loss -1"),
