@@ -128,7 +128,7 @@ def require_refused(line: list[str], capsys: pytest.CaptureFixture[str]) -> None
     captured = capsys.readouterr()
     assert captured.err.startswith("dyngs: error: "), line
     assert captured.err.count("\n") == 1, line
-    assert "is read" in captured.err, line
+    assert "is an input" in captured.err, line
     assert captured.out == "", line
 
 

@@ -32,12 +32,12 @@ def test_a_file_is_converted_there_and_back(tmp_path: Path, capsys: Capture) -> 
     plain = write_splats(tmp_path / "a.ply", SplatFile(cloud(200), up="-y")).path
     assert main(["convert", str(plain), str(tmp_path / "b.spz")]) == 0
     said = capsys.readouterr().out
-    assert "note: 200 Gaussians; up is y in the file, it was -y" in said
+    assert "note: 200 Gaussians, up axis rotated from -y to y" in said
     assert "note: drawn again: " in said
     assert (
         main(["convert", str(tmp_path / "b.spz"), str(tmp_path / "c.ply"), "--sh-degree", "4"]) == 0
     )
-    assert "up is -y in the file, it was y" in capsys.readouterr().out
+    assert "up axis rotated from y to -y" in capsys.readouterr().out
     assert read_splats(tmp_path / "c.ply").gaussians.sh_degree == 4
     means = read_splats(tmp_path / "c.ply").gaussians.means
     assert float((means - read_splats(plain).gaussians.means).abs().max()) < 1e-3

@@ -48,7 +48,7 @@ def test_options_one_after_another(plain: Path, capsys: Capture) -> None:
         "without the cameras of a run",
         "crop: ",
         "plain.ply: 400 Gaussians added",
-        "up is -y",
+        "up axis of the output: -y",
     ):
         assert line in said
     assert "next:    dyngs view a.ply" in said
@@ -118,6 +118,6 @@ def test_what_is_refused(plain: Path, capsys: Capture) -> None:
         out = [] if "--out" in words else ["--out", "a.ply"]
         assert said in error_line(capsys, "edit", "plain.ply", *words, *out), words
     assert "it is truncated" in error_line(capsys, "edit", "half.ply", "--out", "a.ply")
-    assert "holds no Gaussians" in error_line(capsys, "edit", "none.ply", "--out", "a.ply")
+    assert "no Gaussians" in error_line(capsys, "edit", "none.ply", "--out", "a.ply")
     assert "no such file or folder" in error_line(capsys, "edit", "nothing", "--out", "a.ply")
     assert {path: path.read_bytes() for path in Path().iterdir()} == before

@@ -314,8 +314,8 @@ def test_contents_that_do_not_fit_end_in_one_line_or_a_finite_image(
         ("model.field.learned.exp_avg.means", lambda x: x.double(), "'exp_avg.means' is float64"),
         ("model.field.box", torch.zeros_like, "'box' must be above 0"),
         ("model.field.numbers", lambda x: -x, "'numbers' must be above 0"),
-        ("gaussians.sh", lambda x: x[:, :3], "'sh' has 3 terms"),
-        ("gaussians.means", lambda x: x * torch.nan, "'means' holds NaN"),
+        ("gaussians.sh", lambda x: x[:, :3], "'sh' has an invalid number"),
+        ("gaussians.means", lambda x: x * torch.nan, "'means' has NaN"),
     ],
 )
 def test_what_does_not_fit_is_named(

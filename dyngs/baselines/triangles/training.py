@@ -154,7 +154,7 @@ def _train_gaussians(run: StartContext, steps: int) -> GaussianModel:
 
 
 def _downscale(image: Image) -> Image:
-    return image.shrunk(-(-max(image.cameras.width, image.cameras.height) // LONGEST_SIDE))
+    return image.downscaled(-(-max(image.cameras.width, image.cameras.height) // LONGEST_SIDE))
 
 
 def _flat_patches(corners: Tensor, colours: Tensor, model: BgTriangleModel) -> Patches:

@@ -74,7 +74,7 @@ def test_no_run_ends_with_more_and_a_resumed_one_knows(
     config = config_of(kind, captures, tmp_path / "run", BudgetConfig(max_gaussians=100))
     saves = config.train.model_copy(update={"save_every": config.train.steps - 1})
     folder, messages = trained(config.model_copy(update={"train": saves}))
-    assert "dB on training views when they were removed" in messages[-1]
+    assert "dB on training views by the removal" in messages[-1]
     end = checkpoint_paths(folder)[-1]
     wanted = end.read_bytes()
     assert len(load_run(folder).scene) <= 100
