@@ -1,4 +1,5 @@
-"""Write docs/reference/cli.md and docs/reference/config.md from the program.
+"""Write docs/reference/cli.md, docs/reference/config.md and the table of packages in
+docs/contributing/code.md from the program.
 
 python docs/generate.py            write both pages
 python docs/generate.py --check    exit with 1 if a page is out of date
@@ -7,6 +8,7 @@ python docs/generate.py --check    exit with 1 if a page is out of date
 from __future__ import annotations
 
 import argparse
+import ast
 import re
 import sys
 from collections.abc import Iterator
@@ -89,9 +91,11 @@ def main() -> int:
 def pages() -> dict[Path, str]:
     """Return the text of each generated page."""
     reference = DOCS / "reference"
+    code = DOCS / "contributing" / "code.md"
     return {
         reference / "cli.md": NOTICE + link_pages(cli_page()),
         reference / "config.md": NOTICE + link_pages(config_page()),
+        code: fill_package_table(code.read_text(encoding="utf-8")),
     }
 
 
@@ -111,6 +115,17 @@ def link_pages(text: str) -> str:
             r"`?dyngs docs ([a-z][\w/-]*)`?|docs/([\w/-]+)\.md", link, parts[index]
         )
     return "".join(parts)
+
+
+def fill_package_table(text: str) -> str:
+    """Replace each row of a package by the first paragraph of its docstring."""
+
+    def row(match: re.Match[str]) -> str:
+        source = (DOCS.parent / "dyngs" / match[1] / "__init__.py").read_text(encoding="utf-8")
+        docstring = ast.get_docstring(ast.parse(source)) or ""
+        return f"| `dyngs/{match[1]}` | {cell(docstring.split(chr(10) * 2)[0])} |"
+
+    return re.sub(r"^\| `dyngs/(\w+)` \| .* \|$", row, text, flags=re.MULTILINE)
 
 
 # ---------------------------------------------------------------------------------- commands

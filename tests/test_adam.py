@@ -41,7 +41,7 @@ def stepped_along(last_axis: bool, adam: AdamState, name: str, x: Tensor, step: 
 
 
 @pytest.mark.parametrize("along_last_axis", [False, True])
-def test_it_is_adam(along_last_axis: bool) -> None:
+def test_equals_torch_adam(along_last_axis: bool) -> None:
     mine = start_values()
     theirs = start_values()
     adam = AdamState.zero(mine)
@@ -57,7 +57,7 @@ def test_it_is_adam(along_last_axis: bool) -> None:
         assert mine[name].grad is None
 
 
-def test_mapped_changes_both_moments_of_what_is_named() -> None:
+def test_map_changes_both_moments_of_named_tensors() -> None:
     adam, _ = stepped(2)
     some, everything, nothing = (
         adam.map(torch.zeros_like, names) for names in (["bias"], None, [])

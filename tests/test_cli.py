@@ -209,8 +209,8 @@ def test_names_that_are_no_text_can_be_printed(tmp_path: Path) -> None:
         ("render nowhere --out x --path orbit --view 3", "--view (fixed camera) and --path"),
         ("render nowhere --out x --times 0:1:2 --frames 3", "--times and --frames both set"),
         ("export nowhere", "nowhere: no such file or folder"),
-        ("export nowhere --times 0:1", "'0:1' is no range of times; write START:STOP:COUNT"),
-        ("export nowhere --times 0:nan:3", "is no range of times"),
+        ("export nowhere --times 0:1", "'0:1': not a range of times; use START:STOP:COUNT"),
+        ("export nowhere --times 0:nan:3", "not a range of times"),
         ("export nowhere --time inf", "'inf' is not a time"),
         ("export nowhere --time 0 --times 0:1:2", "not allowed with"),
         ("export nowhere --static --dynamic", "not allowed with"),
@@ -517,7 +517,7 @@ def test_export_and_render_of_the_file(run_dir: Path, tmp_path: Path, capsys: Ca
     assert "have no splits" in error_line(
         capsys, "render", ply, "--out", tmp_path, "--split", "test"
     )
-    assert "no camera path 'circle'" in error_line(
+    assert "unknown camera path 'circle'" in error_line(
         capsys, "render", ply, "--out", tmp_path, "--path", "circle"
     )
 

@@ -8,7 +8,6 @@ and in blocks of text are checked for the names of their options, ``key=value`` 
 from __future__ import annotations
 
 import argparse
-import ast
 import importlib.util
 import re
 import shlex
@@ -339,20 +338,16 @@ def generator() -> ModuleType:
 
 def test_navigation_has_all_pages_of_the_site() -> None:
     listed = re.findall(r": (\S+\.md)$", (ROOT / "mkdocs.yml").read_text("utf-8"), re.MULTILINE)
-    pages = {page.removeprefix("docs/") for page in PAGES if page.count("/") > 1}
+    pages = {page.removeprefix("docs/") for page in PAGES if page.startswith("docs/")}
     assert len(listed) == len(set(listed))
-    assert set(listed) == pages | {"index.md", "research-log.md"}
+    assert set(listed) == pages
 
 
-def test_table_of_packages_repeats_their_docstrings() -> None:
-    rows = re.findall(
-        r"^\| `dyngs/(\w+)` \| (.+) \|$", PAGES["docs/contributing/code.md"], re.MULTILINE
+def test_all_packages_are_in_the_table() -> None:
+    rows = re.findall(r"^\| `dyngs/(\w+)` \|", PAGES["docs/contributing/code.md"], re.MULTILINE)
+    assert sorted(rows) == sorted(
+        path.parent.name for path in (ROOT / "dyngs").glob("*/__init__.py")
     )
-    summaries = {}
-    for path in (ROOT / "dyngs").glob("*/__init__.py"):
-        docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
-        summaries[path.parent.name] = " ".join(docstring.split("\n\n")[0].split())
-    assert dict(rows) == summaries
 
 
 # --------------------------------------------------------------------------------- running

@@ -103,7 +103,7 @@ def test_opacity_is_trained_in_all_presets_but_that_of_the_published_protocol(
     assert weight_and_findings("static") == (0.1, [])
     weight, (line,) = weight_and_findings("blender")
     assert weight == 0.0
-    assert "compared on white alone, as published (train.alpha_weight=0)" in line
+    assert "train.alpha_weight=0: images are compared on white only" in line
     assert weight_and_findings("blender", restored=True) == (0.0, [])
     assert weight_and_findings("blender", "data.background=random") == (0.0, [])
     assert weight_and_findings("static", "train.alpha_weight=0.3") == (0.3, [])

@@ -1,5 +1,5 @@
-"""A video, or a folder of its frames, of a person before one fixed camera, as a capture with a
-guessed camera."""
+"""A video, or a folder of its frames, of a person filmed by one fixed camera with estimated
+intrinsics."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from dyngs.io.containment import check_inside, check_size, restrict_paths_to
 from dyngs.io.outputs import VIDEO_SUFFIXES
 
 FORMAT = "fixed_camera"
-"""``Capture.format`` of what is read here."""
+"""``Capture.format`` of these captures."""
 MOST_FRAMES = 60  # frames that are taken where ``data.frames`` names none
 FOCAL = 1.2
-"""Guessed focal length, as a fraction of the longest side of the images: between a phone's and a
-film camera's."""
+"""Default focal length in longest sides of the image: between that of a phone and a film
+camera."""
 
 
 def is_image_sequence(source: Path) -> bool:
-    """Whether a path is a video, or a folder that holds images directly or in ``images``."""
+    """Whether a path is a video, or a folder with images directly or in ``images``."""
     with wrap_read_errors(source):
         if source.is_file():
             return source.suffix.lower() in VIDEO_SUFFIXES
@@ -34,17 +34,17 @@ def is_image_sequence(source: Path) -> bool:
 
 
 def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture:
-    """Read a clip of one fixed camera; ``options.root`` is a video, or a folder of images in the
-    order of names.
+    """Read a clip of one fixed camera; ``options.root`` is a video or a folder of images in order
+    of names.
 
-    The camera is a pinhole in the middle of the image, with the focal length of the EXIF tags, else
-    ``FOCAL`` times the longest side. The world is y up if the camera is level, the camera stands at
-    its origin. Without ``data.frames``, ``MOST_FRAMES`` are taken, evenly spread. Raises
-    DyngsError: no clip, images of different sizes, or no mask for an image.
+    The camera is a pinhole with the principal point in the centre and the focal length from EXIF,
+    else ``FOCAL`` times the longest side. It is at the world origin; the world is y up if the
+    camera is level. Without ``data.frames``, ``MOST_FRAMES`` are used, evenly spaced. Raises
+    DyngsError for a missing clip, images of different sizes, or an image without a mask.
 
     Args:
-        masks: folder of masks (white = the person), named as the images, or ``frame_000012.png``
-            for frame 12 of a video; None: alpha, if the images have it.
+        masks: folder of masks (white = the person) named after the images, or ``frame_000012.png``
+            for frame 12 of a video; None: alpha of the images, if any.
     """
     source = options.root
     with (
@@ -97,7 +97,7 @@ def read_fixed_camera(options: DataConfig, masks: Path | None = None) -> Capture
 
 
 def _frames_of(source: Path) -> tuple[Sequence[Path], float | None, list[str]]:
-    """Return the image files of a clip, in order, and of a video its frame rate and a line on
+    """Return the image files of a clip in order, the frame rate of a video, and messages on
     colours."""
     if source.is_file():
         planned = locate_cached_frames(source)
@@ -127,9 +127,9 @@ def _chosen(options: DataConfig, count: int) -> list[int]:
 
 
 def silhouettes_of(masks: Path, names: Sequence[str]) -> list[Silhouette]:
-    """Return the masks (white = the person) in a folder of the named images.
+    """Return the masks (white = the person) of the named images.
 
-    Raises DyngsError: no folder, or an image without a mask.
+    Raises DyngsError if the folder or a mask is missing.
     """
     if not masks.is_dir():
         raise DyngsError(f"no such folder of masks: {masks}")

@@ -1,10 +1,9 @@
-"""The initial points of a scene: those of the capture, else of silhouettes, depth maps or
-triangulation, else none.
+"""Initial points of a scene: from the capture, silhouettes, depth maps, triangulation or plane
+sweeps.
 
-In static captures, dense points are added where there are few.
-
-Triangulated by pycolmap on the CPU from the images of one time step, or of one moving camera over
-the full clip: there, what moves violates the poses.
+Points are triangulated by pycolmap on the CPU, from the images of one time step, or of one moving
+camera over the whole clip, where moving points violate the poses. Static captures with few points
+get dense points in addition.
 """
 
 from __future__ import annotations
@@ -39,12 +38,11 @@ if TYPE_CHECKING:
     import pycolmap
 
 MIN_IMAGES = 3
-"""Images that must see a point; two agree by accident too often."""
+"""Images that must see a point: two agree by accident too often."""
 MIN_POINTS = 30
-"""With fewer points random ones are the better start."""
+"""With fewer points, random ones are better."""
 MIN_CLIP_POINTS = 1000
-"""Likewise over a clip: they lack all that moves. With 509 a static run on the scene of orbits
-ended 1.7 dB lower."""
+"""The same for clips, whose points lack everything that moves."""
 LONGEST_SIDE = 1000
 MAX_FEATURES = 2048
 """SIFT features per image."""
@@ -53,8 +51,7 @@ CLIP_IMAGES = 50  # images of a clip, evenly spaced in time, that points are tri
 TIME_STEPS = (1, 2, 4, 8)
 OVERLAPPING = 4  # and with so many others that share most of what they see
 MAX_TURN = 45.0
-"""Degrees between the optical axes beyond which images are not matched for their overlap: SIFT does
-not."""
+"""Degrees between optical axes above which SIFT does not match."""
 MAX_ERROR, PRECISION = 0.002, 1.0
 """Mean reprojection error of a track over a clip: in longer sides of the image, and in px, which
 SIFT needs."""
@@ -63,10 +60,10 @@ _PROBES = 4000  # random points by which the overlap of images is judged
 
 
 def views_at_one_time(views: Sequence[View], limit: int) -> list[View]:
-    """Return at most ``limit`` views of one time step, evenly spaced; of those with most views, the
-    middle.
+    """Return at most ``limit`` views of one time step, evenly spaced: the middle one of those with
+    most views.
 
-    Without times all views show the same time step.
+    Without times all views belong to one time step.
     """
     shown = Counter(view.time for view in views)
     most = max(shown.values(), default=0)
@@ -76,21 +73,20 @@ def views_at_one_time(views: Sequence[View], limit: int) -> list[View]:
 
 
 def triangulate_from_views(views: Sequence[View], options: DataConfig) -> PointCloud | None:
-    """Return points that several views of a time step see, in order of their coordinates; None for
-    hardly any.
+    """Triangulate points from views of one time step, sorted by coordinates; None for too few.
 
-    SIFT features in images of at most ``LONGEST_SIDE`` px, matched between all pairs, triangulated
-    by the views' poses. One thread, so that the same images give the same points.
+    SIFT features in images of at most ``LONGEST_SIDE`` px are matched between all pairs and
+    triangulated with the given poses, in one thread for reproducible results.
     """
     return _points_of(views, options, None)
 
 
 def triangulate_clip(views: Sequence[View], options: DataConfig) -> PointCloud | None:
-    """Return points of what stands, from one moving camera; None where there are hardly any.
+    """Triangulate static points from one moving camera; None for too few.
 
-    As ``triangulated_points``, of at most ``CLIP_IMAGES`` images and matched between the pairs of
-    ``clip_pairs``; tracks over three images or more that do not agree with the poses, as those of
-    what moves, are left out.
+    As ``triangulate_from_views``, with at most ``CLIP_IMAGES`` images and the pairs of
+    ``clip_pairs``. Tracks of three or more images that do not fit the poses, such as those of
+    moving objects, are removed.
     """
     in_order = sorted(views, key=lambda view: (view.time or 0.0, view.name))
     chosen = [in_order[i] for i in evenly_spaced(len(in_order), CLIP_IMAGES)]
@@ -98,11 +94,11 @@ def triangulate_clip(views: Sequence[View], options: DataConfig) -> PointCloud |
 
 
 def clip_pairs(views: Sequence[View]) -> list[tuple[int, int]]:
-    """Return the pairs (i, j), i < j, of views in order of time that are matched; a bounded number
-    for each view.
+    """Return the pairs (i, j), i < j, of views in order of time to be matched, a limited number
+    per view.
 
-    Those near each other in time (``TIME_STEPS``), and of the others the ``OVERLAPPING`` whose
-    images show most of the same space, judged by random points in what the cameras see.
+    These are neighbours in time (``TIME_STEPS``), and the ``OVERLAPPING`` other views that see
+    most of the same space, judged by random points in the view frusta.
     """
     count = len(views)
     pairs = {(i, i + step) for step in TIME_STEPS for i in range(count - step)}
@@ -136,7 +132,7 @@ def _points_of(
 def _triangulated(
     folder: Path, images: Sequence[Image], pairs: Sequence[tuple[int, int]] | None
 ) -> PointCloud | None:
-    """Return the points of tracks over enough images, matched between all pairs or these."""
+    """Return the points of tracks over enough images, matched between all or the given pairs."""
     import pycolmap
 
     files = folder / "images"
@@ -213,17 +209,14 @@ AROUND_ORIGIN = ("blender", "body_json")
 def create_initial_points(
     capture: Capture, options: DataConfig, init: PointsInit
 ) -> tuple[Capture, list[str]]:
-    """Return the capture with the points that a scene begins with, None for random ones, and lines
-    on the choice.
+    """Return the capture with initial points (None for random ones), and messages on their source.
 
-    Without points they are taken from depth maps that agree with the poses, else triangulated: from
-    the images of a time step that several cameras show, else from those of a moving camera over the
-    full clip. Not where it is published custom to begin with random points: in the cube around the
-    origin of Blender scenes that are still or show each time step from one side, if they lie there.
-    Those of still ones are drawn in the silhouettes, if there are any. To fewer than half of
-    ``init.dense`` in still captures points of plane sweeps are added, which also replace random
-    ones where nothing could be triangulated; those in silhouettes do well without (`still` lost 0.1
-    dB by them).
+    If the capture has none, they come from depth maps that agree with the poses, else from
+    triangulation: of one time step seen by several cameras, or of a moving camera over the whole
+    clip. Blender scenes in the cube around the origin start from random points, as is common:
+    static ones in the silhouettes, if there are any, and dynamic ones seen from one side at a
+    time. Static captures with fewer than half of ``init.dense`` points get points of plane sweeps
+    in addition, which also replace random points where triangulation failed.
     """
     lines: list[str] = []
     if capture.points is not None:
@@ -299,25 +292,24 @@ def _with_dense_points(
 
 
 SILHOUETTES = 40
-"""Images, evenly spaced, whose silhouettes are looked at."""
+"""Silhouettes that are used, evenly spaced."""
 INSIDE = 0.5  # alpha from which a pixel belongs to the silhouette
 # fraction of the silhouettes that may lack a point: of a pixel, or wrong themselves
 MISTAKEN = 0.05
 ENOUGH, DRAWS = 1000, 10
-"""Points until which further ones are drawn, and how often at most. On lego 2,000 did as well as
-5,000 or 20,000, whose runs ended with a quarter, and four fifths, more Gaussians."""
+"""Points until which further ones are drawn, and the largest number of draws; more points did not
+help."""
 MOST = 0.5  # fraction of the points inside above which the silhouettes say nothing
 
 
 def sample_points_in_silhouettes(
     views: Sequence[View], options: DataConfig, num_random: int, half_side: float
 ) -> PointCloud | None:
-    """Return random points of the cube around the origin that lie in the silhouettes, in the
-    images' median colours.
+    """Sample random points of the cube around the origin inside the silhouettes, with median image
+    colours.
 
-    ``num_random`` are drawn, and as many again where few of them lie inside; ``half_side`` is half
-    the side of the cube. None where images have no silhouettes, where those hold no points, or
-    most.
+    ``num_random`` are drawn, repeatedly if few of them are inside; ``half_side`` is half the side
+    of the cube. None if there are no silhouettes, or if they contain no or most points.
     """
     shown = [
         (views[i], _small_image(views[i], options)) for i in evenly_spaced(len(views), SILHOUETTES)
@@ -343,7 +335,7 @@ def sample_points_in_silhouettes(
 
 
 LOOK_SIDE = 240
-"""Longest side of the images that points are looked at in, px."""
+"""Longest side of the images in which points are tested, in px."""
 
 
 def _small_image(view: View, options: DataConfig) -> np.ndarray:
@@ -358,8 +350,7 @@ def _small_image(view: View, options: DataConfig) -> np.ndarray:
 
 
 def _colours_at(xyz: np.ndarray, shown: Sequence[tuple[View, np.ndarray]]) -> np.ndarray:
-    """Return (V, P, 4) colours and alpha of the images at the points, NaN where they lie
-    outside."""
+    """Return (V, P, 4) colours and alpha of the images at the points, NaN outside the images."""
     found = np.full((len(shown), len(xyz), 4), np.nan)
     for i, (view, image) in enumerate(shown):
         positions, inside = project_points(xyz, view)

@@ -1,5 +1,4 @@
-"""Inspection of captures and of videos: what one holds, everything that looks wrong about it, and
-the next command."""
+"""Inspection of captures and videos: their contents, likely problems, and the next command."""
 
 from __future__ import annotations
 
@@ -58,8 +57,8 @@ MAX_VIEWS = 300  # views, evenly spaced, in which points are looked for
 # degrees between neighbouring views, seen from the scene, from which they are far apart
 WIDE_BASELINE = 10.0
 CLOSE_IN_TIME, FEW_VIEWS = 0.08, 3
-"""Motion over this fraction of a clip is small; with fewer views in it, each time step is seen from
-one side only."""
+"""Fraction of a clip with little motion; if fewer views are in it, each time step is seen from one
+side."""
 # degrees around a body without a camera from which on a part of it is hardly seen
 UNSEEN_SIDE = 200.0
 LOOKED_AT = 4  # masks that are read
@@ -68,8 +67,8 @@ MOST_IGNORED = 0.5
 
 
 def check_before_training(capture: Capture) -> list[str]:
-    """Return one line for everything about a capture that is likely to spoil a training; only some
-    masks are read."""
+    """Return messages on everything in a capture that may harm training; only some masks are
+    read."""
     masks, problems = describe_masks(capture)
     line = [] if masks is None else [f"masks of {masks}"]
     found = [*capture.warnings, *line, *problems, *time_problems(capture), *scene_problems(capture)]
@@ -77,12 +76,10 @@ def check_before_training(capture: Capture) -> list[str]:
 
 
 def time_problems(capture: Capture) -> list[str]:
-    """Return the problems of times and of who saw them: a moving scene must be seen from several
-    sides.
+    """Return problems of times and viewpoints: a moving scene must be seen from several sides.
 
-    A single camera that does not move, or few images of one time each from places far apart: what
-    moves has moved on before another side of it is seen. Many such images are no problem (D-NeRF's
-    are all like that): neighbours in time then show nearly the same.
+    Reported are a single fixed camera, and few images at different times from distant viewpoints.
+    Many such images (as in D-NeRF) are fine: neighbours in time then show nearly the same.
     """
     views = [view for view in capture.splits.get("train", ()) if view.time is not None]
     views.sort(key=lambda view: view.time or 0.0)
@@ -111,7 +108,7 @@ def time_problems(capture: Capture) -> list[str]:
 
 
 def body_problems(capture: Capture) -> list[str]:
-    """Return a line if no training view shows one side of a captured person, in any frame."""
+    """Return a message if no training view shows one side of a captured person."""
     body = None if capture.body is None else capture.body["train"]
     if body is None:
         return []
@@ -141,8 +138,7 @@ def body_problems(capture: Capture) -> list[str]:
 
 
 def scene_problems(capture: Capture) -> list[str]:
-    """Return the problems of poses and points together: cameras that look away, points that no
-    camera sees, .."""
+    """Return problems of poses and points: cameras that look away, points that no camera sees."""
     views = all_views(capture.splits)
     problems = []
     poses = np.stack([invert_rigid(view.cam_from_world) for view in views])
@@ -168,7 +164,7 @@ def scene_problems(capture: Capture) -> list[str]:
 
 
 def limit_messages(lines: Iterable[str]) -> list[str]:
-    """Return the lines, and a count of those beyond ``MAX_LINES_PER_KIND``."""
+    """Return at most ``MAX_LINES_PER_KIND`` messages, and a count of the others."""
     found = list(lines)
     more = len(found) - MAX_LINES_PER_KIND
     if more <= 0:
@@ -177,8 +173,8 @@ def limit_messages(lines: Iterable[str]) -> list[str]:
 
 
 def find_problems(capture: Capture, deep: bool) -> list[str]:
-    """Return a line for everything suspicious, next to the capture's own warnings; ``deep``: decode
-    every image."""
+    """Return messages on all problems besides the capture's own warnings; ``deep``: decode every
+    image."""
     views = all_views(capture.splits)
     train = capture.splits.get("train", ())
     problems = []
@@ -231,10 +227,10 @@ def _image_problems(views: Iterable[View], deep: bool) -> list[str]:
 
 
 def describe_masks(capture: Capture) -> tuple[str | None, list[str]]:
-    """Return a description of the masks of a capture, None without any, and a line if they ignore
-    most of the pixels.
+    """Return a description of the masks, None without any, and a message if they ignore most
+    pixels.
 
-    A few masks are read; unreadable ones are reported by those who check files.
+    A few masks are read; unreadable ones are reported elsewhere.
     """
     views = all_views(capture.splits)
     paths = [view.mask_path for view in views if view.mask_path is not None]
@@ -260,8 +256,8 @@ def describe_masks(capture: Capture) -> tuple[str | None, list[str]]:
 
 @dataclass(frozen=True)
 class InspectReport:
-    """Facts of a capture, (name, value) pairs in order, and all that is suspicious; no ``capture``
-    if unreadable."""
+    """Facts of a capture as (name, value) pairs, and its problems; ``capture`` is None if
+    unreadable."""
 
     root: Path
     capture: Capture | None
@@ -270,12 +266,11 @@ class InspectReport:
 
 
 def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectReport:
-    """Return a report on the capture at ``source``; what makes a capture unreadable is a problem in
-    it, no error.
+    """Return a report on the capture at ``source``; errors of reading become problems of the
+    report.
 
-    ``deep``: every image is decoded in full and videos to files, which is slow and finds truncated
-    files; otherwise only headers are read, and frames of videos only where they are decoded
-    already.
+    ``deep``: decode all images and videos, which is slow but finds truncated files; otherwise only
+    headers and cached video frames are read.
     """
     from dyngs.data.read import read_capture
 
@@ -316,7 +311,7 @@ def _aligned(facts: dict[str, str]) -> list[str]:
 
 
 def _facts_of(capture: Capture) -> Iterator[tuple[str, str]]:
-    """Yield what a capture holds as (name, value) pairs, in the order in which they are shown."""
+    """Yield the facts of a capture as (name, value) pairs in display order."""
     views = all_views(capture.splits)
     split_sizes = [f"{len(views)} {split}" for split, views in capture.splits.items() if views]
     focal_px = np.array([np.diag(view.intrinsics)[:2] for view in views])
@@ -405,12 +400,12 @@ SPLIT_COLORS = {
 
 
 def draw_cameras(capture: Capture, out: Path, size: int = 640) -> None:
-    """Write an image of 2 ``size`` x ``size`` pixels: the scene from above and from the side,
-    orthographic.
+    """Write an image of 2 ``size`` x ``size`` pixels: orthographic views from above and from the
+    side.
 
-    Frusta of training cameras are orange, of validation green, of test and new poses blue; points
-    have their colours. Up is the mean of the cameras' up axes. Points far beyond the cameras are
-    left out.
+    Camera frusta are orange for training, green for validation, blue for test and pose; points
+    have their colours. Up is the mean up axis of the cameras. Points far beyond the cameras are
+    omitted.
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -471,8 +466,8 @@ BLURRED = 0.4  # frames with less than this fraction of the typical sharpness ar
 
 
 def video_report(path: Path) -> str:
-    """Return a report on a video file, or on the videos of a folder, as lines of text; their frames
-    are decoded once."""
+    """Return a text report on a video file, or on the videos of a folder; frames are decoded
+    once."""
     videos = [
         open_video(check_inside(video))
         for video in ([path] if path.is_file() else list_videos(path))
@@ -504,7 +499,7 @@ def video_report(path: Path) -> str:
 
 
 def video_facts(video: CameraVideo) -> tuple[dict[str, str], bool]:
-    """Return facts about a video for people, by name, and whether its camera is fixed."""
+    """Return facts about a video by name, and whether its camera is fixed."""
     small: list[np.ndarray] = []
 
     def frames() -> Iterator[np.ndarray]:

@@ -1,7 +1,8 @@
-"""Masks of a person by the difference from the background, where the camera is fixed: what most
-frames show at a pixel.
+"""Masks of a person by background subtraction for fixed cameras; the background is the temporal
+median.
 
-Local letters: F frames of one camera, H height, W width."""
+Local letters: F frames of one camera, H height, W width.
+"""
 
 from __future__ import annotations
 
@@ -29,13 +30,13 @@ from dyngs.io.write import write_image
 
 NOISE = 1.5  # least standard deviation of the background that is expected, grey levels
 LOW, HIGH = 5.0, 12.0
-"""Differences, in standard deviations, above which a pixel may be, and is, the person: what may be
-is, where it touches what is."""
+"""Hysteresis thresholds in standard deviations: pixels above LOW belong to the person if connected
+to pixels above HIGH."""
 GAP = 0.006  # half the width of gaps that are closed, as a fraction of the image's longer side
 OFTEN, MOST_STAYING = 0.4, 0.1
 LEAST_ON_EDGES, LEAST_AREA = 0.8, 1e-3
-"""Limits of what can be trusted. Two people walking by, and on the spot: on edges 0.96 to 1.00, and
-0.56 to 0.79; staying 0.00, and 0.14 to 0.61."""
+"""Limits for reliable masks. Two walking people reach an edge fraction of 0.96 to 1.00, two on the
+spot 0.56 to 0.79."""
 LEAST_FRACTION = 0.1  # smaller parts than this fraction of the largest are left out
 SHADE = (0.5, 0.97)  # range of brightness, as a fraction of the background's, that a shadow has
 # largest spread of that fraction, of its mean, in a window where it is a shadow
@@ -43,22 +44,21 @@ SHADE_SPREAD = 0.08
 _WINDOW = 5
 _SMOOTH = 0.7
 UNSURE, SEEN_BARE = 0.02, 3
-"""How far off the outline of a detector may be, in heights of the person, and in how many images a
-pixel must be seen without them."""
+"""Largest error of a detector's outline in heights of the person, and the number of images in
+which a background pixel must be visible."""
 AGREED = 0.8
-"""Overlap (IoU) with a detector's mask below which somebody else before the background is taken for
-the person."""
+"""Overlap (IoU) with a detector's mask below which another person was segmented."""
 EDGE, HALF = 2, 0.45
-"""Width of the rim of a mask, px, and the fraction of the largest difference nearby that a pixel in
-it has: a pixel at the outline is a mixture."""
+"""Width of the rim of a mask in px, and the fraction of the largest nearby difference that a pixel
+of the rim needs: pixels at the outline are mixed."""
 
 
 @dataclass(frozen=True)
 class Background:
-    """What a fixed camera sees without the person, in grey levels.
+    """Background of a fixed camera, in grey levels.
 
     Attributes:
-        colours: (H, W, 3) float32, the median over time.
+        colours: (H, W, 3) float32, median over time.
         noise: (H, W) float32, robust standard deviation over time of smoothed images, at least
             ``NOISE``.
     """
@@ -69,15 +69,14 @@ class Background:
 
 @dataclass(frozen=True)
 class Separation:
-    """How well masks separate a person from the background.
+    """Quality of the separation of a person from the background.
 
     Attributes:
-        on_edges: fraction of the masks' outlines along which the image changes more than the
-            background does: outlines of who is there are edges of the image, outlines of who has
-            left are edges of the background.
+        on_edges: fraction of the mask outlines where the image gradient exceeds that of the
+            background, as at the outline of a visible person.
         area: median fraction of the image that the masks cover.
-        staying: fraction of the masks at pixels that they cover in more than ``OFTEN`` of the
-            frames: somebody stands there so long that the background may be a part of them.
+        staying: fraction of the mask pixels covered in more than ``OFTEN`` of the frames: the
+            person stands there so long that the background may contain them.
     """
 
     on_edges: float
@@ -86,7 +85,7 @@ class Separation:
 
     @property
     def is_clear(self) -> bool:
-        """Whether the masks can be trusted."""
+        """Whether the masks are reliable."""
         return (
             self.on_edges > LEAST_ON_EDGES
             and self.staying < MOST_STAYING
@@ -95,7 +94,8 @@ class Separation:
 
 
 def background_of(images: np.ndarray) -> Background:
-    """Return the background of a fixed camera from images (F, H, W, 3) uint8, spread over time."""
+    """Estimate the background of a fixed camera from images (F, H, W, 3) uint8 spread over
+    time."""
     colours = np.median(images, axis=0).astype(np.float32)
     away = np.stack([_away(colours, image) for image in images])
     noise = 1.4826 * np.median(away, axis=0)
@@ -107,11 +107,11 @@ def background_of(images: np.ndarray) -> Background:
 def person_mask(
     background: Background, image: np.ndarray, likely: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the mask (H, W) bool of what stands before the background in an image (H, W, 3) uint8.
+    """Return the foreground mask (H, W) bool of an image (H, W, 3) uint8.
 
-    Shadows are left out: there the image is the background times a number that hardly varies. Holes
-    are filled, as clothes may have the colours of the background: all of them, or where a detector
-    sees the person, ``likely`` (H, W).
+    Shadows, where the image is a nearly constant multiple of the background, are removed. Holes
+    are filled, as clothes may resemble the background: all of them, or those in ``likely`` (H, W)
+    of a detector.
     """
     away = _difference(background, image)
     sure = ndimage.binary_opening(away > HIGH, iterations=1)
@@ -138,12 +138,12 @@ def person_mask(
 
 
 def refine_outlines(images: np.ndarray, masks: np.ndarray) -> np.ndarray | None:
-    """Return masks (F, H, W) bool that are near the person as a detector has them, with outlines by
-    the background.
+    """Refine the outlines of a detector's masks (F, H, W) by background subtraction; None if the
+    camera moves.
 
-    The background of a pixel is the median of the images in which the detector is sure that nobody
-    is there; where fewer than ``SEEN_BARE`` are, and in images where the background disagrees, as
-    where other people pass, the masks stay as they are. None: the camera moves.
+    The background of a pixel is the median of the images in which the detector is sure to see no
+    person. Masks are unchanged where fewer than ``SEEN_BARE`` of these exist, and in images where
+    the results disagree, as when other people pass.
 
     Args:
         images: (F, H, W, 3) uint8, of one camera.
@@ -177,7 +177,7 @@ def refine_outlines(images: np.ndarray, masks: np.ndarray) -> np.ndarray | None:
 
 
 def _touching(mask: np.ndarray, core: np.ndarray) -> np.ndarray:
-    """Return the connected parts of a mask (H, W) that hold a pixel of ``core``."""
+    """Return the connected components of a mask (H, W) that contain a pixel of ``core``."""
     labels, _ = ndimage.label(mask)  # pyright: ignore[reportGeneralTypeIssues]
     return np.isin(labels, np.unique(labels[core & mask]))
 
@@ -191,8 +191,7 @@ def _moves(images: np.ndarray) -> bool:
 
 
 def measure_separation(background: Background, images: np.ndarray, masks: np.ndarray) -> Separation:
-    """Return how well masks (F, H, W) bool separate what is in images (F, H, W, 3) uint8 from the
-    background."""
+    """Measure how well masks (F, H, W) bool separate a person in images (F, H, W, 3) uint8."""
     on_edges = []
     slope = _slope(background.colours)
     for image, mask in zip(images, masks, strict=True):
@@ -219,7 +218,7 @@ def _away(colours: np.ndarray, image: np.ndarray) -> np.ndarray:
 
 
 def _shadow(background: Background, image: np.ndarray) -> np.ndarray:
-    """Return where (H, W) the image is the background, darker."""
+    """Return where (H, W) the image is a darkened background."""
     smooth = ndimage.gaussian_filter(image.astype(np.float32), (_SMOOTH, _SMOOTH, 0))
     ground = ndimage.gaussian_filter(background.colours, (_SMOOTH, _SMOOTH, 0))
     ratio = smooth.mean(-1) / np.maximum(ground.mean(-1), 1.0)
@@ -274,15 +273,13 @@ class _Camera:
 def add_background_masks(
     capture: Capture, folder: Path, empty: Path | None = None, log: Callable[[str], None] = log_info
 ) -> Capture:
-    """Return the capture of fixed cameras with masks of the person, written to ``folder``, which is
-    made.
+    """Segment the person in a capture of fixed cameras; masks are written to ``folder``.
 
-    Raises DyngsError: a camera that moves, too few images, or nobody who stands out; says what to
-    add.
+    Raises DyngsError for a moving camera, too few images, or no visible foreground, with advice.
 
     Args:
-        empty: an image without the person, or a folder of one for each camera, whose name ends in
-            the camera's number; None: the median over time.
+        empty: an image without the person, or a folder with one per camera, named by camera
+            number; None: the median over time.
     """
     cameras = _fixed_cameras(capture)
     plates = {} if empty is None else _plates(empty, cameras)

@@ -1,9 +1,8 @@
-"""Dense first points of a still scene: depth maps of some views by plane sweep, kept where several
-of them agree.
+"""Dense initial points of a static scene: depth maps of some views by plane sweep, checked for
+consistency.
 
-For each depth of a view the neighbouring images are drawn as if everything lay that far away
-(Collins 1996); the depth at which windows around a pixel correlate best is the pixel's. A few
-hundred sparse points become thousands, so that training has less to add.
+For each depth the neighbouring images are warped as if everything were that far away (Collins
+1996); the depth with the best correlation of local windows is chosen.
 """
 
 from __future__ import annotations
@@ -25,23 +24,20 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.times import evenly_spaced
 
 SWEEP_SIDE = 120
-"""Longest side of the images that are compared, px; 200 gave no better points and took three times
-as long."""
+"""Longest side of the compared images in px; 200 px were slower and no better."""
 MAPS = 24
-"""Views, evenly spaced, whose depth is looked for."""
+"""Number of depth maps, evenly spaced over the views."""
 NEIGHBOURS, MIN_NEIGHBOURS = 4, 2
-"""Views that each is compared with; the two that agree best count: before others there may be
-something else."""
+"""Views that each is compared with; the best two count, because others may be occluded."""
 DEPTHS = 48
-"""Depths that are tried, evenly spaced in inverse depth."""
+"""Number of depths, evenly spaced in inverse depth."""
 WINDOW = 2  # pixels on each side of the middle
 MIN_CORRELATION = 0.8
 AGREEMENT, MIN_AGREEING = 0.02, 2
 """Relative difference of depths up to which two maps agree on a point, and how many others must."""
 FILLED = 0.4
-"""Fraction of filled points. A ray-traced room without points (96 px, 400 steps, mean of three
-seeds): 24.8 dB without them, 27.2 with 0.2, 27.9 with 0.4. The fox (135 px, 1,000 steps): 32.2 dB
-with 0.2 or 0.4; from random points 25.6."""
+"""Fraction of points in textureless regions, filled from their neighbours; 0.2 to 0.4 improve
+textureless rooms."""
 MIN_POINTS = 500  # with fewer the maps have found noise
 # of the pixels of given depth maps; true ones of a room agree on 0.84, of twice its size on 0.09
 MIN_FRACTION = 0.5
@@ -85,13 +81,11 @@ class _Shot:
 def sweep_dense_points(
     views: Sequence[View], options: DataConfig, sparse: np.ndarray, count: int, fill: bool = False
 ) -> PointCloud | None:
-    """Return at most ``count`` points of surfaces that several views show, at random of all that
-    were found.
+    """Return at most ``count`` random surface points seen by several views; None if too few are
+    found.
 
-    ``sparse`` (P, 3) points say how deep to look and which views show the same things. With
-    ``fill``, ``FILLED`` of the points are of pixels without texture, at the depth of the nearest
-    pixel that has one. None where hardly any points are found: without texture, neighbours, or
-    right poses.
+    ``sparse`` (P, 3) points define the depth range and which views overlap. With ``fill``,
+    ``FILLED`` of the points are textureless pixels at the depth of the nearest textured one.
     """
     groups = choose_neighbours(views, sparse)
     needed = sorted({i for group in groups for i in group})
@@ -112,11 +106,10 @@ def sweep_dense_points(
 def points_from_depth_maps(
     views: Sequence[View], options: DataConfig, count: int
 ) -> PointCloud | None:
-    """Return at most ``count`` points of the depth maps that belong to the images, where several of
-    them agree.
+    """Return at most ``count`` points of the given depth maps where several of them agree.
 
-    None without such maps, or where less than ``MIN_FRACTION`` of them agree: they are in another
-    unit than the poses.
+    None without depth maps, or if less than ``MIN_FRACTION`` of them agree, as in another unit
+    than the poses.
     """
     chosen = [views[i] for i in evenly_spaced(len(views), MAPS)]
     loader = ImageLoader(chosen, _small(options), with_maps=True)
@@ -182,12 +175,11 @@ def _gaps_filled(shot: _Shot, depth: np.ndarray) -> np.ndarray:
 
 
 def choose_neighbours(views: Sequence[View], sparse: np.ndarray) -> list[list[int]]:
-    """Return groups of indices of views: one whose depth is looked for, then up to ``NEIGHBOURS``
-    to compare it with.
+    """Return groups of view indices: a view for a depth map, then up to ``NEIGHBOURS`` to compare
+    it with.
 
-    Those that see many of the same points, from an angle that is neither too small to tell depths
-    apart nor too large for windows to look alike; a view with fewer than ``MIN_NEIGHBOURS`` of them
-    has no group.
+    Neighbours see many of the same points at a suitable triangulation angle. Views with fewer than
+    ``MIN_NEIGHBOURS`` are omitted.
     """
     sees = np.stack([project_points(sparse, view)[1] for view in views]).astype(np.float64)
     centers = np.stack([camera_center(view.cam_from_world) for view in views])

@@ -269,7 +269,7 @@ def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
 
 
 def _part(arguments: argparse.Namespace) -> Part:
-    return "still" if arguments.static else "moving" if arguments.dynamic else "all"
+    return "static" if arguments.static else "moving" if arguments.dynamic else "all"
 
 
 def _export_splats(

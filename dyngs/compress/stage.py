@@ -163,7 +163,7 @@ def build_pruning_edit(trainer: GaussianTrainer) -> TrainingEdit:
         trainer, importance_scores(trainer, options) if options.fraction > 0 else None
     )
     message = f"pruned: {len(scene):,} -> "
-    if edit.kept is None:
+    if edit.keep is None:
         return replace(
             edit, message=f"{message}{format_count(len(scene), 'Gaussian')}{_let_through(edit)}"
         )
@@ -193,7 +193,7 @@ def build_removal_edit(trainer: GaussianTrainer, scores: Tensor | None) -> Train
     moves = capability(trainer.config.model, HasMotion) is not None and not whole.is_static
     if options.mask_times > 1 and moves:
         masks = _masks(trainer, whole, kept)
-    return TrainingEdit(kept=kept, masks=masks, stops_densification=True)
+    return TrainingEdit(keep=kept, masks=masks, stops_densification=True)
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Evaluation of a run on its splits, with cameras as the run has refined them."""
+"""Evaluation of a run on a split, with the cameras refined by training."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ from dyngs.training.corrections.camera_refinement import (
 def load_camera_corrections(
     run_dir: Path, run: LoadedRun, trained_on: Sequence[View]
 ) -> CameraCorrections | None:
-    """Return the corrections of a run's cameras; None where it refined none, or has no
+    """Return the camera corrections of a run, or None if it refined no cameras or has no
     checkpoint."""
     if run.config.camera.refine != "always" or not checkpoint_paths(run_dir):
         return None
@@ -78,29 +78,32 @@ def load_camera_corrections(
 def score_fitted_poses(
     drawing: SceneRenderer, images: ImageLoader, size: float, lpips: Lpips
 ) -> dict[str, Any]:
-    """Return the fields of a report on images from poses that were fitted to them: of a person from
-    body poses, else from cameras; ``size`` of the scene is in world units.
+    """Return report fields for views whose poses were fitted to the images, with a fixed scene.
 
-    "silhouette_poses" are fitted to the silhouettes alone. The scene stays as it is.
+    Body poses are fitted for a person, camera poses otherwise. "silhouette_poses" are fitted to
+    silhouettes only.
+
+    Args:
+        size: extent of the scene in world units.
     """
     background = drawing.background
     avatar = as_human_scene(drawing.scene)
     if avatar is not None:
-        outlined = all(images[i].alpha is not None for i in range(len(images)))
-        found: dict[str, Any] = {}
+        has_silhouettes = all(images[i].alpha is not None for i in range(len(images)))
+        fields: dict[str, Any] = {}
         for name, comparison in (
             ("own_poses", IMAGE_COMPARISON),
             ("silhouette_poses", SILHOUETTE_COMPARISON),
         ):
-            if name == "silhouette_poses" and not outlined:
+            if name == "silhouette_poses" and not has_silhouettes:
                 continue
             fitted, updates = fit_poses_to_images(avatar, images, background, comparison)
             each = (images[i] for i in range(len(images)))
             views, _ = score_views(fitted, each, drawing.options, background, lpips)
-            found[name] = PoseScores(
+            fields[name] = PoseScores(
                 **mean_scores(views), updates=fmean(updates), per_view=tuple(views)
             )
-        return found | {"psnr_own_poses": found["own_poses"].psnr}
+        return fields | {"psnr_own_poses": fields["own_poses"].psnr}
     scene = require_gaussians(drawing.scene, "what cameras are fitted to")
     options = scene.options
     scores: list[float] = []
@@ -115,16 +118,15 @@ def score_fitted_poses(
 def load_split_images(
     capture: Capture, views: Sequence[View], run_dir: Path, run: LoadedRun
 ) -> ImageLoader:
-    """Return the images of ``views``, a split of ``capture``, with the cameras that training found,
-    if any.
+    """Return the images of ``views``, a split of ``capture``, with the cameras refined by training.
 
-    Images that were not trained on have the lens that they share with others, and the pose of a
-    camera that stands still; all other poses are those of the capture.
+    Views that were not trained on use the refined lens they share with training views, and the
+    refined pose of a static camera. All other poses are those of the capture.
     """
     images = ImageLoader(views, run.config.data)
-    found = load_camera_corrections(run_dir, run, capture.splits["train"])
-    if found is not None:
-        images.camera_correction = lambda index, cameras: found.correct_cameras(
+    corrections = load_camera_corrections(run_dir, run, capture.splits["train"])
+    if corrections is not None:
+        images.camera_correction = lambda index, cameras: corrections.correct_cameras(
             images.views[index], cameras
         )
     return images
@@ -132,17 +134,15 @@ def load_split_images(
 
 @dataclass(frozen=True, kw_only=True)
 class EvalReport:
-    """The report that ``dyngs eval`` prints and writes; the fields are the keys of the file, see
-    docs/reference/runs.md."""
+    """Report that ``dyngs eval`` prints and writes. Field names are the keys of the JSON file."""
 
     split: str
     num_views: int
-    # ``width, height``: size of the first view in pixels
+    # size of the first view in pixels
     width: int
     height: int
     background: str
-    # ``psnr, ssim, flip, lpips and the like``: means over the views of what ``ViewScore`` holds,
-    # None where one has none
+    # means over views of the metrics in ``ViewScore``, None if a view has none
     psnr: float
     ssim: float
     flip: float | None
@@ -151,46 +151,43 @@ class EvalReport:
     num_gaussians: int = 0
     num_moving: int = 0
     moving_fraction: float = 0.0
-    # float32 parameters of all Gaussians and of the field in 1e6 bytes; an exported .ply adds 12
-    # bytes per Gaussian
+    # float32 parameters of Gaussians and deformation field in 1e6 bytes, without the 12 bytes per
+    # Gaussian that a .ply adds
     model_mb: float
-    field_mb: float = 0.0  # of these, the field's
-    # numbers per Gaussian that its colour takes, with its fraction of a network
+    field_mb: float = 0.0  # deformation field only
+    # colour parameters per Gaussian, including its fraction of a colour network
     colour_floats: float = 0.0
-    # one over the median time of drawing one view, after a warm-up: deformation and rendering;
-    # loading and metrics not counted
+    # inverse median time of deforming and rendering one view, after a warm-up
     fps: float
-    deform_fraction: float  # median fraction of that time that the deformation takes
+    deform_fraction: float  # median fraction of the time spent on deformation
     seconds_train: float
     step: int
     flicker: float | None = None
     flicker_error: float | None = None
     psnr_per_time: tuple[TimeScore, ...] = ()
-    reasons: dict[str, str] = field(default_factory=dict)  # metric name to why it is None
-    notes: tuple[str, ...] = ()  # anything else that a reader of the numbers should know
+    reasons: dict[str, str] = field(default_factory=dict)  # why a metric is None, by name
+    notes: tuple[str, ...] = ()  # other remarks about the scores
     per_view: tuple[ViewScore, ...] = ()
     psnr_person: float | None = None
     ssim_person: float | None = None
-    # size on disk of a run that ``dyngs export --format dyngs`` wrote; None of others
+    # file size of a run written by ``dyngs export --format dyngs``, else None
     stored_mb: float | None = None
-    # ``psnr_foreground, psnr_moving, psnr_static``: means over the views that have such a region
-    # (``Regions``)
+    # means over the views that contain the region, see ``Regions``
     psnr_foreground: float | None = None
     psnr_moving: float | None = None
     psnr_static: float | None = None
-    # means over the views that show a thing, by its label
+    # means over the views that show an object, by its mask label
     psnr_things: dict[int, float] = field(default_factory=dict)
-    moving_from: str | None = None  # how it was found what moves, None where it was not
-    # ``track_error_px, track_within_5px, track_motion_px``: see ``TrackScores``
+    moving_from: str | None = None  # source of the moving region, None if unknown
+    # see ``TrackScores``
     track_error_px: float | None = None
     track_within_5px: float | None = None
     track_motion_px: float | None = None
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None
-    # ``psnr_own_poses, own_poses, silhouette_poses``: from poses that were fitted to the images;
-    # None where that was not requested
+    # from poses fitted to the evaluated images, None if not requested
     psnr_own_poses: float | None = None
-    # ``psnr_white, psnr_black``: None where images have no alpha
+    # None if images have no alpha
     psnr_white: float | None = None
     psnr_black: float | None = None
     ssim_black: float | None = None
@@ -200,7 +197,7 @@ class EvalReport:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Faults of the scene that these scores show."""
+        """Problems of the scene indicated by the scores."""
         if self.psnr_white is None or self.psnr_black is None:
             return ()
         difference = self.psnr_white - self.psnr_black
@@ -208,12 +205,14 @@ class EvalReport:
             return ()
         worse, other = ("black", "white") if difference > 0 else ("white", "black")
         return (
-            f"PSNR on {worse} is {abs(difference):.1f} dB lower than on {other}: opacity is wrong in places "
-            f"(train.alpha_weight); `dyngs render RUN --out DIR --background {worse}` shows where",
+            f"PSNR on {worse} is {abs(difference):.1f} dB lower than on {other}: some opacities "
+            "are "
+            "wrong; raise train.alpha_weight. To see them, run "
+            f"`dyngs render RUN --out DIR --background {worse}`",
         )
 
     def to_json(self) -> str:
-        """Return the report as strict JSON (no NaN or Infinity), ending in a newline."""
+        """Return the report as strict JSON (no NaN or Infinity) with a final newline."""
         return json.dumps(asdict(self), indent=2, allow_nan=False) + "\n"
 
 
@@ -228,33 +227,37 @@ def evaluate_run(
     data_root: Path | None = None,
     capture: Capture | None = None,
 ) -> EvalReport:
-    """Return the report of a run on one split and write it into its folder: ``metrics.json``,
-    ``metrics_SPLIT.json``.
+    """Evaluate a run on one split and write the report to its folder.
 
-    ``threads``: of torch from now on; 0 leaves their number as it is. ``refine_poses``: also score from poses of a
-    person, else of the cameras, that were fitted to the images themselves; always done for a run
-    that refined its cameras. ``data_root``: where the capture lies by now. ``capture``: of the run,
-    if it was read already.
+    The file is ``metrics.json`` for the split "test", else ``metrics_SPLIT.json``.
+
+    Args:
+        threads: number of torch threads from now on. 0 keeps it.
+        refine_poses: also score with poses fitted to the evaluated images: body poses of a person,
+            else camera poses. Always done for a run that refined its cameras.
+        data_root: current folder of the capture, if it was moved.
+        capture: capture of the run, if already read.
     """
-    draws_on = select_device(device)
+    render_device = select_device(device)
     collect_inputs(run_dir).require_output(report_path(run_dir, split))
     if refine_poses and split == "train":
         raise DyngsError(
-            f"{run_dir}: --refine is for images that were not trained on; name them with --split test, val or pose"
+            f"{run_dir}: --refine needs images that were not trained on; use --split test, val or "
+            "pose"
         )
     run = load_run(run_dir, data_root)
     capture = capture or read_run_capture(run.config.data, run.info)
     views = split_views(capture, split)
     background, colour = evaluation_background(run.config.data.background, capture.has_alpha)
-    scene = scene_of_split(run, capture, split).to(draws_on)
-    drawing = SceneRenderer(scene, scene.options, colour.to(draws_on))
+    scene = scene_of_split(run, capture, split).to(render_device)
+    drawing = SceneRenderer(scene, scene.options, colour.to(render_device))
     if threads:
         torch.set_num_threads(threads)
     loader = load_split_images(capture, views, run_dir, run)
-    loader.device = draws_on
+    loader.device = render_device
     regions = Regions(views, loader, drawing.background)
     images = (loader[i] for i in range(len(loader)))
-    lpips = load_lpips(lpips_net, draws_on)
+    lpips = load_lpips(lpips_net, render_device)
     scores, reasons = score_views(
         scene, images, drawing.options, drawing.background, lpips, regions
     )
@@ -268,7 +271,7 @@ def evaluate_run(
     reasons |= {name: regions.reason(name) for name in REGION_METRICS if means[name] is None}
     if means["psnr_right"] is None:
         reasons |= dict.fromkeys(
-            ("psnr_right", "psnr_right_fitted"), "half a view has no pixel that counts"
+            ("psnr_right", "psnr_right_fitted"), "all pixels of one half of a view are masked"
         )
     if tracks.reason is not None:
         reasons["track_error_px"] = tracks.reason
@@ -288,7 +291,7 @@ def evaluate_run(
         notes=_notes(run, scores),
         per_view=tuple(scores),
         stored_mb=_stored_mb(run_dir),
-        psnr_things=_means_of_things(scores),
+        psnr_things=_mean_object_scores(scores),
         moving_from=regions.moving_from,
         track_error_px=tracks.error_px,
         track_within_5px=tracks.within_5px,
@@ -306,12 +309,12 @@ MEAN_METRICS = (*POSE_METRICS, "flip", "psnr_right", "psnr_right_fitted", "psnr_
 MEAN_METRICS += REGION_METRICS
 
 
-def _means_of_things(scores: Sequence[ViewScore]) -> dict[int, float]:
-    found: defaultdict[int, list[float]] = defaultdict(list)
+def _mean_object_scores(scores: Sequence[ViewScore]) -> dict[int, float]:
+    values: defaultdict[int, list[float]] = defaultdict(list)
     for score in scores:
         for label, value in score.psnr_things.items():
-            found[label].append(value)
-    return {label: fmean(found[label]) for label in sorted(found)}
+            values[label].append(value)
+    return {label: fmean(values[label]) for label in sorted(values)}
 
 
 def _sizes(scene: Renderable) -> dict[str, Any]:
@@ -341,7 +344,7 @@ def _track_scores(
     run: LoadedRun, capture: Capture, scene: Renderable, views: Sequence[View]
 ) -> TrackScores:
     if not isinstance(scene, GaussianScene):
-        return TrackScores(reason="it is not made of Gaussians, whose tracks could be compared")
+        return TrackScores(reason="only scenes of Gaussians have tracks")
     cameras = training_cameras(views, run.config.data)
     return track_scores(
         scene,
@@ -352,10 +355,11 @@ def _track_scores(
 
 
 def parameter_megabytes(scene: GaussianScene) -> float:
-    """Return the size in 1e6 bytes as float32: 236 bytes per Gaussian at SH degree 3, the field,
-    and masks as bits.
+    """Return the size of the parameters in 1e6 bytes.
 
-    Harmonics of a Gaussian that are all zero beyond the base colour do not count.
+    Counts float32 parameters of Gaussians (236 bytes at SH degree 3) and of the deformation field,
+    and visibility masks as bits. SH coefficients of a Gaussian that are all zero beyond degree 0
+    are not counted.
     """
     shapes = sum(x.numel() for name, x in scene.gaussians.tensors().items() if name != "sh")
     return (
@@ -367,24 +371,18 @@ def parameter_megabytes(scene: GaussianScene) -> float:
 def _notes(run: LoadedRun, scores: Sequence[ViewScore]) -> tuple[str, ...]:
     notes = []
     if 0 < run.step < run.config.total_steps:
-        notes.append(
-            f"the run is not finished: it stands at step {run.step:,} of {run.config.total_steps:,}, and its schedules "
-            "where they were then"
-        )
+        notes.append(f"unfinished run: step {run.step:,} of {run.config.total_steps:,}")
     if run.config.data.background == "random":
-        notes.append("trained on random backgrounds, evaluated on black")
+        notes.append("trained with random backgrounds, evaluated on black")
     if capability(run.config.model, HasMotion) is not None and run.renderable.is_static:
-        notes.append(
-            "the model is dynamic, but nothing moves in it: it is drawn as fast as a static one"
-        )
+        notes.append("dynamic model without motion: rendered as a static scene")
     if len({(s.width, s.height) for s in scores}) > 1:
-        notes.append("views differ in size; width and height are those of the first")
+        notes.append("views differ in size; width and height are those of the first view")
     return tuple(notes)
 
 
-# number of views compared per split; enough for before and after, not for a benchmark
-COMPARED_VIEWS = 20
-ROUNDS = 3
+COMPARED_VIEWS = 20  # Most views compared per split: enough for a before/after comparison
+ROUNDS = 3  # Renders of each view
 
 
 @dataclass(frozen=True)
@@ -392,20 +390,22 @@ class RunMetrics:
     """Quality, size and speed of a run."""
 
     num_gaussians: int
-    # ``psnr_train, psnr_test``: means over at most 20 views, dB; None without such a split
+    # means over at most ``COMPARED_VIEWS`` views, dB; None without the split
     psnr_train: float | None
     psnr_test: float | None
-    fps: float  # one over the median time of drawing a view, deformation included
-    megabytes: float  # float32 parameters, the field and masks, in 1e6 bytes
-    # size of the file in 1e6 bytes, where the run is only there as one; else None
+    fps: float  # inverse median time of deforming and rendering a view
+    megabytes: float  # see ``parameter_megabytes``
+    # file size in 1e6 bytes, for a run that consists of a scene file only
     stored: float | None = None
 
 
 def compare_runs(
     folders: Sequence[Path], threads: int, device: torch.device = CPU, data_root: Path | None = None
 ) -> list[RunMetrics]:
-    """Return the costs of runs on the capture of the first; drawn in turn, so that load affects all
-    alike."""
+    """Return the metrics of runs on the capture of the first run.
+
+    Runs are rendered alternately, so that other load affects all equally.
+    """
     runs = [load_run(folder, data_root) for folder in folders]
     data = runs[0].config.data
     capture = read_run_capture(data, runs[0].info)

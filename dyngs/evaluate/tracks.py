@@ -1,4 +1,4 @@
-"""How far the motion of a model is off, where the true tracks of a scene are known.
+"""Motion errors of a model with respect to ground-truth point tracks.
 
 Local letters: P true points, N Gaussians, K Gaussians that carry a point.
 """
@@ -20,24 +20,23 @@ from dyngs.deform.scene import field_scene_of
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.ops.quaternions import unit_quats
 
-CARRIERS = 4  # K, nearest Gaussians that carry a point, weighted by opacity
-MIN_OPACITY = 0.3  # fainter Gaussians carry nothing
-CLOSE_PX = 5.0
+CARRIERS = 4  # K: a point is carried by its nearest Gaussians, weighted by opacity
+MIN_OPACITY = 0.3  # Gaussians below this opacity carry no point
+CLOSE_PX = 5.0  # Distance in px below which a track counts as correct
 
 NO_TRACKS = f"the capture has no {TRACKS_FILE}"
-NONE_SEEN = "no view of this split shows a point of the true tracks at a time other than that of its binding"
-NONE_OPAQUE = f"no Gaussian is more opaque than {MIN_OPACITY:g}"
+NONE_SEEN = "no view of this split shows a tracked point at another time than its reference time"
+NONE_OPAQUE = f"no Gaussian has an opacity above {MIN_OPACITY:g}"
 
 
 @dataclass(frozen=True)
 class TrackScores:
-    """Errors of tracks over all pairs of a view and a point that it shows; None where ``reason``
-    says why."""
+    """Track errors over all pairs of a view and a visible point. None if ``reason`` is set."""
 
-    # mean distance in the image between where the model carries a point and where it truly is
+    # mean image distance between predicted and true points
     error_px: float | None = None
     within_5px: float | None = None  # fraction of distances below ``CLOSE_PX``
-    # mean distance of a model in which nothing moves, for comparison
+    # mean distance for a static model, for comparison
     motion_px: float | None = None
     reason: str | None = None
 
@@ -48,13 +47,16 @@ def track_scores(
     split: Sequence[tuple[View, Cameras]],
     views: Sequence[View],
 ) -> TrackScores:
-    """Return the errors of a scene's motion in the images of a split, of which each view has its
-    camera.
+    """Return the track errors of a scene in the images of a split.
 
-    Each point is bound to the ``CARRIERS`` nearest Gaussians at the time nearest to the middle of
-    those at which any of ``views``, of all splits, shows it; from there they carry it as they move
-    and turn. Where Gaussians are there for a while only, others take over at each time. Distances
-    are at most the diagonal of the image.
+    Each point is attached to its ``CARRIERS`` nearest Gaussians at a reference time, and moves
+    rigidly with them. The reference time is the visible time of the point closest to the middle of
+    the clip. If Gaussians have lifetimes, points are handed over at every time step. Distances are
+    clamped to the image diagonal.
+
+    Args:
+        split: evaluated views and their cameras.
+        views: views of all splits, which define the reference times.
     """
     if tracks is None:
         return TrackScores(reason=NO_TRACKS)
@@ -64,9 +66,9 @@ def track_scores(
         return TrackScores(reason=NONE_OPAQUE)
     rows = {name: row for row, name in enumerate(tracks.views.tolist())}
     shown = [x for x in split if x[0].time is not None and x[0].name in rows]
-    points, bound_at = _binding(tracks, views)
+    points, bound_at = _reference_points(tracks, views)
     times = sorted({view.time or 0.0 for view, _ in shown})
-    carried = _carried_to(times, scene, points, bound_at, min(CARRIERS, num_opaque))
+    carried = _track_points(times, scene, points, bound_at, min(CARRIERS, num_opaque))
     errors = []
     motions = []
     for view, cameras in shown:
@@ -75,9 +77,9 @@ def track_scores(
         is_shown = tracks.visible[row] & (np.abs(bound_at - time) > SAME_TIME)
         limit = float(np.hypot(cameras.width, cameras.height))
         true = _pixels(tracks.points[tracks.moments[row]][is_shown], cameras)
-        for found, kept in ((carried[time], errors), (points, motions)):
-            distance = np.linalg.norm(_pixels(found[is_shown], cameras) - true, axis=1)
-            kept.extend(np.minimum(np.nan_to_num(distance, nan=limit), limit).tolist())
+        for predicted, distances in ((carried[time], errors), (points, motions)):
+            distance = np.linalg.norm(_pixels(predicted[is_shown], cameras) - true, axis=1)
+            distances.extend(np.minimum(np.nan_to_num(distance, nan=limit), limit).tolist())
     if not errors:
         return TrackScores(reason=NONE_SEEN)
     error = np.array(errors)
@@ -86,9 +88,9 @@ def track_scores(
     )
 
 
-def _binding(tracks: TrueTracks, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points (P, 3) and times (P,) at which they are bound: nearest to the middle of
-    when they are seen; NaN of points that are never seen."""
+def _reference_points(tracks: TrueTracks, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the reference positions (P, 3) of points, and their reference times (P,). NaN for
+    points that are never visible."""
     times = np.full(len(tracks.points), np.nan)
     known = {view.name: view.time for view in views if view.time is not None}
     for name, row in zip(tracks.views.tolist(), tracks.moments.tolist(), strict=True):
@@ -106,15 +108,15 @@ def _binding(tracks: TrueTracks, views: Sequence[View]) -> tuple[np.ndarray, np.
 
 
 @dataclass(frozen=True)
-class _Moment:
-    """The Gaussians at one time."""
+class _GaussianStates:
+    """States of the N Gaussians at one time."""
 
     means: np.ndarray  # (N, 3)
     quats: np.ndarray  # (N, 4) unit, xyzw
     opacities: np.ndarray  # (N,)
 
 
-def _moment(scene: GaussianScene, time: float) -> _Moment:
+def _states_at(scene: GaussianScene, time: float) -> _GaussianStates:
     gaussians = scene.at(time)
     means, quats, opacities = (
         x.detach().cpu().double().numpy()
@@ -124,18 +126,21 @@ def _moment(scene: GaussianScene, time: float) -> _Moment:
             gaussians.logit_opacities.sigmoid(),
         )
     )
-    return _Moment(means, quats[:, [1, 2, 3, 0]], opacities)
+    return _GaussianStates(means, quats[:, [1, 2, 3, 0]], opacities)
 
 
-def _carried_to(
+def _track_points(
     times: Sequence[float],
     scene: GaussianScene,
     points: np.ndarray,
     bound_at: np.ndarray,
     count: int,
 ) -> dict[float, np.ndarray]:
-    """Return where ``points`` (P, 3) are at ``times``, each carried by ``count`` Gaussians from
-    where it was bound; or, where Gaussians come and go, from one time to the next."""
+    """Return the positions of ``points`` (P, 3) at ``times``, carried by ``count`` Gaussians each.
+
+    Points are carried from their reference times, or from one time step to the next if Gaussians
+    have lifetimes.
+    """
     starts = np.unique(bound_at[np.isfinite(bound_at)]).tolist()
     moved = field_scene_of(scene)
     if moved is None or moved.field is None or not moved.field.has_lifetime:
@@ -143,14 +148,14 @@ def _carried_to(
         bound = []
         for start in starts:
             rows = np.flatnonzero(bound_at == start)
-            bound.append((rows, _bind(_moment(scene, start), points[rows], count)))
+            bound.append((rows, _bind(_states_at(scene, start), points[rows], count)))
         for time in times:
-            moment = _moment(scene, time)
+            moment = _states_at(scene, time)
             for rows, binding in bound:
                 found[time][rows] = _carried(moment, *binding)
         return found
     steps = sorted({*scene.times, *times, *starts})
-    moments = {time: _moment(scene, time) for time in steps}
+    moments = {time: _states_at(scene, time) for time in steps}
     found = {time: np.where((bound_at == time)[:, None], points, np.nan) for time in steps}
     for order in (steps, steps[::-1]):
         for now, then in pairwise(order):
@@ -162,14 +167,18 @@ def _carried_to(
 
 
 def _bind(
-    moment: _Moment, points: np.ndarray, count: int
+    moment: _GaussianStates, points: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the rows (P, K) of the ``count`` Gaussians nearest to ``points`` (P, 3), their weights
-    (P, K) by opacity, and the points in their axes (P, K, 3)."""
+    """Attach points (P, 3) to the ``count`` nearest Gaussians.
+
+    Returns:
+        indices (P, K), weights (P, K) by opacity, and offsets (P, K, 3) in the axes of the
+            Gaussians.
+    """
     from scipy.spatial import KDTree
     from scipy.spatial.transform import Rotation
 
-    # A field may fade Gaussians: of those that are too faint now, the least faint fill up.
+    # If a field fades too many Gaussians, the most opaque of the faint ones are used.
     num_opaque = max(count, int((moment.opacities > MIN_OPACITY).sum()))
     opaque = np.argsort(-moment.opacities, kind="stable")[:num_opaque]
     _, nearest = KDTree(moment.means[opaque]).query(points, k=count)
@@ -182,13 +191,9 @@ def _bind(
 
 
 def _carried(
-    moment: _Moment, rows: np.ndarray, weights: np.ndarray, arms: np.ndarray
+    moment: _GaussianStates, rows: np.ndarray, weights: np.ndarray, arms: np.ndarray
 ) -> np.ndarray:
-    """Return points (P, 3) as the Gaussians carry them, which move and turn.
-
-    What lies beside the centre of a Gaussian turns about it: on a ball that rolls, its shift alone
-    would not do.
-    """
+    """Return points (P, 3) that move and rotate with the Gaussians they are attached to."""
     from scipy.spatial.transform import Rotation
 
     rotations = Rotation.from_quat(moment.quats[rows.ravel()])
@@ -197,7 +202,7 @@ def _carried(
 
 
 def _pixels(points: np.ndarray, cameras: Cameras) -> np.ndarray:
-    """Return the (P, 2) pixels of ``points`` (P, 3); NaN of those behind the camera."""
+    """Return the pixels (P, 2) of ``points`` (P, 3); NaN behind the camera."""
     pose, intrinsics = (
         x[0].cpu().double().numpy() for x in (cameras.cam_from_world, cameras.intrinsics)
     )

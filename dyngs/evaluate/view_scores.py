@@ -1,12 +1,12 @@
-"""Scores of views: the render against the truth, whole, on parts of the image and over time, and how
-long it took to draw.
+"""Scores of rendered views against the true images: whole image, regions, changes over time, speed.
 
-Of people also inside their box, and on black, as published figures have it. Where training images
-differ in exposure, so do test images: the published protocol (Martin-Brualla et al. 2021) fits the
-left half, and scores the right half. Both measures of flicker are in grey levels of 255 and mean
-absolute values over pixels, channels and time steps, of images clamped to [0, 1]. Local letters: T
-images of a camera, H x W pixels, R a rendered image, G the true one, t its time, k time steps in
-order.
+People are also scored inside their bounding box and on black, as in published results. With
+differing exposures, an affine colour map is fitted on the left half of a view and the right half is
+scored (Martin-Brualla et al. 2021). Flicker metrics are means of absolute values over pixels,
+channels and time steps, in grey levels of 255, for images clamped to [0, 1].
+
+Local letters: T images of a camera, H x W pixels, R a rendered image, G the true image, t its time,
+k time steps.
 """
 
 from __future__ import annotations
@@ -38,29 +38,28 @@ from dyngs.ops.device import synchronize
 
 REGION_METRICS = ("psnr_foreground", "psnr_moving", "psnr_static")
 
-# a region of fewer pixels in a view is not measured there: a few pixels of an outline say nothing
-FEWEST_PIXELS = 25
+FEWEST_PIXELS = 25  # Regions with fewer pixels in a view are not scored
+# Mean channel difference from the camera's median image, in [0, 1], above which a pixel moves
 CHANGE = 0.05
-"""Mean difference of the channels from the camera's median, in [0, 1], from which a pixel counts as
-moving."""
-MEDIAN_IMAGES = 31  # number of images, spread over the clip, from which a camera's median is taken
+MEDIAN_IMAGES = 31  # Images, spread over the clip, of which a camera's median is computed
 
-NO_ALPHA = "the images have no alpha and no silhouettes"
+NO_ALPHA = "the images have no alpha"
 NO_TIMES = "the images have no times"
-NO_MOTION_KNOWN = (
-    "the views have no motion masks, and no camera of this split stands still while time passes"
-)
-TOO_SMALL = f"fewer than {FEWEST_PIXELS} pixels in every view"
+NO_MOTION_KNOWN = "no motion masks, and no static camera with several time steps in this split"
+TOO_SMALL = f"fewer than {FEWEST_PIXELS} pixels in each view"
 
 
 class Regions:
-    """The regions of the images of one split; ``loader`` holds those of ``views``, ``background``
-    (3,) is behind them.
+    """Foreground, moving and static regions of the images of one split.
 
-    The foreground is where the true image is not fully transparent. What moves is known, in this
-    order, from motion masks, and before cameras that stand still from pixels that differ by
-    ``CHANGE`` from their median over time. What is left does not move. Where there is a foreground,
-    both are parts of it.
+    The foreground is where the true alpha is positive. The moving region is taken from motion
+    masks. Without masks, views of static cameras use pixels that differ by ``CHANGE`` from their
+    median over time. The static region is the remainder. With a foreground, both are restricted to
+    it.
+
+    Args:
+        loader: images of ``views``.
+        background: (3,) colour behind them.
     """
 
     def __init__(self, views: Sequence[View], loader: ImageLoader, background: Tensor) -> None:
@@ -77,8 +76,8 @@ class Regions:
         self._has_alpha = False
 
     def scores(self, image: Image, rendered: Tensor, truth: Tensor) -> dict[str, float | None]:
-        """Return the PSNR of a view's regions, dB, by metric; None for too few such pixels, or
-        unknown ones."""
+        """Return the PSNR of the regions of a view in dB, by metric. None for unknown or small
+        regions."""
         moves = self.moving(image)
         foreground = None if image.alpha is None else image.alpha > 0
         self._has_alpha |= foreground is not None
@@ -89,17 +88,16 @@ class Regions:
         return dict(zip(REGION_METRICS, found, strict=True))
 
     def object_scores(self, image: Image, rendered: Tensor, truth: Tensor) -> dict[int, float]:
-        """Return the PSNR of a view, dB, on each thing that its motion mask tells apart and that it
-        shows, by label."""
+        """Return the PSNR of each labelled object in a view in dB, by mask label."""
         if image.labels is None:
             return {}
         labels = image.labels if image.alpha is None else image.labels * (image.alpha > 0)
-        found = labels[labels != 0].unique().cpu().tolist()
-        scores = {label: _psnr_inside(labels == label, image, rendered, truth) for label in found}
+        shown = labels[labels != 0].unique().cpu().tolist()
+        scores = {label: _psnr_inside(labels == label, image, rendered, truth) for label in shown}
         return {label: score for label, score in scores.items() if score is not None}
 
     def moving(self, image: Image) -> Tensor | None:
-        """Return (H, W) bool, the pixels in which something moves; None where that is not known."""
+        """Return the moving pixels (H, W) bool, or None if unknown."""
         if image.motion_mask is not None:
             self._moving_from.add("motion masks")
             return image.motion_mask >= 0.5
@@ -108,15 +106,15 @@ class Regions:
             return None
         self._moving_from.add("change over time")
         change = (image.composite(self._background) - self._median(indices)).abs().mean(-1)
-        return _opened(change > CHANGE)
+        return _morphological_opening(change > CHANGE)
 
     @property
     def moving_from(self) -> str | None:
-        """How it was found what moves in the images so far; None where it was not."""
+        """Source of the moving regions so far, or None."""
         return " and ".join(sorted(self._moving_from)) or None
 
     def reason(self, metric: str) -> str:
-        """Return why no image so far has a score of this region."""
+        """Return why no image so far has a score for this region."""
         if metric == "psnr_foreground":
             return TOO_SMALL if self._has_alpha else NO_ALPHA
         if self._moving_from:
@@ -124,7 +122,7 @@ class Regions:
         return NO_MOTION_KNOWN if self._has_times else NO_TIMES
 
     def _median(self, indices: Sequence[int]) -> Tensor:
-        """Return the (H, W, 3) median over time of the images of a camera that stands still."""
+        """Return the median image (H, W, 3) over time of a static camera."""
         key = tuple(indices)
         if key not in self._medians:
             chosen = [indices[i] for i in evenly_spaced(len(indices), MEDIAN_IMAGES)]
@@ -145,8 +143,8 @@ def _psnr_inside(
     return psnr(rendered, truth, weights) if int((weights > 0).sum()) >= FEWEST_PIXELS else None
 
 
-def _opened(shown: Tensor) -> Tensor:
-    """Return (H, W) bool, ``shown`` less what no square of 3x3 pixels fits into."""
+def _morphological_opening(shown: Tensor) -> Tensor:
+    """Return the opening (H, W) bool of ``shown`` by 3 x 3 pixels."""
     grown = torch.nn.functional.max_pool2d((~shown)[None, None].float(), 3, stride=1, padding=1)
     kept = 1 - grown
     return torch.nn.functional.max_pool2d(kept, 3, stride=1, padding=1)[0, 0] > 0.5
@@ -154,7 +152,7 @@ def _opened(shown: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class SceneRenderer:
-    """A scene and how it is drawn."""
+    """A scene with render options and background."""
 
     scene: Renderable
     options: DrawOptions  # as in training, without depth
@@ -162,7 +160,7 @@ class SceneRenderer:
 
     @torch.no_grad()
     def image(self, cameras: Cameras, time: float | None) -> Tensor:
-        """Return the image (H, W, 3) of the one camera at ``time``."""
+        """Render the image (H, W, 3) of one camera at ``time``."""
         rendering = self.scene.render(
             cameras, time, options=self.options, background=self.background
         )
@@ -172,10 +170,9 @@ class SceneRenderer:
 def time_renders(
     drawings: Sequence[SceneRenderer], images: Sequence[Image], rounds: int
 ) -> np.ndarray:
-    """Return the seconds (D, ``rounds`` * I) that each of D drawings takes for each image.
+    """Return the seconds (D, ``rounds`` * I) that D renderers take for I images.
 
-    All draw each image in turn, starting with another one each time, so that other load on the
-    machine affects all alike. ``images``: I; their cameras and times are drawn.
+    Renderers alternate on each image, so that other load affects all equally.
     """
     seconds = np.zeros((len(drawings), rounds * len(images)))
     for drawing in drawings:
@@ -192,11 +189,11 @@ def time_renders(
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Metrics of one view; None where a metric cannot be had (``EvalReport.reasons`` says why).
+    """Metrics of one view. None if a metric is unavailable, see ``EvalReport.reasons``.
 
-    ``render_seconds`` holds ``deform_seconds``. Of images with alpha, ``psnr_white`` and
-    ``psnr_black`` are of the full image on white and on black. Of people, ``psnr_person`` and
-    ``ssim_person`` are inside the person's box, ``ssim_black`` and ``lpips_black`` on black.
+    ``render_seconds`` includes ``deform_seconds``. ``psnr_white`` and ``psnr_black`` are of images
+    with alpha, on these backgrounds. ``psnr_person`` and ``ssim_person`` are inside the person's
+    bounding box, ``ssim_black`` and ``lpips_black`` on black.
     """
 
     name: str
@@ -225,8 +222,7 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class PoseScores:
-    """Means over views of a person in poses that were fitted to these views themselves; names as in
-    ``ViewScore``."""
+    """Mean scores of a person in poses fitted to the evaluated views. Names as in ``ViewScore``."""
 
     psnr: float
     ssim: float
@@ -236,7 +232,7 @@ class PoseScores:
     psnr_black: float | None
     ssim_black: float | None
     lpips_black: float | None
-    updates: float  # mean number of updates that the pose of a moment took
+    updates: float  # mean number of optimizer updates per pose
     per_view: tuple[ViewScore, ...]
 
 
@@ -248,20 +244,21 @@ def score_views(
     lpips: Lpips,
     regions: Regions | None = None,
 ) -> tuple[list[ViewScore], dict[str, str]]:
-    """Return scores of the Gaussians against images, and the reasons for metrics that are None.
+    """Return the scores of a scene on images, and the reasons for metrics that are None.
 
-    The scene is drawn at the time of each image on ``background`` (3,); ``regions`` are of the
-    split, None: not measured.
+    Args:
+        background: (3,) colour behind rendering and image.
+        regions: regions of the split. None scores no regions.
     """
     scores: list[ViewScore] = []
     reasons: dict[str, str] = {}
     for image in images:
         if not scores:
-            _timed_render(scene, image, options, background)  # the warm-up
+            _timed_render(scene, image, options, background)  # warm-up
         rendering, seconds, deform_seconds = _timed_render(scene, image, options, background)
         rendered = rendering.rgb[0]
         if not rendered.isfinite().all():
-            raise DyngsError(f"view {image.name!r}: the render holds NaN or Inf")
+            raise DyngsError(f"view {image.name!r}: the rendering contains NaN or Inf")
         truth = image.composite(background)
         mask = image.mask
         values: dict[str, Any] = {
@@ -269,15 +266,15 @@ def score_views(
             "ssim": ssim(rendered, truth, mask),
         }
         for name, metric in (("flip", flip), ("lpips", lpips)):
-            found = metric(rendered, truth, mask)
-            values[name] = found.value
-            if found.reason is not None:
-                reasons.setdefault(name, found.reason)
+            result = metric(rendered, truth, mask)
+            values[name] = result.value
+            if result.reason is not None:
+                reasons.setdefault(name, result.reason)
         for name, value in values.items():
             if value is not None and not math.isfinite(value):
                 empty = mask is not None and not bool((mask > 0).any())
-                why = "its mask ignores every pixel" if empty else "the image holds NaN or Inf"
-                raise DyngsError(f"view {image.name!r}: {name} is not finite, {why}")
+                why = "all pixels are masked" if empty else "the image contains NaN or Inf"
+                raise DyngsError(f"view {image.name!r}: {name} is not finite ({why})")
         if as_human_scene(scene) is not None:
             values |= person_scores(image, rendering, background, lpips)
         values |= right_half_scores(image, rendering, background)
@@ -301,7 +298,8 @@ def score_views(
 def person_scores(
     image: Image, rendering: Rendering, background: Tensor, lpips: Lpips
 ) -> dict[str, float | None]:
-    """Return the scores by their names in ``ViewScore``; none where nobody is to be seen."""
+    """Return the scores of a person, by their names in ``ViewScore``. Empty if no person is
+    visible."""
     box = None if image.alpha is None else silhouette_box(image.alpha)
     if box is None:
         return {}
@@ -319,8 +317,8 @@ def person_scores(
 
 
 def background_scores(image: Image, rendering: Rendering, background: Tensor) -> dict[str, float]:
-    """Return ``psnr_white`` and ``psnr_black``, dB, from one rendering on ``background`` (3,); none
-    without alpha."""
+    """Return ``psnr_white`` and ``psnr_black`` in dB from one rendering on ``background`` (3,).
+    Empty without alpha."""
     scores: dict[str, float] = {}
     for name in ("white", "black") if image.alpha is not None else ():
         colour = background_colour(name).to(background)
@@ -330,11 +328,10 @@ def background_scores(image: Image, rendering: Rendering, background: Tensor) ->
 
 
 def right_half_scores(image: Image, rendering: Rendering, background: Tensor) -> dict[str, float]:
-    """Return ``psnr_right`` and ``psnr_right_fitted``, dB; none where a half of the image has no
-    pixel that counts.
+    """Return the PSNR of the right half in dB, without and with an affine colour map fitted on the
+    left half.
 
-    That is the PSNR of the right half as the scene shows it, and after an affine colour fitted on
-    the left half.
+    Empty if all pixels of one half are masked.
     """
     truth = image.composite(background)
     left = torch.zeros_like(truth[..., 0])
@@ -356,8 +353,10 @@ POSE_METRICS = tuple(x.name for x in fields(PoseScores) if x.name not in ("updat
 
 
 def mean_scores(scores: Sequence[ViewScore], names: Sequence[str] = POSE_METRICS) -> dict[str, Any]:
-    """Return the means of metrics over at least one view; None where a view has none, but for
-    regions: these are over the views that have one."""
+    """Return the means of metrics over views.
+
+    None if a view lacks the metric. Region metrics are means over the views that have the region.
+    """
     means = {}
     for name in names:
         values = [getattr(score, name) for score in scores]
@@ -370,7 +369,7 @@ def mean_scores(scores: Sequence[ViewScore], names: Sequence[str] = POSE_METRICS
 def _timed_render(
     scene: Renderable, image: Image, options: DrawOptions, background: Tensor
 ) -> tuple[Rendering, float, float]:
-    """Return the rendering, the seconds it took, and the seconds of these for deformation."""
+    """Return a rendering, its total seconds, and the seconds of deformation."""
     with torch.no_grad():
         device = scene.device
         synchronize(device)
@@ -386,7 +385,7 @@ def _timed_render(
 
 @dataclass(frozen=True)
 class TimeScore:
-    """PSNR (dB) at one time step: the mean of the views taken then."""
+    """Mean PSNR in dB of the views at one time step."""
 
     time: float
     psnr: float
@@ -394,30 +393,29 @@ class TimeScore:
 
 
 def psnr_per_time(scores: Iterable[tuple[float | None, float]]) -> tuple[TimeScore, ...]:
-    """Return the PSNR at each distinct time, ascending, from (time, psnr) of the views that have a
-    time."""
-    found: defaultdict[float, list[float]] = defaultdict(list)
+    """Return the PSNR at each distinct time, ascending, from (time, psnr) pairs. Views without a
+    time are skipped."""
+    by_time: defaultdict[float, list[float]] = defaultdict(list)
     for at, value in scores:
         if at is not None:
-            found[at].append(value)
+            by_time[at].append(value)
     return tuple(
-        TimeScore(time, fmean(values), len(values)) for time, values in sorted(found.items())
+        TimeScore(time, fmean(values), len(values)) for time, values in sorted(by_time.items())
     )
 
 
 def flicker(drawing: SceneRenderer, cameras: Cameras, times: Sequence[float]) -> MetricValue:
-    """Return the mean of |R_{k+1} - 2 R_k + R_{k-1}| x 255: the second difference in time at one
-    camera, without truth.
+    """Return the mean of |R_{k+1} - 2 R_k + R_{k-1}| x 255 at one camera: a second difference in
+    time.
 
-    Where time steps are not evenly spaced, R_k is compared with the line between its neighbours: 2
-    |w R_{k-1} + (1 - w) R_{k+1} - R_k| with
-    w = (t_{k+1} - t_k) / (t_{k+1} - t_{k-1}). Of more than 60 time steps, 20 triples of
-    neighbours are taken, evenly spaced. A scene in which nothing moves has 0.
+    For uneven time steps, R_k is compared with the line between its neighbours: 2 |w R_{k-1} + (1 -
+    w) R_{k+1} - R_k| with w = (t_{k+1} - t_k) / (t_{k+1} - t_{k-1}). Of more than 60 time steps, 20
+    evenly spaced triples are used. A static scene has 0.
     """
     if drawing.scene.is_static:
         return MetricValue(0.0)
     if len(times) < 3:
-        return MetricValue(None, f"needs at least three training times, there are {len(times)}")
+        return MetricValue(None, f"needs at least three training times, found {len(times)}")
     seen: dict[int, Tensor] = {}
     values = []
     last = len(times) - 1
@@ -436,18 +434,16 @@ def flicker(drawing: SceneRenderer, cameras: Cameras, times: Sequence[float]) ->
 def flicker_error(
     drawing: SceneRenderer, loader: ImageLoader, views: Sequence[View]
 ) -> MetricValue:
-    """Return the mean of |(R_{k+1} - R_k) - (G_{k+1} - G_k)| x 255: the error of changes in time,
-    at fixed cameras.
+    """Return the mean of |(R_{k+1} - R_k) - (G_{k+1} - G_k)| x 255 at static cameras.
 
-    Over all neighbours in time of each pose that has several times; a mask leaves out what does not
-    count in one of the two. Something that should move but does not has it, as has everything that
-    flickers.
+    Missing motion and flicker both increase it. Pixels masked in one of the two images are
+    excluded.
     """
     total = weight = 0.0
     for indices in static_cameras(views):
         before: tuple[Tensor, Tensor] | None = None
         for image in (loader[i] for i in indices):
-            # R' - R - (G' - G) is the difference of two errors
+            # R' - R - (G' - G) is the difference of two errors.
             truth = image.composite(drawing.background).clamp(0, 1)
             error = drawing.image(image.cameras, image.time).clamp(0, 1) - truth
             counts = torch.ones_like(truth[..., 0]) if image.mask is None else image.mask
@@ -457,14 +453,14 @@ def flicker_error(
                 weight += float(weights.double().sum())
             before = error, counts
     if not weight:
-        return MetricValue(None, "no camera of this split stands still while time passes")
+        return MetricValue(None, "no static camera with several time steps in this split")
     return MetricValue(255 * total / weight)
 
 
 def temporal_scores(
     drawing: SceneRenderer, loader: ImageLoader, views: Sequence[View]
 ) -> dict[str, MetricValue]:
-    """Return ``flicker`` before the first camera of a split, at the training times, and
+    """Return ``flicker`` at the first camera of a split, at the training times, and
     ``flicker_error``."""
     if all(view.time is None for view in views):
         return dict.fromkeys(("flicker", "flicker_error"), MetricValue(None, NO_TIMES))

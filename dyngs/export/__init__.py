@@ -1,1 +1,1 @@
-"""Files for other programs: images, videos, Gaussians, meshes, pages; camera paths; scene edits."""
+"""Export of images, videos, Gaussians, meshes and web pages; camera paths; scene edits."""

@@ -1,7 +1,4 @@
-"""Camera paths for rendering: scene times, JSON files of dyngs and of other programs, keyframes.
-
-The file format is described in docs/reference/camera-paths.md.
-"""
+"""Camera paths for rendering: scene times, JSON files of dyngs and other programs, keyframes."""
 
 from __future__ import annotations
 
@@ -26,16 +23,17 @@ from dyngs.io.fields import (
     require_key,
 )
 
-_MAX_FRAMES = 100_000
-"""A longer path is taken for a typing mistake."""
-AUTOMATIC_PATHS = ("orbit", "spiral", "along")
+_MAX_FRAMES = 100_000  # Longer paths are assumed to be a typing mistake
+AUTOMATIC_PATHS = ("orbit", "spiral", "along")  # Paths that are placed automatically
 
 
 @dataclass(frozen=True)
 class CameraPath:
-    """F cameras in the order of the frames, and scene times in [0, 1], or None for a static scene.
+    """F cameras in the order of the frames.
 
-    ``notes``: about where the cameras were placed, and changed input.
+    Attributes:
+        times: scene times in [0, 1], or None for a static scene.
+        notes: remarks on the placement of the cameras and on changed input.
     """
 
     cameras: Cameras
@@ -48,19 +46,19 @@ class CameraPath:
 
 
 def clamp_times(times: Sequence[float]) -> tuple[tuple[float, ...], tuple[str, ...]]:
-    """Return ``times`` within [0, 1], and a line where one was not."""
+    """Return ``times`` clamped to [0, 1], and a note if any changed."""
     inside = tuple(min(max(float(time), 0.0), 1.0) for time in times)
     count = sum(a != b for a, b in zip(times, inside, strict=True))
-    line = f"{count} of {len(times)} times lie outside [0, 1] and were clamped to it"
-    return inside, (line,) if count else ()
+    note = f"clamped {count} of {len(times)} times to [0, 1]"
+    return inside, (note,) if count else ()
 
 
 def with_times(path: CameraPath, times: Sequence[float]) -> CameraPath:
-    """Return the path with other scene times, as many as cameras; those outside [0, 1] are clamped,
-    with a note."""
+    """Return the path with other scene times, one per camera, clamped to [0, 1]."""
     if len(times) != len(path):
         raise DyngsError(
-            f"the camera path has {len(path)} cameras, but there are {len(times)} times; give as many"
+            f"the camera path has {len(path)} cameras but {len(times)} times; give one time per "
+            "camera"
         )
     inside, notes = clamp_times(times)
     return replace(path, times=inside, notes=(*path.notes, *notes))
@@ -75,8 +73,7 @@ def pick_cameras(cameras: Cameras, rows: Sequence[int] | np.ndarray) -> Cameras:
 
 
 def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
-    """Return the cameras at another image size: the whole image stays visible, pixels stay
-    square."""
+    """Return the cameras at another image size, with square pixels and the whole image visible."""
     scale = min(width / cameras.width, height / cameras.height)
     intrinsics = cameras.intrinsics.clone()
     intrinsics[:, :2] *= scale
@@ -86,23 +83,23 @@ def resize_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
 
 
 def camera_path_file(path: str) -> Path | None:
-    """Return the JSON file that ``path`` names; None for a path that is placed: orbit, spiral,
+    """Return the JSON file named by ``path``, or None for an automatic path: orbit, spiral,
     along."""
     if path in AUTOMATIC_PATHS:
         return None
     if not path.endswith(".json"):
         names = ", ".join(AUTOMATIC_PATHS)
         raise DyngsError(
-            f"no camera path {path!r}; use {names}, or a .json file (`dyngs docs camera-paths`)"
+            f"unknown camera path {path!r}; use {names}, or a .json file (docs/camera_paths.md)"
         )
     return Path(path)
 
 
 def parse_times(text: str) -> tuple[float, ...]:
-    """Return COUNT evenly spaced times from ``START:STOP:COUNT``, both ends included; a single one
-    is START.
+    """Return COUNT evenly spaced times of ``START:STOP:COUNT``, including both ends.
 
-    Raises DyngsError: ``text`` is anything else.
+    Raises:
+        DyngsError: invalid text.
     """
     try:
         first, last, number = text.split(":")
@@ -111,9 +108,8 @@ def parse_times(text: str) -> tuple[float, ...]:
         start, stop, count = 0.0, 0.0, 0
     if not (math.isfinite(start) and math.isfinite(stop) and 1 <= count <= _MAX_FRAMES):
         raise DyngsError(
-            f"{format_one_line(repr(text), 60)} is no range of times; write START:STOP:COUNT, "
-            "for instance 0:1:60 for 60 "
-            "evenly spaced times"
+            f"{format_one_line(repr(text), 60)}: not a range of times; use START:STOP:COUNT, such as "
+            "0:1:60"
         )
     return tuple(np.linspace(start, stop, count).tolist())
 
@@ -121,13 +117,17 @@ def parse_times(text: str) -> tuple[float, ...]:
 def read_path(
     file: Path, world_offset: np.ndarray | None = None, size: tuple[int, int] | None = None
 ) -> CameraPath:
-    """Read a camera path from a JSON file, see docs/reference/camera-paths.md.
+    """Read a camera path from a JSON file (docs/camera_paths.md). Cameras are float32 on the CPU.
 
-    The file is in the coordinates of the capture, the returned cameras are in the world rebased by
-    ``world_offset`` (3,), ``Capture.world_offset``. ``size``: of the images, for files without one.
+    The file uses the coordinates of the capture. The returned cameras are in the world shifted by
+    ``world_offset``.
+
+    Args:
+        world_offset: (3,), see ``Capture.world_offset``.
+        size: image size for files without one.
 
     Raises:
-        DyngsError: names the file, the frame and the key that is missing or wrong.
+        DyngsError: names the file, the frame and the missing or wrong key.
     """
     document, notes = _as_document(read_json(file), file)
     if size is not None:
@@ -135,13 +135,11 @@ def read_path(
     (name, *others) = [key for key in ("frames", "keyframes") if key in document] or ["frames"]
     frames = document.get(name)
     if others or not isinstance(frames, list) or not frames:
-        raise DyngsError(
-            f"{file}: a camera path needs one non-empty list, 'frames' or 'keyframes'; see docs"
-        )
+        raise DyngsError(f"{file}: a camera path needs one non-empty list, 'frames' or 'keyframes'")
     require_at_most(file, len(frames), _MAX_FRAMES, "cameras")
     first = frames[0] if isinstance(frames[0], dict) else {}
     known = {key: value for key, value in first.items() if key in ("w", "h")} | document
-    # nerfstudio's names of the size, in the file or in its frames
+    # nerfstudio calls the size w and h, in the file or in its frames.
     width = int(_number(known, "width", file, 1, 65536, known.get("w")))
     height = int(_number(known, "height", file, 1, 65536, known.get("h")))
     fps = _number(document, "fps", file, 1e-3, 1000, 30.0)
@@ -151,7 +149,7 @@ def read_path(
         where = f"{file}: {name}[{i}]"
         pose = _read_pose(frame, where)
         if any(frame.get(key) != first.get(key) for key in ("w", "h")):
-            raise DyngsError(f"{where}: all images of a path must have one size; this one differs")
+            raise DyngsError(f"{where}: image size differs from that of the first frame")
         if world_offset is not None:
             pose[:3, 3] += pose[:3, :3] @ world_offset
         poses.append(pose)
@@ -167,27 +165,32 @@ def read_path(
 
 
 def _as_document(found: Any, file: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return the JSON of a path as a document of our own, and notes: also of nerfstudio's
-    camera_path.json and transforms.json, and of 3DGS's cameras.json."""
+    """Return the JSON of a path in our own layout, and notes.
+
+    Also converts nerfstudio's camera_path.json and transforms.json, and 3DGS's cameras.json.
+    """
     if isinstance(found, list):
-        return {"frames": [_frame_of_3dgs(x, f"{file}: [{i}]") for i, x in enumerate(found)]}, ()
+        return {
+            "frames": [_convert_3dgs_frame(x, f"{file}: [{i}]") for i, x in enumerate(found)]
+        }, ()
     if not isinstance(found, dict):
-        raise DyngsError(f"{file}: a camera path is a JSON object; see `dyngs docs camera-paths`")
+        raise DyngsError(f"{file}: must be a JSON object; see docs/camera_paths.md")
     kind = str(found.get("camera_type", found.get("camera_model")))
     panoramic = ("fisheye", "equirectangular", "spherical", "omni", "vr180")
     if any(name in kind.lower() for name in panoramic):
-        raise DyngsError(f"{file}: cameras of a path are pinholes, not {format_one_line(kind, 40)}")
+        raise DyngsError(f"{file}: cameras must be pinholes, not {format_one_line(kind, 40)}")
     if "camera_path" in found:
-        return _of_nerfstudio(found, file), (
-            "nerfstudio's path is taken to be in the coordinates of the capture; its viewer may have turned, shifted "
-            "and scaled them (dataparser_transforms.json)",
+        return _convert_nerfstudio(found, file), (
+            "the nerfstudio path is read in coordinates of the capture; nerfstudio may have used "
+            "others "
+            "(dataparser_transforms.json)",
         )
-    is_bent = any(found.get(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    return found, ("the lens distortion is left out",) if is_bent else ()
+    is_distorted = any(found.get(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    return found, ("lens distortion is ignored",) if is_distorted else ()
 
 
-def _of_nerfstudio(found: dict[str, Any], file: Path) -> dict[str, Any]:
-    """Return the document of a camera_path.json, whose fields of view are vertical, in degrees."""
+def _convert_nerfstudio(found: dict[str, Any], file: Path) -> dict[str, Any]:
+    """Convert a nerfstudio camera_path.json, whose fields of view are vertical, in degrees."""
     height = _number(found, "render_height", file, 1, 65536)
     views = found["camera_path"]
     frames = []
@@ -201,8 +204,8 @@ def _of_nerfstudio(found: dict[str, Any], file: Path) -> dict[str, Any]:
     return {**size, "fps": found.get("fps", 30.0), "frames": frames}
 
 
-def _frame_of_3dgs(view: object, where: str) -> dict[str, Any]:
-    """Return a frame of a cameras.json, which holds places and rotations of cameras in the
+def _convert_3dgs_frame(view: object, where: str) -> dict[str, Any]:
+    """Convert an entry of a 3DGS cameras.json, which stores camera positions and rotations in the
     world."""
     pose = np.eye(4)
     pose[:3, :3] = parse_numbers(
@@ -230,8 +233,10 @@ def _read_pose(frame: object, where: str) -> np.ndarray:
 def _read_intrinsics(
     document: dict[str, Any], frame: dict[str, Any], size: tuple[int, int], where: str
 ) -> np.ndarray:
-    """Return intrinsics (3, 3) in pixels from 'fl_x' [fl_y, cx, cy] or 'camera_angle_x'; keys of
-    the frame first."""
+    """Return intrinsics (3, 3) in pixels from 'fl_x' [fl_y, cx, cy] or 'camera_angle_x'.
+
+    Keys of the frame override those of the document.
+    """
     width, height = size
     focal_keys = {"fl_x", "fl_y", "camera_angle_x"}
     replaced = set() if focal_keys.isdisjoint(frame) else focal_keys
@@ -259,22 +264,20 @@ def _number(
     value = keys.get(key, default)
     if not is_number(value) or not low <= value <= high:
         problem = "is missing" if value is None else f"is {format_one_line(repr(value), 60)}"
-        raise DyngsError(
-            f"{where}: '{key}' {problem}; it must be a number from {low:g} to {high:g}"
-        )
+        raise DyngsError(f"{where}: '{key}' {problem}; must be a number from {low:g} to {high:g}")
     return float(value)
 
 
 def _numbers_of_all(
     frames: list[dict[str, Any]], key: str, most: float, where: str
 ) -> np.ndarray | None:
-    """Return the numbers (F,) at ``key`` in each of ``frames``; None if none has it."""
+    """Return the numbers (F,) at ``key`` in each of ``frames``, or None if no frame has the key."""
     if not any(key in frame for frame in frames):
         return None
     return np.array([_number(x, key, f"{where}[{i}]", -most, most) for i, x in enumerate(frames)])
 
 
-# Keyframes: cameras that the path passes through.
+# Keyframes
 
 
 @dataclass(frozen=True)
@@ -286,8 +289,7 @@ class Keyframes:
         intrinsics: (K, 3, 3) in pixels, positive focal lengths.
         seconds: (K,) strictly increasing.
         times: (K,) scene times, or None for a static scene.
-        period: seconds after which a loop is back at the first keyframe, more than the keyframes
-            span; None: no loop.
+        period: seconds of a loop, longer than the span of the keyframes. None without a loop.
     """
 
     cam_from_world: np.ndarray
@@ -300,8 +302,10 @@ class Keyframes:
 def _with_seconds(
     keys: Keyframes, document: dict[str, Any], fps: float, file: Path
 ) -> tuple[Keyframes, int]:
-    """Return keyframes with seconds and period, and the number of frames, by 'at', 'num_frames',
-    'seconds', 'loop'."""
+    """Return keyframes with seconds and period, and the number of frames.
+
+    They are derived from the keys 'at', 'num_frames', 'seconds' and 'loop'.
+    """
     loops = document.get("loop") is True
     num_frames = None
     if "num_frames" in document:
@@ -317,11 +321,11 @@ def _with_seconds(
     span = float(at[-1] - at[0])
     period = None
     if loops:
-        way_back = span / (count - 1) if count > 1 else 1.0
-        period = num_frames / fps if num_frames else span + way_back
+        return_seconds = span / (count - 1) if count > 1 else 1.0
+        period = num_frames / fps if num_frames else span + return_seconds
     if at[0] < 0 or (np.diff(at) <= 0).any() or (period is not None and period <= span):
         raise DyngsError(
-            f"{file}: each keyframe must be 'at' a later second than the one before, and before a loop ends"
+            f"{file}: 'at' of keyframes must increase, and stay below the length of a loop"
         )
     if num_frames is None:
         num_frames = round(at[-1] * fps) + 1 if period is None else max(1, round(period * fps))
@@ -332,13 +336,12 @@ def _with_seconds(
 def interpolate_keyframes(keys: Keyframes, seconds: np.ndarray) -> Keyframes:
     """Return camera and scene time at each of ``seconds``; exact at the keyframes.
 
-    Rotations are interpolated the shorter way by slerp (Shoemake 1985). Centres follow a cubic
-    Hermite curve with Catmull-Rom tangents for non-uniform knots, with continuous velocity; a
-    tangent is shortened where the camera (nearly) rests on one side of a keyframe, so that equal
-    keyframes give a fixed camera. Focal lengths are interpolated geometrically, the principal point
-    and the scene time linearly.
+    Rotations use slerp (Shoemake 1985). Centres follow a cubic Hermite curve with non-uniform
+    Catmull-Rom tangents. Tangents are shortened next to (nearly) equal keyframes, so that a fixed
+    camera stays fixed. Focal lengths are interpolated geometrically, principal point and scene time
+    linearly.
 
-    Before the first and after the last of K >= 1 keyframes the camera rests, a loop repeats.
+    Outside the keyframes the camera stays at the first or last one, or a loop repeats.
     """
     from scipy.interpolate import CubicHermiteSpline
     from scipy.spatial.transform import Rotation, Slerp
@@ -357,33 +360,35 @@ def interpolate_keyframes(keys: Keyframes, seconds: np.ndarray) -> Keyframes:
     pose = keys.cam_from_world[index]
     centers = -np.einsum("kji,kj->ki", pose[:, :3, :3], pose[:, :3, 3])
     eyes = CubicHermiteSpline(knots, centers, _tangents(knots, centers))(t)
-    made = np.tile(np.eye(4), (len(t), 1, 1))
-    made[:, :3, :3] = Slerp(knots, Rotation.from_matrix(pose[:, :3, :3]))(t).as_matrix()
-    made[:, :3, 3] = -np.einsum("fij,fj->fi", made[:, :3, :3], eyes)
+    poses = np.tile(np.eye(4), (len(t), 1, 1))
+    poses[:, :3, :3] = Slerp(knots, Rotation.from_matrix(pose[:, :3, :3]))(t).as_matrix()
+    poses[:, :3, 3] = -np.einsum("fij,fj->fi", poses[:, :3, :3], eyes)
     intrinsics = np.tile(np.eye(3), (len(t), 1, 1))
     for axis in (0, 1):
         focal = np.log(keys.intrinsics[index, axis, axis])
         intrinsics[:, axis, axis] = np.exp(np.interp(t, knots, focal))
         intrinsics[:, axis, 2] = np.interp(t, knots, keys.intrinsics[index, axis, 2])
     times = None if keys.times is None else np.interp(t, knots, keys.times[index])
-    return Keyframes(made, intrinsics, np.asarray(seconds), times)
+    return Keyframes(poses, intrinsics, np.asarray(seconds), times)
 
 
 def _tangents(knots: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the velocities (K, 3) of the curve through points (K, 3) at K >= 2 knots: at most
-    three times as fast as the slower of the two neighbouring intervals."""
+    """Return the velocities (K, 3) of the curve through points (K, 3) at K >= 2 knots.
+
+    They are at most three times the slower speed of the two neighbouring intervals.
+    """
     steps = np.diff(knots)[:, None]
     slopes = np.diff(points, axis=0) / steps
     tangents = np.empty_like(points)
     tangents[1:-1] = (slopes[:-1] * steps[1:] + slopes[1:] * steps[:-1]) / (steps[1:] + steps[:-1])
     speeds = np.linalg.norm(slopes, axis=1)
-    tangents[1:-1] = _shortened(tangents[1:-1], np.minimum(speeds[:-1], speeds[1:]))
+    tangents[1:-1] = _limit_speed(tangents[1:-1], np.minimum(speeds[:-1], speeds[1:]))
     inner = tangents[[1, -2]] if len(points) > 2 else slopes[[0, 0]]
-    # The ends are those of the parabola with the inner tangent.
-    tangents[[0, -1]] = _shortened(2 * slopes[[0, -1]] - inner, speeds[[0, -1]])
+    # At the ends, use the parabola with the inner tangent.
+    tangents[[0, -1]] = _limit_speed(2 * slopes[[0, -1]] - inner, speeds[[0, -1]])
     return tangents
 
 
-def _shortened(vectors: np.ndarray, speeds: np.ndarray) -> np.ndarray:
+def _limit_speed(vectors: np.ndarray, speeds: np.ndarray) -> np.ndarray:
     length = np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)
     return vectors * np.minimum(3.0 * speeds / length, 1.0)[:, None]

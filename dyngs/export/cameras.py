@@ -1,5 +1,4 @@
-"""Cameras of a run as a transforms.json: those of training as training found them, the others by
-the capture."""
+"""Export of the cameras of a run as transforms.json, with the poses refined by training."""
 
 from __future__ import annotations
 
@@ -25,12 +24,17 @@ def write_cameras(
     splits: Mapping[Split, Sequence[View]],
     world: Similarity | None = None,
 ) -> Path:
-    """Write cameras of train, val and test in nerfstudio's layout, and the capture's points; return
-    ``path``.
+    """Write the cameras of train, val and test in nerfstudio's layout, and the points of the
+    capture.
 
-    ``file_path`` is the way to the images from the folder of ``path``. Poses are moved by
-    ``world``; without it they are in the world of the capture's files. Coefficients of distortion
-    are those of the capture.
+    ``file_path`` entries are relative to the folder of ``path``. Lens distortion is that of the
+    capture.
+
+    Args:
+        world: transform of the poses. None uses the world of the capture's files.
+
+    Returns:
+        ``path``.
     """
     for out in (path, path.with_name(POINTS_NAME)):
         collect_inputs(capture).require_output(out)
@@ -55,7 +59,7 @@ def write_cameras(
 
 
 def _frame(view: View, folder: Path, capture: Capture, world: Similarity) -> dict[str, object]:
-    """Return the entry of a view; its files are named as seen from ``folder``."""
+    """Return the entry of a view, with file paths relative to ``folder``."""
     pose = to_opengl_pose(view.cam_from_world)
     pose[:3, :3] = world.rotation @ pose[:3, :3]
     pose[:3, 3] = world.points(pose[:3, 3])
@@ -75,7 +79,7 @@ def _frame(view: View, folder: Path, capture: Capture, world: Similarity) -> dic
         mask: view.motion_mask_path,
     }
     return {
-        "file_path": _way(view.image_path, folder),
+        "file_path": _relative_path(view.image_path, folder),
         "transform_matrix": pose.tolist(),
         "fl_x": float(matrix[0, 0]),
         "fl_y": float(matrix[1, 1]),
@@ -88,13 +92,13 @@ def _frame(view: View, folder: Path, capture: Capture, world: Similarity) -> dic
         **dict(zip(names, lens.params, strict=False)),
         **({} if view.time is None else {"time": first + view.time * (last - first)}),
         **({} if view.frame is None else {"frame": view.frame}),
-        **{key: _way(file, folder) for key, file in files.items() if file is not None},
+        **{key: _relative_path(file, folder) for key, file in files.items() if file is not None},
     }
 
 
-def _way(file: Path, folder: Path) -> str:
-    """Return the way from ``folder`` to ``file``; the whole path where there is none, as between
-    two drives."""
+def _relative_path(file: Path, folder: Path) -> str:
+    """Return ``file`` relative to ``folder``, or its absolute path if they are on different
+    drives."""
     file = Path(os.path.abspath(file))
     try:
         return os.path.relpath(file, folder).replace(os.sep, "/")

@@ -1,5 +1,4 @@
-"""The camera path of a command: placed by cameras, a person or points, read from a file, or the
-camera of one view."""
+"""Choice of the camera path of a command: automatic, from a file, or the camera of one view."""
 
 from __future__ import annotations
 
@@ -31,35 +30,35 @@ from dyngs.models.views import training_cameras
 from dyngs.runs.opened import OpenedScene, cameras_for_paths, split_views
 
 DEFAULT_FRAMES = 120
-DEFAULT_SIZE = (960, 720)
-_RING = 24  # cameras around a scene, among which the one in front of a person is looked for
+DEFAULT_SIZE = (960, 720)  # Image size in pixels for scenes without a capture
+_RING = 24  # Cameras around a scene, one of which faces a person
 
 
 @dataclass(frozen=True)
 class PathOptions:
     """Cameras and times to render."""
 
-    # "orbit", "spiral", "along" (the training cameras), a JSON file of cameras
-    # (docs/reference/camera-paths.md), or None: one fixed camera
+    # "orbit", "spiral", "along" (the training cameras), a JSON file (docs/camera_paths.md), or
+    # None for one fixed camera
     path: str | None = "orbit"
-    # frames of a path that is not a file; None: as many as a motion has, else 120
+    # frames of an automatic path; None uses the frames of a motion, else 120
     num_frames: int | None = None
-    # width and height in pixels; None: that of the images, of the JSON, or 960x720 for a file
+    # width and height in pixels; None uses that of the images or of the JSON, else 960x720
     size: tuple[int, int] | None = None
-    # scene times of the frames, or a single one for all. None: those of the JSON; otherwise that of
-    # the view for a fixed camera, from 0 to 1 along a path
+    # scene times of the frames, or one for all; None uses those of the JSON, that of the view for
+    # a fixed camera, else 0 to 1 along the path
     times: tuple[float, ...] | None = None
-    # the view of the fixed camera: its name, the name of its image, or its number from 0
+    # view of the fixed camera: its name, the name of its image, or its index
     view: str | None = None
-    split: str | None = None  # split of that view; None: test, or val or train if there is none
+    split: str | None = None  # split of that view; None uses test, else val, else train
 
 
 def choose_path(opened: OpenedScene, options: PathOptions) -> CameraPath:
-    """Return the cameras and times along which a scene is rendered, with notes about defaults that
-    were chosen.
+    """Return the cameras and times to render, with notes about chosen defaults.
 
-    Raises DyngsError: a missing capture, no such view, an invalid path file, times that do not fit
-    its frames, or what a file cannot have.
+    Raises:
+        DyngsError: a missing capture, an unknown view, an invalid path file, or times that do not
+            match its frames.
     """
     scene = opened.renderable
     times = options.times
@@ -69,15 +68,16 @@ def choose_path(opened: OpenedScene, options: PathOptions) -> CameraPath:
     ):
         file = opened.config.data.root
         raise DyngsError(
-            f"{file}: a {file.suffix.lower()} holds one time and no views; leave out --path along, --time, --times "
-            "and --view"
+            f"{file}: a {file.suffix.lower()} has no times and no views; remove --path along, "
+            "--time, "
+            "--times and --view"
         )
     if options.path is None:
         path = _fixed_camera(opened, options)
     else:
         file = camera_path_file(options.path)
         if file is None:
-            path = _placed(opened, options.path, options)
+            path = _automatic_path(opened, options.path, options)
         else:
             path = read_path(file, opened.world_offset, options.size)
             path = replace(path, cameras=opened.frame.inverse().cameras(path.cameras))
@@ -85,12 +85,12 @@ def choose_path(opened: OpenedScene, options: PathOptions) -> CameraPath:
             path = with_times(path, times * len(path) if len(times) == 1 else times)
     notes = path.notes
     if scene.is_static and times is not None:
-        notes = (*notes, "nothing moves in this run: it looks the same at all times")
+        notes = (*notes, "static scene: --time and --times have no effect")
     elif not scene.is_static and path.times is None:
         path = with_times(path, np.linspace(0, 1, len(path)).tolist())
         notes = (
             *notes,
-            "time runs from 0 to 1 along the path; --time or --times choose other times",
+            "scene time runs from 0 to 1 along the path; change with --time or --times",
         )
     if options.size is not None:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
@@ -98,11 +98,16 @@ def choose_path(opened: OpenedScene, options: PathOptions) -> CameraPath:
 
 
 def select_view(capture: Capture, name: str | None = None, split: str | None = None) -> View:
-    """Return the view called ``name``, by default the first one.
+    """Return the view called ``name``, or the first one.
 
-    ``name``: of a view, of its image as written by ``dyngs render RUN``, or its number in the
-    split, from 0. ``split``: None looks for a name in all, for a number in the first that has
-    views. Raises DyngsError: no such view or split.
+    Args:
+        name: name of the view, name of its image as written by ``dyngs render RUN``, or its index
+            in the split.
+        split: None searches names in all splits, and uses an index in the first split that has
+            views.
+
+    Raises:
+        DyngsError: no such view or split.
     """
     order = [split] if split else [s for s in ("test", "val", "train") if capture.splits.get(s)]
     candidates = [split_views(capture, s) for s in order]
@@ -116,18 +121,18 @@ def select_view(capture: Capture, name: str | None = None, split: str | None = N
     if name.isascii() and name.isdigit() and len(name) < 10 and int(name) < len(first):
         return first[int(name)]
     raise DyngsError(
-        f"{capture.root}: no view {name!r}; the split {order[0]} has {len(first)} views: {first[0].name} (0) to "
-        f"{first[-1].name} ({len(first) - 1})"
+        f"{capture.root}: unknown view {name!r}; split {order[0]} has {len(first)} views, "
+        f"{first[0].name} (0) to {first[-1].name} ({len(first) - 1})"
     )
 
 
 def orbit_cameras_around(
     opened: OpenedScene, count: int, size: tuple[int, int] = DEFAULT_SIZE
 ) -> Cameras:
-    """Return ``count`` cameras with images of ``size`` on a circle around a scene, a person in all
-    of their motion.
+    """Return ``count`` cameras on a circle around a scene, which see a person in all of their
+    motion.
 
-    z is up where nothing says what is.
+    The up axis is z if the scene has none.
     """
     scene = opened.renderable
     moves = opened.person is not None and not scene.is_static
@@ -141,14 +146,13 @@ def orbit_cameras_around(
 
 
 def framing_points(scene: Renderable, time: float | None = None) -> Tensor:
-    """Return the points (K, 3) that a camera is placed by: the Gaussians, or the corners of the box
-    of all else."""
+    """Return points (K, 3) to frame a scene: means of Gaussians, or corners of the bounding box."""
     return scene.at(time).means if isinstance(scene, GaussianScene) else scene.bounds
 
 
 def frontal_cameras(opened: OpenedScene, size: tuple[int, int] = DEFAULT_SIZE) -> Cameras:
-    """Return three neighbours on a circle around a scene, of which the second sees a person's
-    front."""
+    """Return three neighbouring cameras on a circle around a scene. The second one faces a
+    person."""
     ring = orbit_cameras_around(opened, _RING, size)
     front = 0
     person = as_human_scene(opened.renderable)
@@ -170,9 +174,8 @@ def _fixed_camera(opened: OpenedScene, options: PathOptions) -> CameraPath:
     return with_times(CameraPath(pick_cameras(camera, [0] * len(times))), times)
 
 
-def _placed(opened: OpenedScene, name: str, options: PathOptions) -> CameraPath:
-    """Return the path called ``name`` (orbit, spiral, along), placed by the training cameras or by
-    the scene."""
+def _automatic_path(opened: OpenedScene, name: str, options: PathOptions) -> CameraPath:
+    """Return the orbit, spiral or along path, placed by the training cameras or the scene."""
     scene = opened.renderable
     frames = options.num_frames or (DEFAULT_FRAMES if opened.fps is None else len(scene.times))
     up = None if opened.stated_up is None else opened.direction_of(opened.stated_up)
@@ -194,5 +197,5 @@ def _placed(opened: OpenedScene, name: str, options: PathOptions) -> CameraPath:
         return path
     around = orbit_cameras_around(opened, frames, (cameras.width, cameras.height))
     return CameraPath(
-        around, notes=("the person was filmed from one side: the orbit goes all around them",)
+        around, notes=("the person was captured from one side; the orbit is a full circle",)
     )

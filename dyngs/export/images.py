@@ -1,4 +1,5 @@
-"""Rendered images, contact sheets, and the images of a capture drawn anew."""
+"""Rendered images and videos, contact sheets, and comparison of exported files with their
+source."""
 
 from __future__ import annotations
 
@@ -34,11 +35,11 @@ from dyngs.runs.opened import OpenedScene, split_views
 
 @dataclass(frozen=True)
 class DrawnImage:
-    """One rendered image, float32."""
+    """A rendered image, float32."""
 
-    rgb: np.ndarray  # (H, W, 3), composited on the background, clamped to [0, 1]
+    rgb: np.ndarray  # (H, W, 3) on the background, clamped to [0, 1]
     alpha: np.ndarray  # (H, W) in [0, 1]
-    # (H, W) expected depth, 0 where nothing is hit; None if it was not rendered
+    # (H, W) expected depth, 0 for empty pixels; None if not rendered
     depth: np.ndarray | None
 
 
@@ -60,10 +61,12 @@ def render_frame(
     time: float | TimeStep | None = None,
     options: DrawOptions | None = None,
 ) -> DrawnImage:
-    """Render one camera, without gradients.
+    """Render one camera without gradients.
 
-    ``time``: in [0, 1], or the scene at that time, so that it is not computed again. ``options``:
-    None: those of the scene; ``depth`` other than "none" fills ``DrawnImage.depth``.
+    Args:
+        time: scene time in [0, 1], or a precomputed time step.
+        options: render options. None uses those of the scene. ``depth`` other than "none" adds
+            depth.
     """
     with torch.no_grad():
         rendering = scene.render(camera, time, options=options)
@@ -76,19 +79,18 @@ def render_frame(
 def render_path(
     scene: Renderable, path: CameraPath, options: DrawOptions | None = None
 ) -> Iterator[DrawnImage]:
-    """Yield the frames along a path one by one, so that memory does not grow with their number.
+    """Yield the frames along a path, one at a time.
 
-    The scene is deformed only where the time differs from that of the frame before. A path without
-    times shows time 0.
+    The scene is deformed again only if the time changes. A path without times uses time 0.
     """
-    moment, moment_time = None, None
+    time_step, step_time = None, None
     for i in range(len(path)):
         time = None if path.times is None or scene.is_static else path.times[i]
-        if moment is None or time != moment_time:
+        if time_step is None or time != step_time:
             with torch.no_grad():
-                moment = scene.time_step(time)
-            moment_time = time
-        yield render_frame(scene, path.cameras.select(i), moment, options)
+                time_step = scene.time_step(time)
+            step_time = time
+        yield render_frame(scene, path.cameras.select(i), time_step, options)
 
 
 def write_path_images(
@@ -96,19 +98,23 @@ def write_path_images(
     path: CameraPath,
     out_dir: Path | None,
     output: OutputOptions = OutputOptions(),
-    report: ProgressCallback = ignore_progress,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> list[Path]:
-    """Render a scene along a path to ``frame_0000.png`` and so on, and to a video if requested;
-    return the paths.
+    """Render a scene along a path to ``frame_0000.png`` etc. and to a video. Return the paths.
 
-    ``out_dir``: None writes only the video. Images of the capture are not overwritten; depth
-    colours have the range of the first frame. Raises DyngsError: no cameras, nothing to write, or
-    a file cannot be written.
+    Depth colours of all frames use the range of the first frame.
+
+    Args:
+        out_dir: folder of the images. None writes only the video.
+        on_progress: receives the number of frames.
+
+    Raises:
+        DyngsError: no cameras, no output, or a file cannot be written.
     """
     if len(path) == 0:
         raise DyngsError("the camera path has no cameras")
     if out_dir is None and output.video is None:
-        raise DyngsError("nothing to write: give a folder for the images or a video file")
+        raise DyngsError("no output: give a folder for images or a video file")
     scene = opened.renderable
     options = _with_depth(scene, output)
     digits = max(4, len(str(len(path) - 1)))
@@ -116,7 +122,7 @@ def write_path_images(
     def frames() -> Iterator[tuple[str, DrawnImage]]:
         for i, frame in enumerate(render_path(scene, path, options)):
             yield f"frame_{i:0{digits}d}", frame
-            report("frames", i + 1, len(path))
+            on_progress("frames", i + 1, len(path))
 
     return _write_images(opened, frames(), out_dir, output, one_range=True)
 
@@ -126,15 +132,19 @@ def write_split_images(
     split: str,
     out_dir: Path,
     output: OutputOptions = OutputOptions(),
-    report: ProgressCallback = ignore_progress,
+    on_progress: ProgressCallback = ignore_progress,
     device: torch.device = CPU,
 ) -> list[Path]:
-    """Render a split of a run to ``NAME.png`` per view and ``sheet.png`` (truth, render, error);
-    return the paths.
+    """Render a split of a run to ``NAME.png`` per view and ``sheet.png`` (truth, render, error).
 
-    The sheet shows at most 12 views, evenly spread, with their PSNR; masked pixels are black. The
-    background is that of ``opened``, behind truth and render. Raises DyngsError: no such split,
-    unreadable images, or a video of several sizes.
+    The sheet shows at most 12 evenly spread views with their PSNR. Masked pixels are black. The
+    background is that of ``opened``, behind truth and render.
+
+    Returns:
+        the paths of the written files.
+
+    Raises:
+        DyngsError: unknown split, unreadable images, or a video of images with several sizes.
     """
     views = split_views(opened.capture, split)
     loader = ImageLoader(views, opened.config.data)
@@ -148,12 +158,12 @@ def write_split_images(
             image = loader[i]
             frame = render_frame(scene, image.cameras, image.time, options)
             yield stem, frame
-            report("views", i + 1, len(views))
+            on_progress("views", i + 1, len(views))
             if i in shown:
                 truth = image.composite(opened.background)
                 rendered = torch.from_numpy(frame.rgb)
                 label = f"{psnr(rendered, truth, image.mask):.2f} dB  {image.name}"
-                # masked pixels show no error
+                # Masked pixels have no error.
                 counts = 1.0 if image.mask is None else image.mask[..., None]
                 rows.append((label, (truth * counts).numpy(), (rendered * counts).numpy()))
 
@@ -169,11 +179,10 @@ def _with_depth(scene: Renderable, output: OutputOptions) -> DrawOptions:
 
 
 def file_stems(names: Sequence[str]) -> list[str]:
-    """Return safe and unique file names, without suffix, for the names of views.
+    """Return safe, unique file names without suffix for the names of views.
 
-    Folders that all names share are dropped, other folders become a prefix (``left/0001`` is
-    ``left_0001``). Parts such as ``..`` and special characters are replaced, so that no name leaves
-    the output folder.
+    Common folders are dropped and other folders become prefixes (``left/0001`` is ``left_0001``).
+    Special characters and parts such as ``..`` are replaced, so files stay in the output folder.
     """
     parts = []
     for name in names:
@@ -186,7 +195,7 @@ def file_stems(names: Sequence[str]) -> list[str]:
     for part in parts:
         stem = base = "_".join(part)
         number = 1
-        # in lower case because some file systems ignore case
+        # Compare in lower case, since some file systems ignore case.
         while stem.lower() in taken:
             number += 1
             stem = f"{base}_{number}"
@@ -203,8 +212,11 @@ def _write_images(
     *,
     one_range: bool = False,
 ) -> list[Path]:
-    """Write named frames as images and a video; return the paths. ``one_range``: depth colours of
-    all frames have the range of the first one."""
+    """Write named frames as images and a video. Return the paths.
+
+    Args:
+        one_range: depth colours of all frames use the range of the first frame.
+    """
     limits = None
     inputs = collect_inputs(opened)
     for out in (out_dir, output.video):
@@ -240,10 +252,12 @@ def _write_images(
 def contact_sheet(rows: Sequence[tuple[str, np.ndarray, np.ndarray]]) -> np.ndarray:
     """Return a sheet (H', W', 3) uint8 with truth, render and error side by side, one view per row.
 
-    ``rows``: a label, truth and render, (H, W, 3) of the same size, uint8 or float in [0, 1]. The
-    error is the mean absolute difference of the channels times 5, in magma colours (black = equal).
-    Images wider than 480 pixels are shrunk, after the difference was taken; captions are cut off
-    where an image is narrower.
+    The error is the mean absolute channel difference times 5 in magma colours. Images wider than
+    480 px are downscaled after computing the difference. Captions are cut to the width of the
+    image.
+
+    Args:
+        rows: label, truth and render, (H, W, 3) of equal size, uint8 or float in [0, 1].
     """
     from PIL import Image, ImageDraw
 
@@ -279,10 +293,10 @@ def contact_sheet(rows: Sequence[tuple[str, np.ndarray, np.ndarray]]) -> np.ndar
 
 
 def _depth_limits(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float]:
-    """Return near and far for ``depth_to_rgb``: the 1st and 99th percentile of depth where alpha is
-    at least 0.5.
+    """Return near and far of depth colours: the 1st and 99th percentile of depth where alpha >=
+    0.5.
 
-    Any equal shapes, so that the frames of a video can share limits. (0, 1) if nothing is opaque.
+    (0, 1) if no pixel is opaque.
     """
     seen = depth[(alpha >= 0.5) & np.isfinite(depth)]
     if not seen.size:
@@ -294,11 +308,12 @@ def _depth_limits(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float]:
 def depth_to_rgb(
     depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float] | None = None
 ) -> np.ndarray:
-    """Return depth as colours (H, W, 3) uint8: near is red, far is blue (turbo), darkened to black
-    where alpha is 0.
+    """Return depth as colours (H, W, 3) uint8, from red (near) to blue (far), multiplied by alpha.
 
-    ``depth``: (H, W) expected depth in world units; non-finite values count as far. ``alpha``: (H,
-    W) in [0, 1]. ``limits``: near and far; None: those of this image.
+    Args:
+        depth: (H, W) expected depth in world units. Non-finite values count as far.
+        alpha: (H, W) in [0, 1].
+        limits: near and far. None uses the range of this image.
     """
     near, far = limits or _depth_limits(depth, alpha)
     finite = np.nan_to_num(depth, nan=far, posinf=far, neginf=near)
@@ -308,30 +323,32 @@ def depth_to_rgb(
 
 
 def color_map(values: np.ndarray, name: str) -> np.ndarray:
-    """Return colours (H, W, 3) uint8 of values (H, W) in [0, 1], by a colour map of OpenImageIO
-    (magma, turbo...)."""
+    """Return colours (H, W, 3) uint8 of values (H, W) in [0, 1], by a colour map of OpenImageIO."""
     import OpenImageIO as oiio
 
     clipped = np.clip(values, 0.0, 1.0)[..., None]
     source = oiio.ImageBuf(np.ascontiguousarray(clipped, dtype=np.float32))
     colored = oiio.ImageBufAlgo.color_map(source, 0, name)
-    linear = np.asarray(colored.get_pixels(oiio.FLOAT))[..., :3]  # tables are in linear light
+    linear = np.asarray(colored.get_pixels(oiio.FLOAT))[..., :3]  # colour tables are linear
     return to_uint8(encode_srgb(np.clip(linear, 0.0, 1.0)))
 
 
 def compare_file_with_run(
     opened: OpenedScene, scene: GaussianScene, time: float, meant: SplatFile, read: SplatFile
 ) -> float:
-    """Return the PSNR, dB, of a file and a scene at one time, seen by four cameras of its capture,
-    else from an orbit; 100 where they are equal.
+    """Return the PSNR in dB between renderings of a file and of its scene; 100 if equal.
 
-    ``time``: in [0, 1]. ``meant``: what the file is meant to hold, turned from the axes of the
-    scene.
+    Uses four cameras of the capture, or an orbit.
+
+    Args:
+        time: scene time in [0, 1].
+        meant: intended content of the file, in its axes.
+        read: content read from the file.
     """
     frame = meant.frame.after(opened.file_unit)
     cameras = opened.cameras
     if cameras is None:
-        cameras = frame.inverse().cameras(_around(meant))
+        cameras = frame.inverse().cameras(_orbit_of_file(meant))
     else:
         rows = np.unique(np.linspace(0, len(cameras) - 1, 4).round().astype(int))
         fraction = min(1.0, 240 / max(cameras.width, cameras.height))
@@ -343,11 +360,12 @@ def compare_file_with_run(
 
 
 def compare_file_with_source(splat: SplatFile, written: WrittenFile) -> float:
-    """Return the PSNR, dB, of a file and what it was converted from, seen from an orbit.
+    """Return the PSNR in dB between renderings of a converted file and its source on an orbit.
 
-    Raises DyngsError: the file cannot be read.
+    Raises:
+        DyngsError: the file cannot be read.
     """
-    cameras = _around(splat)
+    cameras = _orbit_of_file(splat)
     moved = written.splat.frame.after(splat.frame.inverse())
     options = file_render_options(splat)
     black = torch.zeros_like(splat.gaussians.means[0])
@@ -358,7 +376,7 @@ def compare_file_with_source(splat: SplatFile, written: WrittenFile) -> float:
 
 
 def _compare(wanted: Tensor, cameras: Cameras, splat: SplatFile, near: float) -> float:
-    """Return how what a file holds, seen by cameras in its axes, differs from images (V, H, W,
+    """Return the PSNR between a file rendered from ``cameras`` and images ``wanted`` (V, H, W,
     3)."""
     options = replace(splat_options(splat), near=near)
     with torch.no_grad():
@@ -366,7 +384,7 @@ def _compare(wanted: Tensor, cameras: Cameras, splat: SplatFile, near: float) ->
     return float(np.mean([psnr(a, b) for a, b in zip(drawn, wanted, strict=True)]))
 
 
-def _around(splat: SplatFile) -> Cameras:
-    """Return an orbit around Gaussians, in their own axes."""
+def _orbit_of_file(splat: SplatFile) -> Cameras:
+    """Return an orbit around the Gaussians of a file, in its axes."""
     means = splat.gaussians.means.numpy()
     return frame_orbit_for_points(means, 4, (240, 180), AXES[splat.up or "z"])

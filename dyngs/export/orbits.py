@@ -1,4 +1,4 @@
-"""Camera paths that are placed by the cameras of a capture or by points: orbit, spiral, along."""
+"""Automatic camera paths: orbit, spiral, and along the training cameras."""
 
 from __future__ import annotations
 
@@ -27,13 +27,15 @@ from dyngs.export.camera_paths import CameraPath
 def orbit_path(
     cameras: Cameras, num_frames: int, up: np.ndarray | None = None
 ) -> tuple[CameraPath, bool]:
-    """Return a path on a level circle around the point that V >= 1 ``cameras`` look at, and whether
-    they stand all around it.
+    """Return a level circle around the point that V >= 1 ``cameras`` look at, and whether they
+    surround it.
 
-    ``up`` (3,) is the axis. Radius and height are means over the cameras; intrinsics, and the
-    azimuth of frame 0, are those of the first. Cameras on an arc, with nobody behind: the path
-    swings from its middle to one end, to the other, and back, at the radius and height of the
-    cameras near. A note says so.
+    Radius and height are means over the cameras. Intrinsics and the azimuth of frame 0 are those of
+    the first camera. If the cameras cover only an arc, the path swings along the arc and back, at
+    the radius and height of nearby cameras, and has a note.
+
+    Args:
+        up: (3,) axis of the circle. None estimates it from the cameras.
     """
     poses = world_from_cam(cameras)
     center = estimate_focus(cameras)
@@ -47,13 +49,13 @@ def orbit_path(
     axis_x = unit(flat[beside[0]]) if len(beside) else perpendicular(up)
     angles = np.arctan2(flat @ np.cross(up, axis_x), flat @ axis_x)
     middle, width = _arc(angles[beside]) if len(beside) else (0.0, None)
-    azimuths = _turn(num_frames)
+    azimuths = _full_circle(num_frames)
     smallest = 0.1 * float(np.hypot(radii, heights).mean())
     notes = ()
     if width is None:
         near = np.full((num_frames, len(poses)), 1 / len(poses))
     else:
-        # A capture from one place: the camera would stand still otherwise.
+        # Otherwise the camera would not move for a capture from a single position.
         narrowest = math.radians(10)
         swing = 0.5 * max(width, narrowest) * np.sin(azimuths)
         apart = swing[:, None] - ((angles - middle + np.pi) % (2 * np.pi) - np.pi)
@@ -61,13 +63,9 @@ def orbit_path(
         near /= near.sum(axis=1, keepdims=True)
         azimuths = swing + middle
         degrees = round(math.degrees(width))
-        notes = (
-            f"the capture was filmed from an arc of {degrees} degrees: the orbit swings along it and back",
-        )
+        notes = (f"cameras cover an arc of {degrees} degrees: the orbit swings along it and back",)
     if fraction_in_front(poses, center) < 0.5:
-        notes = (
-            "the cameras look outwards, an orbit shows little of that: --path along follows them",
-        )
+        notes = ("cameras look outwards: consider --path along instead of an orbit",)
     heights = near @ heights
     radii = np.maximum(near @ radii, smallest)
     made = _on_circle(cameras, center, up, axis_x, azimuths, radii, heights)
@@ -75,12 +73,14 @@ def orbit_path(
 
 
 def _arc(angles: np.ndarray) -> tuple[float, float | None]:
-    """Return middle and width of the smallest arc that holds ``angles`` (V,), radians; no width:
-    they go all around."""
+    """Return middle and width of the smallest arc containing ``angles`` (V,), in radians.
+
+    The width is None if the angles cover the full circle.
+    """
     order = np.sort(angles)
     gaps = np.diff(np.append(order, order[0] + 2 * np.pi))
     widest = int(gaps.argmax())
-    # A ring of few cameras has even gaps; from a wider one nobody has seen the scene.
+    # A full ring of few cameras has large but even gaps.
     is_even = len(order) > 1 and gaps[widest] <= 1.3 * 2 * np.pi / len(order)
     if gaps[widest] <= math.radians(100) or is_even:
         return 0.0, None
@@ -88,8 +88,8 @@ def _arc(angles: np.ndarray) -> tuple[float, float | None]:
     return float(order[(widest + 1) % len(order)] + 0.5 * width), float(width)
 
 
-def _turn(num_frames: int) -> np.ndarray:
-    """Return the angles (F,) of one turn, radians."""
+def _full_circle(num_frames: int) -> np.ndarray:
+    """Return the angles (F,) of a full circle in radians."""
     return 2 * np.pi * np.arange(num_frames) / max(num_frames, 1)
 
 
@@ -102,7 +102,7 @@ def _on_circle(
     radii: np.ndarray | float,
     heights: np.ndarray | float,
 ) -> Cameras:
-    """Return cameras at cylinder coordinates (F,) around ``center``, which they look at."""
+    """Return cameras at cylindrical coordinates (F,) around ``center``, looking at it."""
     flat = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=-1) @ [axis_x, np.cross(up, axis_x)]
     high = np.broadcast_to(heights, azimuths.shape)[:, None] * up
     wide = np.broadcast_to(radii, azimuths.shape)[:, None] * flat
@@ -114,11 +114,11 @@ def _looking_at(cameras: Cameras, eyes: np.ndarray, target: np.ndarray, up: np.n
 
 
 def spiral_path(cameras: Cameras, num_frames: int, up: np.ndarray | None = None) -> Cameras:
-    """Return cameras on a closed spiral in front of a scene seen from one side, as in LLFF.
+    """Return cameras on a closed spiral in front of a scene captured from one side, as in LLFF.
 
-    The spiral is centred on the mean of V >= 1 cameras, which roughly face one way, and as wide as
-    the 90% quantile of their distances from it; all cameras look at the same point. It makes two
-    circles, and moves by half its width along the viewing axis.
+    The spiral is centred on the mean of V >= 1 cameras. Its width is the 90% quantile of their
+    distances from it. All cameras look at the same point. It has two circles and moves along the
+    viewing axis by half its width.
     """
     centers = world_from_cam(cameras)[:, :3, 3]
     target = estimate_focus(cameras)
@@ -129,7 +129,7 @@ def spiral_path(cameras: Cameras, num_frames: int, up: np.ndarray | None = None)
     radii = np.quantile(np.abs((centers - middle) @ base), 0.9, axis=0)
     radii = np.maximum(radii, 0.02 * distance)
     radii[2] = min(0.5 * radii.max(), 0.3 * distance)
-    phase = _turn(num_frames)
+    phase = _full_circle(num_frames)
     local = np.stack([np.cos(2 * phase), -np.sin(2 * phase), np.sin(phase)], axis=-1)
     return _looking_at(cameras, middle + local * radii @ base.T, target, up)
 
@@ -141,17 +141,23 @@ def frame_orbit_for_points(
     up: tuple[float, float, float] = (0, 0, 1),
     least: float = 0.0,
 ) -> Cameras:
-    """Return an orbit around a set of points whose robust extent fills the image.
+    """Return an orbit in which the robust extent of points fills the image.
 
-    The centre is the median. The extent is the sphere around it that holds 99% of the points (N, 3)
-    within the 1st to 99th percentile of every axis, so that outliers have no effect; those that are
-    not finite are ignored. It is ``least`` at least, such as the size of what the points stand for;
-    1 where both are 0. Raises DyngsError: no finite point.
+    The centre is the median of the points (N, 3). The extent is the radius around it that contains
+    99% of the points between the 1st and 99th percentile of every axis. Non-finite points are
+    ignored.
+
+    Args:
+        least: lower bound of the extent, such as the size of a Gaussian. The extent is 1 if both
+            are 0.
+
+    Raises:
+        DyngsError: no finite point.
     """
     points = np.asarray(means, np.float64).reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
-        raise DyngsError("cannot place an orbit: there are no points with finite coordinates")
+        raise DyngsError("cannot place an orbit: no points with finite coordinates")
     low, high = np.quantile(points, [0.01, 0.99], axis=0)
     inside = points[((points >= low) & (points <= high)).all(axis=1)]
     points = inside if len(inside) else points
@@ -167,7 +173,7 @@ def frame_orbit_for_points(
     radius = distance * math.cos(elevation)
     height = distance * math.sin(elevation)
     arm = perpendicular(axis_z)
-    return _on_circle(template, center, axis_z, arm, _turn(num_frames), radius, height)
+    return _on_circle(template, center, axis_z, arm, _full_circle(num_frames), radius, height)
 
 
 def path_along(
@@ -178,14 +184,16 @@ def path_along(
 ) -> CameraPath:
     """Return a smooth path along V >= 1 cameras, with intrinsics of the first.
 
-    With ``times`` (V,) that all differ, which is a clip of one moving camera, the path plays the
-    clip from the first time to the last. Otherwise it visits every position once, at even speed: in
-    the order of the capture if that is a walk, else by a short way from the first camera on.
-    Positions, viewing directions and up directions (without ``up``) are means over the cameras near
-    on the way, with Gaussian weights.
+    With distinct ``times`` (V,), the cameras are a clip of one moving camera, and the path plays
+    the clip. Otherwise it visits every position once at constant speed, in the order of the capture
+    if that is a short route, else from each camera to the nearest unvisited one. Positions and
+    directions are smoothed with Gaussian weights.
+
+    Args:
+        up: (3,) up direction. None averages that of the cameras.
     """
     poses = world_from_cam(cameras)
-    # The path is smoothed, so that 500 cameras are enough.
+    # The path is smoothed, so 500 cameras suffice.
     kept = np.linspace(0, len(poses) - 1, min(len(poses), 500)).round().astype(int)
     poses = poses[kept]
     if times is not None and len(kept) > 1:
@@ -194,28 +202,30 @@ def path_along(
         seconds = seconds[order]
         if (np.diff(seconds) > 0).all():
             steps = np.linspace(seconds[0], seconds[-1], num_frames)
-            smooth = cameras_at_poses(cameras, _smoothed(poses[order], seconds, steps, up))
+            smooth = cameras_at_poses(cameras, _smooth_poses(poses[order], seconds, steps, up))
             return CameraPath(smooth, times=tuple(steps.tolist()))
-    # Distances of these six numbers are those between the images: place, and viewing direction
-    # times the distance of what is looked at.
+    # Features whose distances approximate image differences: position, and viewing direction times
+    # the distance to the scene.
     centers = poses[:, :3, 3]
     reach = float(np.linalg.norm(centers - estimate_focus(cameras), axis=1).mean())
     features = np.concatenate([centers, reach * poses[:, :3, 2]], axis=1)
-    # Nine digits of the largest, so that equal poses are equal in any unit of length.
+    # Round to nine digits, so that equal poses stay equal in any unit of length.
     features = (features / (float(np.abs(features).max()) or 1.0)).round(9)
     _, first = np.unique(features, axis=0, return_index=True)
-    first.sort()  # back to the order of the capture
-    visited = first[_walk(features[first])]
+    first.sort()  # order of the capture
+    visited = first[_visiting_order(features[first])]
     lengths = np.linalg.norm(np.diff(features[visited], axis=0), axis=1)
     way = np.concatenate([[0.0], np.cumsum(lengths)])
-    smooth = _smoothed(poses[visited], way, np.linspace(0, way[-1], num_frames), up)
+    smooth = _smooth_poses(poses[visited], way, np.linspace(0, way[-1], num_frames), up)
     return CameraPath(cameras_at_poses(cameras, smooth))
 
 
-def _walk(features: np.ndarray) -> np.ndarray:
-    """Return the order (V,) in which to visit ``features`` (V, D): as they are if that is at most
-    twice as long as from the first always to the nearest next, else that way."""
-    from scipy.spatial.distance import cdist  # late: importing it takes a tenth of a second
+def _visiting_order(features: np.ndarray) -> np.ndarray:
+    """Return an order (V,) in which to visit ``features`` (V, D).
+
+    The given order is kept if it is at most twice as long as the nearest-neighbour route.
+    """
+    from scipy.spatial.distance import cdist  # slow import
 
     between = cdist(features, features)
     given = np.arange(len(features))
@@ -228,12 +238,12 @@ def _walk(features: np.ndarray) -> np.ndarray:
     return given if lengths[0] <= 2 * lengths[1] else short
 
 
-def _smoothed(
+def _smooth_poses(
     poses: np.ndarray, way: np.ndarray, steps: np.ndarray, up: np.ndarray | None
 ) -> np.ndarray:
-    """Return poses (F, 4, 4) at ``steps`` (F,) of the way: means of poses (V, 4, 4) at ``way`` (V,)
-    near them."""
-    # standard deviation: two mean distances between cameras that follow each other
+    """Return poses (F, 4, 4) at positions ``steps`` (F,), averaged over poses (V, 4, 4) at ``way``
+    (V,)."""
+    # The standard deviation is twice the mean distance of consecutive cameras.
     spread = max(2.0 * (way[-1] - way[0]) / max(len(way) - 1, 1), 1e-12)
     distance = ((steps[:, None] - way) / spread) ** 2
     near = np.exp(-0.5 * (distance - distance.min(axis=1, keepdims=True)))

@@ -1,4 +1,5 @@
-"""Scenes as files of Gaussians, one time or a clip, also as streamed .sog in levels of detail."""
+"""Export of Gaussians: single times, sequences, streamed .sog levels, .4dgs, .glb bodies and
+tracks."""
 
 from __future__ import annotations
 
@@ -58,22 +59,26 @@ from dyngs.runs.folder import collect_inputs
 from dyngs.runs.opened import OpenedScene
 
 PER_LEAF = MERGED**7  # Gaussians of a leaf at level 0
-PER_FILE = MERGED**9  # at most, at each level
-COARSEST = 4  # Level, at most; 64 Gaussians of a leaf
+PER_FILE = MERGED**9  # Most Gaussians of a file
+COARSEST = 4  # Coarsest level, with 64 Gaussians per leaf
 
 
 def write_sog_levels(folder: Path, splat: SplatFile) -> tuple[int, ...]:
-    """Write a new folder of what ``fitted`` made fit a .sog, and return the Gaussians by level, the
-    finest first.
+    """Write a new folder of streamed .sog levels of detail. Return the number of Gaussians per
+    level, finest first.
 
-    Raises DyngsError: the folder holds something, or cannot be written.
+    Args:
+        splat: content that fits the .sog format, see ``fitted``.
+
+    Raises:
+        DyngsError: the folder is not empty or cannot be written.
     """
     require_new_folder(folder)
     levels = build_levels(splat.gaussians).levels[: COARSEST + 1]
     counts = tuple(len(level) for level in levels)
     names: list[str] = []
     with atomic_folder(folder) as started:
-        first = []  # number of a level's first file
+        first = []  # index of the first file of each level
         for number, level in enumerate(levels):
             first.append(len(names))
             for i, start in enumerate(range(0, len(level), PER_FILE)):
@@ -94,7 +99,7 @@ def write_sog_levels(folder: Path, splat: SplatFile) -> tuple[int, ...]:
                     "count": min(PER_LEAF // MERGED**level, count - own),
                 }
             nodes.append({"bound": _box(_rows(levels[0], start, PER_LEAF)), "lods": lods})
-        while len(nodes) > 1:  # four nodes below each
+        while len(nodes) > 1:  # group four nodes into one
             groups = [nodes[i : i + MERGED] for i in range(0, len(nodes), MERGED)]
             nodes = []
             for group in groups:
@@ -120,7 +125,7 @@ def _rows(gaussians: Gaussians, start: int, count: int) -> Gaussians:
 
 
 def _box(gaussians: Gaussians) -> dict[str, list[float]]:
-    """Return the box around Gaussians, to three standard deviations."""
+    """Return the bounding box of Gaussians at three standard deviations."""
     axes = rotation_matrices(gaussians.quats) * gaussians.scales[:, None]
     reach = 3.0 * axes.square().sum(2).sqrt()
     low = (gaussians.means - reach).amin(0)
@@ -128,20 +133,19 @@ def _box(gaussians: Gaussians) -> dict[str, list[float]]:
     return {"min": low.tolist(), "max": high.tolist()}
 
 
-Part = Literal["all", "moving", "still"]
+Part = Literal["all", "moving", "static"]
 
 
 @dataclass(frozen=True)
 class WriteOptions:
-    """How Gaussians are written."""
+    """Options for writing Gaussians to a file."""
 
-    # unit quaternion wxyz, from the axes of the capture, or of the frame of an edited run, to those
-    # of the file
+    # unit quaternion wxyz from the axes of the capture (or of an edited run) to those of the file
     turn: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    up: str | None = None  # axis that then points up, such as "-y"; None: not known
-    # degree of the harmonics in the file; None: as they are, up to what the format holds
+    up: str | None = None  # up axis in the file, such as "-y"; None if unknown
+    # SH degree in the file; None keeps it, up to the limit of the format
     sh_degree: int | None = None
-    edit: Similarity = IDENTITY  # made after ``turn``, and stored so that it can be undone
+    edit: Similarity = IDENTITY  # applied after ``turn``, and stored to be undone
 
 
 DEFAULT_WRITE_OPTIONS = WriteOptions()
@@ -154,11 +158,15 @@ def choose_write_options(
     from_up: str | None = None,
     sh_degree: int | None = None,
 ) -> tuple[WriteOptions, str]:
-    """Return how a scene is written, and a line about which way is up in the file.
+    """Return write options for a scene, and a note about the up axis of the file.
 
-    ``target``: axis that viewers of the format take for up. ``up``: axis requested instead; "keep":
-    nothing is turned. ``from_up``: axis that is up in the scene; None: found as ``up_of`` does.
-    Raises DyngsError: no such axis.
+    Args:
+        target: up axis that viewers of the format expect.
+        up: requested up axis. "keep" keeps the axes of the scene.
+        from_up: up axis of the scene. None finds it with ``find_up_direction``.
+
+    Raises:
+        DyngsError: invalid axis.
     """
     edited = opened.edited
     frame = "capture" if edited is None else "edited run"
@@ -167,25 +175,24 @@ def choose_write_options(
         known = "" if own is None else f", {own} up"
         return WriteOptions(
             up=own, sh_degree=sh_degree
-        ), f"axes are those of the {frame.removesuffix('ed run')}{known}"
+        ), f"axes of the {frame.removesuffix('ed run')} are kept{known}"
     found = find_up_direction(opened) if from_up is None else (parse_axis(from_up), "--from-up")
     if found is None:
-        line = "nothing says which way is up in this run, so axes are those of the capture; --from-up=AXIS tells it"
+        line = "unknown up direction, axes of the capture are kept; set it with --from-up=AXIS"
         return WriteOptions(sh_degree=sh_degree), line
     direction, who = found
     wanted = target if up is None else up
     here = next((name for name, axis in AXES.items() if axis == direction), "a slanted direction")
-    turned = f"turned, it was {here} in the {frame}"
-    turned = f"the axes of the {frame} are kept" if here == wanted else turned
+    turned = f"rotated from {here} in the {frame}"
+    turned = f"axes of the {frame} kept" if here == wanted else turned
     how = WriteOptions(rotation_between(direction, parse_axis(wanted)), wanted, sh_degree)
-    return how, f"up is {wanted} in the file ({turned}, says {who})"
+    return how, f"up is {wanted} in the file ({turned}; source: {who})"
 
 
 def find_up_direction(opened: OpenedScene) -> tuple[tuple[float, ...], str] | None:
-    """Return the direction (3,) that is up and what says so: an axis where one is within 30
-    degrees; None: nothing.
+    """Return the up direction (3,) in the axes of ``splats_at``, and its source. None if unknown.
 
-    In the axes in which ``splats_at`` gives the scene as it is.
+    A direction within 30 degrees of an axis is snapped to the axis.
     """
     if opened.up is None:
         return None
@@ -204,11 +211,13 @@ def write_run_splats(
     part: Part = "all",
     how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> WrittenFile:
-    """Write a run at a time in [0, 1] as a file of Gaussians; its suffix names the format.
+    """Write a run at a time in [0, 1] as a file of Gaussians. The suffix selects the format.
 
-    A 3D filter is fused, and colours of a network become harmonics; the header, where the format
-    has one, states the render mode, and the time if something moves. Raises DyngsError: the part is
-    empty, or an unknown suffix.
+    The 3D filter is fused, and colours of a network become spherical harmonics. The header stores
+    the render mode, and the time of a moving scene.
+
+    Raises:
+        DyngsError: an empty part, or an unknown suffix.
     """
     collect_inputs(opened).require_output(path)
     splat = splats_at(opened, scene_part(opened.scene, part), time, how)
@@ -223,10 +232,12 @@ def write_run_sequence(
     how: WriteOptions = DEFAULT_WRITE_OPTIONS,
     suffix: str = ".ply",
 ) -> list[WrittenFile]:
-    """Write a sequence ``frame_0000.ply`` and so on, one file per time in [0, 1], for players.
+    """Write a sequence ``frame_0000.ply`` etc., one file per time in [0, 1].
 
-    Files of an earlier sequence of the same length are replaced. Raises DyngsError: the part is
-    empty, the folder holds other such files, or they cannot be written.
+    Files of an earlier sequence of the same length are replaced.
+
+    Raises:
+        DyngsError: an empty part, other such files in the folder, or files that cannot be written.
     """
     digits = max(4, len(str(len(times) - 1)))
     names = [f"frame_{i:0{digits}d}{suffix}" for i in range(len(times))]
@@ -236,8 +247,7 @@ def write_run_sequence(
     others = sorted(file.name for file in folder.glob(f"[!.]*{suffix}") if file.name not in names)
     if others:
         raise DyngsError(
-            f"{folder}: holds other {suffix} files ({others[0]}), which players would take for frames; give an empty "
-            "folder"
+            f"{folder}: contains other {suffix} files ({others[0]}); use an empty folder"
         )
     return [
         write_run_splats(opened, folder / name, time, part, how)
@@ -252,10 +262,11 @@ def write_run_levels(
     part: Part = "all",
     how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Write a run at a time as a new folder of .sog in levels of detail; return Gaussians by level,
-    and notes.
+    """Write a run at a time as a new folder of .sog levels. Return the Gaussians per level, and
+    notes.
 
-    Raises DyngsError: the part is empty, or the folder holds something.
+    Raises:
+        DyngsError: an empty part, or a folder that is not empty.
     """
     collect_inputs(opened).require_output(folder)
     splat = splats_at(opened, scene_part(opened.scene, part), time, how)
@@ -264,13 +275,13 @@ def write_run_levels(
 
 
 def scene_part(scene: GaussianScene, part: Part) -> GaussianScene:
-    """Return a part of a scene. Raises DyngsError if it is empty."""
+    """Return the moving or static part of a scene. Raises DyngsError if it is empty."""
     if part == "all":
         return scene
     found = scene.part(part)
     if not len(found):
-        what = "the whole scene moves" if part == "still" else "nothing moves in this run"
-        raise DyngsError(f"{what}: it has no {'static' if part == 'still' else 'dynamic'} part")
+        what = "the whole scene moves" if part == "static" else "nothing moves in this run"
+        raise DyngsError(f"{what}: no {'static' if part == 'static' else 'dynamic'} part")
     return found
 
 
@@ -280,10 +291,9 @@ def splats_at(
     time: float,
     how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> SplatFile:
-    """Return what a file of Gaussians is to hold of a scene at one time, in the axes that are asked
-    for.
+    """Return the content of a file of Gaussians for a scene at one time, in the requested axes.
 
-    A run that was edited is in its frame, which the file can undo.
+    An edited run is in its own frame, which the file stores to be undone.
     """
     model = opened.config.model
     with torch.no_grad():
@@ -310,26 +320,28 @@ def splats_at(
 
 @dataclass(frozen=True)
 class Tracks:
-    """Positions of N Gaussians (or of the M moving ones) at T times; fields are named as the arrays
-    of the file."""
+    """Positions of N Gaussians, or of the moving ones, at T times. Fields are the arrays of the
+    file."""
 
-    # (N, T, 3) in the coordinates of the capture, or of the frame of an edited run, float32;
-    # float64 if the scene was rebased because it is far from its origin, where float32 is too
-    # coarse, or edited
+    # (N, T, 3) in the coordinates of the capture or of an edited run; float32, or float64 if the
+    # scene has a world offset or was edited
     positions: np.ndarray
     times: np.ndarray  # (T,) float64 in [0, 1]
-    moving: np.ndarray  # (N,) bool, false if the position never changes
-    # (N,) int64 index of each Gaussian in the model, which is also its row in an exported .ply
+    moving: np.ndarray  # (N,) bool
+    # (N,) int64 index of each Gaussian in the model, and its row in an exported .ply
     ids: np.ndarray
 
 
 def tracks_of(
     scene: GaussianScene, times: Sequence[float], frame: Similarity = IDENTITY, *, part: str = "all"
 ) -> Tracks:
-    """Return the tracks of a scene, or with ``part`` "moving" of what moves, moved by ``frame`` to
-    what people mean.
+    """Return the tracks of a scene, transformed by ``frame``.
 
-    Raises DyngsError: nothing moves.
+    Args:
+        part: "moving" returns moving Gaussians only.
+
+    Raises:
+        DyngsError: no Gaussian moves, for the moving part.
     """
     moves = torch.zeros(len(scene), dtype=torch.bool, device="cpu")
     moves[scene.rows] = not scene.is_static
@@ -348,13 +360,13 @@ def tracks_of(
 
 
 def write_tracks(path: Path, tracks: Tracks) -> Path:
-    """Write tracks as uncompressed .npz, atomically: one array per field of ``Tracks``, no pickle.
-    Return the path.
+    """Write tracks as uncompressed .npz with one array per field of ``Tracks``. Return the path.
 
-    Raises DyngsError: non-finite positions, or the file cannot be written.
+    Raises:
+        DyngsError: non-finite positions, or the file cannot be written.
     """
     if not np.isfinite(tracks.positions).all():
-        raise DyngsError(f"{path}: not written, some positions are not finite")
+        raise DyngsError(f"{path}: not written, positions are not finite")
     with atomic_file(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, **asdict(tracks))
     return path
@@ -372,10 +384,13 @@ def write_4dgs(
     part: Part = "all",
     how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> tuple[tuple[SplatFile, ...], tuple[str, ...]]:
-    """Write a run at T >= 1 times in [0, 1] as one .4dgs, each shown for 1/30 s; return what it is
-    meant to hold at each time, and notes about what the format could not hold.
+    """Write a run at T >= 1 times in [0, 1] as one .4dgs file, each time shown for 1/30 s.
 
-    Raises DyngsError: the package is missing, the part is empty, or the file cannot be written.
+    Returns:
+        the intended content at each time, and notes about properties the format cannot store.
+
+    Raises:
+        DyngsError: a missing package, an empty part, or the file cannot be written.
     """
     collect_inputs(opened).require_output(path)
     model, delta, files = _fourdgs(path)
@@ -394,7 +409,7 @@ def write_4dgs(
             colors=rgba.numpy(),
             motions=np.zeros((n, 3), np.float32),
             mu_t=np.full(n, i / FOURDGS_FPS, np.float32),
-            # standard deviation in time: a Gaussian never fades
+            # standard deviation in time: Gaussians never fade
             sigma_t=np.full(n, 1e4 * duration, np.float32),
             win_lo=np.zeros(n, np.float32),
             win_hi=np.full(n, duration, np.float32),
@@ -409,17 +424,15 @@ def write_4dgs(
         *offset_notes(splats[0], "4dgs cannot state it"),
     )
     if any(bool(splat.gaussians.sh[:, 1:].any()) for splat in splats):
-        notes += (
-            "SH coefficients above degree 0 are dropped: .4dgs stores none for moving Gaussians",
-        )
+        notes += ("SH degree reduced to 0: .4dgs stores no more for moving Gaussians",)
     return splats, notes
 
 
 def read_4dgs_frame(path: Path, index: int) -> SplatFile:
-    """Return what a .4dgs that dyngs wrote shows at its time number ``index``, read by the package
-    fourdgs.
+    """Read the Gaussians of a .4dgs written by dyngs at time index ``index``.
 
-    Raises DyngsError: the package is missing, or values that are not finite.
+    Raises:
+        DyngsError: a missing package, or non-finite values.
     """
     _, _, files = _fourdgs(path)
     found = files.render_at(files.decode_streamed(path.read_bytes()), (index + 0.5) / FOURDGS_FPS)
@@ -435,7 +448,7 @@ def _fourdgs(path: Path) -> tuple[Any, Any, Any]:
         model, delta, files = (import_module(f"fourdgs.{name}") for name in names)
     except ImportError:
         raise DyngsError(
-            f"{path}: .4dgs files need the package fourdgs: pip install 'dyngs[4dgs]'"
+            f"{path}: .4dgs needs the package fourdgs; run pip install 'dyngs[4dgs]'"
         ) from None
     return model, delta, files
 
@@ -444,27 +457,25 @@ def _fourdgs(path: Path) -> tuple[Any, Any, Any]:
 def write_rigid_bodies(
     opened: OpenedScene, path: Path, time: float, how: WriteOptions = DEFAULT_WRITE_OPTIONS
 ) -> WrittenFile:
-    """Write a run at a time in [0, 1] as .glb: a node for each body, with its motion as an
-    animation, one for the rest.
+    """Write a run at a time in [0, 1] as .glb: an animated node per rigid body, and one for the
+    rest.
 
-    Without the animation the file shows the scene at ``time``. Raises DyngsError: no body turns in
-    this run, or the file cannot be written.
+    Raises:
+        DyngsError: no rigid body in this run, or the file cannot be written.
     """
     collect_inputs(opened).require_output(path)
     scene = field_scene_of(opened.scene)
     field = None if scene is None else find_body_field(scene.field)
     if scene is None or field is None:
-        raise DyngsError(
-            "--bodies: no body that turns was found in this run; leave it out, or give --times A:B:N"
-        )
-    scene = scene.without_masks()  # the rows of the labels
+        raise DyngsError("--bodies: no rotating body in this run; remove it, or use --times A:B:N")
+    scene = scene.without_masks()  # labels refer to all rows
     splat = splats_at(opened, scene, time, how)
     require_writable(path, splat.gaussians)
     gaussians = splat.gaussians.replace(quats=unit_rotations(splat.gaussians.quats))
     gaussians = with_sh_degree(gaussians, min(gaussians.sh_degree, 3))
     labels = torch.full((len(scene),), -1, device=scene.moving.device)
     labels[scene.moving] = field.rest.labels
-    # Twice as many poses as training times: rotations are interpolated between them.
+    # Twice as many poses as training times, since rotations are interpolated.
     moments = np.linspace(0.0, 1.0, 2 * max(len(scene.times) - 1, 1) + 1)
     places, turns = _poses(field, [time, *moments.tolist()], splat.frame)
     document = GlbDocument()
@@ -498,9 +509,10 @@ def write_rigid_bodies(
     with atomic_file(path) as temporary:
         document.write(temporary)
     notes = (
-        f"bodies: {len(channels) // 2}, which turn for {opened.seconds:.1f} s in the colours of time {time:g}",
-        f"all else and shadows stand as at time {time:g}; a sequence has their motion",
-        *offset_notes(splat, "stored in the file"),
+        f"bodies: {len(channels) // 2}, animated for {opened.seconds:.1f} s, with the colours of "
+        f"time {time:g}",
+        f"other motion and shadows are frozen at time {time:g}; export a sequence to keep them",
+        *offset_notes(splat, "the file states it"),
     )
     return WrittenFile(path, splat, notes)
 
@@ -508,8 +520,8 @@ def write_rigid_bodies(
 def _poses(
     field: BodyField, times: Sequence[float], frame: Similarity
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return centres (T, B, 3) of B bodies at T times, in the axes of the file, and their rotations
-    (T, B, 4) xyzw."""
+    """Return centres (T, B, 3) and rotations (T, B, 4) xyzw of B bodies at T times, in the axes of
+    the file."""
     axes = Rotation.from_quat(np.asarray(frame.turn)[[1, 2, 3, 0]])
     places, quats = zip(*(field.poses(float(time)) for time in times), strict=True)
     unit = unit_quats(torch.stack(quats)).double().numpy()[..., [1, 2, 3, 0]]

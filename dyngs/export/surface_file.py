@@ -1,5 +1,4 @@
-"""A scene's surface as a mesh that other programs read: .ply, .glb or .obj with colours of
-vertices."""
+"""Export of the surface of a scene as a mesh (.ply, .glb, .obj) with vertex colours."""
 
 from __future__ import annotations
 
@@ -30,10 +29,9 @@ SUFFIXES = ".ply", ".glb", ".obj"
 def surface_write_options(
     opened: OpenedScene, suffix: str, up: str | None, from_up: str | None
 ) -> tuple[WriteOptions, str]:
-    """Return how the mesh of a scene is turned, and a line about it, as of ``writing_of``.
+    """Return the rotation of an exported mesh, and a note about it, see ``choose_write_options``.
 
-    Viewers take y for up in .glb and .obj; those of .ply have no convention, so it stays in the
-    axes of the capture.
+    Viewers expect y up in .glb and .obj. A .ply keeps the axes of the capture.
     """
     usual = "keep" if suffix.lower() == ".ply" else None
     return choose_write_options(opened, "y", up or usual, from_up)
@@ -47,11 +45,10 @@ def write_surface(
     options: SurfaceOptions | None = None,
     how: WriteOptions = DEFAULT_WRITE_OPTIONS,
 ) -> Surface:
-    """Write the surface of a scene at ``time`` and return it.
+    """Write the surface of a scene at ``time`` and return it, in the coordinates of the capture.
 
-    The file is in the coordinates of the capture or of the edit, turned by ``how``. Raises
-    DyngsError: a suffix of no mesh, an option of another kind, no capture where that is needed, or
-    no surface is there.
+    Raises:
+        DyngsError: unsupported suffix or option, a missing capture, or an empty surface.
     """
     options = options or SurfaceOptions()
     suffix = out.suffix.lower()
@@ -59,13 +56,9 @@ def write_surface(
     for name, value in vars(options).items():
         if value is not None and name not in scene.surface_options:
             known = ", ".join(f"--{one}" for one in sorted(scene.surface_options))
-            raise DyngsError(
-                f"--{name} does not go with the mesh of this kind of scene, but {known}"
-            )
+            raise DyngsError(f"--{name}: not supported for the mesh of this scene; use {known}")
     if suffix not in SUFFIXES:
-        raise DyngsError(
-            f"{out}: a mesh of a surface is one file that ends in {', '.join(SUFFIXES)}"
-        )
+        raise DyngsError(f"{out}: a mesh file must end in {', '.join(SUFFIXES)}")
     collect_inputs(opened).require_output(out)
     surface = scene.own_surface(time, options) or _fused_surface(opened, time, options.cells)
     vertices = Similarity(how.turn).points(opened.world.points(surface.vertices))
@@ -76,8 +69,8 @@ def write_surface(
 
 
 def _mesh_bytes(suffix: str, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> bytes:
-    """Return the file of a mesh; vertices (V, 3) too far from the origin for float32 are written
-    with more digits."""
+    """Return the content of a mesh file. Vertices (V, 3) far from the origin are stored with more
+    digits."""
     import trimesh
 
     detail = float(np.median(np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1)))
@@ -97,8 +90,7 @@ def _mesh_bytes(suffix: str, vertices: np.ndarray, faces: np.ndarray, colours: n
 
 
 def _fused_surface(opened: OpenedScene, time: float, cells: int | None) -> Surface:
-    """Return what training cameras see of Gaussians; what they frame, where there is a
-    background."""
+    """Return the surface of Gaussians fused from training views, bounded to the captured volume."""
     scene = opened.scene
     views = opened.capture.splits["train"]
     seen = [views[i] for i in evenly_spaced(len(views), 150)]

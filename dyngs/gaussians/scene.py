@@ -171,7 +171,7 @@ class GaussianScene(Renderable):
         """Return the scene with only the Gaussians at ``index`` (long or bool)."""
         return self.apply_edit(TopologyEdit.select(index))
 
-    def part(self, which: Literal["moving", "still"]) -> GaussianScene:
+    def part(self, which: Literal["moving", "static"]) -> GaussianScene:
         """Return the scene with only the moving, or only the static Gaussians."""
         moves = torch.zeros(len(self), dtype=torch.bool, device=self.gaussians.means.device)
         if not self.is_static:

@@ -1,9 +1,8 @@
-"""Containment of untrusted captures: their files must lie in their folder, their images must not be
-too large.
+"""Containment of untrusted captures: their files must be in their folder, their images limited in
+size.
 
-A capture may name any file of the user as one of its images, by a link, an absolute path or ``..``,
-and an image of a few kilobytes may fill all memory. Every path is checked here before it is opened,
-every image before it is decoded.
+A capture may refer to any file of the user by a link, an absolute path or ``..``, and an image of
+a few kilobytes may fill all memory. Paths are checked here before opening, images before decoding.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import Any
 from dyngs.core.errors import DyngsError, require_regular_file
 
 LIMITS_VARIABLE = "DYNGS_LIMITS"
-"""Environment variable that multiplies all limits: 4 allows four times as much of everything."""
+"""Environment variable that scales all limits: 4 allows four times as much."""
 MAX_PIXELS = 150_000_000
 """Pixels of an image; decoding takes some 30 bytes of memory for each."""
 _MAX_LISTED = 100_000
@@ -40,7 +39,7 @@ def _set(variable: ContextVar[Any], value: object) -> Iterator[None]:
 
 
 def restrict_paths_to(root: Path, follow_links: bool = False) -> AbstractContextManager[None]:
-    """Make ``inside`` refuse paths outside ``root`` in the block; nothing is refused if
+    """Make ``check_inside`` refuse paths outside ``root`` in the block, unless
     ``follow_links``."""
     return _set(_boundary, None if follow_links else (root, os.path.realpath(root)))
 
@@ -59,7 +58,7 @@ def run_links_allowed() -> bool:
 
 
 def check_inside(path: Path) -> Path:
-    """Return ``path`` if it may be opened; outside a block of ``staying_within`` any path may."""
+    """Return ``path`` if it may be opened; without ``restrict_paths_to`` any path may."""
     boundary = _boundary.get()
     if boundary is not None and not _is_below(real := os.path.realpath(path), boundary[1]):
         raise DyngsError(
@@ -71,8 +70,7 @@ def check_inside(path: Path) -> Path:
 
 
 def scaled_limit(most: int) -> int:
-    """Return ``most`` times the value of the environment variable ``DYNGS_LIMITS``, 1 if it is not
-    set."""
+    """Return ``most`` times the value of ``DYNGS_LIMITS`` (default 1)."""
     text = os.environ.get(LIMITS_VARIABLE, "1")
     try:
         factor = float(text)
@@ -86,8 +84,8 @@ def scaled_limit(most: int) -> int:
 
 
 def require_at_most(where: Path | str, amount: int, most: int, what: str) -> None:
-    """Check that a file asks for at most ``most`` of ``what`` (plural), a limit that
-    ``DYNGS_LIMITS`` may raise."""
+    """Raise DyngsError if ``amount`` exceeds the limit ``most``, scaled by ``DYNGS_LIMITS``;
+    ``what`` is plural."""
     if amount > most and amount > scaled_limit(most):
         shown = f"{amount:,}" if amount < 10**18 else "over 10^18"
         factor = math.ceil(amount / most) if amount < 10**18 else "N"
@@ -109,8 +107,8 @@ def max_decoded_mb() -> int:
 
 
 def find_escaping_links(root: Path) -> list[tuple[Path, str]]:
-    """List links among the first 100,000 entries below ``root`` that lead out of it, with targets;
-    none is followed."""
+    """List links among the first 100,000 entries below ``root`` that lead out of it, with their
+    targets."""
     real = os.path.realpath(root)
     found = []
     seen = 0

@@ -1,4 +1,5 @@
-"""Files by the names that other programs wrote: other separators, case, Unicode form, machine."""
+"""File lookup by names from other programs, which may differ in separators, case, Unicode form or
+root."""
 
 from __future__ import annotations
 
@@ -13,13 +14,12 @@ from dyngs.io.containment import check_inside
 
 
 def normalize_name(name: str) -> str:
-    """Return a name or path as a key in which separators, case and Unicode form do not count."""
+    """Return a name or path as a key independent of separators, case and Unicode form."""
     return unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
 
 
 class FileFinder:
-    """Finds files below ``root`` by the names in a capture; lists a folder once, if a name
-    differs."""
+    """Finds files below ``root`` by the names in a capture; folder listings are cached."""
 
     def __init__(self, root: Path) -> None:
         self.root = root

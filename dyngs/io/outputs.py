@@ -1,7 +1,6 @@
-"""Checks of output paths, advice on paths given in the wrong place, new folders, and locks.
+"""Checks of output paths, advice for misplaced paths, atomic folders, and locks.
 
-A lock is for one writer at a time in a folder, and released by the system when its process ends,
-however it ends.
+A lock allows one writer in a folder; the system releases it when its process ends.
 """
 
 from __future__ import annotations
@@ -36,10 +35,9 @@ _CAPTURE = (
 
 
 def suggest_command(path: Path, *, captures: bool = True) -> str | None:
-    """Return what the path is and the command that takes it, in a few words; None for anything
-    else.
+    """Return what a path is and the command for it, None for anything else.
 
-    Only names are looked at, those directly in a folder and in ``images`` below it.
+    Only file names are checked, those directly in a folder and in ``images`` below it.
     """
     where = quote_path(path)
     static = f"`dyngs train static data.root={where}`"
@@ -74,12 +72,8 @@ _OF_RUNS = ("checkpoints", "scene.dyngs")
 
 
 class Inputs:
-    """Files and folders that are read; a folder stands for all that lies in it.
-
-    A link in a folder stands for the file or folder that it leads to, a capture that dyngs made
-    also for its photos or video. What is None counts for
-    nothing.
-    """
+    """Input files and folders; a folder includes its contents, the targets of its links, and the
+    photos or video that a capture was made from."""
 
     def __init__(self, paths: Iterable[Path | None]) -> None:
         self.paths = {path.resolve() for path in paths if path is not None}
@@ -88,12 +82,11 @@ class Inputs:
             self.paths |= _sources(folder)
 
     def require_output(self, out: Path) -> None:
-        """Check that ``out`` may be written: it does not exist, or is none of the inputs.
+        """Check that ``out`` may be written: it must not exist, or not be part of the inputs.
 
-        Raises DyngsError: ``out`` is an input, or leads to one; it exists in a folder that is read;
-        a link leads it out of its run folder; or it is a device, a pipe or the like. A run folder
-        in a capture, an empty folder, and a folder around a capture may be written to. A link that
-        is a file is replaced itself.
+        Raises DyngsError if ``out`` is an input or links to one, exists in an input folder, links
+        out of its run folder, or is not a regular file. A run folder in a capture, an empty
+        folder, and a folder around a capture may be written. A link to a file is replaced itself.
         """
         require_within_run(out)
         require_replaceable(out)
@@ -111,7 +104,7 @@ class Inputs:
 
 
 def require_within_run(out: Path) -> None:
-    """Check that no link leads an output in a run folder, perhaps a stranger's, out of it."""
+    """Check that no link leads an output out of its run folder, which may come from a stranger."""
     for run in out.absolute().parents:
         if (run / _RUN_MARK).is_file() and any((run / name).exists() for name in _OF_RUNS):
             place = out if out.is_dir() else out.parent
@@ -134,10 +127,10 @@ def require_new_folder(out: Path) -> None:
 def atomic_folder(
     out: Path, require: Callable[[Path], None] = require_new_folder
 ) -> Iterator[Path]:
-    """Yield a hidden folder next to ``out`` that gets its name when the block ends well, and is
-    removed otherwise.
+    """Yield a hidden folder next to ``out`` that is renamed to ``out`` on success and removed
+    otherwise.
 
-    Raises DyngsError: by ``require``, before and after; ``out`` cannot be written.
+    Raises DyngsError by ``require``, before and after, or if ``out`` cannot be written.
     """
     require(out)
     started = temporary_folder_beside(out)
@@ -155,7 +148,7 @@ def atomic_folder(
 
 
 def record_source(capture: Path, source: Path) -> None:
-    """Write into a made capture where its photos or video lie; no output replaces them."""
+    """Record the source photos or video of a capture, so that no output replaces them."""
     names = {"sources": [os.path.abspath(source)]}
     write_text(capture / SOURCES_NAME, json.dumps(names, indent=1) + "\n")
 
@@ -191,16 +184,14 @@ class InUseError(DyngsError):
 
 @contextmanager
 def lock_folder(folder: Path) -> Iterator[bool]:
-    """Yield whether no other process writes into the folder in the block, which is not known where
-    its file system has no locks.
+    """Lock a folder for writing; yields false where the file system has no locks.
 
-    The folder is made where it is missing, and removed where nothing came of it. The file
-    ``run.lock`` says who writes. A file system that has no locks (some network file systems) is
-    told of in a line on stderr.
+    The folder is created if missing, and removed if it stays empty. ``run.lock`` records the
+    writer. A missing lock is logged as a warning.
 
     Raises:
         InUseError: another process writes there.
-        DyngsError: nobody can; a link leads out of the folder.
+        DyngsError: it cannot be written, or a link leads out of the folder.
     """
     require_within_run(folder)
     links = find_escaping_links(folder)
@@ -268,7 +259,7 @@ def _made(folder: Path) -> list[Path]:
 
 
 def _locked(path: Path) -> tuple[int, bool]:
-    """Return the lock file ``path``, open, and whether it is locked."""
+    """Open the lock file ``path``; return it and whether it is locked."""
     folder = path.parent
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
     while True:
@@ -312,7 +303,7 @@ def _lock(file: int) -> None:
 
 
 def _freed(path: Path, file: int) -> None:
-    """Remove and close the lock file; others that wait to lock it notice that it is gone."""
+    """Remove and close the lock file; waiting processes notice that it is gone."""
     with suppress(OSError):
         if sys.platform != "win32" and _is_the_same(file, path):
             path.unlink()
@@ -331,7 +322,7 @@ def _is_the_same(file: int, path: Path) -> bool:
 
 
 def _owner(path: Path) -> str:
-    """Return the process that writes there, as far as the lock file says."""
+    """Return a description of the process in the lock file."""
     try:
         with path.open("rb") as file:
             known = json.loads(file.read(4096))

@@ -1,1 +1,1 @@
-"""Studies of several runs: `dyngs compare` and `dyngs tradeoff`."""
+"""Studies of several runs: ``dyngs compare`` and ``dyngs tradeoff``."""

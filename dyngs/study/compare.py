@@ -1,5 +1,7 @@
-"""Several models trained on one capture with the same time, steps or size, and compared. After a
-kill the same call goes on."""
+"""``dyngs compare``: trains several models on one capture with an equal budget and measures them.
+
+An interrupted comparison continues when called again.
+"""
 
 from __future__ import annotations
 
@@ -36,22 +38,22 @@ from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import validate_limits
 from dyngs.training.trainer import Trainer
 
+# Requested steps of a run with a time limit, which reduces them to what fits
 MOST_STEPS = 1_000_000
-"""Steps that are asked for within a time: as many as fit are done, on schedules of that length."""
-TIMED_VIEWS = 4
-ROUNDS = 3
-CURVE_VIEWS = 6
+TIMED_VIEWS = 4  # Views used for timing
+ROUNDS = 3  # Renders of each timed view
+CURVE_VIEWS = 6  # Held-out views scored during training
+# Fractions of a run after which they are scored, denser at the start, where quality rises fast
 MARKS = tuple((i / 12) ** 2 for i in range(1, 12))
-"""Fractions of a run after which views are drawn, and at its end: more in the beginning, when
-quality rises fast."""
+# Step, seconds of training, mean PSNR in dB of some held-out views
 Curve = list[tuple[int, float, float]]
-"""Step, seconds of training, and mean PSNR, dB, of some held-out views then."""
 _CURVE = TypeAdapter(Curve)
 
 
 @dataclass(frozen=True)
 class ModelComparison:
-    """The capture, the images and the limit shared by all models; two of the limits are None."""
+    """The capture and the budget shared by all models: exactly one of minutes, steps and
+    megabytes."""
 
     capture: Path
     out: Path
@@ -74,12 +76,10 @@ class ModelComparison:
         return self.out / "runs" / name
 
     def configs(self, models: Sequence[str]) -> tuple[dict[str, Config], dict[str, str]]:
-        """Return the configurations of the models that take part, and why others do not; nothing is
-        written.
+        """Return the configs of comparable models, and the reasons why other models are skipped.
 
         Raises:
-            DyngsError: a model that does not exist, a capture on which nothing can be compared, or
-                one that no model takes.
+            DyngsError: an unknown model, an invalid override, or a capture that no model supports.
         """
         if self.minutes is not None:
             limits = [f"train.minutes={self.minutes:g}", f"train.steps={MOST_STEPS}"]
@@ -97,23 +97,23 @@ class ModelComparison:
         for word in self.overrides:
             if word.startswith(tuple(keys)):
                 raise DyngsError(
-                    f"{format_one_line(word, 80)}: the comparison sets this itself; see its options"
+                    f"{format_one_line(word, 80)}: set by `dyngs compare`; use its options"
                 )
         of_data = [word for word in self.overrides if word.startswith("data.")]
         data = load_config(None, [*of_data, fixed[0]]).data
         capture = read_capture(data)
-        split_views(capture, self.split)  # refuses a split without views
+        split_views(capture, self.split)  # raises for a split without views
         configs = dict[str, Config]()
         left_out = dict[str, str]()
         for word in models:
             file = find_preset(Path(word))
-            load_config(
-                file, [fixed[0]]
-            )  # one that is wrong in itself is no model that is left out
+            # An invalid preset is an error, not a skipped model.
+            load_config(file, [fixed[0]])
             name = re.sub(r"[^\w.-]", "_", file.stem).lstrip(".-") or "model"
             if name in configs or name in left_out:
                 raise DyngsError(
-                    f"--models: {format_one_line(word, 60)} makes two models called {name}; rename one"
+                    f"--models: {format_one_line(word, 60)}: two models are named {name}; rename one "
+                    "preset"
                 )
             words = [*self.overrides, *fixed, f"run.dir={self.run_dir(name)}"]
             try:
@@ -121,7 +121,7 @@ class ModelComparison:
                 validate_limits(config)
                 problem = find_kind(config.model).refusal(capture)
                 if capability(config.model, PredictsScenes) is not None:
-                    problem = "is a network, which is trained on many people"
+                    problem = "predicts people and needs several captures"
             except DyngsError as error:
                 problem = str(error)
             if problem is None:
@@ -136,8 +136,8 @@ class ModelComparison:
         return configs, left_out
 
     def require_same(self, configs: dict[str, Config], left_out: dict[str, str]) -> None:
-        """Note what is compared in the folder, or raise DyngsError where something else is compared
-        there."""
+        """Store what is compared in the output folder. Raise DyngsError if it holds another
+        comparison."""
         digests = {
             name: hashlib.sha256(config.model_dump_json().encode()).hexdigest()[:12]
             for name, config in configs.items()
@@ -145,20 +145,23 @@ class ModelComparison:
         facts = asdict(self) | {"models": sorted([*configs, *left_out]), "settings": digests}
         facts |= {"capture": str(self.capture), "out": None}
         others = [key for key in facts if key != "settings"]
-        # settings follow from the others, unless a preset was changed
+        # Check settings last: they follow from the others unless a preset changed.
         for compared_keys in (others, ["settings"]):
             require_same_study(self.out, facts, compared_keys)
 
     def run(
         self, configs: dict[str, Config], ray_cores: int | None = None
     ) -> tuple[list[Measurement], dict[str, str], dict[str, Curve]]:
-        """Return the measurements in the order of the models, why others are left out, and the
-        curves of quality; each is kept once it is there.
+        """Train and measure the models. Results are stored as soon as they are available.
+
+        Returns:
+            measurements in the order of the models, reasons why models were skipped, and quality
+                curves.
 
         Raises:
             DyngsError: no model could be trained.
         """
-        bench = SceneMeasurer(
+        measurer = SceneMeasurer(
             self.out,
             self.split,
             self.threads,
@@ -168,16 +171,18 @@ class ModelComparison:
             self.num_shown,
         )
         study_scenes = {
-            name: StudyScene(name, name, self.run_dir(name), partial(self._trained, config))
+            name: StudyScene(name, name, self.run_dir(name), partial(self._train, config))
             for name, config in configs.items()
         }
-        missing = [x for x in study_scenes.values() if not bench.point(x.slug).is_file()]
+        missing = [
+            x for x in study_scenes.values() if not measurer.measurement_path(x.slug).is_file()
+        ]
         left_out = dict[str, str]()
-        for study_scene, result in run_tasks(bench.measure, missing, ray_cores):
+        for study_scene, result in run_tasks(measurer.measure, missing, ray_cores):
             if isinstance(result, DyngsError):
                 left_out[study_scene.name] = str(result)
                 del study_scenes[study_scene.name]
-                log_info(f"{study_scene.name}: left out: {result}")
+                log_info(f"{study_scene.name}: skipped: {result}")
             else:
                 done = f"{result.steps:,} steps in {result.seconds:.0f} s"
                 log_info(f"{study_scene.name}: {result.psnr:.2f} dB, {done}")
@@ -185,46 +190,52 @@ class ModelComparison:
             name, problem = next(iter(left_out.items()))
             raise DyngsError(f"no model could be trained; {name}: {problem}")
         curves = {name: QualityCurve(self, self.run_dir(name)).points() for name in study_scenes}
-        return bench.with_speeds(list(study_scenes.values())), left_out, curves
+        return measurer.with_speeds(list(study_scenes.values())), left_out, curves
 
-    def _trained(self, config: Config) -> Path:
-        """Train a model, unless that is done; return the folder that it is drawn from: of limited
-        size, where that is what was asked for."""
+    def _train(self, config: Config) -> Path:
+        """Train a model unless it is complete. Return the folder to render from.
+
+        With a size limit, that is the exported scene of limited size.
+        """
         folder = config.run.dir
         assert folder is not None
         if not (self.out / "points" / f"{folder.name}.json").is_file():
-            said_path = self.out / "said" / f"{folder.name}.txt"
-            said_path.parent.mkdir(parents=True, exist_ok=True)
+            log_path = self.out / "logs" / f"{folder.name}.txt"
+            log_path.parent.mkdir(parents=True, exist_ok=True)
             log_info(f"training {folder.name}: {self.limit}")
-            with said_path.open("a", encoding="utf-8") as said, redirect_stdout(said):
+            with log_path.open("a", encoding="utf-8") as log, redirect_stdout(log):
                 train_to_end(config, folder, [QualityCurve(self, folder)])
             side = load_resolved(folder).data.longest_side
             if side != config.data.longest_side:
                 raise DyngsError(
-                    f"too few steps fit into {self.limit}, so its images were shrunk to {side} px, unlike those "
-                    f"of the others; give more minutes, or data.longest_side={side} for all"
+                    f"too few steps fit into {self.limit}, so its images were resized to {side} "
+                    "px, unlike "
+                    f"those of the other models; use more minutes, or data.longest_side={side} for "
+                    "all"
                 )
         is_limited = self.max_mb is not None and has_file(folder)
         return folder / EXPORT_FOLDER if is_limited else folder
 
 
 class QualityCurve:
-    """Listener that draws some held-out views while a model trains, and keeps their quality in a
-    file of its run folder; drawing takes none of the run's time, and changes nothing."""
+    """Listener that scores some held-out views while a model trains, and stores their mean PSNR.
+
+    Scoring does not count as training time and does not change the training.
+    """
 
     def __init__(self, comparison: ModelComparison, folder: Path) -> None:
         self._split = comparison.split
         self._seconds = None if comparison.minutes is None else 60 * comparison.minutes
         self._path = folder / "curve.json"
         self._images: list[Image] | None = None
-        self._drawn = -1.0
+        self._last_scored = -1.0
 
     def __call__(self, event: Event) -> None:
         if not isinstance(event, StepDone) or not isinstance(event.loop.trainer, Trainer):
             return
         done = event.step / event.total if self._seconds is None else event.seconds / self._seconds
-        if event.is_last or any(self._drawn < mark <= done for mark in MARKS):
-            self._drawn = done
+        if event.is_last or any(self._last_scored < mark <= done for mark in MARKS):
+            self._last_scored = done
             start = time.perf_counter()
             score = self._score(event.loop.trainer)
             event.loop.stopwatch.exclude(time.perf_counter() - start)

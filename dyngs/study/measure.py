@@ -1,5 +1,4 @@
-"""Quality, size and speed of scenes, measured by rendering held-out views, and kept in files, so
-that nothing is measured twice."""
+"""Measurement of quality, size and speed of scenes on held-out views, stored in files for reuse."""
 
 from __future__ import annotations
 
@@ -28,29 +27,26 @@ from dyngs.runs.checkpoint import SCENE_FILE, has_only_scene_file, load_run
 from dyngs.runs.opened import scene_of_split, split_views
 from dyngs.study.runs import STORED_CONFIG, read_stored, write_stored
 
-SERIES = 12
-"""Scenes timed together with the first one; bounds the memory needed."""
-TRUTH = ".truth"
-"""Folder of the images themselves: no model has a name that begins like that."""
+SERIES = 12  # Most scenes timed together with the first one, which bounds the memory
+TRUTH = ".truth"  # Folder of the true images; no model name starts with a dot
+# Milliseconds, megabytes or speed ratio; smaller numbers are no valid measurements
 _Measured = Annotated[float, Field(gt=1e-9)]
-"""Milliseconds, megabytes or a gain: a smaller number is none that was measured."""
 SCORES = ("psnr", "ssim", "lpips", "psnr_foreground", "psnr_moving")
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """A scene, measured on the held-out views; None: not known.
+    """Measurement of a scene on the held-out views. None means unknown.
 
     Attributes:
-        psnr, ssim, lpips, psnr_foreground, psnr_moving: means over the views that have them.
-        gaussians: of curved triangles their number, of fields 0.
-        mb: 1e6 bytes on disk: the .dyngs file, or of all that drawing needs where nothing is
-            quantised.
-        steps, seconds: of training.
-        views: names of the views that were drawn for the page, and their PSNR, dB.
-        ms: median milliseconds per image, with deformation; None until they are measured.
-        gain: median speed relative to the first scene, over pairs of renders taken right after each
-            other.
+        psnr, ssim, lpips, psnr_foreground, psnr_moving: means over the views that have the metric.
+        gaussians: number of Gaussians or triangles, 0 for radiance fields.
+        mb: 1e6 bytes of the .dyngs file, or of all parameters if nothing is quantised.
+        steps: training steps.
+        seconds: training time.
+        views: names of the views shown on the page, and their PSNR in dB.
+        ms: median milliseconds per image, with deformation. None until measured.
+        gain: median speed relative to the first scene, over pairs of consecutive renders.
     """
 
     __pydantic_config__ = STORED_CONFIG
@@ -79,22 +75,22 @@ def read_measurement(path: Path) -> Measurement:
 
 @dataclass(frozen=True)
 class StudyScene:
-    """A scene of a study."""
+    """A scene to measure."""
 
     name: str
-    slug: str  # name of its files
-    run_dir: Path  # whose capture and cameras it is compared with
-    make: Callable[[], Path]  # returns the folder that it is drawn from, made if it is not there
+    slug: str  # file name
+    run_dir: Path  # run whose capture and cameras are used
+    make: Callable[[], Path]  # returns the folder of the scene, and creates it if missing
 
 
 @dataclass(frozen=True)
 class SceneMeasurer:
-    """How the scenes of a study are measured.
+    """Measures the scenes of a study.
 
     Attributes:
-        timed_views: for timing, evenly spread over the split; quality is measured on all.
+        timed_views: views used for timing, evenly spread. Quality is measured on all views.
         rounds: renders of each timed view.
-        num_shown: views that are drawn for the page.
+        num_shown: views rendered for the page.
     """
 
     out: Path
@@ -105,13 +101,13 @@ class SceneMeasurer:
     rounds: int = 5
     num_shown: int = 0
 
-    def point(self, slug: str) -> Path:
+    def measurement_path(self, slug: str) -> Path:
         """Return the file of a measurement."""
         return self.out / "points" / f"{slug}.json"
 
     def measure(self, study_scene: StudyScene) -> Measurement:
-        """Return the stored measurement of a subject, or make it without its speed."""
-        path = self.point(study_scene.slug)
+        """Return the stored measurement of a scene, or measure it, without its speed."""
+        path = self.measurement_path(study_scene.slug)
         if path.is_file():
             return read_measurement(path)
         folder = study_scene.make()
@@ -121,7 +117,7 @@ class SceneMeasurer:
         return measurement
 
     def _measurement(self, study_scene: StudyScene, folder: Path) -> Measurement:
-        drawing, loader = self._drawn(study_scene.run_dir, folder)
+        drawing, loader = self._open_renderer(study_scene.run_dir, folder)
         background = drawing.background
         scores, _ = score_views(
             drawing.scene,
@@ -161,9 +157,9 @@ class SceneMeasurer:
             views=tuple(views),
         )
 
-    def _drawn(self, run_dir: Path, folder: Path) -> tuple[SceneRenderer, ImageLoader]:
-        """Return how the scene in a folder is drawn, and the images of the run that it is compared
-        with."""
+    def _open_renderer(self, run_dir: Path, folder: Path) -> tuple[SceneRenderer, ImageLoader]:
+        """Return the renderer of the scene in ``folder``, and the images of the run in
+        ``run_dir``."""
         run = load_run(run_dir)
         device = select_device(self.device)
         capture = read_run_capture(run.config.data, run.info)
@@ -175,8 +171,10 @@ class SceneMeasurer:
         return SceneRenderer(scene, scene.options, background.to(device)), loader
 
     def with_speeds(self, study_scenes: Sequence[StudyScene]) -> list[Measurement]:
-        """Return the measurements of all, the missing speeds measured in turn with the first one,
-        so that other load affects all alike."""
+        """Return the measurements of all scenes, with missing speeds measured now.
+
+        Scenes are timed alternately with the first one, so that other load affects all equally.
+        """
         found = [self.measure(study_scene) for study_scene in study_scenes]
         missing = [i for i in range(1, len(found)) if found[i].ms is None]
         groups = [missing[i : i + SERIES] for i in range(0, len(missing), SERIES)]
@@ -184,8 +182,11 @@ class SceneMeasurer:
             groups = [[]]
         for group in groups:
             together = [0, *group]
-            log_info(f"timing {format_count(len(together), 'scene')} in turn")
-            drawn = [self._drawn(study_scenes[i].run_dir, study_scenes[i].make()) for i in together]
+            log_info(f"timing {format_count(len(together), 'scene')}")
+            drawn = [
+                self._open_renderer(study_scenes[i].run_dir, study_scenes[i].make())
+                for i in together
+            ]
             loader = drawn[0][1]
             images = [loader[i] for i in evenly_spaced(len(loader), self.timed_views)]
             with kernel_threads(self.threads or num_cores()):
@@ -194,15 +195,15 @@ class SceneMeasurer:
                 if found[i].ms is None:
                     gain = median((seconds[0] / own).tolist())
                     found[i] = replace(found[i], ms=1e3 * median(own.tolist()), gain=gain)
-                    write_stored(self.point(study_scenes[i].slug), asdict(found[i]))
+                    write_stored(self.measurement_path(study_scenes[i].slug), asdict(found[i]))
         return found
 
 
 def state_megabytes(scene: Renderable) -> float:
-    """Return the size of all that drawing needs, 1e6 bytes."""
+    """Return the size of all parameters needed for rendering, in 1e6 bytes."""
     return 1e-6 * sum(x.tensor.nbytes for x in scene.drawing_state().values())
 
 
 def _count(scene: Renderable) -> int:
-    """Return the number of Gaussians or triangles; 0 of anything else."""
+    """Return the number of Gaussians or triangles, or 0 for other scenes."""
     return len(scene) if hasattr(scene, "__len__") else 0  # type: ignore[arg-type]

@@ -1,5 +1,7 @@
-"""The report of a study: its table as .csv, .json and .md, a page as .html, and, with matplotlib of
-the extra ``plots``, a plot as .svg."""
+"""Report of a study: tables as .csv, .json and .md, a page as .html, and a plot as .svg.
+
+The plot needs matplotlib (extra ``plots``).
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MATPLOTLIB_MISSING = "the plot needs the package matplotlib; run pip install 'dyngs[plots]'"
+MATPLOTLIB_MISSING = "no plot without matplotlib; run pip install 'dyngs[plots]'"
+# Headings and formats of the columns
 COLUMNS = {
     "psnr": ("PSNR", ".2f"),
     "ssim": ("SSIM", ".4f"),
@@ -39,7 +42,6 @@ COLUMNS = {
     "steps": ("steps", ",.0f"),
     "seconds": ("s", ".0f"),
 }
-"""Heads and formats of the columns of scenes."""
 RATES = {
     "db_per_speed": ("dB lost per doubled speed", "+.2f"),
     "db_per_size": ("dB lost per halved size", "+.2f"),
@@ -61,14 +63,19 @@ class Table:
 
 @dataclass(frozen=True)
 class Report:
-    """Content of a report; ``views``: name, and the name and PSNR of each image of it, whose
-    files are in ``images``."""
+    """Content of a report.
+
+    Attributes:
+        values: further values of the .json file.
+        left_out: reasons why models were skipped, by name.
+        views: name, true image and images of the models, as returned by ``page_views``.
+    """
 
     title: str
     about: str
     rows: Sequence[Row]
     tables: Sequence[Table]
-    values: Mapping[str, Any] = field(default_factory=dict)  # further ones of the .json
+    values: Mapping[str, Any] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     views: Sequence[Mapping[str, Any]] = ()
     figure: Figure | None = None
@@ -81,8 +88,7 @@ def can_plot() -> bool:
 def build_table(
     title: str, rows: Sequence[Row], columns: Mapping[str, tuple[str, str]] = COLUMNS
 ) -> Table:
-    """Return a table of rows, without columns in which none has a figure; the Pareto front is
-    marked."""
+    """Return a table of rows, without empty columns. Rows on the Pareto front are marked."""
     shown = [key for key in columns if any(row.get(key) is not None for row in rows)]
     cells = []
     for row in rows:
@@ -92,29 +98,28 @@ def build_table(
 
 
 def page_views(out: Path, results: Sequence[Measurement]) -> list[dict[str, Any]]:
-    """Return the views that a page shows, each with its images: the truth first, then those of the
-    models."""
+    """Return the views shown on a page, each with the true image and the images of the models."""
 
     images = out / "images"
     views = []
     for index, (name, _) in enumerate(results[0].views):
         file = f"{index:02d}.png"
         models = [
-            {"name": x.name, "psnr": x.views[index][1], "image": _address(images / x.name / file)}
+            {"name": x.name, "psnr": x.views[index][1], "image": _data_url(images / x.name / file)}
             for x in results
         ]
-        views.append({"name": name, "truth": _address(images / TRUTH / file), "models": models})
+        views.append({"name": name, "truth": _data_url(images / TRUTH / file), "models": models})
     return views
 
 
-def _address(file: Path) -> str:
+def _data_url(file: Path) -> str:
     return f"data:image/png;base64,{base64.b64encode(file.read_bytes()).decode()}"
 
 
 def write_report(stem: Path, report: Report) -> list[Path]:
-    """Write the files of a report, whose path without a suffix is ``stem``; return their paths."""
+    """Write the files of a report with path ``stem`` without suffix. Return their paths."""
     left_out = "".join(
-        f"\nLeft out: {markdown_text(f'{name}: {why}')}\n" for name, why in report.left_out.items()
+        f"\nSkipped: {markdown_text(f'{name}: {why}')}\n" for name, why in report.left_out.items()
     )
     tables = "\n".join(markdown_table(table.head, table.cells) for table in report.tables)
     svg = "" if report.figure is None else figure_to_svg(report.figure)
@@ -134,10 +139,10 @@ def write_report(stem: Path, report: Report) -> list[Path]:
 
 
 def page_text(report: Report, svg: str) -> str:
-    """Return a self-contained page with tables, the plot as SVG or "", and synchronised crops."""
+    """Return a self-contained page with tables, the plot as SVG (or ""), and synchronised crops."""
     script = _file("page.js") if report.views else ""
     left_out = "".join(
-        f"<p>Left out: <b>{escape(name)}</b>: {escape(why)}</p>"
+        f"<p>Skipped: <b>{escape(name)}</b>: {escape(why)}</p>"
         for name, why in report.left_out.items()
     )
     tables = "".join(
@@ -167,18 +172,18 @@ def _file(name: str) -> str:
 
 
 def csv_text(rows: Sequence[Mapping[str, object]]) -> str:
-    """Return rows, at least one, whose keys are the columns.
+    """Return rows as CSV. The keys of the first row are the columns.
 
-    Texts that a spreadsheet would take for formulas begin with an apostrophe.
+    Texts that a spreadsheet would interpret as formulas begin with an apostrophe.
     """
     table = io.StringIO()
     writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
     writer.writeheader()
-    writer.writerows({key: _no_formula(value) for key, value in row.items()} for row in rows)
+    writer.writerows({key: _escape_formula(value) for key, value in row.items()} for row in rows)
     return table.getvalue()
 
 
-def _no_formula(value: object) -> object:
+def _escape_formula(value: object) -> object:
     if not isinstance(value, str):
         return value
     return escape_control_characters(
@@ -200,7 +205,7 @@ def markdown_table(head: Sequence[str], cells: Cells) -> str:
 
 
 def markdown_text(text: str) -> str:
-    """Return ``text`` as one line of Markdown in which names are no HTML, links or columns."""
+    """Return ``text`` as one line of Markdown without HTML, links or table columns."""
     return re.sub(r"([\\`*<>\[\]|&])", r"\\\1", format_one_line(text))
 
 
@@ -208,7 +213,7 @@ def markdown_text(text: str) -> str:
 
 
 def figure_to_svg(figure: Figure) -> str:
-    """Return a figure as an SVG element; equal figures give equal text."""
+    """Return a figure as an SVG element. Equal figures give equal text."""
     import matplotlib
 
     file = io.StringIO()
@@ -232,7 +237,11 @@ def _logarithmic(axes: Axes, label: str, title: str) -> None:
 
 
 def plot_curves(curves: Mapping[str, Sequence[tuple[int, float, float]]]) -> Figure:
-    """Return quality over seconds, a line per model; ``curves``: step, seconds and PSNR."""
+    """Return a plot of PSNR over seconds of training, with a line per model.
+
+    Args:
+        curves: (step, seconds, PSNR) by model.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 4.6), layout="constrained")
@@ -246,11 +255,13 @@ def plot_curves(curves: Mapping[str, Sequence[tuple[int, float, float]]]) -> Fig
 
 
 def plot_variants(rows: Sequence[Row], settings: Sequence[str]) -> Figure:
-    """Return two panels, PSNR against speed and against size, and a legend; ``settings``: of each
-    row.
+    """Return plots of PSNR over speed and over size.
 
-    A thin line joins the run, which comes first, with the values of one setting in their order; the
-    thick grey line is the Pareto front of the two axes.
+    A thin line joins the values of one setting with the original run, which comes first. The thick
+    grey line is the Pareto front of the two axes.
+
+    Args:
+        settings: setting of each row.
     """
     from matplotlib.figure import Figure
 
@@ -264,7 +275,7 @@ def plot_variants(rows: Sequence[Row], settings: Sequence[str]) -> Figure:
         best = pareto_mask([(row["psnr"], sign * row[key]) for row in rows])
         front = sorted((row[key], row["psnr"]) for row, on in zip(rows, best, strict=True) if on)
         axes.plot(*zip(*front, strict=True), color="#d4d4d4", linewidth=5)
-        for name in reversed(dict.fromkeys(settings)):  # draws the run itself on top
+        for name in reversed(dict.fromkeys(settings)):  # plots the original run on top
             alone = name in ("", SEVERAL)
             shown = [
                 row
@@ -272,6 +283,6 @@ def plot_variants(rows: Sequence[Row], settings: Sequence[str]) -> Figure:
                 if own == name or (own == "" and not alone)
             ]
             places = [row[key] for row in shown], [row["psnr"] for row in shown]
-            axes.plot(*places, "o" if alone else "o-", lw=0.75, label=name or "the run itself")
+            axes.plot(*places, "o" if alone else "o-", lw=0.75, label=name or "original run")
     figure.legend(*speed.get_legend_handles_labels(), loc="outside lower center", ncols=6)
     return figure

@@ -1,5 +1,4 @@
-"""The runs of a study, one after another or by Ray, and the files in which a study keeps what it
-has, so that nothing is trained or measured twice."""
+"""Execution of the runs of a study, one by one or with Ray, and storage of its results."""
 
 from __future__ import annotations
 
@@ -24,17 +23,16 @@ from dyngs.training.events import Listener
 
 T = TypeVar("T")
 R = TypeVar("R")
+# Validation of stored dataclasses: no unknown fields, finite numbers
 STORED_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
-"""How the dataclasses of results are read: nothing else, and only numbers."""
-STUDY_FILE = "study.json"
-"""What a study is about, in its folder."""
+STUDY_FILE = "study.json"  # File in the folder of a study that describes it
 
 
 def train_to_end(config: Config, out: Path, listeners: Sequence[Listener] = ()) -> Path:
-    """Train the run in folder ``out`` to its end, from its last checkpoint if there is one; return
+    """Train the run in folder ``out`` to its end, from its last checkpoint if there is one. Return
     ``out``.
 
-    A run that goes on keeps its own length, which a time limit may have changed.
+    A resumed run keeps its number of steps, which a time limit may have changed.
     """
     if not checkpoint_paths(out):
         return train(config, listeners=listeners)
@@ -46,14 +44,16 @@ def train_to_end(config: Config, out: Path, listeners: Sequence[Listener] = ()) 
 def run_tasks(
     do: Callable[[T], R], tasks: Sequence[T], ray_cores: int | None = None
 ) -> Iterator[tuple[T, R | DyngsError]]:
-    """Yield each task and what ``do`` makes of it, or why it cannot, as they end.
+    """Yield each task with the result of ``do``, or with its DyngsError, in the order of
+    completion.
 
-    ``ray_cores``: Ray does them at the same time, with so many cores set aside for each, on this
-    machine or on the cluster that ``RAY_ADDRESS`` names, whose machines share the file system;
-    None: here, one after another.
+    Args:
+        ray_cores: cores that Ray reserves per task, on this machine or on the cluster at
+            ``RAY_ADDRESS``, whose machines share the file system. None runs the tasks here, one by
+            one.
     """
 
-    def attempted(task: T) -> R | DyngsError:
+    def attempt(task: T) -> R | DyngsError:
         try:
             return do(task)
         except DyngsError as error:
@@ -61,15 +61,15 @@ def run_tasks(
 
     if ray_cores is None:
         for task in tasks:
-            yield task, attempted(task)
+            yield task, attempt(task)
         return
     here = os.getcwd()
     links = run_links_allowed()
 
-    def attempted_elsewhere(task: T) -> R | DyngsError:
+    def attempt_on_worker(task: T) -> R | DyngsError:
         os.chdir(here)
         with allow_run_links(links):
-            return attempted(task)
+            return attempt(task)
 
     try:
         import ray  # pyright: ignore[reportMissingImports]
@@ -81,7 +81,7 @@ def run_tasks(
     finally:
         os.chdir(here)
     try:
-        remote: Any = ray.remote(num_cpus=ray_cores)(attempted_elsewhere)
+        remote: Any = ray.remote(num_cpus=ray_cores)(attempt_on_worker)
         waiting = {remote.remote(task): task for task in tasks}
         while waiting:
             (ready,), _ = ray.wait(list(waiting))
@@ -91,8 +91,8 @@ def run_tasks(
 
 
 def read_stored(path: Path, kind: TypeAdapter[T]) -> T:
-    """Return a result. Raises DyngsError: the file is damaged."""
-    with wrap_read_errors(path, "it is no result of a study: remove it to have it measured again"):
+    """Return a stored result. Raises DyngsError if the file is damaged."""
+    with wrap_read_errors(path, "not a result of a study; remove it to measure again"):
         return kind.validate_json(read_limited(path))
 
 
@@ -103,27 +103,33 @@ def write_stored(path: Path, values: Mapping[str, Any] | Sequence[Any]) -> None:
 def require_same_study(
     out: Path, facts: Mapping[str, object], compared_keys: Sequence[str]
 ) -> None:
-    """Store the facts of a study in its folder ``out``, or compare them with those stored there.
+    """Store the description of a study in its folder, or compare it with the stored one.
+
+    Args:
+        facts: description of the study.
+        compared_keys: keys of ``facts`` that must be equal.
 
     Raises:
-        DyngsError: one of the ``compared`` facts differs; names those that do.
+        DyngsError: the folder holds another study. The message lists the differences.
     """
     path = out / STUDY_FILE
     if not path.is_file():
         write_stored(path, facts)
         return
     here = json.loads(json.dumps(facts))
-    with wrap_read_errors(path, "what its folder holds is not known; give another --out"):
+    with wrap_read_errors(path, "damaged description of a study; use another --out"):
         known = json.loads(read_limited(path))
         differing = [
-            f"{key} is {_shown(known.get(key))} there and {_shown(here[key])} here"
+            f"{key}: {_describe_value(known.get(key))} there, {_describe_value(here[key])} here"
             for key in compared_keys
             if known.get(key) != here[key]
         ]
     if differing:
-        raise DyngsError(f"{out}: holds another study ({'; '.join(differing)}); give another --out")
+        raise DyngsError(
+            f"{out}: contains another study ({'; '.join(differing)}); use another --out"
+        )
 
 
-def _shown(value: object) -> str:
+def _describe_value(value: object) -> str:
     text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
     return format_one_line(text, 80) or "none"

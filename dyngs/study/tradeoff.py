@@ -1,8 +1,8 @@
-"""A run and its variants, measured: one setting at a time, then combinations; what each setting
-costs, and the variant that meets requirements (``psnr>=30,mb<=5``).
+"""``dyngs tradeoff``: variants of a run, their measurements, and the variant that meets
+requirements.
 
-The run folders of variants are pruned, masked and quantised as these say. None is made or measured
-twice.
+Settings are varied one at a time, then combined. Variants are run folders that are pruned, masked
+or quantised. Existing folders and measurements are reused.
 """
 
 from __future__ import annotations
@@ -47,14 +47,11 @@ from dyngs.study.measure import SCORES, Measurement, SceneMeasurer, StudyScene
 from dyngs.study.runs import STORED_CONFIG, require_same_study, run_tasks, train_to_end
 from dyngs.training.new_trainer import build_trainer
 
-MIN_DOUBLINGS = 0.05
-"""Smaller gains (3.5 %) count as none."""
-MAX_LOSS_DB = 6.0
-"""A single change that loses more is not combined with others."""
-SEVERAL = "several"
-"""Stands for the setting of a variant that changes more than one."""
+MIN_DOUBLINGS = 0.05  # Smaller gains (3.5 %) count as none
+MAX_LOSS_DB = 6.0  # Single changes with a larger loss are not combined with others
+SEVERAL = "several"  # Setting of a variant that changes more than one
+# Columns that a requirement or a goal may name
 METRICS = ("psnr", "ssim", "lpips", "fps", "mb", "gaussians")
-"""Columns that a requirement or a goal may name."""
 _CONDITION = re.compile(r"\s*([a-z_]+)\s*(>=|<=)\s*(\S+)\s*$")
 Row = dict[str, Any]
 Value = float | int | str
@@ -62,16 +59,16 @@ Value = float | int | str
 
 @dataclass(frozen=True, config=STORED_CONFIG)
 class Variant:
-    """Changes of a run; the defaults change nothing.
+    """Changes of a run. The defaults change nothing.
 
     Attributes:
-        prune: fraction of the Gaussians removed, by ``sensitivity``.
+        prune: fraction of Gaussians to remove, by sensitivity.
         mask_times: key times of visibility masks.
         finetune: training steps after pruning and masking.
-        sh_degree: higher spherical harmonics are dropped.
-        storage: allowed change of images by quantisation, grey levels of 255, or "auto", that of
-            ``dyngs export --format dyngs``; None: float32.
-        alpha_min: ``model.alpha_min`` to render with.
+        sh_degree: largest degree of spherical harmonics to keep.
+        storage: largest change of images by quantisation in grey levels of 255, or "auto" as in
+            ``dyngs export --format dyngs``. None stores float32.
+        alpha_min: ``model.alpha_min`` for rendering.
     """
 
     prune: Annotated[float, Field(ge=0, lt=1)] = 0.0
@@ -83,7 +80,7 @@ class Variant:
 
     @property
     def changes(self) -> dict[str, Value]:
-        """The fields that differ from the run; ``Variant(**changes)`` is the variant again."""
+        """Fields that differ from the original run. ``Variant(**changes)`` restores the variant."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         return {f.name: values[f.name] for f in fields(self) if values[f.name] != f.default}
 
@@ -92,30 +89,31 @@ class Variant:
         words = (
             f"{k}={x:g}" if isinstance(x, float) else f"{k}={x}" for k, x in self.changes.items()
         )
-        return " ".join(words) or "as it is"
+        return " ".join(words) or "original"
 
     @property
     def slug(self) -> str:
-        """File name, different for different variants."""
+        """File name, unique for each variant."""
         words = (f"{k}-{x!r}".replace("'", "") for k, x in self.changes.items())
         return "_".join(words) or "as_it_is"
 
     @property
     def settings(self) -> list[str]:
-        """Names of the changed settings; ``finetune`` belongs to the ones before it."""
+        """Names of the changed settings, without ``finetune``, which belongs to pruning and
+        masking."""
         return [name for name in self.changes if name != "finetune"]
 
     @property
     def setting(self) -> str:
-        """The changed setting with what belongs to it; "" for the run itself, ``SEVERAL`` for
-        combinations."""
+        """The changed setting, "" for the original run, ``SEVERAL`` for combinations."""
         return SEVERAL if len(self.settings) > 1 else " + ".join(self.changes)
 
     def merged(self, other: Variant) -> Variant:
-        """Return this variant with the changes of ``other`` on top."""
+        """Return this variant with the changes of ``other`` applied on top."""
         return replace(self, **other.changes)
 
 
+# Settings that can be varied and their default values, in order of increasing compression
 SETTINGS: dict[str, tuple[Value, ...]] = {
     "prune": (0.3, 0.5, 0.7, 0.85),
     "mask_times": (6, 16),
@@ -123,35 +121,39 @@ SETTINGS: dict[str, tuple[Value, ...]] = {
     "storage": ("auto", 1.0, 3.0),
     "alpha_min": (0.008, 0.016, 0.032),
 }
-"""The settings that can be varied, and the values that are tried, stronger ones later."""
 
 
 def parse_variations(words: Sequence[str]) -> dict[str, tuple[Value, ...]]:
-    """Return the settings of ``--vary SETTING`` or ``--vary SETTING=VALUE,VALUE`` with their
-    values; without any, all with defaults."""
-    found: dict[str, tuple[Value, ...]] = {}
+    """Return the settings and values of ``--vary SETTING`` or ``--vary SETTING=VALUE,VALUE``.
+
+    Without options, all settings with their default values.
+    """
+    variations: dict[str, tuple[Value, ...]] = {}
     for word in words:
         name, equals, listed = word.partition("=")
         shown = f"--vary {format_one_line(word, 60)}"
         if name not in SETTINGS:
-            raise DyngsError(f"{shown}: no such setting; there are {', '.join(SETTINGS)}")
-        found[name] = SETTINGS[name]
+            raise DyngsError(f"{shown}: unknown setting; use {', '.join(SETTINGS)}")
+        variations[name] = SETTINGS[name]
         if equals:
             texts = dict.fromkeys(text.strip() for text in listed.split(","))
             try:
                 variants = [Variant(**{name: text}) for text in texts]  # pyright: ignore[reportArgumentType]
             except ValidationError as error:
                 raise DyngsError(f"{shown}: {error.errors()[0]['msg']}") from None
-            found[name] = tuple(getattr(variant, name) for variant in variants)
-    return found or SETTINGS
+            variations[name] = tuple(getattr(variant, name) for variant in variants)
+    return variations or SETTINGS
 
 
 def current_settings(run_dir: Path) -> dict[str, Value | None]:
-    """Return the settings that can be varied in a run, with its own values. Raises DyngsError: none
-    can."""
+    """Return the settings of a run that can be varied, with their current values.
+
+    Raises:
+        DyngsError: the run has no settings to vary.
+    """
     if has_only_scene_file(run_dir):
         raise DyngsError(
-            f"{run_dir}: only {SCENE_FILE} is there; give the run that it was exported from"
+            f"{run_dir}: contains only {SCENE_FILE}; use the run that it was exported from"
         )
     config = load_resolved(run_dir)
     if capability(config.model, HasGaussians) is None:
@@ -171,8 +173,13 @@ def current_settings(run_dir: Path) -> dict[str, Value | None]:
 def single_setting_variants(
     settings: Mapping[str, Sequence[Value]], own: Mapping[str, Value | None], finetune: int
 ) -> list[Variant]:
-    """Return one variant per setting and value that applies to a run with the settings ``own`` and
-    differs from its own; pruned and masked ones also with fine-tuning."""
+    """Return one variant per setting and value that applies to the run and changes it.
+
+    Pruned and masked variants are repeated with fine-tuning if ``finetune`` is positive.
+
+    Args:
+        own: current settings of the run.
+    """
     variants = []
     for name, values in settings.items():
         before: Any = own.get(name)
@@ -187,16 +194,16 @@ def single_setting_variants(
 
 @dataclass(frozen=True)
 class Tradeoff:
-    """The variants of a run, their folders and measurements in ``out``.
+    """Variants of a run, stored and measured in the folder ``out``.
 
     Attributes:
         settings: values to measure, by setting.
-        finetune: training steps after pruning and masking, for additional variants; 0: none.
-        combine: combinations in each of three directions, see ``combinations``.
+        finetune: training steps after pruning and masking, for additional variants. 0 adds none.
+        combine: number of combinations in each of three directions, see ``combinations``.
         rounds: renders of each timed view.
-        threads: 0: all cores.
-        device: what trains, prunes and renders.
-        ray_cores: of each variant that Ray makes and measures; None: all is done here.
+        threads: 0 uses all cores.
+        device: device for training, pruning and rendering.
+        ray_cores: cores per variant with Ray. None runs everything here.
     """
 
     run_dir: Path
@@ -211,18 +218,16 @@ class Tradeoff:
     ray_cores: int | None = None
 
     def run(self) -> dict[Variant, Measurement]:
-        """Return the measurements of all variants, the run itself first.
+        """Return the measurements of all variants, the original run first.
 
-        Each is kept as a file in ``out / "points"`` and not made again.
+        Results are stored in ``out / "points"`` and reused.
 
         Raises:
-            DyngsError: no such run or split, or the folder holds measurements of another run.
+            DyngsError: invalid run or split, or the folder contains measurements of another run.
         """
-        load_resolved(self.run_dir)  # what is no run is refused before anything else
+        load_resolved(self.run_dir)  # raises if this is not a run
         collect_inputs(self.run_dir).require_output(self.out)
-        own = current_settings(
-            self.run_dir
-        )  # refuses what cannot be varied before anything is written
+        own = current_settings(self.run_dir)
         run = load_run(self.run_dir)
         split_views(read_run_capture(run.config.data, run.info), self.split)
         newest = checkpoint_paths(self.run_dir)[-1]
@@ -237,33 +242,35 @@ class Tradeoff:
         singles = [Variant(), *single_setting_variants(self.settings, own, self.finetune)]
         idle = self.settings.keys() - {name for variant in singles for name in variant.settings}
         if idle:
-            log_info(f"nothing to vary in this run: {', '.join(sorted(idle))}")
-        found = self._measured(singles, self.ray_cores)
-        # combinations share folders, so these are made one after another
-        return self._measured([*singles, *combinations(found, self.combine)], None)
+            log_info(f"settings without effect on this run: {', '.join(sorted(idle))}")
+        found = self._measure(singles, self.ray_cores)
+        # Combinations share folders, so they are created one by one.
+        return self._measure([*singles, *combinations(found, self.combine)], None)
 
-    def _measured(
+    def _measure(
         self, variants: Sequence[Variant], ray_cores: int | None
     ) -> dict[Variant, Measurement]:
-        bench = SceneMeasurer(self.out, self.split, self.threads, self.device, rounds=self.rounds)
+        measurer = SceneMeasurer(
+            self.out, self.split, self.threads, self.device, rounds=self.rounds
+        )
         study_scenes = [
             StudyScene(v.name, v.slug, self.run_dir, partial(self.folder, v)) for v in variants
         ]
         missing = [
             study_scene
             for study_scene in study_scenes
-            if not bench.point(study_scene.slug).is_file()
+            if not measurer.measurement_path(study_scene.slug).is_file()
         ]
-        for study_scene, found in run_tasks(bench.measure, missing, ray_cores):
+        for study_scene, found in run_tasks(measurer.measure, missing, ray_cores):
             if isinstance(found, DyngsError):
                 raise found
             log_info(f"{study_scene.name}: {found.psnr:.2f} dB, {found.mb:.2f} MB")
-        return dict(zip(variants, bench.with_speeds(study_scenes), strict=True))
+        return dict(zip(variants, measurer.with_speeds(study_scenes), strict=True))
 
     def folder(self, variant: Variant) -> Path:
-        """Return the run folder of a variant; it is made if it does not exist.
+        """Return the run folder of a variant, created if missing.
 
-        After Ctrl-C while fine-tuning, the next call continues.
+        Interrupted fine-tuning continues on the next call.
         """
         if variant == Variant():
             return self.run_dir
@@ -291,37 +298,40 @@ class Tradeoff:
             tensors["gaussians.sh"] = sh.contiguous()
             checkpoint = replace(checkpoint, tensors=tensors)
         elif wanted.finetune:
-            source = self._finetuned(wanted)
+            source = self._finetune(wanted)
             checkpoint = latest_checkpoint(source)
             config = load_resolved(source)
         else:
             source = self.run_dir
             start = latest_checkpoint(source)
             steps = f"train.steps={start.info.step}"
-            config = load_resolved(source, [steps, *self._pruning(wanted)])
+            config = load_resolved(source, [steps, *self._pruning_overrides(wanted)])
             with kernel_threads(self.threads or num_cores()):
                 capture = read_run_capture(config.data, start.info)
                 trainer = build_trainer(config, capture, restored=True)
                 trainer.restore(start)
                 trainer.apply(build_pruning_edit(trainer))
                 checkpoint = trainer.checkpoint()
-        # optimizer, sampler and random state are left out
+        # Omit optimizer, sampler and random state.
         tensors = strip_roles(restore_model(checkpoint, config.model).state())
         checkpoint = replace(checkpoint, tensors=tensors, settings=checkpoint_settings(config))
         save_checkpoint(folder, checkpoint, seconds_at(source, checkpoint.info.step))
         write_config(config, folder)  # marks the folder as complete
 
-    def _finetuned(self, wanted: Variant) -> Path:
+    def _finetune(self, wanted: Variant) -> Path:
         """Prune and fine-tune the run."""
         out = self.out / "training" / wanted.slug
         if checkpoint_paths(out):
             return train_to_end(load_resolved(out), out)
         steps = f"prune.steps={wanted.finetune}"
-        return prune_run(self.run_dir, out, [*self._pruning(wanted), steps])
+        return prune_run(self.run_dir, out, [*self._pruning_overrides(wanted), steps])
 
-    def _pruning(self, wanted: Variant) -> list[str]:
-        """Return overrides of the pruning stage. Limits of the run would change its variants again;
-        masks are those of the run where the variant has none."""
+    def _pruning_overrides(self, wanted: Variant) -> list[str]:
+        """Return config overrides of the pruning stage.
+
+        Limits of the run are removed, since they would change its variants. Masks of the run are
+        kept if the variant has none.
+        """
         masks = wanted.mask_times or load_resolved(self.run_dir).prune.mask_times
         return [
             *(f"budget.{name}=null" for name in BudgetConfig.model_fields),
@@ -333,8 +343,7 @@ class Tradeoff:
 
 
 def pareto_mask(goals: Sequence[Sequence[float]]) -> list[bool]:
-    """Return which points are on the Pareto front: no other is as good in all goals and better in
-    one."""
+    """Return which points are on the Pareto front, with all goals maximised."""
 
     def dominates(a: Sequence[float], b: Sequence[float]) -> bool:
         return a != b and all(x >= y for x, y in zip(a, b, strict=True))
@@ -343,9 +352,11 @@ def pareto_mask(goals: Sequence[Sequence[float]]) -> list[bool]:
 
 
 def build_rows(measurements: Sequence[Measurement]) -> list[Row]:
-    """Return a row per measurement, by column. ``fps`` is that of the first one times the gain, so
-    that scenes timed at another hour compare; ``on_front``: on the Pareto front of PSNR, speed and
-    size."""
+    """Return a table row per measurement.
+
+    ``fps`` is that of the first measurement times the gain, so scenes timed at different hours are
+    comparable. ``on_front`` marks the Pareto front of PSNR, speed and size.
+    """
     base = measurements[0].ms
     fps = 0.0 if base is None else 1e3 / base
     front = pareto_mask([(m.psnr, m.gain, -m.mb) for m in measurements])
@@ -360,19 +371,21 @@ def build_rows(measurements: Sequence[Measurement]) -> list[Row]:
 
 
 def db_per_doubling(losses_and_factors: Iterable[tuple[float, float]]) -> float | None:
-    """Return dB lost per factor 2: the least-squares line through no loss at factor 1; None if
-    less than 3.5 % is gained."""
+    """Return the dB lost per factor 2, by a least-squares line through the origin.
+
+    None if all gains are below 3.5 %.
+    """
     pairs = [(loss, math.log2(factor)) for loss, factor in losses_and_factors]
     pairs = [(loss, doublings) for loss, doublings in pairs if doublings >= MIN_DOUBLINGS]
     return sum(loss * x for loss, x in pairs) / sum(x * x for _, x in pairs) if pairs else None
 
 
 def exchange_rates(found: Mapping[Variant, Measurement]) -> list[Row]:
-    """Return a row per setting, from the variants that change it alone, in order of appearance.
+    """Return a row per setting, from the variants that change only that setting.
 
-    ``db_per_speed``, ``db_per_size``: PSNR lost per doubled speed and per halved size; None where
-    no value of the setting gains any; negative: quality improves as well. ``speed``, ``size``:
-    largest gains of its values, as factors.
+    ``db_per_speed`` and ``db_per_size`` are the PSNR lost per doubled speed and per halved size.
+    None if no value gains any, negative if PSNR improves. ``speed`` and ``size`` are the largest
+    gains as factors.
     """
     base = found[Variant()]
     groups: dict[str, list[Measurement]] = {}
@@ -392,11 +405,11 @@ def exchange_rates(found: Mapping[Variant, Measurement]) -> list[Row]:
 
 
 def combinations(found: Mapping[Variant, Measurement], count: int) -> list[Variant]:
-    """Return combinations of single changes worth measuring next.
+    """Return combinations of single changes to measure next.
 
-    There are three greedy sequences, of ``count`` each: for speed, for size, and for both. Each
-    starts at the run and adds the change that loses the least PSNR per factor 2, then the next; a
-    stronger value of a setting, which comes later in ``found``, replaces a weaker one.
+    Three greedy sequences of ``count`` variants optimise speed, size, and both. Each starts at the
+    original run and adds the change with the smallest PSNR loss per factor 2. A stronger value of a
+    setting, which comes later in ``found``, replaces a weaker one.
     """
     base = found[Variant()]
     combined: dict[Variant, None] = {}
@@ -430,8 +443,8 @@ def combinations(found: Mapping[Variant, Measurement], count: int) -> list[Varia
 
 @dataclass(frozen=True)
 class Requirement:
-    """``name >= bound``, or ``name <= bound`` if ``at_most``; as a goal: the more, or the less, the
-    better."""
+    """A condition ``name >= bound``, or ``name <= bound`` if ``at_most``. Also used as a goal
+    without bound."""
 
     name: str
     at_most: bool
@@ -444,7 +457,7 @@ class Requirement:
         return self.cost(row) <= (self.bound if self.at_most else -self.bound)
 
     def cost(self, row: Row) -> float:
-        """Return a value that is smaller for better rows, infinite where the metric was not
+        """Return a value that is smaller for better rows, infinite if the metric was not
         measured."""
         value = row[self.name]
         if value is None:
@@ -454,7 +467,7 @@ class Requirement:
 
 def parse_requirements(text: str) -> list[Requirement]:
     """Return the conditions of a list such as ``psnr>=30,fps>=20,mb<=5``."""
-    found = []
+    requirements = []
     for part in text.split(","):
         match = _CONDITION.match(part)
         try:
@@ -463,27 +476,29 @@ def parse_requirements(text: str) -> list[Requirement]:
             bound = math.nan
         if match is None or not math.isfinite(bound):
             raise DyngsError(
-                f"--require {format_one_line(part.strip(), 60)!r} is no condition; write for instance "
+                f"--require {format_one_line(part.strip(), 60)!r}: not a condition; example: "
                 "psnr>=30,fps>=20,mb<=5"
             )
-        found.append(replace(parse_goal(match[1], smallest=match[2] == "<="), bound=bound))
-    return found
+        requirements.append(replace(parse_goal(match[1], smallest=match[2] == "<="), bound=bound))
+    return requirements
 
 
 def parse_goal(name: str, *, smallest: bool) -> Requirement:
     """Return the goal of ``--minimize`` or ``--maximize``."""
     if name not in METRICS:
-        raise DyngsError(
-            f"{format_one_line(name, 60)}: no such metric; there are {', '.join(METRICS)}"
-        )
+        raise DyngsError(f"{format_one_line(name, 60)}: unknown metric; use {', '.join(METRICS)}")
     return Requirement(name, smallest)
 
 
 def choose_variant(
     rows: Sequence[Row], requirements: Sequence[Requirement], goal: Requirement
 ) -> int:
-    """Return the number of the best row among those that meet all requirements; of equally good
-    ones that with the higher PSNR."""
+    """Return the index of the best row that meets all requirements. Ties are resolved by PSNR.
+
+    Raises:
+        DyngsError: no row meets the requirements. The message names the best values without each
+            one.
+    """
 
     def meeting(needed: Sequence[Requirement]) -> list[int]:
         return [i for i, row in enumerate(rows) if all(r.is_met(row) for r in needed)]
@@ -499,6 +514,6 @@ def choose_variant(
         )
         if best[binding.name] is not None:
             value = f"{best[binding.name]:.5g} ({best['name']})"
-            hints.append(f"; with the others met the best {binding.name} is {value}")
-    asked = ", ".join(map(str, requirements))
-    raise DyngsError(f"no measured variant has {asked}{''.join(hints)}")
+            hints.append(f"; best {binding.name} with the other conditions: {value}")
+    conditions = ", ".join(map(str, requirements))
+    raise DyngsError(f"no variant meets {conditions}{''.join(hints)}")

@@ -1,1 +1,1 @@
-"""The plan of a run, the trainer, the loop and its events, corrections of images, priors."""
+"""Training: run plan, trainer, loop and events, image corrections and priors."""

@@ -1,10 +1,9 @@
-"""The clock of a run: seconds so far, what a step costs, and the seconds that the rest of a run
-will take.
+"""Training time: elapsed seconds, relative cost of a step, forecast of the remaining seconds.
 
-Images begin small, Gaussians are added, motion begins: steps at the end may cost ten times as much
-as those at the start. The cost of a step is taken as a sum of a constant, of pixels and of
-Gaussians, in proportions measured on two CPU cores; only their ratios matter, as the pace is
-measured. The progress bar, the deadline of ``train.minutes`` and previews all count by it.
+Steps at the end of a run may cost ten times as much as at its start, because images grow, Gaussians
+are added and motion begins. The cost of a step is modelled as a constant plus terms for pixels and
+Gaussians. Only the ratios of the terms matter, since the pace is measured. The progress bar,
+``train.minutes`` and previews use this model.
 """
 
 from __future__ import annotations
@@ -19,20 +18,18 @@ from statistics import fmean
 from dyngs.config import Config
 from dyngs.models.schedule import image_divisor, scale_step
 
+# Cost of a step: constant, per 1e6 rendered pixels, per Gaussian. Milliseconds on two CPU cores.
 FIXED, PER_MEGAPIXEL, PER_GAUSSIAN = 6.0, 300.0, 7e-4
-"""Cost of a step: of any one, of 1e6 pixels that are drawn, of a Gaussian. Milliseconds on two
-cores."""
-MOTION = 2.0  # Factor by which steps cost more once things may move
+MOTION = 2.0  # Factor by which a step costs more once the scene may move
+# Exponent with which the number of Gaussians grows with the side of the images (measured: 2 to 4.7
+# times more from a quarter to the full size).
 DETAIL = 0.5
-"""Power of the images' side with which the number of Gaussians grows: 2 to 4.7 times were seen from
-1/4 to full."""
-SAMPLES = 64
-SAVE_FRACTION = 0.05
-"""Largest fraction of the time that regular checkpoints may take."""
+SAMPLES = 64  # Steps at which the cost of a range of steps is sampled
+SAVE_FRACTION = 0.05  # Largest fraction of the training time that regular checkpoints may take
 
 
 class Stopwatch:
-    """Seconds of training: from reading the capture on, over all resumes, without evaluations."""
+    """Seconds of training, from reading the capture on, over all resumes, without evaluations."""
 
     def __init__(self) -> None:
         self._since = time.perf_counter()
@@ -42,16 +39,16 @@ class Stopwatch:
         return time.perf_counter() - self._since
 
     def exclude(self, seconds: float) -> None:
-        """Leave ``seconds`` out (negative: count them in)."""
+        """Do not count ``seconds``. Negative values add time."""
         self._since += seconds
 
 
 class SaveTimer:
-    """When the next regular checkpoint is due.
+    """Schedule of regular checkpoints.
 
     Args:
         minutes: ``train.save_minutes``.
-        now: seconds of training at which the run begins or is resumed.
+        now: seconds of training when the run starts or resumes.
     """
 
     def __init__(self, minutes: float, now: float) -> None:
@@ -65,14 +62,14 @@ class SaveTimer:
         return self._minutes > 0 and now - self._last >= interval
 
     def record_save(self, begin: float, end: float) -> None:
-        """Note that a checkpoint was written from ``begin`` to ``end``, seconds of training."""
+        """Record a checkpoint that was written from ``begin`` to ``end``, in seconds of
+        training."""
         self._last = end
         self._duration = end - begin
 
 
 def step_cost(config: Config, step: int, pixels: float, num_gaussians: float) -> float:
-    """Return the cost of ``step``, whose image has so many pixels at full size; only ratios mean
-    something."""
+    """Return the relative cost of ``step`` for an image of ``pixels`` pixels at full size."""
     drawn = pixels / image_divisor(config.train, max(step, 1)) ** 2
     cost = FIXED + PER_MEGAPIXEL * 1e-6 * drawn + PER_GAUSSIAN * num_gaussians
     begins = config.model.motion_start_step(config.train.steps)
@@ -82,8 +79,11 @@ def step_cost(config: Config, step: int, pixels: float, num_gaussians: float) ->
 def cost_between(
     config: Config, done: int, end: int, pixels: float, num_gaussians: Callable[[int], float]
 ) -> float:
-    """Return the cost of the steps after ``done`` up to ``end``, with ``num_gaussians`` (step)
-    Gaussians."""
+    """Return the relative cost of the steps after ``done`` up to ``end``.
+
+    Args:
+        num_gaussians: returns the expected number of Gaussians at a step.
+    """
     left = max(end - done, 0)
     sampled = (done + math.ceil(left * (i + 0.5) / SAMPLES) for i in range(SAMPLES))
     return left * fmean(step_cost(config, step, pixels, num_gaussians(step)) for step in sampled)
@@ -91,7 +91,7 @@ def cost_between(
 
 @dataclass(frozen=True)
 class _Mark:
-    """A point of a run: steps done, seconds of training, cost of the steps up to it, Gaussians."""
+    """Progress of a run: step, seconds of training, accumulated cost, number of Gaussians."""
 
     step: int
     seconds: float
@@ -100,10 +100,10 @@ class _Mark:
 
 
 class TimeForecast:
-    """Prediction of the seconds that a run still takes, by its pace so far.
+    """Forecast of the remaining seconds of a run from its measured pace.
 
     Args:
-        pixels: of a training image at full size.
+        pixels: number of pixels of a training image at full size.
     """
 
     def __init__(self, step: int, seconds: float, num_gaussians: int, pixels: float) -> None:
@@ -111,7 +111,7 @@ class TimeForecast:
         self._marks = [_Mark(step, seconds, 0.0, num_gaussians)]
 
     def exclude(self, seconds: float) -> None:
-        """Leave ``seconds`` that were not spent training out."""
+        """Do not count ``seconds`` that were not spent on training."""
         self._marks = [replace(mark, seconds=mark.seconds + seconds) for mark in self._marks]
 
     def observe(self, config: Config, step: int, seconds: float, num_gaussians: int) -> None:
@@ -121,7 +121,7 @@ class TimeForecast:
 
     @property
     def mean_step(self) -> float:
-        """Mean seconds of a step so far."""
+        """Mean seconds per step so far."""
         first = self._marks[0]
         now = self._marks[-1]
         return (now.seconds - first.seconds) / max(now.step - first.step, 1)
@@ -133,8 +133,8 @@ class TimeForecast:
         return (now.seconds - first.seconds) / max(now.cost - first.cost, 1e-9)
 
     def seconds(self, config: Config, total: int, done: int | None = None) -> float:
-        """Return the seconds until step ``total`` of a run of ``config``, by the pace of the second
-        half so far."""
+        """Return the seconds until step ``total``, from the pace of the second half of the steps so
+        far."""
         now = self._marks[-1]
         done = now.step if done is None else done
         if done >= total or now.cost == 0:
@@ -144,10 +144,10 @@ class TimeForecast:
         return self.pace(middle) * cost_between(config, done, total, self.pixels, expected)
 
     def _expected(self, config: Config, since: _Mark, step: int) -> float:
-        """Return how many Gaussians are expected at ``step``.
+        """Return the expected number of Gaussians at ``step``.
 
-        They go on growing as since ``since`` until densification ends, and larger images hold
-        detail for more; at most up to the configured cap.
+        Growth continues at the rate since ``since`` until densification ends. Larger images add
+        detail. The configured cap limits the result.
         """
         now = self._marks[-1]
         stop = scale_step(config.strategy.stop, config.train.steps)

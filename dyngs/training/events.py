@@ -1,6 +1,6 @@
-"""Typed events of training and their listeners.
+"""Events of training and the interface of their listeners.
 
-A progress bar, a log, limits on the result and a viewer are all listeners; training knows none of
+The progress bar, the run log, limits and the viewer are listeners. Training does not depend on
 them.
 """
 
@@ -23,15 +23,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StepReport:
-    """One step of training."""
+    """Result of one training step."""
 
-    step: int  # its number, from 1
+    step: int  # from 1
     loss: float
     image: Image
     # rendered, truth: (H, W, 3) on the same background
     rendered: Tensor
     truth: Tensor
-    message: str | None = None  # lines about what was found out after the step, or None
+    message: str | None = None  # lines to log, or None
 
     @cached_property
     def psnr(self) -> float:
@@ -40,7 +40,7 @@ class StepReport:
 
 @dataclass(frozen=True)
 class Started:
-    """Training begins or goes on after ``step`` steps, of ``total``."""
+    """Training starts, or resumes after ``step`` of ``total`` steps."""
 
     step: int
     total: int
@@ -48,11 +48,11 @@ class Started:
 
 @dataclass(frozen=True)
 class StepDone:
-    """A step is done. Values outside the report are current when read: an earlier listener may have
-    changed them."""
+    """A step is complete. Properties return current values, which an earlier listener may have
+    changed."""
 
-    report: StepReport  # of the step
-    loop: Loop  # that did it; a viewer finds what is trained in ``loop.trainer``
+    report: StepReport
+    loop: Loop
 
     @property
     def step(self) -> int:
@@ -76,7 +76,7 @@ class StepDone:
 
     @property
     def bad_gradients(self) -> int:
-        """Number of rows left out of steps so far because their gradient was not finite."""
+        """Number of parameter rows skipped so far because their gradient was not finite."""
         return int(self.loop.trainer.bad_gradients)
 
     @property
@@ -86,7 +86,7 @@ class StepDone:
 
 @dataclass(frozen=True)
 class TopologyChanged:
-    """The set of Gaussians has changed outside the strategy."""
+    """The number of Gaussians changed outside the densification strategy."""
 
     step: int
     before: int
@@ -95,14 +95,14 @@ class TopologyChanged:
 
 @dataclass(frozen=True)
 class TotalChanged:
-    """There will be another number of steps."""
+    """The number of training steps changed."""
 
     total: int
 
 
 @dataclass(frozen=True)
 class Saved:
-    """A checkpoint of ``step`` is in the file ``path``."""
+    """The checkpoint of ``step`` was written to ``path``."""
 
     step: int
     path: Path
@@ -110,8 +110,7 @@ class Saved:
 
 @dataclass(frozen=True)
 class Evaluated:
-    """Mean scores of a split after ``step``; they took ``seconds``, which do not count as
-    training."""
+    """Mean scores on a split after ``step``. ``seconds`` of evaluation do not count as training."""
 
     step: int
     split: str
@@ -122,7 +121,7 @@ class Evaluated:
 
 @dataclass(frozen=True)
 class Message:
-    """A line for people."""
+    """A line of text for the user."""
 
     text: str
 

@@ -1,7 +1,7 @@
-"""Limits on the number of Gaussians and their combinations; see docs/reference/limits.md.
+"""Limits on the number of Gaussians, and checks of limits against each other.
 
-A limit on the file's size is one on the number of Gaussians first: so few that they fit when stored
-as exactly as is usual.
+A limit on the file size is first converted to a number of Gaussians, at the usual precision of
+storage.
 """
 
 from __future__ import annotations
@@ -11,53 +11,55 @@ from dyngs.core.conventions import num_sh_terms
 from dyngs.core.errors import DyngsError
 from dyngs.models.kind import HasGaussians, HasSizeLimit, capability, find_kind
 
-# Fraction of the limit that is kept free for the random Gaussians with which motion begins
+# Fraction of the limit reserved for the random Gaussians that are added when motion begins
 RANDOM_FRACTION = 0.1
+# Bytes per Gaussian, per SH coefficient, per value of a deformation field: slightly more than
+# measured (docs/storage.md).
 SHAPE_BYTES, HARMONIC_BYTES, FIELD_BYTES = 16.0, 0.35, 1.0
-"""Bytes per Gaussian, per value of its harmonics, per value of a field: a little more than in
-docs/reference/formats.md."""
-FEWEST = 500  # Fewest Gaussians that a limit on the size must have room for
+FEWEST = 500  # Smallest number of Gaussians that a size limit must allow
 
 
 def validate_limits(config: Config) -> None:
-    """Raise DyngsError where limits or choices of ``config`` contradict it or each other."""
+    """Raise DyngsError if limits or options of ``config`` contradict each other or its kind."""
     uses = find_kind(config.model).uses
-    for key, value in _given(config).items():
+    for key, value in _kind_specific_options(config).items():
         if key not in uses:
             raise DyngsError(
-                f"{key}={value}: has no effect with model.kind={config.model.kind}; leave it out"
+                f"{key}={value}: not supported by model.kind={config.model.kind}; remove it"
             )
     if config.train.batch_size > 1:
-        for key, value in _of_single_images(config).items():
+        for key, value in _single_image_options(config).items():
             if value != "never":
                 raise DyngsError(
-                    f"train.batch_size={config.train.batch_size}: {key}={value} follows one image per step; give "
-                    f"{key}=never, or one process"
+                    f"train.batch_size={config.train.batch_size}: {key}={value} needs one image "
+                    "per step; use "
+                    f"{key}=never, or train.batch_size=1"
                 )
     if config.train.minutes is not None and config.prune.is_enabled:
         raise DyngsError(
-            "train.minutes: how long the stage of prune.* takes cannot be foreseen; leave that out and run "
-            "`dyngs prune` afterwards"
+            "train.minutes: cannot be combined with prune.*, whose duration is unknown; train "
+            "first, then run "
+            "`dyngs prune`"
         )
 
 
-def _given(config: Config) -> dict[str, object]:
-    """Return what is requested that only some kinds of model use, by its key."""
-    found: dict[str, object] = {
-        key: x for key, x in _of_single_images(config).items() if x == "always"
+def _kind_specific_options(config: Config) -> dict[str, object]:
+    """Return the options, by key, that are set and that only some model kinds support."""
+    given: dict[str, object] = {
+        key: x for key, x in _single_image_options(config).items() if x == "always"
     }
     for name, section in (("budget", config.budget), ("prune", config.prune)):
-        given = section.model_dump(exclude_defaults=True, exclude={"steps", "score"})
-        found |= {f"{name}.{key}": value for key, value in given.items()}
+        changed = section.model_dump(exclude_defaults=True, exclude={"steps", "score"})
+        given |= {f"{name}.{key}": value for key, value in changed.items()}
     if config.train.minutes is not None:
-        found["train.minutes"] = config.train.minutes
+        given["train.minutes"] = config.train.minutes
     if config.train.batch_size > 1:
-        found["train.batch_size"] = config.train.batch_size
-    return found
+        given["train.batch_size"] = config.train.batch_size
+    return given
 
 
-def _of_single_images(config: Config) -> dict[str, str]:
-    """Return the choices that follow single images, by their keys."""
+def _single_image_options(config: Config) -> dict[str, str]:
+    """Return the options, by key, that need one image per step."""
     train = config.train
     return {
         "train.robust": train.robust,
@@ -67,7 +69,7 @@ def _of_single_images(config: Config) -> dict[str, str]:
 
 
 def apply_gaussian_cap(config: Config, cap: int | None) -> Config:
-    """Return ``config`` with all numbers of Gaussians lowered to ``cap``; None: as it is."""
+    """Return ``config`` with all limits on Gaussians lowered to ``cap``. None changes nothing."""
     changes = {}
     if cap is None:
         return config
@@ -81,8 +83,7 @@ def apply_gaussian_cap(config: Config, cap: int | None) -> Config:
 
 
 def gaussian_limit(config: Config, num_times: int) -> int | None:
-    """Return the largest number of Gaussians at the end by the limits of the run; None without
-    one."""
+    """Return the largest allowed number of Gaussians at the end of a run, or None."""
     limits = [config.budget.max_gaussians] if config.budget.max_gaussians is not None else []
     megabytes = config.budget.max_mb
     if megabytes is not None and capability(config.model, HasSizeLimit) is not None:
@@ -91,24 +92,24 @@ def gaussian_limit(config: Config, num_times: int) -> int | None:
 
 
 def max_gaussians_in_file(config: Config, num_times: int, megabytes: float) -> int:
-    """Return the number of Gaussians that fit in a file of so many 1e6 bytes at the usual
+    """Return the number of Gaussians that fit into a file of ``megabytes`` (1e6 bytes) at the usual
     precision.
 
     Raises:
-        DyngsError: fewer than ``FEWEST``; says which size has room for them.
+        DyngsError: fewer than ``FEWEST`` fit. The message contains the size that would suffice.
     """
     each = SHAPE_BYTES + HARMONIC_BYTES * 3 * (num_sh_terms(config.stored_sh_degree) - 1)
     kind = capability(config.model, HasSizeLimit)
     assert kind is not None
-    fixed, whole = (
+    static_bytes, bytes_per_moving_gaussian = (
         FIELD_BYTES * kind.num_shared(config.model, num_times, moving) for moving in (0, 1)
     )
-    each += whole - fixed  # if all move
-    found = int((1e6 * megabytes - fixed) / each)
-    if found < FEWEST:
-        field = f", of which the field takes {1e-6 * fixed:.2g}" if fixed else ""
+    each += bytes_per_moving_gaussian - static_bytes  # all Gaussians may move
+    count = int((1e6 * megabytes - static_bytes) / each)
+    if count < FEWEST:
+        field = f" (deformation field: {1e-6 * static_bytes:.2g} MB)" if static_bytes else ""
         raise DyngsError(
-            f"budget.max_mb={megabytes:g}: has no room for {FEWEST} Gaussians; "
-            f"{1e-6 * (fixed + FEWEST * each) * 1.05:.2g} would do{field}"
+            f"budget.max_mb={megabytes:g}: too small for {FEWEST} Gaussians; use "
+            f"{1e-6 * (static_bytes + FEWEST * each) * 1.05:.2g} or more{field}"
         )
-    return found
+    return count

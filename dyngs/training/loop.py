@@ -1,4 +1,4 @@
-"""The training loop: steps until the end or an interrupt, and events that tell of them."""
+"""Training loop: runs steps until the end or an interrupt, and emits events."""
 
 from __future__ import annotations
 
@@ -26,16 +26,14 @@ from dyngs.training.trainer import TrainingEdit
 
 
 class Trainable(Protocol):
-    """Interface of the trainers that the loop runs: of a scene, or of a network that predicts
-    scenes."""
+    """Interface of the trainers that the loop runs: scene trainers and network trainers."""
 
     config: Any
-    done: int
-    """Steps done."""
+    done: int  # completed steps
 
     @property
     def bad_gradients(self) -> Count:
-        """How often something was left out of a step because its gradient was not finite."""
+        """Number of parameter rows skipped because their gradient was not finite."""
         ...
 
     @property
@@ -43,41 +41,42 @@ class Trainable(Protocol):
 
     @property
     def num_moving(self) -> int:
-        """Gaussians that depend on time or pose."""
+        """Number of Gaussians that depend on time or pose."""
         ...
 
     @property
     def has_test_views(self) -> bool: ...
 
     def step(self) -> StepReport:
-        """Train on one image, or one choice of them."""
+        """Run one training step."""
         ...
 
     def apply(self, edit: TrainingEdit) -> None:
-        """Change the training between two steps."""
+        """Change the model or the schedule between two steps."""
         ...
 
     def checkpoint(self) -> Checkpoint:
-        """Return everything that ``restore`` needs."""
+        """Return the state that ``restore`` needs."""
         ...
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go back to where ``checkpoint`` was taken."""
+        """Restore the state of ``checkpoint``."""
         ...
 
 
+# Returns the edit to apply between two steps, or None
 Editor = Callable[["Loop"], TrainingEdit | None]
-"""Returns the change of the training that it requests between two steps, if any."""
 
 
 class Loop:
-    """Steps of a trainer, and events for listeners in their order.
+    """Runs the steps of a trainer and sends events to listeners, in the order of their
+    subscription.
 
     Args:
-        watch: seconds of training.
-        advice: added to the message of a step that fails.
-        stages: editors that are asked before each step.
-        limits: editors that are asked after each step, before its event.
+        stopwatch: measures the seconds of training.
+        advice: returns text that is appended to the error message of a failed step.
+        stages: editors called before each step.
+        limits: editors called after each step, before its ``StepDone`` event.
         before_step: called with the trainer before each step.
     """
 
@@ -109,7 +108,7 @@ class Loop:
             listener(event)
 
     def run(self, is_stopped: Callable[[], bool] = lambda: False) -> None:
-        """Step until the end, or until ``is_stopped`` between two steps."""
+        """Train until the last step, or until ``is_stopped`` returns true between two steps."""
         self.emit(Started(self.trainer.done, self.total))
         while self.trainer.done < self.total and not is_stopped():
             self._edit(self._stages)
@@ -132,7 +131,7 @@ class Loop:
             if edit.steps is not None:
                 self.total = edit.steps
                 self.emit(TotalChanged(self.total))
-            elif edit.kept is not None or edit.stops_densification:
+            elif edit.keep is not None or edit.stops_densification:
                 self.emit(TopologyChanged(trainer.done, before, trainer.num_gaussians))
 
     def _step(self) -> StepReport:
@@ -146,11 +145,10 @@ class Loop:
 
 
 class Interrupts:
-    """A context manager in which a signal only sets ``requested``: Ctrl-C, SIGTERM, or SIGHUP from
-    a closed terminal.
+    """Context manager in which Ctrl-C, SIGTERM and SIGHUP only set ``requested``.
 
-    A second Ctrl-C raises as usual. SIGHUP stays ignored under ``nohup``. Does nothing outside the
-    main thread, where Python delivers no signals.
+    A second Ctrl-C raises KeyboardInterrupt. SIGHUP stays ignored under ``nohup``. Has no effect
+    outside the main thread, because Python delivers signals only there.
     """
 
     def __init__(self) -> None:

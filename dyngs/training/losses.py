@@ -1,5 +1,4 @@
-"""Terms of the loss of a training image: colours, silhouette, what the model itself asks for; and
-their check."""
+"""Loss terms of a training image: colours, silhouette, regularizers; and their finiteness check."""
 
 from __future__ import annotations
 
@@ -17,7 +16,7 @@ from dyngs.ops.loss import l1_ssim_loss
 
 
 class ImageLoss(Loss):
-    """L1 and D-SSIM of the image (3DGS)."""
+    """L1 and D-SSIM loss of the image, as in 3DGS."""
 
     def __init__(self, ssim_weight: float) -> None:
         self._ssim_weight = ssim_weight
@@ -29,10 +28,11 @@ class ImageLoss(Loss):
 
 
 class SilhouetteLoss(Loss):
-    """Mean error of alpha, where the images have any, over the pixels that count.
+    """Mean absolute error of alpha over unmasked pixels, for images with alpha.
 
     Args:
-        early: fraction of ``weight`` before ``full_from``, the first step with the whole weight.
+        weight: weight of the term from step ``full_from`` on.
+        early: fraction of ``weight`` before that step.
     """
 
     def __init__(self, weight: float, early: float = 1.0, full_from: float = 0.0) -> None:
@@ -51,21 +51,21 @@ class SilhouetteLoss(Loss):
 
 
 class PenaltyLoss(Loss):
-    """Regularizers of what was drawn."""
+    """Regularizers of the rendered Gaussians."""
 
     def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
         return look.drawn.penalties
 
 
 class RegularizerLoss(Loss):
-    """Regularizers of the model, whatever is drawn."""
+    """Regularizers of the model parameters."""
 
     def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
         return look.model.regularizers()
 
 
 class StepCheck:
-    """The loss of a step, term by term, and whether what was drawn is finite."""
+    """Loss value of a step, with a check that all terms and deformed tensors are finite."""
 
     def __init__(
         self, terms: Mapping[str, Tensor], moved: Mapping[str, Tensor], device: torch.device
@@ -73,26 +73,31 @@ class StepCheck:
         self._terms = tuple(terms)
         self._moved = {name: x.detach() for name, x in moved.items() if x.numel()}
         numbers = [copy_async(x.detach(), device).double().reshape(1) for x in terms.values()]
-        # sums, in which NaN and infinity show: a thirtieth of the time of isfinite
+        # A sum shows NaN and infinity and takes a thirtieth of the time of isfinite.
         numbers += [x.sum().double().reshape(1) for x in self._moved.values()]
         self._read = AsyncReadback(torch.cat(numbers))
 
     def loss(self, step: int, image: Image, deformation_name: tuple[str, str]) -> float:
-        """Return the sum of the terms; waits for them."""
+        """Return the sum of the terms. Blocks until they are computed.
+
+        Raises:
+            DyngsError: a term or a deformed tensor is not finite.
+        """
         numbers = self._read.numbers().tolist()
         values = numbers[: len(self._terms)]
         where = f"step {step}, view {image.name!r}"
         sums = numbers[len(self._terms) :]
         for (name, x), total in zip(self._moved.items(), sums, strict=True):
-            # finite numbers may add up to too much
+            # The sum of finite numbers may overflow.
             if not math.isfinite(total) and not bool(x.isfinite().all()):
                 what, section = deformation_name
                 raise DyngsError(
-                    f"{where}: the {what} makes {name} at {image.time or 0:g} not finite; lower the rates in {section}"
+                    f"{where}: the {what} produced non-finite {name} at time {image.time or 0:g}; "
+                    f"lower the learning rates in {section}"
                 )
         for name, value in zip(self._terms, values, strict=True):
             if not math.isfinite(value):
-                of_image = "look at that image; lower the rates in optim"
-                what = of_image if name == "image" else "lower its weight or rate"
-                raise DyngsError(f"{where}: the loss term {name!r} is {value}; {what}")
+                of_image = "check that image, or lower the learning rates in optim"
+                what = of_image if name == "image" else "lower its weight or learning rate"
+                raise DyngsError(f"{where}: loss term {name!r} is {value}; {what}")
         return sum(values)

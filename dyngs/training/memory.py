@@ -1,5 +1,4 @@
-"""The memory that a run will take: its images, its Gaussians with the state of Adam, and what a
-step draws into."""
+"""Estimate of the memory of a run: images, Gaussians with Adam state, and render buffers."""
 
 from __future__ import annotations
 
@@ -16,30 +15,30 @@ from dyngs.gaussians.schedule import densify_schedule, growth_per_change
 from dyngs.ops.device import gpu_memory
 from dyngs.training.trainer import Trainer
 
-# float32 copies of the values of a Gaussian: value, gradient, two moments, and room for three more
-# when their set changes (measured: 1.65 kB per Gaussian with 59 values)
+# float32 copies of each value of a Gaussian: value, gradient, two Adam moments, three more while
+# Gaussians are rearranged (measured: 1.65 kB per Gaussian with 59 values).
 COPIES = 7
-SHAPE_VALUES = 11  # Values of a Gaussian next to its harmonics
-DRAWING = 200  # Bytes per pixel of the largest image that a step draws into
-STEP = 30_000_000  # Bytes of code and buffers that the first step touches
-DECODING = 45  # Bytes per pixel of a file that is decoded, measured on photos of 12 megapixels
+SHAPE_VALUES = 11  # Values of a Gaussian without SH coefficients
+DRAWING = 200  # Bytes of render buffers per pixel of the largest training image
+STEP = 30_000_000  # Bytes of code and buffers allocated by the first step
+DECODING = 45  # Bytes per pixel of a file while it is decoded (measured on 12 megapixel photos)
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 _USED = ("/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory/memory.usage_in_bytes")
 
 
 @dataclass(frozen=True)
 class MemoryForecast:
-    """Bytes that each process of a run is expected to take at its peak.
+    """Expected peak memory of each process of a run, in bytes.
 
     Attributes:
-        place: "memory" or "memory of the GPU".
-        program: taken already.
-        images: decoded ones, in the cache or on their way to it.
-        drawing: what a step draws into.
-        gaussians: of ``count`` of them.
-        free: bytes that may still be taken; None: unknown.
-        largest: bytes of the largest part, a key, its value, and the power of the part's size with
-            which that goes: what to lower where it is too much.
+        place: "memory" or "GPU memory".
+        program: memory already in use.
+        images: decoded images, cached or prefetched.
+        drawing: render buffers of a step.
+        gaussians: Gaussians with gradients and Adam state, ``count`` of them.
+        free: available bytes. None if unknown.
+        largest: bytes of the largest part, the config key that lowers it, the value of the key, and
+            the exponent that relates value and size.
     """
 
     place: str
@@ -54,34 +53,38 @@ class MemoryForecast:
 
     @property
     def needed(self) -> int:
-        """Bytes that all processes will still take."""
+        """Bytes that all processes will allocate."""
         return self.processes * (self.images + self.drawing + self.gaussians)
 
     def __str__(self) -> str:
-        there = "" if self.free is None else f" ({_gb(self.free + self.program)} are there)"
+        available = ""
+        if self.free is not None:
+            available = f" ({_gb(self.free + self.program)} GB available)"
         return (
-            f"{self.place}: about {_gb(self.program + self.needed)} GB{there}: {_gb(self.images)} images, "
-            f"{_gb(self.drawing)} drawing, {_gb(self.gaussians)} for some {self.count:,} Gaussians"
+            f"{self.place}: needs about {_gb(self.program + self.needed)} GB{available}: "
+            f"images {_gb(self.images)}, rendering {_gb(self.drawing)}, "
+            f"{self.count:,} Gaussians {_gb(self.gaussians)}"
         )
 
     def warning(self) -> str | None:
-        """Return a line where that is likely to be more than is there, with the key to lower and a
-        value that makes the run fit."""
+        """Return a warning if the run is likely to exceed the available memory, else None.
+
+        The warning names a config key and a value with which the run fits.
+        """
         if self.free is None or self.needed <= self.free:
             return None
         part, key, value, power = self.largest
         fraction = 1 - (self.needed - 0.95 * self.free) / max(self.processes * part, 1)
         fits = max(int(value * max(fraction, 0.02) ** power), 1)
-        there = f"{_gb(self.free + self.program)} are there"
+        available = _gb(self.free + self.program)
         needed = _gb(self.program + self.needed)
-        return f"about {needed} GB of {self.place} are needed, and {there}: give {key}={fits}"
+        return f"{self.place}: needs about {needed} GB, {available} GB available; use {key}={fits}"
 
 
 def memory_forecasts(trainer: Trainer[Any], processes: int = 1) -> list[MemoryForecast]:
-    """Return the memory that the run of ``trainer``, which has not begun to step, is expected to
-    take.
+    """Return the expected memory of a run before its first step.
 
-    On a GPU first that of the GPU, with the scene, and then that of the machine.
+    On a GPU, the first entry is the GPU memory and the second one the host memory.
     """
     images = trainer.images
     config = trainer.config
@@ -106,25 +109,28 @@ def memory_forecasts(trainer: Trainer[Any], processes: int = 1) -> list[MemoryFo
     each = -(-processes // max(torch.cuda.device_count(), 1))
     shown = images.bytes_on_gpu
     return [
-        MemoryForecast("memory of the GPU", 0, shown, *scene, gpu[0], each, largest),
+        MemoryForecast("GPU memory", 0, shown, *scene, gpu[0], each, largest),
         MemoryForecast("memory", program, decoded, STEP, 0, 0, free, processes, largest),
     ]
 
 
 def stored_values(config: Config) -> int:
-    """Return the number of values of a Gaussian that are trained, next to those of a field."""
+    """Return the number of trained values per Gaussian, without those of a deformation field."""
     return SHAPE_VALUES + 3 * num_sh_terms(config.stored_sh_degree)
 
 
 def gaussian_bytes(config: Config) -> int:
-    """Return the bytes of memory that a Gaussian takes in training, where it moves if anything
-    may."""
+    """Return the bytes of training memory per Gaussian, including motion if the model has any."""
     return 4 * COPIES * stored_values(config) + config.model.bytes_per_moving_gaussian
 
 
 def expected_gaussians(config: Config, now: int, longest_side: int = 400) -> int:
-    """Return the Gaussians that a run which begins with ``now`` may end with: roughly, before
-    anything is seen."""
+    """Return a rough estimate of the number of Gaussians at the end of a run, before training.
+
+    Args:
+        now: initial number of Gaussians.
+        longest_side: of the training images, in pixels.
+    """
     strategy: Any = config.strategy
     steps = config.train.steps
     changes = 0
@@ -135,8 +141,7 @@ def expected_gaussians(config: Config, now: int, longest_side: int = 400) -> int
     if strategy.kind == "mcmc":
         grown = now * (1 + growth_per_change(steps)) ** min(changes, 200)
     else:
-        # photos of 400 px led to 250,000 Gaussians by the 34 changes of 7,000 steps
-        # (docs/benchmarks/index.md)
+        # Photos of 400 px gave 250,000 Gaussians after the 34 densifications of 7,000 steps.
         factor = changes / 34
         factor = factor if factor < 1 else min(factor, 4.0) ** 0.5
         grown = 250_000 * min(longest_side / 400, 1.0) ** 0.5 * factor
@@ -145,13 +150,12 @@ def expected_gaussians(config: Config, now: int, longest_side: int = 400) -> int
 
 
 def resident_memory() -> int:
-    """Return the bytes of memory that this process takes; 0 where that is not known."""
+    """Return the resident memory of this process in bytes, or 0 if unknown."""
     return _kilobytes("/proc/self/status", "VmRSS") or 0
 
 
 def free_memory() -> int | None:
-    """Return the bytes that this process may still take, by the machine and the limit of its
-    container."""
+    """Return the memory available to this process in bytes, limited by machine and container."""
     found = []
     available = _kilobytes("/proc/meminfo", "MemAvailable")
     if available is not None:

@@ -1,4 +1,4 @@
-"""Trainers and scenes of every kind of model."""
+"""Construction of trainers for all model kinds."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ from dyngs.training.losses import ImageLoss, PenaltyLoss, RegularizerLoss, Silho
 from dyngs.training.priors import PriorLosses, load_priors
 from dyngs.training.trainer import Trainer, TrainerParts
 
-GaussianTrainer = Trainer[GaussianModel]  # The trainer of a scene of Gaussians
+GaussianTrainer = Trainer[GaussianModel]  # Trainer of a scene of Gaussians
 
+# Fraction of opaque pixels that resemble the background, from which alpha is weighted fully from
+# the start: only silhouettes show such moving objects.
 MANY_ALIKE = 0.05
-"""Fraction of the opaque pixels of the background's colour from which moving things are found by
-their silhouettes."""
-# fraction of train.alpha_weight before other moving things, until their motion is followed
+# Fraction of train.alpha_weight for other moving scenes until their motion is learned
 EARLY_OPACITY = 0.2
-# fraction of the run; measured as the others, see docs/benchmarks/index.md
+# Fraction of the run after which train.alpha_weight counts fully (measured)
 FULL_OPACITY_FROM = 0.6
-ALIKE_IMAGES = 12  # number of images in which colours are compared with the background
+ALIKE_IMAGES = 12  # Number of images in which colours are compared with the background
 
 
 def build_trainer(
@@ -55,17 +55,16 @@ def build_trainer(
     first: InitialGaussians | None = None,
     uncapped: Config | None = None,
 ) -> Trainer[Any]:
-    """Return the trainer of a scene: its model begun, nothing trained.
+    """Return the trainer of a scene with an initialised, untrained model.
 
     Args:
-        capture: as ``prepared`` returned it; None: it is read now.
-        restored: a checkpoint will be, so that it does not matter where the model begins: no points
-            are triangulated.
-        images: the training images of another trainer of the same ones; None: they are opened.
+        capture: as returned by ``prepare_capture``. None reads it.
+        restored: a checkpoint will be restored, so initial points are not needed.
+        images: training images of another trainer of the same capture. None opens them.
         held_out: indices of training views that are never trained on.
-        first: Gaussians that it goes on from; None: it begins as ``config.init`` says.
-        uncapped: the config without the limits of the run: it may begin with more Gaussians than it
-            may end with; None: the same.
+        first: Gaussians to start from. None initialises them as in ``config.init``.
+        uncapped: config without the limit on Gaussians, used for initialisation. None uses
+            ``config``.
     """
     if capture is None:
         capture = read_capture(config.data) if restored else prepare_capture(config)
@@ -90,10 +89,11 @@ def build_trainer(
     published = capture.has_alpha and config.train.alpha_weight == 0 and background != "random"
     if published and not restored:
         messages.append(
-            f"images are compared on {background} alone, as published (train.alpha_weight=0): {background} surfaces "
-            "may be transparent"
+            f"train.alpha_weight=0: images are compared on {background} only, so {background} "
+            "surfaces may "
+            "become transparent"
         )
-    early = _early_opacity(config, capture, images, background)
+    early = _early_alpha_fraction(config, capture, images, background)
 
     def parts(config: Config) -> TrainerParts:
         start = StartContext(
@@ -141,45 +141,41 @@ def build_trainer(
 
 
 def prepare_capture(config: Config) -> Capture:
-    """Return the capture of a run with the points that its scene begins with, see
-    ``with_first_points``.
-
-    Problems of the capture and the source of its points are logged.
-    """
+    """Read the capture of a run and add the initial points. Logs problems of the capture."""
     return add_initial_points(require_images(read_capture(config.data)), config)
 
 
 def add_initial_points(capture: Capture, config: Config, *, log_messages: bool = True) -> Capture:
-    """Return ``capture`` as ``prepared`` does, for a kind whose Gaussians begin at points; others
-    need none."""
-    lines: list[str] = []
+    """Return ``capture`` with initial points, if the model kind needs them."""
+    messages: list[str] = []
     if "init" in find_kind(config.model).uses:
         init = config.init
         if isinstance(init, PointsInit):
-            capture, lines = create_initial_points(capture, config.data, init)
+            capture, messages = create_initial_points(capture, config.data, init)
         elif isinstance(init, RandomInit):
             views = capture.splits["train"]
             why = cube_mismatch_reason(
                 views, cube_half_side(init.half_extent, views, capture.world_scale)
             )
-            lines = (
-                []
-                if why is None
-                else [f"init.kind=random draws points around the origin, but {why}: give auto"]
-            )
-    for line in [*lines, *check_before_training(capture)] if log_messages else []:
-        log_warning(line)
+            if why is not None:
+                messages.append(
+                    f"init.kind=random: points are drawn around the origin, but {why}; use auto"
+                )
+    for message in [*messages, *check_before_training(capture)] if log_messages else []:
+        log_warning(message)
     return capture
 
 
-def _early_opacity(config: Config, capture: Capture, images: ImageLoader, background: str) -> float:
-    """Return the fraction of train.alpha_weight that counts while motion is not followed yet.
+def _early_alpha_fraction(
+    config: Config, capture: Capture, images: ImageLoader, background: str
+) -> float:
+    """Return the fraction of train.alpha_weight that applies until motion is learned.
 
-    It depends on the capture alone, so that a moving model begins exactly as a static one.
+    It depends on the capture alone, so a dynamic model starts exactly like a static one.
     """
-    is_still = len(set(training_times(capture))) < 2
+    is_static = len(set(training_times(capture))) < 2
     if (
-        is_still
+        is_static
         or not capture.has_alpha
         or config.train.alpha_weight == 0
         or background == "random"

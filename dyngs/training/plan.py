@@ -1,4 +1,4 @@
-"""The plan of a run before its first step, and plans of runs that go on to more steps."""
+"""Run plans: the state of a run before its first step, and extension of finished runs."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from dyngs.training.corrections.exposure import WARM_UP
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a run; None: no limit.
+    """Limits of a run. None means no limit.
 
     Attributes:
-        gaussians: at the end.
-        megabytes: of the file of the scene, 1e6 bytes.
-        seconds: of training.
+        gaussians: number of Gaussians at the end.
+        megabytes: file size of the scene, in 1e6 bytes.
+        seconds: training time.
     """
 
     gaussians: int | None = None
@@ -35,11 +35,11 @@ class RunPlan:
     """A run before its first step.
 
     Attributes:
-        requested: the config as the user gave it.
-        resolved: the config that is trained and saved.
-        uncapped: the resolved config without the limit on Gaussians, for where they begin.
-        capture: None: of a network, which has several.
-        first: Gaussians of another scene that the run goes on from.
+        requested: config as given by the user.
+        resolved: config that is trained and saved.
+        uncapped: resolved config without the limit on Gaussians, used for initialisation.
+        capture: None for a network, which has several.
+        first: Gaussians of another scene to start from.
         choices: results of pilot runs.
     """
 
@@ -56,27 +56,28 @@ Stage = Callable[[RunPlan], tuple[RunPlan, str | None]]
 
 
 def with_steps(config: Config, steps: int) -> Config:
-    """Return ``config`` with another ``train.steps``, which all schedules follow."""
+    """Return ``config`` with another ``train.steps``. All schedules scale with it."""
     return config.model_copy(update={"train": config.train.model_copy(update={"steps": steps})})
 
 
 def extend_config(config: Config, done: int, steps: int) -> Config:
-    """Return the configuration with which a run goes on, after ``done`` steps, to ``steps``; no
-    limit of time holds.
+    """Return the config with which a run continues after ``done`` steps up to ``steps``, without a
+    time limit.
 
     Raises:
-        DyngsError: so many steps are done already, the run was pruned, or its motion began too
-            early for that length.
+        DyngsError: ``steps`` is not larger than ``done``, the run was pruned, or its exposures or
+            its motion started too early for the new length.
     """
     length = LengthChange(done, config.train.steps, steps)
     if done > length.was:
         raise DyngsError(
-            f"train.steps={steps}: the run was pruned after step {length.was:,}, so its training cannot be made "
-            "longer; go on with the run before that, and prune again"
+            f"train.steps={steps}: a run that was pruned (after step {length.was:,}) cannot be "
+            "extended; "
+            "extend the run before pruning, then prune again"
         )
     if steps <= done:
         raise DyngsError(
-            f"train.steps={steps}: {format_count(done, 'step')} are done already; give more than that"
+            f"train.steps={steps}: the run already has {format_count(done, 'step')}; use a larger number"
         )
     _require_exposures_stay(config, length)
     changed: dict[str, object] = {"train": _train(config.train, length)}
@@ -90,18 +91,21 @@ def _require_exposures_stay(config: Config, length: LengthChange) -> None:
     begun, begins = (round(WARM_UP * steps) for steps in (length.was, length.steps))
     if config.train.exposure == "always" and begun < length.done <= begins:
         raise DyngsError(
-            f"train.steps={length.steps}: exposures were learned after {begun:,} steps, and a run of {length.steps:,} "
-            f"begins with that after {begins:,}; train anew with so many steps"
+            f"train.steps={length.steps}: exposures were learned from step {begun:,} on, but a run "
+            "of "
+            f"{length.steps:,} steps learns them from step {begins:,} on; train a new run of that "
+            "length"
         )
 
 
 def describe_extension(before: Config, after: Config, done: int) -> str:
-    """Return a message about the schedules of a run that continues after ``done`` steps."""
+    """Return a log message about a run that continues after ``done`` steps."""
     steps = after.train.steps
-    no_limit = "" if before.train.minutes is None else "; train.minutes holds no longer"
+    no_limit = "" if before.train.minutes is None else "; train.minutes is ignored"
     return (
-        f"goes on from step {done:,} to {steps:,} instead of {before.train.steps:,}, on the schedules of "
-        f"{format_count(steps, 'step')}{no_limit}"
+        f"resuming at step {done:,}, extended from {before.train.steps:,} to "
+        f"{format_count(steps, 'step')}; "
+        f"schedules rescaled{no_limit}"
     )
 
 

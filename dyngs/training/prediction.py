@@ -1,5 +1,4 @@
-"""Training of networks that predict people from a few images, on captures of several: one trainer
-for all kinds."""
+"""Trainer of networks that predict people from a few images, on several captures."""
 
 from __future__ import annotations
 
@@ -19,23 +18,23 @@ from dyngs.models.prediction import Learner, load_optimizer, optimizer_state, op
 from dyngs.training.events import StepReport
 from dyngs.training.trainer import TrainingEdit, ViewSampler
 
-WARM_UP = 0.05  # Fraction of the run in which the highest learning rate is reached
+WARM_UP = 0.05  # Fraction of the run after which the learning rate peaks
 WEIGHT_DECAY = 1e-5  # Weight decay of AdamW
 
-_LOWEST = 1e-3  # Ratio of the last to the highest learning rate
+_LOWEST = 1e-3  # Ratio of the final to the peak learning rate
 
 
 @dataclass
 class NetworkTrainer:
-    """A run in memory, as ``Trainer``."""
+    """Training state of a network; implements ``Trainable``."""
 
     config: Config
     learner: Learner[Any]
     optimizer: torch.optim.AdamW
-    sampler: ViewSampler  # of people
+    sampler: ViewSampler  # yields indices of people
     generator: torch.Generator
     done: int = 0
-    num_gaussians: int = 0  # of the last person
+    num_gaussians: int = 0  # of the last predicted person
     bad_gradients: int = 0
     has_test_views: bool = False
 
@@ -51,7 +50,7 @@ class NetworkTrainer:
         value = float(example.loss.detach())
         if not math.isfinite(value):
             raise DyngsError(
-                f"step {step}, {self.learner.names[person]}: the loss is {value}; lower model.lr"
+                f"step {step}, {self.learner.names[person]}: loss is {value}; lower model.lr"
             )
         self.update(example.loss, step)
         self.done = step
@@ -59,12 +58,12 @@ class NetworkTrainer:
         return StepReport(step, value, example.image, example.rendered, example.truth)
 
     def update(self, loss: Tensor, step: int) -> None:
-        """Do a step of AdamW; none for gradients that are not finite."""
+        """Run a step of AdamW, skipped if gradients are not finite."""
         rate = one_cycle_rate(self.learner.lr, step, self.config.train.steps)
         self.bad_gradients += not optimizer_step(self.optimizer, self.learner.network, loss, rate)
 
     def apply(self, edit: TrainingEdit) -> None:
-        """Do nothing: no limit is for networks."""
+        """Do nothing: networks have no limits that edit a run."""
 
     def checkpoint(self) -> Checkpoint:
         network = self.learner.network
@@ -75,7 +74,7 @@ class NetworkTrainer:
         tensors |= {
             f"optimizer.{name}": x for name, x in optimizer_state(self.optimizer, network).items()
         }
-        # fields have none
+        # Predicted radiance fields have no rasterize_mode.
         mode = getattr(self.config.model, "rasterize_mode", RasterizeMode.CLASSIC).value
         info = CheckpointInfo(self.done, 1.0, (0.0, 0.0, 0.0), self.learner.background, mode)
         stored = {name: x.detach().cpu() for name, x in tensors.items()}
@@ -91,7 +90,7 @@ class NetworkTrainer:
 
 
 def network_trainer(config: Config) -> NetworkTrainer:
-    """Return the trainer of a network of any kind before the first step."""
+    """Return the trainer of a network of any kind, before its first step."""
     network = capability(config.model, PredictsScenes)
     assert network is not None
     generator = torch.Generator().manual_seed(config.run.seed)
@@ -108,8 +107,8 @@ def network_trainer(config: Config) -> NetworkTrainer:
 
 
 def one_cycle_rate(highest: float, step: int, steps: int) -> float:
-    """Return the learning rate of AdamW: a linear rise, then a linear fall (one cycle; Smith and
-    Topin 2017)."""
+    """Return the learning rate at ``step``: linear warm-up, then linear decay (Smith and Topin
+    2017)."""
     top = max(1, round(WARM_UP * steps))
     fraction = step / top if step <= top else (steps - step) / max(steps - top, 1)
     return highest * max(fraction, _LOWEST)

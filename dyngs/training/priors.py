@@ -1,5 +1,4 @@
-"""Priors of a capture (depth maps, optical flow, tracks, motion masks), and losses that compare the
-scene with them."""
+"""Priors of a capture (depth maps, optical flow, tracks, motion masks) and their losses."""
 
 from __future__ import annotations
 
@@ -22,18 +21,18 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.model import Loss, LossInput
 from dyngs.models.views import training_cameras
 
-SOFT_PX = 0.5  # Charbonnier's constant, px: smaller errors count quadratically
-SOLID = 0.5  # Alpha from which a drawn depth or displacement counts
-DEPTH_WEIGHT = 0.1  # Of the loss term; those of flow and tracks are 1
-MIN_PIXELS = 16  # Fewest pixels that a depth map is aligned by
-MIN_POINTS = 4  # Fewest points that two images must share for their tracks to be compared
-NEAREST = 8  # The other image of tracks is one of so many nearest in time
+SOFT_PX = 0.5  # Constant of the Charbonnier loss, px: smaller errors are penalised quadratically
+SOLID = 0.5  # Rendered alpha above which depth and displacement are compared
+DEPTH_WEIGHT = 0.1  # Weight of the depth term; flow and tracks have weight 1
+MIN_PIXELS = 16  # Fewest pixels with which a depth map is aligned
+MIN_POINTS = 4  # Fewest points that two images must share to compare their tracks
+NEAREST = 8  # Tracks are compared with one of this many images nearest in time
 _TINY = 1e-6
 
 
 @dataclass(frozen=True)
 class TimedCamera:
-    """The camera and time of another image of the same scene."""
+    """Camera and time of another image of the same scene."""
 
     cameras: Cameras
     time: float
@@ -41,17 +40,22 @@ class TimedCamera:
 
 @dataclass(frozen=True)
 class PointTracks:
-    """2D tracks in the training images."""
+    """2D point tracks in the V training images."""
 
-    xy: Tensor  # (V, P, 2) px of the full training images
-    visible: Tensor  # (V, P) bool; a view without tracks has none
-    cameras: Sequence[TimedCamera]  # of the V views
+    xy: Tensor  # (V, P, 2) in px of the full-size training images
+    visible: Tensor  # (V, P) bool; False for views without tracks
+    cameras: Sequence[TimedCamera]  # V of them
 
     def pair(
         self, index: int, may_use: Callable[[float], bool], generator: torch.Generator
     ) -> tuple[TimedCamera, Tensor, Tensor] | None:
-        """Return another view at random among the nearest in time, and P' points here and there, or
-        None."""
+        """Draw another view among the nearest in time, with its camera and the points visible in
+        both.
+
+        Returns:
+            the camera of the other view, and the points (P', 2) in this and in the other view. None
+                without such a view.
+        """
         now = self.cameras[index].time
         shared = (self.visible & self.visible[index]).sum(1)
         others = [
@@ -70,8 +74,11 @@ class PointTracks:
 def load_priors(
     config: Config, capture: Capture, views: Sequence[View], *, moves: bool
 ) -> PriorLosses:
-    """Return the priors of the training ``views`` that ``train.priors`` names; those of motion only
-    where anything ``moves``."""
+    """Return the losses of the priors in ``train.priors`` that the training ``views`` provide.
+
+    Args:
+        moves: whether the model is dynamic. Motion priors are ignored otherwise.
+    """
     wanted = config.train.priors if moves else {"depth"}.intersection(config.train.priors)
     depth = "depth" in wanted and any(view.depth_path for view in views)
     masks = "motion_masks" in wanted and any(view.motion_mask_path for view in views)
@@ -88,7 +95,7 @@ def load_priors(
         tracks = _point_tracks(config, read_tracks(capture.tracks_path), views)
     found = {"depth maps": depth, "optical flow": flow_to, "tracks": tracks, "motion masks": masks}
     names = ", ".join(name for name, x in found.items() if x)
-    return PriorLosses(depth, flow_to, tracks, masks, names and f"priors that are used: {names}")
+    return PriorLosses(depth, flow_to, tracks, masks, names and f"using priors: {names}")
 
 
 def _timed_camera(view: View, config: Config) -> TimedCamera:
@@ -96,8 +103,8 @@ def _timed_camera(view: View, config: Config) -> TimedCamera:
 
 
 def _point_tracks(config: Config, tracks: ImageTracks, views: Sequence[View]) -> PointTracks:
-    """Return tracks in the px of training images, undistorted; points that cannot be undistorted
-    are not visible."""
+    """Return undistorted tracks in px of training images. Points that cannot be undistorted are not
+    visible."""
     rows = tracks.rows_of(views)
     xy = torch.zeros(len(views), tracks.visible.shape[1], 2, device="cpu")
     visible = torch.zeros(xy.shape[:2], dtype=torch.bool, device="cpu")
@@ -117,20 +124,20 @@ def _point_tracks(config: Config, tracks: ImageTracks, views: Sequence[View]) ->
 
 
 def _scale(size: View | Cameras, wanted: Cameras) -> Tensor:
-    """Return the (2,) factors from px of one size of images to those of another."""
+    """Return the (2,) factors from px of one image size to those of another."""
     factors = [wanted.width / size.width, wanted.height / size.height]
     return wanted.intrinsics.new_tensor(factors)
 
 
 @dataclass(frozen=True)
 class PriorLosses(Loss):
-    """Losses of the priors that a run uses."""
+    """Losses of depth maps, optical flow and tracks; motion masks are used by the image loader."""
 
-    depth: bool = False  # whether depth maps are used
-    # by training view, the camera and time that its flow leads to; empty: no flow is used
+    depth: bool = False  # depth maps are used
+    # camera and time that the flow of each training view points to; empty without flow
     flow_to: Mapping[int, TimedCamera] = field(default_factory=dict)
-    tracks: PointTracks | None = None  # None: none are used
-    masks: bool = False  # whether motion masks say what may move
+    tracks: PointTracks | None = None
+    masks: bool = False  # motion masks are used
     message: str = ""
 
     def needs_depth(self, image: Image) -> bool:
@@ -183,12 +190,11 @@ class PriorLosses(Loss):
 def depth_error(
     drawn: Tensor, alpha: Tensor, given: Tensor, mask: Tensor | None = None
 ) -> Tensor | None:
-    """Return the mean error of the drawn inverse depth relative to the map; None where there is too
-    little to compare.
+    """Return the mean relative error of the rendered inverse depth, or None with too few pixels.
 
-    The map is aligned by scale and shift to the drawn inverse depth, without a gradient: maps of
-    sensors are right up to scale, and those of networks that see one image are affine in the
-    inverse depth. |difference| over the median of the drawn values.
+    The map is aligned to the rendered inverse depth by scale and shift, without gradients. Sensor
+    maps are known up to scale, and maps of monocular networks are affine in inverse depth. Errors
+    are divided by the median of the rendered values.
     """
     counts = (given > 0) & (drawn > 0) & (alpha.detach() > SOLID)
     if mask is not None:
@@ -203,11 +209,9 @@ def depth_error(
 
 
 def align_scale_shift(given: Tensor, wanted: Tensor) -> Tensor | None:
-    """Return ``a given + b`` nearest to ``wanted``, both (P,); None where that would turn near and
-    far about.
+    """Return ``a given + b`` closest to ``wanted``, both (P,), or None for a negative ``a``.
 
-    Least absolute deviations by reweighted least squares: 10 % of outliers or a moving thing do not
-    tilt it.
+    Least absolute deviations by iteratively reweighted least squares, robust to 10 % of outliers.
     """
     weight = torch.ones_like(given)
     a = b = given.new_zeros(())
@@ -226,10 +230,12 @@ def align_scale_shift(given: Tensor, wanted: Tensor) -> Tensor | None:
 def render_displacements(
     start: Gaussians, end: Gaussians, here: Cameras, there: Cameras, options: RenderOptions
 ) -> Tensor:
-    """Return (H, W, 3): mean displacement (x, y) in px of the images' size, and the sum of weights
-    it stands for.
+    """Render the mean 2D displacement of Gaussians between two times.
 
-    Differentiable in the means of both, not in how much each Gaussian covers.
+    Only the means of ``start`` and ``end`` receive gradients, not the coverage of pixels.
+
+    Returns:
+        (H, W, 3): displacement x and y in px, and the sum of blending weights.
     """
     (from_px, from_z), (to_px, to_z) = _projected(start.means, here), _projected(end.means, there)
     seen = ((from_z > options.near) & (to_z > options.near))[:, None]
@@ -250,10 +256,15 @@ def _projected(means: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
 
 
 def motion_error(drawn: Tensor, wanted: Tensor, size: int) -> Tensor | None:
-    """Return the mean Charbonnier error of ``drawn`` (..., 3), see ``displacements``, from
-    ``wanted`` (..., 2) px where that is finite.
+    """Return the mean Charbonnier error of displacements, relative to the image size.
 
-    In fractions of ``size`` px, the image's longer side; None where nothing is drawn.
+    Args:
+        drawn: (..., 3) as returned by ``render_displacements``.
+        wanted: (..., 2) true displacement in px. NaN is ignored.
+        size: longer side of the image in px.
+
+    Returns:
+        a scalar, or None if no pixel can be compared.
     """
     counts = wanted.isfinite().all(-1) & (drawn[..., 2].detach() > SOLID)
     if not bool(counts.any()):
@@ -263,7 +274,7 @@ def motion_error(drawn: Tensor, wanted: Tensor, size: int) -> Tensor | None:
 
 
 def track_error(drawn: Tensor, start: Tensor, end: Tensor) -> Tensor | None:
-    """Return ``motion_error`` at the points ``start`` (P, 2) px, which are at ``end`` (P, 2)."""
+    """Return ``motion_error`` at points ``start`` (P, 2) px that moved to ``end`` (P, 2) px."""
     height, width = drawn.shape[:2]
     grid = (2 * start / start.new_tensor([width, height]) - 1)[None, None]
     sampled = torch.nn.functional.grid_sample(

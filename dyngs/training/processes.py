@@ -1,9 +1,9 @@
-"""The processes that train one scene together, as ``torchrun`` starts them: each takes its fraction
-of a step's views.
+"""Data-parallel training of one scene by several processes, as started by ``torchrun``.
 
-All hold the same scene and make the same changes to it, from gradients that are summed over them.
-Sums are formed in the order of the processes, whatever arrives first: a run repeats byte by byte,
-and where each process takes one view, the bytes are those of one process that takes them all.
+Each process renders a part of the views of a step. All processes hold the same scene and apply the
+same updates, from gradients that are summed over processes. Sums are computed in the order of
+ranks, so runs are reproducible byte by byte. With one view per process, the result equals that of a
+single process with the same batch size.
 """
 
 from __future__ import annotations
@@ -22,24 +22,26 @@ from torch.distributed.rendezvous import rendezvous
 
 from dyngs.core.errors import DyngsError
 
-# The others wait while the first one reads, evaluates, or tries settings in small runs
+# Other ranks wait while rank 0 reads data, evaluates or runs pilot runs
 TIMEOUT = timedelta(days=30)
-CHUNK = 2**22  # Most values that are summed at once: each process holds those of all for a while
-FAILED = "dyngs/failed"  # Key of the store that counts the processes that have said why they end
-STOP = "dyngs/stop"  # Key of the store that counts the processes that were told to stop
-EXIT_INTERRUPTED = 130  # Exit code of a process that was told to stop, as after Ctrl-C
-# Exit code of a process that ends because another one has failed, which has said why
-EXIT_FAILED = 2
+CHUNK = 2**22  # Most values summed at once, since each process receives those of all others
+FAILED = "dyngs/failed"  # Store key: number of processes that reported an error
+STOP = "dyngs/stop"  # Store key: number of processes that received a signal to stop
+EXIT_INTERRUPTED = 130  # Exit code of a process that received a signal to stop, as after Ctrl-C
+EXIT_FAILED = 2  # Exit code of a process that ends because another one reported an error
 _NAMES = ("RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE")
 
 
 class Processes:
-    """This process and those that it trains with; a context in which they are connected.
+    """The processes that train together; a context manager that connects them.
 
-    Whoever fails first says why; the others then end with ``EXIT_FAILED`` and without a word.
+    The first process that fails raises its error. The others exit with ``EXIT_FAILED`` without a
+    message.
 
     Args:
         rank: number of this process, from 0.
+        size: number of processes.
+        local_size: number of processes on this machine.
     """
 
     def __init__(self, rank: int = 0, size: int = 1, local_size: int = 1) -> None:
@@ -48,20 +50,23 @@ class Processes:
 
     @staticmethod
     def from_torchrun() -> Processes:
-        """Return the processes that ``torchrun`` has started, this one alone without it. Raises
-        DyngsError."""
+        """Return the processes that ``torchrun`` started, or a single one without it.
+
+        Raises:
+            DyngsError: invalid environment variables.
+        """
         if any(name not in os.environ for name in (*_NAMES, "MASTER_ADDR", "MASTER_PORT")):
             return Processes()
         try:
             return Processes(*(int(os.environ[name]) for name in _NAMES))
         except ValueError:
             raise DyngsError(
-                f"{', '.join(_NAMES)} must be numbers, as torchrun sets them"
+                f"environment variables {', '.join(_NAMES)}: must be integers, as set by torchrun"
             ) from None
 
     @property
     def is_rank_zero(self) -> bool:
-        """Whether this is the process that reads what was asked for, writes files, and speaks."""
+        """True on rank 0, the only process that reads the config, writes files and logs."""
         return self.rank == 0
 
     def __enter__(self) -> Processes:
@@ -79,7 +84,7 @@ class Processes:
             )
         except (RuntimeError, ValueError) as error:
             raise DyngsError(
-                f"the {self.size} processes cannot reach each other: {error}"
+                f"{self.size} processes could not connect to each other: {error}"
             ) from None
         return self
 
@@ -89,27 +94,26 @@ class Processes:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Leave the others; raise SystemExit instead of an error where another process has told one
-        already."""
+        """Disconnect. Raise SystemExit instead of an error if another process has reported one."""
         if self.size == 1:
             return
-        if isinstance(error, Exception) and not self._speaks_first():
+        if isinstance(error, Exception) and not self._reports_first():
             raise SystemExit(EXIT_FAILED) from None
         if error is None:
             distributed.destroy_process_group()
 
     def views_of_process(self, batch: int) -> range:
-        """Return which of the ``batch`` views of a step this process takes."""
+        """Return which of the ``batch`` views of a step this process renders."""
         each, rest = divmod(batch, self.size)
         if rest or not each:
             raise DyngsError(
-                f"train.batch_size={batch} views cannot be shared evenly among {self.size} processes; give a multiple "
-                f"of {self.size}, or start another number of processes"
+                f"train.batch_size={batch}: must be a multiple of the number of processes, "
+                f"{self.size}"
             )
         return range(self.rank * each, (self.rank + 1) * each)
 
     def sum_(self, tensors: Sequence[Tensor]) -> None:
-        """Replace float32 tensors, of the same shapes in all processes, by their sums over the
+        """Replace float32 tensors, of equal shapes in all processes, by their sums over
         processes."""
         if self.size == 1:
             return
@@ -117,14 +121,14 @@ class Processes:
             flat = x.reshape(-1)
             for chunk in flat.split(CHUNK):
                 chunk.copy_(self._summed(chunk))
-            if not x.is_contiguous():  # else they are the same memory
+            if not x.is_contiguous():  # otherwise flat is a view of x
                 x.copy_(flat.view_as(x))
 
     def sum_gradients_(self, leaves: Sequence[Tensor], report: Tensor) -> None:
-        """Replace the gradients of ``leaves`` and the values of ``report`` (R,), in place, by their
-        sums.
+        """Replace the gradients of ``leaves`` and the values ``report`` (R,) by their sums over
+        processes.
 
-        A leaf without a gradient in all processes keeps none.
+        A leaf without a gradient in any process keeps none.
         """
         if self.size == 1:
             return
@@ -138,23 +142,23 @@ class Processes:
                 self.sum_([x.grad])
 
     def request_stop(self) -> None:
-        """Report to rank 0 that this process has received a signal to stop."""
-        with suppress(RuntimeError):  # who kept the store has ended
+        """Report to rank 0 that this process received a signal to stop."""
+        with suppress(RuntimeError):  # the host of the store has ended
             if self._store is not None:
                 self._store.add(STOP, 1)
 
     def is_stop_requested(self) -> bool:
-        """Return whether any process has reported a signal to stop."""
+        """Return whether any process received a signal to stop."""
         return self._count(STOP) > 0
 
     def broadcast_(self, values: Tensor) -> None:
-        """Replace the values of a tensor by those of the first process."""
+        """Replace the values of a tensor by those of rank 0."""
         if self.size > 1:
             with self._connected():
                 distributed.broadcast(values, 0)
 
     def require_same(self, tensors: Mapping[str, Tensor], when: str) -> None:
-        """Raise unless the tensors have the same bytes in all processes."""
+        """Raise DyngsError unless the tensors have the same bytes in all processes."""
         if self.size == 1:
             return
         own = torch.tensor([_checksum(tensors)], dtype=torch.int64, device="cpu")
@@ -164,12 +168,12 @@ class Processes:
         others = [rank for rank, x in enumerate(sums) if int(x) != int(sums[0])]
         if others:
             raise DyngsError(
-                f"{when}: process {others[0]} has come to other Gaussians than process 0; start all on machines of one "
-                "kind, with the same version and the same files, or give all of them one DYNGS_ISA"
+                f"{when}: Gaussians of process {others[0]} differ from those of process 0; "
+                "use the same hardware, version and files for all processes, or set DYNGS_ISA"
             )
 
     def _summed(self, x: Tensor) -> Tensor:
-        """Return the sum (n,) over the processes, in their order."""
+        """Return the sum (n,) over processes, in the order of their ranks."""
         parts = [torch.empty_like(x) for _ in range(self.size)]
         with self._connected():
             distributed.all_gather(parts, x.contiguous())
@@ -180,22 +184,21 @@ class Processes:
 
     @contextmanager
     def _connected(self) -> Iterator[None]:
-        """Turn the error of a broken connection into the end of this process."""
+        """Exit, or raise DyngsError, if the connection is broken."""
         try:
             yield
         except RuntimeError:
             if self._count(FAILED) > 0:
                 raise SystemExit(EXIT_FAILED) from None
             raise DyngsError(
-                f"process {self.rank} of {self.size} has lost the others: one has ended without a word (too little "
-                "memory?)"
+                f"process {self.rank} of {self.size}: connection lost, another process was killed "
+                "(out of memory?)"
             ) from None
 
-    def _speaks_first(self) -> bool:
-        """Return whether no other process has said yet why it ends.
+    def _reports_first(self) -> bool:
+        """Return whether no other process has reported an error yet.
 
-        Without torchrun's agent the first process keeps the store: if it is gone, that process has
-        ended before.
+        Without torchrun's agent, rank 0 hosts the store. If the store is gone, rank 0 has ended.
         """
         try:
             return self._store is None or self._store.add(FAILED, 1) == 1
@@ -203,10 +206,10 @@ class Processes:
             return False
 
     def _count(self, key: str) -> int:
-        """Return how often the processes have counted up a key of the store."""
+        """Return the value of a counter in the store."""
         try:
             return 0 if self._store is None else self._store.add(key, 0)
-        except RuntimeError:  # who kept the store has ended
+        except RuntimeError:  # the host of the store has ended
             return 0
 
 

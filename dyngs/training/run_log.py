@@ -1,4 +1,4 @@
-"""The log of a run: a JSON line per step, and TensorBoard if requested."""
+"""Run log: one JSON line per step, and TensorBoard events if requested."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from dyngs.io.fields import read_limited
 from dyngs.io.write import write_text
 from dyngs.training.events import Evaluated, Event, StepDone
 
-MOST_LOG_BYTES = 1 << 28
-"""A line per step has 150 bytes."""
+MAX_LOG_BYTES = 1 << 28  # a line has about 150 bytes
 
 
 @dataclass(frozen=True)
@@ -23,10 +22,10 @@ class LogRecord:
     """One line of ``log.jsonl``.
 
     Attributes:
-        loss, psnr: of this step; of its image, dB, None where its mask leaves nothing.
-        num_gaussians, num_moving: after the step, and those of them that depend on time.
-        bad_gradients: how often so far a Gaussian was left out of a step because its gradient was
-            not finite.
+        loss, psnr: of this step and its image, in dB. None if the mask excludes all pixels.
+        num_gaussians: after the step.
+        num_moving: Gaussians that depend on time, after the step.
+        bad_gradients: parameter rows skipped so far because their gradient was not finite.
         seconds: training time so far, over all resumes.
     """
 
@@ -40,12 +39,12 @@ class LogRecord:
 
 
 class RunLog:
-    """Listener that writes a run's log; a context manager.
+    """Listener that writes the log of a run; a context manager.
 
     Args:
-        after_step: lines beyond this step, left by an interrupted run, are dropped (0: all).
-        every: steps between lines; the last step has one, too.
-        tensorboard: also write event files to ``tensorboard`` next to the log.
+        after_step: lines beyond this step, left by an interrupted run, are removed. 0 removes all.
+        every: steps between lines. The last step is always logged.
+        tensorboard: also write TensorBoard events to ``tensorboard/`` next to the log.
     """
 
     def __init__(
@@ -58,7 +57,7 @@ class RunLog:
         self._file: IO[str] = self.path.open("a", encoding="utf-8")
 
     def __call__(self, event: Event) -> None:
-        """Write ``event`` to the log, if it belongs there."""
+        """Write ``StepDone`` and ``Evaluated`` events to the log."""
         match event:
             case StepDone() if event.step % self._every == 0 or event.is_last:
                 plotted = ("loss", "psnr", "num_gaussians")
@@ -98,17 +97,16 @@ def log_record(event: StepDone) -> LogRecord:
 
 
 def _lines_up_to(path: Path, step: int) -> list[str]:
-    """Return the complete lines of an earlier log for steps up to ``step``."""
+    """Return the complete lines of an existing log for steps up to ``step``."""
     if step == 0 or not path.is_file():
         return []
     kept = []
-    for line in read_limited(path, MOST_LOG_BYTES).decode(errors="replace").splitlines():
+    for line in read_limited(path, MAX_LOG_BYTES).decode(errors="replace").splitlines():
         try:
             if json.loads(line)["step"] <= step:
                 kept.append(line + "\n")
         except (ValueError, KeyError, TypeError, RecursionError):
-            # the torn last line of a killed run
-            continue
+            continue  # incomplete last line of a killed run
     return kept
 
 
@@ -117,6 +115,6 @@ def _open_tensorboard(run_dir: Path, after_step: int) -> Any:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
         raise DyngsError(
-            "train.tensorboard needs the package 'tensorboard'; pip install it or set it to false"
+            "train.tensorboard=true needs the package tensorboard; run pip install tensorboard"
         ) from None
     return SummaryWriter(str(run_dir / "tensorboard"), purge_step=after_step + 1)

@@ -1,4 +1,4 @@
-"""Training of a model, step by step. It does not depend on what the model is made of."""
+"""Trainer of a scene, independent of the kind of model."""
 
 from __future__ import annotations
 
@@ -34,18 +34,17 @@ from dyngs.training.processes import Processes
 
 
 class ViewSampler:
-    """Every view once per epoch, in a new random order each time."""
+    """Samples every view once per epoch, in a new random order each epoch."""
 
     def __init__(self, num_views: int) -> None:
         self.num_views = num_views
         self._order = torch.zeros(0, dtype=torch.long, device="cpu")
         self._position = 0
 
-    def next(self, generator: torch.Generator, wanted: Callable[[int], bool]) -> int:
-        """Return the index of the next view that is ``wanted``, of which there must be one; others
-        are passed over.
+    def next(self, generator: torch.Generator, is_eligible: Callable[[int], bool]) -> int:
+        """Return the index of the next view for which ``is_eligible`` is true, skipping others.
 
-        ``generator`` is drawn from once per epoch.
+        The generator is used once per epoch. At least one view must be eligible.
         """
         while True:
             if self._position >= len(self._order):
@@ -53,14 +52,13 @@ class ViewSampler:
                 self._position = 0
             self._position += 1
             index = int(self._order[self._position - 1])
-            if wanted(index):
+            if is_eligible(index):
                 return index
 
-    def peek(self, count: int, wanted: Callable[[int], bool]) -> list[int]:
-        """Return up to ``count`` views of this epoch that come next, by what is ``wanted`` now;
-        nothing is drawn."""
-        rest = self._order[self._position :].tolist()
-        return list(islice(filter(wanted, rest), count))
+    def peek(self, count: int, is_eligible: Callable[[int], bool]) -> list[int]:
+        """Return up to ``count`` upcoming eligible views of this epoch, without advancing."""
+        remaining = self._order[self._position :].tolist()
+        return list(islice(filter(is_eligible, remaining), count))
 
     def state(self) -> dict[str, Tensor]:
         return {"order": self._order, "position": torch.tensor([self._position], device="cpu")}
@@ -74,19 +72,19 @@ class ViewSampler:
 
 @dataclass(frozen=True)
 class TrainingEdit:
-    """A change of a training between two steps, as a limit or the pruning stage requests it.
+    """A change to a running training, requested by a limit or by the pruning stage.
 
     Attributes:
-        message: what is changed, and what it costs.
-        kept: (N,) bool, the Gaussians that stay; None: all.
-        masks: times at which Gaussians are visible; None: they are always drawn.
-        stops_growing: the set of Gaussians stays as it is from now on.
-        steps: another length of the run, which all schedules follow; None: as it is.
-        config: the same run with other options of drawing or pruning; None: as it is.
+        message: logged description of the change.
+        keep: (N,) bool, Gaussians to keep. None keeps all.
+        masks: visibility masks over time. None makes all Gaussians always visible.
+        stops_densification: no Gaussians are added or removed from now on.
+        steps: new length of the run, to which all schedules scale. None keeps it.
+        config: same run with other render or pruning options. None keeps it.
     """
 
     message: str = ""
-    kept: Tensor | None = None
+    keep: Tensor | None = None
     masks: Any = None
     stops_densification: bool = False
     steps: int | None = None
@@ -99,7 +97,7 @@ M = TypeVar("M", bound=Model[Any])
 class TrainerParts(NamedTuple):
     """Parts of a trainer that depend on the schedules of a run.
 
-    The order of the losses decides the last bits of gradients.
+    The order of the losses determines the rounding of gradients.
     """
 
     model: Any
@@ -109,18 +107,17 @@ class TrainerParts(NamedTuple):
 
 @dataclass
 class Trainer(Generic[M]):
-    """A run in memory: everything that a step reads and changes.
+    """State of a training run: model, losses, corrections, images and schedules.
 
     Attributes:
-        parts_of: begins model, losses and corrections on the schedules of a config.
-        background: "white", "black" or "random" (a new colour in each step, behind render and
-            image alike).
-        findings: lines that are reported with the next step.
-        bad_gradients: how often something was left out of a step because its gradient was not
-            finite.
-        held_out: indices of the training views that are not trained on.
-        processes: that take a fraction of the views of each step.
-        device: where the model is trained; see ``place``.
+        build_parts: creates model, losses and corrections for the schedules of a config.
+        background: "white", "black" or "random" (a new colour per step, behind rendering and
+            image).
+        pending_messages: lines that are logged with the next step.
+        bad_gradients: number of parameter rows skipped because their gradient was not finite.
+        held_out: indices of training views that are not trained on.
+        processes: the processes that share the views of each step.
+        device: device of the model, see ``place``.
     """
 
     config: Config
@@ -163,14 +160,14 @@ class Trainer(Generic[M]):
         return self.model.num_moving
 
     def step(self) -> StepReport:
-        """Train on this process's fraction of the images of a step; the report is of the first of
-        them."""
+        """Run one training step on this process's part of the batch. The report is of its first
+        view."""
         step = self.done + 1
         reports = []
         for index, seed in self._next_views(step):
             with _random_numbers(self.generator, seed):
                 reports.append(self._backward(step, index))
-        loss = self._averaged(step, [report.loss for report in reports])
+        loss = self._average_gradients(step, [report.loss for report in reports])
         updated = self.model.update(step)
         self.bad_gradients = self.bad_gradients + updated.bad
         self.done = step
@@ -181,8 +178,8 @@ class Trainer(Generic[M]):
         message = "\n".join(line for line in messages if line)
         return replace(reports[0], loss=loss, message=message or None)
 
-    def _averaged(self, step: int, losses: Sequence[float]) -> float:
-        """Return the mean loss over the views of a step, and average their gradients, too."""
+    def _average_gradients(self, step: int, losses: Sequence[float]) -> float:
+        """Average the gradients over the views of a step, and return the mean loss."""
         batch = self.config.train.batch_size
         if batch == 1:
             return losses[0]
@@ -196,8 +193,7 @@ class Trainer(Generic[M]):
         return float(loss) / batch
 
     def _backward(self, step: int, index: int) -> StepReport:
-        """Add the gradients of the image of view ``index`` to those that are there, and return how
-        it was drawn."""
+        """Render view ``index``, accumulate its gradients, and return the report."""
         image = self._image(index, step)
         for correction in self.corrections:
             image = correction.before_render(image)
@@ -211,8 +207,8 @@ class Trainer(Generic[M]):
             drawn.rendering,
             drawn.rendering.rgb[0],
             background,
-            self._drawn_with_depth(background),
-            self._wanted(step),
+            self._render_with_depth(background),
+            self._eligible_views(step),
         )
         for correction in self.corrections:
             view = correction.after_render(view)
@@ -225,7 +221,7 @@ class Trainer(Generic[M]):
             terms |= loss(look)
         check = StepCheck(terms, drawn.moved, self.device)
         with torch.autograd.set_multithreading_enabled(False):
-            # a GPU's nodes in this thread, too: no handing over
+            # Run GPU nodes in this thread, too, to avoid switching threads.
             reduce(add, terms.values()).backward()
         value = check.loss(step, image, self.model.deformation_name)
         drawn.after_backward()
@@ -235,7 +231,7 @@ class Trainer(Generic[M]):
         return StepReport(step, value, image, rendered.detach(), truth)
 
     def apply(self, edit: TrainingEdit) -> None:
-        """Change the training between two steps."""
+        """Apply an edit between two steps."""
         model: Any = self.model
         if edit.steps is not None:
             self._rescale(edit.steps)
@@ -245,8 +241,8 @@ class Trainer(Generic[M]):
         if edit.stops_densification:
             model.replace_scene(model.scene.without_masks())
             model.stop_growing()
-        if edit.kept is not None:
-            model.select_gaussians(edit.kept, self.done)
+        if edit.keep is not None:
+            model.keep(edit.keep, self.done)
         if edit.masks is not None:
             model.replace_scene(replace(model.scene, masks=edit.masks))
 
@@ -261,7 +257,7 @@ class Trainer(Generic[M]):
         self.model.extend(seen, step)
 
     def restart(self, config: Config, checkpoint: Checkpoint) -> None:
-        """Go back to ``checkpoint``, on the schedules of ``config``."""
+        """Restore ``checkpoint`` with the schedules of ``config``."""
         self._begin(config)
         self.restore(checkpoint)
 
@@ -270,7 +266,7 @@ class Trainer(Generic[M]):
         self.processes = processes
 
     def hold_out(self, indices: Sequence[int]) -> None:
-        """Train on other views than these from now on."""
+        """Exclude these views from training from now on."""
         self.held_out = frozenset(indices)
 
     @property
@@ -290,7 +286,7 @@ class Trainer(Generic[M]):
         return Checkpoint(self.info, tensors, settings=checkpoint_settings(self.config))
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go back to where ``checkpoint`` was taken."""
+        """Restore the state of ``checkpoint``."""
         with wrap_read_errors(checkpoint.name, CONFIG_ADVICE):
             try:
                 self.model.restore(checkpoint)
@@ -303,69 +299,72 @@ class Trainer(Generic[M]):
         self.place(self.device)
 
     def place(self, device: torch.device) -> None:
-        """Go on on ``device``: with the model and the images.
+        """Move the model and the images to ``device``.
 
-        Corrections of single images and random numbers stay on the CPU.
+        Corrections and random numbers stay on the CPU.
         """
         self.device = self.images.device = device
         self.model.place(device)
 
     def _image_parts(self) -> dict[str, ViewSampler | Correction]:
-        """Return what belongs to images and has a state, by its name in a checkpoint."""
+        """Return the per-image state, by its name in a checkpoint."""
         return {"sampler": self.sampler} | {x.name: x for x in self.corrections}
 
-    def _drawn_with_depth(self, background: Tensor) -> Callable[[Cameras, float | None], Rendering]:
+    def _render_with_depth(
+        self, background: Tensor
+    ) -> Callable[[Cameras, float | None], Rendering]:
         scene = self.model.scene
         return partial(
             scene.render, options=replace(scene.options, depth="expected"), background=background
         )
 
     def _next_views(self, step: int) -> list[tuple[int, int | None]]:
-        """Return the indices of the views that ``step`` trains on here, each with the seed of its
-        random numbers.
+        """Return the view indices of this process for ``step``, each with a random seed.
 
-        Without a seed they are those of the run. All processes draw the same views and seeds, and
-        take their share.
+        The seed is None for a batch of one, which uses the generator of the run. All processes draw
+        the same views and seeds.
         """
         batch = self.config.train.batch_size
-        wanted = self._wanted(step)
-        drawn = [self.sampler.next(self.generator, wanted) for _ in range(batch)]
-        fraction = self.processes.views_of_process(batch)
+        is_eligible = self._eligible_views(step)
+        drawn = [self.sampler.next(self.generator, is_eligible) for _ in range(batch)]
+        own_views = self.processes.views_of_process(batch)
         if batch == 1:
             return [(drawn[0], None)]
         seeds = torch.randint(2**62, (batch,), generator=self.generator, device="cpu").tolist()
-        return [(drawn[i], seeds[i]) for i in fraction]
+        return [(drawn[i], seeds[i]) for i in own_views]
 
     def _image(self, index: int, step: int) -> Image:
-        """Return the image of view ``index`` for ``step``; those after it begin to be decoded."""
+        """Return the image of view ``index`` for ``step``, and prefetch the following ones."""
         image = self.images.downscaled(index, image_divisor(self.config.train, step))
         if self.images.num_prefetched:
             batch = self.config.train.batch_size
             count = self.images.num_prefetched * self.processes.size
-            fraction = self.processes.views_of_process(batch)
-            upcoming = self.sampler.peek(count, self._wanted(step))
-            self.images.prefetch([view for i, view in enumerate(upcoming) if i % batch in fraction])
+            own_views = self.processes.views_of_process(batch)
+            upcoming = self.sampler.peek(count, self._eligible_views(step))
+            self.images.prefetch(
+                [view for i, view in enumerate(upcoming) if i % batch in own_views]
+            )
         return image
 
-    def _wanted(self, step: int) -> Callable[[int], bool]:
+    def _eligible_views(self, step: int) -> Callable[[int], bool]:
         times = self.images.times
 
         def may_train(index: int) -> bool:
             return self.model.trains_on(times[index], step)
 
-        def is_enabled(index: int) -> bool:
+        def is_eligible(index: int) -> bool:
             return (
                 may_train(index)
                 and not self.model.is_held_out(index, step)
                 and index not in self.held_out
             )
 
-        return is_enabled if any(is_enabled(i) for i in range(len(self.images))) else may_train
+        return is_eligible if any(is_eligible(i) for i in range(len(self.images))) else may_train
 
 
 @contextmanager
 def _random_numbers(generator: torch.Generator, seed: int | None) -> Iterator[None]:
-    """Let ``generator`` draw the numbers of ``seed`` for a while; None: its own."""
+    """Use ``seed`` for ``generator`` within the context. None keeps its state."""
     if seed is None:
         yield
         return

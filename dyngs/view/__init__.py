@@ -1,1 +1,1 @@
-"""The viewer: a local page that shows scenes and training."""
+"""Viewer: a local web page that shows scenes and running trainings."""

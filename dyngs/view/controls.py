@@ -1,5 +1,7 @@
-"""The controls of the page: what is shown, the time, the truth, the cameras of the capture, poses
-and motions of a person, camera paths, screenshots. Each browser has its own."""
+"""Controls of the viewer page: display, time, capture cameras, motions, camera paths, screenshots.
+
+Each browser has its own controls.
+"""
 
 from __future__ import annotations
 
@@ -33,20 +35,19 @@ if TYPE_CHECKING:
 
 NEAREST = "nearest"
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
-AS_CAPTURED, AT_REST, BY_SLIDERS = "as captured", "rest pose", "pose by sliders"
-BODY_JOINTS = JOINT_NAMES[:22]
-"""Joints with sliders: the first ones of every body."""
+AS_CAPTURED, AT_REST, BY_SLIDERS = "as captured", "rest pose", "pose sliders"
+BODY_JOINTS = JOINT_NAMES[:22]  # Joints with sliders, common to all bodies
 FILE_NAME = "camera_path.json"
 MOTION_SUFFIXES = (".npz", ".bvh", ".glb", ".gltf", ".vrma")
 HELP = """\
-**Orbit**: drag; right button or two fingers: shift; wheel: nearer, farther.
-**Fly**: W A S D, Q and E: down, up; arrow keys: turn.
-**Cameras**: click one to go there.
+**Orbit**: drag to rotate, right button or two fingers to pan, wheel to zoom.
+**Fly**: W A S D to move, Q and E for down and up, arrow keys to rotate.
+**Cameras**: click a camera to go there.
 """
 
 
 class Controls:
-    """Controls of one browser; ``show`` makes them anew for another scene."""
+    """Controls of one browser. ``show`` rebuilds them for another scene."""
 
     def __init__(
         self, connection: BrowserConnection, source: SceneSource, motions: Mapping[str, Path]
@@ -66,7 +67,7 @@ class Controls:
         self.show(connection.loaded)
 
     def show(self, opened: OpenedScene) -> None:
-        """Make the controls that a scene needs."""
+        """Create the controls for a scene."""
         for handle in self._folders:
             handle.remove()
         self._frusta.remove()
@@ -96,7 +97,7 @@ class Controls:
                 add()
 
     def _choose(self, name: str) -> None:
-        """Load another scene, in the thread that draws."""
+        """Load another scene, in the render thread."""
         connection = self._connection
         note = connection.client.add_notification("Loading", name, loading=True)
 
@@ -112,7 +113,7 @@ class Controls:
         connection.session.submit_job(load)
 
     def _change(self, **changes: Any) -> None:
-        """Show something else, which frusta may cover."""
+        """Change the display, and hide frusta that cover it."""
         self._connection.session.change(**changes)
         self._frusta.hide_covering_frusta()
 
@@ -125,8 +126,8 @@ class Controls:
         layers = [name for name in LAYERS if name != "error" or len(views_of(opened))]
         if session.display.layer not in layers:
             session.change(layer="colour")
-        hint = "error: against the truth, at a camera of the capture"
-        layer = gui.add_dropdown("What", layers, initial_value=session.display.layer, hint=hint)
+        hint = "error: difference to the true image, at a camera of the capture"
+        layer = gui.add_dropdown("Layer", layers, initial_value=session.display.layer, hint=hint)
         layer.on_update(lambda _: self._change(layer=layer.value))
         has_parts = scene is not None and 0 < scene.num_moving < len(scene)
         if has_parts or (scene is not None and opened.in_training and has_timeline(opened)):
@@ -134,12 +135,12 @@ class Controls:
             part.on_update(lambda _: session.change(part=part.value))
         else:
             session.change(part="all")
-        screenshot = gui.add_button("Screenshot", hint="as .png, of the size of the window")
+        screenshot = gui.add_button("Screenshot", hint="save as .png in window size")
         screenshot.on_click(lambda _: session.submit_job(self._screenshot))
-        gui.add_button("Back to start").on_click(lambda _: self._connection.go_to(None))
+        gui.add_button("Reset view").on_click(lambda _: self._connection.go_to(None))
 
     def _screenshot(self) -> None:
-        """Send what is shown as a .png, in the thread that draws."""
+        """Send the current view as .png, in the render thread."""
         from PIL import Image
 
         session = self._connection.session
@@ -160,19 +161,19 @@ class Controls:
         session.on_play = lambda playing: setattr(play, "label", "Pause" if playing else "Play")
         loop = gui.add_checkbox("Loop", timeline.loops)
         loop.on_update(lambda _: session.change_timeline(loops=bool(loop.value)))
-        hint = "1: as it was filmed"
+        hint = "1: real time"
         speed = gui.add_dropdown("Speed", SPEEDS, initial_value=f"{timeline.speed:g}", hint=hint)
         speed.on_update(lambda _: session.change_timeline(speed=float(speed.value)))
         self._connection.time_slider = slider
 
     def _add_capture(self, gui: viser.GuiApi, opened: OpenedScene) -> None:
         session = self._connection.session
-        hint = "frusta with their images; click one to go there"
+        hint = "camera frusta with images; click one to go there"
         cameras = gui.add_checkbox("Cameras", False, hint=hint)
         cameras.on_update(
             lambda _: self._frusta.show(opened) if cameras.value else self._frusta.remove()
         )
-        hint = "with the true image, on the right of the line"
+        hint = "show the true image on the right of the line"
         compare = gui.add_checkbox("Compare", session.display.comparing, hint=hint)
         compare.on_update(lambda _: self._change(comparing=bool(compare.value)))
         divide = gui.add_slider("Divide", 0.0, 1.0, 0.01, session.display.divide)
@@ -190,10 +191,10 @@ class Controls:
         image.on_update(choose)
 
     def _add_motions(self, gui: viser.GuiApi) -> None:
-        """Add the motion picker, for files by name, and the sliders of the pose."""
+        """Add the motion list and the pose sliders."""
         connection = self._connection
         motion = gui.add_dropdown("Motion", (AS_CAPTURED, AT_REST, BY_SLIDERS, *self._motions))
-        hint = "in motions of files, feet on the floor do not slide"
+        hint = "prevent feet on the floor from sliding in motion files"
         feet = gui.add_checkbox("Keep feet", False, hint=hint)
         joint = gui.add_dropdown("Joint", BODY_JOINTS)
         sliders = [gui.add_slider(axis, -180.0, 180.0, 1.0, 0.0) for axis in "xyz"]
@@ -219,7 +220,7 @@ class Controls:
                 slider.value = value
 
         def turn(event: Any) -> None:
-            if event.client_id is not None:  # None: by ``pick``
+            if event.client_id is not None:  # None: set by ``pick``
                 angles[joint.value] = [float(slider.value) for slider in sliders]
                 motion.value = BY_SLIDERS
                 play(event)
@@ -234,8 +235,8 @@ class Controls:
         connection = self._connection
         session = connection.session
         recording = Recording()
-        status = gui.add_markdown("no keyframes yet")
-        hint = "from the keyframe that is added to the next one"
+        status = gui.add_markdown("no keyframes")
+        hint = "duration from the added keyframe to the next one"
         seconds = gui.add_slider("Seconds", 0.1, 20.0, 0.1, 2.0, hint=hint)
 
         def record(**changes: Any) -> None:
@@ -253,19 +254,19 @@ class Controls:
         def save(_: Any) -> None:
             if len(recording):
                 first = recording.keyframes[0].camera
-                size = first.width // 2 * 2, first.height // 2 * 2  # as videos need it
+                size = first.width // 2 * 2, first.height // 2 * 2  # even size for videos
                 text = recording.document(size, 30.0, session.opened)
                 client = connection.client
                 client.send_file_download(FILE_NAME, text.encode(), save_immediately=True)
 
-        gui.add_button("Add keyframe", hint="this camera, at this time").on_click(add)
+        gui.add_button("Add keyframe", hint="add current camera and time").on_click(add)
         remove = gui.add_button("Remove last")
         remove.on_click(lambda _: record(keyframes=recording.keyframes[:-1]))
-        loop = gui.add_checkbox("Back to the first", False)
+        loop = gui.add_checkbox("Close loop", False)
         loop.on_update(lambda _: record(loops=bool(loop.value)))
         preview = gui.add_button("Preview")
         preview.on_click(lambda _: session.preview(recording) if len(recording) else None)
-        hint = f"{FILE_NAME}, for: dyngs render RUN --path {FILE_NAME}"
+        hint = f"save {FILE_NAME} for dyngs render RUN --path {FILE_NAME}"
         gui.add_button("Save path", hint=hint).on_click(save)
 
 
@@ -278,13 +279,13 @@ def _add_help(gui: viser.GuiApi, opened: OpenedScene) -> None:
 
 
 def pose_person(opened: OpenedScene, angles: Mapping[str, Sequence[float]]) -> OpenedScene:
-    """Return a person in the rest pose with joints rotated by ``angles``: degrees about x, y and z,
-    in this order, by joint."""
+    """Return a person in rest pose with joints rotated by ``angles``: degrees about x, y, z, by
+    joint."""
     from scipy.spatial.transform import Rotation
 
     rest = opened.at_rest()
     person = as_human_scene(rest.renderable)
-    clip = None if person is None else person.played
+    clip = None if person is None else person.replacement_clip
     if person is None or clip is None:
         return rest
     turns = torch.zeros_like(clip.poses)
@@ -296,26 +297,28 @@ def pose_person(opened: OpenedScene, angles: Mapping[str, Sequence[float]]) -> O
 
 
 def motion_files(path: Path | None) -> dict[str, Path]:
-    """Return at most 500 motion files in a folder, or the file itself, by name; empty for None.
-    Raises DyngsError."""
+    """Return at most 500 motion files in a folder, or a single file, by name. Empty for None.
+
+    Raises:
+        DyngsError: the folder contains no motion files.
+    """
     if path is None:
         return {}
     if path.is_file():
         return {path.name: path}
     found = sorted(file for file in path.rglob("*") if file.suffix.lower() in MOTION_SUFFIXES)
     if not found:
-        raise DyngsError(f"--motion {path}: no motion files there ({', '.join(MOTION_SUFFIXES)})")
+        raise DyngsError(f"--motion {path}: no motion files found ({', '.join(MOTION_SUFFIXES)})")
     return {file.relative_to(path).as_posix(): file for file in found[:500]}
 
 
-# The cameras of a capture, as frusta with their images.
+# Camera frusta
 
-MOST_FRUSTA = 120
-"""Frusta that are shown at most, spread evenly over the cameras."""
+MOST_FRUSTA = 120  # Most frusta shown, evenly chosen
 
 
 class CameraFrusta:
-    """Frusta of one browser."""
+    """Frusta of the capture's cameras in one browser."""
 
     def __init__(self, connection: BrowserConnection) -> None:
         self._connection = connection
@@ -323,15 +326,14 @@ class CameraFrusta:
         connection.on_move = self.hide_covering_frusta
 
     def show(self, opened: OpenedScene) -> None:
-        """Add the frusta, image by image, as the thread that draws finds time; of a camera that
-        stands still one."""
+        """Add the frusta one by one in the render thread, one per static camera."""
         self.remove()
         handles = self._handles
         views = views_of(opened).views
         poses = np.stack([view.cam_from_world for view in views])
         centers = centers_of(poses)
         size = 0.05 * initial_viewpoint(opened).extent
-        # Cameras of a video stand close together.
+        # Cameras of a video are close together.
         spread = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
         size = min(size, 0.15 * spread) if spread > 1e-3 * size else size
         indices = list({pose.tobytes(): i for i, pose in enumerate(poses)}.values())
@@ -347,15 +349,14 @@ class CameraFrusta:
             handle.remove()
 
     def hide_covering_frusta(self) -> None:
-        """Hide the frusta that the browser's camera stands in, and all where the image is of
-        another camera."""
+        """Hide frusta close to the browser camera, and all frusta while another view is shown."""
         session = self._connection.session
         browser_camera = session.browser_camera
         if browser_camera is None:
             return
         is_elsewhere = session.shown_view is not None
         for handle, position, size in list(self._handles):
-            # An image covers what is behind it up to 1.5 times the depth of its frustum.
+            # The image of a frustum covers the scene up to 1.5 times its depth.
             is_near = float(np.linalg.norm(position - browser_camera.position)) < 1.5 * size
             handle.visible = not (is_elsewhere or is_near)
 

@@ -1,5 +1,7 @@
-"""The folder Edit of the page: pick points, measure, delete by a box, undo, save. Each browser edits
-for itself; files and runs on disk never change."""
+"""Edit controls of the viewer page: pick points, measure, delete by a box, undo, save.
+
+Each browser has its own edits. Files and runs on disk never change.
+"""
 
 from __future__ import annotations
 
@@ -28,16 +30,16 @@ from dyngs.view.views import camera_at, initial_viewpoint
 if TYPE_CHECKING:
     from dyngs.view.server import BrowserConnection
 
-_SIZE = 9  # px, width and height of the image whose middle is picked
-_SOLID = 0.5  # opacity below which a ray meets nothing
+_SIZE = 9  # Side in px of the image rendered to pick a point
+_SOLID = 0.5  # Alpha below which a ray hits nothing
 _CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
-# (12, 2, 3) of a cube
+# (12, 2, 3) edges of a unit cube
 _EDGES = np.array([(a, b) for a, b in combinations(_CORNERS, 2) if np.abs(a - b).sum() == 1])
 
 
 def world_of(opened: OpenedScene) -> Similarity:
-    """Return the way from a scene to the coordinates that `dyngs edit` means: of a file those of
-    the file itself."""
+    """Return the transform from a scene to the coordinates of ``dyngs edit``; identity for a
+    file."""
     return IDENTITY if opened.captured is None else opened.world
 
 
@@ -48,17 +50,18 @@ def pick_point(
     pixel: float,
     request: ViewRequest,
 ) -> np.ndarray | None:
-    """Return the point (3,) of the scene that a ray meets, at the depth that is drawn there; None:
-    it meets nothing.
+    """Return the point (3,) where a ray hits the scene, or None.
 
-    Depths are those of centres: the point is exact to about the size of the Gaussians there.
+    It lies at the expected depth, so it is accurate to about the size of the Gaussians.
 
-    ``origin``, ``direction``: (3,) of the ray. ``pixel``: rad that a pixel of the image sees.
-    ``shot``: time and part that are shown.
+    Args:
+        origin, direction: (3,) of the ray.
+        pixel: angle of a pixel in rad.
+        request: time and part that are shown.
     """
     length = float(np.linalg.norm(direction))
     if not (np.isfinite([*origin, length]).all() and length > 0 and pixel > 0):
-        return None  # browsers may send anything
+        return None  # invalid input from the browser
     forward = direction / length
     camera = camera_at((1, 0, 0, 0), origin, 2 * math.atan(0.5 * _SIZE * pixel), (_SIZE, _SIZE))
     camera = cameras_at_poses(
@@ -71,12 +74,12 @@ def pick_point(
 
 @dataclass
 class EditState:
-    """Picked points, a box, and what is left of the scene ``whole`` after what was deleted.
+    """Picked points, a box, and the remaining Gaussians of the scene ``whole``.
 
     Attributes:
-        points: at most two, (3,) each, in the coordinates of the scene.
-        centre, size: (3,) each, of the box, in the coordinates that people mean (``world_of``).
-        steps: (K,) indices into ``whole`` of the Gaussians that were left after each deletion.
+        points: at most two, (3,) each, in scene coordinates.
+        centre, size: (3,) each, of the box, in the coordinates of ``world_of``.
+        steps: (K,) indices into ``whole`` that remained after each deletion.
     """
 
     whole: OpenedScene
@@ -91,35 +94,38 @@ class EditState:
 
     @property
     def rows(self) -> Tensor:
-        """(K,) indices of the Gaussians that are left."""
+        """(K,) indices of the remaining Gaussians."""
         return self.steps[-1] if self.steps else torch.arange(len(self.whole.scene), device="cpu")
 
     @property
     def left(self) -> OpenedScene:
-        """The scene that is left."""
+        """The remaining scene."""
         if not self.steps:
             return self.whole
         scene: GaussianScene = self.whole.scene
         return self.whole.with_scene(scene.select(self.rows.to(scene.device)))
 
     def pick(self, point: np.ndarray) -> None:
-        """Add a picked point (3,); a third one is the first of a new pair."""
+        """Add a picked point (3,). A third point starts a new pair."""
         self.points = [point] if len(self.points) == 2 else [*self.points, point]
 
     def delete(self, *, inside: bool) -> int:
-        """Delete what the box holds, or all else; return how many Gaussians go. Raises DyngsError:
-        all would."""
+        """Delete Gaussians inside or outside the box. Return their number.
+
+        Raises:
+            DyngsError: no Gaussian would remain.
+        """
         kept = gaussians_in_region(self.box, self.left.scene, world_of(self.whole)) ^ inside
         if not bool(kept.any()):
-            held = "all of the scene" if inside else "nothing"
-            raise DyngsError(f"nothing would be left: the box holds {held}")
+            content = "the whole scene" if inside else "no Gaussians"
+            raise DyngsError(f"cannot delete all Gaussians: the box contains {content}")
         gone = len(kept) - int(kept.sum())
         if gone:
             self.steps.append(self.rows[kept])
         return gone
 
     def file(self, time: float | None) -> bytes:
-        """Return what is left as a .ply, at ``time`` if it moves."""
+        """Return the remaining Gaussians as a .ply, at ``time`` if the scene moves."""
         moment = None if self.whole.scene.is_static else time
         with tempfile.TemporaryDirectory(prefix="dyngs_view_") as folder:
             path = Path(folder) / "edited.ply"
@@ -127,11 +133,11 @@ class EditState:
 
     @property
     def description(self) -> str:
-        """Lines of markdown about the picks, the box and what is left; options of `dyngs edit` that
-        say the same."""
+        """Markdown about picked points, box and remaining Gaussians, with options of ``dyngs
+        edit``."""
         world = world_of(self.whole)
         places = [world.points(point) for point in self.points]
-        # four digits, and as many more as the scene is far away from the origin
+        # Use more digits for scenes far from the origin.
         low, high, *texts = (
             self._digits(place) for place in (self.box.low, self.box.high, *places)
         )
@@ -142,7 +148,7 @@ class EditState:
             lines.append(f'`--scale "{texts[0]} {texts[1]} LENGTHm"`')
         lines.append(f"box: `--crop {low} {high}`")
         total = format_count(len(self.whole.scene), "Gaussian")
-        lines.append(f"{len(self.rows):,} of {total} left")
+        lines.append(f"{len(self.rows):,} of {total} remaining")
         return "\n\n".join(lines)
 
     def _digits(self, point: np.ndarray) -> str:
@@ -152,7 +158,7 @@ class EditState:
 
 
 def can_be_edited(opened: OpenedScene) -> bool:
-    """Return whether a scene has Gaussians of which a part can be saved: not those of people, or in
+    """Return whether a scene can be edited: Gaussians from a file or run, no person, not in
     training."""
     is_file = opened.path is not None and opened.path.exists()
     has_gaussians = isinstance(opened.renderable, GaussianScene) and opened.person is None
@@ -160,7 +166,7 @@ def can_be_edited(opened: OpenedScene) -> bool:
 
 
 class EditControls:
-    """Controls and marks of one browser for one scene; ``remove`` takes the marks away."""
+    """Edit controls and markers of one browser for one scene."""
 
     def __init__(self, connection: BrowserConnection, opened: OpenedScene) -> None:
         begin = initial_viewpoint(opened)
@@ -172,9 +178,9 @@ class EditControls:
         self._back = world.inverse()
         self._marks = dict[str, Any]()
         gui = connection.client.gui
-        hint = "click on the scene: two points and their distance"
+        hint = "click two points to measure their distance"
         pick = gui.add_checkbox("Pick points", False, hint=hint)
-        hint = "drag its arrows; along the axes of the scene"
+        hint = "drag the arrows to move the box along the axes of the scene"
         self._box = gui.add_checkbox("Box", False, hint=hint)
         step = 10.0 ** (math.floor(math.log10(2 * extent)) - 2)
         self._size = gui.add_vector3(
@@ -191,7 +197,7 @@ class EditControls:
             "Save as .ply": self._save,
         }
         for name, job in jobs.items():
-            gui.add_button(name).on_click(lambda _, job=job: self._ask(job))
+            gui.add_button(name).on_click(lambda _, job=job: self._submit_job(job))
 
     def remove(self) -> None:
         self._connection.client.scene.remove_click_callback()
@@ -199,20 +205,20 @@ class EditControls:
             mark.remove()
         self._marks.clear()
 
-    def _ask(self, job: Callable[[], None]) -> None:
-        """Have a job done by the thread that draws; what cannot be done is told."""
+    def _submit_job(self, job: Callable[[], None]) -> None:
+        """Run a job in the render thread, and show its error."""
 
         def work() -> None:
             try:
                 job()
             except DyngsError as error:
-                self._connection.notify("Not done", str(error))
+                self._connection.notify("Failed", str(error))
             self._refresh()
 
         self._connection.session.submit_job(work)
 
     def _refresh(self) -> None:
-        """Draw the picked points, the line between them, and the box; say where they are."""
+        """Redraw picked points, their line and the box, and update the description."""
         editing = self.editing
         editing.size = np.array(self._size.value, np.float64)
         scene = self._connection.client.scene
@@ -244,7 +250,7 @@ class EditControls:
         scene = self._connection.client.scene
         scene.remove_click_callback()
         if listens:
-            scene.on_click()(lambda event: self._ask(lambda: self._pick(event)))
+            scene.on_click()(lambda event: self._submit_job(lambda: self._pick(event)))
         else:
             self.editing.points = []
             self._refresh()
@@ -258,11 +264,11 @@ class EditControls:
         direction = np.array(event.ray_direction, np.float64)
         point = pick_point(session.opened, origin, direction, pixel, session.view_request())
         if point is None:
-            raise DyngsError("the scene is not solid at this place")
+            raise DyngsError("no surface here")
         self.editing.pick(point)
 
     def _show_box(self) -> None:
-        """Show or hide the box and its gizmo, along the axes of the frame."""
+        """Show or hide the box and its gizmo."""
         if self._box.value:
             gizmo = self._connection.client.scene.add_transform_controls(
                 "/edit/gizmo",
@@ -286,7 +292,7 @@ class EditControls:
         gone = self.editing.delete(inside=inside)
         self._show()
         self._connection.notify(
-            "Deleted", f"{format_count(gone, 'Gaussian')}; Undo brings them back"
+            "Deleted", f"{format_count(gone, 'Gaussian')} (use Undo to restore)"
         )
 
     def _undo(self) -> None:

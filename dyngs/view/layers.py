@@ -1,4 +1,4 @@
-"""Images of a scene for the viewer: colours, depth, opacity, and the error against the truth."""
+"""Images of a scene for the viewer: colour, depth, opacity, and error against the true image."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from dyngs.runs.opened import OpenedScene
 from dyngs.view.views import views_of
 
 Layer = Literal["colour", "depth", "alpha", "error"]
-Part = Literal["all", "moving", "still"]
+Part = Literal["all", "moving", "static"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 PARTS: tuple[Part, ...] = get_args(Part)
 
 
 @dataclass(frozen=True)
 class ViewRequest:
-    """One image to draw.
+    """An image to render.
 
     Attributes:
         camera: one camera, of the size of the image.
-        layer: what is shown; "error" needs ``view``.
-        view: the view of the capture whose camera, time and truth are shown instead; None: no
-            truth.
-        divide: fraction of the width that shows the render; the truth is on the right of it.
-        is_moving: it is one of many, drawn in levels of detail where ``coarser`` has made them.
+        layer: displayed quantity. "error" needs ``view``.
+        view: view of the capture whose camera, time and true image are used. None shows no true
+            image.
+        divide: fraction of the width that shows the rendering, with the true image on its right.
+        is_moving: part of an animation, so levels of detail are used if available.
     """
 
     camera: Cameras
@@ -46,7 +46,7 @@ class ViewRequest:
 
 
 def draw(opened: OpenedScene, request: ViewRequest) -> np.ndarray:
-    """Return the image (H, W, 3) uint8 of a shot."""
+    """Return the image (H, W, 3) uint8 of a request."""
     if request.view is None:
         return _layer(opened, request)
     views = views_of(opened)
@@ -56,23 +56,25 @@ def draw(opened: OpenedScene, request: ViewRequest) -> np.ndarray:
     truth = truth_in_window(opened, request.view, size)
     if truth is None:
         return rgb
-    beside = truth[..., 3:] == 0
+    outside = truth[..., 3:] == 0
     truth = truth[..., :3]
     if request.layer == "error":
-        difference = np.abs(rgb.astype(np.float32) - truth) * ~beside / 255.0
+        difference = np.abs(rgb.astype(np.float32) - truth) * ~outside / 255.0
         return color_map(4.0 * difference.mean(axis=2), "magma")
-    rgb = np.where(beside, rgb // 2, rgb)  # there is no truth: darker
-    made = np.where(beside, rgb, truth)
+    rgb = np.where(outside, rgb // 2, rgb)  # darken pixels without truth
+    composed = np.where(outside, rgb, truth)
     column = round(min(max(request.divide, 0.0), 1.0) * size[0])
-    made[:, :column] = rgb[:, :column]
+    composed[:, :column] = rgb[:, :column]
     if 0 < column < size[0]:
-        made[:, max(column - 1, 0) : column + 1] = (255, 200, 0)
-    return made
+        composed[:, max(column - 1, 0) : column + 1] = (255, 200, 0)
+    return composed
 
 
 def truth_in_window(opened: OpenedScene, view: int, size: tuple[int, int]) -> np.ndarray | None:
-    """Return the true image of a view as large as it fits into a window of ``size``, px: (H, W, 4)
-    uint8, transparent next to it."""
+    """Return the true image of a view, fitted into a window of ``size`` px: (H, W, 4) uint8.
+
+    Pixels outside the image are transparent.
+    """
     from PIL import Image, ImageOps
 
     images = views_of(opened).images
@@ -85,7 +87,7 @@ def truth_in_window(opened: OpenedScene, view: int, size: tuple[int, int]) -> np
 
 @torch.no_grad()
 def _layer(opened: OpenedScene, request: ViewRequest) -> np.ndarray:
-    """Return one layer (H, W, 3) uint8; for the error it is the colours."""
+    """Return one layer (H, W, 3) uint8; colours for the layer "error"."""
     match request.layer:
         case "depth":
             return depth_to_rgb(*depth_of(opened, request))
@@ -97,15 +99,15 @@ def _layer(opened: OpenedScene, request: ViewRequest) -> np.ndarray:
 
 
 def with_levels(opened: OpenedScene, most: int) -> OpenedScene:
-    """Return a still scene of which at most ``most`` Gaussians are drawn while anything moves.
-    Raises DyngsError."""
-    opened = opened.noted(f"while anything moves, at most {most:,} Gaussians are drawn")
+    """Return a static scene with levels of detail: at most ``most`` Gaussians are rendered while it
+    moves."""
+    opened = opened.noted(f"at most {most:,} Gaussians are rendered while the view moves")
     opened.once("levels", lambda: LevelScene.from_scene(opened.renderable, most))
     return opened
 
 
 def _rendering(opened: OpenedScene, request: ViewRequest, **options: Any) -> Rendering:
-    """Return a rendering, on the CPU; the scene at the last time is kept."""
+    """Return a rendering on the CPU. The last deformed scene is cached."""
     part = request.part
     scene = opened.renderable
     levels: LevelScene | None = opened.once("levels", lambda: None)
@@ -122,7 +124,7 @@ def _rendering(opened: OpenedScene, request: ViewRequest, **options: Any) -> Ren
 
 @torch.no_grad()
 def depth_of(opened: OpenedScene, request: ViewRequest) -> tuple[np.ndarray, np.ndarray]:
-    """Return the expected depth (H, W), world units along the axis of the camera, and the opacity
-    (H, W) there."""
-    made = _rendering(opened, request, depth="expected")
-    return np.zeros(0) if made.depth is None else made.depth[0].numpy(), made.alpha[0].numpy()
+    """Return expected depth (H, W) along the optical axis in world units, and alpha (H, W)."""
+    rendering = _rendering(opened, request, depth="expected")
+    depth = np.zeros(0) if rendering.depth is None else rendering.depth[0].numpy()
+    return depth, rendering.alpha[0].numpy()

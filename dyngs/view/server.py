@@ -1,5 +1,4 @@
-"""The server of the viewer, and who may open its page: this machine alone, or holders of the
-token."""
+"""Web server of the viewer, with access control: localhost only, or holders of a token."""
 
 from __future__ import annotations
 
@@ -33,13 +32,11 @@ COOKIE = "dyngs_view"
 
 @dataclass(frozen=True)
 class AccessPolicy:
-    """Decision on requests, of HTTP or of a websocket, by their paths with the query and their
-    headers.
+    """Decides whether HTTP and websocket requests are allowed, by path and headers.
 
     Attributes:
-        token: that a request has to bring, in the link or as the cookie that the link gives; None:
-            requests must be addressed to this machine, so that pages of others cannot reach the
-            viewer through a browser that runs here.
+        token: must be in the link or in the cookie set by the link. None allows only requests
+            addressed to this machine, so that pages of other sites cannot reach the viewer.
     """
 
     token: str | None = None
@@ -49,37 +46,37 @@ class AccessPolicy:
         host = headers.get("Host", "")
         origin = headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
-            return "a page of another site asks for it"
+            return "request from a page of another site"
         try:
             name = urlsplit(f"//{host}").hostname or ""
             cookie = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)
         except (ValueError, CookieError):
-            return "its headers are broken"
+            return "invalid headers"
         if self.token is None:
-            return None if is_loopback(name) else "only for requests to localhost"
+            return None if is_loopback(name) else "only requests to localhost are allowed"
         given = parse_qs(urlsplit(path).query).get("token", [])
         if cookie is not None:
             given.append(cookie.value)
         if any(hmac.compare_digest(word.encode(), self.token.encode()) for word in given):
             return None
-        return "the token is missing or wrong; open the link that `dyngs view` printed"
+        return "missing or wrong token; open the link printed by `dyngs view`"
 
     def cookie(self, path: str) -> str | None:
-        """Return the header ``Set-Cookie`` for a request that brings the token in the link; None:
-        it needs none."""
+        """Return the ``Set-Cookie`` header for a request with a valid token in the link, else
+        None."""
         if self.token is None or "token" not in parse_qs(urlsplit(path).query):
             return None
         return f"{COOKIE}={self.token}; Path=/; HttpOnly; SameSite=Strict"
 
 
 def access_policy_for(host: str) -> AccessPolicy:
-    """Return the gate of a server on ``host``: with a new token unless that is this machine
-    alone."""
+    """Return the access policy of a server on ``host``, with a new token unless it is a loopback
+    address."""
     return AccessPolicy() if is_loopback(host) else AccessPolicy(secrets.token_urlsafe(24))
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a server on ``host`` can be reached from this machine only."""
+    """Return whether ``host`` can be reached from this machine only."""
     if host == "localhost":
         return True
     try:
@@ -89,7 +86,7 @@ def is_loopback(host: str) -> bool:
 
 
 def link_to(host: str, port: int, token: str | None = None) -> str:
-    """Return the address at which browsers find a server that listens on ``host`` and ``port``."""
+    """Return the URL of a server that listens on ``host`` and ``port``."""
     if host in ("0.0.0.0", "::"):
         host = socket.gethostname() or "localhost"
     elif host == "127.0.0.1":
@@ -99,8 +96,11 @@ def link_to(host: str, port: int, token: str | None = None) -> str:
 
 
 def free_port(host: str, port: int | None) -> int:
-    """Return the port to listen on: ``port``; None: 8080, or the next that is free. Raises
-    DyngsError."""
+    """Return ``port``, or the first free port from 8080 on if it is None.
+
+    Raises:
+        DyngsError: the port is not available.
+    """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     problem = None
     for candidate in range(8080, 8130) if port is None else [port]:
@@ -110,17 +110,17 @@ def free_port(host: str, port: int | None) -> int:
         except OSError as error:
             problem = error
     raise DyngsError(
-        f"--host {host}, --port {port or '8080 to 8129'}: cannot listen there ({problem}); choose another, or leave "
-        "--port out to get a free one"
+        f"--host {host} --port {port or '8080 to 8129'}: cannot listen ({problem}); use another "
+        "port, or "
+        "omit --port to find a free one"
     )
 
 
 @contextmanager
-def enforce_access(gate: AccessPolicy) -> Iterator[None]:
-    """Let the servers that viser starts meanwhile ask ``gate`` first: about pages and websockets
-    alike.
+def enforce_access(policy: AccessPolicy) -> Iterator[None]:
+    """Apply ``policy`` to all pages and websockets of servers that viser starts in this context.
 
-    viser has no setting for this; it starts its server by ``websockets.asyncio.server.serve``.
+    viser has no option for this; its server is started by ``websockets.asyncio.server.serve``.
     """
     from websockets.asyncio import server
 
@@ -128,11 +128,11 @@ def enforce_access(gate: AccessPolicy) -> Iterator[None]:
 
     def serve(*args: Any, process_request: Any, **options: Any) -> Any:
         def checked(connection: Any, request: Any) -> Any:
-            refusal = gate.refusal(request.path, request.headers)
+            refusal = policy.refusal(request.path, request.headers)
             if refusal is not None:
                 return connection.respond(http.HTTPStatus.FORBIDDEN, f"dyngs view: {refusal}\n")
             response = process_request(connection, request)
-            cookie = gate.cookie(request.path)
+            cookie = policy.cookie(request.path)
             if response is not None and cookie is not None:
                 response.headers["Set-Cookie"] = cookie
             return response
@@ -147,20 +147,19 @@ def enforce_access(gate: AccessPolicy) -> Iterator[None]:
 
 
 _PUNCTUATION = re.compile(r"([!-/:-@\[-`{-~])")
+# Positions at which links are recognised even if punctuation is escaped
 _IN_LINKS = re.compile(r"(?=://|@)|(?<=www)(?=\.)", re.IGNORECASE)
-"""Where addresses are recognised even if their punctuation is escaped."""
 
 
 @dataclass(frozen=True)
 class ServerOptions:
-    """How the page is served.
+    """Options of the viewer server.
 
     Attributes:
-        port: None: 8080 or the next that is free.
+        port: None uses the first free port from 8080 on.
         motions: motion files for people, by name.
-        target: seconds that an image may take while something moves.
-        in_thread: images are drawn in a thread of the server; else by whoever calls
-            ``drawer.draw_one``.
+        target: seconds per image while the view moves.
+        in_thread: render in a thread of the server. Otherwise the caller uses ``drawer.draw_one``.
     """
 
     host: str = "127.0.0.1"
@@ -171,8 +170,7 @@ class ServerOptions:
 
 
 class BrowserConnection:
-    """One browser: its connection, its session, and the images that went to it; ``opened`` is what
-    it sees first."""
+    """A connected browser with its session; ``opened`` is shown first."""
 
     def __init__(self, client: viser.ClientHandle, opened: OpenedScene, target: float) -> None:
         self.client = client
@@ -183,11 +181,11 @@ class BrowserConnection:
         self.time_slider: viser.GuiSliderHandle | None = None
         self.on_move: Callable[[], None] = lambda: None
         self.num_sent = 0
-        self._shown_at = 0.0  # when the status was set, and the images until then
+        self._shown_at = 0.0  # time of the last status, and number of images then
         self._shown_count = 0
 
     def send(self, sent: SentImage) -> None:
-        """Pass an image to the browser; the status and the time slider follow every half second."""
+        """Send an image to the browser, and update status and time slider twice per second."""
         quality = 95 if sent.is_refined else 75
         self.client.scene.set_background_image(sent.image, format="jpeg", jpeg_quality=quality)
         self.num_sent += 1
@@ -195,7 +193,7 @@ class BrowserConnection:
         if passed >= 0.5 or sent.is_refined:
             height, width = sent.image.shape[:2]
             rate = (self.num_sent - self._shown_count) / passed
-            shown = "still" if sent.is_refined else f"{rate:.0f} images/s"
+            shown = "full resolution" if sent.is_refined else f"{rate:.0f} fps"
             view = self.session.shown_view
             if view is not None:
                 shown += f", truth: {escape_markdown(views_of(self.session.opened).names[view])}"
@@ -209,14 +207,14 @@ class BrowserConnection:
         self.client.flush()
 
     def camera_moved(self) -> None:
-        """Take over the camera of the browser."""
+        """Update the session with the camera of the browser."""
         camera = self.client.camera
         wxyz, position = tuple(camera.wxyz.tolist()), tuple(camera.position.tolist())
         self.session.move(BrowserCamera(wxyz, position, float(camera.fov), _window(camera)))
         self.on_move()
 
     def go_to(self, index: int | None) -> None:
-        """Move the browser's camera to a view of the capture; None: to where it began."""
+        """Move the browser camera to a view of the capture, or to the initial view for None."""
         opened = self.session.opened
         handle = self.client.camera
         begin = initial_viewpoint(opened)
@@ -231,31 +229,31 @@ class BrowserConnection:
         self.camera_moved()
 
     def notify(self, title: str, body: str) -> None:
-        """Show a message for some seconds."""
+        """Show a notification for some seconds."""
         self.client.add_notification(title, body, auto_close_seconds=12.0)
 
 
 def _window(camera: viser.CameraHandle) -> tuple[int, int]:
-    """Return width and height of the window of a browser, px: at least 16, also of one that has
-    none yet."""
+    """Return width and height of a browser window in px, at least 16."""
     return max(16, int(camera.image_width)), max(16, int(camera.image_height))
 
 
 def escape_markdown(text: str) -> str:
-    """Return Markdown that shows ``text`` of others letter by letter: no HTML, which viser would
-    render with its scripts, no links, images or emphasis."""
+    """Return Markdown that shows ``text`` literally, without HTML, links, images or emphasis.
+
+    viser would execute scripts in HTML.
+    """
     return _PUNCTUATION.sub(r"\\\1", _IN_LINKS.sub("\u200b", format_one_line(text)))
 
 
 class Viewer:
-    """A page that shows scenes to any number of browsers, each with its own camera, time and
+    """Web page that shows scenes to any number of browsers, each with its own camera, time and
     settings.
 
-    A context manager: the page is there from ``__enter__`` on. A new browser sees the scene
-    ``first``.
+    A context manager that serves the page. New browsers see the scene ``first``.
 
     Raises:
-        DyngsError: viser is not installed, or the port cannot be had.
+        DyngsError: viser is not installed, or the port is not available.
     """
 
     def __init__(
@@ -267,27 +265,27 @@ class Viewer:
         self.source, self.first, self.serving = source, first, serving
         self.drawer = RenderScheduler()
         self._connections: dict[int, BrowserConnection] = {}
-        gate = access_policy_for(serving.host)
+        policy = access_policy_for(serving.host)
         port = free_port(serving.host, serving.port)
-        with enforce_access(gate), silence_viser():
+        with enforce_access(policy), silence_viser():
             self.server = viser.ViserServer(host=serving.host, port=port, verbose=False)
-        self.link = link_to(serving.host, self.server.get_port(), gate.token)
+        self.link = link_to(serving.host, self.server.get_port(), policy.token)
         self._prepare()
 
     @property
     def connections(self) -> tuple[BrowserConnection, ...]:
-        """All browsers that are connected."""
+        """All connected browsers."""
         return tuple(self._connections.values())
 
     def __enter__(self) -> Viewer:
         if self.serving.in_thread:
             self.drawer.start()
         self.server.on_client_connect(self._connected)
-        self.server.on_client_disconnect(self._gone)
+        self.server.on_client_disconnect(self._disconnected)
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the page; browsers that show it say so."""
+        """Stop serving the page."""
         for connection in self.connections:
             self.drawer.remove(connection.session)
         self.drawer.stop()
@@ -295,15 +293,15 @@ class Viewer:
             self.server.stop()
 
     def _prepare(self) -> None:
-        """Set what all browsers share: the theme, the first camera, the up direction."""
+        """Set the theme, the initial camera and the up direction of all browsers."""
         from viser import _messages
 
         server = self.server
         for kind in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
-            # it would pass the page through a host of others
+            # Sharing would route the page through an external host.
             server._websock_server.unregister_handler(kind)
         server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
-        server.gui.main_panel.dock_right()  # next to the image, not over it
+        server.gui.main_panel.dock_right()  # beside the image
         begin = initial_viewpoint(self.first)
         start = begin.start
         server.scene.set_up_direction(tuple(begin.up))
@@ -328,28 +326,28 @@ class Viewer:
         client.camera.on_update(moved)
         self.drawer.add(connection.session)
         connection.go_to(None)
-        if client.client_id not in self.server.get_clients():  # it went while all this was made
-            self._gone(client)
+        if client.client_id not in self.server.get_clients():  # disconnected in the meantime
+            self._disconnected(client)
 
-    def _gone(self, client: viser.ClientHandle) -> None:
+    def _disconnected(self, client: viser.ClientHandle) -> None:
         connection = self._connections.pop(client.client_id, None)
         if connection is not None:
             self.drawer.remove(connection.session)
 
 
 def require_viser() -> None:
-    """Raise DyngsError where viser is not installed."""
+    """Raise DyngsError if viser is not installed."""
     try:
         import viser  # noqa: F401
     except ImportError as error:
         raise DyngsError(
-            f"the viewer needs viser ({error}); install it with: pip install 'dyngs[view]'"
+            f"the viewer needs viser ({error}); run pip install 'dyngs[view]'"
         ) from error
 
 
 @contextmanager
 def silence_viser() -> Iterator[None]:
-    """Keep viser from printing its own lines."""
+    """Suppress the console output of viser."""
     import rich
 
     console = rich.get_console()

@@ -1,5 +1,7 @@
-"""Sessions of the viewer: the view of one browser, the size of its next image, and the thread that
-renders for all browsers. Independent of viser."""
+"""Viewer sessions: state of one browser, resolution control, and rendering for all browsers.
+
+Independent of viser.
+"""
 
 from __future__ import annotations
 
@@ -26,18 +28,15 @@ from dyngs.view.layers import Layer, Part, ViewRequest, draw
 from dyngs.view.views import camera_at, nearest_view, views_of
 
 _LOG = logging.getLogger(__name__)
-REFINE_DELAY = 0.2
-"""Seconds without change after which the image is refined."""
-_SMALLEST_AREA = 320 * 240
-"""Pixels of an image at least: where Gaussians take all the time, a smaller one would hardly come
-sooner."""
-_LONGEST_SIDE = 1600  # px of an image at most
+REFINE_DELAY = 0.2  # Seconds without changes after which the image is rendered in full resolution
+_SMALLEST_AREA = 320 * 240  # Smallest image in pixels; below, the cost of Gaussians dominates
+_LONGEST_SIDE = 1600  # Longest side of an image in px
 
 
 @dataclass(frozen=True)
 class BrowserCamera:
-    """The camera of a browser: wxyz and position as in ``camera_at``, vertical field of view in
-    rad, window in px."""
+    """Camera of a browser: pose as in ``camera_at``, vertical field of view in rad, window size in
+    px."""
 
     wxyz: tuple[float, ...]
     position: tuple[float, ...]
@@ -45,16 +44,16 @@ class BrowserCamera:
     size: tuple[int, int]
 
     def camera(self, size: tuple[int, int] | None = None) -> Cameras:
-        """Return the camera for images of ``size``; None: that of the window."""
+        """Return the camera for images of ``size``, or of the window for None."""
         return camera_at(self.wxyz, self.position, self.fov, size or self.size)
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """The time that is shown: ``time`` in [0, 1] when the clock read ``since``.
+    """Scene time in [0, 1] as a function of the clock.
 
-    Where it is ``playing``, it takes ``seconds`` / ``speed`` from 0 to 1, where it begins again or
-    stops.
+    Playing takes ``seconds`` / ``speed`` from 0 to 1, then restarts or stops. ``time`` is the scene
+    time at clock ``since``.
     """
 
     time: float = 0.0
@@ -65,7 +64,7 @@ class Timeline:
     seconds: float = 4.0
 
     def at(self, clock: float) -> float:
-        """Return the time in [0, 1] when the clock reads ``clock``."""
+        """Return the scene time in [0, 1] at ``clock``."""
         if not self.playing:
             return self.time
         passed = max(clock - self.since, 0.0) * self.speed / max(self.seconds, 1e-6)
@@ -74,8 +73,8 @@ class Timeline:
         return (self.time + passed) % 1.0 if passed else self.time
 
     def changed(self, clock: float, **changes: bool | float) -> Timeline:
-        """Return the timeline with other attributes; the time does not jump, but it plays from 0
-        where it has ended."""
+        """Return the timeline with changed attributes at the current time. Playing restarts from
+        the end."""
         now = self.at(clock)
         if changes.get("playing") and now == 1.0:
             now = 0.0
@@ -84,12 +83,12 @@ class Timeline:
 
 @dataclass(frozen=True)
 class Display:
-    """What is shown.
+    """Display settings.
 
     Attributes:
         layer, part, divide: as in ``ViewRequest``.
-        comparing: show the truth next to the render.
-        view: index of the view that is compared with; None: the nearest.
+        comparing: show the true image beside the rendering.
+        view: index of the compared view. None uses the nearest one.
     """
 
     layer: Layer = "colour"
@@ -101,7 +100,7 @@ class Display:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """One camera, the time of the scene it shows, and the seconds until the next one."""
+    """A camera, its scene time, and the seconds until the next keyframe."""
 
     camera: Cameras
     time: float | None
@@ -110,8 +109,7 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class Recording:
-    """Keyframes of a camera path in their order; ``loops``: the camera returns to the first one at
-    the end."""
+    """Keyframes of a camera path. With ``loops``, the camera returns to the first one."""
 
     keyframes: tuple[Keyframe, ...] = ()
     loops: bool = False
@@ -121,33 +119,37 @@ class Recording:
 
     @property
     def duration(self) -> float:
-        """Seconds of the path; those after the last keyframe count only in a loop."""
+        """Seconds of the path. Those after the last keyframe count only in a loop."""
         return sum(key.seconds for key in self.keyframes[: None if self.loops else -1])
 
     def at(self, seconds: float, size: tuple[int, int]) -> tuple[Cameras, float]:
-        """Return the camera, for images of ``size``, px, and the time of the scene after
-        ``seconds`` of the path."""
+        """Return the camera for images of ``size`` px, and the scene time, after ``seconds`` of the
+        path."""
         cameras = [resize_cameras(key.camera, *size) for key in self.keyframes]
         poses = np.concatenate([camera.cam_from_world.numpy() for camera in cameras])
         matrices = np.concatenate([camera.intrinsics.numpy() for camera in cameras])
         starts = np.cumsum([0.0, *(key.seconds for key in self.keyframes[:-1])])
         times = np.array([key.time or 0.0 for key in self.keyframes])
         keys = Keyframes(poses, matrices, starts, times, self.duration if self.loops else None)
-        made = interpolate_keyframes(keys, np.array([seconds]))
-        pose, matrix = (torch.from_numpy(x).float() for x in (made.cam_from_world, made.intrinsics))
-        time = 0.0 if made.times is None else float(made.times[0])
+        frame = interpolate_keyframes(keys, np.array([seconds]))
+        pose, matrix = (
+            torch.from_numpy(x).float() for x in (frame.cam_from_world, frame.intrinsics)
+        )
+        time = 0.0 if frame.times is None else float(frame.times[0])
         return Cameras(pose, matrix, *size), time
 
     def document(self, size: tuple[int, int], fps: float, opened: OpenedScene) -> str:
-        """Return the path as JSON for ``dyngs render --path`` (docs/reference/camera-paths.md).
+        """Return the path as JSON for ``dyngs render --path`` (docs/camera_paths.md), in capture
+        coordinates.
 
-        Coordinates are those of the capture; ``size`` is that of its images in px.
+        Args:
+            size: image size in px.
         """
         keys: list[dict[str, Any]] = []
         start = 0.0
         for key in self.keyframes:
             camera = opened.frame.cameras(resize_cameras(key.camera, *size))
-            # rotations as readers repair them, which must not move a far camera
+            # Orthonormalise before shifting, as readers do, so that far cameras do not move.
             pose, _ = validate_pose(camera.cam_from_world[0].double().cpu().numpy(), "camera")
             pose[:3, 3] -= pose[:3, :3] @ opened.world_offset
             entry: dict[str, Any] = {"at": start, "fl_x": float(camera.intrinsics[0, 1, 1])}
@@ -162,8 +164,8 @@ class Recording:
 
 @dataclass(frozen=True)
 class SentImage:
-    """An image for the browser: (H, W, 3) uint8, whether it is a refined one, and the seconds that
-    it took."""
+    """An image (H, W, 3) uint8 for the browser, whether it has full resolution, and its render
+    seconds."""
 
     image: np.ndarray
     is_refined: bool
@@ -171,11 +173,11 @@ class SentImage:
 
 
 class Session:
-    """One browser's view of a scene.
+    """State of one browser.
 
-    Several threads change it; one thread calls ``draw_next``, and passes the newest state to
-    ``send``. While something moves, images have as many pixels as can be drawn in ``target``
-    seconds, by how long the last one took; when all is still they are full.
+    Several threads change it, and one thread calls ``draw_next``, which passes images to ``send``.
+    While the view moves, the resolution is adapted so that an image takes ``target`` seconds.
+    Otherwise it is full.
     """
 
     def __init__(
@@ -191,10 +193,8 @@ class Session:
         self._changed_at = self._drawn_at = -1e9
         self._is_stale = True
         self._area = float(_SMALLEST_AREA)  # pixels of an image while something moves
-        self._is_refined = (
-            False  # whether the image that is shown is full, and of what is there now
-        )
-        self._preview: tuple[Recording, float] | None = None  # a path, and when it began
+        self._is_refined = False  # the shown image is current and has full resolution
+        self._preview: tuple[Recording, float] | None = None  # a path and its start time
         self.on_change: Callable[[], None] = lambda: None
         self.on_play: Callable[[bool], None] = lambda playing: None
         self.on_error: Callable[[str], None] = lambda message: None
@@ -205,13 +205,13 @@ class Session:
         self.failure: str | None = None
 
     def move(self, browser_camera: BrowserCamera) -> None:
-        """Look from ``eye`` from now on."""
+        """Set the browser camera."""
         if browser_camera != self.browser_camera:
             self.browser_camera = browser_camera
             self._note_change()
 
     def change(self, **changes: Any) -> None:
-        """Show something else: attributes of ``Display``."""
+        """Change attributes of ``Display``."""
         with self._lock:
             self.display = replace(self.display, **changes)
         self._note_change()
@@ -220,41 +220,40 @@ class Session:
         self.change_timeline(time=min(max(time, 0.0), 1.0))
 
     def change_timeline(self, **changes: bool | float) -> None:
-        """Play, pause or change the speed: attributes of ``Timeline``."""
+        """Change attributes of ``Timeline``, such as playing or speed."""
         with self._lock:
             self.timeline = self.timeline.changed(self._clock(), **changes)
         self.on_play(self.timeline.playing)
         self._note_change()
 
     def show(self, opened: OpenedScene) -> None:
-        """Look at another scene, at the same time."""
+        """Show another scene at the same time."""
         self.opened = opened
         self.change_timeline(seconds=opened.seconds)
 
     def preview(self, recording: Recording) -> None:
-        """Show what a path with keyframes sees, once."""
+        """Play a recorded camera path once."""
         self._preview = recording, self._clock()
         self._note_change()
 
     def update_scene(self, opened: OpenedScene, *, refreshes: bool) -> None:
-        """Look at a newer state of the scene; ``refreshes``: draw it, as large, even if nothing
-        else has changed."""
+        """Replace the scene by a newer state. ``refreshes`` requests a new image."""
         self.opened = opened
         self._is_stale |= refreshes
 
     def submit_job(self, job: Callable[[], None]) -> None:
-        """Have ``job`` run by the thread that draws, before the next image."""
+        """Run ``job`` in the render thread before the next image."""
         self._jobs.append(job)
         self.on_change()
 
     @property
     def time(self) -> float:
-        """The time that is shown, in [0, 1]."""
+        """Current scene time in [0, 1]."""
         return self.timeline.at(self._clock())
 
     @property
     def shown_view(self) -> int | None:
-        """Index of the view whose truth is shown; None without any."""
+        """Index of the view whose true image is shown, or None."""
         display = self.display
         browser_camera = self.browser_camera
         opened = self.opened
@@ -268,8 +267,7 @@ class Session:
         )
 
     def due(self) -> float | None:
-        """Return in how many seconds something is to be drawn; 0: now, None: not before something
-        changes."""
+        """Return the seconds until the next job or image, or None if nothing is pending."""
         if self.closed or self.browser_camera is None:
             return None
         if self._jobs:
@@ -283,7 +281,7 @@ class Session:
         return None
 
     def draw_next(self) -> None:
-        """Do what is due: a job, or the next image."""
+        """Run the next job, or render the next image."""
         if self.closed or self.browser_camera is None:
             return
         if self._jobs:
@@ -299,7 +297,7 @@ class Session:
         full = self._full_size
         size = _scaled(full, math.sqrt(self._area / math.prod(full))) if is_moving else full
         self._is_stale = False
-        self._is_refined = True  # if it fails, it is not tried again
+        self._is_refined = True  # do not retry if rendering fails
         image = draw(self.opened, replace(self.view_request(size), is_moving=is_moving))
         if not self.closed:
             self._send(SentImage(image, not is_moving, self._clock() - start))
@@ -310,9 +308,9 @@ class Session:
         self._is_refined = not is_moving and version == self._changed_at
 
     def view_request(self, size: tuple[int, int] | None = None) -> ViewRequest:
-        """Return what is shown now as an image of ``size``; None: that of the window."""
+        """Return the request for an image of ``size``, or of the window size for None."""
         if self.browser_camera is None:
-            raise ValueError("there is no camera yet")
+            raise ValueError("no camera received from the browser")
         display = self.display
         size = size or self._full_size
         camera = self.browser_camera.camera(size)
@@ -346,14 +344,15 @@ class Session:
 
 
 def _scaled(size: tuple[int, int], factor: float) -> tuple[int, int]:
-    """Return a size, px, made smaller by ``factor``, at least 16 x 16."""
+    """Return ``size`` in px reduced by ``factor``, at least 16 x 16."""
     width, height = (max(16, round(side * min(factor, 1.0))) for side in size)
     return width, height
 
 
 class RenderScheduler:
-    """The one thread that draws for all browsers: whoever waits longest is next, and gets the
-    newest state. What went wrong for one session goes to its ``on_error``, the others go on.
+    """Renders for all browsers, the longest waiting session first, with its newest state.
+
+    Errors of a session are reported to its ``on_error`` and do not affect others.
     """
 
     def __init__(self) -> None:
@@ -380,21 +379,21 @@ class RenderScheduler:
                 self._sessions.remove(session)
 
     def draw_one(self) -> bool:
-        """Do what is due for one session; return whether anything was."""
+        """Run one pending job or image. Return whether there was one."""
         session, wait = self._next()
         if session is None or wait > 0:
             return False
         with self._changed:
-            if session in self._sessions:  # served: last in the row
+            if session in self._sessions:  # move to the end of the queue
                 self._sessions.remove(session)
                 self._sessions.append(session)
         try:
             session.draw_next()
             session.failure = None
-        except Exception as error:  # a fault of one session must not end the images of all
+        except Exception as error:  # keep rendering for other sessions
             is_known = isinstance(error, DyngsError)
             message = str(error) if is_known else f"{type(error).__name__}: {error}"
-            # once in a row: what is played fails many times a second
+            # Report repeated failures of an animation once.
             if not session.closed and session.failure != message:
                 session.failure = message
                 session.on_error(message)
@@ -403,14 +402,14 @@ class RenderScheduler:
         return True
 
     def start(self) -> None:
-        """Draw in a thread of its own."""
+        """Start a render thread."""
         self._thread = threading.Thread(
             target=copy_context().run, args=(self._run,), name="dyngs-view", daemon=True
         )
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread, after the image that it is at."""
+        """Stop the thread after the current image."""
         self._is_stopped = True
         self._wake()
         if self._thread is not None:
@@ -425,8 +424,8 @@ class RenderScheduler:
                         self._changed.wait(wait)
 
     def _next(self) -> tuple[Session | None, float]:
-        """Return the session that is due first, among equals that served longest ago, and when:
-        within 0.5 s."""
+        """Return the session with the earliest due time, and the seconds until then, at most
+        0.5."""
         best: tuple[Session | None, float] = (None, 0.5)
         for session in self.sessions:
             wait = session.due()

@@ -1,4 +1,4 @@
-"""What can be chosen to look at: one scene, or the runs in a folder."""
+"""Scenes to choose from in the viewer: a single scene, or the runs in a folder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dyngs.view.layers import with_levels
 
 @dataclass(frozen=True)
 class SceneSource:
-    """Names of scenes, at least one, and what loads the scene of a name."""
+    """Names of scenes, at least one, and the function that loads a scene by name."""
 
     names: tuple[str, ...]
     load: Callable[[str], OpenedScene]
@@ -33,26 +33,26 @@ def open_source(
     data_root: Path | None = None,
     most: int | None = None,
 ) -> SceneSource:
-    """Return what is to be seen of a run, a file or a folder of runs; the first scene is not loaded
-    yet.
+    """Return the scenes of a run, a file or a folder of runs, without loading them.
 
     Args:
         up, data_root: as in ``open_to_view``.
-        device: draws the scenes.
-        most: Gaussians of a still scene that are drawn at most while anything moves; None: all.
+        device: render device.
+        most: largest number of Gaussians rendered while the view of a static scene moves. None
+            renders all.
 
     Raises:
-        DyngsError: nothing is there, or a folder without runs.
+        DyngsError: no scene found.
     """
     runs = {path.name or str(path): path}
     if path.is_dir() and not (path / RESOLVED_NAME).is_file() and format_to_read(path) is None:
         if data_root is not None:
-            raise DyngsError(f"data.root= goes with one run, {path} is none; leave it out")
+            raise DyngsError(f"data.root=: {path} is not a single run; remove it")
         runs = {run.relative_to(path).as_posix(): run for run in runs_in(path)}
     if not runs:
         known = suggest_command(path)
         instead = f"{known}; then " if known else ""
-        raise DyngsError(f"{path}: no runs there; {instead}give a run, a file, or a folder of runs")
+        raise DyngsError(f"{path}: no runs found; {instead}give a run, a file, or a folder of runs")
 
     def load(name: str) -> OpenedScene:
         opened = open_to_view(runs[name], name, up, data_root).to(device)
@@ -64,45 +64,47 @@ def open_source(
 def open_to_view(
     path: Path, name: str, up: str | None = None, data_root: Path | None = None
 ) -> OpenedScene:
-    """Open a run or a file; where its capture is gone, a note says what lacks.
+    """Open a run or a file for viewing. A missing capture is reported in a note.
 
     Args:
-        name: that it is shown by.
-        up: up axis such as "z" or "-y"; None: that of the capture, or as the file or its format has
-            it.
-        data_root: where the capture of a run lies by now, if it was moved.
+        name: displayed name.
+        up: up axis such as "z" or "-y". None uses that of the capture or the file.
+        data_root: current folder of the capture, if it was moved.
 
     Raises:
-        DyngsError: nothing is there, it is damaged, or it is something else.
+        DyngsError: missing, damaged or unsupported file.
     """
     opened = open_scene(path, nonfinite="skip", data_root=data_root)
     opened = replace(opened, name=name, stated_up=up or opened.stated_up)
     if opened.missing is not None:
         opened = opened.noted(
-            f"without the capture, so no cameras and no truth: {opened.missing}; if it was moved, add data.root=FOLDER"
+            f"capture not found, no cameras and true images: {opened.missing}; if it was moved, "
+            "add "
+            "data.root=FOLDER"
         )
     return opened
 
 
 def load_first(source: SceneSource) -> OpenedScene:
-    """Return the first scene that can be loaded; a note says which could not. Raises DyngsError."""
+    """Return the first scene that can be loaded, with notes about those that cannot. Raises
+    DyngsError."""
     failed: list[DyngsError] = []
     for name in source.names:
         try:
-            return source.load(name).noted(*(f"left out: {error}" for error in failed))
+            return source.load(name).noted(*(f"skipped: {error}" for error in failed))
         except DyngsError as error:
             failed.append(error)
     raise failed[0]
 
 
 def runs_in(folder: Path) -> list[Path]:
-    """Return the runs with a scene or a network in a folder, and up to three folders below it, by
-    name; at most 500."""
-    found = []
+    """Return at most 500 runs with a scene or network, up to three folders below ``folder``, by
+    name."""
+    runs = []
     for below in ("*", "*/*", "*/*/*"):
         for config in folder.glob(f"{below}/{RESOLVED_NAME}"):
             run = config.parent
             is_hidden = any(part.startswith(".") for part in run.relative_to(folder).parts)
             if not is_hidden and ((run / SCENE_FILE).is_file() or checkpoint_paths(run)):
-                found.append(run)
-    return sorted(found)[:500]
+                runs.append(run)
+    return sorted(runs)[:500]

@@ -1,5 +1,4 @@
-"""The page that shows a scene while it is trained: a listener of the events that the progress bar
-listens to."""
+"""Viewer page of a running training, as a listener of training events."""
 
 from __future__ import annotations
 
@@ -26,17 +25,15 @@ from dyngs.view.session import RenderScheduler
 from dyngs.view.source import SceneSource
 from dyngs.view.views import captured_views
 
-REFRESH_SECONDS = 1.0
-"""Seconds between two images of a browser in which nothing moves but the scene."""
+REFRESH_SECONDS = 1.0  # Seconds between images of a browser in which only the scene changes
 
 
 class BetweenStepRenderer:
-    """Draws for browsers in the thread that trains, between two steps, since steps change the scene
-    in place.
+    """Renders for browsers in the training thread between steps, since steps change the scene in
+    place.
 
-    Images take at most ``fraction`` of the time. Without browsers a step costs one look at an empty
-    list. Images change nothing of the training: they are drawn from a copy of the scene's shell,
-    with caches of its own, and without gradients or random numbers.
+    Rendering takes at most ``fraction`` of the time. It does not affect the training: a shallow
+    copy of the scene with its own caches is rendered, without gradients or random numbers.
     """
 
     def __init__(
@@ -50,7 +47,7 @@ class BetweenStepRenderer:
         self._refreshed_at = -1e9
 
     def after_step(self, scene: GaussianScene) -> float:
-        """Draw one image if one is due and time for it is left; return the seconds that it took."""
+        """Render an image if one is due and the time budget allows. Return the seconds it took."""
         sessions = self._drawer.sessions
         if not sessions:
             return 0.0
@@ -73,23 +70,25 @@ class BetweenStepRenderer:
 
 
 class TrainingView:
-    """Listener that serves a page with the scene of a training; a context manager. ``say`` is told
-    the link.
+    """Listener that serves a page with the scene in training; a context manager.
 
-    Raises DyngsError: a network is trained, which has no scene, viser is missing, or the port
-    cannot be had.
+    Args:
+        log: receives the link to the page.
+
+    Raises:
+        DyngsError: a network is trained, viser is missing, or the port is not available.
     """
 
     def __init__(self, config: Config, serving: ServerOptions, log: Callable[[str], None]) -> None:
         if capability(config.model, PredictsScenes) is not None:
             raise DyngsError(
-                "--view shows scenes, and a network has none; `dyngs predict` makes one"
+                "--view: a network has no scene to show; create one with `dyngs predict`"
             )
         require_viser()
-        free_port(serving.host, serving.port)  # now, not after reading the capture
-        self._say = log
+        free_port(serving.host, serving.port)  # fail before reading the capture
+        self._log = log
         self._serving = replace(serving, in_thread=False, target=0.05)
-        self._drawn: BetweenStepRenderer | None = None
+        self._renderer: BetweenStepRenderer | None = None
         self._stack = ExitStack()
 
     def __enter__(self) -> TrainingView:
@@ -99,24 +98,24 @@ class TrainingView:
         self._stack.close()
 
     def __call__(self, event: Event) -> None:
-        """Draw what browsers ask for, after a step; serve the page after the first one."""
+        """Serve the page after the first step, and render requested images after each step."""
         if not isinstance(event, StepDone) or not isinstance(event.loop.trainer, Trainer):
             return
         trainer = event.loop.trainer
         start = time.perf_counter()
-        begins = self._drawn is None
-        if self._drawn is None:
+        is_first_step = self._renderer is None
+        if self._renderer is None:
             first = opened_training(trainer)
             source = SceneSource((first.name,), lambda _: first)
             viewer = self._stack.enter_context(Viewer(source, first, self._serving))
-            self._say(f"viewing: {viewer.link} (until the training ends)")
-            self._drawn = BetweenStepRenderer(viewer.drawer)
-        if self._drawn.after_step(trainer.model.scene) or begins:
+            self._log(f"viewer: {viewer.link}")
+            self._renderer = BetweenStepRenderer(viewer.drawer)
+        if self._renderer.after_step(trainer.model.scene) or is_first_step:
             event.loop.stopwatch.exclude(time.perf_counter() - start)
 
 
 def opened_training(trainer: Trainer[Any]) -> OpenedScene:
-    """Return the scene of a trainer with the views that it is trained on."""
+    """Return the scene of a trainer with its training views."""
     config = trainer.config
     views = trainer.images.views
     shown = captured_views(views, config.data, trainer.images)
@@ -137,7 +136,7 @@ def opened_training(trainer: Trainer[Any]) -> OpenedScene:
 
 
 def _shell(scene: Renderable, background: Tensor) -> Renderable:
-    """Return the same scene with caches of its own, to be drawn whatever its values are."""
+    """Return a shallow copy of the scene with its own caches, which skips non-finite Gaussians."""
     if isinstance(scene, GaussianScene):
         scene = replace(scene, options=replace(scene.options, nonfinite="skip"))
     return scene.on_background(background)

@@ -1,5 +1,4 @@
-"""Cameras of the viewer: the views of a capture, the first viewpoint, and poses of a browser's
-camera."""
+"""Cameras of the viewer: views of a capture, initial viewpoint, and poses of browser cameras."""
 
 from __future__ import annotations
 
@@ -25,10 +24,9 @@ MAX_FOV = math.radians(160)
 
 @dataclass(frozen=True)
 class CapturedViews:
-    """V views of a capture, each with a camera of the size of training, and their images, also
-    small ones.
+    """V views of a capture with cameras at training size, images and thumbnails.
 
-    There are no images where those of the capture do not show what the scene plays.
+    Images are None if the scene plays another motion than the capture.
     """
 
     views: tuple[View, ...] = ()
@@ -46,8 +44,7 @@ class CapturedViews:
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """The camera from which a scene is looked at first, the point (3,) to orbit around, its rough
-    size, and up (3,)."""
+    """Initial camera, orbit centre (3,), approximate scene size, and up direction (3,)."""
 
     start: Cameras
     center: np.ndarray
@@ -56,8 +53,7 @@ class Viewpoint:
 
 
 def views_of(opened: OpenedScene) -> CapturedViews:
-    """Return the views of a scene's capture, if there is one; without images where a person is in
-    other poses."""
+    """Return the views of the capture of a scene, without images if a person is in other poses."""
     if opened.captured is None:
         return CapturedViews()
     found = opened.captured.once("views", lambda: _views_of_capture(opened))
@@ -65,8 +61,7 @@ def views_of(opened: OpenedScene) -> CapturedViews:
 
 
 def _views_of_capture(opened: OpenedScene) -> CapturedViews:
-    """Return the views of all splits that show what the scene plays: a person may be filmed in
-    other clips, too."""
+    """Return the views of all splits that show the same motion as the scene."""
     if opened.missing is not None:
         return CapturedViews()
     by_name = {}
@@ -80,7 +75,7 @@ def _views_of_capture(opened: OpenedScene) -> CapturedViews:
 def captured_views(
     views: Sequence[View], data: DataConfig, images: ImageLoader | None = None
 ) -> CapturedViews:
-    """Return views with their cameras, and what loads their images."""
+    """Return views with their cameras and image loaders."""
     small = data.model_copy(update={"downscale": 1.0, "longest_side": 96, "cache_mb": 256.0})
     return CapturedViews(
         tuple(views),
@@ -91,8 +86,8 @@ def captured_views(
 
 
 def initial_viewpoint(opened: OpenedScene) -> Viewpoint:
-    """Return where to begin: at the first camera of the capture, else where all of the scene is in
-    view."""
+    """Return the initial viewpoint: the first camera of the capture, or a view of the whole
+    scene."""
     return (opened.captured or opened).once("viewpoint", lambda: _viewpoint(opened))
 
 
@@ -115,17 +110,15 @@ def _viewpoint(opened: OpenedScene) -> Viewpoint:
 
 
 def has_timeline(opened: OpenedScene) -> bool:
-    """Return whether there are times to choose from, now or later."""
+    """Return whether the scene has, or may get, several times."""
     may_move = opened.in_training and len(opened.renderable.times) > 1
     return may_move or not opened.renderable.is_static or opened.person is not None
 
 
 def nearest_view(opened: OpenedScene, camera: Cameras, time: float) -> int:
-    """Return which view of the capture is nearest to one camera in position, viewing direction and,
-    where the scene moves, time.
+    """Return the index of the view nearest to a camera in position, direction and time.
 
-    As much as a radian between viewing directions weigh half the size of the scene, and half of the
-    times.
+    An angle of one radian counts as half the size of the scene, and as a quarter of the clip.
     """
     shown = views_of(opened)
     poses = np.stack([view.cam_from_world for view in shown.views])
@@ -150,8 +143,13 @@ def camera_at(
     fov: float,
     size: tuple[int, int],
 ) -> Cameras:
-    """Return one camera of ``size``, px, at ``position``; ``wxyz``: world from camera; ``fov``:
-    vertical, rad."""
+    """Return a camera at ``position``.
+
+    Args:
+        wxyz: rotation from camera to world.
+        fov: vertical field of view in rad.
+        size: image size in px.
+    """
     from scipy.spatial.transform import Rotation
 
     w, x, y, z = (float(value) for value in wxyz)
@@ -166,8 +164,7 @@ def camera_at(
 
 
 def pose_of(camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rotation (4,) wxyz, world from camera, and the centre (3,) of one camera,
-    float64."""
+    """Return rotation (4,) wxyz, camera to world, and centre (3,) of one camera, float64."""
     from scipy.spatial.transform import Rotation
 
     (pose,) = world_from_cam(camera)
@@ -176,16 +173,16 @@ def pose_of(camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fitting_fov(camera: Cameras, aspect: float) -> float:
-    """Return the vertical field of view, rad, at which a window of an ``aspect`` shows the full
-    image of one camera."""
+    """Return the vertical field of view in rad at which a window with ``aspect`` shows the whole
+    image."""
     focal_x, focal_y, _ = camera.intrinsics[0].diagonal().tolist()
     half = max(0.5 * camera.height / focal_y, 0.5 * camera.width / focal_x / aspect)
     return min(2 * math.atan(half), MAX_FOV)
 
 
 def orbit_center(camera: Cameras, begin: Viewpoint) -> np.ndarray:
-    """Return the point (3,) on the axis of one camera to orbit around: as far away as the centre of
-    the scene is deep."""
+    """Return the orbit centre (3,) on the optical axis of a camera, at the depth of the scene's
+    centre."""
     (pose,) = world_from_cam(camera)
     eye = pose[:3, 3]
     forward = pose[:3, 2]

@@ -71,7 +71,7 @@ def test_control_points_far_away(plain: Path, tmp_path: Path) -> None:
         tell=told.append,
     )
     found = read_splats(tmp_path / "a.ply")
-    line = next(text for text in told if text.startswith("offset, to be added"))
+    line = next(text for text in told if text.startswith("offset to add"))
     offset = np.array([float(x) for x in line.split(": ")[1].split()])
     wanted = 2 * read_splats(plain).gaussians.means.numpy()[:, [1, 2, 0]] + [
         691000.0,

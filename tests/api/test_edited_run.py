@@ -81,7 +81,7 @@ def test_files_have_the_up_of_their_format_and_can_be_undone(tmp_path: Path) -> 
     assert opened.up is not None
     np.testing.assert_allclose(opened.up[0], [0.0, 0.6, 0.8], atol=1e-7)
     how, line = choose_write_options(opened, "-y")
-    assert line == "up is -y in the file (turned, it was z in the edited run, says the edit)"
+    assert line == "up is -y in the file (rotated from z in the edited run; source: the edit)"
     splat = splats_at(opened, opened.scene, 0.0, how)
     np.testing.assert_allclose(splat.frame.rotation @ [0.0, 0.6, 0.8], [0, -1, 0], atol=1e-7)
     back = splat.edited.inverse().gaussians(splat.gaussians)

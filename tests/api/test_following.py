@@ -110,8 +110,8 @@ def test_a_run_goes_on_in_another_number_of_processes(still: Path, tmp_path: Pat
     ("fails", "line"),
     [
         ("step", "dyngs: error: image 3 is damaged"),
-        ("weights", "after step 5: process 1 has come to other Gaussians than process 0"),
-        ("death", "has lost the others: one has ended without a word"),
+        ("weights", "after step 5: Gaussians of process 1 differ from those of process 0"),
+        ("death", "connection lost, another process was killed"),
     ],
 )
 def test_where_one_fails_all_end_with_one_line(
@@ -147,8 +147,10 @@ def test_what_needs_one_process_says_so(still: Path, tmp_path: Path) -> None:
     ):
         train(_still(still, tmp_path / "run", minutes=1), processes=two)
     with pytest.raises(
-        DyngsError, match=r"batch_size=2: train[.]robust=always follows one image per step"
+        DyngsError, match=r"batch_size=2: train[.]robust=always needs one image per step"
     ):
         train(_still(still, tmp_path / "run", robust="always"), processes=two)
-    with pytest.raises(DyngsError, match="batch_size=5 views cannot be shared evenly among 2"):
+    with pytest.raises(
+        DyngsError, match="batch_size=5: must be a multiple of the number of processes, 2"
+    ):
         train(_still(still, tmp_path / "run", batch_size=5), processes=two)

@@ -91,7 +91,7 @@ def test_render_at_times(moving_run: Path, tmp_path: Path, capsys: Capture) -> N
         return len(list((tmp_path / name).glob("*.png")))
 
     assert images("orbit", "--path", "orbit", "--frames", "3") == 3
-    assert "note: time runs from 0 to 1 along the path" in capsys.readouterr().out
+    assert "note: scene time runs from 0 to 1 along the path" in capsys.readouterr().out
     assert images("frozen", "--path", "orbit", "--frames", "3", "--time", "0.5") == 3
     assert images("together", "--path", "spiral", "--times", "0:1:4") == 4
     assert images("one", "--time", "0.5") == 1
@@ -136,7 +136,7 @@ def test_times_where_nothing_moves(run_dir: Path, tmp_path: Path, capsys: Captur
     assert main(["export", str(run_dir), "--out", str(ply), "--time", "0.5"]) == 0
     assert "note: the scene is static" in capsys.readouterr().out
     for words in (["--time", "0"], ["--times", "0:1:2"], ["--view", "0"]):
-        assert "holds one time and no views" in error_line(
+        assert "has no times and no views" in error_line(
             capsys, "render", ply, "--out", tmp_path, *words
         )
     for words in (["--dynamic"], ["--dynamic", "--format", "tracks"]):

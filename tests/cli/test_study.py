@@ -59,7 +59,7 @@ def test_a_table_curves_and_a_page(finished: Path, capsys: pytest.CaptureFixture
     report = evaluate_run(finished / "runs" / "static", threads=1)
     assert (stored["psnr"], stored["ssim"]) == (report.psnr, report.ssim)
     assert stored["psnr_foreground"] == report.psnr_foreground
-    assert "Left out: dynamic: the images have no times" in (finished / "comparison.md").read_text()
+    assert "Skipped: dynamic: the images have no times" in (finished / "comparison.md").read_text()
     assert (finished / "comparison.svg").read_text().startswith("<svg")
 
 
@@ -115,10 +115,9 @@ def test_the_same_command_trains_nothing(
     assert "dynamic" in values["left_out"]
     before = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
     said = error_line(capsys, *words, "init.half_extent=2", "--split", "train")
-    assert "split is test there and train here" in said
+    assert "split: test there, train here" in said
     assert (
-        "overrides is init.num_random=100 there and init.num_random=100, init.half_extent=2 here"
-        in said
+        "overrides: init.num_random=100 there, init.num_random=100, init.half_extent=2 here" in said
     )
     assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
 
@@ -159,7 +158,7 @@ def test_what_was_stopped_goes_on(
             "--models dynamic,human,human_predictor --steps 3",
             "none of the models can be trained on",
         ),
-        ("--models static --steps 3 train.steps=9", "the comparison sets this itself"),
+        ("--models static --steps 3 train.steps=9", "set by `dyngs compare`"),
         ("--models static --steps 3 --split val", "the split 'val' has no views"),
         ("--models static --steps 3 train.stesp=2", "did you mean 'train.steps'?"),
     ],
@@ -244,15 +243,15 @@ def test_variants_and_the_best_run(tmp_path: Path, capsys: pytest.CaptureFixture
     }
     assert len(load_run(Path(text.splitlines()[-1].strip())).scene) == 5
     error = error_line(capsys, *words, "--require", "mb<=0.000001", begun=True)
-    assert "no measured variant has mb<=1e-06; with the others met the best mb is" in error
+    assert "no variant meets mb<=1e-06; best mb with the other conditions:" in error
 
 
 @pytest.mark.parametrize(
     ("words", "part"),
     [
         ("nowhere", "nowhere: not a run folder"),
-        (". --vary prun", "no such setting"),
-        (". --require psnr>30", "is no condition"),
+        (". --vary prun", "unknown setting"),
+        (". --require psnr>30", "not a condition"),
         (". --minimize size", "no such metric"),
         (". --rounds 0", "argument --rounds: '0' is not a number; write a whole number from 1"),
         (". ", "not a run folder"),

@@ -30,7 +30,7 @@ def test_a_page_is_served_until_it_is_ended(
         (["nothing"], "no such file"),
         ([".", "--port", "0"], "not a port"),
         ([".", "--port", "70000"], "not a port"),
-        (["."], "no runs there"),
+        (["."], "no runs found"),
     ],
 )
 def test_what_cannot_be_shown_is_one_line(
@@ -56,7 +56,7 @@ def test_a_taken_port_and_motions_of_no_person_are_refused(
     (tmp_path / "walk.npz").write_bytes(b"")
     with socket.create_server(("127.0.0.1", 0)) as other:
         assert main(["view", run, "--port", str(other.getsockname()[1])]) == 2
-    assert "cannot listen there" in capsys.readouterr().err
+    assert "cannot listen" in capsys.readouterr().err
     assert main(["view", run, "--motion", str(tmp_path / "walk.npz")]) == 2
     assert "requires a person" in capsys.readouterr().err
 

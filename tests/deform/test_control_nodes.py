@@ -97,9 +97,7 @@ def test_a_rigid_motion_of_the_nodes_is_one_of_the_gaussians() -> None:
 @given(
     st.integers(1, 12), st.lists(st.lists(st.integers(0, 11), max_size=15), min_size=1, max_size=4)
 )
-def test_after_any_changes_of_the_set_nodes_are_where_gaussians_are(
-    nodes: int, sets: list[list[int]]
-) -> None:
+def test_nodes_lie_at_gaussians_after_any_edits(nodes: int, sets: list[list[int]]) -> None:
     """Never more than asked for, none twice; with as many as places every Gaussian has one of its
     own."""
     everything = cloud(12).means

@@ -37,7 +37,7 @@ def test_heads_by_name(chosen: tuple[bool, ...]) -> None:
 
 
 @pytest.mark.parametrize("skip", [None, 1])
-def test_it_starts_at_zero_with_weights_of_glorot(skip: int | None) -> None:
+def test_decoder_starts_at_zero_with_glorot_weights(skip: int | None) -> None:
     decoder = Decoder(20, [60, 50], FieldSection(), skip=skip)
     values = decoder.start_values(torch.Generator().manual_seed(0))
     assert not values["weight2"].any()

@@ -19,7 +19,7 @@ from dyngs.deform.fields import field_state, restore_field
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
-def test_a_restored_field_moves_everything_alike(kind: str) -> None:
+def test_restored_field_gives_equal_offsets(kind: str) -> None:
     """Bitwise, also in the next steps of training; the setup comes back, too."""
     field = stirred_field(kind)
     setup = tiny_setup()
@@ -46,7 +46,7 @@ def test_a_restored_field_moves_everything_alike(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
-def test_what_is_missing_is_named(kind: str) -> None:
+def test_missing_tensor_is_named(kind: str) -> None:
     state = strip_roles(field_state(tiny_field(kind)))
     for name in ("box", "numbers", next(name for name in state if name.startswith("learned."))):
         with pytest.raises(KeyError, match=name.removeprefix("learned.")):

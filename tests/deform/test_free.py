@@ -72,7 +72,7 @@ def test_new_gaussians_are_earlier_and_later_on_the_same_path() -> None:
     torch.testing.assert_close(moved.means[1:3], before.means[:1].expand(2, 3))
 
 
-def test_what_a_step_does_not_show_rests() -> None:
+def test_unseen_gaussians_are_not_updated() -> None:
     """Not even Adam's momentum moves it: of two Gaussians only the one with a gradient is
     updated."""
     field = field_of([0.2, 0.8], [0.1, 0.1], [[0.0, 0.0, 0.0]] * 2)

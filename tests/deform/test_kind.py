@@ -16,7 +16,7 @@ from dyngs.training.new_trainer import build_trainer
     ("steps", "minutes", "count"),
     [(49, "null", None), (400, "null", 8), (3000, "null", 16), (3000, "0.2", 4)],
 )
-def test_bodies_are_sought_in_as_many_images_as_the_run_is_long(
+def test_number_of_searched_images_follows_run_length(
     moving: Path, steps: int, minutes: str, count: int | None
 ) -> None:
     """The search is to take at most a tenth of the run: of the capture's 16 images a short run

@@ -179,7 +179,7 @@ def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> 
     before = trainer.model.scene.gaussians.means.detach().clone()
     with pytest.raises(
         DyngsError,
-        match=r"^step 11, view '.*': the field makes means.* at [0-9.]+ not finite; .*deform$",
+        match=r"^step 11, view '.*': the field produced non-finite means.* at time [0-9.]+; .*deform$",
     ):
         trainer.step()
     assert torch.equal(trainer.model.scene.gaussians.means, before)

@@ -8,7 +8,7 @@ from tiny_fields import cloud
 from dyngs.deform.random_gaussians import box_of
 
 
-def test_the_box_holds_what_is_solid() -> None:
+def test_box_contains_opaque_gaussians() -> None:
     """All but the outer percent of it, with a tenth to spare."""
     gaussians = cloud(300).replace(logit_opacities=torch.full((300,), 2.0))
     center, half_size = box_of(gaussians, 1.0)

@@ -61,7 +61,7 @@ def test_times_after_the_clip_are_its_end(time: float) -> None:
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
 @pytest.mark.parametrize("is_filtered", [False, True])
-def test_what_moves_and_what_is_still_make_the_scene(kind: str, is_filtered: bool) -> None:
+def test_moving_and_static_parts_make_the_scene(kind: str, is_filtered: bool) -> None:
     """Together, in their order, at each time."""
     scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if is_filtered else None)
     moving = scene.part("moving")

@@ -88,7 +88,7 @@ def scores_of(gaussians: Gaussians, images: list[Image], background: Tensor) -> 
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.floats(-1, 1, width=32), min_size=3, max_size=3))
-def test_a_known_colour_is_the_error(colour: list[float]) -> None:
+def test_error_of_a_known_colour(colour: list[float]) -> None:
     """Images that differ by a colour all over: its mean over the channels, for all that shows,
     however little."""
     ball = balls(sideways(0.0), sideways(0.5)).replace(logit_opacities=torch.tensor([4.0, -4.0]))
@@ -101,7 +101,7 @@ def test_a_known_colour_is_the_error(colour: list[float]) -> None:
     )
 
 
-def test_errors_count_where_a_gaussian_shows() -> None:
+def test_errors_are_weighted_by_visibility() -> None:
     """The left half is wrong by 0.3: one ball is in it, one in the other half, one on the
     border."""
     scene = balls(sideways(-0.9), sideways(0.9), sideways(0.0))
@@ -136,7 +136,7 @@ def in_place(*errors: float, view: int = 0) -> list[Image]:
     return [image(rendered(ball, view=view) + error, view=view) for error in errors]
 
 
-def test_what_a_still_model_has_not_learned_is_no_motion() -> None:
+def test_unlearned_detail_is_not_motion() -> None:
     """Wrong by far, but in all images alike; with too few images to know, it may be motion."""
     ball = balls(sideways(0.0))
     found = static_errors(lambda _: ball, in_place(*[0.4] * MIN_SAME), OPTIONS, BLACK)
@@ -145,7 +145,7 @@ def test_what_a_still_model_has_not_learned_is_no_motion() -> None:
     assert float(few.peak) == pytest.approx(0.4, rel=1e-3)
 
 
-def test_what_is_hidden_at_times_does_not_move() -> None:
+def test_occluded_gaussians_do_not_move() -> None:
     """Something passes in front in two of ten images: seen by ``most``, not by ``usual``."""
     found = static_errors(
         lambda _: balls(sideways(0.0)), in_place(*[0.0] * 8, 0.3, 0.3), OPTIONS, BLACK
@@ -155,7 +155,7 @@ def test_what_is_hidden_at_times_does_not_move() -> None:
     )
 
 
-def test_what_changes_again_and_again_moves() -> None:
+def test_repeated_change_is_motion() -> None:
     found = static_errors(
         lambda _: balls(sideways(0.0)), in_place(*[0.0] * 6, 0.1, 0.2, 0.3, 0.4), OPTIONS, BLACK
     )
@@ -199,7 +199,7 @@ def test_two_clear_groups_are_parted(low: list[float], high: list[float], scale:
     assert scale * max(low) - bin_width <= threshold < scale * min(high) - bin_width
 
 
-def test_changing_brightness_is_no_motion_and_a_thing_that_comes_is() -> None:
+def test_exposure_change_is_not_motion() -> None:
     room = 0.5 * torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(0))
     assert changed_fraction([[room, room + 0.2, room + 0.4]]) == 0
     come = room.clone()
@@ -233,7 +233,7 @@ def test_the_fraction_of_each_gaussian_in_the_mask() -> None:
     torch.testing.assert_close(found.typical, found.peak)
 
 
-def test_what_is_covered_at_times_only_is_not_usual() -> None:
+def test_occlusion_is_not_typical_error() -> None:
     images = (
         [masked_image(left())]
         + [masked_image(torch.zeros(18, 24)) for _ in range(4)]

@@ -21,7 +21,7 @@ def held(window: TimeWindow, times: list[float], step: int) -> list[float]:
 
 @settings(max_examples=150, deadline=None)
 @given(clips, st.floats(0, 1))
-def test_it_grows_to_everything_and_is_never_too_small(times: list[float], first: float) -> None:
+def test_window_grows_to_all_views(times: list[float], first: float) -> None:
     """For any times: unsorted, repeated, constant, at one end. Looked at in the steps that train on
     all of it."""
     window = TimeWindow.around_middle(times, first, OPENS, OPENS, FULL)

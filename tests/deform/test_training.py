@@ -59,7 +59,7 @@ ERRORS = (0.01, 0.3, 0.02, 0.35, 0.03, 0.0, 0.31, 0.02, 0.01)
 """Of a static model; 1, 3 and 6 stand out."""
 
 
-def test_what_a_still_model_cannot_explain_moves() -> None:
+def test_static_residual_marks_moving_gaussians() -> None:
     """And only after the last step of the coarse phase."""
     run = new_run(flat_cloud(), static_errors=lambda _: alike(torch.tensor(ERRORS)))
     result = run.grow(FINE)
@@ -189,9 +189,7 @@ def test_motion_sparsity_is_the_mean_length_in_extents() -> None:
 
 
 @pytest.mark.parametrize(("in_place", "kept"), [(True, [2, 3]), (False, [0, 2, 3])])
-def test_where_cameras_stay_nothing_moves_that_images_show_still(
-    in_place: bool, kept: list[int]
-) -> None:
+def test_fixed_cameras_freeze_unchanged_gaussians(in_place: bool, kept: list[int]) -> None:
     """Four move by far, the fourth least; the images say of two that they are like the median."""
     static = 0.2 * DynamicModel().motion_threshold
     moving = 0.3 * DynamicModel().motion_threshold
@@ -203,7 +201,7 @@ def test_where_cameras_stay_nothing_moves_that_images_show_still(
     assert run.scene.rows.tolist() == kept
 
 
-def test_freezing_keeps_just_what_is_seen_to_move() -> None:
+def test_only_visibly_moving_gaussians_stay_moving() -> None:
     """A pixel covers 0.03 units: 0.3 px are 0.009."""
     gaussians = flat_cloud()
     run = begun(gaussians)
@@ -259,7 +257,7 @@ def test_every_kind_can_be_frozen(kind: str) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
-def test_descendants_of_what_moves_move(data: st.DataObject) -> None:
+def test_copies_of_moving_gaussians_move(data: st.DataObject) -> None:
     """After any sequence of edits; each with the curve of its ancestor."""
     gaussians = flat_cloud()
     run = begun(gaussians)
@@ -332,7 +330,7 @@ def test_state_goes_round(kind: str, phase: str) -> None:
 # -------------------------------------------------------------------------------------------------
 
 
-def test_motion_begins_where_fixed_cameras_see_changes() -> None:
+def test_motion_starts_at_changes_of_fixed_cameras() -> None:
     """Free primitives: no random Gaussians, all times from the start, and the ball of each time in
     its place then."""
     times = tuple(i / 7 for i in range(8))

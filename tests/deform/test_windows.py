@@ -27,7 +27,7 @@ def windowed(kind: str = "control_nodes", *, everything: bool = True) -> Windowe
 
 
 @pytest.mark.parametrize("everything", [True, False])
-def test_an_open_window_changes_nothing(everything: bool) -> None:
+def test_open_window_is_identity(everything: bool) -> None:
     others = stirred_field("control_nodes", everything=everything)
     field = WindowedField(others, COUNT)
     gaussians = cloud()
@@ -55,7 +55,7 @@ def test_windows_are_flat_inside_and_fall_off_outside() -> None:
             assert x == pytest.approx(window(a, b, time) - window(*OPEN_WINDOW, time), abs=1e-4)
 
 
-def test_windows_close_where_nothing_is_to_be_seen_and_open_no_further_than_they_began() -> None:
+def test_windows_close_and_stay_within_limits() -> None:
     field = WindowedField(stirred_field("control_nodes"), COUNT)
     means = cloud().means
     began = field.edges.detach().clone()

@@ -274,7 +274,7 @@ def test_the_second_figure_is_there_where_cameras_were_refined_or_it_is_asked_fo
     assert asked.psnr == report.psnr
     assert asked.own_poses is None, "nobody is in the images"
     assert evaluate_run(folder, "train").psnr_own_poses is None
-    with pytest.raises(DyngsError, match="--refine is for images that were not trained on"):
+    with pytest.raises(DyngsError, match="--refine needs images that were not trained on"):
         evaluate_run(folder, "train", refine_poses=True)
 
 

@@ -130,11 +130,15 @@ def test_masks_reach_every_metric() -> None:
 @pytest.mark.parametrize(
     ("truth", "mask", "message"),
     [
-        (torch.full((14, 20, 3), math.nan), None, "view 'a': psnr is not finite, the image holds"),
+        (
+            torch.full((14, 20, 3), math.nan),
+            None,
+            "view 'a': psnr is not finite .the image contains",
+        ),
         (
             torch.zeros(14, 20, 3),
             torch.zeros(14, 20),
-            "view 'a': psnr is not finite, its mask ignores every pixel",
+            "view 'a': psnr is not finite .all pixels are masked",
         ),
     ],
 )
@@ -255,7 +259,7 @@ def test_held_out_frames_are_scored_in_the_poses_of_the_file(run: Path) -> None:
 def test_refined_poses_stand_beside_those_as_given(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
+    monkeypatch.setattr(pose_fit, "MAX_WINDOWS", 1)
     stored = {}
     for name, more in (("given", []), ("refined", ["--refine"]), ("again", ["--refine"])):
         assert main(["eval", str(run), "--split", "pose", *more]) == 0
@@ -291,10 +295,7 @@ def test_poses_that_were_trained_on_are_not_refined(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["eval", str(run), "--split", "train", "--refine"]) == 2
-    assert (
-        "--refine is for images that were not trained on; name them with --split"
-        in capsys.readouterr().err
-    )
+    assert "--refine needs images that were not trained on; use --split" in capsys.readouterr().err
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")

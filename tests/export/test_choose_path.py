@@ -75,7 +75,7 @@ def test_times_of_a_file_are_overridden(moving_run: OpenedScene, tmp_path: Path)
     assert choose_path(moving_run, PathOptions(str(file), times=(0.7,))).times == (0.7,) * 5
     given = (0.0, 0.0, 1.0, 1.0, 0.5)
     assert choose_path(moving_run, PathOptions(str(file), times=given)).times == given
-    with pytest.raises(DyngsError, match="5 cameras, but there are 3 times"):
+    with pytest.raises(DyngsError, match="5 cameras but 3 times"):
         choose_path(moving_run, PathOptions(str(file), times=(0.0, 0.5, 1.0)))
 
 
@@ -111,7 +111,7 @@ def test_views_are_found_by_name_image_and_number(moving_run: OpenedScene) -> No
     assert select_view(capture.replace(splits={"train": train, "test": ()})) is train[0]
     for name, split in (("9", None), ("r_9", None), ("-1", None), (train[0].name, "test")):
         with pytest.raises(
-            DyngsError, match=rf"no view '{name}'; the split test has 3 views: .*\(0\) to .*\(2\)"
+            DyngsError, match=rf"unknown view .{name}.; split test has 3 views, .*\(0\) to .*\(2\)"
         ):
             select_view(capture, name, split)
     with pytest.raises(DyngsError, match="'val' has no views"):
@@ -169,7 +169,7 @@ def test_a_single_gaussian_is_in_view_whole() -> None:
 )
 def test_a_file_has_neither_times_nor_views(options: PathOptions, tmp_path: Path) -> None:
     file = write_splats(tmp_path / "a.ply", SplatFile(some_gaussians())).path
-    with pytest.raises(DyngsError, match=r"a \.ply holds one time and no views"):
+    with pytest.raises(DyngsError, match=r"a \.ply has no times and no views"):
         choose_path(open_scene(file), options)
 
 
@@ -190,4 +190,4 @@ def test_who_was_filmed_from_one_side_is_seen_from_all(tmp_path: Path) -> None:
     )
     path = choose_path(open_run(folder), PathOptions("orbit", 4))
     assert np.diff(directions(path.cameras.centers)) == pytest.approx(90, abs=1)
-    assert any("goes all around" in note for note in path.notes)
+    assert any("is a full circle" in note for note in path.notes)

@@ -111,7 +111,7 @@ def test_path_writes_numbered_images_depth_alpha_and_video(tmp_path: Path) -> No
     alone = OutputOptions(video=tmp_path / "alone" / "path.mp4", depth=True)
     assert write_balls(cameras, None, alone) == [tmp_path / "alone" / "path.mp4"]
     assert names(tmp_path / "alone") == ["path.mp4"]
-    with pytest.raises(DyngsError, match="nothing to write"):
+    with pytest.raises(DyngsError, match="no output"):
         write_balls(cameras, None)
     with pytest.raises(DyngsError, match="no cameras"):
         write_balls(cameras_around(0), tmp_path)

@@ -70,7 +70,7 @@ def test_another_reader_finds_mesh_and_texture(tmp_path: Path) -> None:
     run = bare_run()
     notes = write_mesh(run, tmp_path / "ann.glb")
     assert notes[0].startswith("texture of 256 x 256; ")
-    assert "silhouettes agree" in notes[1]
+    assert "silhouette IoU" in notes[1]
     loaded = trimesh.load(tmp_path / "ann.glb", process=False)
     (mesh,) = loaded.geometry.values()  # pyright: ignore[reportAttributeAccessIssue]
     body = template()
@@ -93,7 +93,7 @@ def test_a_motion_becomes_an_animation(tmp_path: Path) -> None:
     scene = replace(bare_scene(resolution=24), shapes=shapes)
     run = playing(bare_run(scene), random_clip(4, seed=5))
     notes = write_mesh(run, tmp_path / "ann.glb", AnimationInfo("dance", 10.0))
-    assert notes[-1] == "offsets that depend on the pose are left out: glTF's skins have none"
+    assert notes[-1] == "pose-dependent offsets are not exported: glTF skins have none"
     found = SkinnedGlb(tmp_path / "ann.glb")
     animation = found.json["animations"][0]
     assert animation["name"] == "dance"
@@ -206,11 +206,9 @@ def test_templates_that_do_not_fit() -> None:
     scene = bare_scene()
     body = template()
     torch.testing.assert_close(rest_vertices(scene, body), body.vertices, atol=1e-4, rtol=0)
-    with pytest.raises(DyngsError, match="is not the one that this person was trained on"):
+    with pytest.raises(DyngsError, match="is not the one this person was trained on"):
         rest_vertices(scene, replace(body, faces=body.faces[:100], uv_faces=None, uv=None))
-    with pytest.raises(
-        DyngsError, match=r"has no texture coordinates; train with model\.uv=FILE\.obj"
-    ):
+    with pytest.raises(DyngsError, match=r"has no UV coordinates; train with model\.uv=FILE\.obj"):
         body_mesh(replace(body, uv=None, uv_faces=None))
 
 
@@ -280,7 +278,7 @@ def test_the_skin_moves_gaussians_as_the_avatar_does(tmp_path: Path) -> None:
 @pytest.mark.parametrize("write", [write_mesh, write_rigged_splats])
 def test_other_scenes_are_refused(tmp_path: Path, write: Any) -> None:
     run = load_run(write_moving_run(tmp_path / "run"))
-    with pytest.raises(DyngsError, match=r"needs the run of a person \(model\.kind=human\)"):
+    with pytest.raises(DyngsError, match=r"needs a run of a person \(model\.kind=human\)"):
         write(run, tmp_path / "x.glb")
     assert not list(tmp_path.glob("x*"))
 

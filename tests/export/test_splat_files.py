@@ -86,15 +86,15 @@ def test_one_moment(moving: OpenedScene, time: float, tmp_path: Path) -> None:
 
 
 def test_parts_together_are_the_whole(moving: OpenedScene, tmp_path: Path) -> None:
-    parts: dict[Part, tuple[int, ...]] = {"moving": MOVING_ROWS, "still": STILL_ROWS}
+    parts: dict[Part, tuple[int, ...]] = {"moving": MOVING_ROWS, "static": STILL_ROWS}
     for part, rows in parts.items():
         path = write_run_splats(moving, tmp_path / f"{part}.ply", 0.7, part).path
         torch.testing.assert_close(x_of(path), moved_x(rows, 0.7))
-    assert not any("time" in comment for comment in read_splats(tmp_path / "still.ply").comments)
+    assert not any("time" in comment for comment in read_splats(tmp_path / "static.ply").comments)
     with pytest.raises(DyngsError, match="nothing moves in this run"):
         scene_part(still_scene(), "moving")
     with pytest.raises(DyngsError, match="no static part"):
-        scene_part(moving_scene(Sliding(), ALL), "still")
+        scene_part(moving_scene(Sliding(), ALL), "static")
 
 
 @pytest.mark.parametrize(("part", "rows"), [("all", ALL), ("moving", MOVING_ROWS)])
@@ -118,7 +118,7 @@ def test_a_sequence_of_the_same_length_is_replaced_and_others_are_refused(
     longer = [one.path for one in write_run_sequence(moving, folder, (1.0, 1.0, 1.0))]
     assert all(torch.equal(x_of(path), x_of(longer[0])) for path in longer)
     before = {p: p.read_bytes() for p in folder.iterdir()}
-    with pytest.raises(DyngsError, match=r"holds other \.ply files \(frame_0002\.ply\)"):
+    with pytest.raises(DyngsError, match=r"contains other \.ply files \(frame_0002\.ply\)"):
         write_run_sequence(moving, folder, (0.0, 0.5))
     assert {p: p.read_bytes() for p in folder.iterdir()} == before
     with pytest.raises(DyngsError, match=r"notes\.txt"):
@@ -131,13 +131,13 @@ def test_up_is_what_the_cameras_or_the_user_say(near: OpenedScene) -> None:
     name = next(name for name, axis in AXES.items() if axis == found[0])
     how, line = choose_write_options(near, "y")
     assert how.turn == rotation_between(found[0], AXES["y"])
-    assert f"it was {name} in the capture" in line or name == "y"
-    assert "the axes of the capture are kept" in choose_write_options(near, name)[1]
+    assert f"rotated from {name} in the capture" in line or name == "y"
+    assert "axes of the capture kept" in choose_write_options(near, name)[1]
     lost = replace(near, captured=SourceCapture(near.config.data, DyngsError("gone")))
     assert find_up_direction(lost) is None
     how, line = choose_write_options(lost, "y", sh_degree=2)
     assert (how.turn, how.up, how.sh_degree) == ((1.0, 0.0, 0.0, 0.0), None, 2)
-    assert "--from-up=AXIS tells it" in line
+    assert "set it with --from-up=AXIS" in line
     assert choose_write_options(lost, "y", from_up="z")[0].turn == rotation_between(
         AXES["z"], AXES["y"]
     )

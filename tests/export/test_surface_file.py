@@ -68,7 +68,7 @@ def test_up_is_what_programs_take_for_it(
     np.testing.assert_array_equal(turned.visual.vertex_colors, kept.visual.vertex_colors)
     assert turned.volume == pytest.approx(kept.volume, rel=1e-3)
     said = capsys.readouterr().out
-    assert "axes are those of the capture" in said
+    assert "axes of the capture are kept" in said
     assert (f"up is {up or 'y'} in the file" in said) == (up is not None or suffix != ".ply")
 
 
@@ -90,11 +90,11 @@ def test_a_moving_scene_has_a_mesh_for_each_time(
     ("options", "words"),
     [
         ("--cells 7", "--cells: '7' is not a number of cells"),
-        ("--level 2", "--level does not go with the mesh"),
-        ("--segments 3", "--segments does not go with the mesh"),
+        ("--level 2", "--level: not supported for the mesh"),
+        ("--segments 3", "--segments: not supported for the mesh"),
         (
             "--out x.stl",
-            r"x\.stl: a mesh of a surface is one file that ends in \.ply, \.glb, \.obj",
+            r"x\.stl: a mesh file must end in \.ply, \.glb, \.obj",
         ),
         ("--times 0:1:2 --out x.ply", r"x\.ply: a sequence is a folder of files; give --out x"),
         ("--static", "--static does not go with --format mesh"),

@@ -84,7 +84,7 @@ def test_each_kind_of_gaussian_meets_its_fate() -> None:
     assert "logit_opacities" not in result.changes
 
 
-def test_what_is_far_may_be_as_much_larger() -> None:
+def test_distant_gaussians_may_be_larger() -> None:
     """Sky and far hills stay, and are copied where nearer ones would be split; ``center`` is what
     they are far from."""
     # distances 60, which is the reach, and 50, five extents: not yet far
@@ -178,7 +178,7 @@ def test_which_side_the_limits_are_on() -> None:
         assert bool(plan.kept[1])
 
 
-def test_a_split_that_replaces_nothing_takes_the_room_of_two() -> None:
+def test_split_of_pruned_gaussian_costs_two() -> None:
     """One that is too large to stay frees no room by being split."""
     huge = _gaussians([1.5, 0.1, 0.1], [0.5, 0.5, 0.5])
     for cap, split in ((3, False), (4, True)):

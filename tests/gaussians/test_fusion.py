@@ -30,7 +30,7 @@ def test_the_surface_is_where_all_views_see_it() -> None:
 
 
 @pytest.mark.parametrize("most", [40, 300, 10**6])
-def test_it_has_as_few_triangles_as_asked_for(most: int) -> None:
+def test_simplified_mesh_has_requested_faces(most: int) -> None:
     mesh = simplify_mesh(ball(), most)
     assert min(most, len(ball().faces)) / 3 < len(mesh.faces) <= most
     assert np.abs(radii(mesh) - RADIUS).max() < 0.3

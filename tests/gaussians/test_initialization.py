@@ -108,7 +108,7 @@ def test_random_points_fill_their_cube(
 @pytest.mark.parametrize(
     ("offset", "by_convention"), [((7.0, -3.0, 11.0), True), ((0.0, 0.0, 0.0), False)]
 )
-def test_other_random_points_lie_where_cameras_look(
+def test_random_points_lie_in_frusta(
     offset: tuple[float, float, float], by_convention: bool
 ) -> None:
     """Wherever the scene lies: all in three images or more, most of them near what all cameras look

@@ -72,7 +72,7 @@ def whole(levels: Levels, cut: list[tuple[int, int]]) -> list[int]:
     return shown.tolist()
 
 
-def test_a_cut_shows_everything_once(small_blocks: None) -> None:
+def test_cut_covers_every_gaussian_once(small_blocks: None) -> None:
     levels = build_levels(cloud(1000))
     counts = []
     for pixels in (0.0, 0.5, 2.0, 8.0, 1e9):
@@ -96,7 +96,7 @@ def test_the_finest_cut_is_the_scene_to_the_bit(small_blocks: None) -> None:
     assert torch.equal(render(seen, camera()).rgb, render(gaussians, camera()).rgb)
 
 
-def test_what_is_behind_or_beside_the_camera_stays_coarse(small_blocks: None) -> None:
+def test_blocks_outside_the_image_stay_coarse(small_blocks: None) -> None:
     levels = build_levels(cloud(1000))
     pose = camera().cam_from_world.clone()
     for turn in (

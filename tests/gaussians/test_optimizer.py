@@ -43,7 +43,7 @@ def _set_gradients(
     return gradients
 
 
-def test_gaussians_that_rest_are_left_alone_where_they_are_not_seen() -> None:
+def test_unseen_rows_are_skipped() -> None:
     """Of two that are not seen only the one that rests; one that is seen moves, be it at rest else
     or not."""
     optimizer = GaussianOptimizer(_gaussians(5), OptimConfig())

@@ -30,7 +30,7 @@ def give_gradients(learned: Parameters, step: int) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("decay", [1.0, 0.01, 0.0])
-def test_it_is_adam_with_a_falling_rate(decay: float) -> None:
+def test_equals_adam_with_decaying_rate(decay: float) -> None:
     """The rate is log-linear from the first to the last; where the last is zero, linear."""
     learned = Parameters(start_values(), RATES, decay)
     num_steps = 12

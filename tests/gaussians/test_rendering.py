@@ -220,9 +220,7 @@ def test_a_pose_that_is_no_rotation_is_refused(verb: Callable[..., object], faul
 
 @pytest.mark.parametrize("verb", VERBS)
 @pytest.mark.parametrize("focal", [0.0, -20.0, 1e-7, 1e13])
-def test_focal_lengths_that_show_nothing_are_refused(
-    verb: Callable[..., object], focal: float
-) -> None:
+def test_non_positive_focal_lengths_are_refused(verb: Callable[..., object], focal: float) -> None:
     scene = random_scene()
     scene.intrinsics[1, 1, 1] = focal
     with pytest.raises(
@@ -232,7 +230,7 @@ def test_focal_lengths_that_show_nothing_are_refused(
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_names_what_is_not_finite(verb: Callable[..., object]) -> None:
+def test_nonfinite_input_is_named_by_every_function(verb: Callable[..., object]) -> None:
     scene = random_scene()
     scene.means[3, 1] = math.nan
     with pytest.raises(

@@ -61,7 +61,7 @@ def leaves(gaussians: Gaussians) -> Gaussians:
 
 
 @pytest.mark.parametrize("drawing", [False, True], ids=["state", "drawing state"])
-def test_what_is_stored_gives_the_same_images(kind: str, drawing: bool) -> None:
+def test_restored_scene_renders_equal_images(kind: str, drawing: bool) -> None:
     """To the bit, but for skinning weights whose corrections are stored within them."""
     scene = scene_of_kind(kind)
     state = scene.drawing_state() if drawing else scene.state()
@@ -84,7 +84,7 @@ def test_every_tensor_has_a_role_and_its_rows(kind: str) -> None:
     copied = TopologyEdit(
         torch.tensor([8, 1, 1, 5, 0]), torch.tensor([False, False, True, False, False])
     )
-    for one in (scene, scene.apply_edit(copied), scene.part("moving"), scene.part("still")):
+    for one in (scene, scene.apply_edit(copied), scene.part("moving"), scene.part("static")):
         for name, x in one.state().items():
             assert isinstance(x.role, Role), name
             if x.role is Role.PER_GAUSSIAN:
@@ -118,7 +118,7 @@ WITHIN_OTHERS = {"model.learned.weights"}
     st.lists(st.tuples(st.integers(0, 8), st.booleans()), max_size=14),
     st.sampled_from(TIMES),
 )
-def test_an_edited_scene_draws_the_copies_of_what_was_drawn(
+def test_edited_scene_renders_copies(
     kind: str, rows: list[tuple[int, bool]], time: float | None
 ) -> None:
     scene = scene_of_kind(kind)
@@ -136,10 +136,10 @@ def test_an_edited_scene_draws_the_copies_of_what_was_drawn(
     assert_alike(scene.at(time), before, atol=0.0)
 
 
-def test_what_moves_and_what_is_still_make_the_scene(kind: str) -> None:
+def test_moving_and_static_parts_make_the_scene(kind: str) -> None:
     scene = scene_of_kind(kind)
     moving = scene.part("moving")
-    still = scene.part("still")
+    still = scene.part("static")
     moves = torch.zeros(len(scene), dtype=torch.bool)
     moves[scene.rows] = True
     assert (len(moving), len(still)) == (int(moves.sum()), int((~moves).sum()))
@@ -159,7 +159,7 @@ def test_what_moves_and_what_is_still_make_the_scene(kind: str) -> None:
 # ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_changed_scene_is_drawn_as_it_is_now(kind: str) -> None:
+def test_cache_is_cleared_after_in_place_changes(kind: str) -> None:
     """What is trained is changed in place, and drawn in between."""
     scene = scene_of_kind(kind)
     scene.at(0.37)
@@ -199,7 +199,7 @@ def test_all_that_is_computed_with_moves_to_a_device(kind: str) -> None:
 
 
 @pytest.mark.parametrize("model", ["static", *FIELDS])
-def test_what_is_trained_is_what_is_loaded(model: str, tmp_path: Path) -> None:
+def test_loaded_scene_equals_trained_scene(model: str, tmp_path: Path) -> None:
     """The same class, which draws the same."""
     capture = write_tiny_capture(tmp_path / "capture")
     config = busy_config(capture, tmp_path, "mlp" if model == "static" else model, filter_3d=True)

@@ -38,7 +38,7 @@ from dyngs.models.schedule import image_divisor
 from dyngs.models.static_section import StaticModel
 
 
-def test_at_30000_steps_it_is_the_published_one() -> None:
+def test_published_schedule_at_30000_steps() -> None:
     schedule = densify_schedule(DefaultStrategy(), 30_000, white_background=False)
     changes = [step for step in range(30_001) if schedule.densifies_at(step)]
     assert changes == list(range(600, 15_000, 100))

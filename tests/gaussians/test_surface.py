@@ -96,7 +96,7 @@ def test_the_surface_is_the_same_in_any_unit(factor: float) -> None:
     torch.testing.assert_close(torch.stack(box) / factor, torch.stack(own))
 
 
-def test_without_what_no_view_sees_the_surface_ends() -> None:
+def test_surface_ends_at_unobserved_space() -> None:
     """From one side half a ball is seen, and nothing closes it."""
     half = fuse_depths(views()[:1], *BOX, 40, unseen_is_solid=False)
     assert half is not None

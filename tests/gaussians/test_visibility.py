@@ -40,7 +40,7 @@ def test_they_follow_the_gaussians() -> None:
     assert masks.select(index).times == TIMES
 
 
-def test_active_is_what_either_end_sees() -> None:
+def test_active_gaussians_are_visible_at_either_end() -> None:
     masks, seen = some_masks()
     for k in range(3):
         assert torch.equal(masks.active(k), torch.nonzero(seen[k] | seen[k + 1])[:, 0])

@@ -243,7 +243,7 @@ print(float(draw(3, 64)))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_AS")
-def test_what_memory_does_not_hold_is_refused() -> None:
+def test_render_beyond_memory_is_refused() -> None:
     """Pairs, an image, gradients, and scratch memory that threads used to allocate; after which all
     is well."""
     path = os.pathsep.join([str(Path(dyngs.__file__).parents[1]), *(p for p in sys.path if p)])

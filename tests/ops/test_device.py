@@ -107,7 +107,7 @@ def test_a_gpu_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
     assert re.search(r"GPU is older than compute capability 7\.5", refused())
 
 
-def test_auto_says_why_only_where_a_gpu_seems_to_be(machine: pytest.MonkeyPatch) -> None:
+def test_auto_explains_cpu_only_with_a_driver(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(device, "has_cuda_core", lambda: False)
     line = cpu_fallback_reason("auto")
     assert line is not None
@@ -122,7 +122,7 @@ def test_other_choices_are_refused() -> None:
         select_device("tpu")
 
 
-def test_on_a_gpu_torch_is_told_to_repeat_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_torch_is_deterministic_on_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     """And only there, only inside, and only if that is wanted."""
     told: list[tuple[bool, bool]] = []
     monkeypatch.delenv("CUBLAS_WORKSPACE_CONFIG", raising=False)
@@ -175,7 +175,7 @@ def test_blocks_are_reused_without_page_faults() -> None:
     assert int(after) < int(before) / 10
 
 
-def test_numbers_are_as_they_were_when_they_were_asked_for() -> None:
+def test_readback_is_a_snapshot() -> None:
     x = torch.tensor([1.0, 2.5], requires_grad=True)
     read = AsyncReadback(x)
     with torch.no_grad():

@@ -49,7 +49,7 @@ def computed(name: str, count: int = 60) -> list[Tensor]:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_it_computes_what_the_cpu_does(gpu: Callable, name: str) -> None:
+def test_emulated_gpu_equals_cpu(gpu: Callable, name: str) -> None:
     """Values and gradients, to float32: sums of some hundred numbers in another order."""
     expected = computed(name)
     with gpu():

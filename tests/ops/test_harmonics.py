@@ -107,7 +107,7 @@ def test_lit_colours_are_those_of_the_formula_and_so_are_gradients(terms: int) -
     assert torch.autograd.gradcheck(lit, inputs)
 
 
-def test_what_has_no_normal_stays_finite() -> None:
+def test_zero_normals_stay_finite() -> None:
     inputs = [
         x.requires_grad_()
         for x in (torch.ones(1, 1, 3), torch.eye(3)[None], torch.zeros(1, 3), torch.ones(8, 3))

@@ -107,7 +107,7 @@ def test_known_answer_of_one_pixel() -> None:
     )
 
 
-def test_equal_images_cost_exactly_nothing() -> None:
+def test_equal_images_give_zero_loss() -> None:
     rendered, _, mask = make_images(30, 40)
     for m in (None, mask):
         value, gradient = value_and_gradient(l1_ssim_loss, rendered, rendered.clone(), 0.2, m)
@@ -116,7 +116,7 @@ def test_equal_images_cost_exactly_nothing() -> None:
     assert ssim(rendered, rendered).item() == 1
 
 
-def test_what_the_mask_hides_does_not_matter() -> None:
+def test_masked_pixels_are_ignored() -> None:
     rendered, target, mask = make_images(40, 40)
     mask = (mask > 0.5).float()
     changed = torch.where(mask[..., None] == 0, torch.rand(40, 40, 3), rendered)
@@ -125,7 +125,7 @@ def test_what_the_mask_hides_does_not_matter() -> None:
     assert not gradient[mask == 0].any()
 
 
-def test_empty_mask_costs_nothing() -> None:
+def test_empty_mask_gives_zero_loss() -> None:
     rendered, target, _ = make_images(9, 9)
     for function in (l1_ssim_loss, reference_l1_ssim):
         value, gradient = value_and_gradient(function, rendered, target, 0.2, torch.zeros(9, 9))
@@ -164,7 +164,7 @@ def test_bright_images_keep_their_digits(brightness: float, contrast: float) -> 
 
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("large", [1e10, 1e30, -3e38])
-def test_one_large_pixel_costs_what_the_formula_says(large: float, ssim_weight: float) -> None:
+def test_loss_of_one_pixel_equals_formula(large: float, ssim_weight: float) -> None:
     rendered, target, mask = make_images(120, 300)  # four tiles, of which two see it
     rendered[10, 20, 1] = large
     for m in (None, mask.clamp_min(0.1)):

@@ -125,7 +125,7 @@ def test_neighbours_leave_no_gap() -> None:
         assert (inside >= 0).all()
 
 
-def test_what_cannot_be_drawn_is_not() -> None:
+def test_invalid_patches_are_not_rendered() -> None:
     """All points equal, collinear, behind the camera, nearer than near, not a number, infinite."""
     point = flat((0, 0, 0), (0, 0, 0), (0, 0, 0))
     line = flat((-1, 0, 0), (0, 0, 0), (1, 0, 0))
@@ -171,7 +171,7 @@ def some_image(
 
 
 @pytest.mark.parametrize(("seed", "views"), [(0, 1), (1, 2), (2, 1)])
-def test_blending_is_what_it_is_defined_as(seed: int, views: int) -> None:
+def test_patch_blending_equals_reference(seed: int, views: int) -> None:
     means, colours, crossings, places = some_image(seed, views)
     found = blend_patches(means, colours, crossings, places)
     expected = reference_blend(colours, crossings, places)
@@ -223,7 +223,7 @@ def test_the_nearer_one_covers_the_other_along_its_own_outline() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_gradient_is_that_of_what_is_drawn(seed: int) -> None:
+def test_gradient_equals_finite_differences_of_rendering(seed: int) -> None:
     """Of whole images by control points, against differences: outlines move, and colours move
     along."""
     points = random_patches(1, seed + 7, 0.1) * 0.2

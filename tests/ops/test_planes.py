@@ -161,7 +161,7 @@ def test_features_equal_grid_sample(
     assert_all_close(got, run_features(reference_features, coords, time, levels), 1e-12)
 
 
-def test_samples_lie_where_they_are_said_to() -> None:
+def test_plane_sample_positions() -> None:
     (level,) = make_levels((3,), 4, 2)
     z, y, x, t = 2, 0, 1, 3
     coords = torch.tensor([[float(i - 1) for i in (x, y, z)]], dtype=torch.float64)

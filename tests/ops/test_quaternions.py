@@ -32,13 +32,13 @@ def exact(quats: Tensor) -> Tensor:
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 10**6), st.floats(-38, 37))
-def test_any_length_is_made_one(seed: int, exponent: float) -> None:
+def test_quaternions_of_any_norm_are_normalised(seed: int, exponent: float) -> None:
     quats = some_quats(seed) * 10.0**exponent
     quats = quats[quats.abs().amax(1) > 0]
     torch.testing.assert_close(unit_quats(quats).double(), exact(quats), rtol=0, atol=ROUNDING)
 
 
-def test_zero_is_the_identity_and_what_is_not_finite_stays_so() -> None:
+def test_zero_is_identity_and_nonfinite_is_kept() -> None:
     quats = torch.zeros(2, 4, requires_grad=True)
     unit = unit_quats(quats)
     assert unit.tolist() == [[1, 0, 0, 0]] * 2

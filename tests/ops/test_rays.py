@@ -178,7 +178,7 @@ def test_nothing_is_seen_through_a_wall_and_everything_through_air() -> None:
     assert offsets.tolist() == [0, 2, 5]
 
 
-def test_what_is_not_reached_changes_nothing() -> None:
+def test_unreached_samples_have_no_effect() -> None:
     densities, colours, samples = some_samples([30, 30])
     which, offsets = reached(densities, samples, 0.01)
     assert 0 < int(which.sum()) < 60

@@ -59,7 +59,7 @@ def test_it_is_what_torch_says(
     torch.testing.assert_close(found, reference.shading_inputs(base, *seen))
 
 
-def test_what_is_degenerate_stays_finite() -> None:
+def test_degenerate_input_stays_finite() -> None:
     """An eye in the centre of a Gaussian, a rotation of length zero, three equal scales, nothing
     seen."""
     zeros = torch.zeros(1, 3)

@@ -189,14 +189,14 @@ def test_a_row_that_does_not_exist_is_refused() -> None:
         add_offsets_(tensors, torch.tensor([9]), (torch.zeros(1, 3), None, None, None, None))
 
 
-def test_what_is_written_to_must_be_contiguous() -> None:
+def test_in_place_tensors_must_be_contiguous() -> None:
     means, *others = (x.clone() for x in cloud().tensors().values())
     strided = means.T.contiguous().T
     with pytest.raises(DyngsError, match="must be contiguous"):
         add_offsets_((strided, *others), None, (torch.zeros(1, 3), None, None, None, None))
 
 
-def test_only_what_gets_offsets_counts_as_changed() -> None:
+def test_only_tensors_with_offsets_change_version() -> None:
     tensors = [x.clone() for x in cloud().tensors().values()]
     add_offsets_(tensors, None, (torch.zeros(1, 3), None, None, torch.zeros(1), None))
     assert [x._version for x in tensors] == [1, 0, 0, 1, 0]

@@ -38,7 +38,7 @@ def test_near_it_is_the_scene_itself() -> None:
         torch.testing.assert_close(getattr(one, name), getattr(other, name), atol=1e-6, rtol=1e-5)
 
 
-def test_few_are_drawn_where_few_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cut_respects_max_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(levels, "BLOCK", 16)
     still = StaticScene(gaussians=cloud(2000))
     coarse = LevelScene.from_scene(still, max_gaussians=300).on_background(torch.ones(3))

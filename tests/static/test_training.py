@@ -78,7 +78,7 @@ def _sized(pixels: list[float]) -> Gaussians:
     )
 
 
-def test_what_no_view_shows_half_a_pixel_of_is_removed_once() -> None:
+def test_small_gaussians_are_pruned_once() -> None:
     elsewhere = replace(
         _camera(), cam_from_world=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))[None]
     )

@@ -70,7 +70,7 @@ def test_lines_of_a_plot_join_the_run_with_a_setting() -> None:
     """Pruning is faster and smaller; fewer harmonics are neither, but a line leads there, too."""
     pytest.importorskip("matplotlib")
     rows = [
-        row("as it is", 30, 10, 5),
+        row("original", 30, 10, 5),
         row("prune=0.5", 29, 20, 2),
         row("prune=0.7", 28, 30, 1),
         row("sh_degree=0", 28, 5, 9),
@@ -80,7 +80,7 @@ def test_lines_of_a_plot_join_the_run_with_a_setting() -> None:
         front, *lines = axes.lines
         assert len(front.get_xdata()) == 3
         found = {line.get_label(): len(line.get_xdata()) for line in lines}
-        assert found == {"the run itself": 1, "prune": 3, "sh_degree": 2}
+        assert found == {"original run": 1, "prune": 3, "sh_degree": 2}
     text = figure_to_svg(figure)
     assert "<image" not in text
     assert 'href="http' not in text

@@ -57,7 +57,7 @@ def test_another_study_is_refused_with_what_differs(tmp_path: Path) -> None:
     before = (tmp_path / STUDY_FILE).read_bytes()
     require_same_study(tmp_path, facts | {"where": "b"}, ("models", "minutes"))
     with pytest.raises(
-        DyngsError, match=r"\(models is static, mip there and static here; minutes is 2.0 there"
+        DyngsError, match=r"\(models: static, mip there, static here; minutes: 2.0 there"
     ):
         require_same_study(tmp_path, {"models": ["static"], "minutes": ""}, ("models", "minutes"))
     assert (tmp_path / STUDY_FILE).read_bytes() == before

@@ -86,7 +86,7 @@ def test_finished_points_are_not_measured_again(found: Found, study: Tradeoff) -
 
 
 def test_points_of_something_else_do_not_mix(found: Found, study: Tradeoff, tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match=r"another study .split is test there and train here"):
+    with pytest.raises(DyngsError, match=r"another study .split: test there, train here"):
         replace(study, split="train").run()
     with pytest.raises(DyngsError, match="no views"):
         replace(study, out=tmp_path, split="val").run()
@@ -98,14 +98,14 @@ def test_on_a_gpu_quality_is_the_same(
     briefly = replace(study, settings={"prune": (0.5,)}, finetune=0, combine=0)
     expected = replace(briefly, out=tmp_path / "here").run()
     for module in ("training.new_trainer", "study.measure", "study.tradeoff"):
-        monkeypatch.setattr(f"dyngs.{module}.device_for", lambda _: GPU)
+        monkeypatch.setattr(f"dyngs.{module}.select_device", lambda _: GPU)
     there = replace(briefly, out=tmp_path / "there")
     with pretend_gpu():
         measured = there.run()
     untimed = [replace(x, ms=None, gain=1.0) for x in measured.values()]
     assert untimed == [replace(x, ms=None, gain=1.0) for x in expected.values()]
     monkeypatch.undo()
-    with pytest.raises(DyngsError, match=r"another study .device is"):
+    with pytest.raises(DyngsError, match=r"another study .device:"):
         there.run()
 
 
@@ -133,7 +133,7 @@ def test_masks_that_a_run_has_stay(found: Found, study: Tradeoff, tmp_path: Path
 
 
 def test_a_stored_run_cannot_be_varied(found: Found, study: Tradeoff) -> None:
-    with pytest.raises(DyngsError, match=r"only scene\.dyngs is there; give the run that it"):
+    with pytest.raises(DyngsError, match=r"contains only scene\.dyngs; use the run that it"):
         current_settings(study.folder(Variant(storage=2.0)))
 
 
@@ -146,7 +146,7 @@ def test_a_damaged_point_says_what_to_do(found: Found, tmp_path: Path) -> None:
     bad += [json.dumps(good | {"ms": value}) for value in (0, float("nan"), float("inf"))]
     for text in (*bad, "", "[]", "{}", "[" * 5000):
         path.write_text(text)
-        with pytest.raises(DyngsError, match=r"x\.json: .* no result of a study: remove it"):
+        with pytest.raises(DyngsError, match=r"x\.json: .* not a result of a study; remove it"):
             read_measurement(path)
 
 
@@ -174,7 +174,7 @@ def test_names_tell_variants_apart_and_merging_keeps_changes(a: Variant, b: Vari
 
 
 def test_the_setting_of_a_variant() -> None:
-    assert (Variant().setting, Variant().name) == ("", "as it is")
+    assert (Variant().setting, Variant().name) == ("", "original")
     assert Variant(prune=0.5, finetune=9).setting == "prune + finetune"
     assert Variant(prune=0.5, sh_degree=0).setting == "several"
 
@@ -194,7 +194,7 @@ def test_single_changes_differ_from_the_run() -> None:
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("prun", "no such setting; there are prune, mask_times, sh_degree"),
+        ("prun", "unknown setting; use prune, mask_times, sh_degree"),
         ("prune=1.5", "--vary prune=1.5: Input should be less than 1"),
         ("prune=", "valid number"),
         ("prune=nan", "finite number"),
@@ -303,11 +303,11 @@ def test_conditions() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("psnr>30", "is no condition; write for instance psnr>=30"),
-        ("psnr>=30,,mb<=5", "is no condition"),
-        ("speed>=3", "no such metric; there are psnr, ssim, lpips, fps"),
-        ("psnr>=nan", "is no condition"),
-        ("psnr>=__import__('os')", "is no condition"),
+        ("psnr>30", ": not a condition; example: psnr>=30"),
+        ("psnr>=30,,mb<=5", "not a condition"),
+        ("speed>=3", "unknown metric; use psnr, ssim, lpips, fps"),
+        ("psnr>=nan", "not a condition"),
+        ("psnr>=__import__('os')", "not a condition"),
     ],
 )
 def test_what_is_no_condition_is_refused(text: str, message: str) -> None:
@@ -327,11 +327,11 @@ def test_the_best_of_what_qualifies() -> None:
     [
         (
             "psnr>=30,fps>=20,mb<=5",
-            r"psnr>=30, fps>=20, mb<=5; with the others met the best psnr is 27 \(prune=0.8\); "
-            r"with the others met the best fps is 18 \(prune=0.5\)",
+            r"psnr>=30, fps>=20, mb<=5; best psnr with the other conditions: 27 \(prune=0.8\); "
+            r"best fps with the other conditions: 18 \(prune=0.5\)",
         ),
-        ("psnr>=50,fps>=90", "has psnr>=50, fps>=90$"),
-        ("lpips<=0.5", "has lpips<=0.5$"),
+        ("psnr>=50,fps>=90", "meets psnr>=50, fps>=90$"),
+        ("lpips<=0.5", "meets lpips<=0.5$"),
     ],
 )
 def test_what_is_missed_is_named(asked: str, message: str) -> None:

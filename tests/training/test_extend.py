@@ -136,7 +136,7 @@ def test_a_run_that_was_stopped_may_become_longer_or_shorter(
 def test_what_cannot_be_is_refused_and_changes_nothing(captures: Path, tmp_path: Path) -> None:
     run = train(_config(captures, tmp_path / "run", "default"))
     before = (run / "config.yaml").read_bytes()
-    with pytest.raises(DyngsError, match="12 steps are done already"):
+    with pytest.raises(DyngsError, match="already has 12 steps"):
         _to(run, 7)
     assert (run / "config.yaml").read_bytes() == before
     config = _config(captures, run, "default")

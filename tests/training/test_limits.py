@@ -86,9 +86,9 @@ def test_a_size_without_room_is_refused_and_the_one_named_is_not(
     model: StaticModel | DynamicModel,
 ) -> None:
     config = NOTHING.model_copy(update={"model": model})
-    with pytest.raises(DyngsError, match=r"budget.max_mb=0.001: .* would do") as refused:
+    with pytest.raises(DyngsError, match=r"budget.max_mb=0.001: too small") as refused:
         gaussian_limit(limited(config, max_mb=0.001), 20)
-    would_do = float(str(refused.value).split(";")[1].split()[0])
+    would_do = float(str(refused.value).split(";")[1].split()[1])
     found = gaussian_limit(limited(config, max_mb=would_do), 20)
     assert found is not None
     assert found >= 500

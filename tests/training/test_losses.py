@@ -26,7 +26,7 @@ def image() -> Image:
 
 
 @pytest.mark.parametrize(
-    ("name", "advice"), [("image", "look at that image"), ("alpha", "lower its weight")]
+    ("name", "advice"), [("image", "check that image"), ("alpha", "lower its weight")]
 )
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
 def test_a_term_that_is_not_finite_is_named(
@@ -34,7 +34,7 @@ def test_a_term_that_is_not_finite_is_named(
 ) -> None:
     terms = {"image": torch.tensor(0.5), "alpha": torch.tensor(0.1)} | {name: torch.tensor(value)}
     with pytest.raises(
-        DyngsError, match=rf"^step 3, view 'r_7': the loss term '{name}' is {value}; {advice}"
+        DyngsError, match=rf"^step 3, view 'r_7': loss term '{name}' is {value}; {advice}"
     ):
         StepCheck(terms, {}, CPU).loss(3, image, MOVES_BY)
 
@@ -44,7 +44,7 @@ def test_gaussians_that_are_not_finite_come_first(image: Image) -> None:
     gaussians = random_scene().gaussians
     gaussians.means[3, 1] = torch.nan
     terms = {"image": torch.tensor(torch.nan)}
-    message = r"the field makes means at 0\.25 not finite; lower the rates in model\.deform$"
+    message = r"the field produced non-finite means at time 0\.25; lower the learning rates in model\.deform$"
     with pytest.raises(DyngsError, match=rf"^step 3, view 'r_7': {message}"):
         StepCheck(terms, gaussians.tensors(), CPU).loss(3, image, MOVES_BY)
 

@@ -147,7 +147,7 @@ def test_views_are_drawn_and_scored_there_alike(
 ) -> None:
     folder, (split, refined, others) = tmp_path / "run", SCORED[name]
     for few in (
-        "human.avatar.pose_fit.WINDOW",
+        "human.avatar.pose_fit.UPDATES_PER_WINDOW",
         "human.avatar.pose_fit.MOST_WINDOWS",
         "training.corrections.camera_refinement.FIT_UPDATES",
     ):

@@ -20,10 +20,10 @@ def test_views_are_shared_evenly_in_order_and_each_once() -> None:
         assert len({len(fraction) for fraction in fractions}) == 1
     with pytest.raises(
         DyngsError,
-        match="batch_size=3 views cannot be shared evenly among 2 processes; give a mult",
+        match="batch_size=3: must be a multiple of the number of processes, 2",
     ):
         Processes(0, 2).views_of_process(3)
-    with pytest.raises(DyngsError, match="cannot be shared"):
+    with pytest.raises(DyngsError, match="must be a multiple"):
         Processes(0, 2).views_of_process(0)
 
 
@@ -44,4 +44,4 @@ def test_sums_are_those_of_a_loop_and_what_differs_is_an_error_of_one_line(tmp_p
     assert codes == [2, 2, 2]
     lines = [line for text in said for line in text.splitlines()]
     assert len(lines) == 1, "one tells it, the others end without a word"
-    assert "after step 8: process 1 has come to other Gaussians than process 0" in lines[0]
+    assert "after step 8: Gaussians of process 1 differ from those of process 0" in lines[0]

@@ -189,7 +189,7 @@ def test_what_is_not_finite_is_named_in_one_line(
     )
     time = "(0|0.25|0.5|0.75|1)" if timed else "0"
     assert re.fullmatch(
-        rf"step 3, view 'train/r_00\d': the field makes means at {time} not finite; lower .*model\.deform",
+        rf"step 3, view 'train/r_00\d': the field produced non-finite means at time {time}; lower .*model\.deform",
         _stops_in_step_3(trainer),
     )
 

@@ -74,7 +74,7 @@ def test_feet_are_kept_in_motions_of_files(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_a_screenshot_is_what_is_shown() -> None:
     page = page_of()
-    page.set("What", "alpha")
+    page.set("Layer", "alpha")
     page.set("Screenshot")
     ((name, data),) = page.files.items()
     assert name == "balls_0.000.png"

@@ -101,15 +101,15 @@ def test_deletions_in_the_coordinates_of_the_frame_and_back(tmp_path: Path) -> N
     assert "box: `--crop -0.1,-1.1,-1.1 2.1,1.1,1.1`" in work.description
     assert work.delete(inside=True) == 3
     assert work.left.scene.gaussians.means[:, 0].tolist() == [-1.0, -0.5]
-    assert "2 of 5 Gaussians left" in work.description
+    assert "2 of 5 Gaussians remaining" in work.description
     assert work.delete(inside=True) == 0
-    with pytest.raises(DyngsError, match="the box holds nothing"):
+    with pytest.raises(DyngsError, match="the box contains no"):
         work.delete(inside=False)
     work.steps.pop()
     assert work.left is work.whole
     assert work.delete(inside=False) == 2
     work.size = np.full(3, 99.0)
-    with pytest.raises(DyngsError, match="the box holds all"):
+    with pytest.raises(DyngsError, match="the box contains the whole"):
         work.delete(inside=True)
 
 

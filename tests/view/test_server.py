@@ -210,7 +210,7 @@ def test_texts_of_strangers_are_shown_and_never_run(browser: Browser, tmp_path: 
     config.write_text(
         re.sub(r"root: .*", lambda _: f"root: {json.dumps(gone)}", config.read_text(), count=1)
     )
-    for folder, wanted in ((run, "truth: "), (other, "without the capture")):
+    for folder, wanted in ((run, "truth: "), (other, "capture not found")):
         source = open_source(folder)
         with Viewer(source, source.load(source.names[0]), ServerOptions()) as viewer:
             page = browser.open(viewer.link, *SIZE)

@@ -33,12 +33,12 @@ def test_a_folder_of_runs_is_a_picker(tmp_path: Path) -> None:
     next((tmp_path / "a/deep/run/checkpoints").iterdir()).write_bytes(b"damaged")
     first = load_first(source)
     assert first.name == "b/run"
-    assert "left out" in first.notes[0]
+    assert "skipped" in first.notes[0]
     assert open_source(tmp_path / "b" / "run").names == ("run",)
 
 
 def test_where_nothing_is_to_be_seen_one_line_says_so(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match="no runs there"):
+    with pytest.raises(DyngsError, match="no runs found"):
         open_source(tmp_path)
     with pytest.raises(DyngsError, match="no such file"):
         load_first(open_source(tmp_path / "nothing"))

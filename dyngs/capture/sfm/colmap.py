@@ -1,5 +1,4 @@
-"""Structure from motion: options, the images laid out for COLMAP, its calls, and the folder to work
-in."""
+"""COLMAP for structure from motion: options, image layout, and calls of pycolmap."""
 
 from __future__ import annotations
 
@@ -20,8 +19,7 @@ if TYPE_CHECKING:
 LENS = "SIMPLE_RADIAL"
 """COLMAP's name of the lens model that is fitted."""
 LONGEST_SIDE, MAX_FEATURES = 1600, 8192
-"""Images are shrunk to so many px for finding so many SIFT features at most; poses refer to the
-full size."""
+"""Longest side in px and number of features for SIFT; poses refer to the full size."""
 SEED = 0
 
 
@@ -30,15 +28,15 @@ class SfmOptions:
     """Options of pose estimation.
 
     Attributes:
-        matching: pairs that are compared; auto = all of up to 60 photos or 24 frames, beyond that
-            neighbours by name (some far ones, too) and those that look alike; sequential = the same
-            without what looks alike.
-        num_frames: images to take at most from a video, None = 100; of several videos time steps,
-            None = ``times.MOST_STEPS``, fewer for many cameras.
-        masks: folder of masks of the photos, named as in captures; white = keep. None without.
-        num_threads: for features and matches, 0 = all cores; mapping has one, so that the result is
-            always the same.
-        follow_links: photos and videos may be links that lead out of their folder.
+        matching: auto = all pairs of up to 60 photos or 24 frames, beyond that neighbours by name
+            (some distant ones, too) and similar images; sequential = without similar images;
+            exhaustive = all pairs.
+        num_frames: images taken from a video at most, None = 100; for several videos the number of
+            time steps, None = ``MOST_STEPS``, fewer for many cameras.
+        masks: folder of masks named after the photos; white = used. None without.
+        num_threads: for features and matches, 0 = all cores; mapping uses one, for reproducible
+            results.
+        follow_links: photos and videos may be links out of their folder.
     """
 
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
@@ -112,8 +110,8 @@ def matching_options(
 def match_listed(
     database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]], num_threads: int
 ) -> None:
-    """Match pairs of images, given by their places among the names, and verify them; those of
-    before are left."""
+    """Match and verify pairs of images, given by index into the names; earlier matches are
+    kept."""
     import pycolmap
 
     matching, verification = matching_options(num_threads)
@@ -140,8 +138,7 @@ class ColmapError(DyngsError):
 
 @contextmanager
 def quiet_colmap() -> Iterator[None]:
-    """Keep COLMAP's log out of the terminal, and make it start from a seed; its errors in the block
-    are ours."""
+    """Silence COLMAP's log, seed it, and turn its errors in the block into ColmapError."""
     import pycolmap
 
     level = pycolmap.logging.minloglevel

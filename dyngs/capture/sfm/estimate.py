@@ -55,8 +55,8 @@ _MOST_FITTED_PAIRS = 2000
 
 
 def pose_agreement(model: pycolmap.Reconstruction, database: Path, longest_side: int) -> float:
-    """Return the fraction of well matched pairs, of images with a pose, whose verified matches fit
-    the poses."""
+    """Return the fraction of well matched pairs of registered images whose matches fit the
+    poses."""
     import pycolmap
 
     posed = {key: image for key, image in model.images.items() if image.has_pose}
@@ -105,8 +105,8 @@ def triangulation_angles_deg(model: pycolmap.Reconstruction) -> np.ndarray:
 
 
 def homography_fraction(database: Path) -> float:
-    """Return the fraction of well matched pairs that a homography explains: all of them where the
-    camera only rotated."""
+    """Return the fraction of well matched pairs explained by a homography: all, if the camera only
+    rotated."""
     import pycolmap
 
     with pycolmap.Database.open(database) as opened:
@@ -154,7 +154,7 @@ class SfmResult:
     notes: tuple[str, ...]
 
     def summary(self) -> str:
-        """The result as lines of text."""
+        """Return the result as lines of text."""
         lines = [
             f"{self.num_registered} of {self.num_images} images registered, {self.num_points} "
             f"points, mean error {self.mean_error_px:.2f} px: {self.root}"
@@ -173,10 +173,10 @@ def estimate_poses(
     """Estimate poses of the images in ``source`` and write a COLMAP capture (``out/images``,
     ``out/sparse/0``).
 
-    Work is done in a hidden folder next to ``out``; it is renamed at the end, so ``out`` is
-    complete or absent. Of several models the one with most images is kept. Raises DyngsError: too
-    few images, an ``out`` in use, a camera that stands still or only rotates, or nothing could be
-    registered, with advice.
+    Work is done in a hidden folder next to ``out``, which is renamed at the end, so ``out`` is
+    complete or absent. The model with most images is kept. Raises DyngsError with advice for too
+    few images, an ``out`` in use, a camera that does not move or only rotates, or failed
+    registration.
 
     Args:
         source: a folder of photos (subfolders included) or a video file.
@@ -268,7 +268,7 @@ def _film(task: SfmTask) -> str:
 
 
 def _require_depth(model: SfmModel, task: SfmTask) -> None:
-    """Check that points are seen from directions that differ, by a lens that there can be."""
+    """Check that triangulation angles are large enough and the lens is plausible."""
     if not model.has_real_lens:
         raise DyngsError(
             "no plausible lens fits the matches: most of them are probably on a moving object, "
@@ -300,7 +300,7 @@ def _write_model(model: SfmModel, capture: Path, names: dict[str, str]) -> tuple
 
 
 def _advice(unregistered: Sequence[str], blurred: Sequence[str], is_video: bool) -> Iterator[str]:
-    """Yield lines about what to film better: images without a pose, or less sharp than others."""
+    """Yield advice on images without a pose and on blurred images."""
     if unregistered:
         more = "move slower there" if is_video else "take more photos around them"
         yield (
@@ -536,12 +536,11 @@ class SfmModel:
 
 
 def run_mapping(task: SfmTask) -> SfmModel | None:
-    """Return the model with most images; None where none could be found.
+    """Return the model with most images, None if mapping fails.
 
-    Global mapping for a video and incremental mapping for photos, where it is as fast and
-    its poses are nearer to given ones (it breaks videos into pieces). The other one is tried only
-    where the first leaves images out, its poses do not fit the matches of all pairs, or its mean
-    reprojection error is large: see ``better``.
+    Videos use global mapping, photos incremental mapping, which is as fast for them and more
+    accurate. The other mapper is tried only if the first leaves images out, its poses do not fit
+    the matches, or its mean reprojection error is large: see ``choose_better_model``.
     """
     order: tuple[Mapper, Mapper] = (
         ("global", "incremental") if task.is_video else ("incremental", "global")
@@ -555,8 +554,8 @@ def run_mapping(task: SfmTask) -> SfmModel | None:
 
 
 def _needs_more(model: SfmModel, task: SfmTask) -> bool:
-    """Whether images are left out, poses do not fit the matches, a lens is none, or the error is
-    large."""
+    """Whether images are missing, poses do not fit the matches, a lens is implausible, or the
+    error is large."""
     bad = (
         model.registered < len(task.names)
         or model.agreeing < GOOD_AGREEMENT
@@ -566,11 +565,10 @@ def _needs_more(model: SfmModel, task: SfmTask) -> bool:
 
 
 def choose_better_model(first: SfmModel | None, second: SfmModel | None) -> SfmModel | None:
-    """Return the model with more images whose pairs agree, then the clearly smaller error, else the
+    """Return the model with more consistent images, then the clearly smaller error, else the
     first.
 
-    Global mapping may give every image a pose and put a part of them elsewhere: such images must
-    not count.
+    Global mapping may place some images wrongly, so that only consistent ones count.
     """
     if first is None or second is None:
         return first or second

@@ -1,5 +1,5 @@
-"""Motion of the camera in a video: frames for structure from motion are chosen by it and by
-sharpness; fixed cameras are recognised."""
+"""Camera motion in videos: selection of frames for structure from motion, and detection of fixed
+cameras."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import numpy as np
 from dyngs.data.times import evenly_spaced
 
 MIN_CAMERA_MOTION = 0.003
-"""Largest motion since the first frame, as a fraction of the image's width, below which the camera
-stands still."""
+"""Smallest motion since the first frame of a moving camera, in image widths."""
 _WIDTH = 96
 _TILES = 6
 _TEXTURE = 1.0
@@ -60,12 +59,11 @@ def measure_frames(frames: Iterable[np.ndarray]) -> FrameMeasures:
 
 
 def choose_frames(measures: FrameMeasures, wanted: int) -> tuple[list[int], list[int]]:
-    """Return the numbers of at most ``wanted`` frames, ascending, the sharpest in each of as many
-    windows of equal motion, and those of them that are much less sharp than the others.
+    """Return at most ``wanted`` frame numbers, ascending, and those of them that are blurred.
 
-    A frame counts by the motion since the one before, at most ``_FASTEST`` times the median, and to
-    a small part by itself, so that what moves while the camera rests is not lost. Frames that
-    repeat the one before count nothing.
+    Frames are the sharpest in each of as many windows of equal motion. The motion of a frame is
+    limited to ``_FASTEST`` times the median, with a small constant so that moving objects before a
+    resting camera are covered. Repeated frames are skipped.
     """
     count = len(measures)
     still = measures.most <= _NOISE
@@ -140,18 +138,16 @@ def motion_between(before: np.ndarray, after: np.ndarray) -> tuple[float, float]
 
 
 FIXED_CAMERA_LIMIT = 0.002
-"""A camera is fixed if its image is never displaced by more than this fraction of its longer
-side."""
+"""Largest image displacement of a fixed camera, in longer sides."""
 SAMPLES = 16  # images that are compared with the median one
 
 
 def camera_displacement(small: np.ndarray) -> float:
-    """Return how far the small images (F, h, w) of a video are displaced against their median, in
-    fractions of the longer side; see ``STANDS``.
+    """Return how far the small images (F, h, w) of a video are displaced from their median, in
+    longer sides.
 
-    That is the lower quartile of the optical flow of the pixels with the largest gradients, so that
-    what moves before a fixed camera does not count. A camera that jumps far leaves no sharp median, and
-    does not fit.
+    It is the lower quartile of the optical flow at the pixels with the largest gradients, so that
+    objects moving before a fixed camera do not count.
     """
     from skimage.registration import optical_flow_ilk
 

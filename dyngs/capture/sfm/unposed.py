@@ -1,5 +1,4 @@
-"""Photos and videos without poses, given as a capture: their poses are estimated first, and
-cached."""
+"""Photos and videos without poses, given as a capture: poses are estimated once and cached."""
 
 from __future__ import annotations
 
@@ -29,17 +28,16 @@ def ensure_poses(
     log: Callable[[str], None] = log_info,
     report: ProgressCallback = ignore_progress,
 ) -> DataConfig:
-    """Return the options with a capture that has poses as their folder: the same one, unless it has
-    none.
+    """Return options whose folder is a capture with poses; unchanged if it has poses already.
 
-    Photos and videos without poses go through structure from motion once; the same ones are found
-    in the user's cache from then on. Of a folder that holds ``images``, those are the photos: masks
-    and maps next to them are not. Raises DyngsError: photos without times where they are needed,
-    several videos where nothing is to move, or poses that cannot be found.
+    Photos and videos without poses go through structure from motion once and are then found in the
+    user's cache. In a folder with ``images`` only these are photos. Raises DyngsError for photos
+    without times where they are needed, several videos for a static scene, or failed pose
+    estimation.
 
     Args:
         data: its ``root`` is a capture of any format, a folder of photos, or a video.
-        needs_times: something is to move, so photos must have an order.
+        needs_times: the scene moves, so photos must have an order.
     """
     if not is_unposed(data):
         return data
@@ -78,10 +76,9 @@ def ensure_poses(
 
 
 def is_unposed(data: DataConfig) -> bool:
-    """Whether ``data.root`` is a video, or a folder of photos or of videos that no reader of
-    captures knows.
+    """Whether ``data.root`` is a video, or a folder of photos or videos that is not a capture.
 
-    Raises DyngsError: a folder of a single video, which it names; one or two photos.
+    Raises DyngsError for a folder with a single video, or with one or two photos.
     """
     root = data.root
     if root.is_file():

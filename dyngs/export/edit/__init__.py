@@ -1,2 +1,1 @@
-"""Scenes changed after training: another frame, a part, what spoils it taken away, several in
-one."""
+"""Edits of trained scenes: change of frame, cropping and merging."""

@@ -1,5 +1,4 @@
-"""The frame that a scene gets: what is up, where the origin is, how long a unit is, or all of it by
-control points."""
+"""Coordinate frames for edited scenes: up axis, origin, scale, control points or GPS."""
 
 from __future__ import annotations
 
@@ -18,19 +17,19 @@ from dyngs.io.fields import read_limited
 from dyngs.io.formats.similarity import AXES, Similarity, rotation_between, similarity_from_matrix
 from dyngs.runs.opened import OpenedScene
 
-_FACTORS = (1e-9, 1e9)
-_MOST_BYTES = 1 << 20  # of a file of control points
+_FACTORS = (1e-9, 1e9)  # Smallest and largest allowed scale
+_MOST_BYTES = 1 << 20  # Largest file of control points
 Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What changes about the frame of a scene; None stays as it is.
+    """Changes to the coordinate frame of a scene. None changes nothing.
 
     Attributes:
-        up: direction (3,) of the scene that is up; "auto": by the cameras of its run.
+        up: direction (3,) of the scene that becomes up, or "auto" to use the cameras of its run.
         origin: point (3,) of the scene that becomes the origin.
-        scale: factor.
+        scale: scale factor.
     """
 
     up: Point | str | None = None
@@ -38,22 +37,22 @@ class Frame:
     scale: float = 1.0
 
     def similarity(self, up: Sequence[float] | None, wanted: Sequence[float]) -> Similarity:
-        """Return the similarity that brings the direction ``up`` (3,) to ``wanted`` (3,), and does
-        the rest.
+        """Return the similarity that rotates direction ``up`` (3,) to ``wanted`` (3,), scales and
+        shifts.
 
-        Without ``up`` nothing is turned.
+        None as ``up`` rotates nothing.
         """
-        found = Similarity(scale=self.scale)
+        similarity = Similarity(scale=self.scale)
         if up is not None:
-            found = found.after(Similarity(rotation_between(tuple(up), tuple(wanted))))
+            similarity = similarity.after(Similarity(rotation_between(tuple(up), tuple(wanted))))
         if self.origin is None:
-            return found
-        x, y, z = (-found.points(np.array(self.origin))).tolist()
-        return replace(found, shift=(x, y, z))
+            return similarity
+        x, y, z = (-similarity.points(np.array(self.origin))).tolist()
+        return replace(similarity, shift=(x, y, z))
 
 
 def parse_point(text: str, option: str) -> Point:
-    """Return the point "x,y,z". Raises DyngsError: it is no such thing."""
+    """Parse a point "x,y,z". Raises DyngsError."""
     try:
         x, y, z = (float(word) for word in text.split(","))
     except ValueError:
@@ -61,38 +60,35 @@ def parse_point(text: str, option: str) -> Point:
     if not all(map(math.isfinite, (x, y, z))):
         shown = format_one_line(repr(text), 60)
         raise DyngsError(
-            f"{option}: {shown} is no point; write three numbers x,y,z without spaces, such as 0,-1.5,2"
+            f"{option}: {shown} is not a point; use three numbers without spaces, such as 0,-1.5,2"
         )
     return x, y, z
 
 
 def parse_number(text: str, option: str) -> float:
-    """Return a finite number, after which "m" may stand. Raises DyngsError: it is no such thing."""
+    """Parse a finite number, optionally followed by "m". Raises DyngsError."""
     try:
         found = float(text.removesuffix("m"))
     except ValueError:
         found = math.nan
     if not math.isfinite(found):
-        raise DyngsError(
-            f"{option}: {format_one_line(repr(text), 60)} is no number; write it as 1.25"
-        )
+        raise DyngsError(f"{option}: {format_one_line(repr(text), 60)} is not a number")
     return found
 
 
 def parse_direction(text: str) -> Point | str:
-    """Return what ``--up`` names: an axis such as "-y", a direction "x,y,z", or "auto". Raises
-    DyngsError."""
+    """Parse ``--up``: an axis such as "-y", a direction "x,y,z", or "auto". Raises DyngsError."""
     if text == "auto":
         return text
     found = AXES[text] if text in AXES else parse_point(text, "--up")
     if not math.hypot(*found) > 0:
-        raise DyngsError(f"--up: {text} has no direction; give x,y,z, an axis such as -y, or auto")
+        raise DyngsError(f"--up: {text} is not a direction; use x,y,z, an axis such as -y, or auto")
     return found
 
 
 def parse_scale(text: str) -> float:
-    """Return the factor that ``--scale`` names: itself, or "x,y,z x,y,z LENGTH", two points of the
-    scene and what their distance is to be. Raises DyngsError."""
+    """Parse ``--scale``: a factor, or "x,y,z x,y,z LENGTH", two points and their distance. Raises
+    DyngsError."""
     words = text.split()
     if len(words) == 3:
         now = math.dist(parse_point(words[0], "--scale"), parse_point(words[1], "--scale"))
@@ -103,43 +99,42 @@ def parse_scale(text: str) -> float:
     if not low <= factor <= high:
         what = "a factor, or two points and their distance: 'x,y,z x,y,z LENGTH'"
         raise DyngsError(
-            f"--scale: {format_one_line(repr(text), 60)} is no factor from {low:g} to {high:g}; give {what}"
+            f"--scale: {format_one_line(repr(text), 60)} is not a factor from {low:g} to {high:g}; use "
+            f"{what}"
         )
     return factor
 
 
 def fit_similarity(points: np.ndarray, wanted: np.ndarray) -> Similarity:
-    """Return the similarity that brings points nearest to where they are wanted, least squares
+    """Return the least-squares similarity from ``points`` to ``wanted``, both (P, 3) float64
     (Umeyama 1991).
 
-    ``points``, ``wanted``: (P, 3) float64. Raises DyngsError: fewer than three, or on a line: they
-    leave the rotation about it open; or a scale that no units explain.
+    Raises:
+        DyngsError: fewer than three points, points on a line, or an implausible scale.
     """
     from skimage.transform import estimate_transform
 
     if len(points) < 3:
-        raise DyngsError(
-            f"{len(points)} control points do not determine a similarity; give three or more"
-        )
+        raise DyngsError(f"{len(points)} control points are too few; use three or more")
     for rows, where in ((points, "the scene"), (wanted, "the world")):
         spread = np.linalg.svd(rows - rows.mean(axis=0), compute_uv=False)
         if not spread[1] > 1e-4 * spread[0]:
-            raise DyngsError(f"the control points lie on one line in {where}; give one beside it")
+            raise DyngsError(f"the control points lie on one line in {where}; add another point")
     found = similarity_from_matrix(estimate_transform("similarity", points, wanted).params)
     if found is None:
-        raise DyngsError("the scale would be beyond all bounds; check the units of the points")
+        raise DyngsError("the scale is implausible; check the units of the points")
     return found
 
 
 @dataclass(frozen=True)
 class GeoFrame:
-    """Control points, or positions of photos, and what follows from them.
+    """Frame determined by control points or by the GPS positions of photos.
 
     Attributes:
-        similarity: from the scene to the file.
-        lines: about the result, for people.
-        offset: (3,) to be added to positions in the file for those in the world: 0, unless these
-            are too large for float32.
+        similarity: transform from the scene to the file.
+        lines: description of the result for the user.
+        offset: (3,) to add to positions in the file to obtain world coordinates. 0 unless these are
+            too large for float32.
     """
 
     similarity: Similarity
@@ -150,7 +145,7 @@ class GeoFrame:
 def _residuals(
     similarity: Similarity, points: np.ndarray, world: np.ndarray, what: str
 ) -> tuple[np.ndarray, str]:
-    """Return the distances (P,) that remain, and a line about them; ``what`` the points are."""
+    """Return the residuals (P,), and a description of the fit of ``what``."""
     residuals = np.linalg.norm(similarity.points(points) - world, axis=1)
     each = ", ".join(f"{x:.3g}" for x in residuals[:12])
     mean = math.sqrt(float(np.square(residuals).mean()))
@@ -159,8 +154,11 @@ def _residuals(
 
 
 def control_point_frame(path: Path) -> GeoFrame:
-    """Return the frame of control points. Raises DyngsError: no such file, or they do not determine
-    it."""
+    """Return the frame of a file of control points.
+
+    Raises:
+        DyngsError: a missing file, or points that do not determine the frame.
+    """
     points, world = np.split(_control_points(path), 2, axis=1)
     try:
         found = fit_similarity(points, world)
@@ -173,15 +171,17 @@ def control_point_frame(path: Path) -> GeoFrame:
         return GeoFrame(found, (line,))
     x, y, z = (np.array(found.shift) - middle).tolist()
     a, b, c = middle.tolist()
-    note = f"offset, to be added to positions: {a:.10g} {b:.10g} {c:.10g}"
+    note = f"offset to add to positions: {a:.10g} {b:.10g} {c:.10g}"
     return GeoFrame(replace(found, shift=(x, y, z)), (line, note), (a, b, c))
 
 
 def _control_points(path: Path) -> np.ndarray:
-    """Return rows (P, 6) float64 of a text file: x y z in the scene, X Y Z in the world; first
-    names, # remarks."""
+    """Read rows (P, 6) float64 of a text file: x y z in the scene, X Y Z in the world.
+
+    A first line of names, and lines starting with #, are ignored.
+    """
     if not path.exists():
-        raise DyngsError(f"{path}: no such file; give rows of x,y,z,X,Y,Z")
+        raise DyngsError(f"{path}: no such file; it must contain rows x,y,z,X,Y,Z")
     text = re.sub("[,;]", " ", read_limited(path, _MOST_BYTES).decode("utf-8", "replace"))
     lines = [line for line in text.splitlines() if line.strip() and line.lstrip()[0] != "#"]
     if lines and lines[0].lstrip()[0].isalpha():
@@ -194,26 +194,27 @@ def _control_points(path: Path) -> np.ndarray:
             row = []
         if len(row) != 6 or not np.isfinite(row).all():
             raise DyngsError(
-                f"{path}: {format_one_line(repr(line), 60)} is not six numbers x,y,z,X,Y,Z (scene, then world)"
+                f"{path}: {format_one_line(repr(line), 60)}: expected six numbers x,y,z,X,Y,Z (scene, "
+                "world)"
             )
         rows.append(row)
     return np.array(rows, np.float64).reshape(-1, 6)
 
 
-FEWEST = 4
-MOST_TILT = 10.0  # degrees that the error of the positions may turn the scene by
-# of EXIF: where the positions are, and what makes them negative
+FEWEST = 4  # Fewest photos with a GPS position
+MOST_TILT = 10.0  # Largest uncertainty of the up direction, in degrees
+# EXIF tag of the GPS block, and its marks of negative coordinates
 _GPS, _SOUTH, _WEST = 0x8825, "S", "W"
-_RADIUS, _FLATTENING = 6378137.0, 1 / 298.257223563  # of WGS84: semi-major axis, m
-_INSTEAD = "give control points (--geo FILE), or --up and --scale"
+_RADIUS, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS84 semi-major axis in m, and flattening
+_INSTEAD = "use control points (--geo FILE), or --up and --scale"
 
 
 def gps_frame(opened: OpenedScene) -> GeoFrame:
-    """Return the frame with x east, y north, z up, in metres, by least squares of the cameras'
-    positions.
+    """Return the frame with x east, y north, z up, in metres, fitted to GPS positions of photos.
 
-    Raises DyngsError: no capture, fewer than ``FEWEST`` photos with a position, or positions so
-    near to a line, for their error, that the scene could be turned about it.
+    Raises:
+        DyngsError: no capture, fewer than ``FEWEST`` photos with a position, or positions too close
+            to a line to determine the up direction.
     """
     root = opened.capture.root
     found = []
@@ -224,7 +225,7 @@ def gps_frame(opened: OpenedScene) -> GeoFrame:
             found.append((position, -view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3]))
     if len(found) < FEWEST:
         have = f"{len(found):,} of {len(views):,} photos have a position with altitude in EXIF"
-        raise DyngsError(f"{root}: {have}, and --geo exif needs {FEWEST} or more; {_INSTEAD}")
+        raise DyngsError(f"{root}: {have}, --geo exif needs {FEWEST}; {_INSTEAD}")
     positions = np.array([position for position, _ in found])
     centres = opened.world.points(np.array([centre for _, centre in found]))
     origin = positions.mean(axis=0)
@@ -233,7 +234,7 @@ def gps_frame(opened: OpenedScene) -> GeoFrame:
         similarity = fit_similarity(centres, world)
     except DyngsError:
         raise DyngsError(
-            f"{root}: the photos stand on one line, which leaves open what is up; {_INSTEAD}"
+            f"{root}: camera positions on one line do not determine the up direction; {_INSTEAD}"
         ) from None
     residuals, line = _residuals(similarity, centres, world, "photos with a position")
     spread = np.linalg.svd(similarity.points(centres - centres.mean(0)), compute_uv=False)
@@ -241,45 +242,47 @@ def gps_frame(opened: OpenedScene) -> GeoFrame:
     tilt = math.degrees(error / spread[1])
     if tilt > MOST_TILT:
         raise DyngsError(
-            f"{root}: the photos stand too near to one line for positions that are off by {error:.2g} m: up would be "
-            f"uncertain by {tilt:.0f} degrees; {_INSTEAD}"
+            f"{root}: positions are too close to one line for errors of {error:.2g} m: up is "
+            "uncertain by "
+            f"{tilt:.0f} degrees; {_INSTEAD}"
         )
     latitude, longitude, altitude = origin.tolist()
     place = f"{latitude:.7f}, {longitude:.7f}, {altitude:.2f} m"
     notes = (
         line,
         f"x is east, y north, z up, in metres; the origin is at {place} (WGS84)",
-        f"positions are off by {error:.2g} m: up and north are good to about {tilt:.2g} degrees, the scale to "
+        f"position error {error:.2g} m; accuracy of up and north about {tilt:.2g} degrees, of "
+        "scale "
         f"{100 * error / float(np.linalg.norm(spread)):.2g} %",
     )
     return GeoFrame(similarity, notes)
 
 
 def read_gps_position(path: Path) -> Point | None:
-    """Return latitude, longitude (degrees) and altitude (m) that EXIF of a photo states; None: not
-    all of them."""
+    """Return latitude and longitude in degrees and altitude in m from the EXIF of a photo, or
+    None."""
     from PIL import Image
 
     try:
         with Image.open(path) as image:
-            told = image.getexif().get_ifd(_GPS)
+            tags = image.getexif().get_ifd(_GPS)
         latitude, longitude = (
-            float(np.dot([float(x) for x in told[key]], (1, 1 / 60, 1 / 3600))) for key in (2, 4)
+            float(np.dot([float(x) for x in tags[key]], (1, 1 / 60, 1 / 3600))) for key in (2, 4)
         )
-        altitude = float(told[6]) * (-1 if told.get(5, b"\0") in (1, b"\1") else 1)
-        latitude *= -1 if str(told[1]).upper().startswith(_SOUTH) else 1
-        longitude *= -1 if str(told[3]).upper().startswith(_WEST) else 1
-    except Exception:  # whatever is wrong with a file, it states no position then
+        altitude = float(tags[6]) * (-1 if tags.get(5, b"\0") in (1, b"\1") else 1)
+        latitude *= -1 if str(tags[1]).upper().startswith(_SOUTH) else 1
+        longitude *= -1 if str(tags[3]).upper().startswith(_WEST) else 1
+    except Exception:  # an invalid file has no position
         return None
-    # false for NaN, too
-    is_one = abs(latitude) <= 90 and abs(longitude) <= 180 and math.isfinite(altitude)
-    return (latitude, longitude, altitude) if is_one else None
+    # False for NaN
+    is_valid = abs(latitude) <= 90 and abs(longitude) <= 180 and math.isfinite(altitude)
+    return (latitude, longitude, altitude) if is_valid else None
 
 
 def east_north_up(positions: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """Return positions (P, 3), degrees and m, relative to ``origin`` (3,): (P, 3) m.
+    """Convert positions (P, 3) in degrees and m to metres east, north and up of ``origin`` (3,).
 
-    In the tangent plane of the ellipsoid, to 0.1 m at a distance of a kilometre.
+    Uses the tangent plane of the ellipsoid, accurate to 0.1 m within one kilometre.
     """
     sine = math.sin(math.radians(origin[0]))
     flat = _FLATTENING * (2 - _FLATTENING)

@@ -1,4 +1,4 @@
-"""Several still scenes in one file."""
+"""Merging of several static scenes into one file."""
 
 from __future__ import annotations
 
@@ -18,20 +18,26 @@ from dyngs.runs.opened import open_scene
 
 
 def merge_scenes(
-    splat: SplatFile, up: Sequence[float] | None, files: Sequence[Path], tell: Callable[[str], None]
+    splat: SplatFile, up: Sequence[float] | None, files: Sequence[Path], log: Callable[[str], None]
 ) -> SplatFile:
-    """Return the contents with those of more files or runs, whose up is brought to ``up`` (3,)
-    first.
+    """Return ``splat`` with the Gaussians of more files or runs, rotated so that their up is ``up``
+    (3,).
 
-    Scenes far from the origin lie as in the world. Harmonics get the largest degree of all. Raises
-    DyngsError: one cannot be read, or moves.
+    Scenes with a world offset keep their relative position. SH coefficients are padded to the
+    largest degree.
+
+    Args:
+        log: receives a line per file.
+
+    Raises:
+        DyngsError: a file cannot be read, or its scene moves.
     """
     parts = [splat.gaussians.detach()]
     for file in files:
-        other, direction = _still(file)
+        other, direction = _read_static_scene(file)
         gaussians = other.gaussians
         if any(splat.world_offset) and any(other.world_offset):
-            # then the world says how they lie to each other
+            # Both positions in the world are known.
             x, y, z = (np.array(other.world_offset) - splat.world_offset).tolist()
             between = splat.frame.after(Similarity(shift=(x, y, z))).after(other.frame.inverse())
             gaussians = between.gaussians(gaussians)
@@ -40,10 +46,11 @@ def merge_scenes(
                 gaussians
             )
         if splat_options(other) != splat_options(splat):
-            tell(
-                f"{file}: was trained for another low-pass filter ({other.mode.value}); it is drawn as the rest is"
+            log(
+                f"{file}: its low-pass filter ({other.mode.value}) is replaced by that of the "
+                "first scene"
             )
-        tell(f"{file}: {format_count(len(gaussians), 'Gaussian')} added")
+        log(f"{file}: {format_count(len(gaussians), 'Gaussian')} added")
         parts.append(gaussians.detach())
     degree = max(part.sh_degree for part in parts)
     return replace(
@@ -51,16 +58,15 @@ def merge_scenes(
     )
 
 
-def _still(file: Path) -> tuple[SplatFile, Sequence[float] | None]:
-    """Return the Gaussians of a file or a run that does not move, and the direction that is up in
-    them."""
+def _read_static_scene(file: Path) -> tuple[SplatFile, Sequence[float] | None]:
+    """Return the Gaussians of a file or static run, and their up direction."""
     if format_to_read(file) is not None:
         splat = read_splats(file, nonfinite="skip")
         return splat, None if splat.up is None else parse_axis(splat.up)
     opened = open_scene(file)
     if not opened.scene.is_static:
         raise DyngsError(
-            f"{file}: moves, and --merge adds still scenes; `dyngs export --time T` makes one of it"
+            f"{file}: --merge needs static scenes; export one time with `dyngs export --time T`"
         )
-    found = find_up_direction(opened)
-    return splats_at(opened, opened.scene, 0.0), None if found is None else found[0]
+    up = find_up_direction(opened)
+    return splats_at(opened, opened.scene, 0.0), None if up is None else up[0]

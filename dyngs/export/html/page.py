@@ -1,4 +1,4 @@
-"""Pages that show a scene in a browser: their parts, scripts and styles named by hash."""
+"""HTML pages that show a scene in a browser."""
 
 from __future__ import annotations
 
@@ -36,43 +36,42 @@ from dyngs.runs.opened import OpenedScene
 
 
 def fill_template(page: str, pieces: Mapping[str, str]) -> str:
-    """Return ``page`` with each ``{{name}}`` replaced by the piece of that name; pieces are not
-    looked into."""
-    first, *rest = page.split("{{")
+    """Return ``page`` with each ``{{name}}`` replaced by the piece of that name. Pieces are
+    inserted verbatim."""
+    first, *remaining = page.split("{{")
     text = [first]
-    for part in rest:
+    for part in remaining:
         name, after = part.split("}}", 1)
         text += [pieces[name], after]
     return "".join(text)
 
 
 def source_hash(text: str) -> str:
-    """Return how a Content-Security-Policy names an inline script or style."""
+    """Return the Content-Security-Policy hash of an inline script or style."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
 def script_safe(value: Any) -> str:
-    """Return JSON that cannot end the script element it stands in."""
+    """Return JSON that cannot close the enclosing script element."""
     return json.dumps(value, allow_nan=False).replace("<", "\\u003c")
 
 
-PAGE, ELEMENT = "index.html", "dyngs-scene.js"  # in a folder for a web server
-# pixels of the first view that a place at its target may be off where motion is fitted
-TOLERANCE = 0.25
+PAGE, ELEMENT = "index.html", "dyngs-scene.js"  # files of a folder for a web server
+TOLERANCE = 0.25  # Position error of fitted motion in pixels of the first view, at the orbit target
 
 
-MOST_VIEWS = 24  # cameras of the capture that a page offers, evenly chosen
-_RING = 8  # cameras around a scene without a capture
+MOST_VIEWS = 24  # Most cameras of the capture offered on a page
+_RING = 8  # Cameras around a scene without a capture
 
 
 @dataclass(frozen=True)
 class WrittenPage:
     """A page on disk."""
 
-    path: Path  # of it
-    num_bytes: int  # its size, with those of all files of its folder
-    header: dict[str, Any]  # what it says except for the layout
-    notes: tuple[str, ...]  # lines about what was chosen or left out
+    path: Path
+    num_bytes: int  # total size of its files
+    header: dict[str, Any]  # header of the page without the layout
+    notes: tuple[str, ...]  # remarks for the user
 
 
 def write_page(
@@ -83,16 +82,18 @@ def write_page(
     time: float = 0.0,
     views: Sequence[Cameras] = (),
 ) -> WrittenPage:
-    """Write the page of a scene, atomically: where its viewer begins, and what moves.
+    """Write a scene as a single HTML file, atomically.
 
-    ``title``: shown in a corner and in the title bar; None: the name of the run, or of the file.
-    ``views``: cameras to begin with and to go through, each a batch of one; without any, those of
-    the capture, or around the scene.
+    Args:
+        title: shown in a corner and in the title bar. None uses the name of the run or file.
+        time: initial scene time.
+        views: cameras offered on the page, each a batch of one, the first one initially. Empty uses
+            those of the capture, or an orbit.
     """
     collect_inputs(opened).require_output(path)
     lists = PackedArrays()
     header = _header(opened, time, views, lists)
-    text = _assembled(opened, header, lists, title)
+    text = _assemble_page(opened, header, lists, title)
     write_text(path, text)
     return WrittenPage(path, len(text.encode()), header, _notes(opened, header))
 
@@ -106,26 +107,31 @@ def write_page_folder(
     time: float = 0.0,
     views: Sequence[Cameras] = (),
 ) -> WrittenPage:
-    """Write a new folder for a web server: ``PAGE``, ``ELEMENT`` for other pages, and what is
-    fetched when it is seen.
+    """Write a scene as a new folder for a web server: ``PAGE``, ``ELEMENT`` for other pages, and
+    data.
 
-    That is a still scene in blocks of its levels of detail, and a long motion in chunks of time.
-    ``most``: Gaussians of a still scene that are drawn at most. Others as of ``write_page``. Raises
-    DyngsError: ``most`` of another scene, or a folder that exists already.
+    Blocks of levels of detail of a static scene, and time chunks of a long motion, are fetched when
+    needed.
+
+    Args:
+        most: largest number of Gaussians rendered of a static scene. Others as for ``write_page``.
+
+    Raises:
+        DyngsError: ``most`` for a moving scene, or the folder exists already.
     """
     require_new_folder(folder)
     lists = PackedArrays(chunked=True)
     if most is not None or opened.renderable.has_levels:
         levelled = LevelScene.from_scene(opened.renderable, most)
         colour = levelled.scene.colour
-        header = add_levels(levelled.levels, colour, lists) | _drawn(levelled.options)
+        header = add_levels(levelled.levels, colour, lists) | _render_header(levelled.options)
         header["levels"]["most"] = most
-        header |= _shown(opened, time, *_beginning(opened, views))
-        parts = block_files(levelled.levels, with_rest=colour is None)
+        header |= _view_header(opened, time, *_initial_views(opened, views))
+        parts = block_files(levelled.levels, includes_harmonics=colour is None)
     else:
         header = _header(opened, time, views, lists)
         parts = ((f"{i}.bin", chunk.deflated()) for i, chunk in enumerate(lists.chunks or ()))
-    text = _assembled(opened, header, lists, title)
+    text = _assemble_page(opened, header, lists, title)
     with atomic_folder(folder) as started:
         write_text(started / PAGE, text)
         write_text(started / ELEMENT, element_script())
@@ -139,43 +145,47 @@ def _notes(opened: OpenedScene, header: dict[str, Any]) -> tuple[str, ...]:
     notes: list[str] = []
     if opened.missing is not None:
         notes.append(
-            f"without the capture ({opened.missing}) the page begins with a view from outside"
+            f"capture not found ({opened.missing}): the page starts with a view from outside"
         )
     if any(opened.world_offset):
         offset = " ".join(f"{x:.12g}" for x in opened.world_offset)
-        notes.append(f"the scene is far from the origin: {offset} is subtracted from its positions")
+        notes.append(f"scene far from the origin: offset {offset} is subtracted")
     person = as_human_scene(opened.renderable)
     if person is not None:
         notes += person.left_out
     curves = header.get("curves", {})
     if curves.get("error"):
         error = opened.frame.scale * curves["error"]
-        fit = f"{curves['points']} control points for each of {curves['count']:,}, off by {error:.2g} units"
-        notes.append(f"splines are fitted to the motion ({fit})")
+        fit = f"{curves['count']:,} x {curves['points']} control points, error {error:.2g} units"
+        notes.append(f"motion fitted by splines ({fit})")
     return tuple(notes)
 
 
 def _header(
     opened: OpenedScene, time: float, views: Sequence[Cameras], lists: PackedArrays
 ) -> dict[str, Any]:
-    views, target = _beginning(opened, views)
+    views, target = _initial_views(opened, views)
     found = opened.renderable.page_data()
     if found is not None:
-        told, own = found
+        header, own = found
         for name, (rows, bits) in own.items():
             lists.quantised(name, rows.detach().float().numpy(), bits)
     else:
         apart = float((views[0].centers[0] - views[0].centers.new_tensor(target)).norm())
         pixel = (apart or 1.0) / float(views[0].intrinsics[0, 1, 1])
-        told = add_scene(opened.scene, lists, TOLERANCE * pixel) | _drawn(opened.scene.options)
-    return told | _shown(opened, time, views, target)
+        header = add_scene(opened.scene, lists, TOLERANCE * pixel) | _render_header(
+            opened.scene.options
+        )
+    return header | _view_header(opened, time, views, target)
 
 
-def _beginning(
+def _initial_views(
     opened: OpenedScene, views: Sequence[Cameras]
 ) -> tuple[Sequence[Cameras], list[float]]:
-    """Return the cameras to begin with and to go through, each a batch of one, and the point to
-    look at: ``views`` if there are any, else those of the capture, else around the scene."""
+    """Return the cameras of the page, each a batch of one, and the orbit target.
+
+    These are ``views`` if given, else cameras of the capture, else an orbit around the scene.
+    """
     cameras = opened.cameras
     if not views and cameras is not None:
         capture = opened.capture
@@ -194,7 +204,7 @@ def _beginning(
     return views, target.tolist()
 
 
-def _shown(
+def _view_header(
     opened: OpenedScene, time: float, views: Sequence[Cameras], target: list[float]
 ) -> dict[str, Any]:
     upward = np.array(AXES["z"]) if opened.up is None else opened.up[0]
@@ -209,7 +219,7 @@ def _shown(
     }
 
 
-def _drawn(options: RenderOptions) -> dict[str, Any]:
+def _render_header(options: RenderOptions) -> dict[str, Any]:
     return {
         "eps2d": options.eps2d,
         "alphaMin": options.alpha_min,
@@ -227,11 +237,11 @@ def _view(camera: Cameras) -> dict[str, Any]:
     }
 
 
-def _assembled(
+def _assemble_page(
     opened: OpenedScene, header: dict[str, Any], lists: PackedArrays, title: str | None
 ) -> str:
-    """Return the text of the page. All that stems from a run is escaped; scripts are allowed by
-    their hash alone."""
+    """Return the text of the page. Texts of a run are escaped, and scripts are allowed by hash
+    only."""
     if title is None:
         title = opened.name if opened.captured is not None else Path(opened.name).stem
     red, green, blue = (round(255 * min(max(x, 0.0), 1.0)) for x in header["background"])
@@ -247,7 +257,7 @@ def _assembled(
         "title": html.escape(title),
         "header": script_safe(header | {"layout": lists.layout}),
         "numbers": lists.text(),
-        "fetched": " connect-src 'self';" if fetches else "",  # nothing, but for its parts
+        "fetched": " connect-src 'self';" if fetches else "",  # only its own files
     }
     size = len(page) + sum(len(x) for x in fixed.values())
     about = format_count(header["count"], "triangle" if "texture" in header else "Gaussian")
@@ -272,8 +282,7 @@ SHADERS += ("harmonics.glsl", "triangles.vert.glsl", "triangles.frag.glsl")
 
 
 def element_script() -> str:
-    """Return the script: it needs nothing else, leaves no other name behind, and is ASCII, as pages
-    may be of any."""
+    """Return the script of the custom element: self-contained, without globals, in ASCII."""
     texts = {
         "STYLE": read_asset("scene.css"),
         "SHADERS": {name: read_asset(name) for name in SHADERS},
@@ -285,5 +294,5 @@ def element_script() -> str:
 
 
 def read_asset(name: str) -> str:
-    """Return a file of this folder."""
+    """Return the text of a file in this folder."""
     return (Path(__file__).parent / name).read_text(encoding="utf-8")

@@ -1,10 +1,10 @@
-"""The numbers that a page draws: Gaussians, what moves them, what colours them, or triangles;
-``data.js`` reads them. Motion is written as splines of a few drivers, which a program without dyngs
-can play: a driver is a control node that several Gaussians follow, or the own one of each Gaussian
-where a field has no nodes.
+"""Packed scene data of a page: Gaussians, motion, colours or triangles; read by ``data.js``.
 
-Local letters: N Gaussians, M of them moving, J joints, F frames of a clip; R rows and D columns of
-a list; S drivers, P control points, B drivers that one Gaussian follows.
+Motion is stored as splines of drivers. A driver is a control node that several Gaussians follow, or
+a single Gaussian if the field has no nodes.
+
+Local letters: N Gaussians, M moving ones, J joints, F frames of a clip; R rows and D columns of an
+array; S drivers, P control points, B drivers per Gaussian.
 """
 
 from __future__ import annotations
@@ -34,18 +34,20 @@ from dyngs.human.avatar.posing import frame_pose, pose_blend_offsets
 from dyngs.human.avatar.scene import HumanScene, as_human_scene
 from dyngs.ops.nodes import SPAN
 
-BONES = 8  # bones that a Gaussian follows on the page
-FINE = ("means", "quats")  # splines of nodes that are stored in 16 bits
-MAX_LOGIT = 15.0  # opacities beyond that of this logit are 1 to seven digits
-CHUNK_BYTES = 1 << 19  # of splines that are fetched at once, before they are deflated
-CHUNK = 256  # rows of a list that share a range for each column: neighbours in space are alike
+BONES = 8  # Joints per Gaussian on the page
+FINE = ("means", "quats")  # Splines of nodes that are stored with 16 bits
+MAX_LOGIT = 15.0  # Opacity logits are clamped to this value, which is 1 to seven digits
+CHUNK_BYTES = 1 << 19  # Bytes of splines fetched at once, before compression
+CHUNK = 256  # Rows that share a quantisation range per column; neighbouring rows are close in space
 
 
 class PackedArrays:
-    """A block of bytes to which lists are added, and where they lie in it.
+    """A block of bytes of several arrays, and their layout.
 
-    ``layout``: by name what ``data.js`` needs to know. ``chunks``: splines that are fetched when
-    they are played, all of one layout; None: everything is in the block.
+    Attributes:
+        layout: kind, size and offset of each array, by name.
+        chunks: splines that are fetched while playing, of one layout. None keeps everything in the
+            block.
     """
 
     def __init__(self, *, chunked: bool = False) -> None:
@@ -55,7 +57,7 @@ class PackedArrays:
         self._size = 0
 
     def quantised(self, name: str, values: NDArray[np.float32], bits: Literal[8, 16]) -> None:
-        """Add ``values`` (R, D) as 8 or 16 bits each: low + step * q, of each chunk and column.
+        """Add ``values`` (R, D) with 8 or 16 bits: low + step * q, per chunk and column.
 
         The error is at most half a step: the range of the chunk over 510 or 131,070.
         """
@@ -76,16 +78,16 @@ class PackedArrays:
         self._add(name, data, "quantised", values.shape, bits=bits, chunk=CHUNK)
 
     def exact(self, name: str, values: NDArray[Any]) -> None:
-        """Add ``values`` (R, D) as they are: uint8, uint16 or float32."""
+        """Add ``values`` (R, D) uint8, uint16 or float32 without quantisation."""
         data = values.astype(values.dtype.newbyteorder("<")).tobytes()
         self._add(name, data, values.dtype.name, values.shape)
 
     def deflated(self) -> bytes:
-        """Return the block as zlib writes it."""
+        """Return the block compressed by zlib."""
         return zlib.compress(b"".join(self._parts), 9)
 
     def text(self) -> str:
-        """Return the block, deflated, in base64."""
+        """Return the compressed block in base64."""
         return base64.b64encode(self.deflated()).decode("ascii")
 
     def _add(self, name: str, data: bytes, kind: str, shape: tuple[int, ...], **more: int) -> None:
@@ -97,9 +99,10 @@ class PackedArrays:
 
 
 def add_scene(scene: GaussianScene, lists: PackedArrays, tolerance: float) -> dict[str, Any]:
-    """Add the numbers of a scene to ``lists`` and return what the page needs to know about them.
+    """Add the data of a scene to ``lists``. Return the header fields of the page.
 
-    ``tolerance``: world units that a place may be off where motion is fitted.
+    Args:
+        tolerance: position error in world units up to which motion is fitted.
     """
     person = as_human_scene(scene)
     moved = field_scene_of(scene)
@@ -112,54 +115,58 @@ def add_scene(scene: GaussianScene, lists: PackedArrays, tolerance: float) -> di
         gaussians = scene.at(None)
         moving = torch.zeros(0, dtype=torch.long, device="cpu")
     order = torch.from_numpy(storage_order(_numpy(gaussians.means), moving.numpy()))
-    told: dict[str, Any] = {"count": len(scene), "frames": len(scene.times)}
-    told["moves"] = not scene.is_static
+    header: dict[str, Any] = {"count": len(scene), "frames": len(scene.times)}
+    header["moves"] = not scene.is_static
     if person is not None:
-        told |= _add_person(person, order, lists, tolerance)
+        header |= _add_person(person, order, lists, tolerance)
     elif moved is not None:
-        told |= _add_motion(moved, order, lists, tolerance)
-    with_rest = scene.colour is None
-    told |= _add_gaussians(gaussians.select(order).detach(), lists, with_rest=with_rest)
-    return told if scene.colour is None else told | _add_network(scene.colour, lists)
+        header |= _add_motion(moved, order, lists, tolerance)
+    includes_harmonics = scene.colour is None
+    header |= _add_gaussians(
+        gaussians.select(order).detach(), lists, includes_harmonics=includes_harmonics
+    )
+    return header if scene.colour is None else header | _add_network(scene.colour, lists)
 
 
 def add_levels(levels: Levels, colour: ColourNetwork | None, lists: PackedArrays) -> dict[str, Any]:
-    """Add where the blocks of ``levels`` are, and a colour network, and return what the page needs
-    to know about all.
+    """Add the block bounds of ``levels`` and a colour network. Return the header fields of the
+    page.
 
-    The page fetches the blocks, see ``block_numbers``.
+    The page fetches the blocks itself, see ``block_numbers``.
     """
     lists.exact("blocks", np.concatenate(levels.blocks).astype(np.float32))
-    coarsest = block_numbers(levels, (len(levels.levels) - 1, 0), with_rest=colour is None)
+    coarsest = block_numbers(levels, (len(levels.levels) - 1, 0), includes_harmonics=colour is None)
     sizes = [len(level) for level in levels.levels]
     known = {"sizes": sizes, "block": BLOCK, "merged": MERGED, "pixels": MAX_SPREAD_PX}
     degree = levels.levels[0].sh_degree if colour is None else 0
-    told: dict[str, Any] = {"count": sizes[0], "frames": 0, "moves": False, "degree": degree}
-    told["levels"] = known | {"layout": coarsest.layout}
-    return told if colour is None else told | _add_network(colour, lists)
+    header: dict[str, Any] = {"count": sizes[0], "frames": 0, "moves": False, "degree": degree}
+    header["levels"] = known | {"layout": coarsest.layout}
+    return header if colour is None else header | _add_network(colour, lists)
 
 
-def block_numbers(levels: Levels, block: Block, *, with_rest: bool) -> PackedArrays:
-    """Return the lists of a block, ``BLOCK`` rows each; the last ones of a block that has fewer are
-    never seen."""
+def block_numbers(levels: Levels, block: Block, *, includes_harmonics: bool) -> PackedArrays:
+    """Return the arrays of a block with ``BLOCK`` rows. Missing rows are padded with transparent
+    Gaussians."""
     gaussians = levels.block_gaussians(block)
     rows = torch.arange(BLOCK, device="cpu").clamp_max(len(gaussians) - 1)
     padded = gaussians.select(rows)
     padded.logit_opacities[len(gaussians) :] = -MAX_LOGIT
     lists = PackedArrays()
-    _add_gaussians(padded, lists, with_rest=with_rest)
+    _add_gaussians(padded, lists, includes_harmonics=includes_harmonics)
     return lists
 
 
-def block_files(levels: Levels, *, with_rest: bool) -> Iterator[tuple[str, bytes]]:
-    """Yield names and bytes of the files of all blocks, as ``levels.js`` asks for them."""
+def block_files(levels: Levels, *, includes_harmonics: bool) -> Iterator[tuple[str, bytes]]:
+    """Yield names and contents of the files of all blocks, as requested by ``levels.js``."""
     for level, balls in enumerate(levels.blocks):
         for place in range(len(balls)):
-            numbers = block_numbers(levels, (level, place), with_rest=with_rest)
+            numbers = block_numbers(levels, (level, place), includes_harmonics=includes_harmonics)
             yield f"{level}-{place}.bin", numbers.deflated()
 
 
-def _add_gaussians(gaussians: Gaussians, lists: PackedArrays, *, with_rest: bool) -> dict[str, Any]:
+def _add_gaussians(
+    gaussians: Gaussians, lists: PackedArrays, *, includes_harmonics: bool
+) -> dict[str, Any]:
     unit = torch.nn.functional.normalize(gaussians.quats, dim=1)
     logits = gaussians.logit_opacities.clamp(-MAX_LOGIT, MAX_LOGIT)
     lists.quantised("means", _numpy(gaussians.means), 16)
@@ -167,7 +174,7 @@ def _add_gaussians(gaussians: Gaussians, lists: PackedArrays, *, with_rest: bool
     lists.quantised("log_scales", _numpy(gaussians.log_scales), 8)
     lists.quantised("logit_opacities", _numpy(logits[:, None]), 8)
     lists.quantised("base", _numpy(gaussians.sh[:, 0]), 8)
-    degree = gaussians.sh_degree if with_rest else 0
+    degree = gaussians.sh_degree if includes_harmonics else 0
     if degree:
         lists.quantised("rest", _numpy(gaussians.sh[:, 1:].flatten(1)), 8)
     return {"degree": degree}
@@ -185,24 +192,23 @@ def _add_motion(
     curves = motion_splines(
         scene.field, scene.gaussians.means[scene.moving], len(scene.times), tolerance
     )
-    told: dict[str, Any] = {"curves": _add_curves(curves, mine, lists)}
+    header: dict[str, Any] = {"curves": _add_curves(curves, mine, lists)}
     if scene.filter_std is not None:
         lists.quantised("filter_std", _numpy(scene.filter_std[order][:, None]), 8)
-        told["filtered"] = True
+        header["filtered"] = True
     if scene.masks is not None:
         masks = scene.masks.select(order)
         lists.exact("masks", masks.bits.numpy())
-        told["masks"] = {"times": list(masks.times)}
-    return told
+        header["masks"] = {"times": list(masks.times)}
+    return header
 
 
 def _add_curves(curves: MotionSplines, order: Tensor, lists: PackedArrays) -> dict[str, Any]:
-    """Add splines of drivers, with the Gaussians that follow them, or their own ones, in ``order``
-    (M,)."""
+    """Add splines of drivers, with Gaussians in ``order`` (M,)."""
     count, points, _ = curves.heads["means"].shape
-    told: dict[str, Any] = {"count": count, "points": points, "moving": len(order)}
-    told["error"] = curves.error
-    has_nodes = curves.pivots is not None  # few, each of which moves many
+    header: dict[str, Any] = {"count": count, "points": points, "moving": len(order)}
+    header["error"] = curves.error
+    has_nodes = curves.pivots is not None
     splines: dict[str, tuple[Tensor, int]] = {}
     for name, x in curves.heads.items():
         bits = 32 if curves.is_steep else 16 if has_nodes and name in FINE else 8
@@ -218,15 +224,15 @@ def _add_curves(curves: MotionSplines, order: Tensor, lists: PackedArrays) -> di
             rows = torch.arange(first, first + chunk + SPAN - 1, device="cpu").clamp_max(points - 1)
             chunks.append(PackedArrays())
             _add_splines(splines, rows, chunks[-1])
-        told |= {"chunk": chunk, "layout": chunks[0].layout}
+        header |= {"chunk": chunk, "layout": chunks[0].layout}
     if curves.pivots is not None and curves.followed is not None and curves.fractions is not None:
         lists.exact("pivots", _numpy(curves.pivots))
         lists.exact("followed", curves.followed[order].numpy().astype(np.uint16))
         lists.exact("shares", _fractions(curves.fractions[order]))
     if curves.windows is not None:
         lists.quantised("windows", _numpy(curves.windows[order]), 16)
-        told |= {"edge": EDGE_WIDTH, "open": OPEN_WINDOW}
-    return told
+        header |= {"edge": EDGE_WIDTH, "open": OPEN_WINDOW}
+    return header
 
 
 def _add_splines(
@@ -259,7 +265,7 @@ def _add_person(
     lists.exact("clip_times", _numpy(clip.times[:, None]))
     lists.exact("clip_places", _numpy(torch.cat([clip.trans, clip.scale[:, None]], dim=1)))
     lists.quantised("clip_quats", quats, 16)
-    told: dict[str, Any] = {"bones": {"parents": list(skeleton.parents)}}
+    header: dict[str, Any] = {"bones": {"parents": list(skeleton.parents)}}
     if scene.shapes is not None:
 
         def offsets(time: float) -> Offsets:
@@ -267,12 +273,13 @@ def _add_person(
             return Offsets(torch.zeros_like(scene.gaussians.means) if found is None else found)
 
         heads, error = fit_splines(offsets, len(clip), tolerance)
-        told["curves"] = _add_curves(MotionSplines(heads, error=error), order, lists)
-    return told
+        header["curves"] = _add_curves(MotionSplines(heads, error=error), order, lists)
+    return header
 
 
 def _add_network(network: ColourNetwork, lists: PackedArrays) -> dict[str, Any]:
-    """Add the rows of all layers, padded to four columns, each layer's biases after its weights."""
+    """Add the weights of a colour network, padded to multiples of four, each layer's biases after
+    its weights."""
     widest = max(max(layer.weight.shape) for layer in network.layers)
     width = -(-widest // 4) * 4
     first = -(-network.layers[0].weight.shape[1] // 4) * 4
@@ -299,7 +306,7 @@ def _add_network(network: ColourNetwork, lists: PackedArrays) -> dict[str, Any]:
 
 
 def _fractions(fractions: Tensor) -> NDArray[np.uint8]:
-    """Return shares in [0, 1] as 8 bits; the page makes their sums 1 again."""
+    """Return fractions in [0, 1] with 8 bits. The page normalises them."""
     return (255 * fractions).round().numpy().astype(np.uint8)
 
 
@@ -307,28 +314,27 @@ def _numpy(x: Tensor) -> NDArray[np.float32]:
     return x.detach().float().numpy()
 
 
-SAMPLES_PER_PIECE = 3  # Times per piece at which a motion is looked at
+SAMPLES_PER_PIECE = 3  # Samples of a motion per spline piece
 FEWEST_PIECES, MOST_PIECES = 8, 256
-# Pieces, however few training times there are: between those a network moves as it likes
+# Smallest limit of pieces with few training times, between which a field may move freely
 ALWAYS_ALLOWED = 32
-# Quantile of the places' errors, root mean squares over time, that a fit keeps within its tolerance
-CHECKED = 0.95
+CHECKED = 0.95  # Quantile of position errors (RMS over time) that must be within the tolerance
 
 
 @dataclass(frozen=True)
 class MotionSplines:
-    """Offsets of S drivers, uniform cubic B-splines over the clip, and who follows them.
+    """Uniform cubic B-splines of S drivers over the clip, and the Gaussians that follow them.
 
     Attributes:
-        heads: control points (S, P, size) by attribute of ``Offsets``; always "means".
-        pivots: (S, 3) places that drivers turn about; None: S = M, and each Gaussian has its own,
-            about itself.
-        followed: (M, B) drivers of each Gaussian, B = 4; None as above.
-        fractions: (M, B) of theirs, rows sum to 1; None as above.
-        is_steep: control points lie far outside what is drawn, and are to be kept as they are.
-        windows: (M, 2) begin and end of each Gaussian's window in time (``WindowedField``); None:
-            all are always there.
-        error: of a driver's place: the quantile ``CHECKED``, in world units.
+        heads: control points (S, P, size) by attribute of ``Offsets``, always with "means".
+        pivots: (S, 3) rotation centres of drivers. None if each Gaussian is its own driver.
+        followed: (M, B) drivers of each Gaussian, B = 4. None as for ``pivots``.
+        fractions: (M, B) their weights, which sum to 1. None as for ``pivots``.
+        is_steep: control points lie far outside the visible range and are stored without
+            quantisation.
+        windows: (M, 2) start and end of each Gaussian's lifetime (``WindowedField``). None if all
+            are permanent.
+        error: quantile ``CHECKED`` of position errors of drivers, in world units.
     """
 
     heads: dict[str, Tensor]
@@ -350,7 +356,7 @@ def motion_splines(
             return replace(motion_splines(others, means, num_times, tolerance), windows=field.edges)
         case ControlNodes():
             return _curves_of_nodes(field, means)
-        case FreePrimitives():  # straight lines and parabolas
+        case FreePrimitives():  # lines and parabolas
             return MotionSplines(_fit(lambda time: field.offsets(means, time), 1), is_steep=True)
         case _:
             heads, error = fit_splines(
@@ -362,11 +368,11 @@ def motion_splines(
 def fit_splines(
     offsets_at: Callable[[float], Offsets], num_times: int, tolerance: float
 ) -> tuple[dict[str, Tensor], float]:
-    """Return control points (S, P, size), by attribute, of the splines nearest to offsets, and the
-    error of places.
+    """Return control points (S, P, size) of splines fitted to offsets, by attribute, and their
+    error.
 
-    The number of pieces is doubled until the error is within ``tolerance``, or there are two for
-    each training time.
+    The number of pieces is doubled until the error is within ``tolerance``, or there are two pieces
+    per training time.
     """
     pieces = FEWEST_PIECES
     most = min(max(2 * (num_times - 1), ALWAYS_ALLOWED), MOST_PIECES)
@@ -393,21 +399,22 @@ def _fit(offsets_at: Callable[[float], Offsets], pieces: int) -> dict[str, Tenso
 
 
 def _error(points: Tensor, offsets_at: Callable[[float], Offsets], pieces: int) -> float:
-    """Return the quantile ``CHECKED`` of the splines' distances from the places, root mean squares
-    over the pieces."""
+    """Return the quantile ``CHECKED`` of RMS position errors of the splines."""
     times = (torch.arange(pieces, dtype=torch.float64, device="cpu") + 0.5) / pieces
     apart = [
         (torch.einsum("p,spd->sd", fractions.float(), points) - offsets_at(time).means).norm(dim=1)
         for time, fractions in zip(times.tolist(), spline_basis(times, pieces), strict=True)
     ]
-    found = torch.stack(apart).square().mean(0).sqrt()
-    return float(found.sort().values[int(CHECKED * (len(found) - 1))]) if len(found) else 0.0
+    errors = torch.stack(apart).square().mean(0).sqrt()
+    return float(errors.sort().values[int(CHECKED * (len(errors) - 1))]) if len(errors) else 0.0
 
 
 def _curves_of_nodes(field: ControlNodes, means: Tensor) -> MotionSplines:
-    nodes = field.nodes_for(means)
+    nodes = field.update_nodes(means)
     more = 0, FOLLOWED - nodes.followed.shape[1]  # of which a Gaussian follows nothing
     followed, fractions = (
         torch.nn.functional.pad(x, more) for x in (nodes.followed, nodes.weights(means))
     )
-    return MotionSplines(_fit(field.at, field.num_pieces), nodes.positions, followed, fractions)
+    return MotionSplines(
+        _fit(field.offsets_of_nodes, field.num_pieces), nodes.positions, followed, fractions
+    )

@@ -1,2 +1,1 @@
-"""People with their skeleton in files of other programs: skinned, textured meshes, and Gaussians
-with joints."""
+"""Export of people with their skeleton: skinned textured meshes, and Gaussians with joints."""

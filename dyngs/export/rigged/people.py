@@ -1,8 +1,8 @@
-"""People with their skeleton in files of other programs: skinned, textured meshes, and Gaussians at
-rest with joints and weights.
+"""Export of people with their skeleton: skinned, textured meshes, and Gaussians with joints and
+weights.
 
 Local letters: M vertices and T triangles of the template, V vertices of the mesh, J joints, N
-Gaussians, F frames, K joints that one Gaussian follows.
+Gaussians, F frames, K joints per Gaussian.
 """
 
 from __future__ import annotations
@@ -52,18 +52,21 @@ from dyngs.ops.quaternions import align_quat_signs
 from dyngs.runs.checkpoint import LoadedRun
 from dyngs.runs.folder import collect_inputs
 
-_MOST_ROWS = 4000  # anchors whose places determine the shape; each gives three equations
+_MOST_ROWS = 4000  # Most anchors used to fit the shape; each gives three equations
 
 
 def body_mesh(body: BodyTemplate) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the mesh of a template, whose vertices are doubled at the seams of its atlas: texture
-    coordinates (V, 2), triangles (T, 3) and the template's vertex (V,) that each is a copy of.
+    """Return the mesh of a template with vertices duplicated at UV seams.
 
-    Raises DyngsError: it has no texture coordinates.
+    Returns:
+        UV coordinates (V, 2), triangles (T, 3), and template vertices (V,) of the mesh vertices.
+
+    Raises:
+        DyngsError: the template has no UV coordinates.
     """
     if body.uv is None or body.uv_faces is None:
         raise DyngsError(
-            f"the body template '{body.name}' has no texture coordinates; train with model.uv=FILE.obj for a mesh"
+            f"body template '{body.name}' has no UV coordinates; train with model.uv=FILE.obj"
         )
     pairs = body.faces.flatten() * len(body.uv) + body.uv_faces.flatten()
     corners, inverse = torch.unique(pairs, return_inverse=True)
@@ -72,18 +75,18 @@ def body_mesh(body: BodyTemplate) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def rest_vertices(scene: HumanScene, body: BodyTemplate) -> Tensor:
-    """Return the template's vertices (M, 3) at rest in the shape of a trained person.
+    """Return the template vertices (M, 3) in rest pose, in the shape of a trained person.
 
-    Runs hold no shape parameters, but joints and points of the surface, which are linear in these:
-    they follow by least squares, exactly. Raises DyngsError: the template is not the one that the
-    person was trained on.
+    Runs store joints and surface points, which are linear in the shape parameters. These are
+    recovered by least squares.
+
+    Raises:
+        DyngsError: not the template that the person was trained on.
     """
     anchors = scene.anchors
     joints = scene.skeleton.joints
     if joints.shape != body.joints.shape or int(anchors.face.max()) >= len(body.faces):
-        raise DyngsError(
-            f"the template '{body.name}' is not the one that this person was trained on"
-        )
+        raise DyngsError(f"body template '{body.name}' is not the one this person was trained on")
     if body.shape_dirs is None or body.joint_shape_dirs is None:
         return body.vertices
     rows = torch.nonzero(anchors.height == 0)[:, 0]  # on the skin
@@ -100,57 +103,57 @@ def rest_vertices(scene: HumanScene, body: BodyTemplate) -> Tensor:
 
 
 def surface_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Return outward unit normals (M, 3) at vertices, of the triangles around each, weighted by
-    area."""
+    """Return area-weighted outward unit normals (M, 3) at vertices."""
     return torch.from_numpy(vertex_normals(vertices.numpy(), faces.numpy())).float()
 
 
 def anchor_normals(anchors: Anchors, body: BodyTemplate, vertices: Tensor) -> Tensor:
-    """Return unit normals (N, 3) of the surface ``vertices`` (M, 3) below the Gaussians at rest."""
+    """Return unit normals (N, 3) of the surface with ``vertices`` (M, 3) at the anchors of the
+    Gaussians."""
     around = surface_normals(vertices, body.faces)[body.faces[anchors.face]]
     return torch.nn.functional.normalize((anchors.barycentric[..., None] * around).sum(1), dim=-1)
 
 
-_FLOOR_FRAMES = 64  # frames, evenly spread, in which the lowest vertex is looked for
-_STILL = 1e-6
+_FLOOR_FRAMES = 64  # Most frames in which the lowest vertex is searched
+_STILL = 1e-6  # Smaller rotations and scale changes are not animated
 
 
 @dataclass(frozen=True)
 class Rig:
-    """A skeleton at rest in the axes of the file: y up, facing +z, soles at y = 0."""
+    """A skeleton in rest pose in the axes of the file: y up, facing +z, soles at y = 0."""
 
-    skeleton: Skeleton  # in m, as the person was trained
+    skeleton: Skeleton  # in m
     scale: float  # world units of the capture per metre of the template
-    rise: float  # what is added to y after scaling
+    rise: float  # offset of y after scaling
 
     @property
     def joints(self) -> Tensor:
-        """Joints (J, 3) in the file."""
-        return self.placed(self.skeleton.joints)
+        """Joints (J, 3) in the axes of the file."""
+        return self.to_file_axes(self.skeleton.joints)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the joints: those of SMPL-X, and hands for SMPL's last two."""
+        """Names of the joints: those of SMPL-X, with hands for the last two of SMPL."""
         count = len(self.skeleton.joints)
         known = [JOINT_NAMES[row] for row in SMPLX_ROWS[count]]
         return (*known, *("left_hand", "right_hand")[: count - len(known)])
 
-    def placed(self, points: Tensor) -> Tensor:
-        """Return points (..., 3) at rest, m, in the file."""
+    def to_file_axes(self, points: Tensor) -> Tensor:
+        """Transform points (..., 3) in rest pose, in m, to the axes of the file."""
         moved = self.scale * points
         moved[..., 1] += self.rise
         return moved
 
 
 def build_rig(scene: HumanScene, vertices: Tensor) -> Rig:
-    """Return the rig of a person whose surface at rest has ``vertices`` (V, 3), m."""
+    """Return the rig of a person with rest-pose surface ``vertices`` (V, 3) in m."""
     scale = float(scene.clip.scale.mean()) * float(np.exp(scene.fit.log_scale))
     return Rig(scene.learned_skeleton, scale, -scale * float(vertices[:, 1].amin()))
 
 
 @dataclass(frozen=True)
 class AnimationInfo:
-    """The motion that a file shows: its name and frame rate; the run plays it."""
+    """Name and frame rate of the exported motion, which the run plays."""
 
     name: str
     fps: float
@@ -164,11 +167,13 @@ def add_animation(
     weights: Tensor,
     played: AnimationInfo,
 ) -> None:
-    """Add the motion that a person plays, y up, on the floor y = 0, around the origin, as an
-    animation of the joints, which are the first nodes; joints that never turn have no channel.
+    """Add the motion of a person as an animation of the joints, which are the first nodes.
 
-    ``vertices``: (V, 3) at rest, m, of which the lowest one stands on the floor. ``weights``: (V,
-    J).
+    It is y up, on the floor y = 0, around the origin. Joints without rotation have no channel.
+
+    Args:
+        vertices: (V, 3) in rest pose, in m, used to find the floor.
+        weights: (V, J) skinning weights.
     """
     joints = rig.skeleton.joints
     parents = rig.skeleton.parents
@@ -187,7 +192,7 @@ def add_animation(
     quats = align_quat_signs(quats)
     scale = clip.scale.double().numpy() / rig.scale
     channels = [(0, "translation", root)]
-    if np.abs(scale - 1).max() > _STILL:  # not of a person who keeps the size
+    if np.abs(scale - 1).max() > _STILL:
         channels.append((0, "scale", np.repeat(scale[:, None], 3, axis=1)))
     for joint in range(quats.shape[1]):
         if np.abs(quats[:, joint, :3]).max() > _STILL:
@@ -196,8 +201,10 @@ def add_animation(
 
 
 def add_person(document: GlbDocument, rig: Rig, primitive: dict[str, Any], extension: str) -> None:
-    """Add a node with a mesh of one ``primitive``, a skin, and the nodes of the joints, which are
-    the first ones, below one called Armature."""
+    """Add a mesh of one ``primitive``, a skin, and joint nodes below a node called Armature.
+
+    The joints are the first nodes.
+    """
     joints = rig.joints.double()
     parents = rig.skeleton.parents
     nodes: list[dict[str, Any]] = []
@@ -210,7 +217,7 @@ def add_person(document: GlbDocument, rig: Rig, primitive: dict[str, Any], exten
     nodes.append({"name": "Armature", "children": roots})
     nodes.append({"name": "person", "mesh": 0, "skin": 0})
     bind = np.tile(np.eye(4, dtype=np.float32), (len(joints), 1, 1))
-    bind[:, 3, :3] = -joints.numpy()  # columns first
+    bind[:, 3, :3] = -joints.numpy()  # column-major
     skin = {
         "joints": list(range(len(joints))),
         "inverseBindMatrices": document.add_numbers(bind.reshape(-1, 16)),
@@ -227,8 +234,8 @@ def add_person(document: GlbDocument, rig: Rig, primitive: dict[str, Any], exten
 
 
 def add_weights(document: GlbDocument, weights: Tensor) -> dict[str, int]:
-    """Add the joints and weights (V, J) of vertices; return the accessors by attribute, the
-    heaviest four first."""
+    """Add joints and weights (V, J) of vertices, heaviest first. Return the accessors by
+    attribute."""
     joints, fractions = heaviest_joints(weights)
     missing = -fractions.shape[1] % 4
     joints, fractions = (torch.nn.functional.pad(x, (0, missing)) for x in (joints, fractions))
@@ -243,18 +250,23 @@ def add_weights(document: GlbDocument, weights: Tensor) -> dict[str, int]:
     return found
 
 
-_FINER = 4  # texels of the texture per texel of the model's atlas, along a side
-_LARGEST = 2048  # texels along a side of the largest texture
-_MOST_SAMPLES = 512  # texels along a side of the atlas from which the surface is moved
+_FINER = 4  # Texels of the texture per texel of the UV map of the model, along a side
+_LARGEST = 2048  # Largest side of the texture in texels
+_MOST_SAMPLES = 512  # Largest side in texels of the UV map from which the surface is displaced
 
 
 def write_mesh(run: LoadedRun, path: Path, played: AnimationInfo | None = None) -> tuple[str, ...]:
-    """Write the person of a run or avatar file as a skinned mesh with a texture, in T-pose, y up,
-    facing +z; return a line about each thing that was chosen, or that glTF cannot hold.
+    """Write the person of a run or avatar file as a skinned, textured mesh in T-pose, y up, facing
+    +z.
 
-    The size is that of the capture; the soles stand at y = 0. Colours have the light of the capture
-    in them, hence a material without light. ``played`` becomes an animation. Raises DyngsError: not
-    the run of a person, or its template is missing or without texture coordinates.
+    The size is that of the capture, with soles at y = 0. The material is unlit, since colours
+    contain the lighting of the capture. ``played`` is added as an animation.
+
+    Returns:
+        notes about choices, and about properties that glTF cannot store.
+
+    Raises:
+        DyngsError: not the run of a person, or a missing template or UV map.
     """
     scene, body = person_and_template(run, "--format mesh")
     collect_inputs(run).require_output(path)
@@ -275,52 +287,51 @@ def write_mesh(run: LoadedRun, path: Path, played: AnimationInfo | None = None) 
             add_animation(document, scene, rig, surface.vertices, body.weights, played)
     with atomic_file(path) as temporary:
         document.write(temporary)
-    moved = "that of the template" if surface.margin is None else "moved to the Gaussians"
+    moved = "of the template" if surface.margin is None else "fitted to the Gaussians"
     unseen = 100 * float((baked.alpha < SEEN).float().mean())
     notes = [
-        f"texture of {len(image)} x {len(image)}; {unseen:.1f} % of the body is not seen in the Gaussians and has "
-        "colours from around it or from its mirror side",
-        f"the surface is {moved}: silhouettes agree at {surface.agreement:.3f} (intersection over union), those of the "
-        f"template as it is at {surface.plain:.3f}",
+        f"texture {len(image)} x {len(image)}; {unseen:.1f} % of the body is unseen and filled "
+        "from its "
+        "surroundings or its mirror side",
+        f"surface {moved}: silhouette IoU {surface.agreement:.3f} (template: {surface.plain:.3f})",
     ]
     if scene.shapes is not None:
-        notes.append("offsets that depend on the pose are left out: glTF's skins have none")
+        notes.append("pose-dependent offsets are not exported: glTF skins have none")
     return (*notes, *scene.left_out)
 
 
 def person_and_template(run: LoadedRun, wanted: str) -> tuple[HumanScene, BodyTemplate]:
-    """Return the person of a run and its template.
+    """Return the person of a run and its body template.
 
-    Raises DyngsError: the run is not that of a person, or the template cannot be read.
+    Raises:
+        DyngsError: not the run of a person, or an unreadable template.
     """
     scene = as_human_scene(run.scene)
     model = run.config.model
     if scene is None or capability(model, HasBody) is None:
-        raise DyngsError(
-            f"{wanted} needs the run of a person (model.kind=human), this one is {model.kind}"
-        )
+        raise DyngsError(f"{wanted} needs a run of a person (model.kind=human), not {model.kind}")
     return scene, load_template(cast(HumanModel, model))
 
 
 def texture_size(scene: HumanScene) -> int:
-    """Return the texels along a side of the texture, by the distance of most anchors in the
-    atlas."""
+    """Return the side of the texture in texels, from the spacing of most anchors in the UV map."""
     columns, counts = scene.anchors.uv[:, 0].unique(return_counts=True)
-    columns = columns[2 * counts >= counts.double().quantile(0.75)]  # without those of finer texels
+    columns = columns[
+        2 * counts >= counts.double().quantile(0.75)
+    ]  # without columns of finer texels
     finest = float(columns.diff().min()) if len(columns) > 1 else 1.0
     return min(_FINER * max(round(1 / finest), 1), _LARGEST)
 
 
 def mesh_document(body: BodyTemplate, rig: Rig, vertices: Tensor, image: np.ndarray) -> GlbDocument:
-    """Return a mesh over ``vertices`` (M, 3) at rest with its skeleton and texture as a glTF
-    document."""
+    """Return a glTF document of a mesh with rest-pose ``vertices`` (M, 3), skeleton and texture."""
     from PIL import Image
 
     document = GlbDocument()
     uv, faces, source = body_mesh(body)
     normals = surface_normals(vertices, body.faces)[source]
     uv = torch.stack([uv[:, 0], 1 - uv[:, 1]], dim=1)
-    places = rig.placed(vertices[source]).float().numpy()
+    places = rig.to_file_axes(vertices[source]).float().numpy()
     kind = np.uint16 if len(source) < 2**16 - 1 else np.uint32
     primitive = {
         "attributes": {
@@ -352,13 +363,18 @@ def mesh_document(body: BodyTemplate, rig: Rig, vertices: Tensor, image: np.ndar
 def write_rigged_splats(
     run: LoadedRun, path: Path, played: AnimationInfo | None = None
 ) -> tuple[str, ...]:
-    """Write the person of a run or avatar file at rest, with skinning weights: T-pose, y up, facing
-    +z, soles at y = 0; return a line about each thing that the file cannot hold.
+    """Write the Gaussians of a person in rest pose with skinning weights: T-pose, y up, facing +z,
+    soles at y = 0.
 
-    ``.ply``: columns ``joint_0`` to ``joint_7`` (heaviest first) and ``weight_0`` to ``weight_7``
-    after those of 3DGS, and a comment ``joint INDEX NAME PARENT X Y Z`` for each joint. ``.glb``:
-    KHR_gaussian_splatting with a skin, and ``played`` as an animation. Raises DyngsError: not the
-    run of a person, or its template is missing.
+    A .ply has columns ``joint_0`` to ``joint_7`` (heaviest first) and ``weight_0`` to ``weight_7``
+    after those of 3DGS, and a comment ``joint INDEX NAME PARENT X Y Z`` per joint. A .glb uses
+    KHR_gaussian_splatting with a skin, and ``played`` as an animation.
+
+    Returns:
+        notes about properties that the file cannot store.
+
+    Raises:
+        DyngsError: not the run of a person, or a missing template.
     """
     scene, body = person_and_template(run, "--joints")
     collect_inputs(run).require_output(path)
@@ -369,14 +385,12 @@ def write_rigged_splats(
     if scene.colour is not None:
         colours = frontal_colours(scene, anchor_normals(scene.anchors, body, vertices))
         gaussians = gaussians.replace(sh=((colours - 0.5) / SH_C0)[:, None])
-        notes = (
-            "the colours of the run are a network; the file has those seen from straight above the skin",
-        )
+        notes = ("colours of the network are exported for views perpendicular to the skin",)
     if scene.shapes is not None:
-        notes = (*notes, "offsets that depend on the pose are left out: skinning weights hold none")
+        notes = (*notes, "pose-dependent offsets are not exported")
     notes = (*notes, *scene.left_out)
     gaussians = gaussians.replace(
-        means=rig.placed(gaussians.means),
+        means=rig.to_file_axes(gaussians.means),
         log_scales=gaussians.log_scales + float(np.log(rig.scale)),
     )
     require_writable(path, gaussians)
@@ -389,7 +403,7 @@ def write_rigged_splats(
             add_animation(document, scene, rig, vertices, body.weights, played)
         with atomic_file(path) as temporary:
             document.write(temporary)
-        unsure = "KHR_gaussian_splatting does not say whether skins turn Gaussians: viewers may show the rest pose"
+        unsure = "KHR_gaussian_splatting does not define skinning: viewers may show the rest pose"
         return (*notes, unsure)
     joints, weights = heaviest_joints(scene.weights)
     columns = {f"joint_{k}": joints[:, k].numpy() for k in range(joints.shape[1])}

@@ -1,6 +1,6 @@
-"""The template's surface moved to where the Gaussians are: clothes, hair, shoes.
+"""Body template surface displaced to the Gaussians, to include clothes, hair and shoes.
 
-Local letters: M vertices, T triangles, P samples of the surface, N Gaussians.
+Local letters: M vertices, T triangles, P surface samples, N Gaussians.
 """
 
 from __future__ import annotations
@@ -24,48 +24,49 @@ from dyngs.human.body.atlas import Texels
 from dyngs.human.body.body import BodyTemplate
 from dyngs.human.body.mesh import rasterize
 
+# Tried distances in m from the uppermost Gaussian centres to the surface
 MARGINS = (0.0, 0.004, 0.008, 0.012, 0.016)
-"""Distances, m, from the uppermost Gaussians to the surface that are tried: Gaussians reach beyond
-their centres."""
-_BOUNDS = (-0.02, 0.06)  # least and greatest displacement, m
-_SMOOTH = 0.01  # standard deviation, m, of the weights by which displacements are averaged
-_NEAR = 64  # samples that displace a vertex
+_BOUNDS = (-0.02, 0.06)  # Smallest and largest displacement, m
+_SMOOTH = 0.01  # Standard deviation in m of the weights that average displacements
+_NEAR = 64  # Samples averaged per vertex
+# Heights in m above a sample at which the body itself excludes the sample (mouth, eye sockets)
 _FOLDS = (0.01, 0.02, 0.03)
-"""Distances, m, above a sample at which the body must not be for the sample to count: mouth, eye
-sockets."""
-_SIZE = 256
+_SIZE = 256  # Side of silhouette images in pixels
+# View directions of silhouettes around the body
 _ANGLES = (0.0, math.pi / 4, math.pi / 2, 3 * math.pi / 4)
-"""Silhouettes that are compared: pixels along a side, and directions around the body."""
 
 
 @dataclass(frozen=True)
 class FittedSurface:
-    """Vertices (M, 3) at rest, m, and how well silhouettes agree with those of the Gaussians."""
+    """Displaced rest-pose vertices, and the agreement of silhouettes with those of the
+    Gaussians."""
 
-    vertices: Tensor  # (M, 3)
-    # the distance of ``MARGINS`` that was taken; None: the template as it is agrees better
+    vertices: Tensor  # (M, 3) in m
+    # chosen distance of ``MARGINS``, or None for the undisplaced template
     margin: float | None
-    agreement: float  # intersection over union of the silhouettes
-    plain: float  # the same for the template as it is
+    agreement: float  # intersection over union of silhouettes
+    plain: float  # the same for the undisplaced template
 
 
 def fit_surface(
     gaussians: Gaussians, body: BodyTemplate, vertices: Tensor, samples: Texels, baked: BakedTexels
 ) -> FittedSurface:
-    """Return the surface whose silhouettes agree best with the Gaussians', of the template's and
-    some moved ones.
+    """Return the surface whose silhouettes agree best with those of the Gaussians.
 
-    A vertex is displaced by the mean displacement of the samples around it in space, along their
-    normals, up to what is seen there. ``vertices`` (M, 3) are at rest in the person's shape.
+    The template and surfaces displaced by several margins are compared. A vertex is displaced by
+    the mean displacement of nearby samples along their normals.
+
+    Args:
+        vertices: (M, 3) in rest pose, in the shape of the person.
     """
     cameras = _cameras(vertices)
     shown = render(gaussians, cameras, RenderOptions()).alpha.numpy() > 0.5
     plain = _agreement(vertices, body, cameras, shown)
-    found = FittedSurface(vertices, None, plain, plain)
+    best = FittedSurface(vertices, None, plain, plain)
     counts = _on_largest_part(body)[samples.faces] & (baked.alpha >= SEEN)
-    rows = torch.nonzero(counts & ~_folded(body, vertices, samples))[:, 0]
+    rows = torch.nonzero(counts & ~_faces_body(body, vertices, samples))[:, 0]
     if not len(rows):
-        return found
+        return best
     count = min(_NEAR, len(rows))
     distance, at = (
         torch.from_numpy(x.reshape(len(vertices), count))
@@ -80,14 +81,13 @@ def fit_surface(
         along = (weights[..., None] * (height[:, None] * samples.normals)[near]).sum(1)
         moved = vertices + torch.where(total > 1e-12, along / total.clamp_min(1e-12), 0.0)
         agreement = _agreement(moved, body, cameras, shown)
-        if agreement > found.agreement:
-            found = FittedSurface(moved, margin, agreement, plain)
-    return found
+        if agreement > best.agreement:
+            best = FittedSurface(moved, margin, agreement, plain)
+    return best
 
 
 def _on_largest_part(body: BodyTemplate) -> Tensor:
-    """Return whether each of T triangles belongs to the largest connected part: eyes and tongue do
-    not."""
+    """Return (T,) bool, triangles of the largest connected part, without eyes and tongue."""
     count = len(body.vertices)
     ends = body.faces.repeat(1, 2)[:, [0, 1, 1, 2]].reshape(-1, 2).numpy()
     edges = coo_array((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
@@ -95,8 +95,8 @@ def _on_largest_part(body: BodyTemplate) -> Tensor:
     return part == part.bincount().argmax()
 
 
-def _folded(body: BodyTemplate, vertices: Tensor, samples: Texels) -> Tensor:
-    """Return whether each of P samples faces the body itself at a small distance."""
+def _faces_body(body: BodyTemplate, vertices: Tensor, samples: Texels) -> Tensor:
+    """Return (P,) bool, samples that face the body itself at a small distance."""
     corners = vertices[body.faces]
     a, b, c = corners.unbind(1)
     normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a, dim=-1), dim=-1)
@@ -113,7 +113,7 @@ def _folded(body: BodyTemplate, vertices: Tensor, samples: Texels) -> Tensor:
 
 
 def _cameras(vertices: Tensor) -> Cameras:
-    """Return cameras around the body, upright, at eye level of its middle."""
+    """Return upright cameras around the body, at the height of its middle."""
     lowest = vertices.amin(0).double().numpy()
     highest = vertices.amax(0).double().numpy()
     middle = (lowest + highest) / 2
@@ -132,8 +132,8 @@ def _cameras(vertices: Tensor) -> Cameras:
 
 
 def _agreement(vertices: Tensor, body: BodyTemplate, cameras: Cameras, shown: np.ndarray) -> float:
-    """Return intersection over union of silhouettes of the mesh with those ``shown`` (V, H, W) from
-    all cameras."""
+    """Return the intersection over union of mesh silhouettes with silhouettes ``shown`` (V, H,
+    W)."""
     common = either = 0
     for pose, intrinsics, mask in zip(
         cameras.cam_from_world, cameras.intrinsics, shown, strict=True

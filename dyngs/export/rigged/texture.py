@@ -1,5 +1,4 @@
-"""The texture of a person: what the Gaussians at rest look like from straight above each texel of
-the atlas.
+"""Texture of a person, baked from rest-pose Gaussians along the normal of each texel.
 
 Local letters: N Gaussians, P texels, K Gaussians near a texel.
 """
@@ -23,38 +22,36 @@ from dyngs.human.motion.placement import rest_clip
 from dyngs.ops.harmonics import harmonics_basis
 from dyngs.ops.quaternions import rotation_matrices
 
-_NEAR = 20  # Gaussians that are looked for at each height above a texel
+_NEAR = 20  # Gaussians searched at each height above a texel
+# Search heights in m: below the skin, on it, in clothes and hair
 _HEIGHTS = (-0.015, 0.005, 0.025, 0.05)
-"""Heights, m, where they are looked for: below the skin, on it, in clothes and hair."""
-_REACH = (-0.04, 0.07)  # heights, m, between which Gaussians belong to a texel
+_REACH = (-0.04, 0.07)  # Heights in m between which Gaussians belong to a texel
+# Smallest cosine between normals of a texel and its Gaussians, so that arms do not colour the trunk
 _FACING = 0.3
-"""Least cosine between the normals of a texel and of a Gaussian that belongs to it: arms do not
-colour the trunk."""
-_TOP = 0.1  # fraction of what is seen from which a texel counts as covered
-_CHUNK = 8192
-SEEN = 0.1  # opacity from which a texel has a colour of its own
-_MIRROR = 0.02  # distance, m, within which the mirror image of a texel is looked for
-_GAP = 0.015  # distance, m, to what is seen, up to which a texel lies in a small gap
-_AROUND = 16  # texels that colour one in a gap, or one that is not seen on either side
+_TOP = 0.1  # Fraction of the blended opacity that defines the height of the surface
+_CHUNK = 8192  # Texels processed at once
+SEEN = 0.1  # Opacity above which a texel counts as seen
+_MIRROR = 0.02  # Search radius in m around the mirror image of a texel
+_GAP = 0.015  # Distance in m to seen texels below which a gap is filled from its surroundings
+_AROUND = 16  # Texels averaged to fill a gap
 
 
 @dataclass(frozen=True)
 class BakedTexels:
-    """What is seen straight above P texels."""
+    """Colour, opacity and height of P texels."""
 
-    rgb: Tensor  # (P, 3) in [0, 1], display-referred as the images were
+    rgb: Tensor  # (P, 3) in [0, 1], in the colour space of the images
     alpha: Tensor  # (P,) opacity
-    # (P,) height above the surface at rest, m, of the Gaussian at which a tenth of what is seen is
-    # reached
+    # (P,) height in m above the rest surface at which a tenth of the opacity is reached
     top: Tensor
 
 
 def bake_texels(scene: HumanScene, texels: Texels, normals: Tensor) -> BakedTexels:
-    """Return what the Gaussians at rest show along the normal of each texel, blended from the
-    outside in.
+    """Blend the rest-pose Gaussians along the normal of each texel, from outside to inside.
 
-    ``texels``: P of the template in the person's shape. ``normals``: (N, 3) of the surface below
-    each Gaussian at rest.
+    Args:
+        texels: P texels of the template in the shape of the person.
+        normals: (N, 3) surface normals at the Gaussians in rest pose.
     """
     colours = frontal_colours(scene, normals)
     gaussians = scene.gaussians
@@ -76,13 +73,12 @@ def bake_texels(scene: HumanScene, texels: Texels, normals: Tensor) -> BakedTexe
         belongs = (height > _REACH[0]) & (height < _REACH[1])
         belongs &= (normals[near] * along[:, None]).sum(-1) > _FACING
         belongs[:, 1:] &= near[:, 1:] != near[:, :-1]
-        parts.append(_blended(torch.where(belongs, alpha, 0.0), height, colours[near]))
+        parts.append(_blend(torch.where(belongs, alpha, 0.0), height, colours[near]))
     return BakedTexels(*(torch.cat(x) for x in zip(*parts, strict=True)))
 
 
 def frontal_colours(scene: HumanScene, normals: Tensor) -> Tensor:
-    """Return the colours (N, 3) of Gaussians seen against ``normals`` (N, 3) at rest; a network's,
-    in the rest pose."""
+    """Return the colours (N, 3) of Gaussians viewed against ``normals`` (N, 3) in rest pose."""
     gaussians = scene.gaussians
     seen_along = -normals
     if scene.colour is not None:
@@ -103,8 +99,8 @@ def frontal_colours(scene: HumanScene, normals: Tensor) -> Tensor:
 
 
 def _neighbours(places: KDTree, points: Tensor, along: Tensor) -> Tensor:
-    """Return the Gaussians (P, K) near and above ``points`` (P, 3), ascending; some more than
-    once."""
+    """Return indices (P, K) of Gaussians near and above ``points`` (P, 3), ascending, with
+    duplicates."""
     count = min(_NEAR, places.n)
     found = [
         places.query((points + h * along).numpy(), k=count)[1].reshape(len(points), count)
@@ -113,9 +109,9 @@ def _neighbours(places: KDTree, points: Tensor, along: Tensor) -> Tensor:
     return torch.from_numpy(np.sort(np.concatenate(found, axis=1), axis=1))
 
 
-def _blended(alpha: Tensor, height: Tensor, colours: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return colours (P, 3), opacity (P,) and top (P,) of (P, K) Gaussians blended from the highest
-    down."""
+def _blend(alpha: Tensor, height: Tensor, colours: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Blend (P, K) Gaussians from the highest down. Return colours (P, 3), opacity (P,) and top
+    (P,)."""
     order = height.argsort(dim=1, descending=True, stable=True)
     alpha = alpha.gather(1, order)
     height = height.gather(1, order)
@@ -129,11 +125,10 @@ def _blended(alpha: Tensor, height: Tensor, colours: Tensor) -> tuple[Tensor, Te
 
 
 def fill_unseen(baked: BakedTexels, texels: Texels) -> Tensor:
-    """Return colours (P, 3) of all texels: small gaps from around them, else those of the mirror side,
-    else what is nearest.
+    """Return colours (P, 3) of all texels, with unseen ones filled.
 
-    Texels count as the same surface where their normals agree, so that an arm does not colour the
-    trunk.
+    Small gaps are filled from their surroundings, others from the mirror side, else from the
+    nearest texels. Only texels with similar normals are used.
     """
     seen = baked.alpha >= SEEN
     rgb = baked.rgb.clone()
@@ -159,10 +154,10 @@ def fill_unseen(baked: BakedTexels, texels: Texels) -> Tensor:
 
 
 def texture_image(rgb: Tensor, texels: Texels) -> np.ndarray:
-    """Return the atlas (S, S, 3) uint8; what no triangle covers has the colour of the nearest
-    texel.
+    """Return the texture (S, S, 3) uint8. Uncovered texels have the colour of the nearest covered
+    one.
 
-    So neither interpolation nor smaller copies of the image show seams.
+    This avoids seams with interpolation and mipmaps.
     """
     size = texels.resolution
     image = np.zeros((size * size, 3), np.float32)
@@ -179,6 +174,5 @@ def texture_image(rgb: Tensor, texels: Texels) -> np.ndarray:
 
 
 def _with_normals(points: Tensor, normals: Tensor) -> np.ndarray:
-    """Return (P, 6): places and normals, where opposite normals are as far apart as points at 10
-    cm."""
+    """Return (P, 6): positions, and normals scaled so that opposite ones are 10 cm apart."""
     return torch.cat([points, 0.05 * normals], dim=1).double().numpy()

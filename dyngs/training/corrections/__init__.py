@@ -1,1 +1,1 @@
-"""Corrections of a capture that training finds: exposure, cameras, and masks of what disagrees."""
+"""Per-image corrections learned during training: exposure, camera refinement and robust masks."""

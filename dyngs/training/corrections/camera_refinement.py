@@ -1,10 +1,9 @@
-"""Refinement of the training cameras while the scene is trained: poses, focal lengths and principal
-points.
+"""Joint refinement of camera poses, focal lengths and principal points during training.
 
-Poses found from images are wrong by some pixels now and then, which blurs the scene. The
-rasterizer's gradients say how each camera should move (as in BARF, Lin et al. 2021). Scene and
-cameras together could move, turn and grow without any change of the images; corrections never
-contain such a common motion, so that test cameras stay where they are.
+Poses estimated from images may be off by a few pixels, which blurs the scene. They are refined with
+the gradients of the rasterizer, as in BARF (Lin et al. 2021). A similarity of the scene and all
+cameras changes no image. Corrections never contain this gauge freedom, so test cameras stay aligned
+with the scene.
 """
 
 from __future__ import annotations
@@ -30,39 +29,38 @@ from dyngs.ops.adam import Count, adam_step_
 from dyngs.ops.loss import l1_ssim_loss
 from dyngs.ops.quaternions import rotation_matrices
 
+# Fraction of the run before refinement starts, since an untrained scene gives useless gradients
 STARTS = 0.05
-"""Fraction of the run in which cameras stay as they are: a scene that is not there yet says nothing
-about them."""
+# Initial and final learning rate of poses, in rad and as a fraction of the scene extent, log-linear
+# in between
 FIRST_RATE, LAST_RATE = 3e-3, 1e-5
-"""Learning rates after ``STARTS`` and at the end, rad, and as a fraction of the scene's size;
-log-linear between."""
+# Learning rate of intrinsics over that of poses; a shared lens is updated in every step
 LENS_RATE = 0.01
-"""Rate of focal lengths and principal points, as a fraction of that of poses: a lens is updated in
-every step."""
-# Fraction of the run in which lenses stay: a wrong pose pulls at a lens that all share
+# Fraction of the run before lenses are refined: wrong poses would bias a shared lens
 LENS_STARTS = 0.3
-MIN_POSES = 8  # Fewer poses do not tell a lens from a shift of the cameras; theirs stays as it is
+# Fewest poses with which a lens is refined: with fewer it cannot be told from a camera shift
+MIN_POSES = 8
 POSES, LENSES = "poses", "lenses"
 
 
 class CameraCorrections:
-    """Small corrections of the cameras of V views, at first none.
+    """Corrections of the cameras of V views, initially zero.
 
-    A camera that stands still has one correction for all its views, and so has a lens that several
-    views share.
+    Views of a static camera share one pose correction, and views with equal intrinsics share one
+    lens correction.
 
     Attributes:
-        poses: (P, 6) rotation vectors, rad, and translations in units of ``size``, both in the
-            camera's frame.
-        lenses: (L, 3) logarithms of the factors of the focal lengths, and shifts of the principal
-            points as fractions of the focal lengths.
+        poses: (P, 6) rotation vectors in rad and translations in units of ``size``, in the camera
+            frame.
+        lenses: (L, 3) log factor of the focal lengths, and shift of the principal point as a
+            fraction of the focal lengths.
     """
 
     def __init__(self, views: Sequence[View], size: float) -> None:
         self.size = size
         by_pose = {_pose_key(view): view for view in views}
-        self._poses = _numbered(by_pose)
-        self._lenses = _numbered(_lens_key(view) for view in views)
+        self._poses = _index_keys(by_pose)
+        self._lenses = _index_keys(_lens_key(view) for view in views)
         self.poses = torch.zeros(len(self._poses), 6, device="cpu")
         self.lenses = torch.zeros(len(self._lenses), 3, device="cpu")
         poses_of_lens = Counter(lens for lens, _ in {(_lens_key(x), _pose_key(x)) for x in views})
@@ -70,17 +68,16 @@ class CameraCorrections:
         self._common = common_motion_basis(list(by_pose.values()), size)
 
     def rows(self, view: View) -> tuple[int | None, int | None]:
-        """Return the rows of the pose and of the lens of a view; None where nothing is known of it,
-        or a lens is not refined."""
+        """Return the rows of the pose and of the lens of a view. None for an unknown pose or a lens
+        that is not refined."""
         lens = _lens_key(view)
         row = self._lenses[lens] if lens in self._refined else None
         return self._poses.get(_pose_key(view)), row
 
     def correct_cameras(self, view: View, cameras: Cameras) -> Cameras:
-        """Return ``cameras``, that of an image of any view of the capture at any scale, corrected.
+        """Return corrected ``cameras`` of an image of ``view`` at any scale.
 
-        A view that was not trained on has the pose of a camera that stands still, or a lens, as
-        training found it.
+        Views that were not trained on share corrections of the same static camera or lens.
         """
         pose, lens = self.rows(view)
         own = torch.zeros(6, device="cpu") if pose is None else self.poses[pose]
@@ -89,7 +86,7 @@ class CameraCorrections:
         )
 
     def correct_view(self, view: View) -> View:
-        """Return ``view`` with its camera as ``applied_to`` has it, in float64."""
+        """Return ``view`` with a corrected camera, in float64."""
         pose, lens = (
             torch.from_numpy(x).double()[None] for x in (view.cam_from_world, view.intrinsics)
         )
@@ -101,15 +98,16 @@ class CameraCorrections:
         )
 
     def remove_common_motion(self) -> None:
+        """Project out the similarity that poses have in common."""
         flat = self.poses.view(-1)
         flat -= self._common @ (self._common.T @ flat)
 
 
 def apply_correction(cameras: Cameras, pose: Tensor, lens: Tensor | None, size: float) -> Cameras:
-    """Return the camera ``cameras`` (V = 1) with the corrections ``pose`` (6,) and ``lens`` (3,);
-    differentiable."""
+    """Return camera ``cameras`` (V = 1) with corrections ``pose`` (6,) and ``lens`` (3,).
+    Differentiable."""
     pose = pose.to(cameras.cam_from_world)
-    # by |pose| up to its cube
+    # First order in the quaternion; the error is cubic in the angle.
     rotation = rotation_matrices(torch.cat([pose.new_ones(1), pose[:3] / 2]))
     last = pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])
     motion = torch.cat([torch.cat([rotation, size * pose[3:, None]], 1), last])
@@ -124,7 +122,7 @@ def apply_correction(cameras: Cameras, pose: Tensor, lens: Tensor | None, size: 
 
 
 def with_camera_gradients(cameras: Cameras) -> Cameras:
-    """Return ``cameras`` as leaf tensors that collect gradients."""
+    """Return ``cameras`` as leaf tensors that require gradients."""
     pose, intrinsics = (
         x.detach().clone().requires_grad_() for x in (cameras.cam_from_world, cameras.intrinsics)
     )
@@ -134,8 +132,7 @@ def with_camera_gradients(cameras: Cameras) -> Cameras:
 def correction_gradients(
     cameras: Cameras, by_pose: Tensor, by_intrinsics: Tensor, size: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the gradients (6,) and (3,) by a further small correction of the pose and of the
-    lens."""
+    """Return the gradients (6,) and (3,) with respect to a small correction of pose and lens."""
     columns = cameras.cam_from_world.detach()[0, :3]
     forces = by_pose[0, :3]  # both (3, 4)
     turn = torch.linalg.cross(columns, forces, dim=0).sum(1)
@@ -146,10 +143,9 @@ def correction_gradients(
 
 
 def common_motion_basis(views: Sequence[View], size: float) -> Tensor:
-    """Return an orthonormal basis (6 P, C), C at most 7, of those corrections of all poses that
-    change no image.
+    """Return an orthonormal basis (6 P, C), C <= 7, of the pose corrections that change no image.
 
-    They turn, shift and scale the scene with all its cameras; to first order.
+    They are rotation, translation and scaling of the scene with all cameras, to first order.
     """
     poses = np.stack([view.cam_from_world for view in views])
     rotations = poses[:, :3, :3]
@@ -165,8 +161,7 @@ def common_motion_basis(views: Sequence[View], size: float) -> Tensor:
 
 
 def _cross_matrices(vectors: np.ndarray) -> np.ndarray:
-    """Return the matrices (V, 3, 3) that multiply a vector from the left by ``vectors`` (V, 3):
-    cross products."""
+    """Return the cross-product matrices (V, 3, 3) of ``vectors`` (V, 3)."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
@@ -180,13 +175,13 @@ def _lens_key(view: View) -> Hashable:
     return view.intrinsics.tobytes(), view.width, view.height
 
 
-def _numbered(keys: Iterable[Hashable]) -> dict[Hashable, int]:
-    """Return the number of each distinct key, in order of their first appearance."""
+def _index_keys(keys: Iterable[Hashable]) -> dict[Hashable, int]:
+    """Return the index of each distinct key, in order of appearance."""
     return {key: number for number, key in enumerate(dict.fromkeys(keys))}
 
 
 class CameraRefinement(Correction):
-    """Corrections of the training cameras, and their optimizer."""
+    """Correction that optimises ``CameraCorrections`` with Adam."""
 
     name = "cameras"
 
@@ -205,11 +200,10 @@ class CameraRefinement(Correction):
 
     @torch.no_grad()
     def after_backward(self, index: int, step: int, image: Image) -> Count:
-        """Update the corrections of view ``index``; return how many had gradients that are not
-        finite.
+        """Update the corrections of view ``index``. Return the number of non-finite gradients.
 
-        A gradient is that by a further correction of the corrected camera; both are so small that
-        they add.
+        The gradient with respect to a further correction of the corrected camera is used, since
+        small corrections add up.
         """
         rate = self.rate(step)
         cameras = image.cameras
@@ -217,7 +211,7 @@ class CameraRefinement(Correction):
         by_intrinsics = cameras.intrinsics.grad
         if rate == 0 or by_pose is None or by_intrinsics is None:
             return 0
-        left_out = torch.zeros((), dtype=torch.int64, device="cpu")
+        num_skipped = torch.zeros((), dtype=torch.int64, device="cpu")
         gradients = correction_gradients(cameras, by_pose, by_intrinsics, self.corrections.size)
         rates = (rate, LENS_RATE * rate if step >= LENS_STARTS * self._steps else 0.0)
         rows = self.corrections.rows(self._views[index])
@@ -230,12 +224,12 @@ class CameraRefinement(Correction):
             arrays = (x, self._adam.exp_avg[name], self._adam.exp_avg_sq[name])
             own, first, second = (array[row : row + 1] for array in arrays)
             count = int(self._updates[name][row])
-            left_out += adam_step_(own, gradient[None].to(own), first, second, lr=lr, step=count)
+            num_skipped += adam_step_(own, gradient[None].to(own), first, second, lr=lr, step=count)
         self.corrections.remove_common_motion()
-        return left_out
+        return num_skipped
 
     def rate(self, step: int) -> float:
-        """Return the learning rate of the poses, see ``FIRST_RATE``; 0 before they begin."""
+        """Return the learning rate of poses at ``step``; 0 before refinement starts."""
         progress = (step / self._steps - STARTS) / (1 - STARTS)
         if progress < 0:
             return 0.0
@@ -258,10 +252,8 @@ class CameraRefinement(Correction):
 
 
 FIT_UPDATES = 60
-FIRST_FIT_RATE, LAST_FIT_RATE = (
-    2e-3,
-    1e-4,
-)  # Learning rates, rad, and as a fraction of the scene's size; log-linear between
+# Initial and final learning rate, in rad and as a fraction of the scene extent; log-linear between
+FIRST_FIT_RATE, LAST_FIT_RATE = 2e-3, 1e-4
 FIT_SSIM_WEIGHT = 0.2
 
 
@@ -274,10 +266,14 @@ def fit_camera_to_image(
     options: RenderOptions | None = None,
     weights: Tensor | None = None,
 ) -> Image:
-    """Return ``image`` with its camera moved to where the scene looks most like it (iNeRF, Yen-Chen
-    et al. 2021).
+    """Return ``image`` with its camera pose fitted to the scene (iNeRF, Yen-Chen et al. 2021).
 
-    The lens stays.
+    The intrinsics stay fixed.
+
+    Args:
+        size: extent of the scene in world units.
+        options: render options. None uses those of the scene.
+        weights: (H, W) weights of pixels, in addition to the mask.
     """
     options = options or scene.options
     truth = image.composite(background)

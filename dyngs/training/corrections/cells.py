@@ -1,7 +1,6 @@
-"""Coarse cells of images, as pixels of small cameras: the places that they show, and where other
-cameras show these.
+"""Coarse cells of images, represented as pixels of low-resolution cameras.
 
-Local letters: V views, P places.
+Local letters: V views, P points.
 """
 
 from __future__ import annotations
@@ -18,15 +17,19 @@ _TINY = 1e-6
 
 
 def cell_camera(cameras: Cameras) -> Cameras:
-    """Return the camera whose pixels are the coarse cells of the images of ``cameras``."""
+    """Return the camera whose pixels are the coarse cells of an image of ``cameras``."""
     width, height = cameras.width, cameras.height
     fraction = CELLS / max(width, height)
     return cameras.resized(max(1, round(fraction * width)), max(1, round(fraction * height)))
 
 
 def unproject_pixels(camera: Cameras, which: Tensor, depth: Tensor) -> Tensor:
-    """Return (P, 3) the points of the world that pixels ``which`` (P,), row by row, show at
-    ``depth`` (P,)."""
+    """Return the world points (P, 3) of pixels at given depths.
+
+    Args:
+        which: (P,) flat pixel indices, row by row.
+        depth: (P,) depth along the optical axis.
+    """
     pose = camera.cam_from_world[0]
     k = camera.intrinsics[0]
     pixels = torch.stack([which % camera.width, which // camera.width], -1) + 0.5
@@ -35,8 +38,10 @@ def unproject_pixels(camera: Cameras, which: Tensor, depth: Tensor) -> Tensor:
 
 
 def project_to_pixels(camera: Cameras, world: Tensor) -> tuple[Tensor, Tensor]:
-    """Return (P,) the pixels, row by row, that show points (P, 3) of the world, -1 beyond the
-    image; and their depths (P,)."""
+    """Return the flat pixel indices (P,) of world points (P, 3), and their depths (P,).
+
+    The index is -1 outside the image and behind the camera.
+    """
     pose = camera.cam_from_world[0]
     k = camera.intrinsics[0]
     local = world @ pose[:3, :3].T + pose[:3, 3]
@@ -50,6 +55,6 @@ def project_to_pixels(camera: Cameras, world: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def camera_distances(cameras: Sequence[Cameras]) -> Tensor:
-    """Return (V, V) the distances of cameras from each other."""
+    """Return the pairwise distances (V, V) of camera centres."""
     centres = torch.cat([camera.centers for camera in cameras]).cpu()
     return torch.cdist(centres, centres, compute_mode="donot_use_mm_for_euclid_dist")

@@ -1,16 +1,16 @@
-"""Exposure and white balance of each training image, learned next to the scene.
+"""Exposure and white balance of each training image, learned with the scene.
 
-A camera that chooses its exposure by itself shows the same place brighter in one image than in the
-next. So each image has an affine colour, 3 x 4, that its rendering goes through before the loss, as
-3DGS has since its second release. The mean over all images is the identity, so that the scene has
-the colours of the mean image and not any.
+With automatic exposure, the same surface has different brightness in different images. The
+rendering of each view is therefore transformed by an affine colour map (3, 4) before the loss, as
+in later releases of 3DGS. The mean map over all images is the identity, which fixes the colours of
+the scene.
 
-Gains of all images are found at once, by the places that they share, as soon as the scene has a
-depth; then Adam refines them. Adam alone is too slow for a short run, and leaves a scene bright
-where bright images were taken.
+Gains of all images are first estimated jointly from surfaces that several images show, as soon as
+the scene has a depth. Adam then refines them. Adam alone is too slow for a short run and leaves
+brightness differences in the scene.
 
-Local letters: V views, J of them compared with, P places, C cells of an image, row by row, M
-(V, 3, 4) deviations from the identity, matrix next to offset.
+Local letters: V views, J compared views, P points, C cells of an image in row-major order, M (V, 3,
+4) deviations of colour maps from the identity.
 """
 
 from __future__ import annotations
@@ -41,24 +41,23 @@ from dyngs.training.corrections.cells import (
     unproject_pixels,
 )
 
+# Fraction of the run before exposures are learned: earlier renderings are too inaccurate
 WARM_UP = 0.25
-"""Fraction of the run in which images are taken as they are: before, the rendering shows too little
-to compare with."""
-# How far a gain may move after it was found, at most: rates follow from how often an image is
-# trained on
+# Largest total change of a gain by Adam; learning rates follow from the visits per image
 TRAVEL = 0.5
-LAST_RATE = 0.02  # Rate at the end over that at the beginning, log-linear between
+LAST_RATE = 0.02  # Ratio of the final to the initial learning rate, log-linear in between
 MAX_RATE = 0.01
-MIXING_RATE = 0.05  # Rate of what mixes channels, and of offsets, over that of gains
+MIXING_RATE = 0.05  # Learning rate of off-diagonal entries and offsets over that of gains
+# Weights of the mean squared deviation from the identity: gains vary, channels hardly mix
 GAIN_WEIGHT, MIXING_WEIGHT = 0.3, 1.0
-"""Weights of the mean squared deviation from the identity: gains differ, channels hardly mix."""
 
 
 class ViewExposures(Loss, Correction):
-    """An affine colour per training image, and their Adam.
+    """An affine colour map per training image, and its Adam state.
 
     Args:
-        images: whose gains are found at once; None: Adam finds them.
+        count: number of training images.
+        images: used to estimate all gains jointly. None leaves them to Adam.
     """
 
     name = "exposures"
@@ -77,30 +76,29 @@ class ViewExposures(Loss, Correction):
         self._weights = MIXING_WEIGHT + (GAIN_WEIGHT - MIXING_WEIGHT) * is_gain
 
     @torch.no_grad()
-    def _find_gains(self, images: ImageLoader, view: RenderedView) -> None:
-        """Find the gains of all images at once."""
-        looked_at = [i for i in range(len(self._visits)) if view.trains_on(i)]
-        gains = estimate_log_gains(images, looked_at, view.draw).exp()
-        self._visits[looked_at] = 1
+    def _initialize_gains(self, images: ImageLoader, view: RenderedView) -> None:
+        """Estimate the gains of all images jointly."""
+        trained = [i for i in range(len(self._visits)) if view.trains_on(i)]
+        gains = estimate_log_gains(images, trained, view.draw).exp()
+        self._visits[trained] = 1
         diagonal = self._values.reshape(-1, 3, 4).diagonal(dim1=1, dim2=2)
-        diagonal.copy_(gains - gains[looked_at].mean(0))
+        diagonal.copy_(gains - gains[trained].mean(0))
         self._values[self._visits == 0] = 0
 
     def affine(self, index: int) -> Tensor:
-        """Return (3, 4) the affine colour of an image: what the camera made of the scene's
-        colours."""
+        """Return the affine colour map (3, 4) from scene colours to image ``index``."""
         return self._values[index].reshape(3, 4) + torch.eye(3, 4, device="cpu")
 
     def after_render(self, view: RenderedView) -> RenderedView:
-        """Return the view with the rendering as its camera would have recorded it."""
+        """Return the view with the colour map of its image applied to the rendering."""
         if view.step <= self._begins:
             return view
         if view.step == self._begins + 1 and self._images is not None:
-            self._find_gains(self._images, view)
+            self._initialize_gains(self._images, view)
         shown = apply_affine_colour(
             self.affine(view.index), view.image, view.rendering, view.background
         )
-        # no sensor shows more than white
+        # Sensors saturate at white.
         white = view.image.composite(view.background) >= SATURATED
         return replace(view, rendered=torch.where(white, shown.clamp_max(1.0), shown))
 
@@ -121,7 +119,7 @@ class ViewExposures(Loss, Correction):
         bad = self._adam.step_("values", self._values, lr=rate, step=visits, rows=rows)
         known = self._visits > 0
         if step > self._begins + len(known):
-            # all are known: what they have in common is the scene's
+            # All images were visited: the common part belongs to the scene.
             with torch.no_grad():
                 self._values[known] -= self._values[known].mean(0)
         return bad
@@ -137,64 +135,63 @@ class ViewExposures(Loss, Correction):
         self._visits, self._values = visits.clone(), values.clone().requires_grad_()
 
 
-DRAWN_FROM = 100  # Views whose cells are the places of ``log_gains``
-COMPARED = 40  # Nearest views that are compared with each of them
-SAME_DEPTH = 0.05  # Relative difference of depth up to which two views show the same place
-OPAQUE = 0.9  # Alpha from which a cell has a depth
-DARKEST = 0.02  # Mean colour from which a cell has a logarithm worth using
-OUTLIER = 0.1  # Residual, in log colour, at which an observation counts half as much
-ROUNDS = 4
-PRIOR = 0.05  # Weight of the square of a log gain, in observations: decides what no place does
+DRAWN_FROM = 100  # Views whose cells are the points of `estimate_log_gains`
+COMPARED = 40  # Nearest views compared with each of them
+SAME_DEPTH = 0.05  # Relative depth difference up to which two views show the same surface
+OPAQUE = 0.9  # Alpha above which a cell has a depth
+DARKEST = 0.02  # Mean colour below which the logarithm is too noisy
+OUTLIER = 0.1  # Residual in log colour at which an observation has half the weight
+ROUNDS = 4  # Reweighting iterations
+# Weight of squared log gains, in observations: determines gains that no point constrains
+PRIOR = 0.05
 
 
 class _Cells(NamedTuple):
-    """A view in coarse cells."""
+    """Coarse cells of a view."""
 
     camera: Cameras
     colours: Tensor  # (C, 3) logarithms
     depth: Tensor  # (C,)
-    known: Tensor  # (C,) bool
+    known: Tensor  # (C,) bool, valid colour and depth
 
 
-class _Places(NamedTuple):
-    """What J views show of P places."""
+class _Observations(NamedTuple):
+    """Observations of P points by J views."""
 
     views: Tensor  # (J,)
     colours: Tensor  # (J, P, 3) logarithms
-    shown: Tensor  # (J, P), 1 where a view shows a place, else 0
+    shown: Tensor  # (J, P), 1 where a view shows a point, else 0
 
 
 @torch.no_grad()
 def estimate_log_gains(
     images: ImageLoader, which: Sequence[int], draw: Callable[[Cameras, float | None], Rendering]
 ) -> Tensor:
-    """Return (V, 3) log gains of the images ``which``, of mean 0; 0 of all others.
+    """Return log gains (V, 3) of the images ``which``, with mean 0. Other images have gain 0.
 
-    Each place p that view v shows has log c_vp = g_v + a_p, the log gain of the view and the log
-    colour of the place, for each channel. Whoever follows the rendering view by view finds only
-    what differs between neighbours: a scene that was trained on bright views of one side and dark
-    ones of the other has a bright side. Least squares over all views at once (as panoramas are
-    compensated; Brown and Lowe 2007) has no such error.
+    The model is log c_vp = g_v + a_p per channel, for the colour of point p in view v. All gains
+    are solved jointly by robust least squares, as in panorama stitching (Brown and Lowe 2007).
+    Fitting single views to the rendering would only remove differences between neighbouring views.
 
     Args:
-        which: indices of those that may be looked at.
+        which: indices of usable images.
         draw: renders the scene from cameras at a time, with expected depth.
     """
-    cells = [_cells_of(images, index, draw) for index in which]
+    cells = [_view_cells(images, index, draw) for index in which]
     distance = camera_distances([x.camera for x in cells])
-    places = [
-        _places(cells, i, distance[i].argsort(stable=True)[:COMPARED])
+    observations = [
+        _observe_points(cells, i, distance[i].argsort(stable=True)[:COMPARED])
         for i in evenly_spaced(len(cells), DRAWN_FROM)
     ]
-    found = torch.zeros(len(cells), 3, dtype=torch.float64, device="cpu")
+    solution = torch.zeros(len(cells), 3, dtype=torch.float64, device="cpu")
     for _ in range(ROUNDS):
-        found = _solved(places, found)
+        solution = _solve_gains(observations, solution)
     gains = torch.zeros(len(images), 3, device="cpu")
-    gains[list(which)] = (found - found.mean(0)).float()
+    gains[list(which)] = (solution - solution.mean(0)).float()
     return gains
 
 
-def _cells_of(
+def _view_cells(
     images: ImageLoader, index: int, draw: Callable[[Cameras, float | None], Rendering]
 ) -> _Cells:
     image = images[index]
@@ -214,8 +211,8 @@ def _cells_of(
     return _Cells(camera.to(device="cpu"), colours.clamp_min(DARKEST).log(), depth, known)
 
 
-def _places(cells: Sequence[_Cells], index: int, compared: Tensor) -> _Places:
-    """Return what the views ``compared`` show of the known cells of one view."""
+def _observe_points(cells: Sequence[_Cells], index: int, compared: Tensor) -> _Observations:
+    """Return the observations of the known cells of one view by the views ``compared``."""
     own = cells[index]
     which = own.known.nonzero()[:, 0]
     world = unproject_pixels(own.camera, which, own.depth[which])
@@ -227,16 +224,16 @@ def _places(cells: Sequence[_Cells], index: int, compared: Tensor) -> _Places:
         same = (other.depth[cell] - z).abs() < SAME_DEPTH * z
         shown.append((at >= 0) & other.known[cell] & same)
         colours.append(other.colours[cell])
-    return _Places(compared, torch.stack(colours), torch.stack(shown).float())
+    return _Observations(compared, torch.stack(colours), torch.stack(shown).float())
 
 
-def _solved(places: Sequence[_Places], gains: Tensor) -> Tensor:
-    """Return (V, 3) the solution of weighted least squares, with weights from the residuals of
+def _solve_gains(observations: Sequence[_Observations], gains: Tensor) -> Tensor:
+    """Return the gains (V, 3) by weighted least squares, reweighted by the residuals of
     ``gains``."""
     count = len(gains)
     products = PRIOR * torch.eye(count, dtype=torch.float64, device="cpu")
     sides = torch.zeros(count, 3, dtype=torch.float64, device="cpu")
-    for views, colours, shown in places:
+    for views, colours, shown in observations:
         weight = shown.double()
         seen = colours.double()
         even = seen - gains[views][:, None]

@@ -1,15 +1,12 @@
-"""Masks of what disagrees with a static scene, found in training: people who walk through, for
-instance.
+"""Robust masks: pixels that disagree with a static scene, such as passers-by, are excluded.
 
-Where an image differs from its rendering, either the scene is not learned yet, or the image shows
-something that the other images do not. So cells of an image count no more where the residual is
-many times the median of the last views, *and* other views of that place look like the rendering
-rather than like this image.
+A large residual means that the scene is not learned yet, or that only this image shows the object.
+A cell of an image is therefore masked if its residual is many times the median residual *and* other
+views of that surface agree with the rendering rather than with this image.
 
-After RobustNeRF (Sabour et al. 2023: residuals with spatial support) and SpotLessSplats (Sabour et
-al. 2024: a running histogram of residuals, a warm-up without masks). There a fixed fraction of the
-pixels is left out; here a multiple of the median decides, and the other views, so that hardly
-anything is where they agree.
+Based on RobustNeRF (Sabour et al. 2023: residuals with spatial support) and SpotLessSplats (Sabour
+et al. 2024: running histogram of residuals, warm-up without masks). These mask a fixed fraction of
+pixels. The threshold and the other views used here mask almost nothing in a consistent capture.
 """
 
 from __future__ import annotations
@@ -33,28 +30,22 @@ from dyngs.training.corrections.cells import (
     unproject_pixels,
 )
 
-# An image is looked at each so many times that it is trained on; in between its mask stays
-EVERY = 4
-WARM_UP = 0.05  # Fraction of the run in which everything counts
+EVERY = 4  # A mask is updated on every n-th visit of its image
+WARM_UP = 0.05  # Fraction of the run without masks
+# Multiples of the median residual above which a cell, and a neighbour of such a cell, is masked
 SEED, GROWN = 5.0, 3.0
-"""Multiples of the median residual: from the first a cell is left out, from the second next to such
-cells."""
-REACH = 2  # Cells up to which a cell counts as next to another
-SUPPORT = 0.5  # Fraction of the 3 x 3 cells around that must be left out, too
+REACH = 2  # Distance in cells within which a cell is a neighbour
+SUPPORT = 0.5  # Fraction of the 3 x 3 neighbourhood that must also be masked
+# Other views must differ from the rendering by less than this fraction of the image's difference
 CLEARLY = 0.5
-"""A place disagrees where the other views differ from the rendering by less than this fraction of
-what it does."""
-RIM = 1  # Cells around what is left out that are left out with it
-DISCOUNT = 0.95
-"""Weight of the histogram of all looks before against that of the present one: it remembers about
-twenty."""
-# The histogram spans residuals from 2 ** -12 to 1, so many bins for each factor of two
+RIM = 1  # Cells by which masks are dilated
+DISCOUNT = 0.95  # Decay of the residual histogram per update, a memory of about twenty updates
+# The histogram spans residuals from 2 ** -12 to 1, with this many bins per factor of two
 _OCTAVES, _PER_OCTAVE = 12, 16
 
 
 class RobustMasks(Correction):
-    """Masks of the pixels that count, one per training image, brought up to date as it is trained
-    on."""
+    """Masks of the training images, updated while they are trained on."""
 
     name = "robust"
 
@@ -72,14 +63,14 @@ class RobustMasks(Correction):
         self._histogram = torch.zeros(_OCTAVES * _PER_OCTAVE, dtype=torch.float64, device="cpu")
 
     def after_render(self, view: RenderedView) -> RenderedView:
-        """Return the view with a mask of the pixels that agree with the other views."""
+        """Return the view with inconsistent cells removed from its mask."""
         if view.step <= self._begins:
             return view
         index = view.index
         camera = cell_camera(view.image.cameras)
         left_out = self._left_out[index, : camera.height, : camera.width]
         if int(self._visits[index]) % EVERY == 0:
-            left_out.copy_(self._disagreeing(view, camera))
+            left_out.copy_(self._inconsistent_cells(view, camera))
         self._visits[index] += 1
         if not bool(left_out.any()):
             return view
@@ -104,23 +95,23 @@ class RobustMasks(Correction):
         self._left_out = left_out.clone()
         self._histogram = histogram.clone()
         if bool(visits.any()):
-            self._begins = 0.0  # also where the run has become longer
+            self._begins = 0.0  # masks stay active in an extended run
 
     @torch.no_grad()
-    def _disagreeing(self, view: RenderedView, camera: Cameras) -> Tensor:
-        """Return (h, w) bool: the cells of a view, the pixels of ``camera``, that count no more."""
+    def _inconsistent_cells(self, view: RenderedView, camera: Cameras) -> Tensor:
+        """Return (h, w) bool, the cells of a view that are excluded from the loss."""
         index = view.index
         background = view.background.cpu()
         size = (camera.height, camera.width)
         drawn = adaptive_avg_pool2d(view.rendered.detach().cpu().permute(2, 0, 1), size)
         seen, keeps = self._others.cells_of(index, background)
         error = (drawn - seen).abs().mean(0)
-        residual = _around(error * keeps)
+        residual = _mean_3x3(error * keeps)
         known = residual[keeps]
         none = torch.zeros_like(keeps)
         if not known.numel():
             return none
-        self._remember(known)
+        self._update_histogram(known)
         median = max(self._median(), float(known.median()))
         candidates = (residual > GROWN * median) & keeps
         if not bool((residual[candidates] > SEED * median).any()):
@@ -131,46 +122,44 @@ class RobustMasks(Correction):
         others = self._others.difference(index, candidates, shown, background)
         odd = candidates.clone()
         odd[candidates] = others < CLEARLY * error[candidates]
-        core = odd & _near(candidates & (residual > SEED * median), REACH)
-        return _near(_around(core.float()) >= SUPPORT, RIM)
+        core = odd & _dilate(candidates & (residual > SEED * median), REACH)
+        return _dilate(_mean_3x3(core.float()) >= SUPPORT, RIM)
 
-    def _remember(self, residual: Tensor) -> None:
+    def _update_histogram(self, residual: Tensor) -> None:
         bins = (_PER_OCTAVE * (residual.clamp(2.0**-_OCTAVES, 1.0).log2() + _OCTAVES)).long()
         most = len(self._histogram)
         counts = torch.bincount(bins.clamp_max(most - 1), minlength=most)
         self._histogram = DISCOUNT * self._histogram + counts.to(self._histogram)
 
     def _median(self) -> float:
-        """Return the median residual of the last looks, the upper end of its bin."""
+        """Return the median of recent residuals, as the upper end of its bin."""
         below = self._histogram.cumsum(0)
         index = int(torch.searchsorted(below, below[-1:] / 2))
         return 2.0 ** ((index + 1) / _PER_OCTAVE - _OCTAVES)
 
 
-def _around(x: Tensor) -> Tensor:
-    """Return (h, w) the means of the cells of ``x`` (h, w) and those next to them."""
+def _mean_3x3(x: Tensor) -> Tensor:
+    """Return (h, w) means over the 3 x 3 neighbourhood of ``x`` (h, w)."""
     return avg_pool2d(x[None], 3, stride=1, padding=1, count_include_pad=False)[0]
 
 
-def _near(x: Tensor, reach: int) -> Tensor:
-    """Return (h, w) whether one of the cells up to ``reach`` away is true in ``x`` (h, w) bool."""
+def _dilate(x: Tensor, reach: int) -> Tensor:
+    """Return (h, w) bool, ``x`` dilated by ``reach`` cells."""
     return max_pool2d(x.float()[None], 2 * reach + 1, stride=1, padding=reach)[0] > 0
 
 
-NEAREST = 24  # Views that are compared with, at most
-FEWEST = 3  # Views that must see a place, at least
-# Alpha from which the drawn depth means anything; and the fraction of a cell that its image's mask
-# must keep
+NEAREST = 24  # Most views that a cell is compared with
+FEWEST = 3  # Fewest views that must see a point
+# Alpha above which rendered depth is valid, and fraction of a cell that the mask must keep
 SOLID = 0.5
 
 
 class NeighbourViews:
-    """Mean colours of the cells of all training images, and where cells of one are found in the
-    others.
+    """Mean colours of the cells of all training images, and their comparison across views.
 
     Args:
-        corrected: returns the camera of a view as it is by now, see ``ImageLoader``; None: it
-            stays.
+        correct_cameras: returns the refined camera of a view, see ``ImageLoader``. None without
+            refinement.
     """
 
     def __init__(
@@ -189,32 +178,33 @@ class NeighbourViews:
         self._cells: dict[int, Tensor] = {}
 
     def cells_of(self, index: int, background: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the (3, h, w) mean colours of an image on ``background`` (3,), and (h, w) bool
-        which cells count."""
+        """Return the mean colours (3, h, w) of an image on ``background`` (3,), and the valid cells
+        (h, w) bool."""
         cells = self._table(index)
         return cells[:3] + (1 - cells[3]) * background[:, None, None], cells[4] > SOLID
 
     def difference(self, index: int, which: Tensor, drawn: Tensor, background: Tensor) -> Tensor:
-        """Return (P,) the median difference of other views from the rendering; infinite where too
-        few see a place.
+        """Return (P,) median colour difference between other views and the rendering.
+
+        It is infinite where too few views see a point.
 
         Args:
-            which: (h, w) bool, P of the cells of the image.
+            which: (h, w) bool, P selected cells of the image.
             drawn: (5, h, w) rendered colour, depth and alpha of the cells.
         """
         shown = drawn[:, which]
         world = unproject_pixels(self._camera(index), which.flatten().nonzero()[:, 0], shown[3])
         order = self._distance[index].argsort(stable=True)[:NEAREST]
-        found = [shown.new_full((shown.shape[1],), torch.nan)]
+        differences = [shown.new_full((shown.shape[1],), torch.nan)]
         for other in order[self._distance[index][order].isfinite()].tolist():
             at, _ = project_to_pixels(self._camera(other), world)
             cells = self._table(other).flatten(1)[:, at.clamp_min(0)]
             colours = cells[:3] + (1 - cells[3]) * background[:, None]
             is_seen = (at >= 0) & (cells[4] > SOLID)
-            found.append(torch.where(is_seen, (colours - shown[:3]).abs().mean(0), torch.nan))
-        differences = torch.stack(found)
-        is_known = (differences.isfinite().sum(0) >= FEWEST) & (shown[4] > SOLID)
-        return torch.where(is_known, differences.nanmedian(0).values, torch.inf)
+            differences.append(torch.where(is_seen, (colours - shown[:3]).abs().mean(0), torch.nan))
+        stacked = torch.stack(differences)
+        is_known = (stacked.isfinite().sum(0) >= FEWEST) & (shown[4] > SOLID)
+        return torch.where(is_known, stacked.nanmedian(0).values, torch.inf)
 
     def _camera(self, index: int) -> Cameras:
         camera = self._cameras[index]
@@ -223,7 +213,7 @@ class NeighbourViews:
         return self._corrected(index, camera).to(device="cpu")
 
     def _table(self, index: int) -> Tensor:
-        """Return the (5, h, w) cells of an image: premultiplied colour, alpha, mask."""
+        """Return the cells (5, h, w) of an image: premultiplied colour, alpha, mask."""
         if index not in self._cells:
             image = self._images[index]
             rgb = image.rgb_premultiplied

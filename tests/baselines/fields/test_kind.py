@@ -88,7 +88,7 @@ def test_its_surface_is_a_mesh_with_colours(
         (["prune", "RUN", "--out", "OUT/pruned"], "Gaussians"),
     ],
 )
-def test_what_does_not_go_is_refused(
+def test_invalid_arguments_are_refused(
     run: Path, tmp_path: Path, command: list[str], said: str, request: pytest.FixtureRequest
 ) -> None:
     request.getfixturevalue("monkeypatch").setattr("dyngs.baselines.fields.scene.CELLS", 24)
@@ -112,7 +112,7 @@ def test_what_does_not_go_is_refused(
         (["model.sizes=huge"], "one of tiny, cpu, published"),
     ],
 )
-def test_what_cannot_be_trained_is_refused(
+def test_unsuitable_captures_are_refused(
     capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], keys: list[str], said: str
 ) -> None:
     assert main(["train", f"data.root={capture}", f"run.dir={tmp_path / 'run'}", *NGP, *keys]) == 2

@@ -18,7 +18,7 @@ def seen(count: int) -> TriangleStatistics:
     return tallies
 
 
-def test_a_good_triangle_is_useful_and_others_are_not() -> None:
+def test_degenerate_triangles_are_prunable() -> None:
     good = triangle((0, 0, 0), (1, 0, 0), (0, 1, 0))
     points = torch.cat([good] * 5)
     points[1] *= 1e-3

@@ -33,7 +33,7 @@ def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return dyngs.train(config_of(capture, *STEPS, "model.gaussian_steps=300", f"run.dir={folder}"))
 
 
-def test_it_learns_and_keeps_to_its_number(run: Path) -> None:
+def test_training_improves_and_respects_max_triangles(run: Path) -> None:
     assert evaluate_run(run).psnr > 18
     scene = open_run(run).renderable
     assert isinstance(scene, TriangleScene)
@@ -54,7 +54,7 @@ def test_a_run_that_is_cut_ends_with_the_same_bytes(capture: Path, tmp_path: Pat
     assert path.read_bytes() == whole
 
 
-def test_a_file_of_it_is_as_small_as_asked(capture: Path, tmp_path: Path) -> None:
+def test_file_fits_requested_size(capture: Path, tmp_path: Path) -> None:
     """Half of what its 72 values a triangle take at the usual precision: it begins with fewer, and
     is no larger."""
     run = tmp_path / "run"
@@ -106,11 +106,11 @@ def test_it_is_a_mesh_with_colours(run: Path, tmp_path: Path, suffix: str) -> No
         (["prune", "RUN", "--out", "OUT/pruned"], "Gaussians"),
         (
             ["train", "data.root=CAPTURE", "model.kind=bg_triangle", "budget.max_gaussians=5"],
-            "has no effect with model.kind=bg_triangle",
+            "not supported by model.kind=bg_triangle",
         ),
     ],
 )
-def test_what_does_not_go_is_refused(
+def test_invalid_arguments_are_refused(
     run: Path,
     capture: Path,
     tmp_path: Path,
@@ -127,7 +127,7 @@ def test_what_does_not_go_is_refused(
     assert said in lines[0]
 
 
-def test_points_in_one_place_are_refused(capture: Path, tmp_path: Path) -> None:
+def test_coincident_points_are_refused(capture: Path, tmp_path: Path) -> None:
     same = tmp_path / "capture"
     shutil.copytree(capture, same)
     trimesh.PointCloud(np.zeros((20, 3))).export(same / "points3d.ply")

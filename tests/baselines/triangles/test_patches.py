@@ -29,7 +29,7 @@ def test_quarters_are_the_same_surface() -> None:
         )
 
 
-def test_a_texture_begins_with_the_colours_that_were_there() -> None:
+def test_texture_starts_with_control_point_colours() -> None:
     patches = bent(3)
     with_texture = patches.with_texture(4)
     places, _ = lattice(4)
@@ -52,7 +52,7 @@ def test_a_texture_begins_with_the_colours_that_were_there() -> None:
         ("harmonics", torch.zeros(4, 2, 3)),
     ],
 )
-def test_what_does_not_fit_is_refused(name: str, value: torch.Tensor) -> None:
+def test_mismatched_tensors_are_refused(name: str, value: torch.Tensor) -> None:
     stored = strip_roles(bent(4).with_texture(3).state())
     with pytest.raises(ValueError, match=r"'\w+'"):
         Patches.from_state(stored | {name: value})

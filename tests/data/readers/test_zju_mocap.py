@@ -349,7 +349,7 @@ def test_bad_pickles_of_one_camera(tmp_path: Path) -> None:
         (
             cameras,
             {**meshes, "frame_0": first},
-            r"mesh_infos\.pkl: frame 0 has body parameters twice",
+            r"mesh_infos\.pkl: frame 0 has two sets of body parameters",
         ),
         (
             cameras,

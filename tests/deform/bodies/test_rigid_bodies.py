@@ -44,7 +44,7 @@ def test_a_rolling_ball_begins_on_its_way() -> None:
         )
 
 
-def test_what_slides_is_not_made_to_turn() -> None:
+def test_sliding_body_is_not_a_rigid_rotation() -> None:
     """It is left to others, or a body with hardly any turn: its path, too, is found from the
     images."""
     frame_stack, _, _ = rolling(turns=False)

@@ -40,7 +40,7 @@ def test_two_turns_about_any_axis_are_followed() -> None:
     assert errors.max() < 20
 
 
-def test_what_slides_does_not_turn() -> None:
+def test_sliding_ball_does_not_rotate() -> None:
     frame_stack, centers, _ = rolling(turns=False)
     rotation = estimate_rotation(frame_stack, Path(centers, RADIUS, 1.0))
     assert angles_deg(rotation.rotations).max() < 10

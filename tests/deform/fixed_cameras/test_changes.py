@@ -30,7 +30,7 @@ def with_patch(factor: tuple[float, float, float], at: int = 0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
-def test_a_ball_is_found_where_it_is(noise: float) -> None:
+def test_ball_is_found_at_its_position(noise: float) -> None:
     """Each image: the pixels whose rays meet the ball, but for those at its rim."""
     path = [Ball((0.0, 1.2 * t - 0.6, 0.0)) for t in TIMES]
     camera = cameras(1)[0]

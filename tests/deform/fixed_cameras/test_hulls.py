@@ -42,7 +42,7 @@ def test_two_balls_are_two() -> None:
     assert all(blob.radius < 0.08 for blob in found[2:]), "crossings of other silhouettes are small"
 
 
-def test_what_one_of_eight_cameras_does_not_see_is_found() -> None:
+def test_object_occluded_in_one_camera_is_found() -> None:
     """Something still hides it there; but of three cameras all must see it."""
     times = [i / (MOMENTS - 1) for i in range(MOMENTS)]
     for count, number in ((8, 1), (3, 0)):

@@ -32,7 +32,7 @@ def test_one_ball_begins_at_each_time() -> None:
 
 
 @pytest.mark.parametrize(("count", "limit"), [(6, 600), (1, 600), (6, 0)])
-def test_where_nothing_changes_nothing_begins(count: int, limit: int) -> None:
+def test_no_motion_without_changes(count: int, limit: int) -> None:
     """A ball that stands still; one camera, which sees no depth; no Gaussians allowed."""
     at = (lambda _: (0.0, 0.0, 0.0)) if count == 6 and limit else crossing
     found = started(lambda t: [Ball(at(t))], count, limit)

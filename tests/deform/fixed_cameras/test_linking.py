@@ -35,7 +35,7 @@ def along(path: Path, times: Sequence[float] = TIMES) -> list[list[Blob]]:
         lambda t: (2 * t, 0.0, abs(np.sin(9 * t))),  # hops
     ],
 )
-def test_one_thing_is_one_track(path: Path) -> None:
+def test_one_object_gives_one_track(path: Path) -> None:
     """That goes about its own diameter from one time to the next."""
     (track,) = link_tracks(TIMES, along(path))
     assert track.times == TIMES
@@ -43,7 +43,7 @@ def test_one_thing_is_one_track(path: Path) -> None:
     np.testing.assert_allclose(track.centers, [path(t) for t in TIMES])
 
 
-def test_it_may_be_lost_for_a_while() -> None:
+def test_track_survives_short_gaps() -> None:
     gone = TIMES[8 : 8 + MAX_GAP]
     (track,) = link_tracks(
         TIMES, along(lambda t: (4 * t, 0.0, 0.0), [t for t in TIMES if t not in gone])
@@ -60,7 +60,7 @@ def test_it_may_be_lost_for_a_while() -> None:
     )
 
 
-def test_two_that_cross_are_told_apart() -> None:
+def test_crossing_objects_keep_separate_tracks() -> None:
     """By velocity, where colours are alike; by colour, where they come from one place."""
     for color in (RED, BLUE):
         found = [[blob((3 * t, 0.1, 0)), blob((3 - 3 * t, -0.1, 0), color=color)] for t in TIMES]
@@ -71,7 +71,7 @@ def test_two_that_cross_are_told_apart() -> None:
             assert abs(track.centers[-1, 0] - track.centers[0, 0]) == pytest.approx(3)
 
 
-def test_what_jumps_to_and_fro_does_not_travel() -> None:
+def test_oscillating_object_does_not_travel() -> None:
     """As parts of a thing that turns in place seem to do."""
     found = [
         [blob((0.9 * (i % 3 == 0), 0.0, 0.0), 0.1 + 0.1 * (i == 5))] for i in range(len(TIMES))

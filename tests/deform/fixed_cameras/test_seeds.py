@@ -23,7 +23,7 @@ def ball_at(time: float) -> Ball:
     )
 
 
-def test_seeds_cover_a_ball_at_each_time_and_pay() -> None:
+def test_initial_gaussians_cover_a_ball_at_each_time() -> None:
     """On its surface, in its colour of that time; at another place or time they would not pay."""
     clips = filmed(lambda t: [ball_at(t)], TIMES, 7)
     (track,) = find_tracks(clips, *BOX)

@@ -29,13 +29,13 @@ def test_boxes_and_spheres() -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["1,2,3"], "give two corners x,y,z x,y,z, or a centre and a radius"),
-        (["1,2,3", "1,2"], "'1,2' is no point"),
-        (["1,2,3", "1,5,9"], "the box is flat"),
-        (["1,2,3", "-1"], "a radius of -1"),
-        (["1,2,3", "nan"], "is no number"),
-        (["box.obj"], "give two corners"),
-        ([""], "give two corners"),
+        (["1,2,3"], "use two corners x,y,z x,y,z, or x,y,z and a radius"),
+        (["1,2,3", "1,2"], "'1,2' is not a point"),
+        (["1,2,3", "1,5,9"], "empty box"),
+        (["1,2,3", "-1"], "radius must be positive, not -1"),
+        (["1,2,3", "nan"], "is not a number"),
+        (["box.obj"], "use two corners"),
+        ([""], "use two corners"),
     ],
 )
 def test_regions_that_are_none(words: list[str], said: str) -> None:

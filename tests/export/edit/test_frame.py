@@ -34,18 +34,18 @@ def table(path: Path, world: np.ndarray, scene: np.ndarray = SCENE, start: str =
     [
         (
             lambda: parse_point("1,2", "--origin"),
-            "--origin: '1,2' is no point; write three numbers",
+            "--origin: '1,2' is not a point; use three numbers",
         ),
-        (lambda: parse_point("1,2,nan", "--origin"), "'1,2,nan' is no point"),
-        (lambda: parse_number("x", "--max-loss"), "--max-loss: 'x' is no number"),
-        (lambda: parse_direction("0,0,0"), "has no direction"),
-        (lambda: parse_direction("up"), "'up' is no point"),
-        (lambda: parse_scale("0,0,0 1,0,0"), "is no number"),
-        (lambda: parse_scale("nan"), "'nan' is no number"),
-        (lambda: parse_scale("0"), "is no factor"),
-        (lambda: parse_scale("-2"), "is no factor"),
-        (lambda: parse_scale("1e300"), "is no factor"),
-        (lambda: parse_scale("1,1,1 1,1,1 2m"), "is no factor"),
+        (lambda: parse_point("1,2,nan", "--origin"), "'1,2,nan' is not a point"),
+        (lambda: parse_number("x", "--max-loss"), "--max-loss: 'x' is not a number"),
+        (lambda: parse_direction("0,0,0"), "is not a direction"),
+        (lambda: parse_direction("up"), "'up' is not a point"),
+        (lambda: parse_scale("0,0,0 1,0,0"), "is not a number"),
+        (lambda: parse_scale("nan"), "'nan' is not a number"),
+        (lambda: parse_scale("0"), "is not a factor"),
+        (lambda: parse_scale("-2"), "is not a factor"),
+        (lambda: parse_scale("1e300"), "is not a factor"),
+        (lambda: parse_scale("1,1,1 1,1,1 2m"), "is not a factor"),
     ],
 )
 def test_words_that_mean_nothing(call: Callable[[], object], said: str) -> None:
@@ -72,18 +72,18 @@ def test_coordinates_too_large_for_float32_get_an_offset(tmp_path: Path) -> None
     found = control_point_frame(table(tmp_path / "a.csv", world))
     np.testing.assert_allclose(found.similarity.points(SCENE) + found.offset, world, atol=1e-6)
     assert np.abs(found.similarity.points(SCENE)).max() < 100
-    assert "to be added to positions: 691002 5334018 507" in found.lines[1]
+    assert "to add to positions: 691002 5334018 507" in found.lines[1]
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "0 control points do not determine"),
+        ("", "0 control points are too few"),
         ("0 0 0 1 1 1\n1 0 0 2 1 1\n", "2 control points"),
         ("0 0 0 1 1 1\n1 1 1 2 2 2\n2 2 2 3 3 3\n", "lie on one line in the scene"),
-        ("0 0 0 1 1 1\n1 1 2\n", "'1 1 2' is not six numbers"),
-        ("a b\n0 0 0 1 1 nan\n", "'0 0 0 1 1 nan' is not six numbers"),
-        ("0 0 0 0 0 0\n1 0 0 1e12 0 0\n0 1 0 0 1e12 0\n", "the scale would be beyond"),
+        ("0 0 0 1 1 1\n1 1 2\n", "'1 1 2': expected six numbers"),
+        ("a b\n0 0 0 1 1 nan\n", "'0 0 0 1 1 nan': expected six numbers"),
+        ("0 0 0 0 0 0\n1 0 0 1e12 0 0\n0 1 0 0 1e12 0\n", "the scale is implausible"),
     ],
 )
 def test_control_points_that_are_none(text: str, said: str, tmp_path: Path) -> None:

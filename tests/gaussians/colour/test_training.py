@@ -174,7 +174,7 @@ def test_every_kind_of_colour_learns_and_goes_on_exactly(seven_views: Path, name
 
 
 @pytest.mark.parametrize("name", ["none pays", "some pay"])
-def test_harmonics_that_do_not_pay_are_dropped(seven_views: Path, name: str) -> None:
+def test_harmonics_without_gain_are_dropped(seven_views: Path, name: str) -> None:
     """For good: they stay zero while the set changes; the view that tells is not trained on
     before."""
     busy = DefaultStrategy(

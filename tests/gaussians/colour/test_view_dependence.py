@@ -65,7 +65,7 @@ def find(
     return find_view_dependent(seen, held_out, RenderOptions(), BLACK, tolerance)
 
 
-def test_a_matte_scene_keeps_none() -> None:
+def test_matte_scene_keeps_no_harmonics() -> None:
     """What was learned of the view is noise: it is worth less than nothing."""
     found = find(balls(0.05 * noise(0)), balls(torch.zeros(24, 3, 3)))
     assert not found.kept_harmonics.any()
@@ -74,7 +74,7 @@ def test_a_matte_scene_keeps_none() -> None:
     assert "view-dependent colour removed" in str(found)
 
 
-def test_only_the_glossy_part_keeps_them() -> None:
+def test_only_glossy_gaussians_keep_harmonics() -> None:
     rest = 0.3 * noise(1) * GLOSSY[:, None, None]
     found = find(balls(rest + 0.01 * noise(2)), balls(rest))
     assert found.kept_harmonics[GLOSSY].float().mean() > 0.8, (
@@ -85,7 +85,7 @@ def test_only_the_glossy_part_keeps_them() -> None:
     assert "kept for 2" in str(found)
 
 
-def test_the_mean_of_what_is_seen_takes_their_place() -> None:
+def test_dropped_harmonics_become_mean_colour() -> None:
     """A colour that is the same from everywhere it is seen from moves into the base."""
     rest = torch.zeros(24, 3, 3)
     model = balls(rest)
@@ -104,9 +104,7 @@ def test_the_mean_of_what_is_seen_takes_their_place() -> None:
 
 @settings(max_examples=80, deadline=None)
 @given(st.integers(0, 2**32), st.integers(1, 40), st.floats(0, 3))
-def test_the_fewest_that_are_worth_nearly_everything(
-    seed: int, count: int, tolerance: float
-) -> None:
+def test_selects_fewest_rows_within_tolerance(seed: int, count: int, tolerance: float) -> None:
     g = torch.Generator().manual_seed(seed)
     changes = torch.rand(count, generator=g)
     worths = torch.randn(count, generator=g)

@@ -89,7 +89,7 @@ def test_control_points_give_the_similarity() -> None:
 @pytest.mark.parametrize(
     ("points", "wanted", "said"),
     [
-        (CORNERS[:2], CORNERS[:2], "2 control points do not determine"),
+        (CORNERS[:2], CORNERS[:2], "2 control points are too few"),
         (np.outer([0, 1, 5], [1, 2, 3]) + 7, CORNERS[:3], "lie on one line in the scene"),
         (CORNERS[:3], np.outer([0, 1, 5], [1, 2, 3]), "lie on one line in the world"),
         (np.ones((3, 3)), CORNERS[:3], "lie on one line in the scene"),

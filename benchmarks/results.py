@@ -1,0 +1,359 @@
+"""Run the published measurements, store them as JSON, and write the benchmark pages from it.
+
+    python benchmarks/results.py list
+    python benchmarks/results.py run lego400 --captures CAPTURES [--runs RUNS]
+    python benchmarks/results.py write
+
+``run`` trains and evaluates one measurement of ``MEASUREMENTS`` and stores
+``benchmarks/results/NAME.json``. CAPTURES holds a folder or video per capture. ``write`` writes
+docs/benchmarks/*.md and the table of README.md from all stored files, so that they cannot differ.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import resource
+import subprocess
+import sys
+from dataclasses import asdict, dataclass, fields
+from datetime import date
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks/results"
+PAGES = ROOT / "docs/benchmarks"
+TABLE_BEGIN = "<!-- results: written by benchmarks/results.py -->"
+TABLE_END = "<!-- end of results -->"
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One training run and its evaluation on the whole test split."""
+
+    page: str  # static, moving or people
+    title: str
+    capture: str  # name of a folder or file in CAPTURES
+    preset: str
+    overrides: tuple[str, ...] = ()
+    estimate_poses: bool = False  # by `dyngs data sfm` before training
+    in_readme: bool = False
+
+
+MEASUREMENTS = {
+    "plush": Measurement(
+        "static", "plush: 97 phone photos", "plush", "static",
+        ("data.longest_side=640",), estimate_poses=True, in_readme=True,
+    ),
+    "street": Measurement(
+        "static", "street: 29 photos, sky, a moving car", "street", "static",
+        ("data.longest_side=480", "train.robust=auto", "train.exposure=auto", "train.steps=5000"),
+        estimate_poses=True, in_readme=True,
+    ),
+    "fox": Measurement(
+        "static", "fox: 50 photos", "fox", "static",
+        ("data.longest_side=240", "train.steps=3000"),
+    ),
+    "colmap_small": Measurement(
+        "static", "cup: 77 photos with COLMAP poses", "colmap_small", "static",
+        ("data.longest_side=400", "train.steps=3000"),
+    ),
+    "lego400": Measurement(
+        "static", "lego (NeRF-synthetic) at 400 px", "lego400", "static",
+        ("train.steps=5000",), in_readme=True,
+    ),
+    "lego400_blender": Measurement(
+        "static", "lego, 30,000 steps", "lego400", "blender", in_readme=True
+    ),
+    "clip_dog": Measurement(
+        "moving", "dog: a phone clip of 4 s", "clip_dog/dog.mp4", "dynamic",
+        ("data.longest_side=480", "train.steps=10000"), in_readme=True,
+    ),
+    "rig": Measurement(
+        "moving", "rig: four fixed cameras", "rig", "dynamic",
+        ("model.choose=false", "train.steps=6000"), in_readme=True,
+    ),
+    "clip_duck": Measurement(
+        "moving", "duck: a clip, one moving camera", "clip_duck", "dynamic",
+        ("data.longest_side=400",),
+    ),
+    "stage": Measurement(
+        "moving", "stage (synthetic): eight fixed cameras", "stage", "dynamic",
+        ("train.steps=10000",), in_readme=True,
+    ),
+    "orbits": Measurement(
+        "moving", "orbits (synthetic): one view per time", "orbits", "dynamic", in_readme=True
+    ),
+    "flag": Measurement("moving", "flag (synthetic): one view per time", "flag", "dynamic"),
+    "casual_m": Measurement(
+        "people", "casual_m (synthetic): a walking man, eight cameras", "human/casual_m", "human",
+        in_readme=True,
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Result:
+    """A stored measurement. None: not measured, or does not apply."""
+
+    command: str
+    capture: str
+    commit: str
+    date: str
+    machine: str
+    threads: int
+    steps: int
+    image_size: str
+    num_views: int | None
+    psnr: float
+    ssim: float | None = None
+    psnr_white: float | None = None
+    psnr_black: float | None = None
+    psnr_moving: float | None = None
+    psnr_person: float | None = None  # within the person's bounding box
+    num_gaussians: int | None = None
+    moving_fraction: float | None = None
+    model_mb: float | None = None  # float32
+    stored_mb: float | None = None  # file of `dyngs export --format dyngs`
+    cpu_seconds: float | None = None  # of training and its pilot runs, all threads
+    wall_seconds: float | None = None
+    source: str = "measured by benchmarks/results.py"
+
+
+def training_command(measurement: Measurement, root: str, run: str, threads: int) -> list[str]:
+    """Return the words of `dyngs train` for a measurement."""
+    return [
+        "train", measurement.preset, f"data.root={root}", *measurement.overrides,
+        f"run.threads={threads}", f"run.dir={run}",
+    ]  # fmt: skip
+
+
+def run_dyngs(words: list[str]) -> float:
+    """Run a dyngs command. Returns its CPU seconds."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run([sys.executable, "-m", "dyngs", *words], check=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def processor() -> str:
+    """Return the model of the processor."""
+    cpuinfo = Path("/proc/cpuinfo")
+    names = [platform.machine()]
+    if cpuinfo.is_file():
+        lines = cpuinfo.read_text(encoding="utf-8").splitlines()
+        names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return f"{names[0]}, {os.cpu_count()} cores"
+
+
+def current_commit() -> str:
+    """Return the short hash of the checked-out commit."""
+    words = ["git", "-C", str(ROOT), "rev-parse", "--short=8", "HEAD"]
+    return subprocess.run(words, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def store(name: str, run: Path, cpu_seconds: float, threads: int, commit: str, day: str) -> Path:
+    """Write the JSON of a measurement from a finished run and its metrics.json."""
+    measurement = MEASUREMENTS[name]
+    metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
+    export = run.parent / f"{run.name}_export"
+    if not export.exists():
+        run_dyngs(["export", str(run), "--format", "dyngs", "--out", str(export)])
+    keys = {field.name for field in fields(Result)} & metrics.keys()
+    values = {key: metrics[key] for key in keys if metrics[key] is not None}
+    place = Path(measurement.capture).name
+    values |= {
+        "command": "dyngs "
+        + " ".join(training_command(measurement, place, f"runs/{name}", threads)),
+        "capture": measurement.capture,
+        "commit": commit,
+        "date": day,
+        "machine": processor(),
+        "threads": threads,
+        "steps": metrics["step"],
+        "image_size": f"{metrics['width']}x{metrics['height']}",
+        "stored_mb": (export / "scene.dyngs").stat().st_size / 1e6,
+        "cpu_seconds": cpu_seconds,
+        "wall_seconds": metrics["seconds_train"],
+    }
+    path = RESULTS / f"{name}.json"
+    path.write_text(json.dumps(asdict(Result(**values)), indent=2) + "\n", encoding="utf-8")
+    return path
+
+
+def measure(name: str, captures: Path, runs: Path, threads: int) -> Path:
+    """Train and evaluate a measurement, and store it."""
+    measurement = MEASUREMENTS[name]
+    capture = captures / measurement.capture
+    if measurement.estimate_poses:
+        posed = runs / f"{name}_capture"
+        if not posed.exists():
+            run_dyngs(["data", "sfm", str(capture), str(posed)])
+        capture = posed
+    run = runs / name
+    cpu_seconds = run_dyngs(training_command(measurement, str(capture), str(run), threads))
+    run_dyngs(["eval", str(run)])
+    return store(name, run, cpu_seconds, threads, current_commit(), date.today().isoformat())
+
+
+def load_results() -> dict[str, Result]:
+    """Return all stored results in the order of MEASUREMENTS."""
+    paths = {name: RESULTS / f"{name}.json" for name in MEASUREMENTS}
+    return {
+        name: Result(**json.loads(path.read_text(encoding="utf-8")))
+        for name, path in paths.items()
+        if path.is_file()
+    }
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """Format a number for a cell; an empty cell for None."""
+    return "" if value is None else f"{value:,.{digits}f}"
+
+
+def psnr_cell(result: Result) -> str:
+    """PSNR, on both backgrounds where images have alpha."""
+    if result.psnr_white is None or result.psnr_black is None:
+        return number(result.psnr)
+    return f"{result.psnr_white:.2f} on white, {result.psnr_black:.2f} on black"
+
+
+def cpu_minutes(result: Result) -> str:
+    """CPU minutes of training with one digit."""
+    return number(None if result.cpu_seconds is None else result.cpu_seconds / 60, 1)
+
+
+def table(rows: list[list[str]]) -> str:
+    """Format a Markdown table; the first row is its head."""
+    lines = ["| " + " | ".join(cells) + " |" for cells in rows]
+    lines.insert(1, "|" + "---|" * len(rows[0]))
+    return "\n".join(lines)
+
+
+def detail_cell(result: Result) -> str:
+    """The PSNR of what moves, or within the box of a person."""
+    if result.psnr_person is not None:
+        return number(result.psnr_person)
+    return number(result.psnr_moving)
+
+
+DETAILS = {"static": None, "moving": "PSNR of what moves", "people": "PSNR in the person's box"}
+
+
+def quality_page(page: str, results: dict[str, Result]) -> str:
+    """The page of one kind of scene: figures, commands and origin."""
+    chosen = {name: r for name, r in results.items() if MEASUREMENTS[name].page == page}
+    detail = DETAILS[page]
+    head = ["capture", "PSNR, dB", "SSIM"]
+    if detail is not None:
+        head.append(detail)
+    head += ["Gaussians", "steps", "image", "test views", "CPU minutes"]
+    rows = [head]
+    for name, result in chosen.items():
+        cells = [MEASUREMENTS[name].title, psnr_cell(result), number(result.ssim, 3)]
+        if detail is not None:
+            cells.append(detail_cell(result))
+        views = "" if result.num_views is None else str(result.num_views)
+        cells += [number(result.num_gaussians, 0), f"{result.steps:,}", result.image_size, views]
+        cells.append(cpu_minutes(result))
+        rows.append(cells)
+    origin = [["capture", "commit", "date", "threads", "machine", "source"]]
+    origin += [
+        [MEASUREMENTS[name].title, r.commit, r.date, str(r.threads), r.machine, r.source]
+        for name, r in chosen.items()
+    ]
+    commands = "\n".join(result.command for result in chosen.values())
+    return (
+        f"# Quality: {page} scenes\n\n"
+        "Mean PSNR and SSIM of the whole test split. How to read the figures: "
+        "[overview](index.md).\n\n"
+        f"{table(rows)}\n\n## Commands\n\n```bash\n{commands}\n```\n\n"
+        f"## Origin\n\n{table(origin)}\n"
+    )
+
+
+def size_page(results: dict[str, Result]) -> str:
+    """Sizes of models in memory and of their files, and CPU seconds of a step."""
+    rows = [["capture", "Gaussians", "float32, MB", "scene.dyngs, MB", "CPU ms per step"]]
+    for name, result in results.items():
+        per_step = None if result.cpu_seconds is None else result.cpu_seconds / result.steps * 1000
+        rows.append(
+            [
+                MEASUREMENTS[name].title,
+                number(result.num_gaussians, 0),
+                number(result.model_mb, 1),
+                number(result.stored_mb),
+                number(per_step, 0),
+            ]
+        )
+    return (
+        "# Sizes and speed\n\n"
+        "`float32` is the size of the model in memory. `scene.dyngs` is the file of\n"
+        "`dyngs export RUN --format dyngs`. CPU time per step includes pilot runs and reading images.\n\n"
+        f"{table(rows)}\n"
+    )
+
+
+def readme_table(results: dict[str, Result]) -> str:
+    """The table of README.md."""
+    rows = [["capture", "preset", "test PSNR, dB", "Gaussians", "file, MB", "CPU minutes"]]
+    for name, result in results.items():
+        measurement = MEASUREMENTS[name]
+        if not measurement.in_readme:
+            continue
+        psnr = psnr_cell(result)
+        if detail_cell(result):
+            what = "in the person's box" if result.psnr_person is not None else "what moves"
+            psnr += f"; {what} {detail_cell(result)}"
+        rows.append(
+            [
+                measurement.title,
+                f"`{measurement.preset}`",
+                psnr,
+                number(result.num_gaussians, 0),
+                number(result.stored_mb),
+                cpu_minutes(result),
+            ]
+        )
+    return table(rows)
+
+
+def written_pages(results: dict[str, Result]) -> dict[Path, str]:
+    """Return the contents of all pages, and of README.md with its new table."""
+    pages = {PAGES / f"{page}.md": quality_page(page, results) for page in DETAILS}
+    pages[PAGES / "size.md"] = size_page(results)
+    readme = ROOT / "README.md"
+    before, rest = readme.read_text(encoding="utf-8").split(TABLE_BEGIN)
+    after = rest.split(TABLE_END)[1]
+    table_text = f"{TABLE_BEGIN}\n{readme_table(results)}\n{TABLE_END}"
+    return pages | {readme: before + table_text + after}
+
+
+def main() -> None:
+    """Run one command of the script."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("list", help="print the names of all measurements")
+    run = commands.add_parser("run", help="measure and store")
+    run.add_argument("name", choices=MEASUREMENTS)
+    run.add_argument("--captures", type=Path, required=True)
+    run.add_argument("--runs", type=Path, default=Path("runs"))
+    run.add_argument("--threads", type=int, default=1)
+    commands.add_parser("write", help="write docs/benchmarks and the table of README.md")
+    options = parser.parse_args()
+    if options.command == "list":
+        for name, measurement in MEASUREMENTS.items():
+            print(f"{name}: {' '.join(training_command(measurement, 'CAPTURE', 'RUN', 1))}")
+    elif options.command == "run":
+        print(measure(options.name, options.captures, options.runs, options.threads))
+    else:
+        for path, text in written_pages(load_results()).items():
+            path.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
