@@ -194,7 +194,7 @@ def test_a_model_whose_images_were_shrunk_is_left_out(
     monkeypatch.setattr(budget_time, "SMALLEST_SIDE", 8)
     words = ["compare", str(capture), "--models", "static", "--minutes", "0.001", "--threads", "1"]
     assert main([*words, "init.num_random=100", "--out", str(tmp_path / "out")]) == 2
-    said = "static: too few steps fit into 0.001 minutes of training, so its images were shrunk to 8 px"
+    said = "static: too few steps fit into 0.001 minutes of training, so its images were resized to 8 px"
     assert said in capsys.readouterr().err
 
 
