@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
-from dyngs.data.body_frames import merge_root_rotation, match_frames
+from dyngs.data.body_frames import match_frames, merge_root_rotation
 from dyngs.data.capture import Capture, View
 from dyngs.human.body.body import BodyTemplate, posed_vertices
 from dyngs.human.body.body_reader import default_template
