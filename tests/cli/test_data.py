@@ -87,7 +87,7 @@ def test_a_motion_of_romp_without_a_rate_is_read_with_one_and_what_is_assumed_is
     assert "4 frames, 0.15 s at 20 frames per second" in printed
     notes = [line for line in printed.splitlines() if line.startswith("note: ")]
     assert len(notes) == 1
-    assert "the file does not say what is up; -y is taken" in notes[0]
+    assert "the file does not name its up axis; -y is used" in notes[0]
     found = read_motion(tmp_path / "out.npz")
     assert float(found.poses.abs().max()) < 1e-6, "upright, in the axes of the template"
 

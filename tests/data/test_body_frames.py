@@ -118,7 +118,7 @@ GOOD: dict[str, Any] = {
             "'poses' has 87 numbers per frame; supported bodies: 72",
         ),
         ({"poses": np.zeros((4, 73))}, "'poses' has 73 numbers per frame"),
-        ({"poses": np.zeros((3, 72))}, "'poses' must hold as many numbers for each of 4 frames"),
+        ({"poses": np.zeros((3, 72))}, "'poses' must have one row of numbers for each of 4 frames"),
         ({"poses": np.zeros(())}, "'poses' must hold as many numbers"),
         ({"poses": [[0.0] * 72] * 3 + [[0.0]]}, "'poses' must hold as many numbers"),
         ({"poses": [["a"] * 72] * 4}, "'poses' must hold as many numbers"),

@@ -1,4 +1,4 @@
-"""How an avatar is trained: in the pose of every image, with the fit of its body refined."""
+"""Training of avatars: losses in the pose of each image, and refinement of the body fit."""
 
 from __future__ import annotations
 
@@ -48,23 +48,23 @@ from dyngs.ops.adam import Count
 from dyngs.ops.device import copy_async
 from dyngs.ops.loss import l1_ssim_loss
 
-OUTLINE_REACH_PX = (
-    2  # distance from the mask up to which images are compared as they were taken, px
-)
-MAX_OUTSIDE_ALPHA = 0.02  # alpha up to which a pixel is outside of the mask
-PLATE_FRAMES = 21  # of a camera, whose median is what is behind
-# median difference, over pixels outside of the masks, from which the camera or the light has moved
+# Width of the rim around the mask in which renders are compared with unmasked photos, px
+OUTLINE_REACH_PX = 2
+MAX_OUTSIDE_ALPHA = 0.02  # largest alpha of pixels outside the mask
+PLATE_FRAMES = 21  # frames per camera whose median is the background plate
+# Median difference from the plate, outside the masks, above which the background is not static
 MAX_BACKGROUND_CHANGE = 12 / 255
-# least fraction of the pixels near outlines, behind which something is known, to use any
+# Outlines are compared only if the plates cover this fraction of the pixels near outlines.
 MIN_OUTLINE_FRACTION = 0.01
-_STRIP = 32  # rows whose median is taken at once
+_STRIP = 32  # image rows per median, which bounds memory
 
 
 class OutlineLoss(Loss):
-    """L1 and D-SSIM of the image; in masks and up to ``REACH`` px around them, before the plate
-    where that is known.
+    """L1 and D-SSIM loss that does not depend on the exact outlines of detected masks.
 
-    There the render's own opacity, not the mask, says how much of the plate is seen.
+    In the mask and up to ``OUTLINE_REACH_PX`` around it, the render is composited over the
+    background plate of its camera and compared with the unmasked photo. Thus the rendered opacity
+    replaces the mask. Pixels without a plate are compared with the masked image.
     """
 
     def __init__(
@@ -75,22 +75,21 @@ class OutlineLoss(Loss):
         ssim_weight: float,
         known: float,
     ) -> None:
-        """Keep all of it.
-
+        """
         Args:
-            photos: the training images as they were taken.
-            plates: colours (H, W, 3) behind the person by the number of the camera, and where (H,
-                W) they are known: seen without the person often enough.
-            behind: (3,) colour of the run's background.
-            known: fraction of the pixels near outlines where a plate is known, for people.
+            photos: training images without masks.
+            plates: by camera id, background colours (H, W, 3) and the pixels (H, W) bool where
+                enough frames show the background.
+            behind: (3,) background colour of the run.
+            known: fraction of the pixels near outlines that have a plate, for the message.
         """
         self._photos = photos
         self._plates = plates
         self._behind = behind
         self._ssim_weight = ssim_weight
         self.finding = (
-            f"masks are found ones: {known:.0%} of the pixels at their outlines are compared before what other frames "
-            "show behind the person"
+            f"masks are detected: {known:.0%} of the pixels at outlines are compared over the "
+            "background that other frames show"
         )
 
     def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
@@ -111,8 +110,11 @@ class OutlineLoss(Loss):
 
 
 def make_outline_loss(run: StartContext) -> OutlineLoss | None:
-    """Return how colours are compared near outlines; None where masks come with the images, or no
-    camera stands."""
+    """Return the loss for detected masks.
+
+    None if masks come with the images, no camera is fixed, plates cover too little, or settings
+    (random background, exposure, camera refinement) rule it out.
+    """
     views = run.images.views
     config = run.config
     if (
@@ -128,12 +130,12 @@ def make_outline_loss(run: StartContext) -> OutlineLoss | None:
         return None
     plates: dict[int, tuple[Tensor, Tensor]] = {}
     known = total = 0.0
-    for camera, rows in _standing(views).items():
+    for camera, rows in _fixed_cameras(views).items():
         shown = [rows[i] for i in evenly_spaced(len(rows), PLATE_FRAMES)]
         alphas = torch.stack([x for i in shown if (x := run.images[i].alpha) is not None])
         near = _near_silhouette(alphas)
         bare = [(255 * photos[i].rgb_premultiplied).round().byte() for i in shown]
-        plate = _plate(torch.stack(bare), near)
+        plate = _background_plate(torch.stack(bare), near)
         if plate is None:
             continue
         plates[camera] = plate
@@ -147,8 +149,8 @@ def make_outline_loss(run: StartContext) -> OutlineLoss | None:
     )
 
 
-def _standing(views: Sequence[View]) -> dict[int, list[int]]:
-    """Return the rows of the views of each camera that stands, by its number."""
+def _fixed_cameras(views: Sequence[View]) -> dict[int, list[int]]:
+    """Return the rows of the views of each fixed camera, by camera id."""
     rows: dict[int, list[int]] = defaultdict(list)
     for row, view in enumerate(views):
         rows[view.camera_id].append(row)
@@ -163,17 +165,22 @@ def _standing(views: Sequence[View]) -> dict[int, list[int]]:
 
 
 def _near_silhouette(alpha: Tensor) -> Tensor:
-    """Return where (..., H, W) the mask is, and up to ``REACH`` px around it."""
+    """Return the mask, dilated by ``OUTLINE_REACH_PX``, as (..., H, W) bool."""
     size = 2 * OUTLINE_REACH_PX + 1
     grown = torch.nn.functional.max_pool2d(alpha[..., None, :, :], size, 1, OUTLINE_REACH_PX)
     return grown[..., 0, :, :] > MAX_OUTSIDE_ALPHA
 
 
-def _plate(photos: Tensor, near: Tensor) -> tuple[Tensor, Tensor] | None:
-    """Return the median of photos (F, H, W, 3) uint8 over those that show no person at a pixel, and
-    where it is known.
+def _background_plate(photos: Tensor, near: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Return the background plate: the median over the frames without the person at a pixel.
 
-    ``near`` (F, H, W) says where the person may be. None: it is not one thing, or never seen.
+    Args:
+        photos: (F, H, W, 3) uint8.
+        near: (F, H, W) bool, pixels where the person may be.
+
+    Returns:
+        colours (H, W, 3), and the pixels (H, W) bool with enough frames. None if the background
+        changes or is never visible.
     """
     known = (~near).sum(0) >= SEEN_BARE
     colours = torch.zeros(*photos.shape[1:], device=photos.device)
@@ -194,18 +201,18 @@ def _plate(photos: Tensor, near: Tensor) -> tuple[Tensor, Tensor] | None:
 class AvatarParams:
     """When and how strongly an avatar is regularised; distances in cm."""
 
-    refine_from: float = 0.1  # fraction of the run after which corrections are learned
-    # fraction after which those of single frames are: what all frames share comes first
+    refine_from: float = 0.1  # fraction of the run after which the body fit is corrected
+    # Fraction after which corrections of single frames are learned, too; shared ones come first.
     refine_frames_from: float = 0.25
-    offset_weight: float = 2e-4  # of squared distances from the scaffold
-    scale_weight: float = 1e-2  # of the squared excess of log-scales over the size of the texel
-    rigidity: float = 1e-2  # of squared changes, by posing, of distances between neighbours
-    smoothness: float = 1e-3  # of squared differences between the offsets of neighbours
-    neighbours: int = 5
-    # of the squared difference between colours of both sides, where light is learned
+    offset_weight: float = 2e-4  # weight of squared distances of Gaussians from their anchors
+    scale_weight: float = 1e-2  # weight of the squared excess of log-scales over the texel size
+    rigidity: float = 1e-2  # weight of squared changes of distances between neighbours by posing
+    smoothness: float = 1e-3  # weight of squared differences between the offsets of neighbours
+    neighbours: int = 5  # neighbours per Gaussian
+    # Weight of squared colour differences between mirror images, if a light is learned
     sides_weight: float = 0.1
-    views: int = 100  # training views, at most, in which it is counted how much they show
-    # fraction of Gaussians that are hardly seen from which on a message says so
+    views: int = 100  # largest number of training views that measure visibility
+    # Fraction of hardly visible Gaussians from which the message is logged
     min_reported_fraction: float = 0.01
 
 
@@ -214,12 +221,15 @@ CENTIMETRE = 0.01
 
 
 class HumanTraining(SceneTraining[HumanScene]):
-    """See ``SceneTraining``; ``frames`` are numbers of the rows of the clip of training, ``rates``
-    say how rates fall.
+    """Training of an avatar, see ``SceneTraining``.
 
-    ``views`` are camera and frame of the training views; without any, what they do not show is not
-    filled. ``outlines`` is how colours are compared near the outlines of found masks, ``refit`` how
-    poses are fitted again.
+    Args:
+        frames: frame numbers of the rows of the training clip.
+        rates: schedule of the learning rates.
+        views: camera and frame number of each training view. Without views, unseen Gaussians are
+            not filled in.
+        outlines: image loss for detected masks.
+        refit: repeated fit of the poses during training.
     """
 
     deformation_name = ("pose", "model")
@@ -247,7 +257,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         self._refit = refit
 
     def time_step(self, scene: HumanScene, image: Image, step: int) -> GaussianTimeStep:
-        """Return the Gaussians in the pose of ``image``, and the regularizers.
+        """Return the Gaussians in the pose of ``image``, and the regularisers.
 
         Raises DyngsError: the image's frame has no pose.
         """
@@ -276,8 +286,8 @@ class HumanTraining(SceneTraining[HumanScene]):
             weights = scene.template_weights()
             self._neighbours = same_part_neighbours(anchors.points, weights, PARAMS.neighbours)
         if self._neighbours.shape[1]:
-            # in each step between neighbours of one of the five columns, in cm^2: distances do not
-            # change, and offsets from the scaffold are alike
+            # Posing should preserve distances to neighbours, and neighbours should have similar
+            # offsets from their anchors. Each step uses one neighbour per Gaussian. Units are cm^2.
             near = self._neighbours[:, step % self._neighbours.shape[1]]
             scale = scene.clip.scale[row]
             strain, uneven = rigidity_errors(rest.means, moved.means, anchors.points, near, scale)
@@ -287,7 +297,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         return GaussianTimeStep(moved, image.time, frame, penalties)
 
     def optimize(self, scene: HumanScene, step: int) -> Count:
-        """Update the corrections."""
+        """Update the corrections of the body fit."""
         if not self._refines(step):
             return 0
         self._has_refined = True
@@ -299,24 +309,23 @@ class HumanTraining(SceneTraining[HumanScene]):
         return scene.learned.step(step - self.refines_from, progress)
 
     def leaves(self, scene: HumanScene) -> list[Tensor]:
-        """Return the corrections."""
+        """Return the corrections of the body fit."""
         return scene.learned.leaves
 
     def edit_scene(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
-        """Return the scene, and after the last step new values for what the images hardly show.
+        """Fill in hardly visible Gaussians after the last step; before it, fit poses again if due.
 
-        After the first step with a line about outlines, if there is one. In between poses may be
-        fitted again.
+        After the first step, only the message of the outline loss is returned.
         """
         if step == 1 and self._finding is not None:
             return scene, EditResult(None, message=self._finding)
         if step == self.rates.steps:
             has_views = self.options.fill_unseen and self.views and len(scene)
-            return self._filled(scene, step) if has_views else None
+            return self._fill_unseen(scene, step) if has_views else None
         found = None if self._refit is None else self._refit.edit_scene(scene, step)
         return None if found is None else (found[0], EditResult(None, message=found[1] or None))
 
-    def _filled(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult]:
+    def _fill_unseen(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult]:
         shown = [self.views[i] for i in evenly_spaced(len(self.views), PARAMS.views)]
         device = scene.skeleton.joints.device
         with torch.no_grad():
@@ -331,17 +340,20 @@ class HumanTraining(SceneTraining[HumanScene]):
             gaussians = scene.gaussians.detach()
             changes = filled(gaussians, scene.anchors, scene.template_weights(), middle, trust)
         hardly = float((trust < LOW_CONFIDENCE).float().mean())
-        line = f"{hardly:.0%} of the surface is hardly seen: filled from the other side of the body and from around it"
+        line = (
+            f"{hardly:.0%} of the surface is hardly seen: filled in from the mirrored side and "
+            "neighbours"
+        )
         message = line if hardly >= PARAMS.min_reported_fraction else None
         return replace(scene, seen=trust), EditResult(None, changes, message=message)
 
     def apply_edit(self, edit: TopologyEdit | None = None) -> None:
-        """Find out anew who the neighbours are."""
+        """Discard cached neighbours and mirror images, since rows have changed."""
         self._neighbours = self._mirror_images = None
 
     def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
         self.apply_edit()
-        if "refines_from" in tensors:  # the run may have become longer since
+        if "refines_from" in tensors:  # The run may have been extended.
             self._has_refined = True
             self.refines_from = min(self.refines_from, int(tensors["refines_from"]))
         if self._refit is not None:
@@ -357,11 +369,11 @@ class HumanTraining(SceneTraining[HumanScene]):
         return with_role(kept, Role.TRAINING)
 
     def _row(self, scene: HumanScene, frame: int) -> int:
-        """Return the row of ``frame`` in the clip; who never moves has one row."""
+        """Return the row of ``frame`` in the clip; clips of a static person have one row."""
         return min(self._rows[frame], len(scene.clip) - 1)
 
     def _in_frame(self, scene: HumanScene, row: int, step: int) -> tuple[Gaussians, BodyPose]:
-        """Return the Gaussians in row ``row`` of the clip as ``step`` draws them, and the pose."""
+        """Return the posed Gaussians of a row of the clip as rendered in ``step``, and the pose."""
         return scene.gaussians_in_frame(
             row, None if self._refines(step) else scene.template_weights()
         )

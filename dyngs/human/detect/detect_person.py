@@ -1,4 +1,4 @@
-"""Silhouettes and key points of one person in a clip, as files that the fit of a body reads.
+"""Detects one person in a capture; writes silhouettes and key points for the body fit.
 
 Local letters: F images of one camera in order of time, H height, W width.
 """
@@ -32,24 +32,26 @@ from dyngs.io.outputs import make_once, record_source, require_new_folder
 from dyngs.io.write import cache_folder, temporary_folder_beside, write_image, write_text
 
 SWAP_COST = 0.04
-"""What a swapped image costs, in heights of the person by which each key point moves: a limb taken
-for the other one in a few images moves them more, and who has turned around stays so for long."""
+"""Cost per image of exchanging left and right, as mean motion of a key point per frame in heights
+of the person. Confused limbs move further than this in a few images; a person who has turned around
+stays so for many images and is not changed."""
 _PAIRS = {
     "all": ((1, 2), (3, 4), (5, 6), (7, 8), (9, 10), (11, 12), (13, 14), (15, 16)),
     "arms": ((7, 8), (9, 10)),
     "legs": ((13, 14), (15, 16)),
 }
-"""Key points of COCO on the left and on the right."""
+"""Pairs of left and right COCO key points, by the groups that are exchanged together."""
 
 
 def fix_left_right_swaps(person: Sequence[Detection | None]) -> tuple[list[Detection | None], int]:
-    """Return the detections of a person (F) with left and right as over time, and in how many
-    images that changed.
+    """Make left and right consistent over time in the F detections of a person.
 
-    Detectors take one arm for the other where they cross, and front for back. First all pairs of
-    key points, then arms, then legs are swapped in those images where the key points then move so
-    much less that ``SWAP`` is worth it: the cheapest sequence of swapped and not, by dynamic
-    programming.
+    Detectors confuse crossing arms, and front with back. All pairs of key points, then arms, then
+    legs are exchanged in the images where this reduces motion by more than ``SWAP_COST``. Dynamic
+    programming finds the sequence of least cost.
+
+    Returns:
+        the corrected detections, and the number of changed images.
     """
     numbers = [number for number, x in enumerate(person) if x is not None]
     detections = [x for x in person if x is not None]
@@ -57,7 +59,7 @@ def fix_left_right_swaps(person: Sequence[Detection | None]) -> tuple[list[Detec
     heights = np.array([x.height for x in detections])
     changed = np.zeros(len(points), bool)
     for pairs in _PAIRS.values():
-        swapped = _swapped(points, np.array(pairs), heights)
+        swapped = _find_swaps(points, np.array(pairs), heights)
         for left, right in pairs:
             points[swapped, left], points[swapped, right] = (
                 points[swapped, right],
@@ -70,16 +72,18 @@ def fix_left_right_swaps(person: Sequence[Detection | None]) -> tuple[list[Detec
     return result, int(changed.sum())
 
 
-def _swapped(points: np.ndarray, pairs: np.ndarray, heights: np.ndarray) -> np.ndarray:
-    """Return in which images (F,) bool the ``pairs`` (P, 2) of ``points`` (F, 17, 3) are better
-    swapped."""
+def _find_swaps(points: np.ndarray, pairs: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """Return the images (F,) bool in which to exchange left and right.
+
+    ``points``: (F, 17, 3) key points. ``pairs``: (P, 2) left and right rows.
+    """
     if len(points) < 2:
         return np.zeros(len(points), bool)
-    # (2, F, P, 2, 3): as they are, swapped
+    # (2, F, P, 2, 3): original and exchanged key points
     both = np.stack([points[:, pairs], points[:, pairs[:, ::-1]]])
     sure: np.ndarray = np.all(points[:, pairs, 2] > MIN_CONFIDENCE, axis=-1)  # (F, P)
     weights = (sure[1:] & sure[:-1])[..., None]
-    # (2, 2, F - 1, P, 2): from the row's state to the column's
+    # (2, 2, F - 1, P, 2): motion from each state of an image to each state of the next one
     moved = np.linalg.norm(both[None, :, 1:, ..., :2] - both[:, None, :-1, ..., :2], axis=-1)
     units = heights[1:].clip(1e-6) * (2 * weights.sum((1, 2))).clip(1)
     changes = (moved * weights).sum((3, 4)) / units
@@ -90,12 +94,12 @@ def _swapped(points: np.ndarray, pairs: np.ndarray, heights: np.ndarray) -> np.n
 def capture_warnings(
     images: np.ndarray, person: Sequence[Detection | None], *, alone: bool = True
 ) -> list[str]:
-    """Return lines on what will be bad.
+    """Return warnings about problems of a recording that reduce the quality of an avatar.
 
     Args:
         images: (F, H, W, 3) uint8.
-        person: their detection in each image.
-        alone: there is no other camera.
+        person: detection of the person in each image, None if there is none.
+        alone: whether the capture has no other camera.
     """
     shown = [(image, x) for image, x in zip(images, person, strict=True) if x is not None]
     detections = [x for _, x in shown]
@@ -108,20 +112,20 @@ def capture_warnings(
     if count < len(images):
         gone = len(images) - count
         lines.append(
-            f"nobody is found in {gone} of {format_count(len(images), 'image')}; these are left out"
+            f"no person found in {gone} of {format_count(len(images), 'image')}; these are left out"
         )
     if cut > 0.1 * count:
         lines.append(
-            f"the feet are cut off or hidden in {cut} of {format_count(count, 'image')}; legs will be a guess there"
+            f"the feet are cut off or hidden in {cut} of {format_count(count, 'image')}; the legs are unknown there"
         )
     if height < 120:
-        lines.append(f"the person is {height:.0f} px high; come nearer or record larger images")
+        lines.append(f"the person is {height:.0f} px high; move closer or record larger images")
     if blurred > 0.1 * count:
         lines.append(
-            f"{format_count(blurred, 'image')} blurred; more light, or slower motion, helps"
+            f"blurred: {format_count(blurred, 'image')}; use more light, or move more slowly"
         )
     if alone and not _turns(detections):
-        lines.append("the person never turns around: what the camera never sees will be a guess")
+        lines.append("the person never turns around; sides that the camera never sees are unknown")
     return lines
 
 
@@ -135,22 +139,25 @@ def _is_cut_off(person: Detection, height: int) -> bool:
 
 
 def _sharpness(image: np.ndarray, person: Detection) -> float:
-    """Return the spread of the Laplacian over that of the grey levels in the person's box."""
+    """Return the ratio of two standard deviations in the person's box: Laplacian, grey levels."""
     left, top, right, bottom = (max(round(float(edge)), 0) for edge in person.box)
     grey = image[top:bottom, left:right].astype(np.float32).mean(-1)
     return float(ndimage.laplace(grey).std() / max(float(grey.std()), 1.0)) if grey.size else 0.0
 
 
 def _turns(people: Sequence[Detection]) -> bool:
-    """Whether the person is seen from the front and from behind: the left shoulder right of the
-    right one, and left, by a tenth of their height."""
+    """Return whether the person is seen from the front and from behind.
+
+    The left shoulder must be to the right of the right one in an image, and to its left in another,
+    each by a tenth of the person's height.
+    """
     left, right = (np.array([x.keypoints[row] for x in people]) for row in (5, 6))
     sure = (left[:, 2] > MIN_CONFIDENCE) & (right[:, 2] > MIN_CONFIDENCE)
     across = (left[sure, 0] - right[sure, 0]) / np.array([max(x.height, 1.0) for x in people])[sure]
     return bool((across > 0.1).any() and (across < -0.1).any())
 
 
-DETECTOR_SIDE_PX = 960  # longest side of the images that a detector sees, px
+DETECTOR_SIDE_PX = 960  # longest side to which images are resized for the detector, px
 
 
 def detect_person(
@@ -160,18 +167,17 @@ def detect_person(
     report: ProgressCallback,
     log: Callable[[str], None] = log_info,
 ) -> FitInputs:
-    """Find a person in all views, write masks and key points to ``folder``, and return where they
-    are.
+    """Detect a person in all views; write masks and key points to ``folder``; return their paths.
 
-    Left and right are made the same over time. Where a camera stands, outlines of masks are those
-    of what stands before its background. Views without the person, or a camera that never shows
-    them, get empty masks. Says what was found, and what will be bad about it.
-    Raises DyngsError: nobody is found.
+    Left and right are made consistent over time. Masks of fixed cameras are refined by background
+    subtraction. Views without the person get empty masks. Logs the detections and warnings about
+    the recording.
+    Raises DyngsError: no view shows a person.
     """
     points: dict[str, np.ndarray] = {}
     cameras = [*group_by_camera(capture.splits).values()]
     for index, views in enumerate(cameras, 1):
-        # A detector reads files, which only live here.
+        # The detector reads files; they are removed after it has run.
         size = target_size(views[0].width, views[0].height, 1.0, DETECTOR_SIDE_PX)
         files = [folder / "frames" / f"{row:06d}.png" for row in range(len(views))]
         images = np.stack([_shrunk_image(view, size) for view in views])
@@ -198,13 +204,14 @@ def detect_person(
                 masks[row] = own.mask > 127
                 scale = views[row].width / size[0]
                 points[views[row].name] = own.keypoints * np.array([scale, scale, 1.0])
-        better = refine_outlines(images, masks) if heights else None
-        if better is not None:
-            common = (better & masks).sum() / max(int((better | masks).sum()), 1)
+        refined = refine_outlines(images, masks) if heights else None
+        if refined is not None:
+            iou = (refined & masks).sum() / max(int((refined | masks).sum()), 1)
             log(
-                f"the camera stands: outlines by its background, which agree with the detector's to {common:.3f} (IoU)"
+                f"fixed camera: outlines refined by its background (IoU {iou:.3f} "
+                "with the detector's masks)"
             )
-            masks = better
+            masks = refined
         for view, mask in zip(views, masks, strict=True):
             write_image(folder / "masks" / f"{view.name}.png", resize_mask(mask, view))
     if not points:
@@ -222,7 +229,7 @@ def _shrunk_image(view: View, size: tuple[int, int]) -> np.ndarray:
 
 
 def _write_keypoints(path: Path, points: dict[str, np.ndarray]) -> None:
-    """Write a COCO file of the key points (17, 3) of each view by name."""
+    """Write key points (17, 3), by name of the view, as a COCO file."""
     images = [{"id": row, "file_name": f"{name}.png"} for row, name in enumerate(points)]
     people = [
         {"image_id": row, "category_id": 1, "keypoints": [round(float(x), 4) for x in own.ravel()]}
@@ -238,11 +245,10 @@ def write_detected_person(
     report: ProgressCallback = ignore_progress,
     log: Callable[[str], None] = log_info,
 ) -> FittedCapture:
-    """Find a person and fit the body to them: write the capture of ``write_fitted_capture`` to the
-    new folder ``out``.
+    """Detect a person, fit the body, and write the fitted capture to the new folder ``out``.
 
-    ``options.root`` is a video or a folder of the frames of one standing camera, or a capture with
-    cameras. Raises DyngsError: see ``detect_person`` and ``write_fitted_capture``.
+    ``options.root`` is a video or a folder of frames of one fixed camera, or a capture with camera
+    poses. Raises DyngsError: see ``detect_person`` and ``write_fitted_capture``.
     """
     require_new_folder(out)
     clip = (
@@ -265,20 +271,19 @@ def ensure_detected_person(
     log: Callable[[str], None] = log_info,
     report: ProgressCallback = ignore_progress,
 ) -> DataConfig:
-    """Return the options with the capture of the person that is found in a clip; the same clip is
-    looked at once.
+    """Return options that name the fitted capture of a clip, which is made if it is not cached.
 
-    Raises DyngsError: no detector, or see ``write_found_person``.
+    Raises DyngsError: no detector is installed, or see ``write_detected_person``.
     """
     name = re.sub(r"[^A-Za-z0-9-]", "_", data.root.stem)[:40]
-    chosen = hashlib.sha256(repr(data.frames).encode()).hexdigest()[:8]
-    folder = cache_folder("people") / f"{name}.{digest_files(data.root)}{chosen}"
+    selection = hashlib.sha256(repr(data.frames).encode()).hexdigest()[:8]
+    folder = cache_folder("people") / f"{name}.{digest_files(data.root)}{selection}"
 
-    def find() -> None:
+    def detect() -> None:
         detector = MediaPipe()
-        log(f"person:  found first, as by `dyngs data people`, into {folder}")
+        log(f"person:  detection and body fit (`dyngs data people`), cached in {folder}")
         log(write_detected_person(data, folder, detector, report, log).summary)
 
-    make_once(folder, find, log, f"person:  found before, in {folder}")
+    make_once(folder, detect, log, f"person:  reuses the body fit in {folder}")
     record_source(folder, data.root)
     return data.model_copy(update={"root": folder, "frames": None})

@@ -22,16 +22,16 @@ from dyngs.io.numpy_files import read_arrays
 from dyngs.io.write import atomic_file
 
 _MODELS = {24: "smpl", 52: "smplh", 55: "smplx", 22: "the body of all three"}
-"""Names of the models by their number of joints."""
+"""Body models by number of joints; 22 joints are common to all three."""
 _PARTS = {"root_orient": 1, "pose_body": 21, "pose_jaw": 1, "pose_eye": 2, "pose_hand": 30}
-"""Keys and joints of the parts of 55 joints, in order; all after the second may be missing."""
+"""AMASS keys of the 55 joints in order, with joint counts. Only the first two are required."""
 _NAMED = {"global_orient": 1, "body_pose": 21, "jaw_pose": 1, "leye_pose": 1, "reye_pose": 1} | {
     "left_hand_pose": 15,
     "right_hand_pose": 15,
 }
-"""The same as the package smplx names its arguments."""
+"""The same for the argument names of the package smplx."""
 _ALIASES = {"smpl_thetas": "poses", "smpl_betas": "betas", "transl": "trans", "cam_trans": "trans"}
-"""Names of the package smplx, and of ROMP, by those of AMASS."""
+"""AMASS names of keys of ROMP and of the package smplx."""
 _RATES = ("mocap_frame_rate", "mocap_framerate", "fps", "frame_rate")
 
 
@@ -40,30 +40,31 @@ def read_amass(
 ) -> Motion:
     """Read a motion of 55 joints, y up; joints that the file lacks do not rotate.
 
-    Tensors are float32, but ``trans`` of a fit, a file with ``scale``, is float64 where the file
-    has it so.
+    Tensors are float32. ``trans`` stays float64 in files with ``scale``, which are body fits.
 
-    Keys: ``poses``, or ``root_orient``, ``pose_body`` and the like; ``trans`` (F, 3);
-    ``mocap_framerate`` or ``mocap_frame_rate``, else ``fps`` frames per second; ``betas`` (B,) or
-    (F, B); ``scale`` (one or F) and ``up_axis`` in files of dyngs or a fit. Or the names of the
-    package smplx: ``global_orient``, ``body_pose`` and the like, ``transl``, ``fps``; or those of
-    ROMP. Poses are axis-angles or rotation matrices of 22, 24, 52 or 55 joints.
+    Keys of AMASS: ``poses``, or its parts ``root_orient``, ``pose_body``, ...; ``trans`` (F, 3);
+    ``betas`` (B,) or (F, B); ``mocap_framerate`` or ``mocap_frame_rate``, else argument ``fps``.
+    Files of dyngs also have ``scale`` (one or F) and ``up_axis``. Names of the package smplx
+    (``global_orient``, ``body_pose``, ``transl``, ...) and of ROMP are read, too. Poses are
+    axis-angles or rotation matrices of 22, 24, 52 or 55 joints.
 
-    AMASS files are z up: unless ``up`` or ``up_axis`` says otherwise, a file is z up if it has no
-    ``scale``; with the names of smplx the axis nearest to the mean up direction of the pelvis is
-    up. The rotation T to y up moves every vertex v to T v: R_0' = T R_0 about the pelvis J_0 of the
-    shaped body, trans' = T (trans + s J_0) - s J_0. If ``body`` is of another family than a file
-    without ``scale`` and ``up_axis``, shape parameters are set to zero and the lowest vertex to y =
-    0. Raises DyngsError: names the file and what is missing or wrong.
+    The up axis is that of ``up``, else of ``up_axis``. Otherwise files with ``scale`` are y up and
+    AMASS files z up; in files with smplx or ROMP names, the axis nearest to the mean up direction
+    of the pelvis is up. The rotation T to y up maps vertices v to T v. With the pelvis J_0 of the
+    shaped body and scale s: R_0' = T R_0, trans' = T (trans + s J_0) - s J_0.
+
+    Files without ``scale`` and ``up_axis`` may be of another body model than ``body``. Then shape
+    parameters are set to zero and the lowest vertex is placed at y = 0.
+    Raises DyngsError: a key is missing or wrong.
     """
     with wrap_read_errors(path, "give an AMASS file of a motion"):
         keys = ("poses", *_PARTS, *_NAMED, "trans", "betas", *_ALIASES, "scale", "up_axis", *_RATES)
-        # Others, which may hold objects, are not read.
+        # Other arrays are not read, since they may be pickled objects.
         arrays = read_arrays(path, lambda names: [key for key in keys if key in names])
         renamed = [key for key, name in _ALIASES.items() if key in arrays and name not in arrays]
         for key in renamed:
             arrays[_ALIASES[key]] = arrays.pop(key)
-        is_named = bool(renamed) or (
+        has_smplx_names = bool(renamed) or (
             "poses" not in arrays and "root_orient" not in arrays and "global_orient" in arrays
         )
         poses, model = _poses(path, arrays)
@@ -79,12 +80,12 @@ def read_amass(
         if "betas" in arrays:
             betas = _numbers(path, arrays, "betas")
             betas = betas.reshape(-1, betas.shape[-1]).mean(0)
-        is_own = "scale" in arrays or "up_axis" in arrays
-        is_other_model = not is_own and body.name != model
-        if not is_own:
+        is_dyngs_file = "scale" in arrays or "up_axis" in arrays
+        is_other_model = not is_dyngs_file and body.name != model
+        if not is_dyngs_file:
             betas = np.zeros_like(betas) if is_other_model else betas[: body.num_shapes]
         rate = _frame_rate(path, arrays, fps)
-        turn, notes = _y_up_from_file(path, arrays, up, poses[:, 0], is_named)
+        turn, notes = _y_up_from_file(path, arrays, up, poses[:, 0], has_smplx_names)
         if turn is not None:
             pelvis = scale[:, None] * _pelvis(body, betas)
             roots = Rotation.from_matrix(turn) * Rotation.from_rotvec(poses[:, 0])
@@ -107,8 +108,8 @@ def write_amass(motion: Motion, path: Path, shape_space: ShapeSpace = "smpl") ->
     """Write the motion of 55 joints as an AMASS file (``.npz``) of SMPL-X with ``up_axis`` y;
     reading it gives the same motion.
 
-    ``shape_space`` is that of the shape parameters: with "anny" the file names the free template as
-    its model. Raises DyngsError: the file cannot be written.
+    ``shape_space``: "anny" if shape parameters are those of the free template.
+    Raises DyngsError: the file cannot be written.
     """
     with atomic_file(path) as temporary, temporary.open("wb") as file:
         np.savez(
@@ -125,7 +126,7 @@ def write_amass(motion: Motion, path: Path, shape_space: ShapeSpace = "smpl") ->
 
 
 def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, str]:
-    """Return axis-angles (F, 55, 3), and the name of the model that the file is for."""
+    """Return axis-angles (F, 55, 3), and the name of the body model of the file."""
     if "poses" in arrays:
         given = _axis_angles(path, arrays, "poses", tuple(_MODELS))
         model = _MODELS[given.shape[1]]
@@ -144,7 +145,7 @@ def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, str]:
         poses = np.zeros((len(turns[root]), 55, 3))
         start = 0
         for key, count in parts.items():
-            if key in turns:  # SMPL's last two joints are the hands
+            if key in turns:  # omits the last two joints of SMPL, the hands
                 poses[:, start : start + count] = turns[key][:, :count]
             start += count
     require_frame_count(path, len(poses), 55)
@@ -159,8 +160,10 @@ def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, str]:
 def _axis_angles(
     path: Path, arrays: dict[str, np.ndarray], key: str, counts: tuple[int, ...]
 ) -> np.ndarray:
-    """Return the axis-angles (F, J, 3) of a key, J one of ``counts``: of (F, 3 J), (F, J, 3) or
-    rotation matrices (F, J, 3, 3)."""
+    """Return axis-angles (F, J, 3) of a key; J must be one of ``counts``.
+
+    The file may hold axis-angles (F, 3 J) or (F, J, 3), or rotation matrices (F, J, 3, 3).
+    """
     value = _numbers(path, arrays, key)
     if value.ndim == 4 and value.shape[2:] == (3, 3):
         matrices = Rotation.from_matrix(value.reshape(-1, 3, 3))
@@ -189,7 +192,7 @@ def _numbers(path: Path, arrays: dict[str, np.ndarray], key: str) -> np.ndarray:
 
 
 def _frame_rate(path: Path, arrays: dict[str, np.ndarray], fps: float | None) -> float:
-    """Return the frame rate of a file, a number or text; ``fps`` if it has none."""
+    """Return the frame rate of a file, which may be stored as text; ``fps`` if it has none."""
     key = next((key for key in _RATES if key in arrays), None)
     if key is not None:
         fps = float(arrays[key].ravel()[0])
@@ -201,14 +204,13 @@ def _frame_rate(path: Path, arrays: dict[str, np.ndarray], fps: float | None) ->
 
 
 def _y_up_from_file(
-    path: Path, arrays: dict[str, np.ndarray], up: UpAxis, roots: np.ndarray, is_named: bool
+    path: Path, arrays: dict[str, np.ndarray], up: UpAxis, roots: np.ndarray, has_smplx_names: bool
 ) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """Return the rotation (3, 3) to y up, None if there is nothing to turn; and a note if up had to
-    be assumed.
+    """Return the rotation (3, 3) to y up, and a note if the up axis was estimated.
 
-    By ``up``, the key ``up_axis``, as AMASS files are, or, with the names of smplx or ROMP, by
-    rotations (F, 3) of the root: the signed axis nearest to the mean up direction becomes y, by
-    half a turn about x for -y.
+    The rotation is None if the file is y up. See ``read_amass`` for the choice of the up axis;
+    ``roots`` (F, 3) are axis-angles of the pelvis, which decide for smplx and ROMP names. -y is
+    turned to y about x.
     """
     if up != "auto":
         chosen = up
@@ -220,13 +222,13 @@ def _y_up_from_file(
         chosen = "y" if "scale" in arrays else "z"
     direction = np.eye(3)["xyz".index(chosen)]
     notes = ()
-    if up == "auto" and "up_axis" not in arrays and is_named:
+    if up == "auto" and "up_axis" not in arrays and has_smplx_names:
         mean = Rotation.from_rotvec(roots).as_matrix()[:, :, 1].mean(axis=0)
         axis = int(np.abs(mean).argmax())
         direction = np.eye(3)[axis] * (1.0 if mean[axis] >= 0 else -1.0)
         name = f"{'' if mean[axis] >= 0 else '-'}{'xyz'[axis]}"
         notes = (
-            f"{path}: the file does not say what is up; {name} is taken, as the pelvis is upright so",
+            f"{path}: the file does not name its up axis; {name} is used, as the pelvis is upright then",
         )
     if direction[1]:
         return (None if direction[1] > 0 else np.diag([1.0, -1.0, -1.0])), notes

@@ -176,4 +176,4 @@ def test_a_clip_is_looked_at_once(
         data = ensure_detected_person(DataConfig(root=clip, frames=frames), log=said.append)
         assert (data.root, data.frames) == (made[-1], None)
     assert len(made) == 2
-    assert [line for line in said if "found before" in line] == [said[2]]
+    assert [line for line in said if "reuses the body fit" in line] == [said[2]]

@@ -265,7 +265,7 @@ def test_files_of_romp_and_hmr(tmp_path: Path, as_matrices: bool) -> None:
     motion = read(tmp_path, parts | rest, 24, shapes=10)
     np.testing.assert_allclose(slow_vertices(body, motion), expected, atol=3e-6)
     assert len(motion.notes) == 1
-    assert "does not say what is up; -y is taken" in motion.notes[0]
+    assert "does not name its up axis; -y is used" in motion.notes[0]
     thetas = read(tmp_path, {"smpl_thetas": rotvecs} | rest, 24, shapes=10)
     np.testing.assert_allclose(thetas.poses, motion.poses, atol=1e-6)
 
