@@ -99,11 +99,11 @@ class StaticTraining(SceneTraining[StaticScene]):
     def __init__(
         self,
         update: FilterUpdate,
-        pruning: SmallGaussianPruning = SmallGaussianPruning(),
+        build_pruning_edit: SmallGaussianPruning = SmallGaussianPruning(),
         frozen_mask: FrozenMask | None = None,
     ) -> None:
         self._update = update
-        self._pruning = pruning
+        self._pruning = build_pruning_edit
         self._frozen_mask = frozen_mask
 
     def frozen_mask(self) -> FrozenMask | None:
