@@ -79,7 +79,7 @@ MUTATIONS = (
     ("human/avatar/posing.py", "height == min(heights)", "height == max(heights)", "human/avatar/test_anchors.py"),
     ("ops/harmonics.py", "3 * z * z - 1", "3 * z * z", "ops/test_harmonics.py"),
     ("ops/harmonics.py", "by_terms[6], y, value=-2", "by_terms[6], y, value=2", "ops/test_harmonics.py"),
-    ("human/body/skinning.py", "(above - turned).mT", "above.mT", "human/body/test_skinning.py"),
+    ("human/body/skinning.py", "(above - rotations).mT", "above.mT", "human/body/test_skinning.py"),
     ("human/body/skinning.py", "along * poses", "along", "human/body/test_skinning.py"),
     ("human/avatar/posing.py", "features[1:].flatten()", "rotations[1:].flatten()", "human/avatar/test_posing.py human/avatar/test_scene.py"),
     ("training/trainer.py", "self._position += 1", "self._position += 2", "training/test_trainer.py"),

@@ -18,7 +18,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.gaussians.visibility import VisibilityMasks
 from dyngs.human.avatar.posing import PoseBlendShapes, Skeleton, texel_gaussians
-from dyngs.human.avatar.scene import HumanScene, first_scene
+from dyngs.human.avatar.scene import HumanScene, initial_human_scene
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.keys import HumanModel
@@ -108,7 +108,7 @@ def _person() -> HumanScene:
     # of a body of three vertices
     shapes = PoseBlendShapes(directions, torch.arange(3).repeat(len(body.faces), 1))
     skeleton = Skeleton(body.joints, body.parents)
-    scene = first_scene(gaussians, anchors, skeleton, clip, shapes)
+    scene = initial_human_scene(gaussians, anchors, skeleton, clip, shapes)
     for x in scene.learned.values().values():
         x += 0.05 * torch.randn(x.shape, generator=generator)
     return scene

@@ -1,1 +1,1 @@
-"""People: body templates, motion, fits, avatars, detection, and networks that predict people."""
+"""People: body templates, motion, body fitting, avatars, detection and feed-forward networks."""

@@ -1,4 +1,4 @@
-"""Section ``model`` of people, and of networks that predict them."""
+"""Configuration of avatars (``model.kind=human``) and of the network that predicts them."""
 
 from __future__ import annotations
 
@@ -13,51 +13,51 @@ NO_BODY = "has no body parameters, which model.kind=human needs; see `dyngs docs
 
 
 class _OnTemplate(SceneModel):
-    """Keys that models of people share: a body template."""
+    """Keys of all models that place Gaussians on a body template."""
 
     body: Path | None = Field(
         default=None, description="SMPL, SMPL-H or SMPL-X file; null: the free template"
     )
     uv: Path | None = Field(
-        default=None, description=".obj with the texture coordinates of body; null: its own"
+        default=None, description=".obj with the UV map of model.body; null: that of the body file"
     )
     resolution: int = Field(
-        default=128, ge=8, le=1024, description="texels per side of the template's texture atlas"
+        default=128, ge=8, le=1024, description="texels per side of the template's UV map"
     )
 
 
 class HumanModel(_OnTemplate):
-    """A person: Gaussians on the texels of a body template, moved by its skeleton
-    (docs/guides/people.md)."""
+    """Avatar: one Gaussian per texel of a body template, posed by linear blend skinning
+    (docs/human.md)."""
 
     kind: Literal["human"] = Field(
         default="human",
-        description="one person: Gaussians on a body template, moved by its skeleton (`dyngs docs people`)",
+        description="avatar of one person: Gaussians on a body template, posed by its skeleton (docs/human.md)",
     )
     fit: bool = Field(
         default=True,
-        description="fit the template to the silhouettes before training, as `dyngs data fit` does; a capture without "
-        "body parameters always is",
+        description="fit the template to the silhouettes before training, as `dyngs data fit` does; always done for a "
+        "capture without body parameters",
     )
     refine: bool = Field(
         default=True,
-        description="learn corrections of poses, skeleton and skinning weights with the Gaussians",
+        description="optimise poses, skeleton and skinning weights together with the Gaussians",
     )
     light: bool = Field(
         default=True,
-        description="learn light that is fixed in the world: colours depend on where the surface faces (with "
-        "colour.kind=sh, model.refine=true)",
+        description="learn light that is fixed in the world, so that colours depend on the surface normal (needs "
+        "colour.kind=sh and model.refine=true)",
     )
     fill_unseen: bool = Field(
         default=True,
-        description="after the last step, fill what the images hardly show from the other side of the body and from "
-        "around it",
+        description="after the last step, fill regions that few images show from the mirrored side of the body and "
+        "from neighbouring texels",
     )
 
     @property
     def bytes_per_moving_gaussian(self) -> int:
-        """Bytes of its anchor, weights of joints, their gradients, and the Gaussian in a pose, where
-        the body fit is refined."""
+        """Memory per Gaussian while ``refine`` is on: anchor, skinning weights, gradients and posed
+        Gaussian."""
         return 2600
 
     def size_key(self, count: int) -> tuple[str, float, float]:
@@ -65,22 +65,24 @@ class HumanModel(_OnTemplate):
 
 
 class HumanPredictorModel(_OnTemplate):
-    """A network that predicts people from a few images, trained on others
-    (docs/guides/people.md)."""
+    """Network that predicts avatars from a few images, trained on other people
+    (docs/people_network.md)."""
 
     kind: Literal["human_predictor"] = Field(
         default="human_predictor",
-        description="a network that predicts people from a few images, after GHG (`dyngs docs people`)",
+        description="network that predicts avatars from a few images, after GHG (docs/people_network.md)",
     )
     scaffold_heights: tuple[float, ...] = Field(
         default=(0.0, 0.02, 0.04),
         min_length=1,
-        description="heights above the skin, m, at which copies of its surface carry one Gaussian per texel (the "
-        "multi-scaffold of GHG)",
+        description="heights of the scaffolds above the skin, m; each has one Gaussian per texel (multi-scaffold of "
+        "GHG)",
     )
     source_views: int = Field(
         default=3,
         ge=1,
-        description="images of a person that it is predicted from, at most; every other training example has fewer",
+        description="largest number of input images per person; every other training example has fewer",
     )
-    lr: Positive = Field(default=2e-3, description="highest learning rate of AdamW (one cycle)")
+    lr: Positive = Field(
+        default=2e-3, description="peak learning rate of AdamW (one-cycle schedule)"
+    )

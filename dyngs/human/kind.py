@@ -1,4 +1,4 @@
-"""The kind ``human``: a person, whose body plays motions."""
+"""The model kind ``human``: an animatable avatar of one person."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class HumanKind(HasGaussians, HasBody):
-    """Avatars: moved by the body, with refined poses instead of refined cameras."""
+    """Avatars; body poses are refined instead of camera poses."""
 
     uses = HasGaussians.uses - {"init", "camera.refine", "train.robust", "train.priors"}
 
@@ -34,18 +34,18 @@ class HumanKind(HasGaussians, HasBody):
         data: DataConfig,
         section: HumanModel,
         log: Callable[[str], None],
-        report: ProgressCallback,
+        on_progress: ProgressCallback,
     ) -> DataConfig:
-        """Return the options of a capture with a body: found, and fitted to the silhouettes."""
+        """Detect the person in a plain clip, fit the body, and return options with both."""
         from dyngs.capture.sfm.unposed import is_unposed
         from dyngs.human.fit.fitted_capture import ensure_fitted_body
 
         if is_unposed(data):
             from dyngs.human.detect.detect_person import ensure_detected_person
 
-            data = ensure_detected_person(data, log=log, report=report)
+            data = ensure_detected_person(data, log=log, on_progress=on_progress)
         return ensure_fitted_body(
-            data, section, only_if_needed=not section.fit, log=log, report=report
+            data, section, only_if_needed=not section.fit, log=log, on_progress=on_progress
         )
 
     def play_motion(

@@ -87,7 +87,7 @@ def test_a_motion_of_romp_without_a_rate_is_read_with_one_and_what_is_assumed_is
     assert "4 frames, 0.15 s at 20 frames per second" in printed
     notes = [line for line in printed.splitlines() if line.startswith("note: ")]
     assert len(notes) == 1
-    assert "the file does not name its up axis; -y is used" in notes[0]
+    assert "no up axis in the file; using -y" in notes[0]
     found = read_motion(tmp_path / "out.npz")
     assert float(found.poses.abs().max()) < 1e-6, "upright, in the axes of the template"
 
@@ -95,13 +95,13 @@ def test_a_motion_of_romp_without_a_rate_is_read_with_one_and_what_is_assumed_is
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        ("in.npz used.npz", "used.npz exists already; name a new file"),
-        ("in.npz new.bvh", "new.bvh: a motion is written as .npz"),
+        ("in.npz used.npz", "used.npz: already exists; give the name of a new file"),
+        ("in.npz new.bvh", "new.bvh: motions are written as .npz"),
         ("nowhere.npz new.npz", "nowhere.npz: cannot be read (No such file"),
-        ("in.txt new.npz", "in.txt: unknown kind of motion"),
-        ("in.npz new.npz --clip walk", "do not ask for 'walk'"),
-        ("in.npz new.npz --fps 0", "0 frames per second"),
-        ("in.npz new.npz --fps nan", "nan frames per second"),
+        ("in.txt new.npz", "in.txt: unknown motion format"),
+        ("in.npz new.npz --clip walk", "remove the clip name 'walk'"),
+        ("in.npz new.npz --fps 0", "frame rate 0 is outside"),
+        ("in.npz new.npz --fps nan", "frame rate nan is outside"),
         ("in.npz new.npz --fps fast", "invalid float value: 'fast'"),
         ("in.npz new.npz --up x", "invalid choice: 'x'"),
         ("in.npz new.npz --body nowhere.npz", "nowhere.npz"),
@@ -181,7 +181,7 @@ def test_options_of_one_video_are_refused_for_several(
     for name in ("a.mp4", "b.mp4"):
         (tmp_path / name).write_bytes(b"")
     assert main(["data", "sfm", str(tmp_path), str(tmp_path / "out"), *words]) == 2
-    assert "--matching and --masks are for photos and one video" in capsys.readouterr().err
+    assert "--matching and --masks are not supported for several videos" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
@@ -193,11 +193,11 @@ def test_a_fitted_capture_says_how_good_it_is(tmp_path: Path, capsys: PrintedOut
     root = write_human_capture(tmp_path / "person", options)
     assert main(["data", "fit", str(root), str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out
-    assert "2 frames; overlap of silhouettes (IoU) on 2 views left out of the fit" in printed
-    assert "taken: the poses as given" in printed, "they are exact"
+    assert "2 frames; silhouette IoU on 2 held-out views" in printed
+    assert "chosen: given poses" in printed, "they are exact"
     assert f"next: dyngs train human data.root={tmp_path / 'out'}" in printed
     report = json.loads((tmp_path / "out" / "fit_report.json").read_text())
-    assert report["taken"] == "the poses as given"
+    assert report["taken"] == "given poses"
     assert set(report["iou_per_frame"]) == {"0", "1"}
     body = str(tmp_path / "out" / "body_train.npz")
     assert main(["data", "motion", body, str(tmp_path / "moves.npz")]) == 0, (
@@ -210,7 +210,7 @@ def test_a_fitted_capture_says_how_good_it_is(tmp_path: Path, capsys: PrintedOut
 def test_the_run_of_a_known_person_finds_poses_by_its_avatar(
     tmp_path: Path, capsys: PrintedOutput, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
+    monkeypatch.setattr(pose_fit, "MAX_WINDOWS", 1)
     options = HumanOptions(
         size=32, num_frames=1, num_pose_frames=0, num_cameras=3, num_test=1, samples=1
     )
@@ -221,7 +221,7 @@ def test_the_run_of_a_known_person_finds_poses_by_its_avatar(
     small = ["model.resolution=24", "train.steps=1", "run.threads=1"]
     assert main(["train", "human", f"data.root={fitted}", f"run.dir={run}", *small]) == 0
     assert main(["data", "fit", str(root), str(tmp_path / "new"), "--person", str(run)]) == 0
-    assert "poses by the silhouette of the person's avatar: " in capsys.readouterr().out
+    assert "poses fitted with the avatar: " in capsys.readouterr().out
     report = json.loads((tmp_path / "new" / "fit_report.json").read_text())
     assert [clip["views_left_out"] for clip in report["by_avatar"]] == [1]
     assert main(["data", "fit", str(root), str(tmp_path / "again"), "--person", str(fitted)]) == 0
@@ -253,7 +253,7 @@ def test_a_body_file_of_ones_own_is_fitted_trained_and_known_again(
     monkeypatch: pytest.MonkeyPatch,
     smpl_files: tuple[Path, Path],
 ) -> None:
-    monkeypatch.setattr(pose_fit, "MOST_WINDOWS", 1)
+    monkeypatch.setattr(pose_fit, "MAX_WINDOWS", 1)
     options = HumanOptions(
         size=32, num_frames=1, num_pose_frames=0, num_cameras=3, num_test=1, samples=1
     )
@@ -263,7 +263,7 @@ def test_a_body_file_of_ones_own_is_fitted_trained_and_known_again(
     body, uv = map(str, smpl_files)
     assert main(["data", "fit", str(root), str(fitted), "--template", body, "--uv", uv]) == 0
     printed = capsys.readouterr().out
-    assert printed.startswith("smpl (smpl.npz), 1 frame; overlap of silhouettes")
+    assert printed.startswith("smpl (smpl.npz), 1 frame; silhouette IoU")
     keys = [f"model.body={body}", f"model.uv={uv}"]
     assert (
         printed.splitlines()[-1] == f"next: dyngs train human data.root={fitted} {' '.join(keys)}"
@@ -274,7 +274,7 @@ def test_a_body_file_of_ones_own_is_fitted_trained_and_known_again(
     assert main(["data", "fit", str(root), str(tmp_path / "new"), "--person", str(run)]) == 0
     printed = capsys.readouterr().out
     assert printed.startswith("smpl (smpl.npz), 1 frame")
-    assert "poses by the silhouette of the person's avatar: " in printed
+    assert "poses fitted with the avatar: " in printed
     with (
         np.load(fitted / "body_train.npz") as old,
         np.load(tmp_path / "new" / "body_train.npz") as new,
@@ -283,7 +283,7 @@ def test_a_body_file_of_ones_own_is_fitted_trained_and_known_again(
         assert str(new["surface_model_type"]) == "smpl"
     assert main(["data", "fit", str(root), str(tmp_path / "other"), "--person", str(fitted)]) == 2
     assert (
-        "is of another template than anny; name that of the person with --template"
+        "was fitted with another template than anny; pass it with --template"
         in capsys.readouterr().err
     )
     assert (
@@ -306,9 +306,9 @@ def test_a_body_file_that_cannot_be_fitted_is_refused_in_one_line(
     for file, atlas, wanted in (
         (str(tmp_path / "none.npz"), uv, "none.npz: "),
         (str(damaged), uv, "damaged.npz: "),
-        (body, None, "smpl.npz: has no texture coordinates"),
+        (body, None, "smpl.npz: has no UV map"),
         (body, str(wrong), "wrong.obj: cannot be read"),
-        (None, uv, "goes with --template"),
+        (None, uv, "requires --template"),
     ):
         out = tmp_path / "out"
         words = (["--template", file] if file else []) + (["--uv", atlas] if atlas else [])

@@ -94,14 +94,14 @@ def no_change(_: Path) -> None:
 @pytest.mark.parametrize(
     ("views", "poses", "files", "message"),
     [
-        ("c01", as_it_is, no_change, "c01 has no neighbour"),
+        ("c01", as_it_is, no_change, "c01 has no neighbouring view"),
         ("c01,c01", as_it_is, no_change, "named twice"),
-        ("c01,c02", same_place, no_change, "c01 has no neighbour"),
-        ("c01,c13", as_it_is, no_change, "c01 has no neighbour"),
+        ("c01,c02", same_place, no_change, "c01 has no neighbouring view"),
+        ("c01,c13", as_it_is, no_change, "c01 has no neighbouring view"),
         ("c01,c07", as_it_is, no_change, "side by side, 5 to 50 degrees apart"),
-        ("c01,c02", twice_as_long, no_change, "the calibration is wrong"),
+        ("c01,c02", twice_as_long, no_change, "check the calibration"),
         ("c01,c02", turned_away, no_change, "c02"),
-        ("c01,c02", as_it_is, nobody, "c02: shows no silhouette of a person"),
+        ("c01,c02", as_it_is, nobody, "c02: no silhouette of a person"),
         ("c01,c02", as_it_is, opaque, "no silhouettes"),
     ],
 )

@@ -1,7 +1,6 @@
-"""Avatar files: a trained person in one file, to be rendered in any pose without the run.
+"""Avatar files: a trained person in one file that can be rendered in any pose without the run.
 
-Local letters: N Gaussians, J joints, K joints that one Gaussian follows, M vertices and T triangles
-of the template.
+Symbols: N Gaussians, J joints, K joints per Gaussian, M vertices and T triangles of the template.
 """
 
 from __future__ import annotations
@@ -34,28 +33,29 @@ SUFFIX = ".safetensors"
 _KIND = FileKind("dyngs avatar", "an avatar", 1)
 _ADVICE = "; export it again with `dyngs export RUN --format avatar`"
 _LONGEST_NAME = 200
-"""Characters of the name of a file, which must have its place in every file system."""
+"""Limit on the length of the template's file name; most file systems allow 255 bytes."""
 
 
 def write_avatar(person: Renderable, model: ModelSection, info: CheckpointInfo, path: Path) -> Path:
-    """Write an avatar in the rest pose and return ``path``; see docs/reference/bodies.md.
+    """Write an avatar in its rest pose, upright at its position in the capture; return ``path``.
 
-    Raises DyngsError: the scene is not that of a person, its template is missing, or the file cannot
-    be written.
+    The format is described in docs/formats.md. Raises DyngsError: the scene is not an avatar, its
+    template is missing, or the file cannot be written.
     """
-    # late: scipy, which reading an avatar does without
+    # imported here because it needs scipy, which reading an avatar does not
     from dyngs.human.motion.placement import rest_clip
 
     scene = as_human_scene(person)
     if scene is None or not isinstance(model, HumanModel):
         raise DyngsError(
-            f"--format avatar needs the run of a person (model.kind=human), this one is {model.kind}"
+            f"--format avatar needs a run with model.kind=human, this one has model.kind={model.kind}"
         )
     if path.suffix.lower() != SUFFIX:
-        raise DyngsError(f"{path}: an avatar is written as {SUFFIX}")
+        raise DyngsError(f"{path}: the name of an avatar file must end in {SUFFIX}")
     if scene.colour is not None:
         raise DyngsError(
-            "an avatar file holds harmonics, this run's colours are a network; train with colour.kind=sh"
+            "avatar files store spherical harmonics, but this run has a colour network; train with "
+            "colour.kind=sh"
         )
     reference = rest_clip(scene.clip, scene.skeleton.joints, scene.skeleton.parents)
     anchors = scene.anchors
@@ -82,8 +82,7 @@ def write_avatar(person: Renderable, model: ModelSection, info: CheckpointInfo, 
     if scene.light is not None:
         tensors |= {"light": scene.light.factors, "normals": scene.light.normals}
     file = template_path(model)
-    # file and SHA-256 of the body template, which motions of other skeletons are retargeted with, and
-    # whether it is the free one that comes with dyngs
+    # Motions of other skeletons are retargeted with the template, so that the file names it.
     template = {"file": file.name, "sha256": _sha256(file), "packaged": model.body is None}
     header = {**asdict(info), "near": model.near, "eps2d": model.eps2d, "template": template}
     write_tensors(
@@ -93,13 +92,11 @@ def write_avatar(person: Renderable, model: ModelSection, info: CheckpointInfo, 
 
 
 def read_avatar(path: Path) -> tuple[HumanModel, HumanScene, CheckpointInfo]:
-    """Read the person of a file, upright and at rest, with its section and its metadata.
+    """Read an avatar file; return its config section, the scene in rest pose, and the metadata.
 
-    A template other than the free one is looked for next to the file when a motion needs it.
-
-    Raises:
-        DyngsError: the file is missing, damaged, altered or not an avatar, or the template next to
-            it is another one.
+    A template other than the free one must lie next to the file; it is read when a motion needs it.
+    Raises DyngsError: the file is missing, damaged, changed or no avatar, or the template next to it
+    is a different one.
     """
     header, tensors = read_tensors(path, _KIND, _ADVICE)
     try:
@@ -113,27 +110,25 @@ def read_avatar(path: Path) -> tuple[HumanModel, HumanScene, CheckpointInfo]:
             sh_degree={1: 0, 4: 1}[scene.gaussians.sh.shape[1]],
         )
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-        why = (
-            f"{error.args[0]} is missing"
-            if isinstance(error, KeyError)
-            else format_one_line(str(error), 120)
-        )
-        raise DyngsError(f"{path}: not a valid avatar ({why}){_ADVICE}") from None
+        reason = format_one_line(str(error), 120)
+        if isinstance(error, KeyError):
+            reason = f"{error.args[0]} is missing"
+        raise DyngsError(f"{path}: not a valid avatar ({reason}){_ADVICE}") from None
     options = render_options(model, info.extent, info.world_scale)
     scene = replace(scene, options=options, background=background_colour(info.background))
     return model, scene, info
 
 
 def _template_beside(path: Path, file: str, sha256: str, packaged: bool) -> Path | None:
-    """Return where the template of an avatar in ``path`` is or should be; None: the free one."""
+    """Return the path of the template next to the avatar file ``path``; None: the free template."""
     name = Path(file).name
     if len(name) > _LONGEST_NAME:
-        raise ValueError("the name of its template is too long")
+        raise ValueError("the file name of its template is too long")
     template = template_path(HumanModel()) if packaged else path.parent / name
     if template.is_file() and _sha256(template) != sha256:
-        whose = "that of this version of dyngs" if packaged else f"{template}"
+        other = "the free template of this version" if packaged else f"{template}"
         raise DyngsError(
-            f"{path}: needs its own template '{file}', not {whose}; put that file beside it"
+            f"{path}: needs its own template '{file}', not {other}; copy that file next to it"
         )
     return None if packaged else template
 
@@ -143,12 +138,12 @@ def _sha256(file: Path) -> str:
         return hashlib.sha256(file.read_bytes()).hexdigest()
     except OSError as error:
         raise DyngsError(
-            f"{file}: the template cannot be read ({error.strerror}); restore it"
+            f"{file}: cannot read the body template ({error.strerror}); restore the file"
         ) from None
 
 
 def _scene(tensors: Mapping[str, Tensor]) -> HumanScene:
-    """Raises KeyError for a missing tensor, ValueError for a wrong type, shape or range."""
+    """Build the scene. Raises KeyError (missing tensor) or ValueError (type, shape or range)."""
     joints = tensors["skeleton.template_joints"]
     poses = tensors["reference.poses"][None]
     trans = tensors["reference.trans"][None]

@@ -1,4 +1,4 @@
-"""A person in the motion of a file."""
+"""Playing motion files with an avatar."""
 
 from __future__ import annotations
 
@@ -18,12 +18,17 @@ from dyngs.models.renderable import Renderable
 
 
 def play_motion(
-    section: HumanModel, person: Renderable, info: CheckpointInfo, path: Path, *, keep_feet: bool
+    section: HumanModel,
+    renderable: Renderable,
+    info: CheckpointInfo,
+    path: Path,
+    *,
+    keep_feet: bool,
 ) -> PlayedMotion:
-    """See ``dyngs.models.kind.HasBody``."""
-    if not isinstance(person, HumanScene):
-        raise DyngsError(f"{path}: only a person plays a motion")
-    scene = person.to("cpu")
+    """Return the avatar animated by a motion file, see ``HasBody.in_motion``."""
+    if not isinstance(renderable, HumanScene):
+        raise DyngsError(f"{path}: motions can only be played by avatars (model.kind=human)")
+    scene = renderable.to("cpu")
     motion = read_motion(path, load_template(section))
     if motion.poses.shape[1] != len(scene.skeleton.joints):
         motion = motion.for_joints(len(scene.skeleton.joints))
@@ -35,13 +40,13 @@ def play_motion(
     clip = motion_clip(motion)
     if not is_fit:
         clip = place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
-    playing = scene.with_motion(clip)
+    animated = scene.with_motion(clip)
     notes = tuple(motion.notes)
     if keep_feet:
-        skeleton = playing.learned_skeleton
+        skeleton = animated.learned_skeleton
         floor = float(scene.anchors.points[:, 1].min())
-        soles = sole_points(playing.played_clip, skeleton.joints, skeleton.parents, floor)
+        soles = sole_points(animated.played_clip, skeleton.joints, skeleton.parents, floor)
         clip, note = reduce_foot_sliding(clip, soles, up_direction(scene.clip), motion.fps)
-        playing = scene.with_motion(clip)
+        animated = scene.with_motion(clip)
         notes = (*notes, note)
-    return PlayedMotion(playing.to(person.gaussians.means.device), motion.fps, notes)
+    return PlayedMotion(animated.to(renderable.gaussians.means.device), motion.fps, notes)

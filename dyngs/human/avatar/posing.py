@@ -1,7 +1,7 @@
-"""Posing: Gaussians at rest moved to a pose by linear blend skinning and pose blend shapes.
+"""Posing: linear blend skinning and pose blend shapes of Gaussians, and learned pose corrections.
 
-Local letters: N Gaussians, J joints, K joints that one Gaussian follows, P texels, M vertices and T
-triangles of the template.
+Symbols: N Gaussians, J joints, K joints per Gaussian, P texels, M vertices and T triangles of the
+template, F frames.
 """
 
 from __future__ import annotations
@@ -29,40 +29,37 @@ from dyngs.ops.harmonics import lit
 from dyngs.ops.posing import pose_by_joints
 from dyngs.ops.quaternions import quats_from_matrices, rotation_matrices
 
-# message of files that cannot hold it
-LIGHT_NOT_EXPORTED = "the learned light is left out: colours are those in even light"
-NUM_LIGHT_TERMS = 8  # number of harmonics of degree 1 and 2; degree 0 is the colour itself
+LIGHT_NOT_EXPORTED = "the learned light is not exported; colours are those under uniform light"
+NUM_LIGHT_TERMS = 8  # spherical harmonics of degree 1 and 2; degree 0 is the colour itself
 
 
 @dataclass(frozen=True)
 class Light:
-    """Light that falls on N Gaussians."""
+    """Learned environment light, fixed in the world, on N Gaussians."""
 
-    normals: Tensor  # (N, 3) outward at rest, of any length
-    factors: Tensor  # (8, 3) A, red, green and blue
+    normals: Tensor  # (N, 3) outward in the rest pose, not normalised
+    factors: Tensor  # (8, 3) harmonics of degree 1 and 2, for red, green and blue
 
 
 def rest_normals(gaussians: Gaussians) -> Tensor:
-    """Return the outward normals (N, 3) at rest of the first Gaussians, which are discs in the
-    tangent plane."""
+    """Return the outward normals (N, 3), in the rest pose, of the initial disc-shaped Gaussians."""
     return rotation_matrices(gaussians.quats)[..., 2]
 
 
-def colour_asymmetry(gaussians: Gaussians, images: Tensor, is_image: Tensor) -> Tensor:
-    """Return the mean squared difference () between base colours and those of the mirror images.
+def colour_asymmetry(gaussians: Gaussians, mirrored: Tensor, has_counterpart: Tensor) -> Tensor:
+    """Return the mean squared difference () between base colours of mirrored Gaussians.
 
-    Clothes are mostly the same on both sides and light is not: this tells one from the other where
-    nobody turns. ``images`` (N,) are rows of the mirror images, ``is_image`` (N,) says where there
-    is one.
+    Clothes are mostly symmetric and light is not, so that this term separates the two when nobody
+    turns. ``mirrored`` (N,) are indices of the counterparts, ``has_counterpart`` (N,) masks.
     """
     colours = gaussians.sh[:, 0] * SH_C0
-    unlike = (colours - colours.index_select(0, images)) * is_image[:, None]
-    return unlike.square().sum() / len(colours)
+    differences = (colours - colours.index_select(0, mirrored)) * has_counterpart[:, None]
+    return differences.square().sum() / len(colours)
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Joints (J, 3) at rest, m, and their parents (J,), -1 for the root."""
+    """Joints (J, 3) in the rest pose, m, and their parents (J,), -1 for the root."""
 
     joints: Tensor
     parents: tuple[int, ...]
@@ -70,33 +67,28 @@ class Skeleton:
 
 @dataclass(frozen=True)
 class PoseBlendShapes:
-    """SMPL's pose blend shapes: pose-dependent offsets of a template's vertices at rest (Loper et
-    al. 2015)."""
+    """SMPL's pose blend shapes: pose-dependent offsets of rest-pose vertices (Loper et al. 2015)."""
 
-    # m per unit of the rotations minus the identity, without the root, as 9 (J - 1) rows of 3 M
-    # numbers
+    # (9 (J - 1), 3 M) metres per unit of the rotation matrices minus the identity, without the root
     directions: Tensor
     faces: Tensor  # (T, 3) int64 vertices of the triangles
 
     def offsets(self, anchors: Anchors, rotations: Tensor) -> Tensor:
-        """Return offsets (N, 3) at rest, m: interpolated between the vertices of each anchor's
-        triangle.
+        """Return the rest-pose offsets (N, 3), m, interpolated at the anchors.
 
         ``rotations`` (J, 3, 3) are relative to the parent joints.
         """
         features = rotations - torch.eye(3, dtype=rotations.dtype, device=rotations.device)
         at_vertices = (features[1:].flatten() @ self.directions).unflatten(0, (-1, 3))
-        around = self.faces.index_select(0, anchors.face)
-        parts = at_vertices.index_select(0, around.flatten()).unflatten(0, (-1, 3))
-        return (anchors.barycentric[..., None] * parts).sum(1)
+        corners = self.faces.index_select(0, anchors.face)
+        corner_offsets = at_vertices.index_select(0, corners.flatten()).unflatten(0, (-1, 3))
+        return (anchors.barycentric[..., None] * corner_offsets).sum(1)
 
 
 def pose_blend_shapes(body: BodyTemplate) -> PoseBlendShapes | None:
-    """Return the pose blend shapes of ``body`` rounded to half precision, as runs store them; None
-    without.
+    """Return the pose blend shapes of ``body`` in half precision, as stored in runs; None without.
 
-    Relative error of a direction: at most 2^-11; random directions that shift points by 1 cm err by
-    8 micrometres.
+    The rounding error is at most 2^-11 of an offset.
     """
     if body.pose_dirs is None:
         return None
@@ -105,7 +97,7 @@ def pose_blend_shapes(body: BodyTemplate) -> PoseBlendShapes | None:
 
 @dataclass(frozen=True)
 class BodyPose:
-    """One pose of a body; differentiable."""
+    """One body pose; differentiable."""
 
     rotations: Tensor  # (J, 3, 3) relative to the parent joints
     trans: Tensor  # (3,) world units, added last
@@ -120,23 +112,33 @@ def pose_gaussians(
     offsets: Tensor | None = None,
     light: Light | None = None,
 ) -> Gaussians:
-    """Return the N Gaussians in a pose, in the world; differentiable in all arguments.
+    """Pose N Gaussians by linear blend skinning, in world coordinates; differentiable in all
+    arguments.
 
-    x' = s T x + t with T = sum_j w_j A_j (Loper et al. 2015); covariances under the same linear
-    map, exactly. Harmonics of degree 1 are rotated as their joints are (``blended_rotations``), so
-    that colours turn with the body. Gaussians are at rest, m, of SH degree 0 or 1; ``weights`` (N,
-    J) skin them; ``offsets`` (N, 3), m, are added to the means at rest.
+    x' = s T x + t with T = sum_j w_j A_j (Loper et al. 2015). Covariances are transformed by s T
+    exactly. Harmonics of degree 1 rotate with the joints (``blended_rotations``).
+
+    Args:
+        gaussians: in the rest pose, m, of SH degree 0 or 1.
+        weights: (N, J) skinning weights.
+        skeleton: in the rest pose.
+        posing: the pose.
+        offsets: (N, 3) m, added to the means in the rest pose.
+        light: multiplies the colours.
     """
-    moves = joint_transforms(skeleton.joints, skeleton.parents, posing.rotations)
-    world = torch.cat(
-        [posing.scale * moves[..., :3], posing.scale * moves[..., 3:] + posing.trans[:, None]],
+    transforms = joint_transforms(skeleton.joints, skeleton.parents, posing.rotations)
+    world_transforms = torch.cat(
+        [
+            posing.scale * transforms[..., :3],
+            posing.scale * transforms[..., 3:] + posing.trans[:, None],
+        ],
         dim=-1,
     )
     means = gaussians.means if offsets is None else gaussians.means + offsets
-    moved = pose_by_joints(means, gaussians.quats, gaussians.log_scales, weights, world)
+    moved = pose_by_joints(means, gaussians.quats, gaussians.log_scales, weights, world_transforms)
     sh = gaussians.sh
     if sh.shape[1] > 1:
-        sh = rotate_sh(sh, blended_rotations(weights, moves))
+        sh = rotate_sh(sh, blended_rotations(weights, transforms))
     if light is not None:
         sh = lit(sh, moved.transforms[..., :3], light.normals, light.factors)
     return Gaussians(
@@ -149,10 +151,10 @@ def pose_gaussians(
 
 
 def blended_rotations(weights: Tensor, transforms: Tensor) -> Tensor:
-    """Return the rotations (N, 3, 3) of joints (J, 3, 4) blended by ``weights`` (N, J), as
-    quaternions; differentiable.
+    """Blend joint rotations (J, 3, 4) by ``weights`` (N, J) as quaternions; return (N, 3, 3).
 
-    Each has the sign in which it is nearer to that of the heaviest joint: their sum never vanishes.
+    Quaternion signs are aligned with that of the heaviest joint, so that their sum never vanishes.
+    Differentiable.
     """
     quats = quats_from_matrices(transforms[..., :3])
     signs = torch.where(quats @ quats.T < 0, -1.0, 1.0).to(weights)
@@ -162,15 +164,16 @@ def blended_rotations(weights: Tensor, transforms: Tensor) -> Tensor:
 def pose_blend_offsets(
     anchors: Anchors, posing: BodyPose, shapes: PoseBlendShapes | None
 ) -> Tensor | None:
-    """Return the pose-dependent offsets (N, 3) at rest, m; None where the template has none."""
+    """Return the pose-dependent offsets (N, 3) in the rest pose, m; None without pose blend
+    shapes."""
     return None if shapes is None else shapes.offsets(anchors, posing.rotations)
 
 
 def rotate_sh(sh: Tensor, rotations: Tensor) -> Tensor:
-    """Return harmonics (N, 4, 3) of degree 1 rotated by (N, 3, 3): the colour along R d is what it
-    was along d.
+    """Rotate harmonics (N, 4, 3) of degree 1 by rotations (N, 3, 3).
 
-    The basis of degree 1 is -y, z, -x: the coefficients form a vector v, and the colour is v . d.
+    The colour along R d becomes that along d. The basis of degree 1 is -y, z, -x, so that the
+    coefficients form a vector v, and the colour is v . d.
     """
     vector = torch.stack([-sh[:, 3], -sh[:, 1], sh[:, 2]], dim=1)
     x, y, z = (rotations @ vector).unbind(1)
@@ -183,31 +186,29 @@ def frame_pose(clip: MotionClip, row: int) -> BodyPose:
 
 
 def posed_joints(skeleton: Skeleton, pose: BodyPose) -> Tensor:
-    """Return the joints (J, 3) in the world."""
-    moves = joint_transforms(skeleton.joints, skeleton.parents, pose.rotations)
-    return pose.scale * apply_transforms(moves, skeleton.joints) + pose.trans
+    """Return the joints (J, 3) of a pose in world coordinates."""
+    transforms = joint_transforms(skeleton.joints, skeleton.parents, pose.rotations)
+    return pose.scale * apply_transforms(transforms, skeleton.joints) + pose.trans
 
 
-# limit on the joints that one Gaussian follows; vertices of the free template follow no more
-MAX_JOINTS = 8
+MAX_JOINTS = 8  # per Gaussian, as for vertices of the free template
 _WIDTH, _THICKNESS = 0.5, 0.25
-"""Standard deviations of an initial Gaussian in the tangent plane and along the normal, in sides of
-its texel."""
-# initial opacities: on the lowest scaffold, and on those above it
+"""Initial standard deviations in the tangent plane and along the normal, in texel sides."""
+# Initial opacities on the lowest scaffold and on those above it.
 _LOWEST_OPACITY, _UPPER_OPACITY = 0.9, 0.1
 
 
 @dataclass(frozen=True)
 class Anchors:
-    """Constant attributes that tie N Gaussians to the template, row by row."""
+    """Fixed attributes that tie N Gaussians to the body template, one row per Gaussian."""
 
-    points: Tensor  # (N, 3) at rest on the scaffold, m
+    points: Tensor  # (N, 3) on the scaffold in the rest pose, m
     size: Tensor  # (N,) side of the texel, m
-    joints: Tensor  # (N, K) int64 joints that the Gaussian follows, heaviest first
+    joints: Tensor  # (N, K) int64 joints of the skinning weights, heaviest first
     weights: Tensor  # (N, K) skinning weights of these joints, rows sum to 1
     face: Tensor  # (N,) int64 triangle of the template that holds the texel's centre
     barycentric: Tensor  # (N, 3) of the texel's centre in that triangle
-    uv: Tensor  # (N, 2) of the texel's centre in the atlas
+    uv: Tensor  # (N, 2) of the texel's centre in the UV map
     height: Tensor  # (N,) of the scaffold above the skin, m
 
     def __len__(self) -> int:
@@ -225,11 +226,11 @@ class Anchors:
 def texel_gaussians(
     texels: Texels, heights: Sequence[float], sh_degree: int
 ) -> tuple[Gaussians, Anchors]:
-    """Return grey discs on every texel, at all ``heights`` (m) above the surface at rest; nearly
-    opaque at the lowest.
+    """Create grey disc-shaped Gaussians on every texel, on scaffolds at ``heights`` (m) above the
+    skin.
 
-    A disc lies in the tangent plane, as wide as its texel. Rows are ordered by height, then by
-    texel.
+    A disc lies in the tangent plane and is as wide as its texel; discs on the lowest scaffold are
+    nearly opaque. Rows are ordered by height, then by texel.
     """
     levels = texels.points.new_tensor(heights)
     rows = torch.arange(len(texels), device=levels.device).repeat(len(levels))
@@ -265,61 +266,64 @@ def texel_gaussians(
 
 
 def heaviest_joints(weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the joints (P, K) int64 of the largest of ``weights`` (P, J), and these, normalised;
-    ties by index."""
+    """Return the joints (P, K) int64 of the largest ``weights`` (P, J), and those weights,
+    normalised.
+
+    Ties are ordered by joint index.
+    """
     count = min(MAX_JOINTS, weights.shape[1])
     ordered = weights.sort(dim=1, descending=True, stable=True)
-    kept = ordered.values[:, :count]
-    return ordered.indices[:, :count].contiguous(), kept / kept.sum(1, keepdim=True)
+    largest = ordered.values[:, :count]
+    return ordered.indices[:, :count].contiguous(), largest / largest.sum(1, keepdim=True)
 
 
 def skinning_weights(
     anchors: Anchors, num_joints: int, corrections: Tensor | None = None
 ) -> Tensor:
-    """Return skinning weights (N, J); with ``corrections`` c (N, K), w e^c, normalised, for the
-    followed joints.
+    """Return dense skinning weights (N, J).
 
-    Corrections have no effect where a Gaussian follows a single joint: they act where parts of the
-    body meet.
+    Learned ``corrections`` c (N, K) change weights w to w e^c, normalised; they have no effect on
+    Gaussians with a single joint.
     """
-    parts = anchors.weights
+    followed = anchors.weights
     if corrections is not None:
-        parts = corrections.exp() * parts
-        parts = parts / parts.sum(1, keepdim=True)
-    dense = parts.new_zeros(len(anchors), num_joints)
-    return dense.scatter_add(1, anchors.joints, parts)
+        followed = corrections.exp() * followed
+        followed = followed / followed.sum(1, keepdim=True)
+    dense = followed.new_zeros(len(anchors), num_joints)
+    return dense.scatter_add(1, anchors.joints, followed)
 
 
-FINE_FACTOR = 2  # texels of the finer atlas along a side of one
-MAX_TEXEL_PIXELS = 2.0  # pixels along the side of a texel from which it is replaced by smaller ones
+FINE_FACTOR = 2  # resolution of the UV map for hands and feet relative to that of the body
+MAX_TEXEL_PIXELS = 2.0  # size of texels in the images from which hands and feet get finer ones
 _LIMBS = ("wrist", "ankle", "foot", "index", "middle", "pinky", "ring", "thumb")
 
 
 def pixel_size(cameras: Sequence[Cameras], clip: MotionClip, pelvis: Tensor) -> float:
-    """Return the side of a pixel on the person, m of the template: the median over the cameras;
-    infinite without any.
+    """Return the size of a pixel on the person, m of the template: median over cameras, infinite
+    without.
 
-    The mean position in ``clip`` counts; ``pelvis`` (3,) is at rest, m.
+    The person is at the mean position of ``clip``; ``pelvis`` (3,) is in the rest pose, m.
     """
     scale = float(clip.scale.mean())
-    place = clip.trans.mean(0) + scale * pelvis
-    away = [
-        float((camera.centers[0] - place).norm() / camera.intrinsics[0, 0, 0]) for camera in cameras
+    pelvis_in_world = clip.trans.mean(0) + scale * pelvis
+    pixel_sizes = [
+        float((camera.centers[0] - pelvis_in_world).norm() / camera.intrinsics[0, 0, 0])
+        for camera in cameras
     ]
-    return median_high(away) / scale if away else torch.inf
+    return median_high(pixel_sizes) / scale if pixel_sizes else torch.inf
 
 
 def surface_texels(
     body: BodyTemplate, resolution: int, vertices: Tensor, pixel: float
 ) -> list[Texels]:
-    """Return the texels of the atlas, and apart from them smaller ones of hands and feet where
-    images show more.
+    """Return the texels of the body, and a second, finer set for hands and feet if images resolve
+    it.
 
-    ``vertices`` (M, 3) are the rest shape, m; ``pixel`` is the side of a pixel on the person, m.
+    ``vertices`` (M, 3) are the rest shape, m; ``pixel`` is the size of a pixel on the person, m.
     """
     texels = atlas_texels(body, resolution, vertices)
-    named = [any(part in name for part in _LIMBS) for name in JOINT_NAMES[: len(body.parents)]]
-    limbs = torch.tensor(named, device=texels.points.device)
+    is_limb = [any(part in name for part in _LIMBS) for name in JOINT_NAMES[: len(body.parents)]]
+    limbs = torch.tensor(is_limb, device=texels.points.device)
     on_limbs = limbs[texels.weights.argmax(1)]
     if not bool(on_limbs.any()) or float(texels.size[on_limbs].median()) < MAX_TEXEL_PIXELS * pixel:
         return [texels]
@@ -327,42 +331,43 @@ def surface_texels(
     return [texels.select(~on_limbs), fine.select(limbs[fine.weights.argmax(1)])]
 
 
-def surface_gaussians(parts: Sequence[Texels], sh_degree: int) -> tuple[Gaussians, Anchors, Tensor]:
-    """Return the ``texel_gaussians`` on the skin of all parts, part by part, their anchors, and
-    normals (N, 3)."""
+def surface_gaussians(
+    texel_sets: Sequence[Texels], sh_degree: int
+) -> tuple[Gaussians, Anchors, Tensor]:
+    """Create Gaussians on the skin for all texel sets; return them, their anchors and normals (N,
+    3)."""
     gaussians, anchors = zip(
-        *(texel_gaussians(texels, (0.0,), sh_degree) for texels in parts), strict=True
+        *(texel_gaussians(texels, (0.0,), sh_degree) for texels in texel_sets), strict=True
     )
-    columns = {name: [own.tensors()[name] for own in anchors] for name in anchors[0].tensors()}
+    columns = {name: [one.tensors()[name] for one in anchors] for name in anchors[0].tensors()}
     joined = Anchors(**{name: torch.cat(x) for name, x in columns.items()})
-    return Gaussians.joined(gaussians), joined, torch.cat([texels.normals for texels in parts])
+    return Gaussians.joined(gaussians), joined, torch.cat([texels.normals for texels in texel_sets])
 
 
 LR = {
-    "poses": 1e-3,  # of single frames, rad
-    "trans": 5e-4,  # of single frames, m
-    "turns": 1e-3,  # of all frames, rad
-    "joints": 2e-3,  # at rest, m
+    "poses": 1e-3,  # per frame, rad
+    "trans": 5e-4,  # per frame, m
+    "turns": 1e-3,  # shared by all frames, rad
+    "joints": 2e-3,  # rest pose, m
     "log_scale": 2e-4,
     "weights": 5e-3,  # logarithms
     "light": 5e-3,  # fraction of the colour
     "normals": 1e-3,
 }
 """Learning rates."""
-PER_FRAME = ("poses", "trans")  # what is learned of single frames
-LR_DECAY = 0.1  # last over first learning rate
+PER_FRAME = ("poses", "trans")
+LR_DECAY = 0.1  # last learning rate relative to the first
 POSE_WEIGHT, WEIGHTS_WEIGHT, LIGHT_WEIGHT = 1e-4, 1e-3, 1e-3
-"""Of the squared corrections of poses and joints, of skinning weights, and of the light, in the
-loss."""
-POSE_CM = 0.05  # rotation of a joint, rad, that is penalized as much as a centimetre
+"""Loss weights of squared corrections: poses and joints, skinning weights, light."""
+POSE_CM = 0.05  # joint rotation, rad, with the same penalty as a centimetre
 
 
 @dataclass(frozen=True)
 class SharedCorrection:
-    """The correction of all poses of a person."""
+    """Correction that all poses of a person share."""
 
-    turns: Tensor  # (J, 3) axis-angle, rad: rotations of the joints applied before those of a pose
-    log_scale: float  # natural logarithm of the factor on the template's size
+    turns: Tensor  # (J, 3) axis-angle joint rotations, rad, applied before those of a pose
+    log_scale: float  # natural logarithm of a factor on the template's size
 
 
 def new_corrections(
@@ -371,12 +376,15 @@ def new_corrections(
     anchors: Anchors,
     normals: Tensor | None = None,
 ) -> Parameters:
-    """Return the corrections to learn, all zero; with ``normals`` (N, 3) also the light that falls
-    on them (``Light``).
+    """Return zero-initialised learnable corrections of poses, skeleton and skinning weights.
 
-    ``poses`` (F, J, 3) axis-angle, rotations of the joints applied before those of the clip;
-    ``trans`` (F, 3); ``turns`` (J, 3) like ``poses``, but for all frames; ``joints`` (J, 3) m;
-    ``log_scale`` (1,); ``weights`` (N, K).
+    With ``normals`` (N, 3) also those of the light (``Light``).
+
+    Returns:
+        Parameters ``poses`` (F, J, 3) axis-angle, applied before the rotations of the clip;
+        ``trans`` (F, 3); ``turns`` (J, 3) like ``poses``, for all frames; ``joints`` (J, 3) m;
+        ``log_scale`` (1,); ``weights`` (N, K); with normals ``light`` (8, 3) and ``normals`` (N,
+        3).
     """
     unit = float(clip.scale.mean())
     zeros = {
@@ -395,8 +403,7 @@ def new_corrections(
 
 
 def correction_penalties(learned: Parameters) -> dict[str, Tensor]:
-    """Return weighted mean squares that keep poses, joints and skinning weights near what was
-    given."""
+    """Return weighted mean squared corrections, by name, for the loss."""
     turns = (learned["poses"].square().mean() + learned["turns"].square().mean()) / POSE_CM**2
     terms = {"pose": POSE_WEIGHT * (turns + (100 * learned["joints"]).square().mean())}
     if "light" in learned:
@@ -406,7 +413,7 @@ def correction_penalties(learned: Parameters) -> dict[str, Tensor]:
 
 
 def corrected_pose(learned: Parameters, clip: MotionClip, row: int) -> BodyPose:
-    """Return the corrected pose of frame ``row`` of the clip of training."""
+    """Return the pose of row ``row`` of the training clip with all learned corrections."""
     own = axis_angle_to_matrix(learned["turns"] + learned["poses"][row])
     return BodyPose(
         clip.rotations[row] @ own,
@@ -421,38 +428,37 @@ def corrected_clip(
     poses: Tensor | None = None,
     trans: Tensor | None = None,
 ) -> MotionClip:
-    """Return the clip with ``fit`` applied, and the corrections ``poses`` (F, J, 3) and ``trans``
-    (F, 3) of its frames.
+    """Apply ``fit`` to a clip, and optional per-frame corrections ``poses`` (F, J, 3) and
+    ``trans`` (F, 3).
 
-    The same poses as ``corrected_pose``, as axis-angle vectors.
+    Gives the same poses as ``corrected_pose``, as axis-angle vectors.
     """
     from scipy.spatial.transform import Rotation
 
-    own = fit.turns.expand_as(clip.poses) if poses is None else fit.turns + poses
-    given, extra = (
+    corrections = fit.turns.expand_as(clip.poses) if poses is None else fit.turns + poses
+    clip_rotations, correction_rotations = (
         Rotation.from_rotvec(x.detach().double().flatten(0, 1).cpu().numpy())
-        for x in (clip.poses, own)
+        for x in (clip.poses, corrections)
     )
-    turned = torch.from_numpy((given * extra).as_rotvec()).to(clip.poses)
+    combined = torch.from_numpy((clip_rotations * correction_rotations).as_rotvec()).to(clip.poses)
     return replace(
         clip,
-        poses=turned.view_as(clip.poses),
+        poses=combined.view_as(clip.poses),
         trans=clip.trans if trans is None else clip.trans + trans.detach(),
         scale=clip.scale * math.exp(fit.log_scale),
     )
 
 
 def corrected_skeleton(learned: Parameters, skeleton: Skeleton) -> Skeleton:
-    """Return the skeleton with its corrected joints."""
+    """Return the skeleton with learned joint positions."""
     return Skeleton(skeleton.joints + learned["joints"], skeleton.parents)
 
 
 def symmetrize_joint_gradients(learned: Parameters) -> None:
-    """Give the joints at rest the mean gradient of both sides of the body, so that they stay mirror
-    images.
+    """Average the gradients of rest-pose joints over both sides, so that the skeleton stays
+    symmetric.
 
-    People are nearly symmetric, rarely move both sides alike, and a motion shows only the joints
-    that it bends.
+    A motion only shows the joints that it bends.
     """
     gradient = learned["joints"].grad
     if gradient is not None:
@@ -465,5 +471,5 @@ def symmetrize_joint_gradients(learned: Parameters) -> None:
 
 
 def learned_light(learned: Parameters) -> Light | None:
-    """Return the light, None if none is learned."""
+    """Return the learned light, or None."""
     return Light(learned["normals"], learned["light"]) if "light" in learned else None

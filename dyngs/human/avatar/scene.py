@@ -1,5 +1,4 @@
-"""The human scene: Gaussians on a body template at rest, which its skeleton poses as a clip
-says."""
+"""Avatar scene: Gaussians on a body template in the rest pose, animated by a motion clip."""
 
 from __future__ import annotations
 
@@ -48,28 +47,26 @@ from dyngs.models.renderable import Posable, Renderable, clamp_time
 
 @dataclass(frozen=True, kw_only=True)
 class HumanScene(GaussianScene, Posable):
-    """N Gaussians at rest, m, and a person who moves as a clip says."""
+    """Avatar of one person: N Gaussians in the rest pose, m, and the motion clip that it plays."""
 
-    anchors: Anchors  # of the Gaussians, with the template's weights
-    skeleton: Skeleton  # of the template in the person's shape; clips are given for it
-    clip: MotionClip  # that of training, as it was given
-    learned: Parameters  # corrections to all of these, see ``new_corrections``
-    shapes: PoseBlendShapes | None = None  # the template's pose blend shapes, or None
-    # another clip to play, given as that of training was; None: that of training, corrected frame
-    # by frame
+    anchors: Anchors  # of the Gaussians, with the skinning weights of the template
+    skeleton: Skeleton  # of the template in the person's shape; clips refer to it
+    clip: MotionClip  # of the training frames, without corrections
+    learned: Parameters  # corrections of all of these, see ``new_corrections``
+    shapes: PoseBlendShapes | None = None  # of the template
+    # Clip to play instead of the training clip; only shared corrections are applied to it.
     replacement_clip: MotionClip | None = None
-    # (N,) in [0, 1] how far colours are what the training views showed, not filled; None: that was
-    # not found out
+    # (N,) in [0, 1], confidence that colours were observed and not filled; None: not measured
     seen: Tensor | None = None
 
     @staticmethod
     def from_state(gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
-        """Return the scene of what ``state`` returned, playing the clip of training. Raises
+        """Restore the scene from the tensors of ``state``; it plays the training clip. Raises
         KeyError or ValueError."""
         tensors = dict(tensors)
         tensors.setdefault(
             "learned.weights", torch.zeros_like(tensors["anchors.weights"])
-        )  # files hold the sum of both
+        )  # exported files hold the corrected weights only
         require_avatar(gaussians, tensors)
         anchors = Anchors(**select_prefix(tensors, "anchors"))
         clip = MotionClip(**select_prefix(tensors, "clip"))
@@ -98,12 +95,12 @@ class HumanScene(GaussianScene, Posable):
 
     @property
     def is_static(self) -> bool:
-        """Whether the clip that is played has one pose."""
+        """True if the played clip has a single pose."""
         return len(self.clip if self.replacement_clip is None else self.replacement_clip) == 1
 
     @property
     def rows(self) -> Tensor:
-        """All of them: a person moves as a whole."""
+        """All rows: a person moves as a whole."""
         return torch.arange(len(self), device=self.gaussians.means.device)
 
     @property
@@ -116,7 +113,7 @@ class HumanScene(GaussianScene, Posable):
 
     @property
     def weights(self) -> Tensor:
-        """(N, J) skinning weights as they were learned."""
+        """Skinning weights (N, J) with learned corrections."""
         if "weights" not in self._derived:
             with torch.no_grad():
                 self._derived["weights"] = skinning_weights(
@@ -126,31 +123,31 @@ class HumanScene(GaussianScene, Posable):
 
     @property
     def learned_skeleton(self) -> Skeleton:
-        """With joints where they were learned to be."""
+        """Skeleton with learned joint positions."""
         with torch.no_grad():
             return corrected_skeleton(self.learned, self.skeleton)
 
     @property
     def light(self) -> Light | None:
-        """The learned light, or None."""
-        found = learned_light(self.learned)
-        return None if found is None else Light(found.normals.detach(), found.factors.detach())
+        """Learned light, or None."""
+        light = learned_light(self.learned)
+        return None if light is None else Light(light.normals.detach(), light.factors.detach())
 
     @property
     def fit(self) -> SharedCorrection:
-        """The correction of all poses."""
+        """Learned correction shared by all poses."""
         return SharedCorrection(
             self.learned["turns"].detach(), float(self.learned["log_scale"].detach())
         )
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Notes about what files without learned light leave out."""
+        """Warnings about what exported files cannot hold."""
         return () if self.light is None else (LIGHT_NOT_EXPORTED,)
 
     @property
     def played_clip(self) -> MotionClip:
-        """The clip that is played, with what was learned about the person applied."""
+        """The played clip with learned corrections applied."""
         if "clip" not in self._derived:
             poses = self.learned["poses"].detach()
             trans = self.learned["trans"].detach()
@@ -162,22 +159,22 @@ class HumanScene(GaussianScene, Posable):
         return self._derived["clip"]
 
     def time_step(self, time: float | None) -> GaussianTimeStep:
-        """Return the person at ``time`` of the clip, clamped to it; None is the first time step.
+        """Return the person at ``time`` of the clip, clamped to its range; None: the first frame.
 
-        Who keeps one pose is posed once, but for gradients.
+        A static person is posed once, unless gradients are needed.
         """
         now = clamp_time(time)
-        kept = self._derived.get("posed")
-        if kept is not None and not torch.is_grad_enabled():
-            return replace(kept, time=now)
+        cached = self._derived.get("posed")
+        if cached is not None and not torch.is_grad_enabled():
+            return replace(cached, time=now)
         posed = self.time_step_in_pose(frame_pose(self.played_clip.at(now), 0), now)
         if self.is_static and not torch.is_grad_enabled():
             self._derived["posed"] = posed
         return posed
 
     def time_step_in_pose(self, posing: BodyPose, time: float) -> GaussianTimeStep:
-        """Return the person in a pose, at ``time`` in [0, 1] for what depends on it; differentiable
-        in the pose."""
+        """Return the person in a pose, at ``time`` in [0, 1] for time-dependent colours;
+        differentiable in the pose."""
         gaussians = self._posed(posing, self.weights, self.learned_skeleton, self.light)
         frame = RestPose(self.gaussians.means, posing.rotations[0])
         return GaussianTimeStep(gaussians, time, frame)
@@ -191,10 +188,10 @@ class HumanScene(GaussianScene, Posable):
     def gaussians_in_frame(
         self, row: int, template_weights: Tensor | None = None
     ) -> tuple[Gaussians, BodyPose]:
-        """Return the Gaussians in frame ``row`` of the clip of training; differentiable in all that
-        is learned.
+        """Pose the Gaussians as in row ``row`` of the training clip; differentiable in all
+        corrections.
 
-        With ``given_weights`` (N, J) nothing that was learned about the body is applied.
+        With ``template_weights`` (N, J) no correction is applied.
         """
         if template_weights is not None:
             posing = frame_pose(self.clip, row)
@@ -205,7 +202,7 @@ class HumanScene(GaussianScene, Posable):
         return self._posed(posing, weights, skeleton, learned_light(self.learned)), posing
 
     def template_weights(self) -> Tensor:
-        """Return (N, J) skinning weights of the template."""
+        """Return the skinning weights (N, J) of the template, without corrections."""
         return skinning_weights(self.anchors, len(self.skeleton.joints))
 
     def apply_edit(self, edit: TopologyEdit) -> HumanScene:
@@ -218,60 +215,61 @@ class HumanScene(GaussianScene, Posable):
         )
 
     def part(self, which: str) -> HumanScene:
-        """Return all of it, or nothing: a person moves as a whole."""
-        count = len(self) if (which == "static") == self.is_static else 0
+        """Return all Gaussians or none: a person moves as a whole."""
+        count = len(self) if (which == "still") == self.is_static else 0
         return self.select(torch.arange(count, device=self.gaussians.means.device))
 
     def with_motion(self, clip: MotionClip) -> HumanScene:
-        """Return the same person in another clip, whose poses are given as those of training were.
+        """Return the same person playing another clip.
 
-        What was learned about all poses is applied: the person's size, and how the joints are
-        turned.
+        Shared corrections (size, joint rotations) are applied to its poses, as to those of
+        training.
         """
         return replace(self, replacement_clip=clip)
 
     def body_up_direction(self) -> Tensor:
-        from dyngs.human.motion.placement import up_direction  # late: scipy
+        from dyngs.human.motion.placement import up_direction  # needs scipy
 
         return up_direction(self.clip)
 
     def at_rest(self) -> HumanScene:
-        from dyngs.human.motion.placement import rest_clip  # late: scipy
+        from dyngs.human.motion.placement import rest_clip  # needs scipy
 
         return self.with_motion(rest_clip(self.clip, self.skeleton.joints, self.skeleton.parents))
 
     def placed(self, rotation: Tensor, scale: float, shift: Tensor) -> HumanScene:
-        from dyngs.human.motion.placement import moved  # late: scipy
+        from dyngs.human.motion.placement import transform_clip  # needs scipy
 
         pelvis = self.learned_skeleton.joints[0] * math.exp(self.fit.log_scale)
         rotation = rotation.to(self.clip.trans)
         shift = shift.to(self.clip.trans)
 
-        def there(clip: MotionClip) -> MotionClip:
-            return moved(clip, rotation, scale, shift, pelvis)
+        def transform(clip: MotionClip) -> MotionClip:
+            return transform_clip(clip, rotation, scale, shift, pelvis)
 
-        replacement_clip = None if self.replacement_clip is None else there(self.replacement_clip)
-        return replace(self, clip=there(self.clip), replacement_clip=replacement_clip)
+        replacement_clip = (
+            None if self.replacement_clip is None else transform(self.replacement_clip)
+        )
+        return replace(self, clip=transform(self.clip), replacement_clip=replacement_clip)
 
     def for_split(self, capture: Capture, split: Split) -> HumanScene:
-        """Return the person as the views of a split show them.
+        """Return the person in the motion of a split's views.
 
-        The split pose, and splits with body parameters of their own, have the poses of their files.
-        Others show the clip of training with its refined poses, interpolated at times between.
+        The split ``pose``, and splits with body parameters of their own, play those. Others play
+        the training clip with refined poses, interpolated at times between its frames.
         """
         if capture.body is None:
             return self
-        own = capture.body[split]
-        if split != "pose" and has_same_parameters(own, capture.body["train"]):
+        body_frames = capture.body[split]
+        if split != "pose" and has_same_parameters(body_frames, capture.body["train"]):
             return self
         views = capture.splits[split]
         return self.with_motion(
-            captured_motion(capture.root, own, views, self.skeleton.joints).clip
+            captured_motion(capture.root, body_frames, views, self.skeleton.joints).clip
         )
 
     def drawing_state(self) -> State:
-        """Return what drawing needs; learned corrections of skinning weights are applied to
-        them."""
+        """Return the tensors needed for rendering, with skinning weight corrections applied."""
         state = super().drawing_state()
         state.pop("model.seen", None)
         corrections = state.pop("model.learned.weights").tensor
@@ -282,15 +280,14 @@ class HumanScene(GaussianScene, Posable):
         return state
 
     def _model_state(self) -> State:
-        """Return everything that the avatar needs besides its Gaussians: no file is read to draw
-        it."""
+        """Return all tensors besides the Gaussians; the avatar is rendered without other files."""
         clip = self.clip
         skeleton = self.skeleton
         state = add_prefix("learned", self.learned.state())
         state |= add_prefix("anchors", with_role(self.anchors.tensors(), Role.PER_GAUSSIAN))
         if self.seen is not None:
             state["seen"] = StateTensor(self.seen, Role.PER_GAUSSIAN)
-        given = {
+        tensors = {
             "clip.times": clip.times,
             "clip.poses": clip.poses,
             "clip.trans": clip.trans,
@@ -299,21 +296,21 @@ class HumanScene(GaussianScene, Posable):
             "parents": torch.tensor(skeleton.parents, device="cpu"),
         }
         if self.shapes is not None:
-            given |= {
+            tensors |= {
                 "shapes.directions": self.shapes.directions.half(),
                 "shapes.faces": self.shapes.faces.int(),
             }
-        return state | {name: StateTensor(x, Role.SHARED) for name, x in given.items()}
+        return state | {name: StateTensor(x, Role.SHARED) for name, x in tensors.items()}
 
 
-def first_scene(
+def initial_human_scene(
     gaussians: Gaussians,
     anchors: Anchors,
     skeleton: Skeleton,
     clip: MotionClip,
     shapes: PoseBlendShapes | None = None,
 ) -> HumanScene:
-    """Return the scene of the first Gaussians, on their ``anchors``: nothing is learned yet."""
+    """Return the scene of initial Gaussians on their ``anchors``, with zero corrections."""
     return HumanScene(
         gaussians=gaussians,
         anchors=anchors,
@@ -325,12 +322,12 @@ def first_scene(
 
 
 def as_human_scene(scene: Renderable) -> HumanScene | None:
-    """Return ``scene`` if it is a person, who can be posed; None for any other scene."""
+    """Return ``scene`` if it is an avatar, else None."""
     return scene if isinstance(scene, HumanScene) else None
 
 
 def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
-    """Check the state of an avatar against its Gaussians. Raises KeyError or ValueError."""
+    """Validate the state of an avatar against its Gaussians. Raises KeyError or ValueError."""
     n = len(gaussians)
     j = len(state["joints"])
     f = len(state["clip.times"])
@@ -338,10 +335,12 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
     parents = state["parents"]
     k = state["anchors.weights"].shape[-1]
     if not n or not f or j not in SMPLX_ROWS or terms not in (1, 4):
-        raise ValueError(f"{n} Gaussians of {terms} harmonics on {j} joints in {f} frames")
+        raise ValueError(
+            f"unsupported sizes: {n} Gaussians, {terms} harmonics, {j} joints, {f} frames"
+        )
     if parents.is_floating_point() or tuple(parents.shape) != (j,):
         raise ValueError(
-            f"'parents' is {parents.dtype} {tuple(parents.shape)}, not whole numbers ({j},)"
+            f"'parents' must be integers of shape ({j},), got {parents.dtype} {tuple(parents.shape)}"
         )
     check_tree(tuple(parents.tolist()))
     require_times("clip.times", state["clip.times"])
@@ -367,13 +366,13 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
     weights = state["anchors.weights"]
     if bool((weights < 0).any()) or not bool((weights.sum(1) > 0).all()):
         raise ValueError("the skinning weights of a Gaussian are negative or sum to 0")
-    faces = 2**31  # those of a template without shapes are not there
+    faces = 2**31  # without blend shapes the number of triangles is not stored
     if "shapes.directions" in state:
         directions = state["shapes.directions"]
         require_tensor("shapes.directions", directions, (9 * (j - 1), None), torch.float16)
-        vertices, rest = divmod(directions.shape[1], 3)
-        if rest:
-            raise ValueError("'shapes.directions' has not three columns for each vertex")
+        vertices, remainder = divmod(directions.shape[1], 3)
+        if remainder:
+            raise ValueError("'shapes.directions' must have three columns per vertex")
         faces = len(state["shapes.faces"])
         require_indices("shapes.faces", state["shapes.faces"], (None, 3), vertices, torch.int32)
     require_indices("anchors.joints", state["anchors.joints"], (n, k), j)

@@ -1,4 +1,4 @@
-"""The kind of people: what they begin with, and how they are restored."""
+"""Initial avatars, and avatars restored from checkpoints."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from dyngs.human.avatar.posing import (
     surface_gaussians,
     surface_texels,
 )
-from dyngs.human.avatar.scene import HumanScene, first_scene
+from dyngs.human.avatar.scene import HumanScene, initial_human_scene
 from dyngs.human.avatar.training import HumanTraining, make_outline_loss
 from dyngs.human.body.body_reader import load_template, rest_shape
 from dyngs.human.keys import NO_BODY, HumanModel
@@ -34,26 +34,26 @@ from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
 from dyngs.models.views import evaluation_background, training_cameras
 
-MAX_COLOUR_VIEWS = 50  # number of images from which a person's first colours are taken
+MAX_COLOUR_VIEWS = 50  # training images that the initial colours are averaged over
 
 
 def start(run: StartContext) -> GaussianModel:
-    """Return the model of a person before the first step.
+    """Create the avatar before the first training step.
 
-    Raises DyngsError: a capture without body parameters, or a template that cannot be read.
+    Raises DyngsError: the capture has no body parameters, or the template cannot be read.
     """
     config = run.config
     model = config.model
     assert isinstance(model, HumanModel)
     scene, motion = initialize_human_scene(config, model, run.capture, run.images)
     colours = build_colour_training(run, scene.gaussians, uses_time=False)
-    filmed = run.capture.splits["train"]
-    cameras = training_cameras(filmed, config.data)
-    views = [(camera, view.frame or 0) for camera, view in zip(cameras, filmed, strict=True)]
+    train_views = run.capture.splits["train"]
+    cameras = training_cameras(train_views, config.data)
+    views = [(camera, view.frame or 0) for camera, view in zip(cameras, train_views, strict=True)]
     outlines = None if colours.network is not None else make_outline_loss(run)
-    behind = evaluation_background(config.data.background, run.capture.has_alpha)[1]
+    background = evaluation_background(config.data.background, run.capture.has_alpha)[1]
     refit = (
-        PoseRefit(run.images, behind, config.train.steps)
+        PoseRefit(run.images, background, config.train.steps)
         if model.refine and config.train.minutes is None
         else None
     )
@@ -66,7 +66,7 @@ def start(run: StartContext) -> GaussianModel:
 
 
 def restore(model: HumanModel, checkpoint: Checkpoint) -> HumanScene:
-    """Return the scene of a checkpoint."""
+    """Restore the avatar of a checkpoint."""
     scene = HumanScene.from_state(
         Gaussians.stored(checkpoint.part("gaussians")), checkpoint.part("model")
     )
@@ -76,27 +76,27 @@ def restore(model: HumanModel, checkpoint: Checkpoint) -> HumanScene:
 def initialize_human_scene(
     config: Config, model: HumanModel, capture: Capture, images: ImageLoader
 ) -> tuple[HumanScene, CapturedMotion]:
-    """Return a person before the first step, and the clip of training.
+    """Create the initial scene, coloured from the training images; return it with its motion.
 
-    Raises DyngsError: a capture without body parameters, or a template that cannot be read.
+    Raises DyngsError: the capture has no body parameters, or the template cannot be read.
     """
     sh_degree = config.stored_sh_degree
     if capture.body is None:
         raise DyngsError(f"{capture.root}: {NO_BODY}")
     if sh_degree > 1:
         raise DyngsError(
-            f"model.sh_degree={sh_degree}: colours of a person turn with it up to 1; give 0 or 1"
+            f"model.sh_degree={sh_degree}: avatars support spherical harmonics of degree 0 and 1 only"
         )
-    given = capture.body["train"]
+    body_frames = capture.body["train"]
     body = load_template(model)
-    vertices, joints = rest_shape(body, given)
-    filmed = captured_motion(capture.root, given, capture.splits["train"], joints)
+    vertices, joints = rest_shape(body, body_frames)
+    motion = captured_motion(capture.root, body_frames, capture.splits["train"], joints)
     cameras = training_cameras(capture.splits["train"], config.data)
-    parts = surface_texels(
-        body, model.resolution, vertices, pixel_size(cameras, filmed.clip, joints[0])
+    texels = surface_texels(
+        body, model.resolution, vertices, pixel_size(cameras, motion.clip, joints[0])
     )
-    gaussians, anchors, normals = surface_gaussians(parts, sh_degree)
+    gaussians, anchors, normals = surface_gaussians(texels, sh_degree)
     skeleton = Skeleton(joints, body.parents)
-    scene = first_scene(gaussians, anchors, skeleton, filmed.clip, pose_blend_shapes(body))
-    shown = (images[i] for i in evenly_spaced(len(images), MAX_COLOUR_VIEWS))
-    return colour_from_images(scene, filmed.rows, normals, shown), filmed
+    scene = initial_human_scene(gaussians, anchors, skeleton, motion.clip, pose_blend_shapes(body))
+    first_images = (images[i] for i in evenly_spaced(len(images), MAX_COLOUR_VIEWS))
+    return colour_from_images(scene, motion.rows, normals, first_images), motion

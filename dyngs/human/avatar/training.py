@@ -1,4 +1,4 @@
-"""Training of avatars: losses in the pose of each image, and refinement of the body fit."""
+"""Training of an avatar in the pose of each image, with refinement of the body fit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from dyngs.gaussians.schedule import RateSchedule
 from dyngs.human.avatar.observations import (
     LOW_CONFIDENCE,
     effective_view_counts,
-    filled,
+    fill_unseen,
     find_mirror_gaussians,
     rigidity_errors,
     same_part_neighbours,
@@ -48,48 +48,45 @@ from dyngs.ops.adam import Count
 from dyngs.ops.device import copy_async
 from dyngs.ops.loss import l1_ssim_loss
 
-# Width of the rim around the mask in which renders are compared with unmasked photos, px
-OUTLINE_REACH_PX = 2
-MAX_OUTSIDE_ALPHA = 0.02  # largest alpha of pixels outside the mask
-PLATE_FRAMES = 21  # frames per camera whose median is the background plate
-# Median difference from the plate, outside the masks, above which the background is not static
+OUTLINE_REACH_PX = 2  # width of the band around the mask in which the original image is used
+MAX_OUTSIDE_ALPHA = 0.02  # alpha up to which a pixel is outside the mask
+PLATE_FRAMES = 21  # frames per camera in the median that gives the background plate
+# Median difference from the plate above which the camera or the light must have changed.
 MAX_BACKGROUND_CHANGE = 12 / 255
-# Outlines are compared only if the plates cover this fraction of the pixels near outlines.
+# Least fraction of outline pixels with a known background for which plates are used.
 MIN_OUTLINE_FRACTION = 0.01
-_STRIP = 32  # image rows per median, which bounds memory
+_STRIP = 32  # image rows per median, to bound memory
 
 
 class OutlineLoss(Loss):
-    """L1 and D-SSIM loss that does not depend on the exact outlines of detected masks.
+    """L1 and D-SSIM; inside the mask and up to ``OUTLINE_REACH_PX`` around it, the render is
+    composited over the background plate and compared with the original image.
 
-    In the mask and up to ``OUTLINE_REACH_PX`` around it, the render is composited over the
-    background plate of its camera and compared with the unmasked photo. Thus the rendered opacity
-    replaces the mask. Pixels without a plate are compared with the masked image.
+    The opacity of the render, not the mask, then decides how much of the plate is visible.
     """
 
     def __init__(
         self,
         photos: ImageLoader,
         plates: Mapping[int, tuple[Tensor, Tensor]],
-        behind: Tensor,
+        background: Tensor,
         ssim_weight: float,
-        known: float,
+        known_fraction: float,
     ) -> None:
-        """
-        Args:
-            photos: training images without masks.
-            plates: by camera id, background colours (H, W, 3) and the pixels (H, W) bool where
-                enough frames show the background.
-            behind: (3,) background colour of the run.
-            known: fraction of the pixels near outlines that have a plate, for the message.
-        """
+        """Args:
+        photos: training images without masks.
+        plates: by camera number, colours (H, W, 3) of the background, and where (H, W) they
+            are known.
+        background: (3,) background colour of the run.
+        ssim_weight: weight of D-SSIM.
+        known_fraction: fraction of outline pixels with a known background, for the message."""
         self._photos = photos
         self._plates = plates
-        self._behind = behind
+        self._background = background
         self._ssim_weight = ssim_weight
-        self.finding = (
-            f"masks are detected: {known:.0%} of the pixels at outlines are compared over the "
-            "background that other frames show"
+        self.message = (
+            f"estimated masks: {known_fraction:.0%} of their outline pixels are compared over the "
+            "background of other frames"
         )
 
     def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
@@ -99,22 +96,19 @@ class OutlineLoss(Loss):
         alpha = look.image.alpha
         if plate is not None and alpha is not None and truth.shape == plate[0].shape:
             photo = self._photos[look.index].rgb_premultiplied
-            colours, known, photo, behind = (
-                copy_async(x, rendered.device) for x in (*plate, photo, self._behind)
+            colours, known, photo, background = (
+                copy_async(x, rendered.device) for x in (*plate, photo, self._background)
             )
-            use = (known & _near_silhouette(alpha))[..., None]
-            seen = look.drawn.rendering.transmittance[0][..., None]
-            rendered = rendered + use * seen * (colours - behind)
-            truth = torch.where(use, photo, truth)
+            on_outline = (known & _silhouette_band(alpha))[..., None]
+            transmittance = look.drawn.rendering.transmittance[0][..., None]
+            rendered = rendered + on_outline * transmittance * (colours - background)
+            truth = torch.where(on_outline, photo, truth)
         return {"image": l1_ssim_loss(rendered, truth, self._ssim_weight, look.image.mask)}
 
 
 def make_outline_loss(run: StartContext) -> OutlineLoss | None:
-    """Return the loss for detected masks.
-
-    None if masks come with the images, no camera is fixed, plates cover too little, or settings
-    (random background, exposure, camera refinement) rule it out.
-    """
+    """Return the loss with background plates; None if masks come with the images or no camera is
+    fixed."""
     views = run.images.views
     config = run.config
     if (
@@ -131,17 +125,17 @@ def make_outline_loss(run: StartContext) -> OutlineLoss | None:
     plates: dict[int, tuple[Tensor, Tensor]] = {}
     known = total = 0.0
     for camera, rows in _fixed_cameras(views).items():
-        shown = [rows[i] for i in evenly_spaced(len(rows), PLATE_FRAMES)]
-        alphas = torch.stack([x for i in shown if (x := run.images[i].alpha) is not None])
-        near = _near_silhouette(alphas)
-        bare = [(255 * photos[i].rgb_premultiplied).round().byte() for i in shown]
-        plate = _background_plate(torch.stack(bare), near)
+        indices = [rows[i] for i in evenly_spaced(len(rows), PLATE_FRAMES)]
+        alphas = torch.stack([x for i in indices if (x := run.images[i].alpha) is not None])
+        near = _silhouette_band(alphas)
+        images = [(255 * photos[i].rgb_premultiplied).round().byte() for i in indices]
+        plate = _plate(torch.stack(images), near)
         if plate is None:
             continue
         plates[camera] = plate
-        rims = near & (alphas <= 1 - MAX_OUTSIDE_ALPHA)
-        known += float((rims & plate[1]).sum())
-        total += float(rims.sum())
+        outline = near & (alphas <= 1 - MAX_OUTSIDE_ALPHA)
+        known += float((outline & plate[1]).sum())
+        total += float(outline.sum())
     if not plates or known < MIN_OUTLINE_FRACTION * total:
         return None
     return OutlineLoss(
@@ -150,49 +144,51 @@ def make_outline_loss(run: StartContext) -> OutlineLoss | None:
 
 
 def _fixed_cameras(views: Sequence[View]) -> dict[int, list[int]]:
-    """Return the rows of the views of each fixed camera, by camera id."""
+    """Return the view indices of each camera that does not move, by camera number."""
     rows: dict[int, list[int]] = defaultdict(list)
     for row, view in enumerate(views):
         rows[view.camera_id].append(row)
 
-    def stands(own: list[int]) -> bool:
-        first = views[own[0]]
-        places = np.stack([views[i].cam_from_world for i in own])
-        lenses = {(views[i].intrinsics.tobytes(), views[i].width, views[i].height) for i in own}
-        return len(lenses) == 1 and np.allclose(places, first.cam_from_world, atol=1e-6)
+    def is_fixed(indices: list[int]) -> bool:
+        first = views[indices[0]]
+        poses = np.stack([views[i].cam_from_world for i in indices])
+        intrinsics = {
+            (views[i].intrinsics.tobytes(), views[i].width, views[i].height) for i in indices
+        }
+        return len(intrinsics) == 1 and np.allclose(poses, first.cam_from_world, atol=1e-6)
 
-    return {camera: own for camera, own in rows.items() if len(own) > SEEN_BARE and stands(own)}
+    return {
+        camera: indices
+        for camera, indices in rows.items()
+        if len(indices) > SEEN_BARE and is_fixed(indices)
+    }
 
 
-def _near_silhouette(alpha: Tensor) -> Tensor:
-    """Return the mask, dilated by ``OUTLINE_REACH_PX``, as (..., H, W) bool."""
+def _silhouette_band(alpha: Tensor) -> Tensor:
+    """Return where (..., H, W) the mask is, including a band of ``OUTLINE_REACH_PX`` around it."""
     size = 2 * OUTLINE_REACH_PX + 1
-    grown = torch.nn.functional.max_pool2d(alpha[..., None, :, :], size, 1, OUTLINE_REACH_PX)
-    return grown[..., 0, :, :] > MAX_OUTSIDE_ALPHA
+    dilated = torch.nn.functional.max_pool2d(alpha[..., None, :, :], size, 1, OUTLINE_REACH_PX)
+    return dilated[..., 0, :, :] > MAX_OUTSIDE_ALPHA
 
 
-def _background_plate(photos: Tensor, near: Tensor) -> tuple[Tensor, Tensor] | None:
-    """Return the background plate: the median over the frames without the person at a pixel.
+def _plate(photos: Tensor, person: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Return the background plate of one camera and where it is known; None if it changes or is
+    never visible.
 
-    Args:
-        photos: (F, H, W, 3) uint8.
-        near: (F, H, W) bool, pixels where the person may be.
-
-    Returns:
-        colours (H, W, 3), and the pixels (H, W) bool with enough frames. None if the background
-        changes or is never visible.
+    The plate is the median of photos (F, H, W, 3) uint8 over frames without the person. ``person``
+    (F, H, W) is True where the person may be.
     """
-    known = (~near).sum(0) >= SEEN_BARE
+    known = (~person).sum(0) >= SEEN_BARE
     colours = torch.zeros(*photos.shape[1:], device=photos.device)
-    away = []
+    differences = []
     for first in range(0, len(known), _STRIP):
         rows = slice(first, first + _STRIP)
-        bare = (photos[:, rows] / 255).masked_fill(near[:, rows, :, None], torch.nan)
-        colours[rows] = bare.nanmedian(0).values.nan_to_num()
-        away.append((bare - colours[rows]).abs().amax(-1)[:, known[rows]].flatten())
-    differences = torch.cat(away)
-    differences = differences[~differences.isnan()]
-    if not len(differences) or float(differences.median()) > MAX_BACKGROUND_CHANGE:
+        background = (photos[:, rows] / 255).masked_fill(person[:, rows, :, None], torch.nan)
+        colours[rows] = background.nanmedian(0).values.nan_to_num()
+        differences.append((background - colours[rows]).abs().amax(-1)[:, known[rows]].flatten())
+    difference = torch.cat(differences)
+    difference = difference[~difference.isnan()]
+    if not len(difference) or float(difference.median()) > MAX_BACKGROUND_CHANGE:
         return None
     return colours, known
 
@@ -201,19 +197,17 @@ def _background_plate(photos: Tensor, near: Tensor) -> tuple[Tensor, Tensor] | N
 class AvatarParams:
     """When and how strongly an avatar is regularised; distances in cm."""
 
-    refine_from: float = 0.1  # fraction of the run after which the body fit is corrected
-    # Fraction after which corrections of single frames are learned, too; shared ones come first.
+    refine_from: float = 0.1  # fraction of the run after which corrections are learned
+    # the same for corrections of single frames, after the shared ones have converged
     refine_frames_from: float = 0.25
-    offset_weight: float = 2e-4  # weight of squared distances of Gaussians from their anchors
-    scale_weight: float = 1e-2  # weight of the squared excess of log-scales over the texel size
-    rigidity: float = 1e-2  # weight of squared changes of distances between neighbours by posing
-    smoothness: float = 1e-3  # weight of squared differences between the offsets of neighbours
-    neighbours: int = 5  # neighbours per Gaussian
-    # Weight of squared colour differences between mirror images, if a light is learned
-    sides_weight: float = 0.1
-    views: int = 100  # largest number of training views that measure visibility
-    # Fraction of hardly visible Gaussians from which the message is logged
-    min_reported_fraction: float = 0.01
+    offset_weight: float = 2e-4  # of squared distances from the scaffold
+    scale_weight: float = 1e-2  # of the squared excess of log-scales over the size of the texel
+    rigidity: float = 1e-2  # of squared distance changes between neighbours by posing
+    smoothness: float = 1e-3  # of squared differences between the offsets of neighbours
+    neighbours: int = 5
+    symmetry_weight: float = 0.1  # of squared colour differences between sides, with learned light
+    visibility_views: int = 100  # limit on the training views in which visibility is measured
+    min_reported_fraction: float = 0.01  # of filled Gaussians, for the log message
 
 
 PARAMS = AvatarParams()
@@ -221,15 +215,15 @@ CENTIMETRE = 0.01
 
 
 class HumanTraining(SceneTraining[HumanScene]):
-    """Training of an avatar, see ``SceneTraining``.
+    """Training of a ``HumanScene``, see ``SceneTraining``.
 
     Args:
+        options: config section of the model.
         frames: frame numbers of the rows of the training clip.
-        rates: schedule of the learning rates.
-        views: camera and frame number of each training view. Without views, unseen Gaussians are
-            not filled in.
-        outlines: image loss for detected masks.
-        refit: repeated fit of the poses during training.
+        rates: learning rate schedule.
+        views: camera and frame number of each training view; without them nothing is filled in.
+        outlines: image loss with background plates.
+        refit: schedule of pose refits.
     """
 
     deformation_name = ("pose", "model")
@@ -247,7 +241,7 @@ class HumanTraining(SceneTraining[HumanScene]):
         self.rates = rates
         self.views = views
         self.colour_loss = outlines
-        self._finding = None if outlines is None else outlines.finding
+        self._message = None if outlines is None else outlines.message
         self.refines_from = round(PARAMS.refine_from * rates.steps)
         self.refine_frames_from = round(PARAMS.refine_frames_from * rates.steps)
         self._rows = {frame: row for row, frame in enumerate(frames)}
@@ -257,20 +251,20 @@ class HumanTraining(SceneTraining[HumanScene]):
         self._refit = refit
 
     def time_step(self, scene: HumanScene, image: Image, step: int) -> GaussianTimeStep:
-        """Return the Gaussians in the pose of ``image``, and the regularisers.
+        """Return the Gaussians in the pose of ``image``, and the regularisation terms.
 
-        Raises DyngsError: the image's frame has no pose.
+        Raises DyngsError: the frame of the image has no body parameters.
         """
         if image.frame not in self._rows:
             raise DyngsError(f"view {image.name!r}: no body parameters for frame {image.frame}")
         row = self._row(scene, image.frame)
-        rest = scene.gaussians
+        gaussians = scene.gaussians
         anchors = scene.anchors
-        away = (rest.means - anchors.points) / CENTIMETRE
-        longer = (rest.log_scales - anchors.size.log()[:, None]).clamp_min(0)
+        offsets = (gaussians.means - anchors.points) / CENTIMETRE
+        log_excess = (gaussians.log_scales - anchors.size.log()[:, None]).clamp_min(0)
         penalties = {
-            "offset": PARAMS.offset_weight * away.square().sum() / len(away),
-            "scale": PARAMS.scale_weight * longer.square().sum() / len(longer),
+            "offset": PARAMS.offset_weight * offsets.square().sum() / len(offsets),
+            "scale": PARAMS.scale_weight * log_excess.square().sum() / len(log_excess),
         }
         moved, posing = self._in_frame(scene, row, step)
         if self._refines(step):
@@ -280,24 +274,25 @@ class HumanTraining(SceneTraining[HumanScene]):
                     self._mirror_images = find_mirror_gaussians(
                         anchors, float(scene.skeleton.joints[0, 0])
                     )
-                unlike = colour_asymmetry(rest, *self._mirror_images)
-                penalties["sides"] = PARAMS.sides_weight * unlike
+                asymmetry = colour_asymmetry(gaussians, *self._mirror_images)
+                penalties["sides"] = PARAMS.symmetry_weight * asymmetry
         if self._neighbours is None:
             weights = scene.template_weights()
             self._neighbours = same_part_neighbours(anchors.points, weights, PARAMS.neighbours)
         if self._neighbours.shape[1]:
-            # Posing should preserve distances to neighbours, and neighbours should have similar
-            # offsets from their anchors. Each step uses one neighbour per Gaussian. Units are cm^2.
-            near = self._neighbours[:, step % self._neighbours.shape[1]]
+            # Each step uses one column of neighbours; squared distances are in cm^2.
+            neighbours = self._neighbours[:, step % self._neighbours.shape[1]]
             scale = scene.clip.scale[row]
-            strain, uneven = rigidity_errors(rest.means, moved.means, anchors.points, near, scale)
+            strain, smoothness = rigidity_errors(
+                gaussians.means, moved.means, anchors.points, neighbours, scale
+            )
             penalties["rigidity"] = PARAMS.rigidity * strain / CENTIMETRE**2
-            penalties["smoothness"] = PARAMS.smoothness * uneven / CENTIMETRE**2
-        frame = RestPose(rest.means, posing.rotations[0])
+            penalties["smoothness"] = PARAMS.smoothness * smoothness / CENTIMETRE**2
+        frame = RestPose(gaussians.means, posing.rotations[0])
         return GaussianTimeStep(moved, image.time, frame, penalties)
 
     def optimize(self, scene: HumanScene, step: int) -> Count:
-        """Update the corrections of the body fit."""
+        """Update the body corrections."""
         if not self._refines(step):
             return 0
         self._has_refined = True
@@ -309,51 +304,53 @@ class HumanTraining(SceneTraining[HumanScene]):
         return scene.learned.step(step - self.refines_from, progress)
 
     def leaves(self, scene: HumanScene) -> list[Tensor]:
-        """Return the corrections of the body fit."""
+        """Return the body corrections."""
         return scene.learned.leaves
 
     def edit_scene(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult] | None:
-        """Fill in hardly visible Gaussians after the last step; before it, fit poses again if due.
+        """Fill unseen Gaussians after the last step; before, refit poses when due.
 
-        After the first step, only the message of the outline loss is returned.
+        After the first step it only reports the outline loss.
         """
-        if step == 1 and self._finding is not None:
-            return scene, EditResult(None, message=self._finding)
+        if step == 1 and self._message is not None:
+            return scene, EditResult(None, message=self._message)
         if step == self.rates.steps:
             has_views = self.options.fill_unseen and self.views and len(scene)
             return self._fill_unseen(scene, step) if has_views else None
-        found = None if self._refit is None else self._refit.edit_scene(scene, step)
-        return None if found is None else (found[0], EditResult(None, message=found[1] or None))
+        edited = None if self._refit is None else self._refit.edit_scene(scene, step)
+        return None if edited is None else (edited[0], EditResult(None, message=edited[1] or None))
 
     def _fill_unseen(self, scene: HumanScene, step: int) -> tuple[HumanScene, EditResult]:
-        shown = [self.views[i] for i in evenly_spaced(len(self.views), PARAMS.views)]
+        views = [self.views[i] for i in evenly_spaced(len(self.views), PARAMS.visibility_views)]
         device = scene.skeleton.joints.device
         with torch.no_grad():
-            drawn = (
+            posed = (
                 (self._in_frame(scene, self._row(scene, frame), step)[0], camera.to(device=device))
-                for camera, frame in shown
+                for camera, frame in views
             )
             size = scene.anchors.size
-            seen = effective_view_counts(drawn, size, float(scene.clip.scale.mean()), scene.options)
-            trust = visibility_confidence(seen * (len(self.views) / len(shown)))
+            view_counts = effective_view_counts(
+                posed, size, float(scene.clip.scale.mean()), scene.options
+            )
+            confidence = visibility_confidence(view_counts * (len(self.views) / len(views)))
             middle = float(scene.skeleton.joints[0, 0])
             gaussians = scene.gaussians.detach()
-            changes = filled(gaussians, scene.anchors, scene.template_weights(), middle, trust)
-        hardly = float((trust < LOW_CONFIDENCE).float().mean())
-        line = (
-            f"{hardly:.0%} of the surface is hardly seen: filled in from the mirrored side and "
-            "neighbours"
-        )
-        message = line if hardly >= PARAMS.min_reported_fraction else None
-        return replace(scene, seen=trust), EditResult(None, changes, message=message)
+            changes = fill_unseen(
+                gaussians, scene.anchors, scene.template_weights(), middle, confidence
+            )
+        low_fraction = float((confidence < LOW_CONFIDENCE).float().mean())
+        message = None
+        if low_fraction >= PARAMS.min_reported_fraction:
+            message = f"filled {low_fraction:.0%} of the surface that few views show"
+        return replace(scene, seen=confidence), EditResult(None, changes, message=message)
 
     def apply_edit(self, edit: TopologyEdit | None = None) -> None:
-        """Discard cached neighbours and mirror images, since rows have changed."""
+        """Discard cached neighbours after the set of Gaussians changed."""
         self._neighbours = self._mirror_images = None
 
     def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> HumanScene:
         self.apply_edit()
-        if "refines_from" in tensors:  # The run may have been extended.
+        if "refines_from" in tensors:  # the run may have been extended
             self._has_refined = True
             self.refines_from = min(self.refines_from, int(tensors["refines_from"]))
         if self._refit is not None:
@@ -369,11 +366,11 @@ class HumanTraining(SceneTraining[HumanScene]):
         return with_role(kept, Role.TRAINING)
 
     def _row(self, scene: HumanScene, frame: int) -> int:
-        """Return the row of ``frame`` in the clip; clips of a static person have one row."""
+        """Return the clip row of a frame; a static person has one row."""
         return min(self._rows[frame], len(scene.clip) - 1)
 
     def _in_frame(self, scene: HumanScene, row: int, step: int) -> tuple[Gaussians, BodyPose]:
-        """Return the posed Gaussians of a row of the clip as rendered in ``step``, and the pose."""
+        """Return the Gaussians in clip row ``row`` as trained at ``step``, and the pose."""
         return scene.gaussians_in_frame(
             row, None if self._refines(step) else scene.template_weights()
         )

@@ -1,7 +1,6 @@
-"""Body templates of the SMPL family: rest mesh, shape space, joints, skinning weights, and posed
-vertices.
+"""Body templates of the SMPL family, their shape space, and posed vertices.
 
-Local letters: T triangles, U UV vertices, B shape parameters.
+Symbols: M vertices, T triangles, U UV vertices, J joints, B shape parameters, F frames.
 """
 
 from __future__ import annotations
@@ -23,34 +22,27 @@ from dyngs.human.body.skinning import (
     joint_transforms,
 )
 
-# shape parameters of a file of SMPL's family that are fitted: as many as every such file has
-NUM_FITTED_SHAPES = 10
+NUM_FITTED_SHAPES = 10  # shape parameters that every SMPL, SMPL-H and SMPL-X file has
 
 
 @dataclass(frozen=True)
 class BodyTemplate:
-    """A body template: rest mesh, shape space, joints and skinning weights.
+    """Rest mesh, shape space, joints and skinning weights of a body model.
 
     Metres, y up, facing +z, +x to the person's left; float32 unless converted.
     """
 
-    name: str  # the family of the joints: "anny", "smpl", "smplh" or "smplx"
-    vertices: Tensor  # (M, 3) at rest
+    name: str  # "anny" (the free template), "smpl", "smplh" or "smplx"
+    vertices: Tensor  # (M, 3) in the rest pose
     faces: Tensor  # (T, 3) long, counter-clockwise from outside
-    # (U, 2) texture coordinates in [0, 1], row of the image = (1 - v) * H; or None
-    uv: Tensor | None
-    # (T, 3) long indices into ``uv``, triangles and corners in the order of ``faces``; None with
-    # ``uv``
-    uv_faces: Tensor | None
+    uv: Tensor | None  # (U, 2) in [0, 1]; image row = (1 - v) * H
+    uv_faces: Tensor | None  # (T, 3) long indices into ``uv``, in the order of ``faces``
     weights: Tensor  # (M, J) skinning weights, rows sum to 1
-    # (J,) parent of each joint, -1 for the root; parents come before their children
-    parents: tuple[int, ...]
-    joints: Tensor  # (J, 3) at rest, mean shape
-    shape_dirs: Tensor | None = None  # (M, 3, B) metres per unit of the shape parameters, or None
-    # (J, 3, B) the same for the joints; None with ``shape_dirs``
-    joint_shape_dirs: Tensor | None = None
-    # (9 (J - 1), 3 M) pose blend shapes, metres per unit of the rotations minus the identity, or
-    # None
+    parents: tuple[int, ...]  # (J,), -1 for the root; parents come before their children
+    joints: Tensor  # (J, 3) in the rest pose, mean shape
+    shape_dirs: Tensor | None = None  # (M, 3, B) shape blend shapes, m per unit
+    joint_shape_dirs: Tensor | None = None  # (J, 3, B) the same for joints
+    # (9 (J - 1), 3 M) pose blend shapes, m per unit of the rotations minus the identity
     pose_dirs: Tensor | None = None
 
     @property
@@ -60,8 +52,7 @@ class BodyTemplate:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Return 16 hexadecimal digits that tell its mesh and shape space from those of other
-        files."""
+        """Hash of mesh and shape space, 16 hexadecimal digits, that identifies the body file."""
         digest = hashlib.sha256(self.name.encode())
         for values in (self.vertices, self.faces, self.shape_dirs):
             digest.update(
@@ -74,25 +65,25 @@ class BodyTemplate:
     def to(
         self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> BodyTemplate:
-        """Return the template on ``device``, its floating-point tensors in ``dtype``; None leaves
-        either as it is."""
+        """Return the template on ``device`` with floating-point tensors in ``dtype``; None:
+        unchanged."""
         return move_fields_to(self, device, dtype)
 
 
 def apply_shape(body: BodyTemplate, betas: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return vertices (..., M, 3) and joints (..., J, 3) at rest for shape parameters;
+    """Return rest-pose vertices (..., M, 3) and joints (..., J, 3) for shape parameters;
     differentiable.
 
-    v = v_mean + S beta; the joints are linear in the vertices and follow the same formula. Of
-    ``betas`` (..., B) missing ones are 0; None: the mean.
+    v = v_mean + S beta, and the same for joints, which are linear in the vertices. Missing values
+    of ``betas`` (..., B) are 0; None: the mean shape.
     """
     if betas is None or body.shape_dirs is None or body.joint_shape_dirs is None:
         return body.vertices, body.joints
-    moved = []
+    shaped = []
     for rest, dirs in ((body.vertices, body.shape_dirs), (body.joints, body.joint_shape_dirs)):
         used = dirs[..., : betas.shape[-1]].flatten(0, 1)
-        moved.append(rest + (betas @ used.T).unflatten(-1, (-1, 3)))
-    return moved[0], moved[1]
+        shaped.append(rest + (betas @ used.T).unflatten(-1, (-1, 3)))
+    return shaped[0], shaped[1]
 
 
 def posed_vertices(
@@ -102,73 +93,86 @@ def posed_vertices(
     betas: Tensor | None = None,
     scale: Tensor | None = None,
 ) -> Tensor:
-    """Return the vertices (F, M, 3) of F frames, m; differentiable in all arguments (SMPL, Loper et
-    al. 2015).
+    """Return posed vertices (F, M, 3), m; differentiable in all arguments (SMPL, Loper et al.
+    2015).
 
-    v = scale * (sum_j w_j A_j) (v_shaped + P vec(R_1 - 1, ..)) + trans. ``poses`` (F, J, 3) are
-    axis-angle relative to the parent joint, rad; ``trans`` (F, 3) m; ``betas`` (B,) or (F, B);
-    ``scale`` (F,).
+    v = scale * (sum_j w_j A_j) (v_shaped + P vec(R_1 - 1, ..)) + trans
+
+    Args:
+        body: the template.
+        poses: (F, J, 3) axis-angle relative to the parent joint, rad.
+        trans: (F, 3) m.
+        betas: (B,) or (F, B) shape parameters.
+        scale: (F,) uniform scale.
     """
     vertices, joints = apply_shape(body, betas)
     rotations = axis_angle_to_matrix(poses)
     if body.pose_dirs is not None:
         features = rotations[:, 1:] - torch.eye(3, dtype=poses.dtype, device=poses.device)
         vertices = vertices + (features.flatten(1) @ body.pose_dirs).unflatten(-1, (-1, 3))
-    moves = joint_transforms(joints, body.parents, rotations)
-    posed = apply_transforms(blend_transforms(body.weights, moves), vertices)
+    transforms = joint_transforms(joints, body.parents, rotations)
+    posed = apply_transforms(blend_transforms(body.weights, transforms), vertices)
     if scale is not None:
         posed = scale[:, None, None] * posed
     return posed + trans[:, None]
 
 
 BONE_UNIT = 0.015
-"""Change of a bone vector by one unit of a direction, m: about the spread among adults of the same
-height."""
-# joints that exist on both sides
+"""Change of a bone vector per unit of a shape parameter, m; about one standard deviation among adults
+of the same height."""
 PAIRED_JOINTS = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")
-MIDLINE_JOINTS = ("spine1", "spine2", "spine3", "neck", "head")  # joints in the plane of symmetry
+MIDLINE_JOINTS = ("spine1", "spine2", "spine3", "neck", "head")
 NUM_BONE_SHAPES = 3 * len(PAIRED_JOINTS) + 2 * len(MIDLINE_JOINTS)
-"""B: a bone vector has three coordinates, in the plane of symmetry two."""
-_NEAREST = 0.02  # distance added to all distances when a vertex lies between several joints, m
+"""Three coordinates per paired bone vector, two per bone vector in the plane of symmetry."""
+_NEAREST = 0.02  # added to distances when a vertex is blended between several joints, m
 
 
 def bone_shape_directions(
     vertices: np.ndarray, joints: np.ndarray, parents: tuple[int, ...], weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return directions of the vertices (M, 3, B) and of the joints (J, 3, B), m per unit of a
-    shape parameter.
+    """Return shape directions of single bones, for vertices (M, 3, B) and joints (J, 3, B), m per
+    unit.
 
-    Each moves one joint, or the same joint of both sides, together with everything below it;
-    vertices between two joints are stretched evenly. ``joints`` (J, 3) are the 55 of SMPL-X at
-    rest, +x to the left; ``weights`` are (M, J).
+    Each direction moves one joint, or a pair on both sides, together with all its descendants;
+    vertices between two joints are stretched evenly.
+
+    Args:
+        vertices: (M, 3) in the rest pose.
+        joints: (J, 3) the 55 of SMPL-X in the rest pose, +x to the left.
+        parents: (J,).
+        weights: (M, J) skinning weights.
     """
     joint_dirs = _joint_directions(parents)
-    follow = _following(vertices, joints, parents, weights)
-    return np.einsum("mj,jkb->mkb", follow, joint_dirs, optimize=True), joint_dirs
+    fractions = _follow_fractions(vertices, joints, parents, weights)
+    return np.einsum("mj,jkb->mkb", fractions, joint_dirs, optimize=True), joint_dirs
 
 
 def _joint_directions(parents: tuple[int, ...]) -> np.ndarray:
     """Return the directions (J, 3, B) of the joints, m."""
-    below = np.eye(len(parents))  # below[j, i]: joint j is i, or below it
+    is_descendant = np.eye(len(parents))  # [j, i]: joint j is i or one of its descendants
     for joint, parent in enumerate(parents):
         if parent >= 0:
-            below[joint] = np.maximum(below[joint], below[parent])
-    moves = []
+            is_descendant[joint] = np.maximum(is_descendant[joint], is_descendant[parent])
+    directions = []
     for name in PAIRED_JOINTS:
-        left, right = (below[:, JOINT_NAMES.index(f"{side}_{name}")] for side in ("left", "right"))
+        left, right = (
+            is_descendant[:, JOINT_NAMES.index(f"{side}_{name}")] for side in ("left", "right")
+        )
         for axis, mirrored in enumerate((-1.0, 1.0, 1.0)):
-            moves.append(np.outer(left + mirrored * right, np.eye(3)[axis]))
+            directions.append(np.outer(left + mirrored * right, np.eye(3)[axis]))
     for name in MIDLINE_JOINTS:
-        moves += [np.outer(below[:, JOINT_NAMES.index(name)], np.eye(3)[axis]) for axis in (1, 2)]
-    return BONE_UNIT * np.stack(moves, axis=-1)
+        directions += [
+            np.outer(is_descendant[:, JOINT_NAMES.index(name)], np.eye(3)[axis]) for axis in (1, 2)
+        ]
+    return BONE_UNIT * np.stack(directions, axis=-1)
 
 
-def _following(
+def _follow_fractions(
     vertices: np.ndarray, joints: np.ndarray, parents: tuple[int, ...], weights: np.ndarray
 ) -> np.ndarray:
-    """Return fractions (M, J), rows sum to 1: by how much a vertex moves when a joint at rest
-    does."""
-    follow = np.zeros_like(weights)
+    """Return by which fraction (M, J) a vertex moves with each joint when the joint moves in the
+    rest pose."""
+    fractions = np.zeros_like(weights)
     for joint in range(len(parents)):
         rows = np.flatnonzero(weights[:, joint])
         ends = [joint, *(child for child, parent in enumerate(parents) if parent == joint)]
@@ -176,17 +180,17 @@ def _following(
             child for child in ends[1:] if np.linalg.norm(joints[child] - joints[joint]) > 1e-6
         ]
         if len(bones) == 1:
-            # the position along the bone: 0 at its start or before, 1 at its end or beyond
+            # Position along the bone, from 0 at its start to 1 at its end.
             bone = joints[bones[0]] - joints[joint]
             fraction = np.clip((vertices[rows] - joints[joint]) @ bone / (bone @ bone), 0.0, 1.0)
-            follow[rows, joint] += weights[rows, joint] * (1 - fraction)
-            follow[rows, bones[0]] += weights[rows, joint] * fraction
+            fractions[rows, joint] += weights[rows, joint] * (1 - fraction)
+            fractions[rows, bones[0]] += weights[rows, joint] * fraction
         elif len(bones) > 1 and len(bones) <= 3:
-            # pelvis, chest; the wrist has five fingers and moves as a whole
+            # Pelvis and chest; the wrist with its five fingers moves as a whole.
             ends = [joint, *bones]
-            away = np.linalg.norm(vertices[rows, None] - joints[ends], axis=-1) + _NEAREST
-            parts = away**-2 / (away**-2).sum(1, keepdims=True)
-            follow[rows[:, None], np.array(ends)] += weights[rows, joint, None] * parts
+            distances = np.linalg.norm(vertices[rows, None] - joints[ends], axis=-1) + _NEAREST
+            parts = distances**-2 / (distances**-2).sum(1, keepdims=True)
+            fractions[rows[:, None], np.array(ends)] += weights[rows, joint, None] * parts
         else:
-            follow[rows, joint] += weights[rows, joint]
-    return follow
+            fractions[rows, joint] += weights[rows, joint]
+    return fractions

@@ -1,4 +1,4 @@
-"""The 55 joints of SMPL-X, their names and parents, and which of them SMPL and SMPL-H have."""
+"""Names, parents and mirror images of the 55 SMPL-X joints, and their subsets in SMPL and SMPL-H."""
 
 from __future__ import annotations
 
@@ -17,23 +17,22 @@ JOINT_NAMES = (
 )
 """The 55 joints of SMPL-X, in its order."""
 SMPLX_ROWS = {55: tuple(range(55)), 52: (*range(22), *range(25, 55)), 24: tuple(range(22))}
-"""By number of joints of a body (SMPL-X, SMPL-H, SMPL): the rows of ``JOINT_NAMES`` of its first
-joints.
+"""Rows of ``JOINT_NAMES`` by number of joints of a body: 55 (SMPL-X), 52 (SMPL-H) or 24 (SMPL).
 
 SMPL's last two joints, the hands, have no counterpart.
 """
 
 
 def mirrored_joints(count: int) -> tuple[int, ...]:
-    """Return the row of the same joint on the other side, for each joint of a body with so many of
-    them."""
+    """Return, for each joint of a body with ``count`` joints, the index of its counterpart on the
+    other side."""
     names = [JOINT_NAMES[row] for row in SMPLX_ROWS[count]]
     names += ["left_hand", "right_hand"][: count - len(names)]
     swapped = {"left": "right", "right": "left"}
     parts = (name.partition("_") for name in names)
     other = [
-        f"{swapped[side]}_{rest}" if side in swapped else side + bar + rest
-        for side, bar, rest in parts
+        f"{swapped[side]}_{joint}" if side in swapped else side + bar + joint
+        for side, bar, joint in parts
     ]
     return tuple(names.index(name) for name in other)
 
@@ -43,4 +42,4 @@ JOINT_PARENTS = (
     *(20, 25, 26, 20, 28, 29, 20, 31, 32, 20, 34, 35, 20, 37, 38),
     *(21, 40, 41, 21, 43, 44, 21, 46, 47, 21, 49, 50, 21, 52, 53),
 )
-"""(55,) the parent of each joint, -1 for the root."""
+"""(55,), -1 for the root."""

@@ -1,9 +1,9 @@
-"""Linear blend skinning: axis-angle to rotations, joint transforms along the kinematic tree,
-blended transforms.
+"""Linear blend skinning: axis-angle rotations, joint transforms along the kinematic tree,
+blending.
 
-Pure functions of tensors, differentiable in all of them; of rotations and chains by formulas, as
-autograd's many small operations would cost more than what they compute. Local letters: P points, J
-joints. ``...`` stands for any leading dimensions, such as F frames; they broadcast.
+Differentiable functions of tensors. Rotations and kinematic chains have hand-written gradients,
+which are faster than autograd of many small operations. Symbols: P points, J joints; ``...`` are
+leading dimensions (such as F frames), which broadcast.
 """
 
 from __future__ import annotations
@@ -19,11 +19,10 @@ from torch.autograd.function import once_differentiable
 
 
 def axis_angle_to_matrix(poses: Tensor) -> Tensor:
-    """Return the rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), rad; exact at zero,
-    as is the gradient.
+    """Return the rotation matrices (..., 3, 3) of axis-angle vectors (..., 3), rad.
 
-    Rodrigues: R = cos(t) 1 + sin(t)/t [p]x + (1 - cos(t))/t^2 p p^T with t = |p|; (1 - cos(t))/t^2
-    = sinc(t/2)^2 / 2. Differentiable once.
+    Rodrigues: R = cos(t) 1 + sin(t)/t [p]x + (1 - cos(t))/t^2 p p^T with t = |p| and (1 -
+    cos(t))/t^2 = sinc(t/2)^2 / 2. Value and gradient are exact at zero. Differentiable once.
     """
     return cast(Any, _Rotations).apply(poses)
 
@@ -36,32 +35,33 @@ class _Rotations(torch.autograd.Function):
         angles = torch.linalg.vector_norm(poses, dim=-1, keepdim=True)
         sine = torch.sinc(angles / math.pi)
         half = torch.sinc(angles / (2 * math.pi)).square() / 2
-        turned = angles.cos()[..., None] * torch.eye(3, dtype=poses.dtype, device=poses.device)
-        turned.addcmul_(
+        rotations = angles.cos()[..., None] * torch.eye(3, dtype=poses.dtype, device=poses.device)
+        rotations.addcmul_(
             sine[..., None], (poses @ _crosses(poses.dtype, poses.device)).unflatten(-1, (3, 3))
         )
-        turned.addcmul_((half * poses)[..., None], poses[..., None, :])
-        ctx.save_for_backward(poses, angles, sine, half, turned)
-        return turned
+        rotations.addcmul_((half * poses)[..., None], poses[..., None, :])
+        ctx.save_for_backward(poses, angles, sine, half, rotations)
+        return rotations
 
     @staticmethod
     @once_differentiable  # whose type hides the name of ctx
     def backward(ctx: Any, *grads: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """A change dp turns R by the vector (sin(t)/t 1 + (1 - sin(t)/t)/t^2 p p^T + (1 -
-        cos(t))/t^2 [p]x) dp."""
-        poses, angles, sine, half, turned = ctx.saved_tensors
-        by_turn = (grads[0] @ turned.mT).flatten(-2) @ _crosses(poses.dtype, poses.device).T
-        least = torch.finfo(poses.dtype).tiny  # below it sin(t)/t is exactly 1
+        """A change dp rotates R by (sin(t)/t 1 + (1 - sin(t)/t)/t^2 p p^T + (1 - cos(t))/t^2 [p]x)
+        dp."""
+        poses, angles, sine, half, rotations = ctx.saved_tensors
+        turn_grads = (grads[0] @ rotations.mT).flatten(-2) @ _crosses(poses.dtype, poses.device).T
+        tiny = torch.finfo(poses.dtype).tiny  # below it sin(t)/t is exactly 1
         along = (
-            (1 - sine) / angles.square().clamp_min(least) * (poses * by_turn).sum(-1, keepdim=True)
+            (1 - sine)
+            / angles.square().clamp_min(tiny)
+            * (poses * turn_grads).sum(-1, keepdim=True)
         )
-        return sine * by_turn + along * poses + half * torch.linalg.cross(by_turn, poses)
+        return sine * turn_grads + along * poses + half * torch.linalg.cross(turn_grads, poses)
 
 
 @cache
 def _crosses(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return the matrix (3, 9) that takes a vector p to the nine numbers of [p]x, with [p]x y = p x
-    y."""
+    """Return the matrix (3, 9) that maps p to the nine entries of [p]x, where [p]x y = p x y."""
     rows = [
         [0, 0, 0, 0, 0, -1, 0, 1, 0],
         [0, 0, 1, 0, 0, 0, -1, 0, 0],
@@ -71,25 +71,31 @@ def _crosses(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def joint_transforms(joints: Tensor, parents: tuple[int, ...], rotations: Tensor) -> Tensor:
-    """Return the transforms ``posed_from_rest`` (..., J, 3, 4) of the joints; the identity in the
-    rest pose.
+    """Return the skinning transforms A_j (..., J, 3, 4) of the joints; the identity in the rest
+    pose.
 
     A_j = A_parent(j) [R_j | J_j - R_j J_j], which is [G_R | G_t - G_R J_j] of SMPL (Loper et al.
-    2015); every round doubles the number of ancestors included. ``joints`` (..., J, 3) are at rest;
-    ``rotations`` (..., J, 3, 3) relative to the parents, -1 for a root. Differentiable once; the
-    gradient is that at rotations. Raises ValueError: a parent that does not come before its child.
+    2015). Each round doubles the number of ancestors that are included. Differentiable once; the
+    gradient is valid for rotation matrices only.
+
+    Args:
+        joints: (..., J, 3) in the rest pose.
+        parents: (J,), -1 for the root.
+        rotations: (..., J, 3, 3) relative to the parents.
+
+    Raises:
+        ValueError: a parent does not come before its child.
     """
     return cast(Any, _Chains).apply(joints, rotations, parents)
 
 
 @dataclass(frozen=True)
 class _Tree:
-    """A skeleton of J joints as indices, of which 0 is the world and joint j is j + 1."""
+    """Kinematic tree as index tensors; index 0 is the world and joint j has index j + 1."""
 
-    # (J + 1,) each: where the chain of each joint ends so far, until all end in the world
-    rounds: tuple[Tensor, ...]
+    rounds: tuple[Tensor, ...]  # (J + 1,) each: ancestor reached after each round
     parents: Tensor  # (J,)
-    below: Tensor  # (J, J): 1 where the joint of the column is that of the row, or below it
+    below: Tensor  # (J, J): 1 where the column's joint is the row's or one of its descendants
 
 
 @cache
@@ -129,26 +135,22 @@ class _Chains(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """What turns a joint turns all below it about its place: their gradients by turns about it
-        add up."""
+        """Rotating a joint rotates all its descendants about it, so that their gradients add up."""
         (joints, rotations, chains), tree, (grad,) = ctx.saved_tensors, ctx.tree, grads
         moves = chains[..., 1:, :3, :]
         above = chains.index_select(-3, tree.parents)[..., :3, :3]
-        turned = moves[..., :3]
+        rotations = moves[..., :3]
         parts = torch.cat([grad @ moves.mT, grad[..., 3:]], dim=-1)
         sums = (tree.below @ parts.flatten(-2)).unflatten(-1, (3, 4))
         force = sums[..., 3:]
-        place = turned @ joints[..., None] + moves[..., 3:]
-        by_rotations = above.mT @ (sums[..., :3] - force * place.mT) @ turned
-        by_joints = ((above - turned).mT @ force)[..., 0]
+        position = rotations @ joints[..., None] + moves[..., 3:]
+        by_rotations = above.mT @ (sums[..., :3] - force * position.mT) @ rotations
+        by_joints = ((above - rotations).mT @ force)[..., 0]
         return by_joints.sum_to_size(joints.shape), by_rotations.sum_to_size(rotations.shape), None
 
 
 def check_tree(parents: tuple[int, ...]) -> None:
-    """Check that every parent comes before its child, which excludes cycles.
-
-    Raises ValueError: names the first joint for which this does not hold.
-    """
+    """Raise ValueError, naming the joint, unless every parent comes before its child."""
     for joint, parent in enumerate(parents):
         if not -1 <= parent < joint:
             raise ValueError(
@@ -157,15 +159,14 @@ def check_tree(parents: tuple[int, ...]) -> None:
 
 
 def blend_transforms(weights: Tensor, transforms: Tensor) -> Tensor:
-    """Return transforms of points (..., P, 3, 4): those of joints (..., J, 3, 4) blended by
-    ``weights`` (P, J).
+    """Blend joint transforms (..., J, 3, 4) by ``weights`` (P, J) whose rows sum to 1; return
+    (..., P, 3, 4).
 
-    T_i = sum_j w_ij A_j, in general not rigid. Rows of the weights sum to 1.
+    T_i = sum_j w_ij A_j, in general not rigid.
     """
     return (weights @ transforms.flatten(-2)).unflatten(-1, (3, 4))
 
 
 def apply_transforms(transforms: Tensor, points: Tensor) -> Tensor:
-    """Return the points (..., P, 3), each transformed by its own matrix of ``transforms`` (..., P,
-    3, 4)."""
+    """Transform points (..., P, 3), each by its own matrix of ``transforms`` (..., P, 3, 4)."""
     return (transforms[..., :3] * points[..., None, :]).sum(-1) + transforms[..., 3]

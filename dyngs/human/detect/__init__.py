@@ -1,1 +1,1 @@
-"""Detection of people and key points in images."""
+"""Detection of people, their masks and key points in images."""

@@ -1,11 +1,10 @@
-"""Runs MediaPipe's pose detector; started with the interpreter of MediaPipe's own environment,
-which lacks dyngs.
+"""Runs MediaPipe's pose detector; executed by the interpreter of an environment without dyngs.
 
     PYTHON -I mediapipe_worker.py IMAGES OUT
 
-IMAGES is a folder of PNG files in order of time, OUT a folder to which ``NAME.npz`` is written for
-each image in which somebody is found: ``landmarks`` (33, 3), column and row in pixels, and
-visibility; ``mask`` (H, W) uint8.
+IMAGES is a folder of PNG files in order of time. For each image with a person, ``NAME.npz`` is
+written to the folder OUT with ``landmarks`` (33, 3): column, row (px) and visibility; and ``mask``
+(H, W) uint8.
 """
 
 import importlib
@@ -16,7 +15,7 @@ NO_MEDIAPIPE = 3  # exit status
 
 
 def main() -> int:
-    """Detect."""
+    """Detect the person in all images; return the exit status."""
     images = Path(sys.argv[1])
     out = Path(sys.argv[2])
     try:
@@ -29,14 +28,14 @@ def main() -> int:
     with solutions.pose.Pose(model_complexity=1, enable_segmentation=True) as pose:
         for path in sorted(images.glob("*.png")):
             rgb = np.ascontiguousarray(cv2.imread(str(path))[..., ::-1])
-            found = pose.process(rgb)
-            if found.pose_landmarks is None or found.segmentation_mask is None:
+            result = pose.process(rgb)
+            if result.pose_landmarks is None or result.segmentation_mask is None:
                 continue
             height, width = rgb.shape[:2]
             rows = [
-                (x.x * width, x.y * height, x.visibility) for x in found.pose_landmarks.landmark
+                (x.x * width, x.y * height, x.visibility) for x in result.pose_landmarks.landmark
             ]
-            mask = (np.clip(found.segmentation_mask, 0, 1) * 255).round().astype(np.uint8)
+            mask = (np.clip(result.segmentation_mask, 0, 1) * 255).round().astype(np.uint8)
             np.savez_compressed(
                 out / f"{path.stem}.npz", landmarks=np.array(rows, np.float32), mask=mask
             )

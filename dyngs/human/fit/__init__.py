@@ -1,2 +1,1 @@
-"""Fitting the body template to images of a person: one shape, one skeleton, a pose for every
-frame."""
+"""Fitting a body template to images of a person: one shape, one skeleton, and a pose per frame."""

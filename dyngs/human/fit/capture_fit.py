@@ -1,8 +1,8 @@
-"""The fit of a body template to the silhouettes of a capture: the body drawn as discs, what is
-observed in each frame, the optimisation, first poses where none are given, and the choice among
-fits on views left out.
+"""Fit of a body template to silhouettes: rendering, optimisation, initial poses, and model
+selection.
 
-Local letters: P discs, F frames, V views, J joints, B shape parameters.
+The body is rendered as disc-shaped Gaussians. Candidate fits are compared on held-out views.
+Symbols: P discs, F frames, V views, J joints, B shape parameters, S pixels per side of a crop.
 """
 
 from __future__ import annotations
@@ -57,23 +57,22 @@ _OPTIONS = RenderOptions(nonfinite="trust", eps2d=0.1, mode=RasterizeMode.ANTIAL
 
 @dataclass(frozen=True)
 class BodyDiscs:
-    """Discs on the texels of a template, at rest in some shape, and how they follow shape and
-    pose."""
+    """Disc-shaped Gaussians on the texels of a template, with their blend shapes and skinning
+    weights."""
 
-    discs: Gaussians  # P at rest, m
-    skeleton: Skeleton  # at rest in the same shape
+    discs: Gaussians  # P in the rest pose, m
+    skeleton: Skeleton  # in the rest pose, same shape
     normals: Tensor  # (P, 3) outward
     weights: Tensor  # (P, J) skinning weights
     shape_dirs: Tensor  # (P, 3, B) m per unit of the shape parameters
-    joint_dirs: Tensor  # (J, 3, B) the same for the joints
+    joint_dirs: Tensor  # (J, 3, B) the same for joints
     # (9 (J - 1), 3 P) pose blend shapes, m per unit of the rotations minus the identity
     pose_dirs: Tensor | None
 
     def with_shape(self, betas: Tensor, padding: Tensor) -> BodyDiscs:
-        """Return the body of one person, of the mean shape; differentiable.
+        """Apply shape parameters ``betas`` (B,) to the mean shape; differentiable.
 
-        ``betas`` (B,) are shape parameters; ``padding`` (P,) m, by how much clothes and hair lie
-        outside the skin.
+        ``padding`` (P,) m moves discs outwards, for clothes and hair.
         """
         means = self.discs.means + self.shape_dirs @ betas + padding[:, None] * self.normals
         joints = self.skeleton.joints + self.joint_dirs @ betas
@@ -81,7 +80,7 @@ class BodyDiscs:
         return replace(self, discs=self.discs.replace(means=means), skeleton=skeleton)
 
     def in_pose(self, pose: BodyPose) -> Gaussians:
-        """Return the discs in a pose, in the world; differentiable."""
+        """Return the posed discs in world coordinates; differentiable."""
         offsets = None
         if self.pose_dirs is not None:
             identity = torch.eye(3, dtype=pose.rotations.dtype, device=pose.rotations.device)
@@ -91,23 +90,26 @@ class BodyDiscs:
 
 
 def body_discs(body: BodyTemplate, resolution: int) -> BodyDiscs:
-    """Return the discs of a template's atlas of ``resolution`` texels a side, in the mean shape."""
+    """Create discs on the texels of a template in its mean shape, ``resolution`` texels per side."""
     texels = atlas_texels(body, resolution, body.vertices)
     discs, anchors = texel_gaussians(texels, [0.0], 0)
-    # Standard deviations in the tangent plane and along the normal, and depth below the skin (0.2),
-    # in sides of a texel: silhouettes then have the area of the mesh to 2 % and an IoU with it of
-    # 0.95 (48 texels a side) to 0.97 (72). Wider discs cover more, narrower ones leave gaps.
+    # Standard deviations and depth below the skin (0.2), in texel sides, at which silhouettes have
+    # the area of the mesh to 2 %. Wider discs cover more, narrower ones leave gaps.
     ratios = anchors.size.new_tensor([0.4, 0.4, 0.075]).log()
-    around = body.faces[texels.faces]
-    parts = texels.barycentric[..., None]
+    corner_indices = body.faces[texels.faces]
+    barycentric = texels.barycentric[..., None]
     shape_dirs = discs.means.new_zeros(len(discs), 3, 0)
     joint_dirs = body.joints.new_zeros(len(body.joints), 3, 0)
     if body.shape_dirs is not None and body.joint_shape_dirs is not None:
-        shape_dirs = (parts[..., None] * body.shape_dirs[around]).sum(1)
+        shape_dirs = (barycentric[..., None] * body.shape_dirs[corner_indices]).sum(1)
         joint_dirs = body.joint_shape_dirs
     pose_dirs = None
     if body.pose_dirs is not None:
-        pose_dirs = (parts * body.pose_dirs.unflatten(1, (-1, 3))[:, around]).sum(2).flatten(1)
+        pose_dirs = (
+            (barycentric * body.pose_dirs.unflatten(1, (-1, 3))[:, corner_indices])
+            .sum(2)
+            .flatten(1)
+        )
     return BodyDiscs(
         discs=discs.replace(
             means=discs.means - 0.2 * anchors.size[:, None] * texels.normals,
@@ -124,33 +126,27 @@ def body_discs(body: BodyTemplate, resolution: int) -> BodyDiscs:
 
 
 def render_silhouettes(discs: Gaussians, cameras: Cameras) -> Tensor:
-    """Return coverage (V, H, W) in [0, 1] of posed discs in the images of V cameras;
-    differentiable."""
+    """Render the coverage (V, H, W) in [0, 1] of posed discs for V cameras; differentiable."""
 
-    def black(discs: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
+    def no_colour(discs: Gaussians, cameras: Cameras, radii: Tensor) -> Tensor:
         return discs.means.new_zeros(len(cameras), len(discs), 1)
 
-    return render(discs, cameras, _OPTIONS, shader=black).alpha
+    return render(discs, cameras, _OPTIONS, shader=no_colour).alpha
 
 
 @dataclass(frozen=True)
 class ObservedFrame:
-    """The views of one frame in which the person is seen."""
+    """Silhouettes of the person in the views of one frame, cropped to squares."""
 
-    cameras: Cameras  # V, of squares of S px
+    cameras: Cameras  # V, of S x S crops
     alpha: Tensor  # (V, S, S) float32 in [0, 1]: coverage by the person
-    # (V, S, S) float32, 1 inside the image that the square was cut out of and where its mask
-    # counts, else 0
-    known: Tensor
-    # (V, 55, 3) column and row in the square, as fractions of its side, and confidence of joints
-    # that were marked as key points; None without any
+    known: Tensor  # (V, S, S) float32, 1 inside the original image and its valid mask, else 0
+    # (V, 55, 3) column and row, as fractions of S, and confidence of 2D key points
     joints: Tensor | None = None
-    # (55, 4) positions in the world and confidence of joints that are given in 3D; None without any
-    positions: Tensor | None = None
+    positions: Tensor | None = None  # (55, 4) world positions and confidence of 3D joints
 
-    def part(self, turn: int, count: int) -> ObservedFrame:
-        """Return ``count`` of the V views, far apart in their order; V turns show each as often.
-        All if V <= count."""
+    def select_views(self, turn: int, count: int) -> ObservedFrame:
+        """Return ``count`` evenly spaced views; V consecutive turns use each view equally often."""
         views = len(self.alpha)
         if views <= count:
             return self
@@ -166,26 +162,26 @@ class ObservedFrame:
             joints=None if self.joints is None else self.joints[rows],
         )
 
-    def shrunk(self, factor: int) -> ObservedFrame:
-        """Return the squares with sides divided by ``factor``."""
+    def downscale(self, factor: int) -> ObservedFrame:
+        """Return the crops with sides divided by ``factor``."""
         cameras = self.cameras.scaled(1 / factor)
         alpha, known = (_resized(x, cameras.width) for x in (self.alpha, self.known))
         return replace(self, cameras=cameras, alpha=alpha, known=(known > 0.999).float())
 
 
 def _resized(values: Tensor, size: int) -> Tensor:
-    """Return values (V, S', S') averaged over the areas of the pixels of (V, size, size)."""
+    """Average square values (V, S', S') over pixel areas to (V, size, size)."""
     return area_downscale(values.permute(1, 2, 0), size, size).permute(2, 0, 1).contiguous()
 
 
 def _box(image: Image) -> tuple[slice, slice] | None:
-    """Return rows and columns of the person; None if nobody is seen."""
+    """Return rows and columns of the person; None if the mask is empty."""
     return None if image.alpha is None else silhouette_box(image.alpha, 0.5)
 
 
 def longest_box_side(images: Iterable[Image]) -> int:
-    """Return the longest side of the person's box in the images (with alpha), px; 0 if nobody is
-    seen."""
+    """Return the longest side of the person's bounding box over all images, px; 0 if all masks are
+    empty."""
     longest = 0
     for image in images:
         for part in _box(image) or ():
@@ -197,17 +193,20 @@ def crop_frame(
     images: Sequence[Image],
     box_side: int,
     size: int,
-    marked: Mapping[str, Tensor] | None = None,
+    keypoints: Mapping[str, Tensor] | None = None,
     positions: Tensor | None = None,
 ) -> ObservedFrame | None:
-    """Return the squares around the person in the images of one frame; None if no image shows
-    anybody.
+    """Crop the images of one frame to squares around the person; None if all masks are empty.
 
-    ``box_side`` is the ``longest_box_side`` of all images, so that all squares have the same scale;
-    ``size`` is S; ``marked`` are key points (55, 3) as fractions of the width and height, by image.
+    Args:
+        images: of one frame.
+        box_side: ``longest_box_side`` of all frames, so that all crops have the same scale.
+        size: S, px.
+        keypoints: (55, 3) by image name; columns and rows are fractions of width and height.
+        positions: (55, 4) 3D joints.
     """
     side = max(round(1.25 * box_side), 1)
-    squares = []
+    crops = []
     for image in images:
         box = _box(image)
         if box is None or image.alpha is None:
@@ -224,35 +223,35 @@ def crop_frame(
         intrinsics[:, :2, 2] -= corner
         intrinsics = intrinsics.new_tensor([size / side, size / side, 1.0])[:, None] * intrinsics
         joints = torch.zeros(len(JOINT_NAMES), 3, device="cpu")
-        if marked and image.name in marked:
-            joints = marked[image.name].clone()
+        if keypoints and image.name in keypoints:
+            joints = keypoints[image.name].clone()
         joints[:, :2] = (joints[:, :2] * joints.new_tensor([width, height]) - corner) / side
         known = (known > 0.999).float()
-        squares.append((image.cameras.cam_from_world, intrinsics, alpha, known, joints[None]))
-    if not squares:
+        crops.append((image.cameras.cam_from_world, intrinsics, alpha, known, joints[None]))
+    if not crops:
         return None
-    poses, intrinsics, alpha, known, joints = (torch.cat(x) for x in zip(*squares, strict=True))
+    poses, intrinsics, alpha, known, joints = (torch.cat(x) for x in zip(*crops, strict=True))
     cameras = Cameras(poses, intrinsics, size, size)
-    return ObservedFrame(cameras, alpha, known, joints if marked else None, positions)
+    return ObservedFrame(cameras, alpha, known, joints if keypoints else None, positions)
 
 
 Observations = Callable[[int], ObservedFrame | None]
-"""Returns what is observed in a row of the clip, None where nobody is seen."""
+"""Returns the observed frame of a clip row; None if its masks are empty."""
 
 
 def rotate_views(frames: Mapping[int, ObservedFrame]) -> Observations:
-    """Return a function that observes a frame by three of its views, the next three at each call."""
+    """Return an ``Observations`` that uses three views per frame, the next three at each call."""
     turns = Counter[int]()
 
-    def look(row: int) -> ObservedFrame | None:
+    def next_views(row: int) -> ObservedFrame | None:
         turns[row] += 1
-        return frames[row].part(turns[row], 3) if row in frames else None
+        return frames[row].select_views(turns[row], 3) if row in frames else None
 
-    return look
+    return next_views
 
 
 NUM_FITTED_JOINTS = 22
-"""Joints that are turned: those of the body. Fingers, jaw and eyes do not show in silhouettes."""
+"""Joints whose rotations are fitted: those of the body, without fingers, jaw and eyes."""
 _USUAL = """
 hip       -11   1  -6   23 14  7
 knee       26   0   1   22  1  0
@@ -267,15 +266,15 @@ shoulder   16 -13 -49   37 20 28
 elbow      -7 -40  16    5 29 13
 wrist      -4  -2  10    3 11  6
 """
-"""Usual poses in clips of CMU: mean axis-angle vectors of joints of the left side or in the middle,
-and their standard deviations, degrees; the right side is the mirror image."""
+"""Pose statistics of CMU motion capture: mean axis-angle vectors and standard deviations, degrees, for
+joints of the left side and the middle; the right side is mirrored."""
 
 
 def usual_pose_statistics(joints: int) -> tuple[Tensor, Tensor]:
     """Return mean and standard deviation (joints, 3) of usual poses, axis-angle, rad.
 
-    The mean is zero for joints that are not known. Deviations are at least 8 degrees: a few clips
-    do not show how far a joint can go.
+    The mean is zero for joints without statistics. Standard deviations are at least 8 degrees,
+    because few clips do not show the range of a joint.
     """
     table = {}
     for line in _USUAL.split("\n")[1:-1]:
@@ -283,9 +282,9 @@ def usual_pose_statistics(joints: int) -> tuple[Tensor, Tensor]:
         table[name] = torch.tensor([float(x) for x in numbers], device="cpu")
     degrees = torch.zeros(joints, 6, device="cpu")
     for row, name in enumerate(JOINT_NAMES[:joints]):
-        own = table.get(name.removeprefix("left_").removeprefix("right_"))
-        if own is not None:
-            degrees[row] = own
+        values = table.get(name.removeprefix("left_").removeprefix("right_"))
+        if values is not None:
+            degrees[row] = values
             if name.startswith("right_"):
                 degrees[row, 1:3] *= -1
     mean, spread = degrees.split(3, dim=1)
@@ -294,22 +293,23 @@ def usual_pose_statistics(joints: int) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class PosePrior:
-    """Expected corrections of the poses of F frames, axis-angle, rad."""
+    """Prior of pose corrections over F frames, axis-angle, rad."""
 
-    centre: Tensor  # (F, 22, 3) mean
-    spread: Tensor  # (22, 3) standard deviation
-    # of these from the centre, beyond which nobody is expected to turn a joint
-    limit: float
+    mean: Tensor  # (F, 22, 3)
+    std: Tensor  # (22, 3)
+    limit: float  # joint limit, in standard deviations
 
 
 def pose_prior(clip: MotionClip, *, is_given: bool) -> PosePrior:
-    """Return the prior that poses are about those given, with an expected error of 0.05 rad, or that
-    corrected poses are usual ones; rotations add as vectors, which holds for small ones."""
+    """Return the prior: given poses with an error of 0.05 rad, or else usual poses.
+
+    Rotations are added as vectors, which holds for small ones.
+    """
     poses = clip.poses[:, :NUM_FITTED_JOINTS]
     if is_given:
         return PosePrior(torch.zeros_like(poses), torch.full_like(poses[0], 0.05), math.inf)
-    mean, spread = (x.to(poses) for x in usual_pose_statistics(NUM_FITTED_JOINTS))
-    return PosePrior(mean - poses, spread, 3.0)
+    mean, std = (x.to(poses) for x in usual_pose_statistics(NUM_FITTED_JOINTS))
+    return PosePrior(mean - poses, std, 3.0)
 
 
 _RATES = {
@@ -322,37 +322,35 @@ _RATES = {
     "offset": 3e-3,
     "shift": 3e-3,
 }
-"""Learning rates at the first step; a tenth at the last."""
+"""Initial learning rates; they fall to a tenth."""
 LIMIT_WEIGHT = 2e-2
-"""Weight of the mean square of what lies beyond the limit of a joint, in standard deviations."""
-KEYPOINT_STD = 0.02  # expected error of a key point, as a fraction of the square's side
+"""Weight of the mean squared excess over joint limits, in standard deviations."""
+KEYPOINT_STD = 0.02  # expected error of a key point, as a fraction of the crop's side
 OUTLIER_ERROR = 1.0
-"""Squared difference of coverages, over the person's area, from which on a silhouette is rather a
-mistake. Good masks have 0.05 to 0.2; at 0.3 bodies found in masks of a detector were no better, at
-infinity twice as far off."""
-FRAMES_PER_STEP = 3  # frames drawn in each step
+"""Relative squared silhouette error at which a mask counts as an outlier; good masks have 0.05 to
+0.2."""
+FRAMES_PER_STEP = 3
 
 
-def silhouette_error(drawn: Tensor, seen: ObservedFrame) -> Tensor:
-    """Return a mean over the V views of e / (1 + e / ``MISTAKEN``); e is the squared difference
-    over what is seen.
+def silhouette_error(rendered: Tensor, observed: ObservedFrame) -> Tensor:
+    """Return the mean over V views of e / (1 + e / ``OUTLIER_ERROR``), e the relative squared
+    error.
 
-    So a mask that shows half the person, or something else, counts little beside those of the other
-    views (Geman and McClure 1987).
+    The robust form limits the influence of wrong masks (Geman and McClure 1987).
     """
-    wrong = ((drawn - seen.alpha) * seen.known).square().sum((1, 2))
-    error = wrong / (seen.alpha * seen.known).sum((1, 2)).clamp_min(1.0)
+    squared = ((rendered - observed.alpha) * observed.known).square().sum((1, 2))
+    error = squared / (observed.alpha * observed.known).sum((1, 2)).clamp_min(1.0)
     return (error / (1 + error / OUTLIER_ERROR)).mean()
 
 
-def keypoint_error(joints: Tensor, marked: Tensor, cameras: Cameras) -> Tensor:
-    """Return the mean robust distance of joints (J, 3) in the world from key points (V, 55, 3), see
+def keypoint_error(joints: Tensor, keypoints: Tensor, cameras: Cameras) -> Tensor:
+    """Return the robust reprojection error of joints (J, 3) to key points (V, 55, 3) of
     ``ObservedFrame``.
 
     J is 24, 52 or 55; joints of the same name are compared.
     """
     rows = SMPLX_ROWS[len(joints)]
-    marked = marked[:, list(rows)]
+    keypoints = keypoints[:, list(rows)]
     local = (
         joints[: len(rows)] @ cameras.cam_from_world[:, :3, :3].mT
         + cameras.cam_from_world[:, None, :3, 3]
@@ -360,51 +358,55 @@ def keypoint_error(joints: Tensor, marked: Tensor, cameras: Cameras) -> Tensor:
     pixels = local @ cameras.intrinsics.mT
     positions = pixels[..., :2] / pixels[..., 2:].clamp_min(1e-3) / cameras.width
     return _robust_mean(
-        (positions - marked[..., :2]).square().sum(-1) / KEYPOINT_STD**2, marked[..., 2]
+        (positions - keypoints[..., :2]).square().sum(-1) / KEYPOINT_STD**2, keypoints[..., 2]
     )
 
 
-def joint_position_error(joints: Tensor, given: Tensor, unit: Tensor) -> Tensor:
-    """Return the mean robust distance of joints (J, 3) from positions (55, 4), as for key points.
+def joint_position_error(joints: Tensor, targets: Tensor, unit: Tensor) -> Tensor:
+    """Return the robust distance of joints (J, 3) to 3D joints (55, 4), with an expected error of
+    3 cm.
 
-    ``unit`` is the length of a metre of the person in the world; errors of 3 cm are expected.
+    ``unit`` is the length of a metre of the person in world units.
     """
     rows = SMPLX_ROWS[len(joints)]
-    given = given[list(rows)]
-    away = (joints[: len(rows)] - given[:, :3]).square().sum(-1) / (0.03 * unit) ** 2
-    return _robust_mean(away, given[:, 3])
+    targets = targets[list(rows)]
+    squared = (joints[: len(rows)] - targets[:, :3]).square().sum(-1) / (0.03 * unit) ** 2
+    return _robust_mean(squared, targets[:, 3])
 
 
 def _robust_mean(squares: Tensor, weights: Tensor) -> Tensor:
-    """Return the weighted mean of sqrt(1 + s) - 1: large errors count linearly."""
+    """Return the weighted mean of sqrt(1 + s) - 1 of squared errors s; large errors count
+    linearly."""
     return (weights * ((1 + squares).sqrt() - 1)).sum() / weights.sum().clamp_min(1.0)
 
 
 @dataclass(frozen=True)
 class CandidateFit:
-    """One way to fit."""
+    """Result of one fitting variant."""
 
-    name: str  # for people
-    learned: Parameters  # of the clip
-    iou: float  # mean IoU of drawn and seen silhouettes
-    per_frame: tuple[float, ...]  # (F,) the same, per frame; NaN where nobody is seen
+    name: str  # for messages
+    learned: Parameters
+    iou: float  # mean silhouette IoU
+    per_frame: tuple[float, ...]  # (F,) IoU per frame; NaN where the masks are empty
 
 
 @dataclass(frozen=True)
 class BodyFit:
-    """Given poses of F frames, the template's discs, and the poses that are expected."""
+    """Optimisation problem: initial poses of F frames, the discs of the template, and a pose
+    prior."""
 
     clip: MotionClip
     body: BodyDiscs
-    expected: PosePrior
+    prior: PosePrior
 
-    def start(self) -> Parameters:
-        """Return what is learned, all zero.
+    def initial_parameters(self) -> Parameters:
+        """Return the zero-initialised parameters of the fit.
 
-        ``betas`` (B,) shape; ``log_scale`` (1,) of the factor on the scale; ``turns`` (22, 3)
-        axis-angle, rad, applied before the given rotations, in all frames; ``poses`` (F, 22, 3) the
-        same per frame; ``shift`` (3,) added to the translations, ``offset`` (3,) m in the frame of
-        the pelvis; ``trans`` (F, 3) per frame; ``padding`` (P,) m between skin and silhouette.
+        Returns:
+            ``betas`` (B,) shape; ``log_scale`` (1,); ``turns`` (22, 3) axis-angle, rad, applied
+            before the initial rotations in all frames; ``poses`` (F, 22, 3) the same per frame;
+            ``shift`` (3,) added to all translations; ``offset`` (3,) m, in the frame of the
+            pelvis; ``trans`` (F, 3) per frame; ``padding`` (P,) m between skin and silhouette.
         """
         frames = len(self.clip)
         shapes = {
@@ -418,35 +420,37 @@ class BodyFit:
             "shift": (3,),
         }
         zeros = {name: self.body.weights.new_zeros(shape) for name, shape in shapes.items()}
-        # Positions are in the unit of the world, rates per metre of the person.
+        # Learning rates are per metre of the person, positions in world units.
         unit = float(self.clip.scale.mean())
         rates = _RATES | {name: _RATES[name] * unit for name in ("trans", "shift")}
         return Parameters(zeros, rates, 0.1)
 
     def pose(self, learned: Parameters, row: int) -> BodyPose:
-        """Return the fitted pose of frame ``row``."""
-        own = learned["turns"] + learned["poses"][row]
-        given = self.clip.rotations[row]
-        turned = given[:NUM_FITTED_JOINTS] @ axis_angle_to_matrix(own)
+        """Return the fitted pose of clip row ``row``."""
+        correction = learned["turns"] + learned["poses"][row]
+        initial = self.clip.rotations[row]
+        rotated = initial[:NUM_FITTED_JOINTS] @ axis_angle_to_matrix(correction)
         scale = self.clip.scale[row] * learned["log_scale"][0].exp()
-        away = learned["shift"] + learned["trans"][row] + scale * (turned[0] @ learned["offset"])
-        rotations = torch.cat([turned, given[NUM_FITTED_JOINTS:]])
-        return BodyPose(rotations, self.clip.trans[row] + away, scale)
+        translation = (
+            learned["shift"] + learned["trans"][row] + scale * (rotated[0] @ learned["offset"])
+        )
+        rotations = torch.cat([rotated, initial[NUM_FITTED_JOINTS:]])
+        return BodyPose(rotations, self.clip.trans[row] + translation, scale)
 
     def shaped(self, learned: Parameters) -> BodyDiscs:
         """Return the body in the fitted shape."""
         return self.body.with_shape(learned["betas"], learned["padding"])
 
     def silhouettes(self, learned: Parameters, row: int, cameras: Cameras) -> Tensor:
-        """Return the silhouettes (V, H, W) of frame ``row`` for V cameras."""
+        """Render the silhouettes (V, H, W) of clip row ``row`` for V cameras."""
         return render_silhouettes(self.shaped(learned).in_pose(self.pose(learned, row)), cameras)
 
-    def error(self, learned: Parameters, seen: Mapping[int, ObservedFrame]) -> Tensor:
-        """Return the mean error of the frames ``seen``, by row: of silhouettes, and of joints where
-        they are marked."""
+    def error(self, learned: Parameters, frames: Mapping[int, ObservedFrame]) -> Tensor:
+        """Return the mean error of observed frames, by row: silhouettes, and 2D and 3D joints if
+        given."""
         body = self.shaped(learned)
         errors = []
-        for row, frame in seen.items():
+        for row, frame in frames.items():
             pose = self.pose(learned, row)
             error = silhouette_error(render_silhouettes(body.in_pose(pose), frame.cameras), frame)
             if frame.joints is not None:
@@ -461,81 +465,79 @@ class BodyFit:
         return torch.stack(errors).mean()
 
     def penalty(self, learned: Parameters) -> Tensor:
-        """Return the penalty of shapes, turns and poses that are far from those given, or that
-        jump.
+        """Return the penalty of unlikely shapes and poses, and of fast pose changes.
 
-        What silhouettes do not show, such as a limb turned about itself, follows the noise of
-        Adam's steps where the weights are much smaller: renders of new poses then lose 1 to 3 dB.
+        Silhouettes do not constrain all joints, such as a limb rotated about its axis. With much
+        lower weights these follow the noise of Adam.
         """
-        # Of the free template the last directions are those of bones; SMPL has none.
+        # The last directions of the free template are those of bones; SMPL has none.
         bones = learned["betas"].square().tensor_split([-NUM_BONE_SHAPES])
         total = learned["betas"].new_zeros(())
         for part in bones:
             total = total + (1e-3 * part.mean() if len(part) else 0.0)
         total = total + 3e-2 * (learned["turns"][1:] / 0.25).square().mean()
-        away = (learned["poses"] - self.expected.centre) / self.expected.spread
-        total = total + 1e-3 * away[:, 1:].square().mean()
-        beyond = (away[:, 1:].abs() - self.expected.limit).clamp_min(0.0)
-        total = total + LIMIT_WEIGHT * beyond.square().mean()
+        deviations = (learned["poses"] - self.prior.mean) / self.prior.std
+        total = total + 1e-3 * deviations[:, 1:].square().mean()
+        excess = (deviations[:, 1:].abs() - self.prior.limit).clamp_min(0.0)
+        total = total + LIMIT_WEIGHT * excess.square().mean()
         if len(self.clip) > 1:
             total = total + 1e-3 * (learned["poses"].diff(dim=0) / 0.1).square().mean()
         return total + 2e-3 * (learned["padding"] / 0.01).square().mean()
 
-    def run(
+    def optimize(
         self,
         start: Parameters,
         learned: Sequence[str],
         steps: int,
         observed: Observations,
-        report: ProgressCallback = ignore_progress,
+        on_progress: ProgressCallback = ignore_progress,
         schedule_start: float = 0.0,
     ) -> Parameters:
-        """Return the fit ``start`` after ``steps`` of Adam on what is named.
+        """Return ``start`` after ``steps`` of Adam on the parameters named in ``learned``.
 
-        Frames are taken in a fixed order that covers the clip evenly. Rates begin where they are
-        after the fraction ``fallen`` of a run; higher where it is negative.
+        Frames are visited in a fixed order that covers the clip evenly. Learning rates start at
+        fraction ``schedule_start`` of their schedule; a negative value gives higher rates.
         """
-        # Copies, as updates are in place and ``start`` may be what is taken in the end; without
-        # moments.
+        # Updates are in place, and ``start`` may be chosen in the end: optimise a copy.
         copies = {name: x.clone() for name, x in start.values().items()}
-        found = Parameters(copies, start.rates, start.decay)
+        parameters = Parameters(copies, start.rates, start.decay)
         for name in copies:
-            found[name].requires_grad_(name in learned)
+            parameters[name].requires_grad_(name in learned)
         order = spread_order(len(self.clip))
         for step in range(1, steps + 1):
             rows = {
                 order[((step - 1) * FRAMES_PER_STEP + i) % len(order)]
                 for i in range(FRAMES_PER_STEP)
             }
-            seen = {row: frame for row in sorted(rows) if (frame := observed(row)) is not None}
-            loss = self.penalty(found)
-            if seen:
-                loss = loss + self.error(found, seen) * (len(seen) / len(rows))
-            if loss.requires_grad:  # else nothing is to be learned
+            frames = {row: frame for row in sorted(rows) if (frame := observed(row)) is not None}
+            loss = self.penalty(parameters)
+            if frames:
+                loss = loss + self.error(parameters, frames) * (len(frames) / len(rows))
+            if loss.requires_grad:
                 loss.backward()
-            found.step(step, schedule_start + (1 - schedule_start) * step / steps)
-            report("fit of the body", step, steps)
-        return found
+            parameters.step(step, schedule_start + (1 - schedule_start) * step / steps)
+            on_progress("fitting the body", step, steps)
+        return parameters
 
     @torch.no_grad()
-    def measured(
-        self, name: str, learned: Parameters, judged: Mapping[int, ObservedFrame]
+    def evaluate(
+        self, name: str, learned: Parameters, frames: Mapping[int, ObservedFrame]
     ) -> CandidateFit:
-        """Return a candidate with its IoU in the frames ``judged``, by row."""
-        found = [torch.zeros(0, device="cpu")] * len(self.clip)
-        for row, frame in judged.items():
-            ours = self.silhouettes(learned, row, frame.cameras) > 0.5
-            theirs = frame.alpha > 0.5
+        """Return a candidate with its silhouette IoU in the given frames, by row."""
+        ious = [torch.zeros(0, device="cpu")] * len(self.clip)
+        for row, frame in frames.items():
+            rendered = self.silhouettes(learned, row, frame.cameras) > 0.5
+            observed = frame.alpha > 0.5
             known = frame.known > 0
-            both = ours & theirs & known
-            either = (ours | theirs) & known
-            found[row] = both.sum((1, 2)) / either.sum((1, 2)).clamp_min(1)
-        per_frame = tuple(float(x.mean()) for x in found)
-        return CandidateFit(name, learned, float(torch.cat(found).mean()), per_frame)
+            intersection = rendered & observed & known
+            union = (rendered | observed) & known
+            ious[row] = intersection.sum((1, 2)) / union.sum((1, 2)).clamp_min(1)
+        per_frame = tuple(float(x.mean()) for x in ious)
+        return CandidateFit(name, learned, float(torch.cat(ious).mean()), per_frame)
 
 
 def spread_order(count: int) -> list[int]:
-    """Return 0 .. count - 1 in an order whose every stretch is spread over the full range."""
+    """Return a permutation of 0 .. count - 1 whose every section is spread over the full range."""
     stride = max(1, round(count * 0.618))
     while count > 1 and math.gcd(stride, count) != 1:
         stride += 1
@@ -543,55 +545,55 @@ def spread_order(count: int) -> list[int]:
 
 
 def apply_fit(learned: Parameters, clip: MotionClip, *, own_frames: bool) -> MotionClip:
-    """Return a clip with what was learned: of the clip that was fitted with the corrections of its
-    frames, of another one, whose poses were given by the same means, with what holds for all."""
+    """Return a clip with fitted corrections: per-frame ones for the fitted clip (``own_frames``),
+    only shared ones for another clip."""
     values = learned.values()
-    missing = (0, 0, 0, clip.poses.shape[1] - NUM_FITTED_JOINTS)
-    turns, poses = (torch.nn.functional.pad(values[name], missing) for name in ("turns", "poses"))
+    padding = (0, 0, 0, clip.poses.shape[1] - NUM_FITTED_JOINTS)
+    turns, poses = (torch.nn.functional.pad(values[name], padding) for name in ("turns", "poses"))
     shared = SharedCorrection(turns, float(values["log_scale"][0]))
     frames = (poses, values["trans"]) if own_frames else ()
-    turned = corrected_clip(shared, clip, *frames)
-    roots = axis_angle_to_matrix(turned.poses[:, 0])
-    away = values["shift"] + turned.scale[:, None] * (roots @ values["offset"][:, None])[..., 0]
-    return replace(turned, trans=turned.trans + away)
+    clip_with_rotations = corrected_clip(shared, clip, *frames)
+    roots = axis_angle_to_matrix(clip_with_rotations.poses[:, 0])
+    translation = (
+        values["shift"]
+        + clip_with_rotations.scale[:, None] * (roots @ values["offset"][:, None])[..., 0]
+    )
+    return replace(clip_with_rotations, trans=clip_with_rotations.trans + translation)
 
 
 NUM_HEADINGS = 8  # directions that a person may face
 STEPS = 40
-"""Steps of Adam for each heading of an anchor, and, at each size, for each frame from the pose of
-the one before."""
+"""Adam steps per heading of an anchor frame, and per frame and resolution level when tracking."""
 MAX_HEADING_ERROR = math.radians(30)
-"""Rotation of the root away from the path of headings from which a frame is begun on that path
-instead."""
-STATURE = 1.70  # height of a person in a usual pose, m, where a single camera leaves it open
+"""Deviation of the root from the heading path above which tracking restarts on the path."""
+STATURE = 1.70  # assumed height of the person, m, for a single camera
 FramePose = tuple[Tensor, Tensor, float]
 """Pose (J, 3), translation (3,) and error of one frame."""
 
 
 def viterbi_path(costs: np.ndarray, changes: np.ndarray) -> list[int]:
-    """Return the states (T,) whose costs (T, S) and changes (T - 1, S, S) cost least in all.
+    """Return the states (T,) with the lowest sum of costs (T, S) and transition costs (T - 1, S,
+    S).
 
-    ``changes`` are from the state of the row to that of the column. Source: the algorithm of
-    Viterbi, 1967.
+    ``changes[t, a, b]`` is the cost from state a to state b (Viterbi 1967).
     """
     total = costs[0]
-    came_from = []
-    for own, change in zip(costs[1:], changes, strict=True):
-        ways = total[:, None] + change
-        came_from.append(ways.argmin(0))
-        total = ways.min(0) + own
+    predecessors = []
+    for cost, change in zip(costs[1:], changes, strict=True):
+        candidates = total[:, None] + change
+        predecessors.append(candidates.argmin(0))
+        total = candidates.min(0) + cost
     path = [int(total.argmin())]
-    for back in reversed(came_from):
+    for back in reversed(predecessors):
         path.append(int(back[path[-1]]))
     return path[::-1]
 
 
 def likely_headings(errors: Sequence[Sequence[float]], weight: float = 0.01) -> list[int]:
-    """Return the heading (A,) of each anchor for which errors (A, H) and changes of heading cost
-    least in all.
+    """Return the most likely heading (A,) of each anchor frame from errors (A, H) per heading.
 
-    ``weight``: error that costs as much as a turn of 45 degrees from one anchor to the next; it
-    grows with the square.
+    ``weight`` is the cost of a turn by 45 degrees between anchors; it grows with the squared
+    angle.
     """
     costs = np.asarray(errors, dtype=np.float64)
     anchors, count = costs.shape
@@ -604,162 +606,164 @@ def estimate_initial_poses(
     times: Tensor,
     body: BodyDiscs,
     observed: Observations,
-    report: ProgressCallback = ignore_progress,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> MotionClip:
-    """Return poses of a person in F frames, found in the silhouettes of ``observed`` (per row)
-    alone.
+    """Estimate the poses of F frames from silhouettes alone.
 
-    In up to 20 frames, the anchors, every heading is tried; a likely path through them says which
-    way the person faces. Each frame starts from the pose of the one before, and where that has left
-    the path from the path's heading. Without key points clips that never look at the path are
-    compared with it. Raises DyngsError: nobody in the first frame.
+    Up to 20 anchor frames are fitted from every heading; the most likely sequence of headings
+    gives the direction that the person faces. Each frame then starts from the pose of the previous
+    one, or from the heading path where tracking left it. Without key points, tracks without the
+    path compete with it, since silhouettes from opposite sides look alike. Raises DyngsError: the
+    first frame has empty masks.
     """
-    seen = observed(0)
-    if seen is None:
-        raise DyngsError("nobody is seen in the first frame; leave it out (data.frames=1::)")
-    up = up_of(seen)
+    first_frame = observed(0)
+    if first_frame is None:
+        raise DyngsError("the first frame has an empty mask; skip it (data.frames=1::)")
+    up = mean_up_direction(first_frame)
     standing = standing_clip(times, body, up, observed)
     anchors: list[int] = []
-    tried: list[list[FramePose]] = []
+    anchor_poses: list[list[FramePose]] = []
     rows = evenly_spaced(len(times), 20)
     for number, row in enumerate(rows, 1):
         frame = observed(row)
         if frame is not None:
             anchors.append(row)
-            tried.append(_all_headings(standing, row, up, body, frame))
-        report("headings", number, len(rows))
-    path = likely_headings([[error for _, _, error in own] for own in tried])
-    roots = torch.stack([own[heading][0][0] for own, heading in zip(tried, path, strict=True)])
-    roots = _roots_between(anchors, roots, len(times))
-    ways: list[tuple[int, Tensor | None]] = [(path[0], roots)]
-    if seen.joints is None:  # outlines from two opposite sides are alike: the path may be wrong
-        best = sorted(range(NUM_HEADINGS), key=lambda i: tried[0][i][2])
-        ways += [(index, None) for index in best[:2]]
-    followed = []
-    for number, (index, along) in enumerate(ways, 1):
-        followed.append(_followed(standing, tried[0][index], along, body, observed))
-        report("first poses", number, len(ways))
-    return min(followed, key=lambda found: found[1])[0]
+            anchor_poses.append(_try_headings(standing, row, up, body, frame))
+        on_progress("estimating headings", number, len(rows))
+    heading_path = likely_headings([[error for _, _, error in poses] for poses in anchor_poses])
+    roots = torch.stack(
+        [poses[heading][0][0] for poses, heading in zip(anchor_poses, heading_path, strict=True)]
+    )
+    roots = _interpolate_roots(anchors, roots, len(times))
+    starts: list[tuple[int, Tensor | None]] = [(heading_path[0], roots)]
+    # Silhouettes from opposite sides look alike: without key points the path may be wrong.
+    if first_frame.joints is None:
+        best = sorted(range(NUM_HEADINGS), key=lambda i: anchor_poses[0][i][2])
+        starts += [(index, None) for index in best[:2]]
+    tracks = []
+    for number, (index, path_roots) in enumerate(starts, 1):
+        tracks.append(_track_poses(standing, anchor_poses[0][index], path_roots, body, observed))
+        on_progress("tracking poses", number, len(starts))
+    return min(tracks, key=lambda track: track[1])[0]
 
 
 def standing_clip(times: Tensor, body: BodyDiscs, up: Tensor, observed: Observations) -> MotionClip:
-    """Return the usual pose, upright, at the place and in the size of the silhouettes of each
+    """Return the usual pose, upright, at the position and in the size of the silhouettes of each
     frame.
 
-    Where nobody is seen, the place is that of the frame before; ``up`` (3,) is a unit vector.
+    Frames with empty masks keep the previous position; ``up`` (3,) is a unit vector.
     """
     joints = body.skeleton.joints
     positions = [torch.zeros(3, device="cpu")]
     heights = []
     for row in range(len(times)):
-        seen = observed(row)
-        place, height = (positions[-1], None) if seen is None else locate_person(seen, up)
-        positions.append(place)
+        frame = observed(row)
+        position, height = (positions[-1], None) if frame is None else locate_person(frame, up)
+        positions.append(position)
         heights += [] if height is None else [height]
     upright = Rotation.align_vectors(up[None].numpy(), np.array([[0.0, 1.0, 0.0]]))[0]
     poses = usual_pose_statistics(len(joints))[0].to(joints).repeat(len(times), 1, 1)
     poses[:, 0] = torch.from_numpy(upright.as_rotvec()).to(poses)
     scale = float(np.median(heights)) / STATURE if heights else 1.0
-    trans = torch.stack(positions[1:]) - scale * joints[0]  # the root turns about the pelvis
+    trans = torch.stack(positions[1:]) - scale * joints[0]  # the root rotates about the pelvis
     return MotionClip(times, poses, trans, torch.full((len(times),), scale, device="cpu"))
 
 
-def up_of(seen: ObservedFrame) -> Tensor:
-    """Return the unit vector (3,) that points up in the images, a mean over cameras."""
-    up = -seen.cameras.cam_from_world[:, 1, :3].mean(0)
+def mean_up_direction(frame: ObservedFrame) -> Tensor:
+    """Return the mean up direction (3,) of the cameras, a unit vector."""
+    up = -frame.cameras.cam_from_world[:, 1, :3].mean(0)
     return up / up.norm()
 
 
-def locate_person(seen: ObservedFrame, up: Tensor) -> tuple[Tensor, float | None]:
-    """Return the place (3,) of the pelvis in the world and the height of the person, None if one
-    camera sees them.
+def locate_person(frame: ObservedFrame, up: Tensor) -> tuple[Tensor, float | None]:
+    """Return the pelvis (3,) in world coordinates and the height of the person (None for one
+    camera).
 
-    The rays through the middles of the silhouettes meet there.
+    The position is where the rays through the centres of the silhouettes meet.
     """
-    boxes = [silhouette_box(alpha, 0.5) or silhouette_box(alpha) for alpha in seen.alpha]
+    boxes = [silhouette_box(alpha, 0.5) or silhouette_box(alpha) for alpha in frame.alpha]
     edges = [(r.start, r.stop, c.start, c.stop) for r, c in filter(None, boxes)]
     top, bottom, left, right = torch.tensor(edges, dtype=torch.float32, device="cpu").T
     middles = torch.stack([(left + right) / 2, (top + bottom) / 2, torch.ones_like(top)], dim=1)
-    intrinsics = seen.cameras.intrinsics
+    intrinsics = frame.cameras.intrinsics
     local = torch.linalg.solve(intrinsics, middles)
-    # height over distance, of a person who stands upright in the image
+    # Height over distance of an upright person.
     angles = (bottom - top) / (intrinsics[:, 1, 1] * local.norm(dim=1))
-    directions = (seen.cameras.cam_from_world[:, :3, :3].mT @ local[..., None])[..., 0]
+    directions = (frame.cameras.cam_from_world[:, :3, :3].mT @ local[..., None])[..., 0]
     directions = torch.nn.functional.normalize(directions, dim=1)
-    starts = seen.cameras.centers
+    starts = frame.cameras.centers
     if len(starts) == 1:
         middle = starts[0] + directions[0] * STATURE / angles[0]
         height = None
     else:
-        across = torch.eye(3, device="cpu") - directions[:, :, None] * directions[:, None]
-        right_side = (across @ starts[..., None]).sum(0)
-        middle = torch.linalg.lstsq(across.sum(0), right_side).solution[:, 0]
+        projections = torch.eye(3, device="cpu") - directions[:, :, None] * directions[:, None]
+        right_side = (projections @ starts[..., None]).sum(0)
+        middle = torch.linalg.lstsq(projections.sum(0), right_side).solution[:, 0]
         height = float((angles * (middle - starts).norm(dim=1)).median())
-    # The pelvis is at 0.53 of the height of a person.
+    # The pelvis is at 0.53 of the body height.
     return middle + up * (0.53 - 0.5) * (height or STATURE), height
 
 
-def _all_headings(
-    standing: MotionClip, row: int, up: Tensor, body: BodyDiscs, seen: ObservedFrame
+def _try_headings(
+    standing: MotionClip, row: int, up: Tensor, body: BodyDiscs, frame: ObservedFrame
 ) -> list[FramePose]:
-    """Return pose, translation and error of a frame as found from each heading; after the first at
-    half the size.
+    """Fit one frame from every heading; return pose, translation and error of each.
 
-    With key points only the three nearest headings are tried, and the error of others is infinite.
+    Frames after the first are fitted at half the resolution. With key points only the three best
+    headings are tried; the errors of others are infinite.
     """
     angles = torch.arange(NUM_HEADINGS, device="cpu").double() * (2 * math.pi / NUM_HEADINGS)
     starts = standing.poses[row].repeat(NUM_HEADINGS, 1, 1)
     starts[:, 0] = compose_rotations(angles[:, None] * up, starts[:, 0])
     trans = standing.trans[row]
-    found = [(start, trans, math.inf) for start in starts]
+    poses = [(start, trans, math.inf) for start in starts]
     likely = list(range(NUM_HEADINGS))
-    if seen.joints is not None:
+    if frame.joints is not None:
         errors = []
         for start in starts:
             pose = BodyPose(axis_angle_to_matrix(start), trans, standing.scale[row])
             joints = posed_joints(body.skeleton, pose)
-            errors.append(float(keypoint_error(joints, seen.joints, seen.cameras)))
+            errors.append(float(keypoint_error(joints, frame.joints, frame.cameras)))
         likely = sorted(likely, key=errors.__getitem__)[:3]
     levels = (2, 1) if row == 0 else (2,)
     for index in likely:
-        found[index] = _fitted_frame(standing, row, starts[index], trans, body, seen, levels)
-    return found
+        poses[index] = _fit_frame(standing, row, starts[index], trans, body, frame, levels)
+    return poses
 
 
-def _fitted_frame(
+def _fit_frame(
     clip: MotionClip,
     row: int,
     pose: Tensor,
     trans: Tensor,
     body: BodyDiscs,
-    seen: ObservedFrame,
+    frame: ObservedFrame,
     levels: Sequence[int] = (2, 1),
 ) -> FramePose:
-    """Return pose (J, 3), translation and error of one frame, found from a start; unusual poses add
-    to the error.
+    """Fit one frame from an initial pose; return pose (J, 3), translation and error (with
+    penalty).
 
-    ``levels`` are the factors by which what is seen is made smaller, one after the other.
+    ``levels`` are the factors by which the crops are downscaled, one after the other.
     """
     one = MotionClip(clip.times[row : row + 1], pose[None], trans[None], clip.scale[row : row + 1])
     fitting = BodyFit(one, body, pose_prior(one, is_given=False))
-    learned = fitting.start()
+    learned = fitting.initial_parameters()
     for level in levels:
-        look = rotate_views({0: seen.shrunk(level)})
-        learned = fitting.run(learned, ("poses", "trans"), STEPS, look)
+        next_views = rotate_views({0: frame.downscale(level)})
+        learned = fitting.optimize(learned, ("poses", "trans"), STEPS, next_views)
     with torch.no_grad():
-        error = float(fitting.error(learned, {0: seen}) + fitting.penalty(learned))
-    found = pose.clone()
-    found[:NUM_FITTED_JOINTS] = compose_rotations(
+        error = float(fitting.error(learned, {0: frame}) + fitting.penalty(learned))
+    fitted = pose.clone()
+    fitted[:NUM_FITTED_JOINTS] = compose_rotations(
         pose[:NUM_FITTED_JOINTS], learned["poses"][0].detach()
     )
-    return found, trans + learned["trans"][0].detach(), error
+    return fitted, trans + learned["trans"][0].detach(), error
 
 
-def _roots_between(anchors: Sequence[int], roots: Tensor, count: int) -> Tensor:
-    """Return rotations (count, 3) of the root, axis-angle, rad: those (A, 3) of the anchors, turned
-    on between them.
+def _interpolate_roots(anchors: Sequence[int], roots: Tensor, count: int) -> Tensor:
+    """Interpolate root rotations (A, 3) of the anchors to all frames (count, 3), axis-angle, rad.
 
-    Before the first anchor and after the last one they stay.
+    Frames before the first and after the last anchor keep its rotation.
     """
     if len(anchors) == 1:
         return roots.expand(count, 3)
@@ -768,105 +772,93 @@ def _roots_between(anchors: Sequence[int], roots: Tensor, count: int) -> Tensor:
     return torch.from_numpy(between(rows).as_rotvec()).to(roots)
 
 
-def _followed(
+def _track_poses(
     standing: MotionClip,
     first: FramePose,
     roots: Tensor | None,
     body: BodyDiscs,
     observed: Observations,
 ) -> tuple[MotionClip, float]:
-    """Return the clip with the poses after the first frame found one by one, and the mean error of
-    what is seen.
+    """Track poses from the first frame on; return the clip and the mean error.
 
-    ``roots`` (F, 3) is a path of headings to stay near; None: there is none.
+    ``roots`` (F, 3) is the heading path to stay near, or None.
     """
     poses = standing.poses.clone()
     trans = standing.trans.clone()
     poses[0], trans[0], _ = first
     errors = []
     for row in range(1, len(poses)):
-        seen = observed(row)
-        poses[row] = _extrapolated(poses, row)
+        frame = observed(row)
+        poses[row] = _extrapolate_pose(poses, row)
         trans[row] = trans[row - 1] + standing.trans[row] - standing.trans[row - 1]
-        if seen is None:
+        if frame is None:
             continue
         starts = [poses[row]]
         if roots is not None and _angle_between(poses[row, 0], roots[row]) > MAX_HEADING_ERROR:
             others = torch.stack([poses[row], standing.poses[row]])
             others[:, 0] = roots[row]
             starts = list(others)
-        found = [_fitted_frame(standing, row, x, trans[row], body, seen) for x in starts]
-        poses[row], trans[row], error = min(found, key=lambda x: x[2])
+        candidates = [_fit_frame(standing, row, x, trans[row], body, frame) for x in starts]
+        poses[row], trans[row], error = min(candidates, key=lambda x: x[2])
         errors.append(error)
     return replace(standing, poses=poses, trans=trans), sum(errors) / max(len(errors), 1)
 
 
-def _extrapolated(poses: Tensor, row: int) -> Tensor:
-    """Return the pose (J, 3) expected in frame ``row``: that before it, turned on as it turned
-    before.
+def _extrapolate_pose(poses: Tensor, row: int) -> Tensor:
+    """Predict the pose (J, 3) of frame ``row`` by continuing 0.8 of the last rotation.
 
-    Four fifths of the last rotation are expected again, so that legs which pass each other are not
-    exchanged. What was put on the path of headings was no motion.
+    This keeps legs that pass each other apart. A restart on the heading path is not continued.
     """
     if row < 2 or _angle_between(poses[row - 2, 0], poses[row - 1, 0]) > MAX_HEADING_ERROR:
         return poses[row - 1].clone()
-    before, last = poses[row - 2 : row].double()
-    return compose_rotations(last, 0.8 * compose_rotations(-before, last)).to(poses)
+    previous, last = poses[row - 2 : row].double()
+    return compose_rotations(last, 0.8 * compose_rotations(-previous, last)).to(poses)
 
 
 def _angle_between(a: Tensor, b: Tensor) -> float:
-    """Return the angle, rad, of the rotation from ``a`` (3,) to ``b`` (3,), both axis-angle."""
+    """Return the angle, rad, between two rotations (3,) given as axis-angle vectors."""
     return float(compose_rotations(-a.double(), b.double()).norm())
 
 
-RESOLUTION = 48  # texels per side of the atlas whose discs are drawn
+RESOLUTION = 48  # texels per side of the discs
 MIN_GAIN, MIN_SHAPE_GAIN = 0.01, 0.03
-"""Gain of IoU for which more is learned, and for which given poses are touched at all.
+"""Least IoU gain for which a more complex fit is chosen, and for which given poses are changed.
 
-Below the first, renders of new poses were worse by 0.1 to 0.3 dB on two people. A body of another
-shape explains thick clothes, too: with exact poses it gained 0.02, and lost 2.7 dB in new poses.
+The second is larger because a wrong shape can explain loose clothes and then gives worse new poses.
 """
-SHARED_PARAMETERS = (
-    "log_scale",
-    "betas",
-    "padding",
-    "offset",
-    "shift",
-)  # what is the same in all frames
+SHARED_PARAMETERS = ("log_scale", "betas", "padding", "offset", "shift")  # same in all frames
 
 
 @dataclass(frozen=True)
 class FitEffort:
-    """How much a fit may cost."""
+    """Computational cost of a fit."""
 
-    side: int = 128  # of the squares around the person that are looked at, px
-    steps: int = 120  # least number of steps of Adam of a stage
-    draws_per_frame: int = 18  # how often a frame is drawn where its pose is learned
+    side: int = 128  # of the crops around the person, px
+    steps: int = 120  # minimum Adam steps per stage
+    draws_per_frame: int = 18  # how often each frame is used when per-frame poses are fitted
 
     def steps_for(self, clip: MotionClip) -> int:
-        """Return the number of steps that draws every frame often enough."""
+        """Return the number of steps that uses every frame often enough."""
         return max(self.steps, -(-self.draws_per_frame * len(clip) // FRAMES_PER_STEP))
 
 
 @dataclass(frozen=True)
 class CaptureFit:
-    """A fit of a capture's clip of training."""
+    """Body fit of the training clip of a capture."""
 
-    motion: CapturedMotion  # the given clip, F frames
-    chosen: CandidateFit  # the candidate that was taken
-    tried: tuple[CandidateFit, ...]  # all candidates; the first one has the poses as given
-    # views left out of the fit, on which the candidates were measured; 0: measured on those fitted
-    # to
-    num_held_out: int
+    motion: CapturedMotion  # initial poses of F frames
+    chosen: CandidateFit
+    candidates: tuple[CandidateFit, ...]  # from simple to complex
+    num_held_out: int  # views for the IoU of candidates; 0: measured on the fitted views
 
     @property
     def betas(self) -> Tensor:
-        """Shape parameters (B,) of the template."""
+        """Shape parameters (B,)."""
         return self.chosen.learned.values()["betas"]
 
     @property
     def clip(self) -> MotionClip:
-        """The clip that was fitted, with its corrections."""
+        """The fitted clip."""
         return apply_fit(self.chosen.learned, self.motion.clip, own_frames=True)
 
 
@@ -874,7 +866,7 @@ def fit_capture(
     capture: Capture,
     options: DataConfig,
     body: BodyTemplate,
-    report: ProgressCallback,
+    on_progress: ProgressCallback,
     keypoints: Keypoints | None = None,
     effort: FitEffort = FitEffort(),
     *,
@@ -882,20 +874,25 @@ def fit_capture(
     one_camera: bool = False,
     shape_known: bool = False,
 ) -> CaptureFit:
-    """Return the fit of ``body`` to the silhouettes of a capture's training views.
+    """Fit ``body`` to the silhouettes of a capture's training views.
 
-    With given poses: first the shape; then rotations that are the same in all frames, and then
-    those of every frame, each where it explains views clearly better that were left out. Without:
-    poses are found first (``first_poses``).
+    With given poses: first the shape, then rotations shared by all frames, then rotations per
+    frame; each stage is kept only if it improves held-out views clearly. Without poses: these are
+    estimated first (``estimate_initial_poses``).
 
     Args:
-        keypoints: of the images, by view.
-        joints: in 3D, of frames of the capture.
-        one_camera: the size stays as it is, as one camera does not tell a small person from a
-            distant one.
-        shape_known: the body has the shape of the person already.
+        capture: with silhouettes.
+        options: of reading images.
+        body: template to fit.
+        on_progress: progress callback.
+        keypoints: 2D key points, by view.
+        effort: computational cost.
+        joints: 3D joints, by frame.
+        one_camera: keep the size, which a single camera does not determine.
+        shape_known: keep the shape of ``body``.
 
-    Raises DyngsError: no silhouettes, or nobody in them.
+    Raises:
+        DyngsError: no silhouettes, or empty masks.
     """
     if not capture.has_alpha:
         raise DyngsError(
@@ -904,10 +901,10 @@ def fit_capture(
     capture = capture.replace(splits=assign_frame_numbers(capture.splits))
     views = capture.splits["train"]
     if capture.body is None:
-        motion = _unposed(views, body.joints)
+        motion = _clip_without_poses(views, body.joints)
     else:
         motion = captured_motion(capture.root, capture.body["train"], views, body.joints)
-    seen = crop_views(capture, motion, options, effort, keypoints or {}, joints or {})
+    fit_views = crop_views(capture, motion, options, effort, keypoints or {}, joints or {})
     discs = body_discs(body, RESOLUTION)
     shape = list(SHARED_PARAMETERS)
     if one_camera:
@@ -915,135 +912,144 @@ def fit_capture(
     if shape_known:
         shape.remove("betas")
     if capture.body is not None:
-        fitting = BodyFit(motion.clip, discs, pose_prior(motion.clip, is_given=True))
-        tried = _from_given(fitting, seen, shape, report, effort)
+        body_fit = BodyFit(motion.clip, discs, pose_prior(motion.clip, is_given=True))
+        candidates = _from_given(body_fit, fit_views, shape, on_progress, effort)
         first_gain = MIN_GAIN if shape_known else MIN_SHAPE_GAIN
     else:
-        clip = estimate_initial_poses(motion.clip.times, discs, seen.used.get, report)
+        clip = estimate_initial_poses(motion.clip.times, discs, fit_views.used.get, on_progress)
         motion = CapturedMotion(clip, motion.frames)
-        fitting = BodyFit(clip, discs, pose_prior(clip, is_given=False))
-        tried = _from_silhouettes(fitting, seen, shape, report, effort)
+        body_fit = BodyFit(clip, discs, pose_prior(clip, is_given=False))
+        candidates = _from_silhouettes(body_fit, fit_views, shape, on_progress, effort)
         first_gain = 0.0
-    return CaptureFit(motion, _simplest_of_the_best(tried, first_gain), tried, seen.num_held_out)
+    return CaptureFit(
+        motion, _choose_simplest(candidates, first_gain), candidates, fit_views.num_held_out
+    )
 
 
-def _simplest_of_the_best(tried: Sequence[CandidateFit], first_gain: float) -> CandidateFit:
-    """Return the candidate after which none is clearly better: ``tried`` is ordered from simple to
+def _choose_simplest(candidates: Sequence[CandidateFit], first_gain: float) -> CandidateFit:
+    """Return the first candidate that no later one clearly improves on; they go from simple to
     complex.
 
-    ``first_gain`` is the gain of IoU for which the first one is left: given poses are touched for
-    much only.
+    ``first_gain`` is the IoU gain needed to leave the first candidate.
     """
-    best = tried[0]
-    for candidate in tried[1:]:
-        gain = first_gain if best is tried[0] else MIN_GAIN
+    best = candidates[0]
+    for candidate in candidates[1:]:
+        gain = first_gain if best is candidates[0] else MIN_GAIN
         best = candidate if candidate.iou > best.iou + gain else best
     return best
 
 
 def _from_given(
-    fitting: BodyFit,
-    seen: FitViews,
+    body_fit: BodyFit,
+    fit_views: FitViews,
     shape: Sequence[str],
-    report: ProgressCallback,
+    on_progress: ProgressCallback,
     effort: FitEffort,
 ) -> tuple[CandidateFit, ...]:
-    """Return candidates from given poses, from simple to complex."""
-    start = fitting.start()
-    halves = rotate_views(seen.halves())
-    # Clothes and hair are no sign of wrong poses.
-    dressed = fitting.run(start, ("padding",), effort.steps, halves, report)
-    tried = [fitting.measured("the poses as given", dressed, seen.judged)]
-    found = start
-    for look in (halves, seen.used.get):
-        found = fitting.run(found, shape, effort.steps, look, report)
-    tried.append(fitting.measured("one shape", found, seen.judged))
+    """Return candidate fits that start from given poses, from simple to complex."""
+    start = body_fit.initial_parameters()
+    halves = rotate_views(fit_views.halves())
+    # Padding for clothes and hair, which silhouettes include, is fitted in any case.
+    dressed = body_fit.optimize(start, ("padding",), effort.steps, halves, on_progress)
+    candidates = [body_fit.evaluate("given poses", dressed, fit_views.evaluated)]
+    parameters = start
+    for views in (halves, fit_views.used.get):
+        parameters = body_fit.optimize(parameters, shape, effort.steps, views, on_progress)
+    candidates.append(body_fit.evaluate("shape", parameters, fit_views.evaluated))
     every_frame = (*shape, "turns", "poses", "trans")
     for name, learned, steps in (
-        ("turns that are the same in all frames as well", (*shape, "turns"), effort.steps),
-        ("turns of every frame as well", every_frame, effort.steps_for(fitting.clip)),
+        ("shape and shared rotations", (*shape, "turns"), effort.steps),
+        ("shape and per-frame rotations", every_frame, effort.steps_for(body_fit.clip)),
     ):
-        # The last quarter of the steps, at low rates, shows whether all of them are worth it.
-        found = fitting.run(
-            tried[-1].learned, learned, -(-steps // 4), seen.used.get, report, schedule_start=0.75
+        # A trial with the last quarter of the schedule decides whether to run all of it.
+        parameters = body_fit.optimize(
+            candidates[-1].learned,
+            learned,
+            -(-steps // 4),
+            fit_views.used.get,
+            on_progress,
+            schedule_start=0.75,
         )
-        candidate = fitting.measured(name, found, seen.judged)
-        if candidate.iou > max(x.iou for x in tried) + 0.75 * MIN_GAIN:
-            found = fitting.run(found, learned, steps, seen.used.get, report)
-            candidate = fitting.measured(name, found, seen.judged)
-        tried.append(candidate)
-    return tuple(tried)
+        candidate = body_fit.evaluate(name, parameters, fit_views.evaluated)
+        if candidate.iou > max(x.iou for x in candidates) + 0.75 * MIN_GAIN:
+            parameters = body_fit.optimize(
+                parameters, learned, steps, fit_views.used.get, on_progress
+            )
+            candidate = body_fit.evaluate(name, parameters, fit_views.evaluated)
+        candidates.append(candidate)
+    return tuple(candidates)
 
 
 def _from_silhouettes(
-    fitting: BodyFit,
-    seen: FitViews,
+    body_fit: BodyFit,
+    fit_views: FitViews,
     shape: Sequence[str],
-    report: ProgressCallback,
+    on_progress: ProgressCallback,
     effort: FitEffort,
 ) -> tuple[CandidateFit, ...]:
-    """Return candidates from poses that were found frame by frame.
+    """Return candidate fits that start from estimated poses.
 
-    These are off by more than given ones: they get three times the steps, at rates of twice as much
-    at first.
+    These are less accurate than given ones: they get three times the steps and higher initial
+    rates.
     """
-    found = fitting.start()
-    first = fitting.measured("poses found frame by frame", found, seen.judged)
+    parameters = body_fit.initial_parameters()
+    first = body_fit.evaluate("frame-by-frame poses", parameters, fit_views.evaluated)
     learned = (*shape, "poses", "trans")
-    steps = 3 * effort.steps_for(fitting.clip)
-    for look in (seen.halves().get, seen.used.get):
-        found = fitting.run(found, learned, steps, look, report, schedule_start=-0.3)
-    return first, fitting.measured("one shape, and poses of every frame", found, seen.judged)
+    steps = 3 * effort.steps_for(body_fit.clip)
+    for views in (fit_views.halves().get, fit_views.used.get):
+        parameters = body_fit.optimize(
+            parameters, learned, steps, views, on_progress, schedule_start=-0.3
+        )
+    return first, body_fit.evaluate("shape and per-frame poses", parameters, fit_views.evaluated)
 
 
 @dataclass(frozen=True)
 class FitViews:
-    """Observed frames by row of the clip: those to fit to, and those to judge by."""
+    """Observed frames by clip row: to fit to, and to evaluate on."""
 
     used: dict[int, ObservedFrame]
-    judged: dict[int, ObservedFrame]
-    num_held_out: int  # number of views to judge by; 0: they are those to fit to
+    evaluated: dict[int, ObservedFrame]
+    num_held_out: int  # views in ``evaluated``; 0: the same as in ``used``
 
     def halves(self) -> dict[int, ObservedFrame]:
-        """Return the frames to fit to at half the size."""
-        return {row: frame.shrunk(2) for row, frame in self.used.items()}
+        """Return the frames to fit to at half the resolution."""
+        return {row: frame.downscale(2) for row, frame in self.used.items()}
 
 
 def split_views(
     views: Sequence[View], motion: CapturedMotion
 ) -> tuple[dict[int, list[int]], dict[int, list[int]]]:
-    """Return, per row of the clip, the indices of at most eight views to fit to, and of those left
-    out to judge by.
+    """Return, per clip row, at most eight view indices to fit to, and those held out for
+    evaluation.
 
-    One view of each frame is left out, another one in each frame, where a frame has at least five.
+    Of frames with five or more views one is held out, in turn.
     """
     by_row: dict[int, list[int]] = {row: [] for row in range(len(motion.clip))}
     for i, view in enumerate(views):
         by_row[motion.rows[frame_number(view)]].append(i)
     used = {}
-    left_out = {}
-    for row, own in by_row.items():
-        left_out[row] = [own[row % len(own)]] if len(own) >= 5 else []
-        rest = [i for i in own if i not in left_out[row]]
-        step = max(1, -(-len(rest) // 8))
-        used[row] = rest[row % step :: step]
-    return used, left_out
+    held_out = {}
+    for row, indices in by_row.items():
+        held_out[row] = [indices[row % len(indices)]] if len(indices) >= 5 else []
+        remaining = [i for i in indices if i not in held_out[row]]
+        step = max(1, -(-len(remaining) // 8))
+        used[row] = remaining[row % step :: step]
+    return used, held_out
 
 
-def _unposed(views: Sequence[View], joints: Tensor) -> CapturedMotion:
-    """Return a clip of the views' frames that says nothing about poses, for a body with ``joints``
-    (J, 3)."""
+def _clip_without_poses(views: Sequence[View], joints: Tensor) -> CapturedMotion:
+    """Return a clip of the views' frames with all poses zero, for a body with ``joints`` (J, 3)."""
     times = {frame_number(view): view.time for view in views}
     frames = tuple(sorted(times))
-    even = np.linspace(0, 1, len(frames)).tolist()
-    moments = [
+    spread_times = np.linspace(0, 1, len(frames)).tolist()
+    clip_times = [
         start if times[frame] is None else times[frame]
-        for frame, start in zip(frames, even, strict=True)
+        for frame, start in zip(frames, spread_times, strict=True)
     ]
     zeros = joints.new_zeros(len(frames), len(joints), 3)
-    moments = torch.tensor(moments, dtype=torch.float64, device="cpu")
+    clip_times = torch.tensor(clip_times, dtype=torch.float64, device="cpu")
     return CapturedMotion(
-        MotionClip(moments, zeros, zeros[:, 0], torch.ones_like(zeros[:, 0, 0])), frames
+        MotionClip(clip_times, zeros, zeros[:, 0], torch.ones_like(zeros[:, 0, 0])), frames
     )
 
 
@@ -1055,27 +1061,27 @@ def crop_views(
     keypoints: Keypoints,
     joints: Joints3D,
 ) -> FitViews:
-    """Return the squares around the person in all frames of ``motion``.
+    """Crop all frames of ``motion`` to squares around the person.
 
-    Raises DyngsError: nobody is seen, or the masks are those of the background.
+    Raises DyngsError: the masks are empty or inverted.
     """
     views = capture.splits["train"]
     images = ImageLoader(views, options.model_copy(update={"longest_side": 512, "downscale": 1}))
-    used, left_out = split_views(views, motion)
-    shown = [i for rows in (used, left_out) for own in rows.values() for i in own]
-    # People who are cut off on three sides cover less.
-    if float(np.mean([_border_covered(images[i]) for i in shown])) > 0.6:
+    used, held_out = split_views(views, motion)
+    indices = [i for rows in (used, held_out) for row_views in rows.values() for i in row_views]
+    # Even a person cut off on three sides covers less of the image border.
+    if float(np.mean([_border_covered(images[i]) for i in indices])) > 0.6:
         raise DyngsError(
-            f"{capture.root}: the silhouettes cover the borders of the images; white is the person: are the masks "
-            "inverted? (`dyngs docs people`)"
+            f"{capture.root}: the masks cover the image borders and seem to be inverted; the person must "
+            "be white (docs/human.md)"
         )
-    side = longest_box_side(images[i] for i in shown)
+    side = longest_box_side(images[i] for i in indices)
     if side < 8:
         raise DyngsError(
-            f"{capture.root}: nobody is seen in the silhouettes; check the masks (`dyngs docs people`)"
+            f"{capture.root}: the silhouettes are empty; check the masks (docs/human.md)"
         )
     size = min(effort.side, 2 * (side // 2))
-    marked = {
+    relative_keypoints = {
         view.name: keypoints[view.name] / torch.tensor([view.width, view.height, 1], device="cpu")
         for view in views
         if view.name in keypoints
@@ -1084,18 +1090,20 @@ def crop_views(
 
     def observed(rows: dict[int, list[int]]) -> dict[int, ObservedFrame]:
         frames = {
-            row: crop_frame([images[i] for i in own], side, size, marked, positions.get(row))
-            for row, own in rows.items()
+            row: crop_frame(
+                [images[i] for i in row_views], side, size, relative_keypoints, positions.get(row)
+            )
+            for row, row_views in rows.items()
         }
         return {row: frame for row, frame in frames.items() if frame is not None}
 
-    num_held_out = sum(map(len, left_out.values()))
+    num_held_out = sum(map(len, held_out.values()))
     frames = observed(used)
-    return FitViews(frames, observed(left_out) if num_held_out else frames, num_held_out)
+    return FitViews(frames, observed(held_out) if num_held_out else frames, num_held_out)
 
 
 def _border_covered(image: Image) -> float:
-    """Return the fraction of the image's outermost pixels that the silhouette covers."""
+    """Return the fraction of the outermost pixels that the silhouette covers."""
     if image.alpha is None:
         return 0.0
     border = torch.ones_like(image.alpha, dtype=torch.bool)
@@ -1105,18 +1113,18 @@ def _border_covered(image: Image) -> float:
 
 @dataclass(frozen=True)
 class PlacedClip:
-    """Another clip of a fitted person."""
+    """Poses of the split ``pose``, placed by the fit."""
 
-    motion: CapturedMotion  # its poses as given, with what holds for all frames; a row per frame
-    iou: float  # at the place of the fit
-    iou_moved: float | None  # moved to its own silhouettes; None where that was not taken
+    motion: CapturedMotion  # given poses with shared corrections, one row per frame
+    iou: float  # with the translation of the fit
+    iou_moved: float | None  # after fitting the translation to its own silhouettes; None: not used
 
     def summary(self) -> str:
-        """Return a line for people."""
+        """Return a one-line summary."""
         if self.iou_moved is None:
-            return f"new poses: at the place of the fit; overlap of silhouettes {self.iou:.3f}"
+            return f"new poses: silhouette IoU {self.iou:.3f}"
         return (
-            f"new poses: moved to their silhouettes; overlap {self.iou:.3f} -> {self.iou_moved:.3f}"
+            f"new poses: translation fitted; silhouette IoU {self.iou:.3f} -> {self.iou_moved:.3f}"
         )
 
 
@@ -1124,30 +1132,34 @@ def place_new_poses(
     capture: Capture,
     options: DataConfig,
     body: BodyTemplate,
-    found: CaptureFit,
-    report: ProgressCallback,
+    fit: CaptureFit,
+    on_progress: ProgressCallback,
     effort: FitEffort = FitEffort(),
 ) -> PlacedClip | None:
-    """Return the clip of ``pose`` moved to its silhouettes, if it looks better there; None without
-    such a clip.
+    """Fit the translation of the split ``pose`` to its silhouettes if that improves them.
 
-    All views of ``capture`` have frame numbers; ``found`` is the fit of those of training.
+    Returns None without such a split. All views need frame numbers; ``fit`` is that of the
+    training clip.
     """
     views = capture.splits.get("pose", ())
     if not views or capture.body is None:
         return None
     motion = captured_motion(capture.root, capture.body["pose"], views, body.joints)
-    seen = crop_views(capture.replace(splits={"train": views}), motion, options, effort, {}, {})
-    fitting = BodyFit(
+    fit_views = crop_views(
+        capture.replace(splits={"train": views}), motion, options, effort, {}, {}
+    )
+    body_fit = BodyFit(
         motion.clip, body_discs(body, RESOLUTION), pose_prior(motion.clip, is_given=True)
     )
-    start = fitting.start()
+    start = body_fit.initial_parameters()
     with torch.no_grad():
         for name in (*SHARED_PARAMETERS, "turns"):
-            start[name].copy_(found.chosen.learned[name])
-    # Three numbers are learned: few steps are enough.
-    moved = fitting.run(start, ("shift",), min(effort.steps, 40), seen.used.get, report)
-    before, after = (fitting.measured("", x, seen.judged) for x in (start, moved))
+            start[name].copy_(fit.chosen.learned[name])
+    # Three parameters need few steps.
+    moved = body_fit.optimize(
+        start, ("shift",), min(effort.steps, 40), fit_views.used.get, on_progress
+    )
+    before, after = (body_fit.evaluate("", x, fit_views.evaluated) for x in (start, moved))
     is_better = after.iou > before.iou + 0.001
     clip = apply_fit(
         moved if is_better else start, motion.clip_of_frames(motion.frames), own_frames=False
@@ -1156,21 +1168,21 @@ def place_new_poses(
 
 
 def collect_fitted_clips(
-    capture: Capture, body: BodyTemplate, found: CaptureFit, new_poses: PlacedClip | None
+    capture: Capture, body: BodyTemplate, fit: CaptureFit, new_poses: PlacedClip | None
 ) -> dict[Split, CapturedMotion]:
-    """Return the clip of training, with the frames of val and test, and that of ``pose``, if the
-    capture has one.
+    """Return the fitted clips by split: ``train`` (with the frames of val and test) and ``pose``,
+    if present.
 
-    Frames that were not fitted have what holds for all frames applied to their given poses; without
-    given poses they lie between their neighbours. All views of ``capture`` have frame numbers.
+    Frames outside the fit get shared corrections on given poses, or interpolated poses without
+    any. All views need frame numbers.
     """
     views = [view for split in ("train", "val", "test") for view in capture.splits.get(split, ())]
     times = {frame_number(view): view.time for view in views}
     frames = tuple(sorted(times))
-    fitted = replace(found.motion, clip=found.clip)
+    fitted = replace(fit.motion, clip=fit.clip)
     if capture.body is not None:
         motion = captured_motion(capture.root, capture.body["train"], views, body.joints)
-        clip = apply_fit(found.chosen.learned, motion.clip_of_frames(frames), own_frames=False)
+        clip = apply_fit(fit.chosen.learned, motion.clip_of_frames(frames), own_frames=False)
     else:
         clip = MotionClip.joined([fitted.clip.at(times[frame]) for frame in frames])
     rows = [row for row, frame in enumerate(frames) if frame in fitted.rows]

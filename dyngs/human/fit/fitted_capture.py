@@ -1,4 +1,4 @@
-"""``dyngs data fit``: a capture of a person with the body fitted to it, and a report of the fit."""
+"""``dyngs data fit``: fits the body to a capture and writes the fitted capture with a report."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ _BODY = "body_train.npz"
 
 @dataclass(frozen=True)
 class KnownAvatar:
-    """The avatar of a person, and the longest side of the images it was trained on, px; None: as
-    they are."""
+    """Trained avatar of the person, and the longest image side of its training, px (None: full
+    size)."""
 
     scene: HumanScene
     longest_side: int | None
@@ -66,80 +66,78 @@ class KnownAvatar:
 
 @dataclass(frozen=True)
 class FitInputs:
-    """What is given next to the capture; everything may be None."""
+    """Optional inputs of the body fit besides the capture."""
 
     keypoints: Path | None = None  # folder or file of 2D key points
     masks: Path | None = None  # folder of masks, white = the person
-    # image of the place without the person, or a folder of one for each camera
-    background: Path | None = None
+    background: Path | None = None  # image without the person, or a folder with one per camera
     joints: Path | None = None  # file or folder of 3D joints, see ``read_joints``
-    person: Path | None = None  # capture or run of the same person, whose shape is kept
-    # of the same person, if that run has one: its silhouette decides the poses in the end
-    avatar: KnownAvatar | None = None
-    template: HumanModel = field(default_factory=HumanModel)  # names the body file that is fitted
+    person: Path | None = None  # fitted capture or run of the same person, whose shape is reused
+    avatar: KnownAvatar | None = None  # of the same person; poses are refined by its silhouette
+    template: HumanModel = field(default_factory=HumanModel)  # names the body file
 
 
 @dataclass(frozen=True)
 class FittedCapture:
-    """Result of ``write_fitted_capture``: the new capture's folder and the fit."""
+    """Result of ``write_fitted_capture``: folder of the new capture, the fit, and a text summary."""
 
     root: Path
-    found: CaptureFit
-    model: HumanModel  # names the template
-    summary: str  # lines for people: how good the fit is
+    fit: CaptureFit
+    model: HumanModel  # names the body file
+    summary: str
 
 
 def write_fitted_capture(
     options: DataConfig,
     out: Path,
-    report: ProgressCallback,
-    given: FitInputs = FitInputs(),
+    on_progress: ProgressCallback,
+    inputs: FitInputs = FitInputs(),
     *,
     with_images: bool = True,
 ) -> FittedCapture:
-    """Fit the template to a capture and write it to the new folder ``out`` in the layout
-    ``body_json``.
+    """Fit the template to a capture and write the fitted capture to the new folder ``out``.
 
-    Files: ``transforms_SPLIT.json``, ``images/`` and found ``masks/`` (else for ``data.body``),
-    ``body_train.npz``, ``body_pose.npz`` for another clip, ``fit_report.json``, and
-    ``fit_overlays.png`` to look at. Raises DyngsError: see ``fit_capture``; ``out`` is not empty; a
-    template that cannot be read or has no texture coordinates.
+    Files, in the layout ``body_json``: ``transforms_SPLIT.json``, ``images/``, ``masks/``
+    (estimated masks), ``body_train.npz``, ``body_pose.npz`` for another clip, ``fit_report.json``
+    and ``fit_overlays.png``. Without images the folder can be used as ``data.body``. Raises
+    DyngsError: see ``fit_capture``; ``out`` is not empty; or a template that cannot be read or has
+    no UV map.
     """
-    model = given.template
-    if given.person is not None and model.body is None:
-        model = read_run_template(given.person)
+    model = inputs.template
+    if inputs.person is not None and model.body is None:
+        model = read_run_template(inputs.person)
     body = load_template(model)
     _require_texels(model, body)
-    person = None if given.person is None else read_known_shape(given.person, body)
+    person = None if inputs.person is None else read_known_shape(inputs.person, body)
     with atomic_folder(out) as folder:
         masks = folder / ".masks"
-        capture = read_person_capture(options, given, masks)
+        capture = read_person_capture(options, inputs, masks)
         capture = capture.replace(splits=assign_frame_numbers(capture.splits))
         views = capture.splits["train"]
-        # The fit begins with the shape of a known person, or with that of the capture.
-        first = person
-        if first is None and body.name != "anny" and capture.body is not None:
-            given_body = capture.body["train"]
-            first = given_body if has_same_shape_space(body, given_body) else None
-        shaped = apply_known_shape(body, first)
-        found = fit_capture(
+        # The fit starts from the shape of a known person, or from that of the capture.
+        known_body = person
+        if known_body is None and body.name != "anny" and capture.body is not None:
+            capture_body = capture.body["train"]
+            known_body = capture_body if has_same_shape_space(body, capture_body) else None
+        shaped = apply_known_shape(body, known_body)
+        fit = fit_capture(
             capture,
             options,
             shaped,
-            report,
-            None if given.keypoints is None else read_keypoints(given.keypoints, views),
-            joints=None if given.joints is None else read_joints(given.joints, capture),
+            on_progress,
+            None if inputs.keypoints is None else read_keypoints(inputs.keypoints, views),
+            joints=None if inputs.joints is None else read_joints(inputs.joints, capture),
             one_camera=capture.format == FORMAT,
             shape_known=person is not None,
         )
-        betas = known_betas(body, first)
-        betas[: len(found.betas)] += found.betas
-        new_poses = place_new_poses(capture, options, shaped, found, report)
-        clips = collect_fitted_clips(capture, shaped, found, new_poses)
+        betas = known_betas(body, known_body)
+        betas[: len(fit.betas)] += fit.betas
+        new_poses = place_new_poses(capture, options, shaped, fit, on_progress)
+        clips = collect_fitted_clips(capture, shaped, fit, new_poses)
         by_avatar: list[AvatarPoseFit] = []
-        if given.avatar is not None:
+        if inputs.avatar is not None:
             for split, clip in clips.items():
-                posed = fit_poses_by_avatar(given.avatar, capture.splits[split], options, clip)
+                posed = fit_poses_by_avatar(inputs.avatar, capture.splits[split], options, clip)
                 clips[split] = posed.clip
                 by_avatar.append(posed)
         if with_images:
@@ -151,76 +149,72 @@ def write_fitted_capture(
             }
         for split, clip in clips.items():
             write_body_file(folder / f"body_{split}.npz", clip, body, betas.numpy(), capture)
-        write_image(folder / "fit_overlays.png", _overlays(capture, options, shaped, found))
+        write_image(folder / "fit_overlays.png", _overlays(capture, options, shaped, fit))
         shutil.rmtree(masks, ignore_errors=True)
-        chosen = found.chosen
+        chosen = fit.chosen
         fields = {
-            "template": _called(model, body),
+            "template": _template_label(model, body),
             "betas": [round(beta, 4) for beta in betas.tolist()],
-            "frames": len(found.motion.clip),
+            "frames": len(fit.motion.clip),
             "taken": chosen.name,
-            "iou": {candidate.name: round(candidate.iou, 4) for candidate in found.tried},
-            "views_left_out": found.num_held_out,
+            "iou": {candidate.name: round(candidate.iou, 4) for candidate in fit.candidates},
+            "views_left_out": fit.num_held_out,
             "new_poses": new_poses and {"iou": new_poses.iou, "iou_moved": new_poses.iou_moved},
             "by_avatar": [
-                {"iou": x.before, "iou_posed": x.after, "views_left_out": x.left_out}
+                {"iou": x.before, "iou_posed": x.after, "views_left_out": x.num_held_out}
                 for x in by_avatar
             ],
             "iou_per_frame": {
                 str(frame): round(iou, 4)
-                for frame, iou in zip(found.motion.frames, chosen.per_frame, strict=False)
+                for frame, iou in zip(fit.motion.frames, chosen.per_frame, strict=False)
                 if iou == iou
             },
         }
         write_text(folder / "fit_report.json", json.dumps(fields, indent=1) + "\n")
-    tried = ", ".join(f"{candidate.iou:.3f} with {candidate.name}" for candidate in found.tried)
+    candidates = ", ".join(f"{candidate.iou:.3f} {candidate.name}" for candidate in fit.candidates)
     worst = int(np.nanargmin(chosen.per_frame))
+    label = "" if body.name == "anny" else f"{_template_label(model, body)}, "
     lines = [
-        f"{'' if body.name == 'anny' else _called(model, body) + ', '}{format_count(len(found.motion.clip), 'frame')}; "
-        f"overlap of silhouettes (IoU) on {_judged_on(found.num_held_out)}: {tried}",
-        f"taken: {chosen.name}; worst frame {found.motion.frames[worst]} with {chosen.per_frame[worst]:.3f}; look at "
-        f"{out / 'fit_overlays.png'}",
+        f"{label}{format_count(len(fit.motion.clip), 'frame')}; "
+        f"silhouette IoU on {_evaluation_views(fit.num_held_out)}: {candidates}",
+        f"chosen: {chosen.name}; worst frame {fit.motion.frames[worst]} (IoU "
+        f"{chosen.per_frame[worst]:.3f}); see {out / 'fit_overlays.png'}",
         *(x.summary() for x in (new_poses, *by_avatar) if x is not None),
     ]
-    return FittedCapture(out, found, model, "\n".join(lines))
+    return FittedCapture(out, fit, model, "\n".join(lines))
 
 
-def _judged_on(left_out: int) -> str:
-    return (
-        f"{format_count(left_out, 'view')} left out of the fit"
-        if left_out
-        else "the views fitted to"
-    )
+def _evaluation_views(num_held_out: int) -> str:
+    return format_count(num_held_out, "held-out view") if num_held_out else "the fitted views"
 
 
 def read_run_template(path: Path) -> HumanModel:
-    """Return what names the template of an avatar's run, of anything else the free one."""
+    """Return the template of an avatar's run; of anything else the free template."""
     model = load_resolved(path).model if (path / RESOLVED_NAME).is_file() else None
     if not isinstance(model, HumanModel):
         return HumanModel()
     return HumanModel(body=model.body, uv=model.uv)
 
 
-def _called(model: HumanModel, body: BodyTemplate) -> str:
-    """Return the name of a template for people."""
+def _template_label(model: HumanModel, body: BodyTemplate) -> str:
+    """Return the name of a template for messages."""
     return body.name if model.body is None else f"{body.name} ({model.body.name})"
 
 
 def _require_texels(model: HumanModel, body: BodyTemplate) -> None:
-    """Raise DyngsError if the template has no texture coordinates."""
+    """Raise DyngsError if the template has no UV map."""
     if body.uv is None:
         raise DyngsError(
-            f"{model.body}: has no texture coordinates, which the fit needs to draw the body; name the .obj that has "
-            "them (--uv FILE, of a training model.uv=FILE)"
+            f"{model.body}: has no UV map, which the fit needs; pass the .obj that has it (--uv FILE, "
+            "or model.uv=FILE in training)"
         )
 
 
 def read_known_shape(path: Path, body: BodyTemplate) -> BodyFrames:
-    """Return the body parameters of a person, of whom only the shape counts, which is one of
-    ``body``.
+    """Return the body parameters of a known person, of which only the shape is used.
 
-    ``path`` is a capture or a folder that ``dyngs data fit`` wrote, or the run of an avatar trained
-    on one. Raises DyngsError: none of these, or a shape of another template.
+    ``path`` is a capture or folder that ``dyngs data fit`` wrote, or the run of an avatar trained
+    on one. Raises DyngsError: none of these, or the shape of another template.
     """
     with wrap_read_errors(
         path, "give a capture that `dyngs data fit` wrote, or a run trained on it"
@@ -228,25 +222,25 @@ def read_known_shape(path: Path, body: BodyTemplate) -> BodyFrames:
         folder = path
         if (path / RESOLVED_NAME).is_file():
             data = load_resolved(path).data
-            # The fit of a run may lie in its folder.
+            # A run may store its fit in its own folder.
             folder = data.root if data.body is None else path / data.body
         if not (folder / _BODY).is_file():
             raise DyngsError(
-                f"{path}: no fitted person there; give a capture that `dyngs data fit` wrote, or its run"
+                f"{path}: no fitted body; give a capture that `dyngs data fit` wrote, or its run"
             )
-        found = read_body_file(folder / _BODY)
-    if not has_same_shape_space(body, found):
+        body_frames = read_body_file(folder / _BODY)
+    if not has_same_shape_space(body, body_frames):
         raise DyngsError(
-            f"{folder / _BODY}: is of another template than {body.name}; name that of the person with --template, or "
-            "fit that person with `dyngs data fit` first"
+            f"{folder / _BODY}: was fitted with another template than {body.name}; pass it with "
+            "--template, or fit that person with `dyngs data fit` first"
         )
-    return found
+    return body_frames
 
 
 def apply_known_shape(body: BodyTemplate, known: BodyFrames | None) -> BodyTemplate:
-    """Return the template that is fitted: its mean shape is that of a known person.
+    """Return the template to fit: its mean shape is the known shape.
 
-    Of a file of SMPL's family it has the first ``NUM_FITTED`` shape parameters.
+    Only the first ``NUM_FITTED_SHAPES`` shape parameters of SMPL-family files are kept.
     """
     if known is not None:
         vertices, joints = rest_shape(body, known)
@@ -261,158 +255,159 @@ def apply_known_shape(body: BodyTemplate, known: BodyFrames | None) -> BodyTempl
 
 
 def known_betas(body: BodyTemplate, known: BodyFrames | None) -> torch.Tensor:
-    """Return the known shape parameters (B,) of a template with B of them; 0 for those that are not
-    known."""
+    """Return the known shape parameters (B,) of a template; unknown ones are 0."""
     betas = torch.zeros(body.num_shapes, device="cpu")
     if known is not None:
-        given = torch.from_numpy(known.betas[: len(betas)]).float()
-        betas[: len(given)] = given
+        stored = torch.from_numpy(known.betas[: len(betas)]).float()
+        betas[: len(stored)] = stored
     return betas
 
 
 def _at_most(options: DataConfig, longest_side: int) -> DataConfig:
-    """Return the options of reading smaller images."""
+    """Return reading options with a limit on the longest image side, px."""
     return options.model_copy(update={"longest_side": longest_side, "downscale": 1})
 
 
 def read_person_capture(
-    options: DataConfig, given: FitInputs, work: Path, log: Callable[[str], None] = log_info
+    options: DataConfig, inputs: FitInputs, work: Path, log: Callable[[str], None] = log_info
 ) -> Capture:
-    """Return a capture with silhouettes: of a capture, or a video or a folder of images of one
-    fixed camera.
+    """Read a capture with silhouettes from a capture, a video, or a folder of images of one fixed
+    camera.
 
-    Masks of ``given`` take the place of those of the capture; without any they are made from the
-    background, in the folder ``work``. Raises DyngsError: neither capture nor clip; no masks, and
-    none that can be made.
+    Masks of ``inputs`` replace those of the capture; without any they are estimated from the
+    background and written to ``work``. Raises DyngsError: neither capture nor clip, or masks
+    cannot be made.
     """
     source = options.root
     if options.format == "auto" and not is_capture(source) and is_image_sequence(source):
-        capture = read_fixed_camera(options, given.masks)
+        capture = read_fixed_camera(options, inputs.masks)
         for line in capture.warnings:
             log(line)
     else:
         capture = read_capture(options)
-        if given.masks is not None:
+        if inputs.masks is not None:
             splits: dict[Split, tuple[View, ...]] = {}
             for split, views in capture.splits.items():
                 names = [f"{view.name}{view.image_path.suffix}" for view in views]
-                found = silhouettes_of(given.masks, names)
+                masks = silhouettes_of(inputs.masks, names)
                 splits[split] = tuple(
-                    replace(view, silhouette=own) for view, own in zip(views, found, strict=True)
+                    replace(view, silhouette=mask) for view, mask in zip(views, masks, strict=True)
                 )
             capture = capture.replace(splits=splits, has_alpha=True)
-    if given.background is not None or not capture.has_alpha:
+    if inputs.background is not None or not capture.has_alpha:
         if capture.format == "neuman":
             raise DyngsError(
-                f"{source}: no silhouettes, and the camera moves; add masks of the person"
+                f"{source}: no silhouettes, and a moving camera; add masks of the person"
             )
-        capture = add_background_masks(capture, work, given.background, log)
-    if capture.format != FORMAT and given.masks is None:
+        capture = add_background_masks(capture, work, inputs.background, log)
+    if capture.format != FORMAT and inputs.masks is None:
         return capture
-    # Found masks may be empty: frames with less than a fifth of the usual area are left out.
+    # Estimated masks may be empty: skip frames with less than a fifth of the usual area.
     views = capture.splits["train"]
     images = ImageLoader(views, _at_most(options, 128))
     areas = []
     for i in range(len(views)):
         alpha = images[i].alpha
         areas.append(0.0 if alpha is None else float(alpha.mean()))
-    usual = sorted(areas)[len(areas) * 3 // 4]
-    kept = tuple(view for view, area in zip(views, areas, strict=True) if area > 0.2 * usual)
-    if not kept:
-        raise DyngsError(f"{capture.root}: nobody is seen in the masks; white is the person")
-    if len(kept) < len(views):
-        gone = next(view.name for view in views if view not in kept)
+    median_area = sorted(areas)[len(areas) * 3 // 4]
+    visible = tuple(
+        view for view, area in zip(views, areas, strict=True) if area > 0.2 * median_area
+    )
+    if not visible:
+        raise DyngsError(f"{capture.root}: the masks are empty; the person must be white")
+    if len(visible) < len(views):
+        first_skipped = next(view.name for view in views if view not in visible)
         log(
-            f"{len(views) - len(kept)} frames in which hardly anybody is seen are left out, first {gone}"
+            f"skipped {len(views) - len(visible)} frames with (almost) empty masks, first "
+            f"{first_skipped}"
         )
-    return capture.replace(splits={**capture.splits, "train": kept})
+    return capture.replace(splits={**capture.splits, "train": visible})
 
 
 SILHOUETTE_SIDE_PX = 320
-"""Of the images whose silhouettes are looked at, px, at most; an avatar trained on smaller ones is
-compared at that size, since its edges are those of its images."""
+"""Longest side of the compared silhouettes; an avatar trained on smaller images is compared at their
+size."""
 
 
 @dataclass(frozen=True)
 class AvatarPoseFit:
-    """Poses that an avatar found; taken where they are better than those before."""
+    """Poses fitted with an avatar; used where they improve the silhouettes."""
 
-    clip: CapturedMotion  # of all frames; as it was where the overlap did not grow
-    before: float  # overlap of silhouettes (IoU) at some time steps, of the avatar
+    clip: CapturedMotion  # of all frames; unchanged if the IoU did not improve
+    before: float  # silhouette IoU at some time steps
     after: float
-    # number of views, which were left out of the fit, that this was measured on; 0: on those fitted
-    # to
-    left_out: int
+    num_held_out: int  # views of that IoU; 0: measured on fitted views
 
     def summary(self) -> str:
-        """Return a line for people."""
-        taken = "taken" if self.after > self.before else "not taken"
+        """Return a one-line summary."""
+        decision = "used" if self.after > self.before else "not used"
         return (
-            f"poses by the silhouette of the person's avatar: {taken}; overlap on {_judged_on(self.left_out)} "
-            f"{self.before:.3f} -> {self.after:.3f}"
+            f"poses fitted with the avatar: {decision}; silhouette IoU on "
+            f"{_evaluation_views(self.num_held_out)} {self.before:.3f} -> {self.after:.3f}"
         )
 
 
 def fit_poses_by_avatar(
     avatar: KnownAvatar, views: Sequence[View], options: DataConfig, start: CapturedMotion
 ) -> AvatarPoseFit:
-    """Return the poses of a clip in which the avatar has the silhouettes of its images, where that
-    is better.
+    """Fit the poses of a clip to silhouettes with a trained avatar; keep them if the IoU improves.
 
-    Frames of ``start`` without an image keep their poses. One view of each of up to three time
-    steps with at least three views is left out to see what the fit is worth.
+    Frames of ``start`` without an image keep their poses. The IoU is measured on one held-out view
+    at each of up to three time steps with at least three views.
     """
     times = start.clip.times
     groups: dict[int, list[View]] = {}
     for view in views:
         row = start.rows[frame_number(view)]
         groups.setdefault(row, []).append(replace(view, time=float(times[row])))
-    enough = [group for group in groups.values() if len(group) >= 3]
-    some = enough or list(groups.values())
-    chosen = [some[i] for i in evenly_spaced(len(some), 3)]
-    left_out = [group[-1] for group in chosen] if enough else []
-    others = [view for group in chosen for view in group if view not in left_out]
+    large = [group for group in groups.values() if len(group) >= 3]
+    candidates = large or list(groups.values())
+    chosen = [candidates[i] for i in evenly_spaced(len(candidates), 3)]
+    held_out = [group[-1] for group in chosen] if large else []
+    fit_views = [view for group in chosen for view in group if view not in held_out]
     sides = (SILHOUETTE_SIDE_PX, options.longest_side, avatar.longest_side)
     small = _at_most(options, min(side for side in sides if side))
-    tested = ImageLoader(left_out or others, small)
+    tested = ImageLoader(held_out or fit_views, small)
     scene = avatar.scene.with_motion(start.clip)
 
     def fitted(views: Sequence[View]) -> HumanScene:
-        nothing = scene.gaussians.means.new_zeros(3)
-        return fit_poses_to_images(
-            scene, ImageLoader(views, small), nothing, SILHOUETTE_COMPARISON
-        )[0]
+        black = scene.gaussians.means.new_zeros(3)
+        return fit_poses_to_images(scene, ImageLoader(views, small), black, SILHOUETTE_COMPARISON)[
+            0
+        ]
 
-    before = _overlap(scene, tested)
-    after = _overlap(fitted(others), tested)
+    before = _mean_iou(scene, tested)
+    after = _mean_iou(fitted(fit_views), tested)
     clip = start.clip
     if after > before:
-        found = fitted([view for group in groups.values() for view in group]).replacement_clip
-        if found is not None:
-            clip = clip.replace_rows(torch.searchsorted(times, found.times).tolist(), found)
-    return AvatarPoseFit(replace(start, clip=clip), before, after, len(left_out))
+        fitted_clip = fitted([view for group in groups.values() for view in group]).replacement_clip
+        if fitted_clip is not None:
+            clip = clip.replace_rows(
+                torch.searchsorted(times, fitted_clip.times).tolist(), fitted_clip
+            )
+    return AvatarPoseFit(replace(start, clip=clip), before, after, len(held_out))
 
 
 @torch.no_grad()
-def _overlap(scene: HumanScene, images: ImageLoader) -> float:
-    """Return the mean intersection over union of the silhouettes of the person and of images."""
-    found = []
+def _mean_iou(scene: HumanScene, images: ImageLoader) -> float:
+    """Return the mean silhouette IoU of the rendered person and the images."""
+    ious = []
     for i in range(len(images)):
         image = images[i]
-        drawn = scene.render(image.cameras, image.time, options=scene.options).alpha[0] > 0.5
-        truth = drawn if image.alpha is None else image.alpha > 0.5
-        found.append(float((drawn & truth).sum() / (drawn | truth).sum().clamp_min(1)))
-    return fmean(found)
+        rendered = scene.render(image.cameras, image.time, options=scene.options).alpha[0] > 0.5
+        truth = rendered if image.alpha is None else image.alpha > 0.5
+        ious.append(float((rendered & truth).sum() / (rendered | truth).sum().clamp_min(1)))
+    return fmean(ious)
 
 
 def write_split(
     out: Path, split: Split, rows: Mapping[int, int], capture: Capture, options: DataConfig
 ) -> None:
-    """Write ``transforms_SPLIT.json`` and the images of a split as PNG with straight alpha,
-    undistorted.
+    """Write ``transforms_SPLIT.json`` and the undistorted images of a split as PNG with straight
+    alpha.
 
-    Where masks are files beside the images, they stay so (``silhouette_path``). ``rows`` are those
-    of the body parameters by frame number.
+    Separate mask files stay separate (``silhouette_path``). ``rows`` gives the row of the body
+    parameters by frame number.
     """
     views = capture.splits[split]
     if not views:
@@ -458,18 +453,17 @@ def write_split(
 
 def write_body_file(
     path: Path,
-    found: CapturedMotion,
+    motion: CapturedMotion,
     body: BodyTemplate,
     betas: np.ndarray,
     capture: Capture,
 ) -> None:
-    """Write the body parameters of a clip, also readable as a motion: rows are named by their frame
-    numbers.
+    """Write the body parameters of a clip, in file coordinates; the file can also be read as a
+    motion.
 
-    They are in the coordinates of the files of ``capture``. ``betas`` (B,) are of the shape space
-    of the template ``body``.
+    ``betas`` (B,) belong to the shape space of ``body``.
     """
-    clip = found.clip
+    clip = motion.clip
     with atomic_file(path) as temporary, temporary.open("wb") as file:
         np.savez(
             file,
@@ -481,35 +475,37 @@ def write_body_file(
             fitted_to="" if body.name == "anny" else body.fingerprint,
             gender="neutral",
             up_axis="y",
-            frames=np.asarray(found.frames, dtype=np.int64),
+            frames=np.asarray(motion.frames, dtype=np.int64),
             mocap_frame_rate=np.float64(capture.fps or 30),
         )
 
 
 @torch.no_grad()
 def _overlays(
-    capture: Capture, options: DataConfig, body: BodyTemplate, found: CaptureFit
+    capture: Capture, options: DataConfig, body: BodyTemplate, fit: CaptureFit
 ) -> np.ndarray:
-    """Return up to eight images with outlines: the mean shape in the given pose in red, the fit in
-    green."""
+    """Return up to eight images with body outlines: mean shape in the given pose (red) and the fit
+    (green)."""
     views = capture.splits["train"]
     images = ImageLoader(views, _at_most(options, 400))
     discs = body_discs(body, 72)
-    nothing = torch.zeros_like(discs.weights[:, 0])
-    mean = discs.with_shape(torch.zeros_like(found.betas), nothing)
-    shaped = discs.with_shape(found.betas, nothing)
-    fitted = found.clip
+    zero_padding = torch.zeros_like(discs.weights[:, 0])
+    mean = discs.with_shape(torch.zeros_like(fit.betas), zero_padding)
+    shaped = discs.with_shape(fit.betas, zero_padding)
+    fitted = fit.clip
     sheets = []
     for i in evenly_spaced(len(views), 8):
         image = images[i]
-        row = found.motion.rows[frame_number(views[i])]
+        row = fit.motion.rows[frame_number(views[i])]
         sheet = image.composite(torch.ones(3, device="cpu")).clamp(0, 1).clone()
-        for person, clip, colour in (
-            (mean, found.motion.clip, (0.9, 0.1, 0.1)),
+        for discs_in_shape, clip, colour in (
+            (mean, fit.motion.clip, (0.9, 0.1, 0.1)),
             (shaped, fitted, (0.0, 0.7, 0.1)),
         ):
-            drawn = render_silhouettes(person.in_pose(frame_pose(clip, row)), image.cameras)
-            inside = drawn[0] > 0.5
+            silhouettes = render_silhouettes(
+                discs_in_shape.in_pose(frame_pose(clip, row)), image.cameras
+            )
+            inside = silhouettes[0] > 0.5
             outside = (~inside).float()[None]
             near_edge = torch.nn.functional.max_pool2d(outside, 3, 1, 1)[0] > 0
             sheet[inside & near_edge] = sheet.new_tensor(colour)
@@ -528,13 +524,13 @@ def ensure_fitted_body(
     *,
     only_if_needed: bool = False,
     log: Callable[[str], None] = log_info,
-    report: ProgressCallback = ignore_progress,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> DataConfig:
-    """Return the options with a fit of a template to the capture; the same capture is fitted once.
+    """Return options for the capture with a fitted body; the fit is cached per capture.
 
-    ``model`` names the template; None: the free one. Nothing is fitted where ``data.body`` names a
-    fit, where the capture holds one of this template, or without silhouettes; with
-    ``only_if_needed`` where it has body parameters. Raises DyngsError: neither body parameters nor
+    ``model`` names the template; None: the free one. Nothing is fitted if ``data.body`` names a
+    fit, if the capture has one of this template, or without silhouettes; with ``only_if_needed``
+    also not if the capture has body parameters. Raises DyngsError: neither body parameters nor
     silhouettes, or a template that cannot be read.
     """
     model = model or HumanModel()
@@ -542,57 +538,58 @@ def ensure_fitted_body(
         path = data.body / _BODY
         if path.is_file() and not has_same_shape_space(load_template(model), read_body_file(path)):
             log(
-                f"body:    {data.body} is a fit of another template: its poses are taken, not its shape"
+                f"body:    {data.body} was fitted with another template; using its poses, not its shape"
             )
         return data
     capture = read_capture(data)
-    given = None if capture.body is None else capture.body["train"]
-    if given is not None and only_if_needed:
+    body_frames = None if capture.body is None else capture.body["train"]
+    if body_frames is not None and only_if_needed:
         return data
     body = load_template(model)
-    if given is not None:
-        # Of the free template nobody else has the shape space.
-        own_fit = given.shape_space if body.name == "anny" else given.fitted_to
-        if own_fit in ("anny", body.fingerprint):
+    if body_frames is not None:
+        # Only dyngs writes shapes of the free template.
+        fitted_template = body_frames.shape_space if body.name == "anny" else body_frames.fitted_to
+        if fitted_template in ("anny", body.fingerprint):
             return data
     if not capture.has_alpha:
-        if given is None:
+        if body_frames is None:
             raise DyngsError(
-                f"{data.root}: has neither silhouettes nor body parameters, so no person can be found; add masks of "
-                "the person (`dyngs docs people`)"
+                f"{data.root}: has neither silhouettes nor body parameters; add masks of the person "
+                "(docs/person.md)"
             )
-        log(f"{data.root}: no silhouettes, so the body parameters are taken as given")
+        log(f"{data.root}: no silhouettes; using the body parameters of the capture")
         return data
     _require_texels(model, body)
-    own = "" if model.body is None else f".{body.fingerprint}"
+    suffix = "" if model.body is None else f".{body.fingerprint}"
     name = re.sub(r"[^A-Za-z0-9-]", "_", data.root.name)[:40]
-    folder = cache_folder("bodies") / f"{name}.{_digest(data)}{own}"
+    folder = cache_folder("bodies") / f"{name}.{_digest(data)}{suffix}"
 
-    def fit() -> None:
+    def run_fit() -> None:
         log(
-            f"body:    {_called(model, body)} is fitted to the silhouettes first, as by `dyngs data fit`, into {folder}"
+            f"body:    fitting {_template_label(model, body)} to the silhouettes (see `dyngs data fit`), "
+            f"result in {folder}"
         )
-        points = data.root / "keypoints"  # as OpenPose writes them
-        inputs = FitInputs(points if points.is_dir() else None, template=model)
-        log(write_fitted_capture(data, folder, report, inputs, with_images=False).summary)
+        keypoints = data.root / "keypoints"  # as OpenPose writes them
+        inputs = FitInputs(keypoints if keypoints.is_dir() else None, template=model)
+        log(write_fitted_capture(data, folder, on_progress, inputs, with_images=False).summary)
 
-    make_once(folder, fit, log, f"body:    the fit of before, in {folder}")
+    make_once(folder, run_fit, log, f"body:    using the cached fit in {folder}")
     return data.model_copy(update={"body": folder})
 
 
 def _digest(data: DataConfig) -> str:
-    """Return a digest of the capture's files (names, sizes, times of change) and of the options of
-    reading it.
+    """Return a hash of the capture's files (name, size, time of change) and of the options that
+    select views.
 
-    Files beyond 100 MB, such as videos, say nothing about bodies and cameras.
+    Files above 100 MB, such as videos, hold neither bodies nor cameras and are skipped.
     """
     root = data.root.resolve()
     with wrap_read_errors(root):
-        found = [path for path in root.rglob("*") if path.is_file()]
-        files = sorted(path for path in found if path.stat().st_size < 100_000_000)
+        paths = [path for path in root.rglob("*") if path.is_file()]
+        files = sorted(path for path in paths if path.stat().st_size < 100_000_000)
     names = (
         "format frames pose_frames train_cameras times frames_per_second test_every skip_missing"
     )
     options = data.model_dump(mode="json", include=set(names.split()))
-    chosen = hashlib.sha256(repr(sorted(options.items())).encode()).hexdigest()[:8]
-    return f"{digest_files(root, files)}{chosen}"
+    options_hash = hashlib.sha256(repr(sorted(options.items())).encode()).hexdigest()[:8]
+    return f"{digest_files(root, files)}{options_hash}"

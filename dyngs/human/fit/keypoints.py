@@ -1,6 +1,6 @@
-"""2D key points of a person in images (OpenPose, COCO), and fits of other programs as 3D joints.
+"""Readers of 2D key points (OpenPose, COCO) and of 3D joints fitted by other programs.
 
-Local letter: K key points or joints of a format.
+Symbol: K key points or joints of a format.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _COCO = """
 nose left_eye right_eye left_ear right_ear left_shoulder right_shoulder left_elbow right_elbow left_wrist
 right_wrist left_hip right_hip left_knee right_knee left_ankle right_ankle
 """
-# Neck and pelvis (-) are marked elsewhere than the joints of a body.
+# Neck and pelvis (-) are defined differently from body joints.
 _BODY_25 = """
 nose - right_shoulder right_elbow right_wrist left_shoulder left_elbow left_wrist - right_hip right_knee
 right_ankle left_hip left_knee left_ankle right_eye left_eye
@@ -40,7 +40,7 @@ _IN_IMAGES = {
     25: _BODY_25.split(),
     18: _BODY_25.replace("left_wrist -", "left_wrist").split(),
 }
-"""Names of the first key points by their number in a format."""
+"""Names of the first 2D key points by the number of key points in the format."""
 _IN_SPACE = {
     17: _COCO.split(),
     25: _BODY_25.split(),
@@ -49,24 +49,22 @@ _IN_SPACE = {
     24: JOINT_NAMES[:22],
     55: JOINT_NAMES,
 }
-"""Names of the first 3D joints by their number: COCO, OpenPose, SAM 3D Body, SMPL's family."""
+"""Names of the first 3D joints by number of joints: COCO, OpenPose, SAM 3D Body, SMPL family."""
 JOINTS = {
     name: row
     for row, name in enumerate(JOINT_NAMES)
     if name.partition("_")[2] in ("eye", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 }
-"""Joints that detectors mark where they are, on both sides, and their rows in ``JOINT_NAMES``. Nose
-and ears are no joints; necks and toes are marked elsewhere."""
+"""Rows in ``JOINT_NAMES`` of joints that detectors place at the joint; necks and toes are not."""
 Keypoints = dict[str, Tensor]
-"""Name of a view to (55, 3): column, row and confidence of joints in its stored image, undistorted;
-confidence 0 where a joint is not marked."""
+"""By view name: (55, 3) column, row (undistorted, px of the stored image) and confidence; 0 for
+missing joints."""
 Joints3D = dict[int, Tensor]
-"""Frame number to (55, 4): place in the world of the cameras and confidence, 0 where a joint is not
-known."""
+"""By frame number: (55, 4) position in world coordinates and confidence; 0 for missing joints."""
 
 
 def _by_name(views: Sequence[View]) -> dict[str, View]:
-    """Return the views by name, and by the image's name without folder where that is unique."""
+    """Return the views by name, and by the file name of the image where that is unique."""
     stems = [PurePosixPath(view.image_path.name).stem for view in views]
     counts = Counter(stems)
     unique = {stem: view for stem, view in zip(stems, views, strict=True) if counts[stem] == 1}
@@ -78,14 +76,14 @@ def _view_of(named: Mapping[str, View], name: str) -> View | None:
 
 
 def read_keypoints(path: Path, views: Sequence[View]) -> Keypoints:
-    """Return the key points of the views: of a folder of OpenPose files, or of one COCO file.
+    """Read the key points of views from a folder of OpenPose files or from a COCO file.
 
-    OpenPose: ``NAME_keypoints.json`` or ``NAME.json`` by the image's name, ``pose_keypoints_2d`` of
-    25 or 18 points. COCO: 17 or 133 points. Of several people the most confident one is taken.
-    Raises DyngsError: neither, or no known view.
+    OpenPose: ``NAME_keypoints.json`` or ``NAME.json`` per image, ``pose_keypoints_2d`` with 25 or
+    18 points. COCO: 17 or 133 points. The most confident of several people is used. Raises
+    DyngsError: another format, or no view of the capture.
     """
     named = _by_name(views)
-    found: Keypoints = {}
+    keypoints: Keypoints = {}
     with wrap_read_errors(path):
         files = sorted(path.rglob("*.json")) if path.is_dir() else [path]
     for file in files:
@@ -104,24 +102,24 @@ def read_keypoints(path: Path, views: Sequence[View]) -> Keypoints:
                 view = _view_of(named, name)
                 if view is not None and numbers:
                     joints = _marked_joints(file, numbers, view)
-                    best = found.get(view.name, joints)
+                    best = keypoints.get(view.name, joints)
                     if joints[:, 2].sum() >= best[:, 2].sum():
-                        found[view.name] = joints
-    if not found:
+                        keypoints[view.name] = joints
+    if not keypoints:
         raise DyngsError(
-            f"{path}: no key points for any image of the capture; files of OpenPose are called "
-            "IMAGE_keypoints.json, and COCO's images have the images' names as file_name"
+            f"{path}: no key points for any image of the capture; name OpenPose files "
+            "IMAGE_keypoints.json, or use the image names as file_name in COCO"
         )
-    return found
+    return keypoints
 
 
 def _marked_joints(file: Path, numbers: object, view: View) -> Tensor:
-    """Return the joints (55, 3) of a list of column, row, confidence, undistorted."""
+    """Return the undistorted joints (55, 3) of a list of column, row, confidence."""
     points = parse_numbers(f"{file}: a list of key points", numbers, None).reshape(-1, 3)
     names = _IN_IMAGES.get(len(points))
     if names is None:
         raise DyngsError(
-            f"{file}: a person has {len(points)} key points; known are {sorted(_IN_IMAGES)}"
+            f"{file}: a person has {len(points)} key points; supported are {sorted(_IN_IMAGES)}"
         )
     if points[:, 2].max() > 1:  # COCO: 1 hidden, 2 seen
         points[:, 2] = points[:, 2].clip(0, 2) / 2
@@ -130,23 +128,22 @@ def _marked_joints(file: Path, numbers: object, view: View) -> Tensor:
         if name in JOINTS and point[2] > 0:
             joints[JOINTS[name]] = torch.from_numpy(point)
     positions = undistort_points(view.lens, view.intrinsics, joints[:, :2])
-    # What is further away, px, is a mistake; false for NaN.
+    # Positions further away, px, and NaN are outliers.
     near = (positions.abs() < 1e6).all(1, keepdim=True)
     marked = [torch.where(near, positions, 0.0), joints[:, 2:].clamp(0, 1) * near]
     return torch.cat(marked, dim=1).float()
 
 
 def read_joints(path: Path, capture: Capture) -> Joints3D:
-    """Return the 3D joints of the frames of training.
+    """Read the 3D joints of the training frames.
 
-    ``.npz``: ``joints`` (F, K, 3 or 4: with confidence) in the world of the capture's files, NaN
-    where not known, and ``frames`` (F,) numbers. A folder: files of SAM 3D Body, ``IMAGE.npz``,
-    each of one person in the axes of the camera. Raises DyngsError: another layout, no frame of the
-    capture, or no numbers; names the file.
+    ``.npz``: ``joints`` (F, K, 3 or 4 with confidence) in file coordinates, NaN where unknown, and
+    frame numbers ``frames`` (F,). Folder: files of SAM 3D Body, ``IMAGE.npz`` with one person in
+    camera coordinates. Raises DyngsError: another layout, no frame of the capture, or no numbers.
     """
     views = capture.splits["train"]
     scale = capture.world_scale
-    found: Joints3D = {}
+    joints: Joints3D = {}
     with wrap_read_errors(path):
         if path.is_dir():
             named = _by_name(views)
@@ -156,29 +153,29 @@ def read_joints(path: Path, capture: Capture) -> Joints3D:
                     arrays = read_npz(file, ("pred_keypoints_3d", "pred_cam_t"))
                     points = arrays["pred_keypoints_3d"].reshape(70, 3)
                     points = (points + arrays["pred_cam_t"].reshape(3)) / scale
-                    places = (points - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
-                    found[frame_number(view)] = _placed_joints(file, places)
+                    positions = (points - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
+                    joints[frame_number(view)] = _placed_joints(file, positions)
         else:
             arrays = read_npz(path, ("joints",), ("frames",))
             rows = arrays["joints"].astype(np.float64)
             rows[..., :3] = (rows[..., :3] - capture.world_offset) / scale
             numbers = arrays.get("frames", np.arange(len(rows))).tolist()
-            shown = {frame_number(view) for view in views}
+            wanted_frames = {frame_number(view) for view in views}
             for number, row in zip(numbers, rows, strict=True):
-                if number in shown:
-                    found[number] = _placed_joints(path, row)
-    if not found:
+                if number in wanted_frames:
+                    joints[number] = _placed_joints(path, row)
+    if not joints:
         raise DyngsError(
-            f"{path}: no joints for any frame of the capture; name them by their numbers, files of SAM 3D Body by the "
-            "names of images"
+            f"{path}: no joints for any frame of the capture; give frame numbers, or name SAM 3D Body "
+            "files like the images"
         )
-    return found
+    return joints
 
 
 def _placed_joints(file: Path, values: object) -> Tensor:
-    """Return the joints (55, 4) of (K, 3 or 4) places and confidences.
+    """Return the joints (55, 4) of (K, 3 or 4) positions and confidences.
 
-    Joints inside the trunk, which differ from model to model by centimetres, count by 0.3.
+    Joints inside the trunk, whose definitions differ by centimetres, get 0.3 of the confidence.
     """
     rows = as_float_array(values)
     if rows is None or rows.ndim != 2 or rows.shape[1] not in (3, 4) or len(rows) not in _IN_SPACE:

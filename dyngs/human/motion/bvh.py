@@ -1,6 +1,6 @@
 """Reader of Biovision Hierarchy files (``.bvh``).
 
-Local letters: S joints of the file, C channels of all joints together.
+Symbols: F frames, S joints of the file.
 """
 
 from __future__ import annotations
@@ -20,13 +20,12 @@ _CHANNELS = {f"{axis}{kind}" for kind in ("position", "rotation") for axis in "x
 
 
 def read_bvh(path: Path) -> SkeletonMotion:
-    """Read the motion of the file's joints, in its own units and axes; in the rest pose all
-    rotations are zero.
+    """Read the motion of a file's joints in its own units and axes; the rest pose has zero
+    rotations.
 
-    The transform of a joint relative to its parent is T R: T from its position channels, or from
-    OFFSET along axes without one, and R = R_1 R_2 R_3 from its rotations about single axes, in
-    degrees, in the order of its channels. Raises DyngsError: names the file and what is wrong with
-    it.
+    A joint's transform relative to its parent is T R. T comes from position channels, or from
+    OFFSET for axes without one; R = R_1 R_2 R_3 from rotation channels in degrees, in their order.
+    Raises DyngsError: names the file and what is wrong.
     """
     with wrap_read_errors(path):
         text = read_limited(path, 1 << 28).decode("utf-8-sig", errors="replace")
@@ -36,28 +35,28 @@ def read_bvh(path: Path) -> SkeletonMotion:
             re.IGNORECASE | re.MULTILINE,
         )
         if header is None:
-            raise DyngsError(f"{path}: has no MOTION with 'Frames: ' and 'Frame Time: '")
+            raise DyngsError(f"{path}: no MOTION section with 'Frames:' and 'Frame Time:'")
         names: list[str] = []
         parents: list[int] = []
         offsets: list[list[float]] = []
         channels: list[list[str]] = []
-        opened = -1  # joint that the next brace opens; -1 for an end site
-        blocks = [-1]  # joints with open braces
+        open_joint = -1  # joint of the next opening brace; -1 for an end site
+        blocks = [-1]  # joints of open braces
         hierarchy = text[: header.start()].replace("{", "\n{\n").replace("}", "\n}\n")
         for line in hierarchy.splitlines():
             word, *rest = line.split() or [""]
             word = word.upper()
             if word in ("ROOT", "JOINT"):
-                opened = len(names)
-                require_at_most(path, opened + 1, 4096, "joints")
+                open_joint = len(names)
+                require_at_most(path, open_joint + 1, 4096, "joints")
                 names.append(" ".join(rest)[:200])
                 parents.append(blocks[-1])
-                offsets.append([np.nan] * 3)  # until it is read
+                offsets.append([np.nan] * 3)
                 channels.append([])
             elif word == "END":
-                opened = -1
+                open_joint = -1
             elif word == "{":
-                blocks.append(opened)
+                blocks.append(open_joint)
             elif word == "}":
                 blocks.pop()
             elif word == "OFFSET" and blocks[-1] >= 0:
@@ -66,11 +65,11 @@ def read_bvh(path: Path) -> SkeletonMotion:
                 channels[blocks[-1]] = [x.lower() for x in rest[1:]]
                 if rest[0] != str(len(rest) - 1) or not set(channels[blocks[-1]]) <= _CHANNELS:
                     raise DyngsError(
-                        f"{path}: the CHANNELS of '{names[blocks[-1]]}' must be a count and so many of Xposition ... "
-                        "Zrotation"
+                        f"{path}: CHANNELS of '{names[blocks[-1]]}' must be a count followed by that many "
+                        "names, Xposition ... Zrotation"
                     )
         if blocks != [-1] or not names:
-            raise DyngsError(f"{path}: HIERARCHY is cut off or has no ROOT; export it again")
+            raise DyngsError(f"{path}: HIERARCHY is truncated or has no ROOT; export it again")
         fps = require_frame_rate(path, 1.0 / float(header[2]))
         frames = int(header[1])
         width = sum(map(len, channels))
@@ -78,11 +77,12 @@ def read_bvh(path: Path) -> SkeletonMotion:
         values = np.loadtxt(io.StringIO(text[header.end() :]), comments=None, ndmin=2)
         if not values.size or values.size != frames * width:
             raise DyngsError(
-                f"{path}: says {frames} frames of {width} numbers but holds {values.size} numbers; it may be cut off"
+                f"{path}: expected {frames} frames of {width} numbers, got {values.size} numbers; the "
+                "file may be truncated"
             )
         values = values.reshape(frames, width)
-        places = np.array(offsets, dtype=np.float64)
-        if not (np.abs(values) < 1e9).all() or not (np.abs(places) < 1e9).all():
+        offset_array = np.array(offsets, dtype=np.float64)
+        if not (np.abs(values) < 1e9).all() or not (np.abs(offset_array) < 1e9).all():
             raise DyngsError(
                 f"{path}: holds NaN or huge numbers, or a joint without OFFSET; export it again"
             )
@@ -91,21 +91,23 @@ def read_bvh(path: Path) -> SkeletonMotion:
         positions = np.empty((frames, len(names), 3))
         column = 0
         for i, parent in enumerate(parents):
-            position = np.tile(places[i], (frames, 1))
-            turns = {}
+            position = np.tile(offset_array[i], (frames, 1))
+            angles_by_axis = {}
             for channel in channels[i]:
                 if channel.endswith("rotation"):
-                    turns[channel[0].upper()] = values[:, column]
+                    angles_by_axis[channel[0].upper()] = values[:, column]
                 else:
                     position[:, "xyz".index(channel[0])] = values[:, column]
                 column += 1
             rotation = np.eye(3)
-            if turns:
-                angles = np.stack([*turns.values()], axis=1)
-                rotation = Rotation.from_euler("".join(turns), angles, degrees=True).as_matrix()
+            if angles_by_axis:
+                angles = np.stack([*angles_by_axis.values()], axis=1)
+                rotation = Rotation.from_euler(
+                    "".join(angles_by_axis), angles, degrees=True
+                ).as_matrix()
             if parent >= 0:
                 above = rotations[:, parent]
-                rest[i] = rest[parent] + places[i]
+                rest[i] = rest[parent] + offset_array[i]
                 position = positions[:, parent] + (above @ position[..., None])[..., 0]
                 rotation = above @ rotation
             rotations[:, i] = rotation

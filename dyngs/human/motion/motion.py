@@ -1,7 +1,7 @@
-"""The motion of a body, pose parameters per frame; and a clip in the world of the cameras, at any
-time between.
+"""Body motion: pose parameters per frame, and clips in world coordinates that are sampled at any
+time.
 
-Local letter: B shape parameters.
+Symbols: F frames, J joints, B shape parameters.
 """
 
 from __future__ import annotations
@@ -27,20 +27,19 @@ from dyngs.io.containment import LIMITS_VARIABLE, scaled_limit
 
 UpAxis = Literal["auto", "y", "z"]
 MAX_JOINT_POSES = 5_000_000
-"""Limit on joints (at least 55) times frames of a motion: 90,909 frames, or 50 minutes at 30 frames
-per second."""
+"""Limit on frames times joints (at least 55) of a motion: 50 minutes at 30 frames per second."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Body parameters per frame; y up."""
+    """Body parameters per frame, y up."""
 
     poses: Tensor  # (F, J, 3) axis-angle relative to the parent joint, rad
     trans: Tensor  # (F, 3) m, added after skinning; float64 in a fit to a capture
     betas: Tensor  # (B,) shape parameters
     fps: float  # frames per second
     scale: Tensor  # (F,) uniform scale of the template
-    notes: tuple[str, ...] = ()  # assumptions that the reader of the file made
+    notes: tuple[str, ...] = ()  # assumptions made when reading the file
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -50,52 +49,47 @@ class Motion:
         return move_fields_to(self, device)
 
     def for_joints(self, count: int) -> Motion:
-        """Return the motion for a body of 55 (SMPL-X), 52 (SMPL-H) or 24 (SMPL) joints, see
+        """Convert the motion to 55 (SMPL-X), 52 (SMPL-H) or 24 (SMPL) joints, see
         ``poses_for_joints``."""
         return replace(self, poses=poses_for_joints(self.poses, count))
 
     def resampled(self, fps: float) -> Motion:
-        """Return the motion at ``fps`` > 0 frames per second, from the first frame to at most the
-        last one.
+        """Resample the motion at ``fps`` > 0, from the first frame to at most the last one.
 
-        Rotations are interpolated spherically the shorter way, all else linearly. Nothing is
-        smoothed.
+        Rotations are interpolated spherically, all else linearly, without smoothing.
         """
         if fps == self.fps:
             return self
         times = sample_times(len(self) - 1, self.fps, fps)
         before = np.minimum(times.astype(np.int64), max(len(self) - 2, 0))
         after = np.minimum(before + 1, len(self) - 1)
-        return replace(self, fps=fps, **_between(self, before, after, times - before))
+        return replace(self, fps=fps, **_interpolate(self, before, after, times - before))
 
 
 def require_frame_count(path: Path, frames: float, joints: int) -> None:
-    """Check that the motion of a file fits into memory before it is allocated.
-
-    Raises DyngsError: it exceeds ``MAX_JOINT_POSES``.
-    """
+    """Raise DyngsError if a motion exceeds ``MAX_JOINT_POSES``, before it is allocated."""
     count = max(joints, len(JOINT_NAMES))
     most = scaled_limit(MAX_JOINT_POSES)
     if not frames * count <= most:
         raise DyngsError(
-            f"{path}: {frames:.0f} frames of {count} joints are too many; at most {most:,} poses of joints are read; "
-            f"cut it into shorter pieces, or set {LIMITS_VARIABLE}=N to allow N times as many"
+            f"{path}: {frames:.0f} frames of {count} joints exceed the limit of {most:,} joint poses; "
+            f"split the motion, or set {LIMITS_VARIABLE}=N to allow N times as many"
         )
 
 
 def require_frame_rate(path: Path, fps: float) -> float:
-    """Return ``fps`` if it is a plausible frame rate of a motion. Raises DyngsError: it is not."""
+    """Return ``fps`` if it is a plausible frame rate; raise DyngsError otherwise."""
     if not 1e-3 <= fps <= 1e5:
         raise DyngsError(
-            f"{path}: {fps:g} frames per second is not the rate of a motion (0.001 to 100,000); correct its frame rate "
-            "or frame time"
+            f"{path}: frame rate {fps:g} is outside 0.001 to 100,000 frames per second; correct the frame "
+            "rate or frame time"
         )
     return fps
 
 
 def sample_times(last: float, from_fps: float, fps: float) -> np.ndarray:
-    """Return times (F,) in [0, last], in frames of ``from_fps``, that are 1 / ``fps`` seconds
-    apart.
+    """Return sample times (F,) in [0, last], in frames of ``from_fps``, spaced 1 / ``fps``
+    seconds.
 
     The last frame is included if it is missed by at most a thousandth of a frame.
     """
@@ -104,28 +98,26 @@ def sample_times(last: float, from_fps: float, fps: float) -> np.ndarray:
 
 
 def poses_for_joints(poses: Tensor, count: int) -> Tensor:
-    """Return axis-angle poses (F, count, 3) for a body of ``count`` joints from those (F, J, 3) of
-    a body of J.
+    """Convert axis-angle poses (F, J, 3) to (F, count, 3) for a body with ``count`` joints.
 
-    Both have 55 (SMPL-X), 52 (SMPL-H) or 24 (SMPL) joints. Joints that one of them lacks do not
+    J and ``count`` are 55 (SMPL-X), 52 (SMPL-H) or 24 (SMPL); joints missing on either side do not
     rotate.
     """
     if poses.shape[1] == count:
         return poses
-    theirs = SMPLX_ROWS[poses.shape[1]]
-    ours = SMPLX_ROWS[count]
+    source_rows = SMPLX_ROWS[poses.shape[1]]
+    target_rows = SMPLX_ROWS[count]
     smplx = poses.new_zeros(len(poses), len(JOINT_NAMES), 3)
-    smplx[:, list(theirs)] = poses[:, : len(theirs)]
-    wanted = poses.new_zeros(len(poses), count, 3)
-    wanted[:, : len(ours)] = smplx[:, list(ours)]
-    return wanted
+    smplx[:, list(source_rows)] = poses[:, : len(source_rows)]
+    converted = poses.new_zeros(len(poses), count, 3)
+    converted[:, : len(target_rows)] = smplx[:, list(target_rows)]
+    return converted
 
 
 def compose_rotations(first: Tensor, second: Tensor) -> Tensor:
-    """Return the axis-angle vectors (..., 3) of the products of two rotations, the second one
-    applied before the first one; computed in float64.
+    """Return axis-angle vectors (..., 3) of the product R(first) R(second), computed in float64.
 
-    ``second`` (..., 3); ``first`` has the same shape, or is one vector (3,).
+    ``first`` has the shape of ``second`` (..., 3) or is a single vector (3,).
     """
     from scipy.spatial.transform import Rotation
 
@@ -135,44 +127,46 @@ def compose_rotations(first: Tensor, second: Tensor) -> Tensor:
     return torch.from_numpy((one * other).as_rotvec()).to(second).reshape(second.shape)
 
 
-def _between(
+def _interpolate(
     frames: Motion | MotionClip, before: np.ndarray, after: np.ndarray, fraction: np.ndarray
 ) -> dict[str, Tensor]:
-    """Return poses, translations and scales at ``fraction`` (F,) of the way between two rows:
-    rotations R_a exp(s log(R_a^T R_b)), all else linearly."""
+    """Interpolate poses, translations and scales between rows at ``fraction`` (F,).
+
+    Rotations are R_a exp(s log(R_a^T R_b)), all else is linear.
+    """
 
     def weight_for(values: Tensor) -> Tensor:
         return torch.from_numpy(fraction).to(values).reshape(-1, *[1] * (values.dim() - 1))
 
     start, end = (frames.poses[rows].double() for rows in (before, after))
-    turn = compose_rotations(-start, end)
-    found = {"poses": compose_rotations(start, weight_for(turn) * turn).to(frames.poses)}
+    rotation = compose_rotations(-start, end)
+    interpolated = {
+        "poses": compose_rotations(start, weight_for(rotation) * rotation).to(frames.poses)
+    }
     for name in ("trans", "scale"):
         values: Tensor = getattr(frames, name)
-        found[name] = torch.lerp(values[before], values[after], weight_for(values))
-    return found
+        interpolated[name] = torch.lerp(values[before], values[after], weight_for(values))
+    return interpolated
 
 
 @dataclass(frozen=True)
 class SkeletonMotion:
-    """The motion of S joints of another skeleton than ours; float64, in any unit of length."""
+    """Motion of S joints of another skeleton; float64, in any unit of length."""
 
-    path: Path  # of the file, for messages
-    names: tuple[str, ...]  # (S,) of the joints
-    rest: np.ndarray  # (S, 3) joints in the rest pose, in its own axes
+    path: Path  # source file, for messages
+    names: tuple[str, ...]  # (S,) joint names
+    rest: np.ndarray  # (S, 3) joints in the rest pose, in the axes of the file
     rotations: np.ndarray  # (F, S, 3, 3) world_from_rest of each joint
-    positions: np.ndarray  # (F, S, 3) of the joints in the world
+    positions: np.ndarray  # (F, S, 3) joints in world coordinates
     fps: float  # frames per second
-    # whether the world is known to be y up; otherwise it has the axes of the rest pose
-    world_is_y_up: bool
+    world_is_y_up: bool  # if False, the world has the axes of the rest pose
 
 
 @dataclass(frozen=True)
 class MotionClip:
     """Body parameters at F >= 1 times."""
 
-    # (F,) float64 in [0, 1], strictly ascending; always on the CPU, as they are read one by one
-    times: Tensor
+    times: Tensor  # (F,) float64 in [0, 1], strictly ascending; always on the CPU
     poses: Tensor  # (F, J, 3) axis-angle relative to the parent joint, rad
     trans: Tensor  # (F, 3) world units, added last
     scale: Tensor  # (F,) world units per metre of the template
@@ -182,7 +176,7 @@ class MotionClip:
 
     @cached_property
     def rotations(self) -> Tensor:
-        """Return the rotations (F, J, 3, 3) relative to the parent joints."""
+        """Rotations (F, J, 3, 3) relative to the parent joints."""
         return axis_angle_to_matrix(self.poses)
 
     def to(self, *, device: torch.device | str) -> MotionClip:
@@ -195,7 +189,7 @@ class MotionClip:
 
     @staticmethod
     def joined(clips: Sequence[MotionClip]) -> MotionClip:
-        """Return the frames of several clips, one after the other."""
+        """Concatenate the frames of several clips."""
         rows = [(x.times, x.poses, x.trans, x.scale) for x in clips]
         return MotionClip(*(torch.cat(parts) for parts in zip(*rows, strict=True)))
 
@@ -211,43 +205,42 @@ class MotionClip:
     def at(self, time: float | None) -> MotionClip:
         """Return a clip of one frame at ``time``, clamped to the clip; None: the first frame.
 
-        Between frames rotations are interpolated spherically the shorter way, all else linearly.
+        Between frames, rotations are interpolated spherically, all else linearly.
         """
         times = self.times
         first, last = times[[0, -1]].tolist()
-        moment = first if time is None else min(max(time, first), last)
-        after = int(torch.searchsorted(times, moment - 1e-9).clamp_max(len(self) - 1))
-        if abs(float(times[after]) - moment) <= 1e-9:
+        clamped = first if time is None else min(max(time, first), last)
+        after = int(torch.searchsorted(times, clamped - 1e-9).clamp_max(len(self) - 1))
+        if abs(float(times[after]) - clamped) <= 1e-9:
             return self.select(torch.tensor([after], device="cpu"))
-        fraction = (moment - times[after - 1]) / (times[after] - times[after - 1])
+        fraction = (clamped - times[after - 1]) / (times[after] - times[after - 1])
         rows = (np.array([after - 1]), np.array([after]))
         return MotionClip(
-            times.new_tensor([moment]), **_between(self, *rows, fraction[None].numpy())
+            times.new_tensor([clamped]), **_interpolate(self, *rows, fraction[None].numpy())
         )
 
 
 def motion_clip(motion: Motion) -> MotionClip:
-    """Return the motion as a clip, its frames spread evenly over [0, 1]; place and size stay as
-    given."""
+    """Convert a motion to a clip with frames spread evenly over [0, 1]; position and size are
+    kept."""
     times = torch.from_numpy(np.linspace(0, 1, len(motion)))
     return MotionClip(times, motion.poses.float(), motion.trans.float(), motion.scale.float())
 
 
 @dataclass(frozen=True)
 class CapturedMotion:
-    """A clip of the frames that have images."""
+    """Clip of the frames that have images."""
 
-    # of F frames, or of one where the person keeps one pose in one place: nothing moves
-    clip: MotionClip
-    frames: tuple[int, ...]  # (F,) frame numbers, as views name them
+    clip: MotionClip  # of F frames, or of one if the person does not move
+    frames: tuple[int, ...]  # (F,) frame numbers of the views
 
     @cached_property
     def rows(self) -> dict[int, int]:
-        """The row of the clip that shows each frame."""
+        """Clip row by frame number."""
         return {frame: min(row, len(self.clip) - 1) for row, frame in enumerate(self.frames)}
 
     def clip_of_frames(self, frames: Sequence[int]) -> MotionClip:
-        """Return a clip with a row for each of the ``frames``, also of who never moves."""
+        """Return a clip with one row per given frame, also for a static person."""
         return self.clip.select(torch.tensor([self.rows[x] for x in frames], device="cpu"))
 
     def to(self, *, device: torch.device | str) -> CapturedMotion:
@@ -256,37 +249,39 @@ class CapturedMotion:
 
 
 def captured_motion(
-    where: Path, given: BodyFrames, views: Sequence[View], joints: Tensor
+    where: Path, body_frames: BodyFrames, views: Sequence[View], joints: Tensor
 ) -> CapturedMotion:
-    """Return the frames of ``given`` that ``views`` show, for a body with ``joints`` (J, 3) at
-    rest.
+    """Return the motion of the frames that ``views`` show, for a body with rest-pose ``joints``
+    (J, 3).
 
-    Joints that the body of ``given`` lacks do not rotate. Views without times are spread over [0,
-    1] by frame number. Raises DyngsError: a view without parameters.
+    Joints missing in ``body_frames`` do not rotate. Views without times are spread over [0, 1] by
+    frame number. Raises DyngsError: a view without body parameters.
     """
-    found = merge_root_rotation(given, joints[0].double().cpu().numpy())
-    rows = match_frames(where, found, views)
-    last = max(len(found.frames) - 1, 1)
+    centred = merge_root_rotation(body_frames, joints[0].double().cpu().numpy())
+    rows = match_frames(where, centred, views)
+    last = max(len(centred.frames) - 1, 1)
     times = {
         row: row / last if view.time is None else view.time
         for view, row in zip(views, rows.tolist(), strict=True)
     }
     order = sorted(times, key=lambda row: (times[row], row))
-    kept = [row for i, row in enumerate(order) if i == 0 or times[row] > times[order[i - 1]]]
+    unique_rows = [row for i, row in enumerate(order) if i == 0 or times[row] > times[order[i - 1]]]
     clip = MotionClip(
-        times=torch.tensor([times[row] for row in kept], dtype=torch.float64, device="cpu"),
-        poses=poses_for_joints(torch.from_numpy(found.poses[kept]).to(joints), len(joints)),
-        trans=torch.from_numpy(found.trans[kept]).to(joints),
-        scale=torch.from_numpy(found.scale[kept]).to(joints),
+        times=torch.tensor([times[row] for row in unique_rows], dtype=torch.float64, device="cpu"),
+        poses=poses_for_joints(
+            torch.from_numpy(centred.poses[unique_rows]).to(joints), len(joints)
+        ),
+        trans=torch.from_numpy(centred.trans[unique_rows]).to(joints),
+        scale=torch.from_numpy(centred.scale[unique_rows]).to(joints),
     )
-    keeps_still = all(bool((x == x[:1]).all()) for x in (clip.poses, clip.trans, clip.scale))
-    frames = tuple(found.frames[row] for row in kept)
+    is_static = all(bool((x == x[:1]).all()) for x in (clip.poses, clip.trans, clip.scale))
+    frames = tuple(centred.frames[row] for row in unique_rows)
     return CapturedMotion(
-        clip.select(torch.tensor([0], device="cpu")) if keeps_still else clip, frames
+        clip.select(torch.tensor([0], device="cpu")) if is_static else clip, frames
     )
 
 
 def has_same_parameters(a: BodyFrames, b: BodyFrames) -> bool:
-    """Return whether both hold the same body parameters for the same frames."""
+    """True if both hold the same body parameters for the same frames."""
     pairs = ((getattr(a, name), getattr(b, name)) for name in ("poses", "trans", "scale"))
     return a.frames == b.frames and all(np.array_equal(x, y) for x, y in pairs)

@@ -1,7 +1,6 @@
-"""Reader of motion files, and retargeting: another skeleton's motion carried over to a body, by
-world rotations.
+"""Reader of motion files, and retargeting of other skeletons to a body by world rotations.
 
-Local letter: S joints of the other skeleton.
+Symbols: F frames, S joints of the source skeleton.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ _OURS = (
     "pelvis spine1 spine2 spine3 neck head *_collar *_shoulder *_elbow *_wrist *_hip *_knee *_ankle *_foot "
     "*_index# *_middle# *_pinky# *_ring# *_thumb# jaw *_eye"
 )
-"""Names of SMPL-X; ``*`` stands for left and right, ``#`` for 1, 2 and 3."""
+"""SMPL-X joint names; ``*`` stands for left and right, ``#`` for 1, 2 and 3."""
 
 
 _SMPL = "pelvis spine1 spine2 spine3 neck head *collar *shoulder *elbow *wrist *hip *knee *ankle"
@@ -73,14 +72,16 @@ Anny | l r | 1 2 3
     root spine04 spine03 spine02 neck01 head clavicle* upperarm01* lowerarm01* wrist* upperleg01* lowerleg01* foot*
     toe11* finger2#* finger3#* finger5#* finger4#* finger1#*
 """
-"""Joint names of each kind of skeleton, in lower case and without punctuation: the program or data
-set, what stands for ``*`` (left and right) and for ``#`` (``_``: nothing), and a name for each word
-of ``_OURS``: ``a|b`` is a or b, ``-`` none; words at the end may be missing. Rocketbox avatars use
-Biped, VALID avatars Mixamo, the cgspeed conversions of CMU either CMU or DAZ."""
+"""Joint names of known rigs, in lower case and without punctuation.
+
+First line: name of the rig, values of ``*`` (left, right), values of ``#`` (``_``: empty). Then one
+name per word of ``_OURS``: ``a|b`` is a or b, ``-`` none; names at the end may be missing. Rocketbox
+avatars use Biped, VALID avatars Mixamo, cgspeed conversions of CMU either CMU or DAZ.
+"""
 
 
 def _joints_of_rig(sides: str, segments: str, words: str) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield each joint of SMPL-X with the names that it may have in a row of ``_RIGS``."""
+    """Yield each SMPL-X joint with its possible names in one row of ``_RIGS``."""
     marks = segments.replace("_", "").split(" ")
     for ours, theirs in zip(_OURS.split(), words.split(), strict=False):
         for our_side, side in (
@@ -97,7 +98,7 @@ RIGS = {
         r"^(\S+) \| (.+) \| (.+)\n((?: .*\n)+)", _RIGS, re.MULTILINE
     )
 }
-"""The joints of SMPL-X, with the names that they may have, by the name of the rig."""
+"""SMPL-X joints with their possible names, by rig."""
 _NEEDED = (
     "pelvis",
     *(
@@ -109,12 +110,12 @@ _NEEDED = (
 
 
 def match_joints(path: Path, names: Sequence[str]) -> dict[str, int]:
-    """Return the joints of SMPL-X that a skeleton with these joint names has, with their indices in
-    ``names``.
+    """Match joint names of a skeleton to SMPL-X; return indices into ``names`` by SMPL-X joint
+    name.
 
-    Case, punctuation and a prefix before the name of the pelvis (``mixamorig:``, ``Bip01``) do not
-    matter. The rig that matches most joints of the body is chosen. Raises DyngsError: the pelvis, a
-    leg or an arm is missing; names the joint and the file ``path``.
+    Case, punctuation and a prefix (``mixamorig:``, ``Bip01``) are ignored. The rig that matches
+    most body joints is chosen. Raises DyngsError: the pelvis, a leg or an arm is missing; names
+    the joint and ``path``.
     """
     plain = [re.sub(r"[^a-z0-9]", "", name.lower()) for name in names]
     best: dict[str, int] = {}
@@ -123,24 +124,24 @@ def match_joints(path: Path, names: Sequence[str]) -> dict[str, int]:
     for rig, wanted in RIGS.items():
         ends = [x.removesuffix(end) for x in plain for end in wanted["pelvis"] if x.endswith(end)]
         for prefix in list(dict.fromkeys(["", *ends]))[:4]:
-            # the first joint of a name, and the first name of a joint count
-            there = {x.removeprefix(prefix): i for i, x in reversed([*enumerate(plain)])}
-            found = {
-                ours: next(there[name] for name in theirs if name in there)
+            # The first joint of a name and the first name of a joint are used.
+            index_of = {x.removeprefix(prefix): i for i, x in reversed([*enumerate(plain)])}
+            matched = {
+                ours: next(index_of[name] for name in theirs if name in index_of)
                 for ours, theirs in wanted.items()
-                if not there.keys().isdisjoint(theirs)
+                if not index_of.keys().isdisjoint(theirs)
             }
             rank = (
-                sum(name in found for name in _NEEDED),
-                sum(name in found for name in JOINT_NAMES[:22]),
+                sum(name in matched for name in _NEEDED),
+                sum(name in matched for name in JOINT_NAMES[:22]),
             )
             if rank > best_rank:
-                best, best_rig, best_rank = found, rig, rank
+                best, best_rig, best_rank = matched, rig, rank
     wanted = RIGS[best_rig]
     missing = [" or ".join(wanted[name]) for name in _NEEDED if name not in best]
     if missing:
         raise DyngsError(
-            f"{path}: unknown joint names; compared with {best_rig}, the most similar rig, it lacks "
+            f"{path}: unknown joint names; compared with the most similar rig, {best_rig}, it lacks "
             f"{', '.join(missing)}; rename its joints (known rigs: {', '.join(RIGS)})"
         )
     return best
@@ -155,7 +156,7 @@ _BONE_ENDS = {f"{finger}{i}": f"{finger}{i + 1}" for finger in _FINGERS for i in
     "elbow": "wrist",
     "wrist": "middle1",
 }
-"""The joints of limbs whose bones are aligned, and the joint at the end of each bone."""
+"""Joints of limbs whose bones are aligned, with the joint at the end of the bone."""
 _FOLLOWS = {
     f"{finger}{i}": f"{finger}{i - 1}" if i > 1 else "wrist"
     for finger in _FINGERS
@@ -165,42 +166,46 @@ _FOLLOWS = {
     "elbow": "shoulder",
     "wrist": "elbow",
 }
-"""The joint whose alignment a joint of a limb takes if the end of its own bone is unknown."""
+"""Joint that provides the alignment if the end of a joint's own bone is unknown."""
 
 
 def retarget(source: SkeletonMotion, body: BodyTemplate) -> Motion:
-    """Return the motion of ``source`` on ``body``: 55 joints, y up, float32, the rest pose facing
-    +z.
+    """Retarget a motion to ``body``; return 55 joints, float32, y up, with a rest pose facing +z.
 
-    World rotations of joint b and of joint s of the source: G_b = N G_s M^T align(d_b, M d_s).
-    ``align`` is the smallest rotation between bone directions d at rest (of limbs; else the
-    identity), M maps the axes of the source's rest pose to ours (by hips, shoulders and ankles) and
-    N those of its world: the identity if that is y up, else M. The pelvis follows the source's path
-    times the ratio of leg lengths; the lowest vertex is put to y = 0. Raises DyngsError: unknown
-    joint names, or a rest pose that does not stand upright.
+    World rotation of joint b, driven by joint s: G_b = N G_s M^T align(d_b, M d_s). ``align`` is
+    the smallest rotation between rest-pose bone directions d (limbs only, else the identity). M
+    maps the axes of the source's rest pose to ours, found from hips, shoulders and ankles; N maps
+    its world axes (the identity for y up, else M). The pelvis path is scaled by the ratio of leg
+    lengths; the lowest vertex is placed at y = 0. Raises DyngsError: unknown joint names, or a
+    rest pose that is not upright.
     """
-    found = match_joints(source.path, source.names)
-    target_from_rest = _target_from_rest(source, found)
+    matched = match_joints(source.path, source.names)
+    target_from_rest = _target_from_rest(source, matched)
     target_from_world = np.eye(3) if source.world_is_y_up else target_from_rest
-    ours = {
+    target_joints = {
         JOINT_NAMES[row]: body.joints[i].double().numpy()
         for i, row in enumerate(SMPLX_ROWS[len(body.joints)])
     }
-    theirs = {name: target_from_rest @ source.rest[i] for name, i in found.items()}
-    alignments = _alignments(ours, theirs)
+    source_joints = {name: target_from_rest @ source.rest[i] for name, i in matched.items()}
+    alignments = _alignments(target_joints, source_joints)
     world = np.empty((len(source.rotations), 55, 3, 3))
     for i, name in enumerate(JOINT_NAMES):
-        if name in found:
-            own = source.rotations[:, found[name]]
-            world[:, i] = target_from_world @ own @ (target_from_rest.T @ alignments[name])
+        if name in matched:
+            joint_rotations = source.rotations[:, matched[name]]
+            world[:, i] = (
+                target_from_world @ joint_rotations @ (target_from_rest.T @ alignments[name])
+            )
         else:
             world[:, i] = world[:, JOINT_PARENTS[i]]
-    local = world.copy()
-    local[:, 1:] = world[:, JOINT_PARENTS[1:]].swapaxes(2, 3) @ world[:, 1:]
-    poses = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 55, 3)
-    first = {name: source.positions[0, i] for name, i in found.items()}
-    ratio = _leg_length(ours) / max(_leg_length(first), 1e-9)
-    trans = ratio * source.positions[:, found["pelvis"]] @ target_from_world.T - ours["pelvis"]
+    local_rotations = world.copy()
+    local_rotations[:, 1:] = world[:, JOINT_PARENTS[1:]].swapaxes(2, 3) @ world[:, 1:]
+    poses = Rotation.from_matrix(local_rotations.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 55, 3)
+    first_positions = {name: source.positions[0, i] for name, i in matched.items()}
+    ratio = _leg_length(target_joints) / max(_leg_length(first_positions), 1e-9)
+    trans = (
+        ratio * source.positions[:, matched["pelvis"]] @ target_from_world.T
+        - target_joints["pelvis"]
+    )
     motion = Motion(
         poses=torch.from_numpy(poses).float(),
         trans=torch.from_numpy(trans).float(),
@@ -211,29 +216,31 @@ def retarget(source: SkeletonMotion, body: BodyTemplate) -> Motion:
     return place_on_floor(motion, body)
 
 
-def _target_from_rest(source: SkeletonMotion, found: dict[str, int]) -> np.ndarray:
+def _target_from_rest(source: SkeletonMotion, matched: dict[str, int]) -> np.ndarray:
     """Return the rotation (3, 3) from the axes of the rest pose to x left, y up, z forward.
 
-    Up is the axis nearest to the direction from the ankles to the shoulders. Left is the direction
-    from right to left hip and shoulder, made perpendicular to up, or the axis within 15 degrees of
-    it.
+    Up is the axis nearest to the direction from ankles to shoulders. Left is the direction from
+    right to left hips and shoulders, perpendicular to up, or the axis within 15 degrees of it.
     """
-    at = {name: source.rest[i] for name, i in found.items()}
+    positions = {name: source.rest[i] for name, i in matched.items()}
     middle = {
-        part: (at[f"left_{part}"] + at[f"right_{part}"]) / 2 for part in ("ankle", "shoulder")
+        part: (positions[f"left_{part}"] + positions[f"right_{part}"]) / 2
+        for part in ("ankle", "shoulder")
     }
     up = _nearest_axis(middle["shoulder"] - middle["ankle"])
-    if not up @ middle["ankle"] < up @ at["pelvis"] < up @ middle["shoulder"]:
+    if not up @ middle["ankle"] < up @ positions["pelvis"] < up @ middle["shoulder"]:
         raise DyngsError(
-            f"{source.path}: its rest pose does not stand upright; export it with a T-pose as rest pose"
+            f"{source.path}: the rest pose is not upright; export it with a T-pose as rest pose"
         )
-    across = [at[f"left_{part}"] - at[f"right_{part}"] for part in ("hip", "shoulder")]
-    left = sum(x / max(float(np.linalg.norm(x)), 1e-12) for x in across)
+    left_from_right = [
+        positions[f"left_{part}"] - positions[f"right_{part}"] for part in ("hip", "shoulder")
+    ]
+    left = sum(x / max(float(np.linalg.norm(x)), 1e-12) for x in left_from_right)
     left = left - up * (up @ left)
     length = float(np.linalg.norm(left))
     if length < 0.1:
         raise DyngsError(
-            f"{source.path}: in its rest pose left and right coincide; export it with a T-pose as rest pose"
+            f"{source.path}: left and right coincide in the rest pose; export it with a T-pose as rest pose"
         )
     left = left / length
     if left @ _nearest_axis(left) > np.cos(np.radians(15)):
@@ -251,9 +258,8 @@ def _nearest_axis(direction: np.ndarray) -> np.ndarray:
 def _alignments(
     ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """Return align(d_b, M d_s) (3, 3) of each joint; the identity for joints that belong to no
-    limb."""
-    turns: dict[str, np.ndarray] = {}
+    """Return align(d_b, M d_s) (3, 3) of each joint; the identity outside limbs."""
+    alignments: dict[str, np.ndarray] = {}
     for name in JOINT_NAMES:
         side, _, joint = name.partition("_")
         end = f"{side}_{_BONE_ENDS.get(joint, '')}"
@@ -262,10 +268,10 @@ def _alignments(
         ]
         lengths = [float(np.linalg.norm(bone)) for bone in bones]
         if min(lengths) > 1e-9:
-            turns[name] = shortest_arc_rotation(bones[0] / lengths[0], bones[1] / lengths[1])
+            alignments[name] = shortest_arc_rotation(bones[0] / lengths[0], bones[1] / lengths[1])
         else:
-            turns[name] = turns.get(f"{side}_{_FOLLOWS.get(joint, '')}", np.eye(3))
-    return turns
+            alignments[name] = alignments.get(f"{side}_{_FOLLOWS.get(joint, '')}", np.eye(3))
+    return alignments
 
 
 def _leg_length(at: dict[str, np.ndarray]) -> float:
@@ -290,21 +296,27 @@ def read_motion(
     """Read a motion of 55 joints, float32, from ``.npz`` (AMASS, SMPL-X), ``.bvh``, ``.glb``,
     ``.gltf`` or ``.vrma``.
 
-    Other skeletons are retargeted to ``body`` (None: the default template), with the lowest vertex
-    at y = 0. Without ``fps`` it has the frame rate of the file, 30 for glTF; an ``.npz`` without a
-    rate needs ``fps``. ``up``: see ``read_amass``; ``clip`` names the animation of a glTF file.
-    Raises DyngsError: names the file and what is wrong.
+    Args:
+        path: of the file.
+        body: template for retargeting; None: the free template.
+        fps: frame rate to resample to; None: that of the file (30 for glTF). Required for an
+            ``.npz`` without a rate.
+        up: up axis, see ``read_amass``.
+        clip: name of the animation in a glTF file.
+
+    Raises:
+        DyngsError: names the file and what is wrong.
     """
     suffix = path.suffix.lower()
     if suffix not in _SUFFIXES:
-        raise DyngsError(f"{path}: unknown kind of motion; give {', '.join(_SUFFIXES)}")
+        raise DyngsError(f"{path}: unknown motion format; supported are {', '.join(_SUFFIXES)}")
     if up != "auto" and suffix != ".npz":
         raise DyngsError(
-            f"{path}: the up axis can only be chosen for an .npz; that of a {suffix} is known"
+            f"{path}: the up axis can only be set for .npz files; that of {suffix} is known"
         )
     if clip is not None and suffix in (".npz", ".bvh"):
         raise DyngsError(
-            f"{path}: a {suffix} holds one motion without a name; do not ask for '{clip}'"
+            f"{path}: {suffix} files hold one unnamed motion; remove the clip name '{clip}'"
         )
     if fps is not None:
         require_frame_rate(path, fps)

@@ -1,4 +1,4 @@
-"""Sections `model` of networks that predict people, and of the fields that some predict."""
+"""Configuration of networks that predict people, and of the fields that some predict."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dyngs.core.section import ModelSection, Positive, SceneModel
 
 
 class FieldPredictorModel(ModelSection):
-    """Keys that networks share which predict fields of people."""
+    """Keys of networks that predict a radiance field of a person."""
 
     body: Path | None = Field(
         default=None, description="SMPL, SMPL-H or SMPL-X file; null: the free template"
@@ -20,9 +20,11 @@ class FieldPredictorModel(ModelSection):
         default=4,
         ge=2,
         le=16,
-        description="images that a person is predicted from; each training example has 2 to so many",
+        description="input images per person; training examples have 2 to this number",
     )
-    lr: Positive = Field(default=2e-3, description="highest learning rate of AdamW (one cycle)")
+    lr: Positive = Field(
+        default=2e-3, description="peak learning rate of AdamW (one-cycle schedule)"
+    )
 
 
 class KeypointNerfModel(FieldPredictorModel):
@@ -30,8 +32,8 @@ class KeypointNerfModel(FieldPredictorModel):
 
     kind: Literal["keypoint_nerf"] = Field(
         default="keypoint_nerf",
-        description="a network that predicts a field of a person, placed by key points (KeypointNeRF; "
-        "`dyngs docs people`)",
+        description="network that predicts a radiance field of a person from images and key points (KeypointNeRF; "
+        "docs/people_network.md)",
     )
 
 
@@ -40,35 +42,37 @@ class EgHumanNerfModel(FieldPredictorModel):
 
     kind: Literal["eg_human_nerf"] = Field(
         default="eg_human_nerf",
-        description="a network that predicts a field of a person from few samples around a body (EG-HumanNeRF; "
-        "`dyngs docs people`)",
+        description="network that predicts a radiance field of a person with few samples around a body "
+        "(EG-HumanNeRF; docs/people_network.md)",
     )
 
 
 class PredictedFieldModel(ModelSection):
-    """What such a network has predicted: not trained, but drawn like any other scene."""
+    """Radiance field predicted by such a network; it is rendered but not trained."""
 
     kind: Literal["predicted_field"] = Field(
         default="predicted_field",
-        description="a field of a person, as `dyngs predict` writes it; it is not trained",
+        description="radiance field of a person, as written by `dyngs predict`; it is not trained",
     )
     network: Literal["keypoint_nerf", "eg_human_nerf"] = Field(
-        default="keypoint_nerf", description="what has predicted it"
+        default="keypoint_nerf", description="network that predicted it"
     )
 
 
 class GpsModel(SceneModel):
-    """A network that predicts people from pairs of neighbouring views (docs/guides/people.md)."""
+    """Network that predicts people from pairs of neighbouring views (docs/people_network.md)."""
 
     kind: Literal["gps"] = Field(
         default="gps",
-        description="a network that predicts people from two neighbouring views, after GPS-Gaussian "
-        "(`dyngs docs people`)",
+        description="network that predicts people from two neighbouring views, after GPS-Gaussian "
+        "(docs/people_network.md)",
     )
     person_px: int = Field(
         default=256,
         ge=32,
         le=4096,
-        description="height of the person in the rectified views, px; a Gaussian per pixel",
+        description="height of the person in the rectified views, px; one Gaussian per pixel",
     )
-    lr: Positive = Field(default=1e-3, description="highest learning rate of AdamW (one cycle)")
+    lr: Positive = Field(
+        default=1e-3, description="peak learning rate of AdamW (one-cycle schedule)"
+    )

@@ -1,4 +1,4 @@
-"""The kinds of networks that predict people, and of the fields that some predict."""
+"""Model kinds of networks that predict people, and of the fields that some predict."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class HumanPredictorKind(PredictsScenes):
-    """See the module."""
+    """Predicts avatars on a body template (GHG)."""
 
     def num_views(self, section: HumanPredictorModel) -> int:
         return section.source_views
@@ -35,7 +35,7 @@ HUMAN_PREDICTOR = HumanPredictorKind(HumanPredictorModel)
 
 
 class GpsKind(PredictsScenes):
-    """See the module."""
+    """Predicts Gaussians from pairs of views (GPS-Gaussian)."""
 
     def num_views(self, section: GpsModel) -> int:
         return 2
@@ -50,7 +50,7 @@ GPS = GpsKind(GpsModel)
 
 
 class FieldPredictorKind(PredictsScenes):
-    """See the module."""
+    """Predicts radiance fields (KeypointNeRF, EG-HumanNeRF)."""
 
     def num_views(self, section: FieldPredictorModel) -> int:
         return section.source_views
@@ -62,10 +62,10 @@ class FieldPredictorKind(PredictsScenes):
 
 
 class PredictedFieldKind(ModelKind):
-    """Fields that these networks predict: rendered, not trained."""
+    """Predicted radiance fields: rendered, not trained."""
 
     def refusal(self, capture: Capture) -> str:
-        return "model.kind=predicted_field is what `dyngs predict` writes, and is not trained"
+        return "model.kind=predicted_field is written by `dyngs predict` and cannot be trained"
 
     def functions(self) -> tuple[Start, Restore]:
         from dyngs.human.predict.fields.prediction import PredictedModel, restore

@@ -1,7 +1,6 @@
-"""Captured people with their bodies and images, as networks see them: those that predict fields in
-metres of the body.
+"""Captured people with bodies and images, as inputs of prediction networks.
 
-Local letters: V images of H x W pixels, J key points, M vertices, T triangles.
+Symbols: V images of H x W pixels, J key points, M vertices, T triangles, N points.
 """
 
 from __future__ import annotations
@@ -29,14 +28,14 @@ from dyngs.human.motion.motion import CapturedMotion, captured_motion
 from dyngs.human.predict.gps.rectification import crop_image, crop_to_person
 
 NUM_KEY_POINTS = 22
-"""Joints that are key points: those of the body, which SMPL, SMPL-H and SMPL-X have in common."""
-MULTIPLE = 8  # Sides of images are padded to multiples of so many pixels
-MARGIN = 8  # px of background around a person
+"""Body joints that SMPL, SMPL-H and SMPL-X have in common."""
+MULTIPLE = 8  # image sides are padded to multiples of this, px
+MARGIN = 8  # background around a person, px
 
 
 @dataclass(frozen=True)
 class PosedBody:
-    """A posed body in a world of metres."""
+    """Posed body, m."""
 
     key_points: Tensor  # (J, 3)
     vertices: Tensor  # (M, 3)
@@ -45,10 +44,9 @@ class PosedBody:
 
 @dataclass(frozen=True)
 class Sources:
-    """The images that a person is predicted from, cut around the silhouettes and padded to one
-    size."""
+    """Input images of a prediction, cropped to the person and padded to one size; V of them."""
 
-    rgba: Tensor  # (V, 4, H, W), colours times alpha
+    rgba: Tensor  # (V, 4, H, W), premultiplied alpha
     cam_from_world: Tensor  # (V, 4, 4), m
     intrinsics: Tensor  # (V, 3, 3), px
 
@@ -57,7 +55,7 @@ class Sources:
 
     @property
     def centers(self) -> Tensor:
-        """(V, 3) camera centres, m."""
+        """Camera centres (V, 3), m."""
         rotation = self.cam_from_world[:, :3, :3]
         translation = self.cam_from_world[:, :3, 3]
         return -(rotation * translation[..., None]).sum(1)
@@ -71,10 +69,10 @@ class Sources:
 
 @dataclass(frozen=True)
 class Person:
-    """One capture of a person."""
+    """Person of one capture: body, motion and images."""
 
     name: str
-    body: BodyTemplate  # the template in the person's shape, without a shape space
+    body: BodyTemplate  # in the person's shape, without a shape space
     motion: CapturedMotion
     images: ImageLoader
     _bodies: dict[int | None, tuple[PosedBody, float]] = field(default_factory=dict)
@@ -88,18 +86,17 @@ class Person:
         return frame_pose(self.motion.clip, row)
 
     def posed(self, vertices: Tensor, pose: BodyPose) -> tuple[Tensor, Tensor]:
-        """Return ``vertices`` (M, 3) at rest, and the joints (J, 3), in a pose before scale and
-        translation."""
+        """Return posed vertices (M, 3) and joints (J, 3), before scale and translation."""
         body = self.body
         if body.pose_dirs is not None:
             features = (pose.rotations[1:] - torch.eye(3, device=vertices.device)).flatten()
             vertices = vertices + (features @ body.pose_dirs).unflatten(0, (-1, 3))
-        moves = joint_transforms(body.joints, body.parents, pose.rotations)
-        posed = apply_transforms(blend_transforms(body.weights, moves), vertices)
-        return posed, apply_transforms(moves, body.joints)
+        transforms = joint_transforms(body.joints, body.parents, pose.rotations)
+        posed = apply_transforms(blend_transforms(body.weights, transforms), vertices)
+        return posed, apply_transforms(transforms, body.joints)
 
     def body_in(self, view: View) -> tuple[PosedBody, float]:
-        """Return the body in the pose of ``view``, and how many world units are a metre; kept."""
+        """Return the body in the pose of ``view``, and the world units per metre; cached."""
         if view.frame not in self._bodies:
             pose = self.pose_in(view)
             vertices, joints = self.posed(self.body.vertices, pose)
@@ -112,15 +109,13 @@ class Person:
 def captured_person(capture: Capture, template: BodyTemplate, images: ImageLoader) -> Person:
     """Return the person of a capture with its ``images``.
 
-    Raises DyngsError: no body parameters, no silhouettes, or a view without parameters.
+    Raises DyngsError: no body parameters, no silhouettes, or a view without body parameters.
     """
     if capture.body is None or not capture.has_alpha:
         missing = "silhouettes" if capture.body is not None else "body parameters"
-        raise DyngsError(
-            f"{capture.root}: has no {missing}, which a prediction needs; see `dyngs docs people`"
-        )
-    given = capture.body["train"]
-    vertices, joints = rest_shape(template, given)
+        raise DyngsError(f"{capture.root}: no {missing}, which predictions need; see docs/human.md")
+    body_frames = capture.body["train"]
+    vertices, joints = rest_shape(template, body_frames)
     body = replace(
         template,
         vertices=vertices,
@@ -128,40 +123,40 @@ def captured_person(capture: Capture, template: BodyTemplate, images: ImageLoade
         shape_dirs=None,
         joint_shape_dirs=None,
     )
-    motion = captured_motion(capture.root, given, capture.splits["train"], joints)
+    motion = captured_motion(capture.root, body_frames, capture.splits["train"], joints)
     return Person(capture.root.name, body, motion, images)
 
 
 def read_captured_person(data: DataConfig, template: BodyTemplate) -> Person:
-    """Return the person of a capture with depth maps; see ``person_in``."""
+    """Read the person of a capture with depth maps; see ``captured_person``."""
     capture = read_capture(data)
     return captured_person(
         capture, template, ImageLoader(capture.splits["train"], data, with_maps=True)
     )
 
 
-def metric(cameras: Cameras, scale: float) -> Cameras:
-    """Return cameras of a world of which ``scale`` units are a metre in metres: they see the
-    same."""
+def cameras_in_metres(cameras: Cameras, scale: float) -> Cameras:
+    """Convert cameras of a world with ``scale`` units per metre to metres."""
     pose = cameras.cam_from_world.clone()
     pose[:, :3, 3] /= scale
     return replace(cameras, cam_from_world=pose)
 
 
 def crop_source_images(images: Sequence[Image], scale: float) -> Sources:
-    """Return images of a world of which ``scale`` units are a metre."""
-    parts = [crop_to_person(image, MARGIN) for image in images]
+    """Crop images to the person, in a world with ``scale`` units per metre, and pad them to one
+    size."""
+    crops = [crop_to_person(image, MARGIN) for image in images]
     height, width = (
-        -(-max(getattr(part.cameras, side) for part in parts) // MULTIPLE) * MULTIPLE
+        -(-max(getattr(crop.cameras, side) for crop in crops) // MULTIPLE) * MULTIPLE
         for side in ("height", "width")
     )
-    rgba = torch.zeros((len(parts), 4, height, width), device=parts[0].rgb_premultiplied.device)
-    for own, part in zip(rgba, parts, strict=True):
-        assert part.alpha is not None
-        rows, columns = part.alpha.shape
-        own[:3, :rows, :columns] = part.rgb_premultiplied.permute(2, 0, 1)
-        own[3, :rows, :columns] = part.alpha
-    cameras = [metric(part.cameras, scale) for part in parts]
+    rgba = torch.zeros((len(crops), 4, height, width), device=crops[0].rgb_premultiplied.device)
+    for target, crop in zip(rgba, crops, strict=True):
+        assert crop.alpha is not None
+        rows, columns = crop.alpha.shape
+        target[:3, :rows, :columns] = crop.rgb_premultiplied.permute(2, 0, 1)
+        target[3, :rows, :columns] = crop.alpha
+    cameras = [cameras_in_metres(crop.cameras, scale) for crop in crops]
     poses, intrinsics = (
         torch.cat([getattr(x, name) for x in cameras]).to(rgba)
         for name in ("cam_from_world", "intrinsics")
@@ -169,11 +164,10 @@ def crop_source_images(images: Sequence[Image], scale: float) -> Sources:
     return Sources(rgba, poses, intrinsics)
 
 
-def window(image: Image, left: int, top: int, side: int) -> Image:
-    """Return the square of ``side`` px of an image, with its camera and depth, that begins at a
-    column and row.
+def crop_window(image: Image, left: int, top: int, side: int) -> Image:
+    """Crop a square of ``side`` px at a column and row, with camera and depth.
 
-    It is moved into the image, and is smaller only where the image is.
+    The square is shifted to lie inside the image, and smaller only if the image is.
     """
     camera = image.cameras
     width = min(side, camera.width)
@@ -183,12 +177,12 @@ def window(image: Image, left: int, top: int, side: int) -> Image:
     return crop_image(image, top, left, height, width)
 
 
-DILATION, EROSION = 0.06, 0.04  # How far the copies are from the mesh, m
-_NEAREST = 0.05  # Least depth of what is drawn, m
+DILATION, EROSION = 0.06, 0.04  # distances of the boundary meshes from the body, m
+_NEAREST = 0.05  # near plane of depth maps, m
 
 
 class BodyBoundaries:
-    """The meshes of a body, and of a dilated and an eroded copy."""
+    """Body mesh with a dilated and an eroded copy, which bound the clothed surface."""
 
     def __init__(self, body: PosedBody) -> None:
         self._faces = body.faces.cpu().numpy()
@@ -197,35 +191,34 @@ class BodyBoundaries:
         self._tree = KDTree(self._body)
 
     def height(self, points: Tensor) -> Tensor:
-        """Return how far points (N, 3) are from the nearest vertex of the body, m; negative
+        """Return the signed distance (N,) of points (N, 3) to the nearest vertex, m; negative
         inside."""
-        places = points.detach().cpu().double().numpy()
-        distance, nearest = (np.asarray(x) for x in self._tree.query(places))
-        inside = ((places - self._body[nearest]) * self._normals[nearest]).sum(1) < 0
-        return torch.from_numpy(np.where(inside, -distance, distance)).to(points)
+        positions = points.detach().cpu().double().numpy()
+        distance, nearest = (np.asarray(x) for x in self._tree.query(positions))
+        is_inside = ((positions - self._body[nearest]) * self._normals[nearest]).sum(1) < 0
+        return torch.from_numpy(np.where(is_inside, -distance, distance)).to(points)
 
     def depth(self, camera: Cameras) -> Tensor:
-        """Return depths (H, W) of the body, m, infinite beside it."""
+        """Return the depth map (H, W) of the body, m; infinite in the background."""
         return depths(self._body, self._faces, camera)
 
     def interval(self, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
-        """Return where the rays of one camera may meet the person, as depths (H, W) in m; infinite
-        where they do not.
+        """Return where the rays of a camera may hit the clothed surface, as depth maps (H, W), m.
 
-        Where they come in; where they are surely inside, or come out; where they meet the body.
+        The first depth is the entry into the dilated mesh; the last is the eroded mesh or the exit
+        of the dilated mesh; the third is the body. Infinite where rays miss.
         """
         outer = self._body + DILATION * self._normals
         inner = self._body - EROSION * self._normals
-        begin = depths(outer, self._faces, camera)
-        out = depths(outer, self._faces, camera, last=True)
-        # what is thinner than the copy is eroded is turned inside out: its back faces lie before
-        # its front, and where there are cavities (mouth, eyes) and between fingers even front faces
-        # do; nobody is inside before the body
-        surely = depths(inner, self._faces, camera, front_faces=True)
-        met = self.depth(camera)
-        inside = torch.minimum(torch.maximum(surely, met + EROSION / 2), out)
-        end = torch.where(met.isfinite(), inside, out)
-        return begin, torch.maximum(end, begin), met
+        entry = depths(outer, self._faces, camera)
+        exit_depth = depths(outer, self._faces, camera, last=True)
+        # Parts thinner than the erosion turn inside out, so that faces of the eroded mesh may lie in
+        # front of the body; depths before the body are therefore raised.
+        eroded = depths(inner, self._faces, camera, front_faces=True)
+        body_depth = self.depth(camera)
+        last = torch.minimum(torch.maximum(eroded, body_depth + EROSION / 2), exit_depth)
+        end = torch.where(body_depth.isfinite(), last, exit_depth)
+        return entry, torch.maximum(end, entry), body_depth
 
 
 def depths(
@@ -236,11 +229,14 @@ def depths(
     last: bool = False,
     front_faces: bool = False,
 ) -> Tensor:
-    """Return depths (H, W) at pixel centres where rays meet a mesh first, m, or ``last``; infinite
-    beside it.
+    """Return the depth map (H, W) of a mesh at pixel centres, m; infinite in the background.
 
-    ``vertices`` (M, 3), ``faces`` (T, 3) anticlockwise from outside. ``front_faces``: of those
-    alone.
+    Args:
+        vertices: (M, 3).
+        faces: (T, 3), counter-clockwise from outside.
+        camera: a single camera.
+        last: return the last intersection instead of the first.
+        front_faces: ignore back faces.
     """
     pose, k = (x[0].double().cpu().numpy() for x in (camera.cam_from_world, camera.intrinsics))
     local = vertices @ pose[:3, :3].T + pose[:3, 3]
@@ -254,10 +250,10 @@ def depths(
         (x0, x1, x2), (y0, y1, y2) = corners[..., 0].T, corners[..., 1].T
         hidden |= (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0) >= 0  # rows go down
     corners = corners[~hidden]
-    found = rasterize(corners, camera.width, camera.height)
-    # linear in the image
-    nearness = 1 / (found.barycentric / corners[found.faces, :, 2]).sum(axis=1)
+    fragments = rasterize(corners, camera.width, camera.height)
+    # Inverse depth is linear in the image.
+    nearness = 1 / (fragments.barycentric / corners[fragments.faces, :, 2]).sum(axis=1)
     image = np.full(camera.height * camera.width, np.inf)
-    image[found.index] = 1 / (most - nearness if last else nearness)
+    image[fragments.index] = 1 / (most - nearness if last else nearness)
     shape = camera.height, camera.width
     return torch.from_numpy(image.reshape(shape)).to(camera.intrinsics)

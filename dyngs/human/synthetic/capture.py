@@ -1,8 +1,8 @@
-"""Synthetic captures of dressed people: clips, clothes, and the captures themselves, with exact body
+"""Synthetic captures of clothed people: motions, outfits and rendered captures with exact body
 parameters.
 
-Rasterized in numpy, independently of the rasterizer of Gaussians. M vertices, T triangles, U
-vertices of the atlas, P points, H fragments, S texels per side.
+Rendered by the NumPy mesh rasteriser, independently of the Gaussian rasteriser. Symbols: F frames,
+M vertices, T triangles, U UV vertices, P points, H fragments, S texels or pixels per side.
 """
 
 from __future__ import annotations
@@ -37,34 +37,33 @@ from dyngs.io.write import write_image, write_text
 FPS = 12.0
 _Rotations = dict[str, np.ndarray]  # axis-angle vectors (F, 3) or (1, 3) by joint, rad
 _SIDES = (("left", 1.0), ("right", -1.0))
-_KEY_POSES = 4  # poses that a random clip passes through
+_KEY_POSES = 4  # key poses of a random clip
 
 
 def _clip(body: BodyTemplate, num_frames: int, seed: int | None, is_new: bool) -> Motion:
-    """Return the clip of ``seed``, or with ``is_new`` another one: a walk, a squat or a dance, of
-    random extent and heading; soles at y = 0.
+    """Return the motion of ``seed``: a walk, a squat or a dance of random extent and heading.
 
-    A dance passes smoothly through random poses: arms from hanging to above the shoulders, legs in
-    steps. None: a walk, the new clip is a squat.
+    ``is_new`` selects a second motion. Without a seed, the first motion is a walk, the second a
+    squat. The soles are at y = 0.
     """
     time = np.linspace(0.0, 1.0, num_frames)
     if seed is None:
         return _grounded_motion(body, (_squat if is_new else _walk)(time, 1.0, 0.0), num_frames)
-    make = np.random.default_rng([2 * seed + is_new, 2])
-    heading = float(make.uniform(-np.pi, np.pi))
-    match int(make.integers(4)):
+    generator = np.random.default_rng([2 * seed + is_new, 2])
+    heading = float(generator.uniform(-np.pi, np.pi))
+    match int(generator.integers(4)):
         case 0:
-            rotations = _walk(time, float(make.uniform(0.5, 1.2)), heading)
+            rotations = _walk(time, float(generator.uniform(0.5, 1.2)), heading)
         case 1:
-            rotations = _squat(time, float(make.uniform(0.4, 1.0)), heading)
+            rotations = _squat(time, float(generator.uniform(0.4, 1.0)), heading)
         case _:
-            rotations = _dance(time, make, heading)
+            rotations = _dance(time, generator, heading)
     return _grounded_motion(body, rotations, num_frames)
 
 
 def _walk(time: np.ndarray, extent: float, heading: float) -> _Rotations:
-    """Return three swings of legs and arms in place while the body turns by 50 degrees, at ``time``
-    (F,) in [0, 1]; ``heading`` in rad."""
+    """Return three steps in place while the body turns by 50 degrees; ``time`` (F,) in [0, 1],
+    ``heading`` in rad."""
     swing = extent * np.sin(3 * np.pi * time)
     lift = 0.3 - 0.3 * np.cos(3 * np.pi * time)
     rotations = {
@@ -83,7 +82,7 @@ def _walk(time: np.ndarray, extent: float, heading: float) -> _Rotations:
 
 
 def _squat(time: np.ndarray, extent: float, heading: float) -> _Rotations:
-    """Return a motion from standing into a squat while the arms rise sideways."""
+    """Return a motion from standing into a squat, with arms rising sideways."""
     depth = extent * (0.5 - 0.5 * np.cos(np.pi * time))
     rotations = {
         "pelvis": _axis_angle(y=heading),
@@ -101,36 +100,47 @@ def _squat(time: np.ndarray, extent: float, heading: float) -> _Rotations:
     return rotations
 
 
-def _dance(time: np.ndarray, make: np.random.Generator, heading: float) -> _Rotations:
+def _dance(time: np.ndarray, generator: np.random.Generator, heading: float) -> _Rotations:
+    """Return a smooth motion through random key poses."""
 
-    def between(low: float, high: float) -> np.ndarray:
-        knots = make.uniform(low, high, _KEY_POSES)
+    def random_curve(low: float, high: float) -> np.ndarray:
+        knots = generator.uniform(low, high, _KEY_POSES)
         return PchipInterpolator(np.linspace(0.0, 1.0, _KEY_POSES), knots)(time)
 
     rotations = {
-        "pelvis": _axis_angle(y=heading + between(-0.5, 0.5)),
-        "spine1": _axis_angle(x=between(-0.05, 0.3), y=between(-0.2, 0.2), z=between(-0.12, 0.12)),
-        "spine2": _axis_angle(y=between(-0.2, 0.2), z=between(-0.12, 0.12)),
-        "head": _axis_angle(x=between(-0.25, 0.25), y=between(-0.6, 0.6), z=between(-0.15, 0.15)),
+        "pelvis": _axis_angle(y=heading + random_curve(-0.5, 0.5)),
+        "spine1": _axis_angle(
+            x=random_curve(-0.05, 0.3), y=random_curve(-0.2, 0.2), z=random_curve(-0.12, 0.12)
+        ),
+        "spine2": _axis_angle(y=random_curve(-0.2, 0.2), z=random_curve(-0.12, 0.12)),
+        "head": _axis_angle(
+            x=random_curve(-0.25, 0.25), y=random_curve(-0.6, 0.6), z=random_curve(-0.15, 0.15)
+        ),
     }
     for side, sign in _SIDES:
-        bent = between(0.0, 1.0)
+        bent = random_curve(0.0, 1.0)
         rotations |= {
             f"{side}_hip": _axis_angle(
-                x=-0.9 * bent + 0.2, y=sign * between(0.0, 0.3), z=sign * between(0.02, 0.35)
+                x=-0.9 * bent + 0.2,
+                y=sign * random_curve(0.0, 0.3),
+                z=sign * random_curve(0.02, 0.35),
             ),
-            f"{side}_knee": _axis_angle(x=between(0.0, 0.3) + 0.9 * bent),
+            f"{side}_knee": _axis_angle(x=random_curve(0.0, 0.3) + 0.9 * bent),
             f"{side}_shoulder": _axis_angle(
-                x=between(-0.4, 0.4), y=-sign * between(-0.2, 0.7), z=sign * between(-1.2, 0.5)
+                x=random_curve(-0.4, 0.4),
+                y=-sign * random_curve(-0.2, 0.7),
+                z=sign * random_curve(-1.2, 0.5),
             ),
-            f"{side}_elbow": _axis_angle(x=between(-0.3, 0.3), y=-sign * between(0.05, 1.5)),
+            f"{side}_elbow": _axis_angle(
+                x=random_curve(-0.3, 0.3), y=-sign * random_curve(0.05, 1.5)
+            ),
         }
     return rotations
 
 
 def _grounded_motion(body: BodyTemplate, rotations: _Rotations, num_frames: int) -> Motion:
-    """Return the motion of joints rotated by axis-angle (F, 3) or (3,), the lowest vertex always at
-    y = 0."""
+    """Return a motion from axis-angle joint rotations (F, 3) or (1, 3), its lowest vertex always
+    at y = 0."""
     device = body.vertices.device
     poses = torch.zeros(num_frames, len(JOINT_NAMES), 3, device=device)
     for name, rotation in rotations.items():
@@ -146,8 +156,8 @@ def _grounded_motion(body: BodyTemplate, rotations: _Rotations, num_frames: int)
 def _axis_angle(
     x: np.ndarray | float = 0.0, y: np.ndarray | float = 0.0, z: np.ndarray | float = 0.0
 ) -> np.ndarray:
-    """Return axis-angle vectors (F, 3) of rotations about the fixed axes z, then y, then x by
-    angles (F,), rad."""
+    """Return axis-angle vectors (F, 3) of rotations about the fixed axes z, y, x by angles (F,),
+    rad."""
     angles = np.stack(np.broadcast_arrays(np.atleast_1d(z), y, x), axis=-1)
     return Rotation.from_euler("zyx", angles).as_rotvec()
 
@@ -162,20 +172,20 @@ _PARTS = {
     "leg": ("hip", "knee"),
     "shoe": ("ankle", "foot"),
 }
-"""The joints of each part of the body, without side and number."""
-_BELOW_KNEE = -0.36  # height at which shorts end in T-pose, m
+"""Joints of each body part, without side and number."""
+_SHORTS_HEM = -0.36  # height of the hem of shorts in T-pose, m
 
 
 @dataclass(frozen=True)
 class Outfit:
-    """Clothes and hair of a person in T-pose, and the person's size."""
+    """Clothes, hair and body size of a person in T-pose."""
 
-    palette: dict[str, np.ndarray]  # sRGB values (3,) by name of cloth or part of the body
+    palette: dict[str, np.ndarray]  # sRGB values (3,) by name of garment or body part
     pitch: float = 1.0  # width of stripes and checks, relative to 0.05 m
-    upright: bool = False  # whether the stripes on the front are vertical
-    long_sleeves: bool = False  # whether sleeves and legs reach the hands and shoes
+    vertical_stripes: bool = False  # on the front
+    long_sleeves: bool = False
     long_legs: bool = True
-    shirt: float = 0.0  # of these the largest offset from the skin, m
+    shirt: float = 0.0  # largest offset from the skin, m
     trousers: float = 0.0
     hair: float = 0.0
     folds: float = 20.0  # spatial frequency, radians per metre
@@ -183,48 +193,46 @@ class Outfit:
 
 
 def random_outfit(seed: int, is_everyday: bool = False) -> Outfit:
-    """Return the outfit of ``seed``. 0 is the bare template, painted; others have clothes with
-    offsets of up to 4 cm, differ in cut and pattern, and are 0.88 to 1.04 times as tall.
+    """Return the outfit of ``seed``; 0 is the painted template without clothes.
 
-    ``is_usual``: left mostly as right, back as front, bare hands; else all of these differ, to show
-    what is mixed up.
+    Clothes differ in cut and pattern, with offsets up to 4 cm; people are 0.88 to 1.04 times as
+    tall as the template. With ``is_everyday`` both sides, front and back mostly match and hands
+    are bare; else all differ, so that mix-ups are visible.
     """
     palette = _palette(seed)
     if is_everyday:
-        palette = _usual(palette, np.random.default_rng([seed, 4]))
+        palette = _everyday_palette(palette, np.random.default_rng([seed, 4]))
     if seed == 0:
         return Outfit(palette)
-    make = np.random.default_rng([seed, 1])
+    generator = np.random.default_rng([seed, 1])
     return Outfit(
         palette,
-        pitch=float(make.uniform(0.7, 2.5)),
-        upright=bool(make.uniform() < 0.5),
-        long_sleeves=bool(make.uniform() < 0.5),
-        long_legs=bool(make.uniform() < 0.7),
-        shirt=float(make.uniform(0.005, 0.04)),
-        trousers=float(make.uniform(0.005, 0.04)),
-        hair=float(make.uniform(0.005, 0.04)),
-        folds=float(make.uniform(10.0, 30.0)),
-        size=float(make.uniform(0.88, 1.04)),
+        pitch=float(generator.uniform(0.7, 2.5)),
+        vertical_stripes=bool(generator.uniform() < 0.5),
+        long_sleeves=bool(generator.uniform() < 0.5),
+        long_legs=bool(generator.uniform() < 0.7),
+        shirt=float(generator.uniform(0.005, 0.04)),
+        trousers=float(generator.uniform(0.005, 0.04)),
+        hair=float(generator.uniform(0.005, 0.04)),
+        folds=float(generator.uniform(10.0, 30.0)),
+        size=float(generator.uniform(0.88, 1.04)),
     )
 
 
 def dress_body(body: BodyTemplate, outfit: Outfit) -> BodyTemplate:
-    """Return ``body`` with the clothes as part of its surface; joints, weights and atlas stay the
+    """Return ``body`` with the clothes as part of its surface; joints, weights and UV map stay the
     same."""
     vertices = body.vertices.double().cpu().numpy()
-    away = _cloth_offsets(vertices, _part_weights(body), _left_eye(body), outfit)
-    moved = vertices + away[:, None] * vertex_normals(vertices, body.faces.cpu().numpy())
-    return replace(body, vertices=torch.from_numpy(moved).to(body.vertices))
+    offsets = _cloth_offsets(vertices, _part_weights(body), _left_eye(body), outfit)
+    clothed = vertices + offsets[:, None] * vertex_normals(vertices, body.faces.cpu().numpy())
+    return replace(body, vertices=torch.from_numpy(clothed).to(body.vertices))
 
 
 def paint_texture(body: BodyTemplate, outfit: Outfit, resolution: int = 512) -> np.ndarray:
-    """Return the texture (S, S, 3) of ``outfit``, sRGB in [0, 1], float64; left and right, front
-    and back differ.
+    """Paint the texture (S, S, 3) of ``outfit``, sRGB in [0, 1], float64.
 
-    Texels that no triangle covers repeat the nearest covered one, so that interpolation at seams is
-    correct. The template is in T-pose, with texture coordinates and the 55 joints of SMPL-X;
-    ``resolution`` is S.
+    Uncovered texels repeat the nearest covered one, for interpolation at seams. The template is in
+    T-pose, with a UV map and the 55 joints of SMPL-X.
     """
     fragments, nearest = _covered(body.uv, body.uv_faces, resolution)
     around = body.faces.cpu().numpy()[fragments.faces]
@@ -237,10 +245,9 @@ def paint_texture(body: BodyTemplate, outfit: Outfit, resolution: int = 512) -> 
     return texture[nearest]
 
 
-@lru_cache(maxsize=1)  # people of a set share one atlas
+@lru_cache(maxsize=1)  # people of a set share one UV map
 def _covered(uv: Tensor, uv_faces: Tensor, resolution: int) -> tuple[Fragments, np.ndarray]:
-    """Return the texels that the atlas covers, and of every texel the number (S, S) of the nearest
-    one covered."""
+    """Return the covered texels of the UV map, and the nearest covered texel (S, S) of each."""
     columns, rows = texel_coordinates(uv.double().cpu().numpy(), resolution)
     corners = np.stack([columns, rows, np.ones_like(rows)], axis=-1)[uv_faces.cpu().numpy()]
     fragments = rasterize(corners, resolution, resolution)
@@ -254,14 +261,14 @@ def _covered(uv: Tensor, uv_faces: Tensor, resolution: int) -> tuple[Fragments, 
 
 
 def texture_coordinates(body: BodyTemplate) -> tuple[np.ndarray, np.ndarray]:
-    """Return texture coordinates (U, 2), float64, and the triangles (T, 3) that index them."""
+    """Return UV coordinates (U, 2), float64, and their triangles (T, 3)."""
     assert body.uv is not None
     assert body.uv_faces is not None
     return body.uv.double().cpu().numpy(), body.uv_faces.cpu().numpy()
 
 
 def texel_coordinates(uv: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return column and row (U,) of ``uv`` (U, 2) in a texture, whole numbers at texel centres."""
+    """Return column and row (U,) of ``uv`` (U, 2) in a texture; integers are texel centres."""
     return uv[:, 0] * resolution - 0.5, (1.0 - uv[:, 1]) * resolution - 0.5
 
 
@@ -270,7 +277,7 @@ def _left_eye(body: BodyTemplate) -> np.ndarray:
 
 
 def _part_weights(body: BodyTemplate) -> np.ndarray:
-    """Return the weights (M, 8) of each vertex for the parts of ``_PARTS``; rows sum to 1."""
+    """Return the weights (M, 8) of vertices for the parts of ``_PARTS``; rows sum to 1."""
     bases = [
         name.removeprefix("left_").removeprefix("right_").rstrip("123") for name in JOINT_NAMES
     ]
@@ -285,19 +292,21 @@ def _cloth_offsets(
 ) -> np.ndarray:
     """Return the offsets (M,) of clothes and hair from the skin along the normal, m."""
     x, y, z = vertices.T
-    of = dict(zip(_PARTS, part_weights.T, strict=True))
+    weight = dict(zip(_PARTS, part_weights.T, strict=True))
     waist = _smoothstep((y - 0.1) / 0.08)
-    below = _smoothstep((_BELOW_KNEE - y) / 0.06)
-    sleeves = of["arm"] + (of["forearm"] if outfit.long_sleeves else 0.0)
-    legs = of["leg"] * (1.0 if outfit.long_legs else 1.0 - below) + of["torso"] * (1.0 - waist)
+    below = _smoothstep((_SHORTS_HEM - y) / 0.06)
+    sleeves = weight["arm"] + (weight["forearm"] if outfit.long_sleeves else 0.0)
+    legs = weight["leg"] * (1.0 if outfit.long_legs else 1.0 - below) + weight["torso"] * (
+        1.0 - waist
+    )
     legs = legs * _smoothstep(np.abs(x) / 0.05) * (0.5 + 0.5 * _smoothstep(-y / 0.6))
-    scalp = of["head"] * np.maximum(
+    scalp = weight["head"] * np.maximum(
         _smoothstep((y - eye[1] - 0.03) / 0.04), _smoothstep((-0.02 - z) / 0.04)
     )
     scalp = scalp * _smoothstep((y - eye[1] + 0.1) / 0.06)
     folds = 0.8 + 0.2 * np.sin(outfit.folds * (y + 0.5 * x) + 4.0 * np.arctan2(z, np.abs(x) - 0.1))
     return (
-        folds * (outfit.shirt * (of["torso"] * waist + sleeves) + outfit.trousers * legs)
+        folds * (outfit.shirt * (weight["torso"] * waist + sleeves) + outfit.trousers * legs)
         + outfit.hair * scalp
     )
 
@@ -308,9 +317,8 @@ def _smoothstep(x: np.ndarray) -> np.ndarray:
 
 
 def _palette(seed: int) -> dict[str, np.ndarray]:
-    """Return sRGB values (3,) by name of cloth or part: well separated hues in an order that
-    ``seed`` chooses."""
-    make = np.random.default_rng(seed)
+    """Return sRGB values (3,) by garment or body part, with well separated hues."""
+    generator = np.random.default_rng(seed)
     names = (
         "shirt",
         "stripe",
@@ -322,32 +330,41 @@ def _palette(seed: int) -> dict[str, np.ndarray]:
         "left_shoe",
         "right_shoe",
     )
-    hues = (make.permutation(len(names)) + make.uniform()) / len(names)
+    hues = (generator.permutation(len(names)) + generator.uniform()) / len(names)
     values = {"shirt": 0.85, "stripe": 0.95, "back": 0.6, "left_leg": 0.6, "right_leg": 0.75}
     colors = {
-        name: np.array(colorsys.hsv_to_rgb(hue, make.uniform(0.55, 0.85), values.get(name, 0.9)))
+        name: np.array(
+            colorsys.hsv_to_rgb(hue, generator.uniform(0.55, 0.85), values.get(name, 0.9))
+        )
         for name, hue in zip(names, hues, strict=True)
     }
-    skin = make.uniform(0.35, 0.9)
-    hair = make.uniform(0.1, 0.5)
+    skin = generator.uniform(0.35, 0.9)
+    hair = generator.uniform(0.1, 0.5)
     return colors | {
         "skin": skin * np.array([1.0, 0.8, 0.68]),
         "hair": hair * np.array([1.0, 0.75, 0.5]),
     }
 
 
-def _usual(palette: dict[str, np.ndarray], make: np.random.Generator) -> dict[str, np.ndarray]:
-    """Return the palette of clothes that a person would wear: half of the shirts are of one colour,
-    colours are less saturated and of any lightness, and one shirt in five has another back."""
+def _everyday_palette(
+    palette: dict[str, np.ndarray], generator: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """Return a palette of everyday clothes.
+
+    Half of the shirts have one colour, colours are less saturated, and one shirt in five has a
+    different back.
+    """
     names = ("shirt", "stripe", "back", "left_leg", "left_shoe")
     muted = {
-        name: make.uniform(0.25, 1.1) * (palette[name] + make.uniform(0.0, 1.5) * 0.5) / 1.5
+        name: generator.uniform(0.25, 1.1)
+        * (palette[name] + generator.uniform(0.0, 1.5) * 0.5)
+        / 1.5
         for name in names
     }
     muted = {name: color.clip(0.03, 0.97) for name, color in muted.items()}
-    if make.uniform() < 0.5:
+    if generator.uniform() < 0.5:
         muted["stripe"] = muted["shirt"]
-    if make.uniform() < 0.8:
+    if generator.uniform() < 0.8:
         muted["back"] = muted["shirt"]
     sides = {f"right_{part}": muted[f"left_{part}"] for part in ("leg", "shoe")}
     muted["cuff"] = muted["stripe"]
@@ -385,7 +402,7 @@ def _painted(points: np.ndarray, part: np.ndarray, eye: np.ndarray, outfit: Outf
     back = palette["back"]
     checks = 0.65 + 0.35 * ((np.floor(y / (0.06 * pitch)) + np.floor(z / (0.06 * pitch))) % 2)
     trousers = checks[:, None] * either("leg")
-    ahead, behind = (x, y) if outfit.upright else (y, x)
+    ahead, behind = (x, y) if outfit.vertical_stripes else (y, x)
     torso = np.where(
         is_front[:, None], striped(ahead, 0.05, shirt, stripe), striped(behind, 0.06, back, stripe)
     )
@@ -395,7 +412,7 @@ def _painted(points: np.ndarray, part: np.ndarray, eye: np.ndarray, outfit: Outf
         striped(side, 0.08, back, palette.get("cuff", white)),
     )
     is_sleeve = (part == "arm") | ((part == "forearm") & outfit.long_sleeves)
-    is_leg = is_leg & (outfit.long_legs | (y > _BELOW_KNEE))
+    is_leg = is_leg & (outfit.long_legs | (y > _SHORTS_HEM))
     for where, colors in (
         (is_torso, torso),
         (is_torso & disc(0.09, 0.47, 0.05), white),
@@ -416,18 +433,16 @@ def _painted(points: np.ndarray, part: np.ndarray, eye: np.ndarray, outfit: Outf
 
 
 _RADIUS = 3.5  # radius of the ring of cameras, m
-# of a ring that a seed chooses: cameras lie up to so far above or below its height, m
-_UNSTEADY = 0.08
-_TARGET = np.array([0.0, 0.95, 0.0])  # the point that all cameras look at, m
+_HEIGHT_JITTER = 0.08  # of cameras on a random ring, m
+_TARGET = np.array([0.0, 0.95, 0.0])  # point that all cameras look at, m
 
 
 @dataclass(frozen=True)
 class DirectionalLight:
-    """A distant lamp and light from all sides."""
+    """Directional light plus ambient light."""
 
-    # (3,) direction to the lamp, of any length
-    direction: tuple[float, float, float] = (0.35, 0.75, 0.56)
-    # sRGB factors by channel, (3,) or one; ambient + diffuse where the surface faces the lamp
+    direction: tuple[float, float, float] = (0.35, 0.75, 0.56)  # towards the light, not normalised
+    # factors on sRGB values, one or three; a surface facing the light receives ambient + diffuse
     ambient: tuple[float, ...] = (0.6,)
     diffuse: tuple[float, ...] = (0.45,)
 
@@ -437,28 +452,23 @@ class HumanOptions:
     """Options of a synthetic capture of a person."""
 
     size: int = 128  # width and height in pixels
-    num_frames: int = 12  # frames of the walk, for the splits train and test
-    num_pose_frames: int = 6  # frames of another motion, the split ``pose``; 0: no such split
+    num_frames: int = 12  # frames of the splits train and test
+    num_pose_frames: int = 6  # frames of the split ``pose``, another motion; 0: no such split
     num_cameras: int = 8  # training cameras, on a ring around the person
-    # test cameras, each midway between two training cameras; 0: neither test nor ``pose``
-    num_test: int = 2
-    # of the outfit, see ``dyngs.human.synthetic.capture.random_outfit``; the same seed gives the
-    # same bytes
-    seed: int = 0
-    samples: int = 2  # per side of a pixel
-    body_seed: int | None = None  # of the person's body shape; None: the template's own
-    # of the light (direction, strength, tint), the clips (see ``_clip``), and the ring (radius and
-    # height; cameras are nearly level); None: the usual light, a walk, then a squat, and cameras
-    # alternately low and high, 3.5 m away
+    num_test: int = 2  # test cameras, between training cameras; 0: neither test nor ``pose``
+    seed: int = 0  # of the outfit, see ``random_outfit``; output is reproducible to the byte
+    samples: int = 2  # per pixel and axis
+    body_seed: int | None = None  # of the body shape; None: that of the template
+    # of light, motions (see ``_clip``) and camera ring; None: default light, a walk, then a squat,
+    # and cameras alternately low and high at 3.5 m
     scene_seed: int | None = None
-    # left mostly as right, back as front and bare hands, instead of clothes that differ everywhere
-    everyday_clothes: bool = False
-    with_depth: bool = False  # whether there are depth maps
+    everyday_clothes: bool = False  # see ``random_outfit``
+    with_depth: bool = False  # write depth maps
 
 
 @dataclass(frozen=True)
 class PosedMesh:
-    """A textured mesh in the world; float64, m."""
+    """Textured mesh in world coordinates; float64, m."""
 
     vertices: np.ndarray  # (M, 3) in the world
     faces: np.ndarray  # (T, 3) int64, counter-clockwise from outside
@@ -468,24 +478,22 @@ class PosedMesh:
 
     @cached_property
     def normals(self) -> np.ndarray:
-        """Unit normals (M, 3) at the vertices, the same for all cameras."""
+        """Unit vertex normals (M, 3)."""
         return vertex_normals(self.vertices, self.faces)
 
 
 def write_human_capture(out: Path, options: HumanOptions = HumanOptions()) -> Path:
-    """Write images of a walking person in the layout that ``dyngs.data.readers.transforms`` reads;
-    returns ``out``.
+    """Render a moving person and write a capture (layout of ``dyngs.data.readers.transforms``);
+    return ``out``.
 
     Files: ``images/SPLIT/fFFF_cCC.png`` (RGBA, straight alpha), ``transforms_SPLIT.json`` (OpenGL
-    poses, m, y up, floor at y = 0), and the exact parameters of the default template,
-    ``body_train.npz`` and ``body_pose.npz``. The split test shows the frames of train from other
-    cameras, ``pose`` another motion. Raises DyngsError: options out of range.
+    poses, m, y up, floor at y = 0), and the exact body parameters ``body_train.npz`` and
+    ``body_pose.npz``. The split test shows the frames of train from other cameras, ``pose``
+    another motion. Raises DyngsError: options out of range.
     """
     least = min(options.size, options.num_frames, options.num_cameras, options.seed + 1)
     if least < 1:
-        raise DyngsError(
-            "a synthetic person needs size, frames and cameras of at least 1, a seed of at least 0"
-        )
+        raise DyngsError("a synthetic person needs size, frames and cameras >= 1 and seed >= 0")
     body, betas = _person(options.body_seed)
     outfit, clothed, texture = _dressed(body, options.seed, options.everyday_clothes)
     train, test = _cameras(options)
@@ -518,26 +526,28 @@ def _person(seed: int | None) -> tuple[BodyTemplate, Tensor]:
     return replace(body, vertices=vertices, joints=joints), betas
 
 
-@lru_cache(maxsize=4)  # several captures of a person, of other clips or cameras, are painted once
+@lru_cache(maxsize=4)  # shared by captures of one person
 def _dressed(
     body: BodyTemplate, seed: int, everyday_clothes: bool
 ) -> tuple[Outfit, BodyTemplate, np.ndarray]:
-    """Return the clothes of ``seed``, the body with them on, and its texture (S, S, 3)."""
+    """Return the outfit of ``seed``, the clothed body, and its texture (S, S, 3)."""
     outfit = random_outfit(seed, everyday_clothes)
     return outfit, dress_body(body, outfit), paint_texture(body, outfit)
 
 
 def random_light(seed: int | None) -> DirectionalLight:
-    """Return the light of ``seed``, from any side and above, of which three quarters to all reach a
-    white surface that faces it; None: ``Lamp()``."""
+    """Return the light of ``seed``, from above the horizon; None: the default light.
+
+    A white surface that faces the light reaches 75 to 105 % of white.
+    """
     if seed is None:
         return DirectionalLight()
-    make = np.random.default_rng([seed, 3])
-    azimuth = make.uniform(-np.pi, np.pi)
-    height = make.uniform(0.0, 1.2)
-    diffuse = make.uniform(0.2, 0.6)
-    ambient = make.uniform(0.75, 1.05) - diffuse
-    tint = 1.0 + make.uniform(-0.06, 0.06) * np.array([1.0, 0.0, -1.0])
+    generator = np.random.default_rng([seed, 3])
+    azimuth = generator.uniform(-np.pi, np.pi)
+    height = generator.uniform(0.0, 1.2)
+    diffuse = generator.uniform(0.2, 0.6)
+    ambient = generator.uniform(0.75, 1.05) - diffuse
+    tint = 1.0 + generator.uniform(-0.06, 0.06) * np.array([1.0, 0.0, -1.0])
     red, green, blue = (float(diffuse * part) for part in tint)
     return DirectionalLight(
         (float(np.sin(azimuth)), float(height), float(np.cos(azimuth))),
@@ -553,12 +563,20 @@ def render_mesh(
     samples: int,
     light: DirectionalLight = DirectionalLight(),
 ) -> np.ndarray:
-    """Return sRGB values and straight alpha (size, size, 4) in [0, 1], of ``samples`` x ``samples``
-    per pixel.
+    """Render a mesh; return sRGB values and straight alpha (size, size, 4) in [0, 1].
 
-    Lambertian: the texture times ambient + diffuse max(n . l, 0) with smooth normals n, at most 1.
-    ``world_from_cam`` (4, 4) is an OpenGL pose; pixels are square, centred, ``CAMERA_ANGLE_X``
-    across. Raises ValueError: the mesh reaches behind it.
+    Lambertian: texture times ambient + diffuse max(n . l, 0), at most 1, with smooth normals n.
+    Anti-aliased with ``samples`` x ``samples`` per pixel.
+
+    Args:
+        mesh: in world coordinates.
+        world_from_cam: (4, 4) OpenGL pose; the camera is ``CAMERA_ANGLE_X`` wide.
+        size: width and height, px.
+        samples: per pixel and axis.
+        light: of the scene.
+
+    Raises:
+        ValueError: the mesh reaches behind the camera.
     """
     image = _image_of(mesh.vertices, world_from_cam, size)
     corners = image[mesh.faces]
@@ -573,8 +591,8 @@ def render_mesh(
 
 
 def _image_of(points: np.ndarray, world_from_cam: np.ndarray, size: int) -> np.ndarray:
-    """Return column, row and inverse depth (P, 3) of ``points`` (P, 3). Raises ValueError: one lies
-    behind."""
+    """Project ``points`` (P, 3) to column, row and inverse depth (P, 3). Raises ValueError: one
+    lies behind."""
     x, up, back = ((points - world_from_cam[:3, 3]) @ world_from_cam[:3, :3]).T
     if not (back < 0).all():
         raise ValueError("all vertices must be in front of the camera")
@@ -620,7 +638,7 @@ def _write_split(
 
 
 def _depth_map(mesh: PosedMesh, world_from_cam: np.ndarray, size: int) -> np.ndarray:
-    """Return the depth (S, S) along the view axis at pixel centres, m; 0 where nothing is."""
+    """Return the depth (S, S) along the view axis at pixel centres, m; 0 in the background."""
     image = _image_of(mesh.vertices, world_from_cam, size) - [0.5, 0.5, 0.0]
     surface = rasterize(image[mesh.faces], size, size)
     depth = np.zeros(size * size)
@@ -638,27 +656,30 @@ def _posed_meshes(body: BodyTemplate, motion: Motion, texture: np.ndarray) -> li
 
 
 def _cameras(options: HumanOptions) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
-    """Return the OpenGL poses (4, 4) of the training and the test cameras by number, on a ring
-    around the person."""
+    """Return the OpenGL poses (4, 4) of training and test cameras by number, on a ring."""
     count = options.num_cameras
-    others = options.num_test
-    around = np.arange(count) / max(count, 1)
-    between = (np.arange(others) * count // max(others, 1) + 0.5) / count
+    num_test = options.num_test
+    train_fractions = np.arange(count) / max(count, 1)
+    test_fractions = (np.arange(num_test) * count // max(num_test, 1) + 0.5) / count
     if options.scene_seed is None:
-        train = _on_ring(around, np.where(np.arange(count) % 2 == 0, 0.9, 1.7))
-        test = _on_ring(between, np.full(others, 1.3))
+        train = _on_ring(train_fractions, np.where(np.arange(count) % 2 == 0, 0.9, 1.7))
+        test = _on_ring(test_fractions, np.full(num_test, 1.3))
     else:
-        make = np.random.default_rng([options.scene_seed, 5])
-        radius = make.uniform(3.3, 4.2)
-        height = make.uniform(0.7, 1.6)
-        train = _on_ring(around, height + make.uniform(-_UNSTEADY, _UNSTEADY, count), radius)
-        test = _on_ring(between, np.full(others, height), radius)
+        generator = np.random.default_rng([options.scene_seed, 5])
+        radius = generator.uniform(3.3, 4.2)
+        height = generator.uniform(0.7, 1.6)
+        train = _on_ring(
+            train_fractions,
+            height + generator.uniform(-_HEIGHT_JITTER, _HEIGHT_JITTER, count),
+            radius,
+        )
+        test = _on_ring(test_fractions, np.full(num_test, height), radius)
     return dict(enumerate(train)), {len(train) + i: pose for i, pose in enumerate(test)}
 
 
 def _on_ring(fractions: np.ndarray, heights: np.ndarray, radius: float = _RADIUS) -> np.ndarray:
-    """Return OpenGL camera-to-world poses (V, 4, 4), y up, at ``fractions`` (V,) of a turn from +z
-    to +x, and ``heights`` (V,), m."""
+    """Return OpenGL poses (V, 4, 4), y up, at ``fractions`` (V,) of a turn from +z to +x, and
+    ``heights`` (V,), m."""
     azimuths = 2 * np.pi * fractions
     centers = np.stack([radius * np.sin(azimuths), heights, radius * np.cos(azimuths)], axis=-1)
     backward = normalized(centers - _TARGET)
@@ -683,8 +704,7 @@ def _shaded(mesh: PosedMesh, fragments: Fragments, light: DirectionalLight) -> n
 
 
 def _sampled(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Return the values (H, 3) of a texture (S, S, 3) at ``uv`` (H, 2), bilinear between texel
-    centres."""
+    """Sample a texture (S, S, 3) at ``uv`` (H, 2), bilinear; return (H, 3)."""
     places = texel_coordinates(uv, len(texture))[::-1]
     channels = [
         map_coordinates(x, places, order=1, mode="nearest") for x in np.moveaxis(texture, 2, 0)
@@ -693,8 +713,8 @@ def _sampled(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 PEOPLE_PER_FOLDER = 100
-"""People in a folder."""
-_MOST = 10**6  # People of one seed, so that those of two seeds share nothing
+"""People per folder."""
+_MAX_PEOPLE = 10**6  # per seed, so that people of different seeds never share a random seed
 
 
 @dataclass(frozen=True)
@@ -704,25 +724,24 @@ class PeopleOptions:
     people: int = 100
     size: int = 256  # width and height of the images, px
     cameras: int = 24  # on a ring around each person
-    frames: int = 1  # of a clip of each person
-    seed: int = 0  # people of different seeds have no body, outfit, clip, light or ring in common
+    frames: int = 1  # per person
+    seed: int = 0  # different seeds share no body, outfit, motion, light or camera ring
 
 
 def write_people(
     out: Path, options: PeopleOptions = PeopleOptions(), report: ProgressCallback = ignore_progress
 ) -> Path:
-    """Write people as ``out/SHARD/PERSON``, captures of ``write_human_capture`` with depth maps.
+    """Write people as ``out/FOLDER/PERSON``, captures of ``write_human_capture`` with depth maps.
 
-    Every person has a body, an outfit, a clip, a light and a ring of cameras of their own; every
-    other one wears usual clothes. The same options give the same bytes. One person is in memory at
-    a time. Where ``out`` holds people of the same options already, the missing ones are added: a
-    set may be written in parts, and trained on meanwhile. Raises DyngsError: options out of range,
-    or a folder that holds something else.
+    Every person has their own body, outfit, motion, light and camera ring; every other one wears
+    everyday clothes. Output is reproducible to the byte. If ``out`` holds people of the same
+    options, missing ones are added, so that a set can be written in parts and used meanwhile.
+    Raises DyngsError: options out of range, or a folder with other contents.
     """
     least = min(options.people, options.size, options.cameras, options.frames, options.seed + 1)
-    if least < 1 or options.people > _MOST:
+    if least < 1 or options.people > _MAX_PEOPLE:
         raise DyngsError(
-            f"people need size, cameras and frames of at least 1, a seed of at least 0, and be 1 to {_MOST:,}"
+            f"synthetic people need size, cameras and frames >= 1, seed >= 0, and 1 to {_MAX_PEOPLE:,} people"
         )
     mark = out / PEOPLE_FILE
     made_with = {name: value for name, value in asdict(options).items() if name != "people"}
@@ -732,7 +751,7 @@ def write_people(
         write_text(mark, text)
     elif mark.read_text(encoding="utf-8", errors="replace") != text:
         raise DyngsError(
-            f"{out}: holds people of other options ({PEOPLE_FILE}); name a new folder, or give the same"
+            f"{out}: holds people with other options ({PEOPLE_FILE}); use a new folder or the same options"
         )
     for number in range(options.people):
         person = out / f"s{number // PEOPLE_PER_FOLDER:04d}" / f"p{number:06d}"
@@ -743,8 +762,8 @@ def write_people(
 
 
 def person_options(options: PeopleOptions, number: int) -> HumanOptions:
-    """Return the options of the person ``number``, from 0."""
-    seed = options.seed * _MOST + number + 1  # 0 would be the bare template
+    """Return the options of person ``number``, counted from 0."""
+    seed = options.seed * _MAX_PEOPLE + number + 1  # 0 would be the bare template
     return HumanOptions(
         size=options.size,
         num_frames=options.frames,

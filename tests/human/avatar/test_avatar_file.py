@@ -160,7 +160,7 @@ Change = Callable[[dict[str, Tensor]], object]
             "'anchors.joints' is float32",
         ),
         (lambda x: x["gaussians.means"].fill_(torch.nan), "'means' holds NaN"),
-        (lambda x: x["anchors.joints"].fill_(55), "'anchors.joints' names something beyond the 55"),
+        (lambda x: x["anchors.joints"].fill_(55), "'anchors.joints' has indices outside"),
         (lambda x: x["anchors.weights"].neg_(), "negative or sum to 0"),
         (lambda x: x["skeleton.parents"].fill_(7), "joint 0 has parent 7"),
         (lambda x: x["reference.scale"].zero_(), "'clip.scale' must be above 0"),
@@ -181,7 +181,9 @@ def test_a_proper_checksum_over_improper_contents(file: Path, change: Change, wo
 
 def test_only_people_are_exported(tmp_path: Path, run_dir: Path) -> None:
     run = load_run(write_moving_run(tmp_path / "run"))
-    with pytest.raises(DyngsError, match=r"--format avatar needs the run of a person"):
+    with pytest.raises(DyngsError, match=r"--format avatar needs a run with model.kind=human"):
         written(run, tmp_path / "a.safetensors")
-    with pytest.raises(DyngsError, match=r"a\.npz: an avatar is written as \.safetensors"):
+    with pytest.raises(
+        DyngsError, match=r"a\.npz: the name of an avatar file must end in \.safetensors"
+    ):
         written(load_run(run_dir), tmp_path / "a.npz")

@@ -13,7 +13,7 @@ from dyngs.gaussians import Gaussians
 from dyngs.gaussians.rendering import RenderOptions
 from dyngs.human.avatar.observations import (
     effective_view_counts,
-    filled,
+    fill_unseen,
     find_mirror_gaussians,
     nearest_neighbours,
     rigidity_errors,
@@ -155,7 +155,7 @@ def test_the_unseen_half_of_a_symmetric_body_is_that_of_the_other_side() -> None
         logit_opacities=torch.where(right, -3.0, true.logit_opacities),
     )
     weights = torch.stack([right, ~right], dim=1).float()
-    new = filled(spoilt, anchors, weights, 0.0, (~right).float())
+    new = fill_unseen(spoilt, anchors, weights, 0.0, (~right).float())
     torch.testing.assert_close(new["means"], true.means)
     torch.testing.assert_close(new["logit_opacities"], true.logit_opacities)
     assert float((new["sh"] - true.sh).abs().max()) < 0.06, (
@@ -177,7 +177,7 @@ def test_without_a_seen_mirror_image_a_gap_is_filled_smoothly_and_from_its_own_p
     torch.testing.assert_close(found, colours, atol=1e-3, rtol=0)
     _, is_image = find_mirror_gaussians(anchors, 0.5)
     assert not bool(is_image.any())
-    new = filled(gaussians.replace(sh=noisy[:, None]), anchors, weights, 0.5, (~gap).float())
+    new = fill_unseen(gaussians.replace(sh=noisy[:, None]), anchors, weights, 0.5, (~gap).float())
     torch.testing.assert_close(new["sh"][:, 0], colours, atol=1e-3, rtol=0)
     torch.testing.assert_close(new["means"], gaussians.means)
 

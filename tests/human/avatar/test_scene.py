@@ -21,7 +21,7 @@ from dyngs.human.avatar.posing import (
     corrected_pose,
     texel_gaussians,
 )
-from dyngs.human.avatar.scene import HumanScene, first_scene
+from dyngs.human.avatar.scene import HumanScene, initial_human_scene
 from dyngs.human.body.atlas import atlas_texels
 from dyngs.human.body.body_reader import default_template
 from dyngs.human.body.skinning import axis_angle_to_matrix
@@ -48,7 +48,7 @@ def stirred() -> HumanScene:
         sh=torch.randn(gaussians.sh.shape, generator=torch.Generator().manual_seed(1))
     )
     skeleton = Skeleton(body.joints, body.parents)
-    scene = first_scene(gaussians, anchors, skeleton, random_clip(4))
+    scene = initial_human_scene(gaussians, anchors, skeleton, random_clip(4))
     generator = torch.Generator().manual_seed(2)
     for x in scene.learned.values().values():
         x += 0.05 * torch.randn(x.shape, generator=generator)

@@ -170,7 +170,7 @@ def test_mirrored_texture_has_right_handed_frames_all_the_same() -> None:
 
 def test_what_cannot_be_done() -> None:
     body = square()
-    with pytest.raises(DyngsError, match="'test' has no texture coordinates"):
+    with pytest.raises(DyngsError, match="'test' has no UV map"):
         atlas_texels(replace(body, uv=None, uv_faces=None), 8)
     with pytest.raises(DyngsError, match="at least 1, got 0"):
         atlas_texels(body, 0)

@@ -275,11 +275,11 @@ def with_parents(change: dict[int, int]) -> Arrays:
 
 
 WRONG: dict[str, tuple[Arrays, str]] = {
-    "cycle": (with_parents({4: 7, 7: 4}), "list parents before"),
-    "two roots": (with_parents({5: -1}), "list parents before"),
+    "cycle": (with_parents({4: 7, 7: 4}), "parents before"),
+    "two roots": (with_parents({5: -1}), "parents before"),
     "numbering": (
         changed("kintree_table", lambda x: with_entry(x, (1, 4), 5)),
-        "must number the joints",
+        "must number joints",
     ),
     "joints": (changed("kintree_table", lambda x: x[:, :23]), "has 23 joints; SMPL has 24"),
     "weights": (
@@ -290,11 +290,17 @@ WRONG: dict[str, tuple[Arrays, str]] = {
         changed("weights", lambda x: with_entry(x, (3,), [1.5, -0.5] + [0] * 22)),
         "must be non-negative and sum to 1",
     ),
-    "shape": (changed("weights", lambda x: x[:-1]), "'weights' must be 30 x 24, is 29 x 24"),
-    "no vertices": (changed("v_template", lambda x: x[:0]), "'v_template' must be n x 3, is 0 x 3"),
+    "shape": (
+        changed("weights", lambda x: x[:-1]),
+        "'weights' must have shape 30 x 24, got 29 x 24",
+    ),
+    "no vertices": (
+        changed("v_template", lambda x: x[:0]),
+        "'v_template' must have shape n x 3, got 0 x 3",
+    ),
     "other kind": (
         changed("posedirs", lambda x: x[..., :99]),
-        "'posedirs' must be 30 x 3 x 207, is 30 x 3 x 99",
+        "'posedirs' must have shape 30 x 3 x 207, got 30 x 3 x 99",
     ),
     "NaN": (
         changed("v_template", lambda x: with_entry(x, (4, 1), np.nan)),
@@ -302,14 +308,14 @@ WRONG: dict[str, tuple[Arrays, str]] = {
     ),
     "faces": (
         changed("f", lambda x: with_entry(x, (4, 1), M)),
-        "'f' must hold whole numbers from 0 to 29",
+        "'f' must hold integers from 0 to 29",
     ),
-    "fractions": (changed("f", lambda x: x + 0.5), "'f' must hold whole numbers"),
+    "fractions": (changed("f", lambda x: x + 0.5), "'f' must hold integers"),
     "text": (
         changed("v_template", lambda _: np.array("no")),
         "'v_template' must hold numbers, not <U2",
     ),
-    "uv": (changed("vt", lambda x: x + 0.5, "smplx"), "texture coordinates must lie in"),
+    "uv": (changed("vt", lambda x: x + 0.5, "smplx"), "UV coordinates must lie in"),
     "half a uv": ({k: v for k, v in model("smplx").items() if k != "ft"}, "'ft'"),
 }
 

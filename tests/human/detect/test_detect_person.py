@@ -107,14 +107,14 @@ def test_masks_and_key_points_of_all_views(
     assert set(points) == {f"f{number}" for number in seen}
     ankle = points["f2"][JOINTS["left_ankle"]].numpy()
     np.testing.assert_allclose(ankle, person(50, 90.0).keypoints[15], atol=1e-3)
-    assert any("finds the person" in line and "in 9 of 10 images" in line for line in said)
+    assert any("detected the person" in line and "in 9 of 10 images" in line for line in said)
     assert not list((tmp_path / "found" / "frames").iterdir()), (
         "images for the detector only live while it runs"
     )
 
 
 def test_nobody_is_an_error(clip: Path, tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match="Rough finds nobody in 10 images"):
+    with pytest.raises(DyngsError, match="Rough detects nobody in 10 images"):
         detect_person(
             capture_of(clip), Rough(nobody=True), tmp_path / "found", ignore_progress, [].append
         )
@@ -131,7 +131,7 @@ def test_a_camera_in_which_nobody_is_found_is_left_out(clip: Path, tmp_path: Pat
     said: list[str] = []
     both = capture.replace(splits={"train": (*first, *others)})
     found = detect_person(both, detector, tmp_path / "found", ignore_progress, said.append)
-    assert "warning: camera 1: Rough finds nobody, its images are left out" in said
+    assert "warning: camera 1: Rough detects nobody; skipping its images" in said
     assert found.masks is not None
     assert not any(read_image(found.masks / f"{view.name}.png").any() for view in others)
     assert overlap(found.masks, 2) > 0.93
@@ -176,4 +176,4 @@ def test_a_clip_is_looked_at_once(
         data = ensure_detected_person(DataConfig(root=clip, frames=frames), log=said.append)
         assert (data.root, data.frames) == (made[-1], None)
     assert len(made) == 2
-    assert [line for line in said if "reuses the body fit" in line] == [said[2]]
+    assert [line for line in said if "using the cached result" in line] == [said[2]]

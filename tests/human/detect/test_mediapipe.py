@@ -64,8 +64,8 @@ def test_what_the_process_finds_comes_back(tmp_path: Path, images: list[Path]) -
 @pytest.mark.parametrize(
     ("body", "said"),
     [
-        ("sys.exit('out of memory')", "MediaPipe failed (1): out of memory"),
-        ("sys.exit(7)", "MediaPipe failed (7): nothing was said"),
+        ("sys.exit('out of memory')", "MediaPipe failed with exit status 1: out of memory"),
+        ("sys.exit(7)", "MediaPipe failed with exit status 7: no error output"),
         (
             "for x in Path(images).iterdir(): (Path(out) / f'{x.stem}.npz').write_bytes(b'rubbish')",
             "damaged",

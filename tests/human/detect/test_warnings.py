@@ -34,7 +34,7 @@ def test_a_good_clip_has_no_warning() -> None:
     ("people", "said"),
     [
         ([person(200)] * 12, "never turns around"),
-        (turning(12)[:9] + [None] * 2 + turning(12)[11:], "no person found in 2 of 12 images"),
+        (turning(12)[:9] + [None] * 2 + turning(12)[11:], "no person detected in 2 of 12 images"),
         (turning(12, 100), "100 px high"),
         (turning(12, 380), "feet are cut off or hidden in 12 of 12 images"),
     ],

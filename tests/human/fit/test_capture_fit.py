@@ -120,7 +120,7 @@ def test_a_body_file_finds_its_own_shape(
     fit = fit_capture(
         capture.replace(body=wrong), DataConfig(root=root), body, lambda *_: None, effort=effort
     )
-    assert fit.chosen.iou > fit.tried[0].iou + MIN_GAIN
+    assert fit.chosen.iou > fit.candidates[0].iou + MIN_GAIN
     assert body.shape_dirs is not None
     truth, found = (body.vertices + body.shape_dirs @ x for x in (betas, fit.betas))
     size = float(fit.chosen.learned["log_scale"].detach())
@@ -167,7 +167,7 @@ def test_without_given_poses_every_frame_has_its_own(
     fit = fit_capture(
         capture, DataConfig(root=capture.root), default_template(), lambda *_: None, effort=effort
     )
-    assert fit.tried[0].name == "poses found frame by frame"
+    assert fit.candidates[0].name == "frame-by-frame poses"
     assert fit.motion.frames == (0, 1, 2, 3)
     poses = fit.clip.poses
     assert len({tuple(pose.flatten().tolist()) for pose in poses}) == 4
@@ -190,7 +190,7 @@ def test_masks_of_the_background_are_refused(
             replace(view, image_path=photo, silhouette=silhouettes_of(mask.parent, [mask.name])[0])
         )
     capture = given.replace(splits={**given.splits, "train": tuple(views)})
-    with pytest.raises(DyngsError, match="are the masks inverted"):
+    with pytest.raises(DyngsError, match="seem to be inverted"):
         fit_capture(capture, DataConfig(root=capture.root), default_template(), print)
 
 
@@ -228,7 +228,7 @@ def as_given(capture: Capture) -> CaptureFit:
     fitting = BodyFit(
         motion.clip, body_discs(body, RESOLUTION), pose_prior(motion.clip, is_given=True)
     )
-    candidate = CandidateFit("the poses as given", fitting.start(), 0.9, (0.9, 0.9))
+    candidate = CandidateFit("given poses", fitting.initial_parameters(), 0.9, (0.9, 0.9))
     return CaptureFit(motion, candidate, (candidate,), 0)
 
 
@@ -251,7 +251,7 @@ def test_a_clip_that_stands_elsewhere_is_moved_to_its_silhouettes(capture: Captu
     assert found is not None
     assert found.iou_moved is not None
     assert found.iou_moved > found.iou + 0.02
-    assert "moved" in found.summary()
+    assert "translation fitted" in found.summary()
     assert wrong.body is not None
     views = wrong.splits["pose"]
     given = captured_motion(wrong.root, wrong.body["pose"], views, body.joints).clip

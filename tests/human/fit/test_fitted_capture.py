@@ -64,10 +64,10 @@ def test_a_capture_is_fitted_once(data: DataConfig) -> None:
     assert {split: frames.shape_space for split, frames in body.items()} == dict.fromkeys(
         ("train", "val", "test", "pose"), "anny"
     )
-    assert "fitted to the silhouettes first" in said[0]
+    assert "fitting" in said[0]
     again = ensure_fitted_body(data, log=said.append)
     assert again == fitted
-    assert "the fit of before" in said[-1]
+    assert "using the cached fit" in said[-1]
 
 
 @pytest.fixture
@@ -86,12 +86,12 @@ def test_a_fit_is_fitted_again_only_for_another_template(
     said = list[str]()
     assert ensure_fitted_body(given, smpl, log=pytest.fail) == given
     assert ensure_fitted_body(given, log=said.append) != given
-    assert "fitted to the silhouettes first" in said[0]
+    assert "fitting" in said[0]
     named = data.model_copy(update={"body": out})
     said = []
     assert ensure_fitted_body(named, smpl, log=pytest.fail) == named
     assert ensure_fitted_body(named, log=said.append) == named
-    assert "is a fit of another template: its poses are taken, not its shape" in said[0]
+    assert "was fitted with another template; using its poses, not its shape" in said[0]
 
 
 def test_the_fit_begins_with_a_given_shape_of_the_template(
@@ -106,7 +106,7 @@ def test_the_fit_begins_with_a_given_shape_of_the_template(
         data, tmp_path / "fitted", lambda *_: None, FitInputs(template=smpl)
     )
     with np.load(tmp_path / "fitted" / "body_train.npz") as file:
-        assert np.allclose(file["betas"], betas[:10] + found.found.betas.numpy(), atol=1e-6)
+        assert np.allclose(file["betas"], betas[:10] + found.fit.betas.numpy(), atol=1e-6)
     body = load_template(smpl)
     given = read_capture(data).body
     assert given is not None
@@ -114,7 +114,7 @@ def test_the_fit_begins_with_a_given_shape_of_the_template(
     clip = captured_motion(
         data.root, given["train"], read_capture(data).splits["train"], joints
     ).clip
-    assert torch.equal(found.found.motion.clip.trans, clip.trans), "of the shaped body"
+    assert torch.equal(found.fit.motion.clip.trans, clip.trans), "of the shaped body"
 
 
 def test_a_fitted_capture_shows_the_same_images(data: DataConfig, tmp_path: Path) -> None:
@@ -157,9 +157,7 @@ def test_a_plain_clip_gets_masks_and_loses_empty_frames(tmp_path: Path) -> None:
     assert capture.format == FORMAT
     assert capture.has_alpha
     assert [view.name for view in capture.splits["train"]] == [f"f{i:02d}" for i in range(2, 12)]
-    assert any(
-        "2 frames in which hardly anybody is seen are left out, first f00" in line for line in said
-    )
+    assert any("skipped 2 frames with (almost) empty masks, first f00" in line for line in said)
 
 
 def test_photos_and_found_masks_are_written_apart(tmp_path: Path) -> None:

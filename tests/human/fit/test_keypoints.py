@@ -79,7 +79,7 @@ def test_points_are_undistorted(tmp_path: Path) -> None:
     [
         (
             '{"people": [{"pose_keypoints_2d": [1, 2, 3]}]}',
-            "1 key points; known are",
+            "1 key points; supported are",
         ),
         ('{"people": [{"pose_keypoints_2d": [1, 2, null]}]}', "must hold finite numbers"),
         ('{"people": 3}', "a.*json: cannot be read"),

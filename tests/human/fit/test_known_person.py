@@ -59,9 +59,9 @@ def test_the_template_gets_the_shape(tmp_path: Path) -> None:
 
 
 def test_others_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match="no fitted person there"):
+    with pytest.raises(DyngsError, match="no fitted body"):
         read_known_shape(tmp_path, default_template())
-    with pytest.raises(DyngsError, match="of another template"):
+    with pytest.raises(DyngsError, match="another template than"):
         read_known_shape(fitted(tmp_path / "b", "smplx"), default_template())
 
 
@@ -146,9 +146,9 @@ def test_disturbed_poses_are_found_again(
     monkeypatch.setattr(pose_fit, "MAX_WINDOWS", 4)
     start = turned(avatar.clip)
     found = posed(avatar, views, start)
-    assert found.left_out == 2
+    assert found.num_held_out == 2
     assert found.after > found.before + 0.1
-    assert "taken; overlap on 2 views left out of the fit" in found.summary()
+    assert "used; silhouette IoU on 2 held-out views" in found.summary()
     after = found.clip.clip
     assert error(after, avatar.clip)[:2].max() < 0.025 < error(start, avatar.clip).min()
     assert torch.equal(after.poses[2], start.poses[2]), "no image shows that frame"

@@ -81,7 +81,7 @@ def test_a_wrong_mask_among_right_ones_moves_the_person_less(
     fitting = fitting_of(clip(), body)
     view = camera()
     with torch.no_grad():
-        alpha = fitting.silhouettes(fitting.start(), 0, view)
+        alpha = fitting.silhouettes(fitting.initial_parameters(), 0, view)
     views = Cameras(
         view.cam_from_world.expand(4, 4, 4), view.intrinsics.expand(4, 3, 3), SIZE, SIZE
     )
@@ -90,7 +90,7 @@ def test_a_wrong_mask_among_right_ones_moves_the_person_less(
     moved = []
     for scale in (OUTLIER_ERROR, 1e9 * OUTLIER_ERROR):
         monkeypatch.setattr(capture_fit, "OUTLIER_ERROR", scale)
-        found = fitting.run(fitting.start(), ("trans",), 80, lambda _: seen)
+        found = fitting.optimize(fitting.initial_parameters(), ("trans",), 80, lambda _: seen)
         moved.append(abs(float(found["trans"][0, 0].detach())))
     assert moved[0] < 0.5 * moved[1]
 
@@ -101,8 +101,8 @@ def test_key_points_lead_an_arm_where_silhouettes_do_not(body: BodyDiscs) -> Non
     straight = fitting_of(clip(), body)
     view = camera()
     with torch.no_grad():
-        truth = joints_at(straight.start(), straight)
-        alpha = straight.silhouettes(straight.start(), 0, view)
+        truth = joints_at(straight.initial_parameters(), straight)
+        alpha = straight.silhouettes(straight.initial_parameters(), 0, view)
     marked = torch.zeros(1, 55, 3)
     wrist = JOINT_NAMES.index("left_wrist")
     for name in ("left_shoulder", "left_elbow", "left_wrist"):
@@ -113,7 +113,9 @@ def test_key_points_lead_an_arm_where_silhouettes_do_not(body: BodyDiscs) -> Non
     errors = []
     for joints in (None, marked):
         seen = ObservedFrame(view, alpha, torch.ones_like(alpha), joints)
-        found = fitting.run(fitting.start(), ("poses",), 120, lambda _, seen=seen: seen)
+        found = fitting.optimize(
+            fitting.initial_parameters(), ("poses",), 120, lambda _, seen=seen: seen
+        )
         errors.append(float((joints_at(found, fitting) - truth)[wrist].detach().norm()))
     assert errors[1] < 0.2, "the prior of given poses still pulls"
     assert errors[1] < 0.5 * errors[0]
@@ -123,8 +125,8 @@ def test_only_what_a_stage_names_is_learned(body: BodyDiscs) -> None:
     alpha = torch.ones(1, SIZE, SIZE)
     seen = ObservedFrame(camera(), alpha, alpha)
     fitting = fitting_of(clip(), body)
-    start = fitting.start()
-    found = fitting.run(start, ("betas",), 2, lambda _: seen)
+    start = fitting.initial_parameters()
+    found = fitting.optimize(start, ("betas",), 2, lambda _: seen)
     assert not any(value.any() for value in start.values().values()), (
         "what was learned before stays as it is"
     )
@@ -134,19 +136,19 @@ def test_only_what_a_stage_names_is_learned(body: BodyDiscs) -> None:
 
 def test_joints_beyond_what_anybody_does_cost_much_more(body: BodyDiscs) -> None:
     limited = fitting_of(clip(), body, is_given=False)
-    expected = limited.expected
+    expected = limited.prior
     row = JOINT_NAMES.index("left_collar")
 
     def cost(deviations: float, fitting: BodyFit) -> float:
-        learned = fitting.start().values()
-        learned["poses"] = expected.centre.clone()
-        learned["poses"][0, row, 1] += deviations * expected.spread[row, 1]
+        learned = fitting.initial_parameters().values()
+        learned["poses"] = expected.mean.clone()
+        learned["poses"][0, row, 1] += deviations * expected.std[row, 1]
         return float(fitting.penalty(Parameters(learned, {}, 1.0)).detach())
 
     fraction = 1 / (21 * 3)
-    unlimited = replace(limited, expected=replace(expected, limit=math.inf))
+    unlimited = replace(limited, prior=replace(expected, limit=math.inf))
     assert cost(2.9, limited) == pytest.approx(cost(2.9, unlimited), abs=1e-8)
     assert cost(5.0, limited) - cost(5.0, unlimited) == pytest.approx(
         LIMIT_WEIGHT * 2.0**2 * fraction, rel=1e-4
     )
-    assert fitting_of(clip(), body).expected.limit == math.inf, "given poses may be as they like"
+    assert fitting_of(clip(), body).prior.limit == math.inf, "given poses may be as they like"

@@ -26,9 +26,9 @@ from dyngs.human.fit.capture_fit import (
     estimate_initial_poses,
     likely_headings,
     locate_person,
+    mean_up_direction,
     pose_prior,
     standing_clip,
-    up_of,
     usual_pose_statistics,
 )
 from dyngs.human.motion.motion import MotionClip
@@ -91,18 +91,20 @@ def standing(place: torch.Tensor, heading: float, scale: float = 1.0) -> MotionC
 def seen_by(body: BodyDiscs, clip: MotionClip, cameras: Cameras) -> ObservedFrame:
     fitting = BodyFit(clip, body, pose_prior(clip, is_given=True))
     with torch.no_grad():
-        alpha = fitting.silhouettes(fitting.start(), 0, cameras)
+        alpha = fitting.silhouettes(fitting.initial_parameters(), 0, cameras)
     return ObservedFrame(cameras, alpha, torch.ones_like(alpha))
 
 
 def test_place_and_size_of_who_stands_somewhere(body: BodyDiscs) -> None:
     place = torch.tensor([1.0, 2.0, -3.0])
     seen = seen_by(body, standing(place, 0.3, scale=1.2), ring(4, place))
-    assert up_of(seen) == pytest.approx([0, 1, 0], abs=1e-6)
-    found, height = locate_person(seen, up_of(seen))
+    assert mean_up_direction(seen) == pytest.approx([0, 1, 0], abs=1e-6)
+    found, height = locate_person(seen, mean_up_direction(seen))
     assert found == pytest.approx(place, abs=0.2)  # the middle of the box is not the pelvis
     assert height == pytest.approx(1.2 * STATURE, rel=0.1)
-    clip = standing_clip(torch.zeros(1, dtype=torch.float64), body, up_of(seen), lambda _: seen)
+    clip = standing_clip(
+        torch.zeros(1, dtype=torch.float64), body, mean_up_direction(seen), lambda _: seen
+    )
     assert float(clip.scale[0]) == pytest.approx(1.2, rel=0.1)
 
 

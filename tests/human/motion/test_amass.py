@@ -265,7 +265,7 @@ def test_files_of_romp_and_hmr(tmp_path: Path, as_matrices: bool) -> None:
     motion = read(tmp_path, parts | rest, 24, shapes=10)
     np.testing.assert_allclose(slow_vertices(body, motion), expected, atol=3e-6)
     assert len(motion.notes) == 1
-    assert "does not name its up axis; -y is used" in motion.notes[0]
+    assert "no up axis in the file; using -y" in motion.notes[0]
     thetas = read(tmp_path, {"smpl_thetas": rotvecs} | rest, 24, shapes=10)
     np.testing.assert_allclose(thetas.poses, motion.poses, atol=1e-6)
 
@@ -283,12 +283,12 @@ NAN = np.full((FRAMES, 3), np.nan)
         ({"poses": None, "root_orient": np.zeros((4, 3))}, "'pose_body' is missing"),
         (
             {"poses": np.zeros((4, 96))},
-            "'poses' must hold .* 22 or 24 or 52 or 55 joints .*, has 4 x 96; .*quaternions",
+            "'poses' must hold .* 22 or 24 or 52 or 55 joints .*, got shape 4 x 96; .*quaternions",
         ),
-        ({"poses": np.zeros((4, 24, 6))}, "'poses' must hold .*, has 4 x 24 x 6; .*6D"),
+        ({"poses": np.zeros((4, 24, 6))}, "'poses' must hold .*, got shape 4 x 24 x 6; .*6D"),
         (
             {"poses": np.full((4, 72), 30.0)},
-            "a joint is rotated by 52 rad, more than two turns; convert degrees",
+            "a joint rotates by 52 rad, more than two turns; convert degrees",
         ),
         ({"poses": np.full((4, 165), "a")}, "'poses' must hold numbers, not <U1"),
         (
@@ -302,13 +302,13 @@ NAN = np.full((FRAMES, 3), np.nan)
             "cannot be read",
         ),
         ({"mocap_framerate": None}, "has no frame rate; .*dyngs data motion FILE OUT.npz --fps 30"),
-        ({"mocap_framerate": 0.0}, "is not the rate of a motion"),
+        ({"mocap_framerate": 0.0}, "is outside 0.001 to 100,000"),
         ({"mocap_framerate": b"fast"}, "could not convert"),
         ({"scale": -1.0}, "'scale' must be positive"),
         ({"scale": np.ones(3)}, "cannot be read"),
         (
             {"poses": np.zeros((90_910, 72), np.uint8)},
-            "90910 frames of 55 joints are too many; at most 5,000,000 poses",
+            "90910 frames of 55 joints exceed the limit of 5,000,000 joint poses",
         ),
         (
             {"up_axis": np.frombuffer(b"\xff" * 4, "<U1")},
@@ -318,7 +318,7 @@ NAN = np.full((FRAMES, 3), np.nan)
         ({"up_axis": "x"}, "'up_axis' must be 'y' or 'z', not 'x'"),
         (
             {"poses": None, "root_orient": np.zeros((4, 3)), "pose_body": np.zeros((4, 60))},
-            "'pose_body' must hold .*, has 4 x 60",
+            "'pose_body' must hold .*, got shape 4 x 60",
         ),
     ],
 )

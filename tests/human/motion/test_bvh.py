@@ -102,20 +102,20 @@ def test_looks_do_not_matter(two: Path, change: tuple[str, str]) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "problem"),
     [
-        ("MOTION\n", "", "has no MOTION"),
-        ("  JOINT Spine\n  {", "  JOINT Spine\n", "cannot be read|cut off"),
-        ("}\nMOTION", "MOTION", "HIERARCHY is cut off"),
+        ("MOTION\n", "", "no MOTION section"),
+        ("  JOINT Spine\n  {", "  JOINT Spine\n", "cannot be read|truncated"),
+        ("}\nMOTION", "MOTION", "HIERARCHY is truncated"),
         ("OFFSET 1 2 3", "OFFSET 1 2", "cannot be read"),
         ("  OFFSET 1 2 3\n", "", "a joint without OFFSET"),
         ("OFFSET 1 2 3", "OFFSET 1 2 nan", "NaN or huge"),
         ("OFFSET 1 2 3", "OFFSET 1 2 x", "could not convert"),
         ("CHANNELS 4", "CHANNELS 6", "CHANNELS of 'Hip Bone' must be a count"),
         ("Xrotation Y", "Wrotation Y", "CHANNELS of 'Hip Bone' must be a count"),
-        ("Frames: 2", "Frames: 0", "says 0 frames"),
-        ("Frames: 2", "Frames: 3", "says 3 frames of 5 numbers but holds 10"),
-        ("Frames: 2", "Frames: 999999999", "too many"),
+        ("Frames: 2", "Frames: 0", "expected 0 frames"),
+        ("Frames: 2", "Frames: 3", "expected 3 frames of 5 numbers, got 10"),
+        ("Frames: 2", "Frames: 999999999", "exceed the limit"),
         ("Frame Time: 0.025", "Frame Time: 0", "division by zero"),
-        ("Frame Time: 0.025", "Frame Time: 1e8", "1e-08 frames per second"),
+        ("Frame Time: 0.025", "Frame Time: 1e8", "frame rate 1e-08 is outside"),
         ("5 0 0 0 90", "5 0 0 0", "cannot be read"),
         ("5 0 0 0 90", "5 0 0 0 inf", "NaN or huge"),
         ("5 0 0 0 90", "5 0 0 0 9,5", "could not convert"),
@@ -133,14 +133,14 @@ def test_broken_files_say_what_is_wrong(two: Path, old: str, new: str, problem: 
 HOSTILE = {
     "frames": (
         f"{TWO[: TWO.index('Frames')]}Frames: 300000\nFrame Time: 0.03\n" + "0 " * 1_500_000,
-        "too many",
+        "exceed the limit",
     ),
-    "blank lines": ("HIERARCHY" + "\n" * 1_000_000, "has no MOTION"),
+    "blank lines": ("HIERARCHY" + "\n" * 1_000_000, "no MOTION section"),
     "joints": (
         "HIERARCHY ROOT a\n{\n" + "JOINT a\n{\n" * 5000 + TWO[TWO.index("MOTION") :],
         "4,097 joints exceed",
     ),
-    "a long word": (TWO.replace("0.025", "9" * 1_000_000), "is not the rate of a motion"),
+    "a long word": (TWO.replace("0.025", "9" * 1_000_000), "is outside 0.001 to 100,000"),
 }
 
 

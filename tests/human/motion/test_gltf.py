@@ -191,7 +191,7 @@ def test_one_of_several_animations(tmp_path: Path) -> None:
         {"name": "Nod\n2", "samplers": [sampler], "channels": walk["channels"][:1]}
     )
     path = glb.write(tmp_path / "x.glb")
-    with pytest.raises(DyngsError, match=r"several animations; choose a clip of 'Walk', 'Nod.n2'"):
+    with pytest.raises(DyngsError, match=r"several animations; choose one of 'Walk', 'Nod.n2'"):
         read_gltf(path)
     with pytest.raises(DyngsError, match=r"no animation 'Run'; it has 'Walk', 'Nod.n2'"):
         read_gltf(path, clip="Run")
@@ -218,9 +218,9 @@ BREAKS: dict[str, tuple[Callable[[Glb], object], str]] = {
     "text": (lambda g: _node(g, scale="here"), "cannot be read"),
     "beyond bounds": (
         lambda g: [n.update(scale=[1e9] * 3, translation=[1e9] * 3) for n in g.json["nodes"]],
-        "bounds",
+        "out of range",
     ),
-    "NaN": (lambda g: _node(g, scale=[1, 1, float("nan")]), "bounds"),
+    "NaN": (lambda g: _node(g, scale=[1, 1, float("nan")]), "out of range"),
     "no child": (lambda g: (_node(g, children=[7]), g.json.pop("skins")), "cannot be read"),
     "cycle": (lambda g: g.json["nodes"][1].update(children=[0]), "its own ancestor"),
     "no joint": (lambda g: g.json["skins"][0].update(joints=[0, 1, 9]), "cannot be read"),
@@ -248,16 +248,19 @@ BREAKS: dict[str, tuple[Callable[[Glb], object], str]] = {
         "is compressed",
     ),
     "interpolation": (lambda g: _sampler(g, interpolation="NONE"), "cannot be read"),
-    "too few": (lambda g: _sampler(g, interpolation="CUBICSPLINE"), "keys of a .* are broken"),
+    "too few": (lambda g: _sampler(g, interpolation="CUBICSPLINE"), "invalid .* keys of node"),
     "no sampler": (
         lambda g: g.json["animations"][0]["channels"][0].update(sampler=9),
         "cannot be read",
     ),
     "falling": (
         lambda g: _sampler(g, input=g.add(np.array([1.0, 0.0]), "SCALAR")),
-        "keys of a .* are broken",
+        "invalid .* keys of node",
     ),
-    "endless": (lambda g: _sampler(g, input=g.add(np.array([0, 1e8]), "SCALAR")), "too many"),
+    "endless": (
+        lambda g: _sampler(g, input=g.add(np.array([0, 1e8]), "SCALAR")),
+        "exceed the limit",
+    ),
     "infinite": (
         lambda g: _sampler(g, input=g.add(np.array([0, np.inf]), "SCALAR")),
         "NaN or huge",
@@ -317,7 +320,7 @@ def _shared_sampler(glb: Glb) -> None:
 HOSTILE: dict[str, tuple[Callable[[Glb], object], str]] = {
     "keys 2.8 hours apart": (
         lambda g: _sampler(g, input=g.add(np.array([0, 10_080.0]), "SCALAR")),
-        "too many",
+        "exceed the limit",
     ),
     "joints": (lambda g: g.json["skins"][0].update(joints=[0] * 5000), "5,000 joints"),
     "one sampler": (_shared_sampler, "numbers exceed the limit"),

@@ -98,7 +98,7 @@ def test_motions_that_fill_the_memory_are_refused(monkeypatch: pytest.MonkeyPatc
         (float("inf"), 1),
     ):
         with pytest.raises(
-            DyngsError, match=r"x\.glb: .* too many; at most 5,000,000 .* or set DYNGS_LIMITS="
+            DyngsError, match=r"x\.glb: .* exceed the limit of 5,000,000 .* or set DYNGS_LIMITS="
         ):
             require_frame_count(Path("x.glb"), frames, joints)
     monkeypatch.setenv("DYNGS_LIMITS", "2")

@@ -240,7 +240,7 @@ def test_a_rest_pose_that_lies_in_a_line_is_refused() -> None:
     for i, parent in enumerate(own.parents):
         depth[i] = 0 if parent < 0 else depth[parent] + 0.2
     line = np.outer(depth, (1, 0, 0))
-    with pytest.raises(DyngsError, match=r"x\.bvh: its rest pose does not stand upright; .*T-pose"):
+    with pytest.raises(DyngsError, match=r"x\.bvh: the rest pose is not upright; .*T-pose"):
         retarget(at_rest(replace(own, rest=line)), tiny_body())
 
 
@@ -285,9 +285,9 @@ def test_the_suffix_says_what_a_file_is(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "options", "problem"),
     [
-        ("x.fbx", {}, r"x\.fbx: unknown kind of motion; give \.npz"),
-        ("x.bvh", {"up": "z"}, "the up axis can only be chosen for an .npz"),
-        ("x.npz", {"clip": "Walk"}, "holds one motion without a name"),
+        ("x.fbx", {}, r"x\.fbx: unknown motion format; supported are \.npz"),
+        ("x.bvh", {"up": "z"}, "the up axis can only be set for .npz files"),
+        ("x.npz", {"clip": "Walk"}, "hold one unnamed motion"),
         ("x.bvh", {}, "cannot be read"),
         ("x.glb", {}, "cannot be read"),
         ("x.npz", {}, "No such file"),

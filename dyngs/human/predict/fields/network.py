@@ -1,5 +1,7 @@
-"""What networks that predict fields of people have in common: they draw a person that they have
-seen in images."""
+"""Common parts of networks that predict radiance fields of people.
+
+Symbols: V images, M points, C features, D values per point.
+"""
 
 from __future__ import annotations
 
@@ -21,13 +23,13 @@ from dyngs.models.prediction import Encoder, initialize_weights, upsample
 from dyngs.ops.perceptron import Layer, perceptron
 
 FINE = 8
-"""Features of a pixel at half the resolution, next to those at a quarter."""
-_BEHIND = 1e-3  # Least depth of a point, m: what is nearer is not seen
-_CLEAR = 1e-2  # Alpha below which a pixel has no colour
+"""Features per pixel at half resolution, next to the coarse ones at a quarter."""
+_MIN_DEPTH = 1e-3  # points nearer to a camera are not visible, m
+_MIN_ALPHA = 1e-2  # limits the division that undoes premultiplied alpha
 
 
 class Perceptron(nn.Module):
-    """Layers of ``widths`` features with a ReLU between them, over rows."""
+    """MLP with layers of ``widths`` features and ReLU between them, applied to rows."""
 
     def __init__(self, *widths: int) -> None:
         super().__init__()
@@ -40,8 +42,8 @@ class Perceptron(nn.Module):
 
 
 class ImageEncoder(nn.Module):
-    """Features of images (V, 4, H, W): ``features`` (V, C, H/4, W/4) that know their surroundings,
-    and fine ones."""
+    """Encodes images (V, 4, H, W) to coarse (V, C, H/4, W/4) and fine (V, FINE, H/2, W/2)
+    features."""
 
     def __init__(self, features: int) -> None:
         super().__init__()
@@ -58,56 +60,55 @@ class ImageEncoder(nn.Module):
 
 @dataclass(frozen=True)
 class PointFeatures:
-    """What V images show at M points."""
+    """Pixel-aligned features of M points in V images."""
 
     features: Tensor  # (V, M, C + FINE)
     rgb: Tensor  # (V, M, 3) straight colours
-    alpha: Tensor  # (V, M), 0 beside the image
+    alpha: Tensor  # (V, M), 0 outside the image
 
 
 @dataclass(frozen=True)
 class SourceFeatures:
-    """Images with their features."""
+    """Input images with their feature maps."""
 
     sources: Sources
     coarse: Tensor  # (V, C, H/4, W/4)
     fine: Tensor  # (V, FINE, H/2, W/2)
 
-    def look(self, points: Tensor) -> PointFeatures:
-        """Return what the images show at points (M, 3); differentiable in the features."""
-        grid, _ = self.projected(points)
-        rgba = at_pixels(self.sources.rgba, grid)
-        features = torch.cat([at_pixels(self.coarse, grid), at_pixels(self.fine, grid)], -1)
+    def sample(self, points: Tensor) -> PointFeatures:
+        """Sample images and features at points (M, 3); differentiable in the features."""
+        grid, _ = self.project(points)
+        rgba = sample_maps(self.sources.rgba, grid)
+        features = torch.cat([sample_maps(self.coarse, grid), sample_maps(self.fine, grid)], -1)
         return PointFeatures(
-            features, rgba[..., :3] / rgba[..., 3:].clamp_min(_CLEAR), rgba[..., 3]
+            features, rgba[..., :3] / rgba[..., 3:].clamp_min(_MIN_ALPHA), rgba[..., 3]
         )
 
     def alpha(self, points: Tensor) -> Tensor:
-        """Return the opacities (V, M) of points (M, 3) in the images, 0 beside them."""
-        return at_pixels(self.sources.rgba[:, 3:], self.projected(points)[0])[..., 0]
+        """Return the alpha (V, M) of points (M, 3) in the images, 0 outside."""
+        return sample_maps(self.sources.rgba[:, 3:], self.project(points)[0])[..., 0]
 
-    def projected(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return where the images show points (M, 3), (V, M, 2) in [-1, 1] within the image, and their
-        depth (V, M)."""
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Project points (M, 3); return positions (V, M, 2) in [-1, 1] within the image, and
+        depths (V, M)."""
         sources = self.sources
         pose = sources.cam_from_world
         local = points @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
         depth = local[..., 2]
-        pixels = (local @ sources.intrinsics.mT)[..., :2] / depth.clamp_min(_BEHIND)[..., None]
+        pixels = (local @ sources.intrinsics.mT)[..., :2] / depth.clamp_min(_MIN_DEPTH)[..., None]
         height, width = sources.rgba.shape[2:]
         grid = 2 * pixels / pixels.new_tensor([width, height]) - 1
-        return torch.where(depth[..., None] > _BEHIND, grid, 2.0).clamp(-2, 2), depth
+        return torch.where(depth[..., None] > _MIN_DEPTH, grid, 2.0).clamp(-2, 2), depth
 
 
-def at_pixels(maps: Tensor, grid: Tensor, mode: str = "bilinear") -> Tensor:
-    """Return (V, M, D) values of maps (V, D, h, w) at places (V, M, 2) in [-1, 1], 0 beside
-    them."""
-    found = grid_sample(maps, grid[:, None], mode=mode, padding_mode="zeros", align_corners=False)
-    return found[:, :, 0].mT
+def sample_maps(maps: Tensor, grid: Tensor, mode: str = "bilinear") -> Tensor:
+    """Sample maps (V, D, h, w) at positions (V, M, 2) in [-1, 1]; return (V, M, D), 0 outside."""
+    sampled = grid_sample(maps, grid[:, None], mode=mode, padding_mode="zeros", align_corners=False)
+    return sampled[:, :, 0].mT
 
 
-def begin(network: nn.Module, generator: torch.Generator) -> None:
-    """Draw all weights from ``generator``, on the CPU; biases are 0."""
+def initialize_network(network: nn.Module, generator: torch.Generator) -> None:
+    """Initialise all weights from ``generator`` on the CPU; biases are 0."""
     initialize_weights(network, generator)
     for layer in network.modules():
         if isinstance(layer, nn.Linear):
@@ -117,97 +118,93 @@ def begin(network: nn.Module, generator: torch.Generator) -> None:
 
 
 def mean_and_variance(values: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Return (M, 2 D): mean and variance over views of values (V, M, D) with weights (V, M) that
+    """Return mean and variance (M, 2 D) over views of values (V, M, D), with weights (V, M) that
     sum to 1."""
     if weights is None:
         weights = values.new_full((len(values), 1), 1 / len(values))
-    share = weights[..., None]
-    mean = (share * values).sum(0)
-    return torch.cat([mean, (share * (values - mean).square()).sum(0)], -1)
+    fractions = weights[..., None]
+    mean = (fractions * values).sum(0)
+    return torch.cat([mean, (fractions * (values - mean).square()).sum(0)], -1)
 
 
-def between(directions: Tensor, points: Tensor, centers: Tensor) -> Tensor:
-    """Return (V, M, 4): how the directions (M, 3) of rays differ from those of the images to points
-    (M, 3).
+def relative_directions(directions: Tensor, points: Tensor, centers: Tensor) -> Tensor:
+    """Return ray directions relative to those of the source cameras (V, M, 4).
 
-    The difference of the two unit vectors, and their product. ``centers`` (V, 3) of the cameras.
+    The normalised difference and the dot product of ray directions (M, 3) and directions from
+    camera ``centers`` (V, 3) to ``points`` (M, 3).
     """
-    theirs = torch.nn.functional.normalize(points - centers[:, None], dim=-1)
-    apart = torch.nn.functional.normalize(directions - theirs, dim=-1)
-    return torch.cat([apart, (directions * theirs).sum(-1, keepdim=True)], -1)
+    source_directions = torch.nn.functional.normalize(points - centers[:, None], dim=-1)
+    difference = torch.nn.functional.normalize(directions - source_directions, dim=-1)
+    return torch.cat([difference, (directions * source_directions).sum(-1, keepdim=True)], -1)
 
 
-def blended(logits: Tensor, colours: Tensor) -> Tensor:
-    """Return (M, 3) colours of V images (V, M, 3), weighted by the softmax of ``logits`` (V, M)."""
+def blend_colours(logits: Tensor, colours: Tensor) -> Tensor:
+    """Blend colours (V, M, 3) of V images by the softmax of ``logits`` (V, M); return (M, 3)."""
     return (logits.softmax(0)[..., None] * colours).sum(0)
 
 
 def split_rays(rays: Tensor) -> Sequence[Tensor]:
-    """Return the indices of rays that are drawn together: all where something is learned."""
+    """Split ray indices into chunks that are rendered together; a single one in training."""
     return [rays] if torch.is_grad_enabled() else rays.split(CHUNK)
 
 
 def sample_offsets(*shape: int, generator: torch.Generator | None) -> Tensor:
-    """Return where samples lie in their part of a ray, in [0, 1): at random, or in the middle."""
+    """Return sample positions within ray segments, in [0, 1): random with a generator, else 0.5."""
     if generator is None:
         return torch.full(shape, 0.5, device="cpu")
     return torch.rand(shape, generator=generator, device="cpu")
 
 
-NEAR = 0.1  # Nearest distance that is drawn, m
-CHUNK = 1 << 12  # Rays drawn together where nothing is learned
+NEAR = 0.1  # near plane, m
+CHUNK = 1 << 12  # rays rendered together without gradients
 
 
 @dataclass(frozen=True)
 class FieldPicture:
-    """What a camera sees, (H, W, ...), before black."""
+    """Rendered image before the background is added."""
 
     colour: Tensor  # (H, W, 3)
     transmittance: Tensor  # (H, W)
-    depth: Tensor  # (H, W) sum of weight times the distance along the ray, m
-    samples: Sequence[Any] = ()  # what ``penalty`` needs
+    depth: Tensor  # (H, W) expected distance along the ray times alpha, m
+    samples: Sequence[Any] = ()  # intermediate results for ``penalty``
 
 
 @dataclass(frozen=True)
 class EncodedPerson:
-    """A person, as a network knows it."""
+    """Person encoded by a network: image features, body, and data of the network's own."""
 
-    seen: SourceFeatures
+    features: SourceFeatures
     body: PosedBody
-    own: Any  # what else the network has found out
+    extra: Any  # see ``FieldNetwork.prepare``
 
 
 class FieldNetwork(nn.Module, ABC):
-    """A network that predicts a field of a person from images and a body."""
+    """Network that predicts a radiance field of a person from images and a posed body."""
 
-    needs_depth: ClassVar[bool] = False  # whether it is trained on depth maps
+    needs_depth: ClassVar[bool] = False  # whether training needs depth maps
 
     def __init__(self, features: int) -> None:
         super().__init__()
         self.encoder = ImageEncoder(features)
 
-    def look(self, sources: Sources, body: PosedBody) -> EncodedPerson:
-        """Return what is known of a person; differentiable."""
-        seen = SourceFeatures(sources, *self.encoder(sources.rgba))
-        return EncodedPerson(seen, body, self.prepared(seen, body))
+    def encode(self, sources: Sources, body: PosedBody) -> EncodedPerson:
+        """Encode a person from images and a body; differentiable."""
+        features = SourceFeatures(sources, *self.encoder(sources.rgba))
+        return EncodedPerson(features, body, self.prepare(features, body))
 
     @abstractmethod
-    def prepared(self, seen: SourceFeatures, body: PosedBody) -> Any:
-        """Return ``EncodedPerson.own``."""
+    def prepare(self, features: SourceFeatures, body: PosedBody) -> Any:
+        """Return ``EncodedPerson.extra``."""
 
     @abstractmethod
-    def picture(
-        self, known: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
+    def render(
+        self, person: EncodedPerson, camera: Cameras, generator: torch.Generator | None = None
     ) -> FieldPicture:
-        """Return what one camera sees, in a world of metres; differentiable where gradients are
-        enabled.
+        """Render one camera, in metres; differentiable where gradients are enabled.
 
         ``generator`` places samples at random, as in training; None: evenly.
         """
 
     def penalty(self, picture: FieldPicture, image: Image, scale: float) -> Tensor:
-        """Return what the loss has besides the error of the picture of ``image``.
-
-        ``scale``: units of its depth map in a metre.
-        """
+        """Return loss terms besides the image error; ``scale`` is the depth map's units per metre."""
         return picture.colour.new_zeros(())

@@ -1,5 +1,5 @@
-"""Fields of people: training of the networks on captures of several, and the fields that they predict
-of one, to draw and to store; they are not trained."""
+"""Training of networks that predict radiance fields of people, prediction, and the predicted
+scene."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from dyngs.human.predict.fields.network import EncodedPerson, FieldNetwork
 from dyngs.human.predict.gps.rectification import (
     MIN_ANGLE,
     angle_between_views,
-    moments,
     spread,
     spread_around_person,
+    views_by_time,
 )
 from dyngs.human.predict.keys import FieldPredictorModel, PredictedFieldModel
 from dyngs.human.predict.people import (
@@ -40,10 +40,10 @@ from dyngs.human.predict.people import (
     Person,
     PosedBody,
     Sources,
+    cameras_in_metres,
     crop_source_images,
-    metric,
+    crop_window,
     read_captured_person,
-    window,
 )
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.kind import StartContext
@@ -77,7 +77,7 @@ NETWORKS: dict[str, Callable[[torch.Generator], FieldNetwork]] = {
 
 @dataclass(frozen=True)
 class PredictedField(Renderable):
-    """A field of a person in the images ``sources``; it looks the same at every time."""
+    """Radiance field of a person, predicted from ``sources``; static."""
 
     network: FieldNetwork
     sources: Sources
@@ -100,10 +100,10 @@ class PredictedField(Renderable):
         return self.sources.rgba.device
 
     @cached_property
-    def known(self) -> EncodedPerson:
-        """What the network knows of the person: the same for all pictures."""
+    def encoded(self) -> EncodedPerson:
+        """The encoded person, which all renders share."""
         with torch.no_grad():
-            return self.network.look(self.sources, self.body)
+            return self.network.encode(self.sources, self.body)
 
     def state(self) -> State:
         tensors = {f"network.{name}": x.detach() for name, x in self.network.state_dict().items()}
@@ -121,24 +121,23 @@ class PredictedField(Renderable):
         background: Tensor | None = None,
     ) -> Rendering:
         options = self.options if options is None else options
-        behind = self.background if background is None else background
-        cameras = fixed_cameras(cameras, behind, self.sources.rgba)
+        background_colour = self.background if background is None else background
+        cameras = fixed_cameras(cameras, background_colour, self.sources.rgba)
         with torch.no_grad():
-            views = [
-                self.network.picture(self.known, metric(cameras.select(i), self.scale))
+            renders = [
+                self.network.render(self.encoded, cameras_in_metres(cameras.select(i), self.scale))
                 for i in range(len(cameras))
             ]
-        rgb = torch.stack([view.colour for view in views])
-        through = torch.stack([view.transmittance for view in views])
-        depth = self.scale * torch.stack([view.depth for view in views])
-        return composite_background(rgb, through, depth, options, behind)
+        rgb = torch.stack([x.colour for x in renders])
+        transmittance = torch.stack([x.transmittance for x in renders])
+        depth = self.scale * torch.stack([x.depth for x in renders])
+        return composite_background(rgb, transmittance, depth, options, background_colour)
 
 
 def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedField:
-    """Return the field of a checkpoint. Raises KeyError or ValueError where tensors
-    do not fit."""
+    """Restore the field of a checkpoint. Raises KeyError or ValueError: tensors do not fit."""
     stored = checkpoint.part("field")
-    # earlier versions stored sizes of the network behind the scale
+    # Earlier versions also stored network sizes, after the scale.
     numbers = require_tensor("numbers", stored["numbers"][:1], (1,), torch.float64)
     require_positive("scale", numbers)
     network = NETWORKS[model.network](torch.Generator())
@@ -146,7 +145,7 @@ def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedFiel
     rgba = require_tensor("rgba", stored["sources.rgba"], (None, 4, None, None))
     count, _, height, width = rgba.shape
     if not rgba.numel() or height % MULTIPLE or width % MULTIPLE:
-        raise ValueError(f"'rgba' is no set of images: {tuple(rgba.shape)}")
+        raise ValueError(f"'rgba' has an invalid shape: {tuple(rgba.shape)}")
     poses = require_tensor("cam_from_world", stored["sources.cam_from_world"], (count, 4, 4))
     intrinsics = require_tensor("intrinsics", stored["sources.intrinsics"], (count, 3, 3))
     points = require_tensor("key_points", stored["body.key_points"], (None, 3))
@@ -162,7 +161,7 @@ def restore(model: PredictedFieldModel, checkpoint: Checkpoint) -> PredictedFiel
 
 
 class PredictedModel(Model[PredictedField]):
-    """What was predicted, in the place of a model in training; to train it is refused."""
+    """Stands in for a trainable model; predicted fields cannot be trained."""
 
     def __init__(self, run: StartContext) -> None:
         assert isinstance(run.config.model, PredictedFieldModel)
@@ -181,8 +180,8 @@ class PredictedModel(Model[PredictedField]):
 
     def _untrained(self) -> DyngsError:
         return DyngsError(
-            f"{self._run_dir}: a predicted field is not trained; predict it from other views, or train `ngp` or "
-            "`human` on the capture"
+            f"{self._run_dir}: predicted fields cannot be trained; predict from other views, or train "
+            "`ngp` or `human` on the capture"
         )
 
     def draw(
@@ -208,12 +207,12 @@ class PredictedModel(Model[PredictedField]):
 
 
 FEWEST_VIEWS = 2
-PATCH = 32  # side of the part of an image that a step is about, px
-_SOLID = 0.5  # Alpha of the pixels that parts of images are cut out around
+PATCH = 32  # side of the image patch of a training step, px
+_MIN_ALPHA = 0.5  # alpha of pixels that patches are centred on
 
 
 class FieldPredictor(Predictor[FieldNetwork]):
-    """Predicts a field."""
+    """Predicts the radiance field of one person."""
 
     def __init__(
         self, config: Config, network: FieldNetwork, person: Person, data: DataConfig
@@ -225,14 +224,14 @@ class FieldPredictor(Predictor[FieldNetwork]):
         return spread_around_person(self.views, count)
 
     def predict(self, views: Sequence[int]) -> PredictedField:
-        shown = [self.views[i] for i in views]
-        first = shown[0]
-        if len({(view.frame, view.time) for view in shown}) > 1 or all(
-            angle_between_views(first, view) < MIN_ANGLE for view in shown
+        chosen = [self.views[i] for i in views]
+        first = chosen[0]
+        if len({(view.frame, view.time) for view in chosen}) > 1 or all(
+            angle_between_views(first, view) < MIN_ANGLE for view in chosen
         ):
             raise DyngsError(
-                f"{self.name}: a field is predicted from two views of one moment at least, that look from different "
-                "directions; give --views A,B"
+                f"{self.name}: needs at least two views of one time step from different directions; "
+                "pass --views A,B"
             )
         body, scale = self._person.body_in(first)
         sources = crop_source_images([self._person.images[i] for i in views], scale)
@@ -249,7 +248,7 @@ class FieldPredictor(Predictor[FieldNetwork]):
 
 
 class FieldLearner(Learner[FieldNetwork]):
-    """A part of an image of a person, predicted from others of the same moment."""
+    """Trains on patches of images, predicted from other images of the same time step."""
 
     def __init__(
         self,
@@ -263,30 +262,34 @@ class FieldLearner(Learner[FieldNetwork]):
         self._opened = keep_captures_open(self._open, people)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
-        known = self._opened(person)
-        sources, target = self._views(known, generator)
-        body, scale = known.body_in(known.views[target])
+        captured = self._opened(person)
+        sources, target = self._views(captured, generator)
+        body, scale = captured.body_in(captured.views[target])
         body = move_fields_to(body, self.device)
-        given = move_fields_to(
-            crop_source_images([known.images[i] for i in sources], scale), self.device
+        sources_in = move_fields_to(
+            crop_source_images([captured.images[i] for i in sources], scale), self.device
         )
-        image = _part(known.images[target], generator).to(self.device)
+        image = _random_patch(captured.images[target], generator).to(self.device)
         background = self.sample_background(generator)
-        seen = self.network.look(given, body)
-        picture = self.network.picture(seen, metric(image.cameras, scale), generator)
-        rendered = picture.colour + picture.transmittance[..., None] * background
+        encoded = self.network.encode(sources_in, body)
+        field_picture = self.network.render(
+            encoded, cameras_in_metres(image.cameras, scale), generator
+        )
+        rendered = field_picture.colour + field_picture.transmittance[..., None] * background
         truth = image.composite(background)
-        loss = image_loss(rendered, 1 - picture.transmittance, image, truth, self.config.train)
-        loss = loss + self.network.penalty(picture, image, scale)
+        loss = image_loss(
+            rendered, 1 - field_picture.transmittance, image, truth, self.config.train
+        )
+        loss = loss + self.network.penalty(field_picture, image, scale)
         return Example(loss, image, rendered.detach(), truth)
 
     def _views(self, person: Person, generator: torch.Generator) -> tuple[list[int], int]:
-        """Return views of a moment to predict from, every other time evenly around the person, and
-        another view."""
-        rings = [ring for ring in moments(person.views).values() if len(ring) > FEWEST_VIEWS]
+        """Choose source views of one time step, every other time evenly around the person, and a
+        target view."""
+        rings = [ring for ring in views_by_time(person.views).values() if len(ring) > FEWEST_VIEWS]
         ring = rings[random_index(len(rings), generator)]
-        most = min(self.section.source_views, len(ring) - 1)
-        count = FEWEST_VIEWS + random_index(most - FEWEST_VIEWS + 1, generator)
+        max_count = min(self.section.source_views, len(ring) - 1)
+        count = FEWEST_VIEWS + random_index(max_count - FEWEST_VIEWS + 1, generator)
         if random_index(2, generator):
             sources = spread(ring, count, random_index(len(ring), generator))
         else:
@@ -296,30 +299,30 @@ class FieldLearner(Learner[FieldNetwork]):
         return sources, others[random_index(len(others), generator)]
 
     def _open(self, data: DataConfig) -> Person:
-        """Return a person. Raises DyngsError: nobody to learn from."""
-        found = read_captured_person(data, self._template)
-        if all(len(ring) <= FEWEST_VIEWS for ring in moments(found.views).values()):
-            raise DyngsError(f"{data.root}: shows no moment in three views or more to learn from")
-        if self.network.needs_depth and any(view.depth_path is None for view in found.views):
+        """Return a person to train on. Raises DyngsError: too few views, or no depth maps."""
+        captured = read_captured_person(data, self._template)
+        if all(len(ring) <= FEWEST_VIEWS for ring in views_by_time(captured.views).values()):
+            raise DyngsError(f"{data.root}: training needs a time step with three or more views")
+        if self.network.needs_depth and any(view.depth_path is None for view in captured.views):
             raise DyngsError(
-                f"{data.root}: has no depth maps, from which {self.config.model.kind} learns where the surface is; "
-                "`dyngs data synth people` writes them"
+                f"{data.root}: no depth maps, which {self.config.model.kind} is trained on; `dyngs data "
+                "synth people` writes them"
             )
-        return found
+        return captured
 
 
-def _part(image: Image, generator: torch.Generator) -> Image:
-    """Return the part of an image around a pixel of the person."""
+def _random_patch(image: Image, generator: torch.Generator) -> Image:
+    """Return a patch around a random pixel of the person."""
     assert image.alpha is not None
-    where = (image.alpha > _SOLID).nonzero()
+    where = (image.alpha > _MIN_ALPHA).nonzero()
     if not len(where):
-        return window(image, 0, 0, PATCH)
+        return crop_window(image, 0, 0, PATCH)
     row, column = where[random_index(len(where), generator)].tolist()
-    return window(image, column - PATCH // 2, row - PATCH // 2, PATCH)
+    return crop_window(image, column - PATCH // 2, row - PATCH // 2, PATCH)
 
 
 def learner(config: Config, generator: torch.Generator) -> FieldLearner:
-    """Return a network before the first step."""
+    """Return the network in training, before the first step."""
     device = select_device(config.run.device)
     network = NETWORKS[config.model.kind](generator).to(device)
     return FieldLearner(config, network, list_captures(config.data), device)
@@ -330,18 +333,18 @@ def predictor(
     checkpoint: Checkpoint,
     data: DataConfig,
     log: Callable[[str], None],
-    report: ProgressCallback,
+    on_progress: ProgressCallback,
 ) -> Predictor[Any]:
-    """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
-    body is fitted.
+    """Return the network of ``checkpoint`` with the person of ``data``; the body is fitted if
+    needed.
 
-    ``say`` and ``report`` receive the messages and the progress of that fit.
+    ``log`` and ``on_progress`` receive messages and progress of that fit.
     """
     model: Any = config.model
     network = NETWORKS[model.kind](torch.Generator())
     load_weights(network, checkpoint)
     if model.body is None:
-        data = ensure_fitted_body(data, only_if_needed=True, log=log, report=report)
+        data = ensure_fitted_body(data, only_if_needed=True, log=log, on_progress=on_progress)
     return FieldPredictor(config, network, read_captured_person(data, template_of(model)), data)
 
 

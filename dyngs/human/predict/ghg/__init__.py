@@ -1,2 +1,2 @@
-"""An avatar from a few images, by a network over the atlas trained on other people (GHG, Kwon et
+"""Avatars from a few images, by a network over the UV map trained on other people (GHG, Kwon et
 al. 2024)."""

@@ -1,7 +1,9 @@
-"""The network over the atlas, a UNet on maps of observations in a few images (GHG, Kwon et al. 2024),
-its training on captures of several people, and the avatar that it predicts of one.
+"""GHG (Kwon et al. 2024): a U-Net over the UV map that predicts an avatar from a few images.
 
-Local letters: D input channels, K scaffolds, S texels per side.
+Observations of the images are collected per texel (``TexelMaps``), the network predicts Gaussians
+on several scaffolds above the skin. Training uses captures of several people.
+
+Symbols: D input channels, K scaffolds, P texels, S texels per side, M vertices.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ from dyngs.gaussians.scene import GaussianTimeStep, render_options
 from dyngs.gaussians.schedule import RateSchedule
 from dyngs.human.avatar.observations import FACING_EXPONENT, project_points
 from dyngs.human.avatar.posing import BodyPose, Skeleton, pose_blend_shapes, texel_gaussians
-from dyngs.human.avatar.scene import HumanScene, first_scene
+from dyngs.human.avatar.scene import HumanScene, initial_human_scene
 from dyngs.human.avatar.training import HumanTraining
 from dyngs.human.body.atlas import Texels, atlas_texels
 from dyngs.human.body.body import BodyTemplate
@@ -65,25 +67,25 @@ from dyngs.ops.quaternions import quat_product, unit_quats
 
 @dataclass(frozen=True)
 class AtlasPerson:
-    """A person with images on the atlas, as input of a prediction."""
+    """Captured person with the texels of the UV map, as input of a prediction."""
 
     person: Person
-    normals: Tensor  # (M, 3) unit normals of the vertices of the body
-    texels: Texels  # P, of the person's shape
-    mirror: Tensor  # (P,) index of the texel at the mirror image of each
+    normals: Tensor  # (M, 3) unit vertex normals of the body
+    texels: Texels  # P, in the person's shape
+    mirror: Tensor  # (P,) index of the mirrored texel
     heights: tuple[float, ...]  # (K,) of the scaffolds, m, ascending
     scene: HumanScene  # K P grey discs, ordered by scaffold
 
     def observe(self, views: Sequence[int]) -> TexelMaps:
-        """Return the maps of the images of some views."""
-        shown = self.person.views
-        poses = [self.person.pose_in(shown[i]) for i in views]
+        """Return the texel maps of some views."""
+        all_views = self.person.views
+        poses = [self.person.pose_in(all_views[i]) for i in views]
         images = (self.person.images[i] for i in views)
         return observe_texels(self, zip(images, poses, strict=True))
 
 
 def atlas_person(person: Person, model: HumanPredictorModel) -> AtlasPerson:
-    """Return a person on the atlas of ``model``."""
+    """Sample the body of a person at the texels of ``model``."""
     body = person.body
     texels = atlas_texels(body, model.resolution, body.vertices)
     heights = tuple(sorted(set(model.scaffold_heights)))
@@ -96,34 +98,33 @@ def atlas_person(person: Person, model: HumanPredictorModel) -> AtlasPerson:
         texels=texels,
         mirror=mirror_texels(texels),
         heights=heights,
-        scene=first_scene(
+        scene=initial_human_scene(
             gaussians, anchors, skeleton, person.motion.clip, pose_blend_shapes(body)
         ),
     )
 
 
 def spread_views(person: AtlasPerson, count: int, first: int | None = None) -> list[int]:
-    """Return the indices, ascending, of ``count`` views, evenly around the body: from the one that
-    is most from the front on, or from the view ``first``.
+    """Return ``count`` view indices, ascending, spread evenly around the body.
 
-    They are of one frame, that of ``first`` or the first with the most views, if it has enough;
-    else of all frames. All views if there are fewer than ``count``.
+    The views start from the most frontal one, or from ``first``, and show one frame, if it has
+    enough views. All views if there are fewer than ``count``.
     """
-    shown = person.person.views
-    frames = [view.frame for view in shown]
+    views = person.person.views
+    frames = [view.frame for view in views]
     frame = max(dict.fromkeys(frames), key=frames.count) if first is None else frames[first]
-    allowed = [i for i, own in enumerate(frames) if own == frame]
-    if len(allowed) < count:
-        allowed = list(range(len(shown)))
-    azimuths = {i: _azimuth(person, shown[i]) for i in allowed}
-    ring = sorted(allowed, key=lambda i: azimuths[i])
+    candidates = [i for i, frame_of_view in enumerate(frames) if frame_of_view == frame]
+    if len(candidates) < count:
+        candidates = list(range(len(views)))
+    azimuths = {i: _azimuth(person, views[i]) for i in candidates}
+    ring = sorted(candidates, key=lambda i: azimuths[i])
     if first is None:
         first = min(ring, key=lambda i: abs(azimuths[i]))
     return sorted(set(spread(ring, count, ring.index(first))))
 
 
 def _azimuth(person: AtlasPerson, view: View) -> float:
-    """Return the angle of a camera around the vertical of the body at rest, rad; 0 is before it."""
+    """Return the azimuth of a camera around the body, rad; 0 is in front."""
     pose = person.person.pose_in(view)
     cam_from_world = torch.from_numpy(view.cam_from_world).to(pose.trans)
     center = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
@@ -132,25 +133,25 @@ def _azimuth(person: AtlasPerson, view: View) -> float:
     return float(torch.atan2(x, z))
 
 
-_NEAREST = 16  # seen texels that an unseen one takes its colour from
-_TURN = 0.1  # metres that count as much as a turn of the normal by 60 degrees
-_SOFT = 0.01  # distance added, m, so that the very nearest texel does not decide alone
+_NEAREST = 16  # observed texels that give an unseen one its colour
+_NORMAL_SCALE = 0.1  # distance, m, equivalent to a rotation of the normal by 60 degrees
+_SOFT_DISTANCE = 0.01  # added to distances, m, so that the nearest texel does not dominate
 _UNKNOWN = 0.5
 
 
 def mirror_texels(texels: Texels) -> Tensor:
-    """Return the index (P,) of the texel nearest to the mirror image of each one, at rest."""
+    """Return the index (P,) of the texel nearest to the mirror image of each, in the rest pose."""
     positions = _positions(texels)
-    found = KDTree(positions).query(positions * np.array([-1.0, 1, 1, -1, 1, 1]))[1]
-    return torch.from_numpy(np.asarray(found, dtype=np.int64)).to(texels.index.device)
+    nearest = KDTree(positions).query(positions * np.array([-1.0, 1, 1, -1, 1, 1]))[1]
+    return torch.from_numpy(np.asarray(nearest, dtype=np.int64)).to(texels.index.device)
 
 
 def fill_unseen_colours(texels: Texels, rgb: Tensor, seen: Tensor) -> Tensor:
-    """Return ``rgb`` (P, 3) where ``seen`` (P,) is positive, elsewhere the mean of seen texels that
-    are near at rest.
+    """Fill colours (P, 3) of texels with ``seen`` (P,) zero from observed texels nearby in the
+    rest pose.
 
-    Weights fall with the squared distance, and grow with the cosine at which a texel is seen;
-    normals count, too, so that the sole is not coloured like the instep. 0.5 if nothing is seen.
+    Weights fall with the squared distance, which includes the normal, and grow with the viewing
+    cosine. 0.5 if nothing is observed.
     """
     is_seen = (seen > 0).cpu().numpy()
     if not is_seen.any():
@@ -158,13 +159,13 @@ def fill_unseen_colours(texels: Texels, rgb: Tensor, seen: Tensor) -> Tensor:
     if is_seen.all():
         return rgb
     positions = _positions(texels)
-    known = np.flatnonzero(is_seen)
-    count = min(_NEAREST, len(known))
-    found = KDTree(positions[known]).query(positions[~is_seen], k=count)
-    # one neighbour comes without its axis
-    distance, near = (np.asarray(x).reshape(-1, count) for x in found)
-    rows = torch.from_numpy(known[near.astype(np.int64)]).to(rgb.device)
-    weight = seen[rows] / (torch.from_numpy(distance).to(rgb) + _SOFT).square()
+    observed = np.flatnonzero(is_seen)
+    count = min(_NEAREST, len(observed))
+    neighbours = KDTree(positions[observed]).query(positions[~is_seen], k=count)
+    # SciPy drops the axis of a single neighbour.
+    distance, near = (np.asarray(x).reshape(-1, count) for x in neighbours)
+    rows = torch.from_numpy(observed[near.astype(np.int64)]).to(rgb.device)
+    weight = seen[rows] / (torch.from_numpy(distance).to(rgb) + _SOFT_DISTANCE).square()
     filled = rgb.clone()
     filled[torch.from_numpy(~is_seen).to(rgb.device)] = (weight[..., None] * rgb[rows]).sum(
         1
@@ -173,43 +174,34 @@ def fill_unseen_colours(texels: Texels, rgb: Tensor, seen: Tensor) -> Tensor:
 
 
 def _positions(texels: Texels) -> np.ndarray:
-    """Return the positions and scaled normals (P, 6) of the texels at rest, m."""
-    return torch.cat([texels.points, _TURN * texels.normals], dim=1).double().cpu().numpy()
+    """Return positions and scaled normals (P, 6) of the texels in the rest pose, m."""
+    return torch.cat([texels.points, _NORMAL_SCALE * texels.normals], dim=1).double().cpu().numpy()
 
 
-_GRAZING = 0.15  # cosine below which a texel does not count as seen
-MAX_SILHOUETTE_DISTANCE = (
-    0.06  # largest distance from the edge of a silhouette that is told apart, m
-)
-# depth tolerance of the visibility test: in m, and in pixels along the surface
-_TOLERANCE, _TOLERANCE_PX = 0.01, 1.5
+_MIN_COSINE = 0.15  # viewing cosine below which a texel is not observed
+MAX_SILHOUETTE_DISTANCE = 0.06  # limit on distances to the silhouette edge, m
+_TOLERANCE, _TOLERANCE_PX = 0.01, 1.5  # of the depth test: m, and pixels along the surface
 
 
 @dataclass(frozen=True)
 class TexelMaps:
-    """Observations in a few images, per texel."""
+    """Observations of a few images, per texel and scaffold."""
 
-    # (K, P, 3) mean colours, weighted towards frontal views; 0 where no view sees a texel
-    rgb: Tensor
-    # (K, P) largest cosine between normal and view direction, 0 where a texel is hidden
-    seen: Tensor
-    # (K, P) fraction of the views in whose silhouette a texel lies, of those that have it in the
-    # frame
-    inside: Tensor
-    # (K, P) least signed distance over the views to the edge of the silhouette, positive inside, m
-    # in the body's size, at most ``HULL_LIMIT`` and at least its negative
+    rgb: Tensor  # (K, P, 3) mean colours, weighted towards frontal views; 0 where unobserved
+    seen: Tensor  # (K, P) largest viewing cosine, 0 where occluded
+    inside: Tensor  # (K, P) fraction of views (with the texel in frame) whose silhouette covers it
+    # (K, P) smallest signed distance to a silhouette edge over the views, m, positive inside,
+    # clamped to ``MAX_SILHOUETTE_DISTANCE``
     silhouette_distance: Tensor
-    # (P, 3) unit vectors from one scaffold to the next in the first view's pose, relative to the
-    # pelvis
+    # (P, 3) unit vectors between scaffolds in the first view's pose, relative to the pelvis
     offsets: Tensor
-    # (P, 3) colours of the lowest scaffold, where it is not seen those of seen texels nearby
-    nearby: Tensor
-    count: int  # of the views
+    nearby: Tensor  # (P, 3) colours of the lowest scaffold, filled where unobserved
+    count: int  # number of views
 
 
 @torch.no_grad()
 def observe_texels(person: AtlasPerson, images: Iterable[tuple[Image, BodyPose]]) -> TexelMaps:
-    """Return the maps of at least one image, each with its body pose."""
+    """Collect the texel maps of one or more images, each with its body pose."""
     shape = (len(person.heights), len(person.texels))
     device = person.texels.points.device
     faces = person.person.body.faces.cpu().numpy()
@@ -231,24 +223,26 @@ def observe_texels(person: AtlasPerson, images: Iterable[tuple[Image, BodyPose]]
         for level, vertices in enumerate(scaffolds):
             world = _at_texels(person, vertices)
             at, depth, in_frame = project_points(world, camera)
-            towards = torch.nn.functional.normalize(camera.centers[0] - world, dim=1)
-            cosine = (towards * normals).sum(1)
-            found = _sampled(torch.cat(planes, dim=-1), at) * in_frame[:, None]
-            covered = found[:, 3]
-            # On a slanted surface the pixels around a texel see nearer points, by their width over
-            # the cosine.
-            slack = scale * _TOLERANCE + _TOLERANCE_PX * depth / focal / cosine.clamp_min(_GRAZING)
-            is_clear = depth <= _nearest_depth(vertices, faces, camera, at) + slack
-            is_seen = is_clear & in_frame & (cosine > _GRAZING)
+            to_camera = torch.nn.functional.normalize(camera.centers[0] - world, dim=1)
+            cosine = (to_camera * normals).sum(1)
+            sampled = _sampled(torch.cat(planes, dim=-1), at) * in_frame[:, None]
+            covered = sampled[:, 3]
+            # On slanted surfaces, pixels around a texel show points that are nearer by the pixel
+            # width over the cosine.
+            tolerance = scale * _TOLERANCE + _TOLERANCE_PX * depth / focal / cosine.clamp_min(
+                _MIN_COSINE
+            )
+            is_clear = depth <= _nearest_depth(vertices, faces, camera, at) + tolerance
+            is_seen = is_clear & in_frame & (cosine > _MIN_COSINE)
             cosine = torch.where(is_seen, cosine, 0.0) * (covered > 0.5)
-            colour[level] += cosine[:, None] ** FACING_EXPONENT * found[:, :3]
+            colour[level] += cosine[:, None] ** FACING_EXPONENT * sampled[:, :3]
             weight[level] += cosine**FACING_EXPONENT * covered
             seen[level] = torch.maximum(seen[level], cosine)
             inside[level] += (covered > 0.5).float()
             in_frames[level] += in_frame.float()
-            # m of the body, within the frame
+            # in metres of the body, for texels within the frame
             to_edge = torch.where(
-                in_frame, found[:, 4] * depth / focal / scale, MAX_SILHOUETTE_DISTANCE
+                in_frame, sampled[:, 4] * depth / focal / scale, MAX_SILHOUETTE_DISTANCE
             )
             silhouette_distance[level] = torch.minimum(silhouette_distance[level], to_edge)
     rgb = (colour / weight.clamp_min(1e-6)[..., None]).clamp(0, 1)
@@ -266,22 +260,21 @@ def observe_texels(person: AtlasPerson, images: Iterable[tuple[Image, BodyPose]]
 
 
 def to_atlas(values: Tensor, texels: Texels) -> Tensor:
-    """Return a map (D, S, S) of ``values`` (P, D) at the texels, 0 elsewhere."""
+    """Scatter ``values`` (P, D) at the texels into a map (D, S, S), 0 elsewhere."""
     atlas = values.new_zeros(values.shape[1], texels.resolution**2)
     atlas[:, texels.index] = values.T
     return atlas.unflatten(1, (texels.resolution, texels.resolution))
 
 
 def from_atlas(atlas: Tensor, texels: Texels) -> Tensor:
-    """Return the values (P, D) of a map (D, S, S) at the texels; differentiable."""
+    """Gather values (P, D) at the texels from a map (D, S, S); differentiable."""
     return atlas.flatten(1).index_select(1, texels.index).T
 
 
 def _edge_distances(image: Image) -> Tensor:
-    """Return the signed distances (H, W) of pixels to the edge of the silhouette, positive inside,
-    in pixels.
+    """Return signed distances (H, W) to the silhouette edge, px, positive inside.
 
-    Next to the edge they are the alpha less a half, which is exact for an upright edge.
+    At the edge they are alpha - 0.5, which is exact for a vertical edge.
     """
     if image.alpha is None:
         return torch.full_like(
@@ -297,8 +290,8 @@ def _edge_distances(image: Image) -> Tensor:
 
 
 def _nearest_depth(vertices: np.ndarray, faces: np.ndarray, camera: Cameras, at: Tensor) -> Tensor:
-    """Return the least depth (P,) of a mesh in the four pixels around ``at`` (P, 2); infinite off
-    the mesh."""
+    """Return the smallest depth (P,) of a mesh in the four pixels around ``at`` (P, 2); infinite
+    outside."""
     depth = np.pad(depths(vertices, faces, camera).numpy(), 1, constant_values=np.inf)
     least = np.minimum.reduce([depth[:-1, :-1], depth[1:, :-1], depth[:-1, 1:], depth[1:, 1:]])
     column, row = (
@@ -309,35 +302,34 @@ def _nearest_depth(vertices: np.ndarray, faces: np.ndarray, camera: Cameras, at:
 
 
 def _sampled(image: Tensor, at: Tensor) -> Tensor:
-    """Return values (P, D) of an image (H, W, D) at columns and rows ``at`` (P, 2), bilinear
-    between pixel centres."""
+    """Sample an image (H, W, D) at columns and rows ``at`` (P, 2), bilinear; return (P, D)."""
     size = at.new_tensor([image.shape[1], image.shape[0]])
     grid = (2 * at / size - 1).nan_to_num().clamp(-2, 2)[None, None]
     planes = image.permute(2, 0, 1)[None]
-    found = torch.nn.functional.grid_sample(
+    sampled = torch.nn.functional.grid_sample(
         planes, grid, padding_mode="border", align_corners=False
     )
-    return found[0, :, 0].T
+    return sampled[0, :, 0].T
 
 
 def _at_texels(person: AtlasPerson, values: np.ndarray) -> Tensor:
-    """Return values (P, 3) at the texels, interpolated between those (M, 3) at the vertices."""
+    """Interpolate vertex values (M, 3) at the texels; return (P, 3)."""
     corners = person.person.body.faces[person.texels.faces]
-    around = torch.from_numpy(values).float().to(corners.device)[corners]
-    return (person.texels.barycentric[..., None] * around).sum(1)
+    corner_values = torch.from_numpy(values).float().to(corners.device)[corners]
+    return (person.texels.barycentric[..., None] * corner_values).sum(1)
 
 
 def _posed_vertices(person: AtlasPerson, pose: BodyPose, height: float) -> np.ndarray:
-    """Return the vertices (M, 3) of a scaffold in the world."""
+    """Return the vertices (M, 3) of a scaffold in world coordinates."""
     vertices = person.person.body.vertices + height * person.normals
     posed, _ = person.person.posed(vertices, pose)
     return (pose.scale * posed + pose.trans).cpu().numpy()
 
 
 WIDTHS = (24, 32, 48, 64)
-"""Channels of the U-Net at 1/2, 1/4, ... of the resolution of the atlas."""
+"""Channels of the U-Net at 1/2, 1/4, ... of the resolution of the UV map."""
 SILHOUETTE_FRACTION = 0.9
-"""Gaussians above the lowest scaffold lie inside at least this fraction of the silhouettes."""
+"""Fraction of silhouettes that must contain a Gaussian above the lowest scaffold."""
 HEADS = {
     "rotation": 4,
     "scale": 3,
@@ -347,23 +339,19 @@ HEADS = {
     "image_weight": 1,
     "guess": 3,
 }
-"""Outputs per texel of a scaffold and their number of channels; see
-``dyngs.human.predict.ghg.network``."""
+"""Output channels per texel of a scaffold, see ``predict_avatar``."""
 
 
 class AtlasNetwork(Encoder):
-    """UNet from maps (D, S, S) to raw predictions (K, 16, S, S) in the order of ``HEADS``, which
-    are 0 before training.
+    """U-Net from maps (D, S, S) to raw predictions (K, 16, S, S) in the order of ``HEADS``.
 
-    Each width halves the resolution; the way up concatenates the features of the way down, and at
-    full resolution the input itself.
+    Predictions are 0 before training. Each width halves the resolution; the last layer also gets
+    the input.
     """
 
     def __init__(self, channels: int, scaffolds: int, generator: torch.Generator) -> None:
-        """D ``channels`` come in, K ``scaffolds`` go out.
-
-        The network is made on the CPU, with weights of ``generator``.
-        """
+        """Create the network on the CPU for D ``channels`` and K ``scaffolds``, with weights from
+        ``generator``."""
         with torch.device("cpu"):
             super().__init__(channels, WIDTHS)
             self.scaffolds = scaffolds
@@ -389,29 +377,28 @@ class AtlasNetwork(Encoder):
         return self.heads(features)[0].unflatten(0, (self.scaffolds, -1))
 
 
-_MAX_LOG_SCALE = 1.5  # limit on the difference of log scales from those of the initial Gaussian
-# logit of the weight of the images' colours in an untrained network, against predicted colours
-_IMAGE_LOGIT = 4.0
-# logits of the fractions of the three guessed_colours in an untrained network
-_GUESS_LOGITS = (0.0, 2.0, 0.0)
-# limit on the offset along the normal with a single scaffold, m; with several: half their distance
-_MAX_HEIGHT = 0.01
+_MAX_LOG_SCALE = 1.5  # limit on the change of log scales from the initial Gaussian
+_IMAGE_LOGIT = 4.0  # initial logit of image colours against predicted colours
+_GUESS_LOGITS = (0.0, 2.0, 0.0)  # initial logits of the three colours of ``guess_unseen_colours``
+_MAX_HEIGHT = 0.01  # limit on offsets along the normal with a single scaffold, m
 
 
 def num_input_channels(scaffolds: int) -> int:
-    """Return the number of input channels D of a network for so many scaffolds."""
+    """Return the number of input channels D for ``scaffolds`` scaffolds."""
     return 6 * scaffolds + 18
 
 
 def network_inputs(person: AtlasPerson, maps: TexelMaps, guesses: Tensor) -> Tensor:
-    """Return the input (D, S, S): per scaffold colour, cosine, silhouettes; then offsets, points,
-    and ``guesses`` (3, P, 3) of colours."""
+    """Return the network input (D, S, S).
+
+    Per scaffold: colour, cosine, silhouettes; then offsets, positions, and ``guesses`` (3, P, 3).
+    """
     measured = torch.stack(
         [maps.seen, maps.inside, maps.silhouette_distance / MAX_SILHOUETTE_DISTANCE], dim=-1
     )
     scaffolds = torch.cat([maps.rgb, measured], dim=-1)
     ones = torch.ones(len(person.texels), 1, device=scaffolds.device)
-    rest = [
+    shared = [
         maps.offsets,
         person.texels.points,
         *guesses,
@@ -419,28 +406,30 @@ def network_inputs(person: AtlasPerson, maps: TexelMaps, guesses: Tensor) -> Ten
         ones,
         ones / maps.count,
     ]
-    return to_atlas(torch.cat([*scaffolds, *rest], dim=1), person.texels)
+    return to_atlas(torch.cat([*scaffolds, *shared], dim=1), person.texels)
 
 
 def guess_unseen_colours(person: AtlasPerson, maps: TexelMaps, mean: Tensor) -> Tensor:
-    """Return three guesses (3, P, 3) of the colours of texels that no image shows: the mean colours
-    (3, S, S) of the training people, those of seen texels nearby, and those of the other side where
-    it is seen, else as nearby."""
-    is_seen = maps.seen[0][person.mirror, None] > 0
-    mirrored = torch.where(is_seen, maps.rgb[0][person.mirror], maps.nearby)
+    """Return three candidate colours (3, P, 3) for unobserved texels.
+
+    The mean colour of the training people (``mean`` (3, S, S)), that of observed texels nearby,
+    and that of the mirrored texel where it is observed (else nearby).
+    """
+    is_mirror_seen = maps.seen[0][person.mirror, None] > 0
+    mirrored = torch.where(is_mirror_seen, maps.rgb[0][person.mirror], maps.nearby)
     return torch.stack([from_atlas(mean, person.texels), maps.nearby, mirrored])
 
 
 def predict_avatar(
     person: AtlasPerson, maps: TexelMaps, mean: Tensor, network: AtlasNetwork
 ) -> HumanScene:
-    """Return the avatar that ``network`` predicts, differentiable in its weights.
+    """Predict an avatar; differentiable in the weights of ``network``.
 
-    All texels of the lowest scaffold get a Gaussian; those above it where a view sees them and they
-    lie inside the fraction ``SILHOUETTE_FRACTION`` of the silhouettes. Rotations are relative to
-    the tangent frame, scales to the initial Gaussian, means move along the normal. Colours are a
-    weighted mean of those of the images and of the network, which mixes and corrects the
-    ``guessed_colours``. ``mean`` is as there.
+    The lowest scaffold gets a Gaussian per texel, upper ones only where a view observes the texel
+    and ``SILHOUETTE_FRACTION`` of the silhouettes contain it. Rotations are relative to the
+    tangent frame, scales to the initial Gaussian, means move along the normal. Colours blend those
+    of the images with a mixture of ``guess_unseen_colours`` plus a correction; ``mean`` (3, S, S)
+    is as there.
     """
     kept = (maps.inside >= SILHOUETTE_FRACTION) & (maps.seen > 0)
     kept[0] = True
@@ -469,20 +458,18 @@ def predict_avatar(
     return replace(scene, gaussians=gaussians)
 
 
-VIEW_CHOICES_PER_PERSON = 6  # choices of source views per person in training; their maps are kept
-TARGET_VIEWS = 2  # images of one time step that a prediction is compared with in each step
-SQUARED_WEIGHT = 1.0  # Weight of the mean squared error in the loss, which counts edges more
-MEAN_COLOUR_VIEWS = 8  # Images of each person that the mean colours are taken from
-ADAPTATION_STEPS = 10  # Steps of training on the images of one person before a prediction
+VIEW_CHOICES_PER_PERSON = 6  # source view sets per person in training; their maps are cached
+TARGET_VIEWS = 2  # target images per training step, of one time step
+SQUARED_WEIGHT = 1.0  # of the mean squared error in the loss, which emphasises edges
+MEAN_COLOUR_VIEWS = 8  # images per person for the mean colours
+ADAPTATION_STEPS = 10  # training steps on the input images before a prediction
 ADAPTATION_RATE = 1e-4
-"""Highest learning rate of Adam per image of one person, which falls linearly: a single one says
-little about the other sides."""
-# Opacity below which a predicted Gaussian is left out, as the preset for one person has it
-_FAINT = 0.02
+"""Initial learning rate of Adam per input image; it falls linearly. More images allow a higher rate."""
+_MIN_OPACITY = 0.02  # of predicted Gaussians, as in the preset ``human``
 
 
 class PersonPredictor(Predictor[AtlasNetwork]):
-    """Predicts an avatar; ``adapt`` trains the network on images of the person before."""
+    """Predicts an avatar of one person, optionally after training on the input images (``adapt``)."""
 
     def __init__(
         self,
@@ -492,7 +479,7 @@ class PersonPredictor(Predictor[AtlasNetwork]):
         person: AtlasPerson,
         data: DataConfig,
     ) -> None:
-        """``mean`` (3, S, S) are colours of the people that the network was trained on."""
+        """``mean`` (3, S, S) are the mean colours of the training people."""
         super().__init__(config, network, person.person.views, data)
         self.mean = mean
         self._person = person
@@ -503,16 +490,15 @@ class PersonPredictor(Predictor[AtlasNetwork]):
     @torch.no_grad()
     def predict(self, views: Sequence[int]) -> HumanScene:
         scene = self._scene(self._person.observe(views))
-        return scene.select(scene.gaussians.opacities >= _FAINT)
+        return scene.select(scene.gaussians.opacities >= _MIN_OPACITY)
 
     def adapt(
         self,
         views: Sequence[int],
         steps: int | None = None,
-        report: ProgressCallback = ignore_progress,
+        on_progress: ProgressCallback = ignore_progress,
     ) -> int:
-        """Train the network until its prediction shows the images better that it is predicted
-        from."""
+        """Train the network on the input images; return the number of steps."""
         steps = ADAPTATION_STEPS if steps is None else steps
         images = [self._person.person.images[i] for i in views]
         maps = self._person.observe(views)
@@ -524,15 +510,17 @@ class PersonPredictor(Predictor[AtlasNetwork]):
             loss = _images_error(scene, time_steps, images, self.background, self.config)[0]
             if not optimizer_step(optimizer, self.network, loss, rate * (1.0 - step / steps)):
                 break
-            report("training on the images", step + 1, steps)
+            on_progress("adapting to the images", step + 1, steps)
         return steps
 
     def run_config(self, views: Sequence[int]) -> Config:
         """Return the preset for one person, with the template of the network."""
         preset = load_config(packaged_preset("human"), ["data.root=."])
-        same = ("body", "uv", "resolution", "near", "eps2d", "rasterize_mode", "sh_degree")
-        given = human_options(self.section)
-        human = preset.model.model_copy(update={name: getattr(given, name) for name in same})
+        shared_keys = ("body", "uv", "resolution", "near", "eps2d", "rasterize_mode", "sh_degree")
+        options = human_options(self.section)
+        human = preset.model.model_copy(
+            update={name: getattr(options, name) for name in shared_keys}
+        )
         return preset.model_copy(update={"data": self.data, "model": human})
 
     def begin(self, model: Any, scene: Renderable, config: Config) -> None:
@@ -547,7 +535,7 @@ class PersonPredictor(Predictor[AtlasNetwork]):
 
 
 class AtlasLearner(Learner[AtlasNetwork]):
-    """Predicted from one choice of images, compared with others of one time step."""
+    """Trains on predictions from one set of views, compared with other views of one time step."""
 
     def __init__(
         self,
@@ -558,7 +546,7 @@ class AtlasLearner(Learner[AtlasNetwork]):
         mean: Tensor,
         device: torch.device = CPU,
     ) -> None:
-        """``choices`` are views to predict each person from; their maps are kept."""
+        """``source_choices`` are the source view sets of each person; their maps are cached."""
         super().__init__(config, network, [x.person.name for x in people], device)
         self.people = people
         self.source_choices = source_choices
@@ -571,18 +559,18 @@ class AtlasLearner(Learner[AtlasNetwork]):
         return move_fields_to(maps, self.device)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
-        filmed = self.people[person].person
+        person_data = self.people[person].person
         choice = random_index(len(self.source_choices[person]), generator)
-        targets = self._targets(filmed, self.source_choices[person][choice], generator)
+        targets = self._targets(person_data, self.source_choices[person][choice], generator)
         background = self.sample_background(generator)
         maps = self._maps(person, choice)
         scene = predict_avatar(self._moved[person], maps, self.mean, self.network)
-        row = filmed.motion.rows[-1 if targets[0].frame is None else targets[0].frame]
+        row = person_data.motion.rows[-1 if targets[0].frame is None else targets[0].frame]
         gaussians, posing = scene.gaussians_in_frame(row, scene.template_weights())
         frame = RestPose(scene.gaussians.means, posing.rotations[0])
-        moment = GaussianTimeStep(gaussians, targets[0].time, frame)
+        time_step = GaussianTimeStep(gaussians, targets[0].time, frame)
         loss, rendered, truth = _images_error(
-            scene, [moment] * len(targets), targets, background, self.config
+            scene, [time_step] * len(targets), targets, background, self.config
         )
         return Example(loss, targets[-1], rendered.detach(), truth, len(scene))
 
@@ -596,18 +584,17 @@ class AtlasLearner(Learner[AtlasNetwork]):
     def _targets(
         self, person: Person, inputs: list[int], generator: torch.Generator
     ) -> list[Image]:
-        """Return images of one time step that were not predicted from, where there are any."""
+        """Return images of one time step that are not among the sources, if possible."""
         views = person.views
         others = [i for i in range(len(views)) if i not in inputs] or inputs
         frame = views[others[random_index(len(others), generator)]].frame
-        shown = [i for i in others if views[i].frame == frame]
-        order = torch.randperm(len(shown), generator=generator, device="cpu").tolist()
-        return [person.images[shown[i]].to(self.device) for i in order[:TARGET_VIEWS]]
+        same_frame = [i for i in others if views[i].frame == frame]
+        order = torch.randperm(len(same_frame), generator=generator, device="cpu").tolist()
+        return [person.images[same_frame[i]].to(self.device) for i in order[:TARGET_VIEWS]]
 
 
 def learner(config: Config, generator: torch.Generator) -> AtlasLearner:
-    """Return the network of ``model.kind: human_predictor`` before the first step: captures read,
-    nothing trained."""
+    """Read the captures and return the network in training, before the first step."""
     device = select_device(config.run.device)
     model: Any = config.model
     body = load_template(human_options(model))
@@ -623,18 +610,18 @@ def predictor(
     checkpoint: Checkpoint,
     data: DataConfig,
     log: Callable[[str], None],
-    report: ProgressCallback,
+    on_progress: ProgressCallback,
 ) -> Predictor[Any]:
-    """Return the network of ``checkpoint`` with the person of ``data``; without body parameters a
-    body is fitted.
+    """Return the network of ``checkpoint`` with the person of ``data``; the body is fitted if
+    needed.
 
-    ``say`` and ``report`` receive the messages and the progress of that fit.
+    ``log`` and ``on_progress`` receive messages and progress of that fit.
     """
     model: Any = config.model
     network = new_network(model, torch.Generator())
     mean = load_network(network, checkpoint, model.resolution)
     data = ensure_fitted_body(
-        data, human_options(model), only_if_needed=True, log=log, report=report
+        data, human_options(model), only_if_needed=True, log=log, on_progress=on_progress
     )
     person = read_atlas_person(data, model, load_template(human_options(model)))
     return PersonPredictor(config, network, mean, person, data)
@@ -650,8 +637,7 @@ def new_network(model: HumanPredictorModel, generator: torch.Generator) -> Atlas
 
 
 def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int) -> Tensor:
-    """Return the mean colours (3, S, S) of a checkpoint, whose weights ``network`` takes; S is the
-    ``resolution``."""
+    """Load the weights of a checkpoint into ``network``; return its mean colours (3, S, S)."""
     load_weights(network, checkpoint)
     with wrap_read_errors(checkpoint.name, CONFIG_ADVICE):
         mean = checkpoint.tensors["model.mean"]
@@ -659,29 +645,28 @@ def load_network(network: AtlasNetwork, checkpoint: Checkpoint, resolution: int)
 
 
 def human_options(model: HumanPredictorModel) -> HumanModel:
-    """Return the section of one person with the same template and texels; nothing of it is
-    learned."""
-    shared = ("body", "uv", "resolution")
-    drawn = ("near", "eps2d", "rasterize_mode", "alpha_min", "transmittance_min")
+    """Return the avatar section with the same template and texels, and no learned corrections."""
+    template_keys = ("body", "uv", "resolution")
+    render_keys = ("near", "eps2d", "rasterize_mode", "alpha_min", "transmittance_min")
     return HumanModel.model_validate(
-        {"sh_degree": 0, "refine": False} | {name: getattr(model, name) for name in shared + drawn}
+        {"sh_degree": 0, "refine": False}
+        | {name: getattr(model, name) for name in template_keys + render_keys}
     )
 
 
 def read_atlas_person(
     data: DataConfig, model: HumanPredictorModel, body: BodyTemplate
 ) -> AtlasPerson:
-    """Return the person of one capture."""
+    """Read the person of one capture."""
     capture = read_capture(data)
     images = ImageLoader(capture.splits["train"], data)
     return atlas_person(captured_person(capture, body, images), model)
 
 
 def mean_colours(people: list[AtlasPerson], resolution: int) -> Tensor:
-    """Return (3, S, S) mean over people of the colours that their images show of the lowest
-    scaffold.
+    """Return the mean colours (3, S, S) of the lowest scaffold over people.
 
-    Where nobody is seen: the mean of all that is.
+    Texels that nobody shows get the overall mean.
     """
     total = torch.zeros(3, resolution, resolution, device="cpu")
     count = torch.zeros(1, resolution, resolution, device="cpu")
@@ -695,10 +680,9 @@ def mean_colours(people: list[AtlasPerson], resolution: int) -> Tensor:
 
 
 def _choices(person: AtlasPerson, source_views: int, generator: torch.Generator) -> list[list[int]]:
-    """Return views to predict from, of a random time step each: one at random, the others chosen to
-    see much.
+    """Return source view sets, each of a random time step, spread around a random view.
 
-    Every other choice has fewer than ``source_views``, in turn each number from 1.
+    Every other set has fewer than ``source_views`` views, in turn each number from 1.
     """
     firsts = torch.randint(
         len(person.person.views), (VIEW_CHOICES_PER_PERSON,), generator=generator, device="cpu"
@@ -713,21 +697,21 @@ def _choices(person: AtlasPerson, source_views: int, generator: torch.Generator)
 
 def _images_error(
     scene: HumanScene,
-    moments: Sequence[GaussianTimeStep],
+    time_steps: Sequence[GaussianTimeStep],
     images: Sequence[Image],
     background: Tensor,
     config: Config,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the mean loss of renders of ``moments`` against images; the last render and its truth
-    (H, W, 3)."""
+    """Return the mean loss of renders of ``time_steps`` against images, and the last render and
+    image."""
     options = replace(render_options(config.model), nonfinite="trust")
     total = torch.zeros((), device=background.device)
-    for image, moment in zip(images, moments, strict=True):
-        drawn = scene.render(image.cameras, moment, options=options, background=background)
-        rendered = drawn.rgb[0]
+    for image, time_step in zip(images, time_steps, strict=True):
+        render = scene.render(image.cameras, time_step, options=options, background=background)
+        rendered = render.rgb[0]
         truth = image.composite(background)
         difference = rendered - truth
-        known = difference if image.mask is None else difference * image.mask[..., None]
-        loss = image_loss(rendered, drawn.alpha[0], image, truth, config.train)
-        total = total + (loss + SQUARED_WEIGHT * known.square().mean()) / len(images)
+        masked = difference if image.mask is None else difference * image.mask[..., None]
+        loss = image_loss(rendered, render.alpha[0], image, truth, config.train)
+        total = total + (loss + SQUARED_WEIGHT * masked.square().mean()) / len(images)
     return total, rendered, truth

@@ -1,6 +1,5 @@
-"""A person from two neighbouring views, by stereo that is learned (GPS-Gaussian, Zheng et al.
-2024).
+"""Gaussians from two neighbouring views by learned stereo (GPS-Gaussian, Zheng et al. 2024).
 
-``pairs`` chooses views, ``rectification`` turns two of them so that rows correspond, ``stereo``
-finds the depth of every pixel, ``surface`` makes a Gaussian of it; ``learner`` trains and predicts.
+``rectification`` chooses and rectifies pairs of views; ``stereo`` estimates the disparity of every
+pixel, turns pixels into Gaussians, and trains and predicts.
 """

@@ -1,14 +1,12 @@
-"""Two views of a person turned so that rows correspond, and the depth that a shift along a row
-means.
+"""Stereo pairs: choice of views, rectification, and conversion between disparity and depth.
 
-Both cameras are turned, in place, to look at right angles to the line between them (Fusiello et al.
-2000), and get a window each of the same focal length, around the person. A point at depth z is seen
-in the left window at x0 = f X / z + cx0, in the right one at x1 = f (X - B) / z + cx1, B the
-distance of the cameras. Its disparity f B / z is ``shift`` + d with shift = cx1 - cx0, which is
-that of the middle of the person; d, the offset, is what the network finds. It is positive where the
-surface is nearer than the middle, in both views: x1 = x0 - d, x0 = x1 + d.
+Both cameras are rotated to look at right angles to the baseline (Fusiello et al. 2000), and get
+crops of the same focal length around the person. A point at depth z is seen in the left crop at x0
+= f X / z + cx0, in the right one at x1 = f (X - B) / z + cx1, with baseline B. Its disparity f B /
+z is ``shift`` + d, where shift = cx1 - cx0 is that of the person's middle and the offset d is
+predicted by the network. Offsets are positive in front of the middle: x1 = x0 - d.
 
-Local letters: two views, left and right; windows of H x W pixels.
+Symbols: two views, left and right; crops of H x W pixels; N points.
 """
 
 from __future__ import annotations
@@ -30,16 +28,18 @@ from dyngs.data.geometry import camera_center
 from dyngs.data.loader import Image
 
 MIN_ANGLE, MAX_ANGLE = 5.0, 50.0
-"""Degrees between the view axes of two views that suit; 45 in the paper."""
-_BEST_ANGLE = 30.0  # Degrees that a pair should have that may be chosen freely
-_LEVEL = 0.8  # Smallest cosine between the line from camera to camera and the rows of the images
+"""Allowed angle between the view axes of a pair, degrees; 45 in the paper."""
+_BEST_ANGLE = 30.0  # preferred angle of a pair, degrees
+_MIN_LEVEL_COSINE = 0.8  # smallest cosine between the baseline and the image rows
 
 
-def neighbours(name: str, views: Sequence[View], chosen: Sequence[int]) -> list[tuple[int, int]]:
-    """Return pairs, left and right, of the ``chosen`` views that are next to each other on their
-    ring, all around where it is closed.
+def neighbour_pairs(
+    name: str, views: Sequence[View], chosen: Sequence[int]
+) -> list[tuple[int, int]]:
+    """Return left-right pairs of the ``chosen`` views that are next to each other around the
+    person.
 
-    Raises DyngsError, for the capture ``name``: a view without a neighbour that suits.
+    Raises DyngsError, for the capture ``name``: a view without a suitable neighbour.
     """
     ordered = order_around_person(views, chosen)
     steps = [*pairwise(ordered), *([(ordered[-1], ordered[0])] if len(ordered) > 2 else [])]
@@ -47,21 +47,22 @@ def neighbours(name: str, views: Sequence[View], chosen: Sequence[int]) -> list[
     alone = set(chosen) - {i for pair in pairs for i in pair}
     if alone:
         raise DyngsError(
-            f"{name}: {views[min(alone)].name} has no neighbour to find depth with; give two views or more of one "
-            f"moment, side by side, {MIN_ANGLE:g} to {MAX_ANGLE:g} degrees apart"
+            f"{name}: {views[min(alone)].name} has no neighbouring view for stereo; give two or more views "
+            f"of one time step, side by side, {MIN_ANGLE:g} to {MAX_ANGLE:g} degrees apart"
         )
     return pairs
 
 
 def order_as_pair(views: Sequence[View], one: int, other: int) -> tuple[int, int] | None:
-    """Return two views as left and right, as seen by both; None: depth cannot be found from
-    them."""
+    """Return two views as (left, right); None if they do not suit as a stereo pair."""
     first = views[one]
     second = views[other]
     line = camera_center(second.cam_from_world) - camera_center(first.cam_from_world)
     across = first.cam_from_world[0, :3] + second.cam_from_world[0, :3]
     along = line @ across
-    is_level = along and abs(along) >= _LEVEL * np.linalg.norm(line) * np.linalg.norm(across)
+    is_level = along and abs(along) >= _MIN_LEVEL_COSINE * np.linalg.norm(line) * np.linalg.norm(
+        across
+    )
     is_near = MIN_ANGLE <= angle_between_views(first, second) <= MAX_ANGLE
     if not is_level or not is_near or (first.frame, first.time) != (second.frame, second.time):
         return None
@@ -75,8 +76,7 @@ def angle_between_views(one: View, other: View) -> float:
 
 
 def order_around_person(views: Sequence[View], chosen: Sequence[int]) -> list[int]:
-    """Return the ``chosen`` views in their order around the vertical, which is the mean of what is
-    up in the images."""
+    """Return the ``chosen`` views in their order around the mean up direction of the images."""
     poses = np.stack([views[i].cam_from_world for i in chosen])
     up = -poses[:, 1, :3].mean(0)
     up = up / max(np.linalg.norm(up), 1e-12)
@@ -86,29 +86,28 @@ def order_around_person(views: Sequence[View], chosen: Sequence[int]) -> list[in
     return [chosen[i] for i in np.argsort(azimuth, kind="stable")]
 
 
-def moments(views: Sequence[View]) -> dict[tuple[int | None, float | None], list[int]]:
-    """Return the views of each moment, in their order around the person."""
-    found: dict[tuple[int | None, float | None], list[int]] = {}
+def views_by_time(views: Sequence[View]) -> dict[tuple[int | None, float | None], list[int]]:
+    """Return the views of each time step, in their order around the person."""
+    groups: dict[tuple[int | None, float | None], list[int]] = {}
     for i, view in enumerate(views):
-        found.setdefault((view.frame, view.time), []).append(i)
-    return {moment: order_around_person(views, own) for moment, own in found.items()}
+        groups.setdefault((view.frame, view.time), []).append(i)
+    return {time: order_around_person(views, group) for time, group in groups.items()}
 
 
 def spread(ring: Sequence[int], count: int, first: int = 0) -> list[int]:
-    """Return ``count`` of the views of a ring, evenly around it from the one at ``first`` on."""
+    """Return ``count`` views of a ring, evenly spaced from the one at ``first``."""
     return [ring[(first + round(i * len(ring) / count)) % len(ring)] for i in range(count)]
 
 
 def spread_around_person(views: Sequence[View], count: int) -> list[int]:
-    """Return ``count`` views, evenly around the person, at the first of the moments that most views
-    show."""
-    ring = max(moments(views).values(), key=len)
+    """Return ``count`` views, evenly around the person, of the time step with the most views."""
+    ring = max(views_by_time(views).values(), key=len)
     return sorted(set(spread(ring, count)))
 
 
 def best_pair(views: Sequence[View]) -> list[int]:
-    """Return the two neighbours, of the moment that most views show, that suit depth best."""
-    ring = max(moments(views).values(), key=len)
+    """Return the best stereo pair of the time step with the most views."""
+    ring = max(views_by_time(views).values(), key=len)
     pairs = [pair for pair in combinations(ring, 2) if order_as_pair(views, *pair) is not None]
     return list(
         min(
@@ -120,10 +119,10 @@ def best_pair(views: Sequence[View]) -> list[int]:
 
 
 def training_pairs(views: Sequence[View]) -> list[tuple[tuple[int, int], list[int]]]:
-    """Return the pairs to train on, each with the views that stand between its two, of which there
-    is at least one."""
-    found = []
-    for ring in moments(views).values():
+    """Return all training pairs, each with the views between its two, of which there is at least
+    one."""
+    pairs = []
+    for ring in views_by_time(views).values():
         for start, first in enumerate(ring):
             for step in range(2, len(ring)):
                 last = ring[(start + step) % len(ring)]
@@ -132,36 +131,34 @@ def training_pairs(views: Sequence[View]) -> list[tuple[tuple[int, int], list[in
                 pair = order_as_pair(views, first, last)
                 if pair is not None:
                     between = [ring[(start + k) % len(ring)] for k in range(1, step)]
-                    found.append((pair, between))
-    return found
+                    pairs.append((pair, between))
+    return pairs
 
 
 SIZE_MULTIPLE = 16
-"""Windows are multiples of so many pixels."""
-MIN_ALPHA = 0.5  # Alpha from which a pixel belongs to the person
-_REACHED = 0.1  # Alpha from which a point may be part of the person: outlines are not cut off
-_MARGIN = 8  # px around the person
-_FEWEST = 16  # Pixels of a person that can be rectified
-# Largest difference of the rows where the person begins or ends, relative to the person's height
-_SAME_HEIGHT = 0.08
-# Difference of depth, relative, from which neighbouring pixels belong to different surfaces
-_EDGE = 0.01
-_LARGEST = 4.0  # Largest width of a window, relative to the person's height
+"""Sides of crops are multiples of this, px."""
+MIN_ALPHA = 0.5  # alpha from which a pixel belongs to the person
+_MIN_OUTLINE_ALPHA = 0.1  # the same for points, so that outlines are not cut off
+_MARGIN = 8  # background around the person, px
+_MIN_PIXELS = 16  # smallest area of a person
+_MAX_ROW_DIFFERENCE = 0.08  # of the person between the views, relative to the height
+_DEPTH_EDGE = 0.01  # relative depth difference of neighbouring pixels on different surfaces
+_MAX_ASPECT = 4.0  # largest width of a crop relative to the person's height
 
 
 @dataclass(frozen=True)
 class RectifiedPair:
-    """Windows on a person in two views.
+    """Rectified crops around the person in two views.
 
     Attributes:
-        rgb: (2, 3, H, W) colours, not multiplied by alpha.
+        rgb: (2, 3, H, W) straight colours.
         alpha: (2, 1, H, W).
-        offsets: (2, 1, H, W) true offset d in px, NaN where no depth map knows it.
-        rect_from_world: (3, 3) rotation of both windows.
-        centers: (2, 3) of the cameras in the world.
-        focal: focal length of both windows, px.
-        principal: (2, 2) cx and cy of the windows, px; the first pixel's centre is (0.5, 0.5); cy
-            is the same.
+        offsets: (2, 1, H, W) true offset d, px; NaN where the depth is unknown.
+        rect_from_world: (3, 3) rotation of both crops.
+        centers: (2, 3) camera centres in the world.
+        focal: focal length of both crops, px.
+        principal: (2, 2) cx and cy of the crops, px; the first pixel's centre is (0.5, 0.5); cy is
+            the same.
         baseline: distance of the cameras, world units.
     """
 
@@ -176,21 +173,21 @@ class RectifiedPair:
 
     @property
     def solid(self) -> Tensor:
-        """(2, 1, H, W) bool: the pixels of the person."""
+        """Pixels of the person (2, 1, H, W), bool."""
         return self.alpha > MIN_ALPHA
 
     @property
     def shift(self) -> Tensor:
-        """() disparity of the middle of the person, px."""
+        """Disparity of the middle of the person (), px."""
         return self.principal[1, 0] - self.principal[0, 0]
 
     def depth(self, offsets: Tensor) -> Tensor:
-        """Return the depth of ``offsets`` of any shape, px, in the axes of the windows, world
+        """Convert offsets of any shape, px, to depths along the view axis of the crops, world
         units."""
         return self.focal * self.baseline / (self.shift + offsets)
 
-    def seen_by_other(self, offsets: Tensor) -> Tensor:
-        """Return the alpha (2, 1, H, W) of the other window where it shows what is at ``offsets``;
+    def alpha_in_other_view(self, offsets: Tensor) -> Tensor:
+        """Return the alpha (2, 1, H, W) of the other crop at the match of each pixel;
         differentiable."""
         height, width = offsets.shape[2:]
         sides = offsets.new_tensor([1.0, -1.0])[:, None, None]
@@ -200,16 +197,15 @@ class RectifiedPair:
         return grid_sample(self.alpha.flip(0), grid, align_corners=False)
 
     def points(self, depth: Tensor) -> Tensor:
-        """Return the points (2, H, W, 3) in the world of all pixels at ``depth`` (2, 1, H, W)."""
+        """Return world points (2, H, W, 3) of all pixels at ``depth`` (2, 1, H, W)."""
         rays = _rays(self.principal, self.focal, (depth.shape[2], depth.shape[3]))
         return (depth[:, 0, ..., None] * rays) @ self.rect_from_world + self.centers[:, None, None]
 
 
 def rectify_views(left: Image, right: Image, person_px: int) -> RectifiedPair:
-    """Return the windows of two images in which the person is ``person_px`` pixels high.
+    """Rectify two images, with the person ``person_px`` pixels high.
 
-    Raises DyngsError: no silhouettes, or views that do not show the same person from where their
-    cameras say.
+    Raises DyngsError: no silhouettes, or the silhouettes do not match the cameras.
     """
     images = [_at_size(image, person_px) for image in (left, right)]
     poses = [image.cameras.cam_from_world[0].double() for image in images]
@@ -217,15 +213,15 @@ def rectify_views(left: Image, right: Image, person_px: int) -> RectifiedPair:
     across = torch.nn.functional.normalize(centers[1] - centers[0], dim=0)
     forward = poses[0][2, :3] + poses[1][2, :3]
     down = torch.nn.functional.normalize(torch.linalg.cross(forward, across), dim=0)
-    turn = torch.stack([across, down, torch.linalg.cross(across, down)])
-    boxes = torch.stack([_box(image, turn) for image in images])
+    rotation = torch.stack([across, down, torch.linalg.cross(across, down)])
+    boxes = torch.stack([_box(image, rotation) for image in images])
     widths, heights = (boxes[..., 1] - boxes[..., 0]).amax(0).tolist()
-    off = float((boxes[0, 1] - boxes[1, 1]).abs().max()) / heights
+    row_difference = float((boxes[0, 1] - boxes[1, 1]).abs().max()) / heights
     is_before = boxes[0, 0].mean() > boxes[1, 0].mean()
-    if off > _SAME_HEIGHT or not is_before or widths > _LARGEST * heights:
+    if row_difference > _MAX_ROW_DIFFERENCE or not is_before or widths > _MAX_ASPECT * heights:
         raise DyngsError(
-            f"{left.name} and {right.name}: do not show the same person where their cameras say (heights differ by "
-            f"{off:.0%}); the calibration is wrong, or a mask is: see `dyngs data inspect`"
+            f"{left.name} and {right.name}: silhouettes do not match the cameras (rows differ by "
+            f"{row_difference:.0%}); check the calibration and the masks with `dyngs data inspect`"
         )
     height = float(boxes[:, 1, 1].max() - boxes[:, 1, 0].min())
     focal = person_px / height
@@ -238,14 +234,14 @@ def rectify_views(left: Image, right: Image, person_px: int) -> RectifiedPair:
     principal = half - focal * middle
     rays = _rays(principal, focal, (rows, columns))
     baseline = float((centers[1] - centers[0]).norm())
-    windows = [_window(image, turn, ray) for image, ray in zip(images, rays, strict=True)]
-    rgb, alpha, depth = (torch.stack(x) for x in zip(*windows, strict=True))
+    crops = [_window(image, rotation, ray) for image, ray in zip(images, rays, strict=True)]
+    rgb, alpha, depth = (torch.stack(x) for x in zip(*crops, strict=True))
     shift = principal[1, 0] - principal[0, 0]
     return RectifiedPair(
         rgb=rgb,
         alpha=alpha,
         offsets=(focal * baseline / depth - shift).float(),
-        rect_from_world=turn.float(),
+        rect_from_world=rotation.float(),
         centers=centers.float(),
         focal=focal,
         principal=principal.float(),
@@ -254,35 +250,33 @@ def rectify_views(left: Image, right: Image, person_px: int) -> RectifiedPair:
 
 
 def _at_size(image: Image, person_px: int) -> Image:
-    """Return the image shrunk by a whole number where the person is at least twice as high as
-    ``person_px``."""
-    if image.alpha is None or int((image.alpha > MIN_ALPHA).sum()) < _FEWEST:
+    """Downscale the image by an integer if the person is at least twice ``person_px`` high."""
+    if image.alpha is None or int((image.alpha > MIN_ALPHA).sum()) < _MIN_PIXELS:
         raise DyngsError(
-            f"{image.name}: shows no silhouette of a person; add alpha or a mask of the person (`dyngs docs people`)"
+            f"{image.name}: no silhouette of a person; add alpha or a mask of the person, see docs/human.md"
         )
     rows = (image.alpha > MIN_ALPHA).any(1).nonzero()
     return image.downscaled(max(1, int(rows.max() - rows.min() + 1) // person_px))
 
 
-def _box(image: Image, turn: Tensor) -> Tensor:
-    """Return the lowest and highest x and y (2, 2) of the person in the turned camera, at depth
-    1."""
+def _box(image: Image, rotation: Tensor) -> Tensor:
+    """Return the extent in x and y (2, 2) of the person in the rotated camera, at depth 1."""
     assert image.alpha is not None
     rows, columns = (image.alpha > MIN_ALPHA).nonzero(as_tuple=True)
     pixels = torch.stack([columns + 0.5, rows + 0.5, torch.ones_like(rows)], dim=1).double()
     camera = image.cameras
     inverse = torch.linalg.inv(camera.intrinsics[0].double())
-    seen = pixels @ inverse.T @ camera.cam_from_world[0, :3, :3].double() @ turn.T
-    flat = seen[:, :2] / seen[:, 2:]
+    rays = pixels @ inverse.T @ camera.cam_from_world[0, :3, :3].double() @ rotation.T
+    flat = rays[:, :2] / rays[:, 2:]
     return torch.stack([flat.amin(0), flat.amax(0)], dim=1)
 
 
-def _window(image: Image, turn: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return colours (3, H, W), alpha (1, H, W) and depth (1, H, W; NaN unknown) along ``rays`` (H,
-    W, 3)."""
+def _window(image: Image, rotation: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Resample an image along ``rays`` (H, W, 3); return colours (3, H, W), alpha and depth (1, H,
+    W; NaN unknown)."""
     camera = image.cameras
-    seen = rays @ turn @ camera.cam_from_world[0, :3, :3].double().T
-    projected = seen @ camera.intrinsics[0].double().T
+    directions = rays @ rotation @ camera.cam_from_world[0, :3, :3].double().T
+    projected = directions @ camera.intrinsics[0].double().T
     size = projected.new_tensor([camera.width, camera.height])
     grid = (2 * projected[..., :2] / projected[..., 2:] / size - 1).float()[None]
     assert image.alpha is not None
@@ -292,28 +286,27 @@ def _window(image: Image, turn: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, T
     rgb = sampled[:3] / sampled[3:].clamp_min(1e-3)
     if image.depth is None:
         return rgb.clamp(0, 1), sampled[3:], torch.full_like(sampled[3:], torch.nan)
-    depth = _depth_at(image.depth, grid) / seen[None, ..., 2].float()
+    depth = _depth_at(image.depth, grid) / directions[None, ..., 2].float()
     return rgb.clamp(0, 1), sampled[3:], depth
 
 
 def _depth_at(depth: Tensor, grid: Tensor) -> Tensor:
-    """Return a depth map (h, w) at the places ``grid`` (1, H, W, 2) as (1, H, W); NaN where it is
+    """Sample a depth map (h, w) at positions ``grid`` (1, H, W, 2); return (1, H, W), NaN where
     unknown.
 
-    Inverse depth is linear on planes, and is interpolated; at edges, where that would lie on
-    neither side, the nearest pixel counts.
+    Inverse depth, which is linear on planes, is interpolated; at edges the nearest pixel is used.
     """
     known = depth > 0
     layers = torch.stack([torch.where(known, 1 / depth, 0), known.float()])[None]
     nearest = grid_sample(layers, grid, mode="nearest", align_corners=False)[0]
     linear = grid_sample(layers, grid, align_corners=False)[0]
     smooth = linear[:1] / linear[1:].clamp_min(1e-6)
-    inverse = torch.where((smooth / nearest[:1] - 1).abs() < _EDGE, smooth, nearest[:1])
+    inverse = torch.where((smooth / nearest[:1] - 1).abs() < _DEPTH_EDGE, smooth, nearest[:1])
     return torch.where(nearest[1:] > 0, 1 / inverse, torch.nan)
 
 
 def _rays(principal: Tensor, focal: float, size: tuple[int, int]) -> Tensor:
-    """Return the rays (2, H, W, 3) through the pixels of the windows, at depth 1 in their axes."""
+    """Return the rays (2, H, W, 3) through the pixels of the crops, at depth 1."""
     pixels = (torch.arange(n, dtype=principal.dtype, device=principal.device) for n in size)
     rows, columns = (x + 0.5 for x in pixels)
     y = ((rows - principal[:, 1:]) / focal)[:, :, None].expand(-1, -1, size[1])
@@ -322,23 +315,22 @@ def _rays(principal: Tensor, focal: float, size: tuple[int, int]) -> Tensor:
 
 
 def is_inside(image: Image, points: Tensor) -> Tensor:
-    """Return (N,) bool: whether an image shows the person, or reaches not, where ``points`` (N, 3)
-    in the world are."""
+    """Return the points (N,) bool that an image shows as the person, or that lie outside the
+    image."""
     assert image.alpha is not None
     camera = image.cameras
     pose = camera.cam_from_world[0]
     flat = (points @ pose[:3, :3].T + pose[:3, 3]) @ camera.intrinsics[0].T
     size = flat.new_tensor([camera.width, camera.height])
-    place = flat[:, :2] / flat[:, 2:].clamp_min(1e-9) / size
-    beyond = (flat[:, 2] <= 0) | ((place < 0) | (place > 1)).any(1)
-    grid = (2 * place - 1)[None, None]
+    position = flat[:, :2] / flat[:, 2:].clamp_min(1e-9) / size
+    is_outside = (flat[:, 2] <= 0) | ((position < 0) | (position > 1)).any(1)
+    grid = (2 * position - 1)[None, None]
     alpha = grid_sample(image.alpha[None, None], grid, align_corners=False)[0, 0, 0]
-    return beyond | (alpha > _REACHED)
+    return is_outside | (alpha > _MIN_OUTLINE_ALPHA)
 
 
 def crop_to_person(image: Image, margin: int) -> Image:
-    """Return the part of an image, with its camera, that shows what is not transparent, and
-    ``margin`` px around it."""
+    """Crop an image to its visible part plus ``margin`` px, with its camera."""
     assert image.alpha is not None
     rows, columns = ((image.alpha > 0).any(side).nonzero()[:, 0] for side in (1, 0))
     if not len(rows):
@@ -351,7 +343,7 @@ def crop_to_person(image: Image, margin: int) -> Image:
 
 
 def crop_image(image: Image, top: int, left: int, height: int, width: int) -> Image:
-    """Return a part of an image, with its camera and maps, that begins at a row and column."""
+    """Crop an image at a row and column, with its camera and maps."""
     camera = image.cameras
     intrinsics = camera.intrinsics.clone()
     intrinsics[:, 0, 2] -= left

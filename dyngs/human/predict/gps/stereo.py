@@ -1,13 +1,12 @@
-"""The depth of every pixel of two rectified views: a sweep over offsets, of which a network finds
-the right one.
+"""Learned stereo: disparity of every pixel of a rectified pair, and Gaussians of the pixels.
 
-GPS-Gaussian (Zheng et al. 2024) correlates learned features and refines a match step by step. Here
-what speaks for an offset is computed: how much colours would differ (plane sweep, Collins 1996),
-and whether the other view shows the person there at all (visual hull). The network corrects that,
-and is as good as block matching before it is trained.
+GPS-Gaussian (Zheng et al. 2024) refines matches of learned features iteratively. Here the costs of
+candidate offsets are computed: colour differences (plane sweep, Collins 1996) and whether the
+other view shows the background (visual hull). The network corrects them; untrained it equals block
+matching.
 
-Local letters: two views, left and right; H x W pixels of the windows, h x w of a quarter of them; C
-channels, D offsets.
+Symbols: two views, left and right; crops of H x W pixels, h x w a quarter of it; C channels, D
+offsets.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ from dyngs.human.predict.gps.rectification import (
     best_pair,
     crop_to_person,
     is_inside,
-    neighbours,
+    neighbour_pairs,
     rectify_views,
     spread_around_person,
     training_pairs,
@@ -72,23 +71,21 @@ from dyngs.ops.device import CPU, select_device
 from dyngs.ops.quaternions import quat_product, quats_from_matrices, unit_quats
 
 QUARTER = 4
-"""Pixels of the windows per pixel of the sweep."""
+"""Pixels of the crops per pixel of the plane sweep, per axis."""
 NUM_OFFSETS = 48
-"""Offsets that are looked at, evenly between those of ``RANGE``."""
+"""Candidate offsets, evenly spaced in ``RANGE``."""
 RANGE = (-0.22, 0.28)
-"""Least and largest offset, relative to the disparity of the middle: 0.56 m behind to 0.44 m before
-it at 2 m."""
-# What the logit of an offset loses by the difference of colours, and beside the person
-_COLOUR, _BESIDE = 300.0, 5.0
-_SHARPNESS = 2.0
-_NEVER = -1e4  # Logits of upsampling: by squared distance, and of what cannot be
+"""Range of offsets, relative to the disparity of the person's middle: 0.56 m behind to 0.44 m in front
+of it at a distance of 2 m."""
+_COLOUR, _BESIDE = 300.0, 5.0  # factors of colour difference and background in the offset logits
+_SHARPNESS = 2.0  # of upsampling weights, which fall with the squared distance
+_NEVER = -1e4  # logit of excluded values
 SIDES = (1.0, -1.0)
-"""A larger offset lies further left in the right view, further right in the left one."""
+"""Direction in which a match moves with its offset: left in the right view, right in the left one."""
 
 
 class StereoNetwork(nn.Module):
-    """Offsets of two views, see ``dyngs.human.predict.gps.rectification``, from a sweep and the features of the
-    images: a UNet."""
+    """U-Net that predicts the offsets of two views from plane-sweep costs and image features."""
 
     def __init__(self, widths: Sequence[int]) -> None:
         super().__init__()
@@ -105,11 +102,14 @@ class StereoNetwork(nn.Module):
     def forward(
         self, levels: Sequence[Tensor], swept: Tensor, offsets: Sequence[int], inside: Tensor
     ) -> tuple[list[Tensor], Tensor]:
-        """Return offsets (2, 1, H, W), px, and features (2, C, h / 2, w / 2).
+        """Return offsets (2, 1, H, W), px, bilinearly upsampled and refined, and features (2, C, h
+        / 2, w / 2).
 
-        The offsets are those of a quarter of the resolution, then fine ones. ``levels`` are
-        features of the images at 1/4, 1/8 and 1/16, ``swept`` is what ``sweep`` says of ``offsets``
-        (D), ``inside`` (2, 1, H, W) is 1 where the person is.
+        Args:
+            levels: image features at 1/4, 1/8 and 1/16 of the resolution.
+            swept: costs of ``plane_sweep_costs``.
+            offsets: D candidate offsets.
+            inside: (2, 1, H, W), 1 on the person.
         """
         fine = self.enter(torch.cat([levels[0], 5 * swept], dim=1))
         middle = self.down[0](torch.cat([fine, upsample(levels[1])], dim=1))
@@ -118,21 +118,23 @@ class StereoNetwork(nn.Module):
         fine = self.up[1](torch.cat([fine, upsample(middle)], dim=1))
         change = self.change(fine)
         colours, beside = swept.split(NUM_OFFSETS, dim=1)
-        shares = (change[:, 1:] - _COLOUR * colours - _BESIDE * beside).softmax(dim=1)
-        found = (shares * shares.new_tensor(offsets)[:, None, None]).sum(1, keepdim=True) + change[
-            :, :1
-        ]
-        enlarged = interpolate(found, scale_factor=QUARTER, mode="bilinear")
-        return [enlarged, refined(found, self.weights(fine), max_pool2d(inside, QUARTER))], middle
+        probabilities = (change[:, 1:] - _COLOUR * colours - _BESIDE * beside).softmax(dim=1)
+        expected = (probabilities * probabilities.new_tensor(offsets)[:, None, None]).sum(
+            1, keepdim=True
+        ) + change[:, :1]
+        upsampled_offsets = interpolate(expected, scale_factor=QUARTER, mode="bilinear")
+        return [
+            upsampled_offsets,
+            convex_upsample(expected, self.weights(fine), max_pool2d(inside, QUARTER)),
+        ], middle
 
 
 def _block(before: int, width: int, stride: int = 1) -> nn.Module:
     return nn.Sequential(nn.Conv2d(before, width, 3, stride, padding=1), ResidualBlock(width))
 
 
-def offsets_of(shift: Tensor) -> list[int]:
-    """Return the offsets (D) that are looked at for the disparity ``shift`` of the middle of the
-    person, even px."""
+def candidate_offsets(shift: Tensor) -> list[int]:
+    """Return the D candidate offsets, even px, for the disparity ``shift`` of the person's middle."""
     return [
         2 * round(float(x))
         for x in (shift / 2) * torch.linspace(*RANGE, NUM_OFFSETS, device=shift.device)
@@ -140,22 +142,22 @@ def offsets_of(shift: Tensor) -> list[int]:
 
 
 def plane_sweep_costs(rgb: Tensor, alpha: Tensor, offsets: Sequence[int]) -> Tensor:
-    """Return (2, 2 D, h, w): per offset the difference of colours, and how much of the other view
-    there is background.
+    """Return costs (2, 2 D, h, w): per offset the colour difference, and the background of the
+    other view.
 
-    Of ``rgb`` (2, 3, H, W) and ``alpha`` (2, 1, H, W) at half the resolution, means over 3 x 3 and
-    2 x 2 of its pixels.
+    Computed at half the resolution of ``rgb`` (2, 3, H, W) and ``alpha`` (2, 1, H, W), and
+    averaged over 3 x 3 and 2 x 2 pixels.
     """
     layers = avg_pool2d(torch.cat([rgb * alpha, alpha], dim=1), 2)
     width = layers.shape[3]
-    room = min(max(abs(x) // 2 for x in offsets), width)
-    around = pad(layers.flip(0), (room, room))
+    padding = min(max(abs(x) // 2 for x in offsets), width)
+    padded = pad(layers.flip(0), (padding, padding))
     colours = []
     beside = []
     for offset in offsets:
-        starts = (room - int(side) * max(-room, min(room, offset // 2)) for side in SIDES)
+        starts = (padding - int(side) * max(-padding, min(padding, offset // 2)) for side in SIDES)
         other = torch.stack(
-            [view[..., at : at + width] for view, at in zip(around, starts, strict=True)]
+            [view[..., at : at + width] for view, at in zip(padded, starts, strict=True)]
         )
         colours.append((other[:, :3] - layers[:, :3]).abs().mean(1))
         beside.append(1 - other[:, 3])
@@ -163,28 +165,26 @@ def plane_sweep_costs(rgb: Tensor, alpha: Tensor, offsets: Sequence[int]) -> Ten
     return avg_pool2d(avg_pool2d(volume, 3, 1, 1, count_include_pad=False), 2)
 
 
-def refined(coarse: Tensor, weights: Tensor, inside: Tensor) -> Tensor:
-    """Return (B, 1, 4 h, 4 w) means of 3x3 values of ``coarse`` (B, 1, h, w), weighted by the
-    softmax of ``weights``.
+def convex_upsample(coarse: Tensor, weights: Tensor, inside: Tensor) -> Tensor:
+    """Upsample ``coarse`` (B, 1, h, w) to (B, 1, 4 h, 4 w) by convex combination (Teed and Deng
+    2020).
 
-    ``weights`` (B, 9 * 16, h, w) are logits of the nine, for each of the 16 pixels (convex
-    upsampling, Teed and Deng 2020), next to those of a Gaussian around the pixel. Values where
-    ``inside`` (B, 1, h, w) is 0 do not count.
+    ``weights`` (B, 9 * 16, h, w) are logits of the 3 x 3 neighbours for each of the 16 pixels,
+    added to those of a Gaussian. Neighbours where ``inside`` (B, 1, h, w) is 0 are excluded.
     """
     batch, _, height, width = coarse.shape
     values, known = (
         unfold(pad(x, (1, 1, 1, 1), mode=mode), 3).view(batch, 9, 1, 1, height, width)
         for x, mode in ((coarse, "replicate"), (inside, "constant"))
     )
-    logits = weights.view(batch, 9, QUARTER, QUARTER, height, width) + _near_first(coarse)
+    logits = weights.view(batch, 9, QUARTER, QUARTER, height, width) + _gaussian_logits(coarse)
     shares = torch.where(known > 0, logits, _NEVER).softmax(dim=1)
     fine = (shares * values).sum(1)
     return fine.permute(0, 3, 1, 4, 2).reshape(batch, 1, QUARTER * height, QUARTER * width)
 
 
-def _near_first(like: Tensor) -> Tensor:
-    """Return logits (9, 4, 4, 1, 1) of 3x3 values for each of 4x4 pixels in the middle: of their
-    squared distance."""
+def _gaussian_logits(like: Tensor) -> Tensor:
+    """Return Gaussian logits (9, 4, 4, 1, 1) of 3 x 3 neighbours for each of 4 x 4 pixels."""
     pixel = (torch.arange(QUARTER, dtype=like.dtype, device=like.device) + 0.5) / QUARTER - 0.5
     square = (
         torch.arange(-1.0, 2.0, dtype=like.dtype, device=like.device)[:, None] - pixel
@@ -195,29 +195,28 @@ def _near_first(like: Tensor) -> Tensor:
 
 
 WIDTHS = (24, 40, 64)
-"""Channels of the features of images at 1/4, 1/8 and 1/16 of the resolution."""
+"""Channels of image features at 1/4, 1/8 and 1/16 of the resolution."""
 HEADS = {"rotation": 4, "scale": 3, "opacity": 1}
-"""Outputs per pixel and their number of channels."""
+"""Output channels per pixel."""
 LARGEST = 4.0
-"""Largest standard deviation, in pixels of the window at the depth of the pixel: 2 cm for a person
-of 256 px images."""
-_SCALE_LOGIT = -1.95
-_OPACITY_LOGIT = 4.0  # Of an untrained network: half a pixel, nearly opaque
-_DEPTH_WIDTHS = (16, 24, 32)  # Channels of the features of depth
-_LAST = 32  # Channels of the features that Gaussians are made from
-_RANGE = 64.0  # px; offsets are divided by it before they enter a network
-_LEAST = 0.2  # Smallest disparity, relative to that of the middle of the person
+"""Largest standard deviation, in pixels at the depth of the pixel."""
+_SCALE_LOGIT = -1.95  # initial scale: half a pixel
+_OPACITY_LOGIT = 4.0  # initial opacity: nearly opaque
+_DEPTH_WIDTHS = (16, 24, 32)  # channels of depth features
+_LAST = 32  # channels of the last layer
+_RANGE = 64.0  # normalisation of offsets as network inputs, px
+_MIN_DISPARITY = 0.2  # relative to that of the person's middle
 
 
 class GpsNetwork(nn.Module):
-    """Depth and Gaussians of two rectified views; features of the images are shared by both tasks.
+    """Network that predicts depth and Gaussians of a rectified pair; both tasks share image
+    features.
 
-    It works at half the resolution of the windows, of which it is given four pixels as one, and
-    returns four as one.
+    It works at half the resolution of the crops, with pixels (un)shuffled in blocks of four.
     """
 
     def __init__(self, generator: torch.Generator) -> None:
-        """Weights are drawn from ``generator`` on the CPU."""
+        """Create the network on the CPU with weights from ``generator``."""
         super().__init__()
         half, quarter, _ = WIDTHS
         with torch.device("cpu"):
@@ -238,14 +237,17 @@ class GpsNetwork(nn.Module):
     def forward(
         self, pair: RectifiedPair, *, with_gaussians: bool = True
     ) -> tuple[list[Tensor], Tensor | None]:
-        """Return offsets (2, 1, H, W) of ``pair``, px, of which the last are the finest, and what makes
-        Gaussians of its pixels (2, 8, H, W) in the order of ``HEADS``."""
+        """Return offsets (2, 1, H, W), px, from coarse to fine, and raw Gaussian values (2, 8, H,
+        W).
+
+        The values are in the order of ``HEADS``.
+        """
         inside = pair.solid.float()
         images = pixel_unshuffle(torch.cat([(2 * pair.rgb - 1) * inside, pair.alpha], dim=1), 2)
         levels = self.encoder(images)
-        around = offsets_of(pair.shift)
+        candidates = candidate_offsets(pair.shift)
         offsets, fused = self.stereo(
-            levels, plane_sweep_costs(pair.rgb, pair.alpha, around), around, inside
+            levels, plane_sweep_costs(pair.rgb, pair.alpha, candidates), candidates, inside
         )
         if not with_gaussians:
             return offsets, None
@@ -258,21 +260,26 @@ class GpsNetwork(nn.Module):
 
 
 def surface_gaussians_of_pair(pair: RectifiedPair, offsets: Tensor, raw: Tensor) -> Gaussians:
-    """Return the Gaussians of the pixels of the person in both views, differentiable in
-    their ``offsets`` (2, 1, H, W) and ``raw`` values (2, 8, H, W).
+    """Return the Gaussians of the person's pixels in both views; differentiable in offsets and raw
+    values.
 
-    Means lie on the rays through the pixels, rotations are relative to the axes of the windows,
-    colours are those of the images. Outlines are as transparent as in the images; what the other
-    view would show beside the person, wholly (visual hull).
+    Means lie on the pixel rays, rotations are relative to the axes of the crops, colours are those
+    of the images. Opacities are multiplied by the alpha of the pixel and of its match in the other
+    view (visual hull).
+
+    Args:
+        pair: rectified views.
+        offsets: (2, 1, H, W) px.
+        raw: (2, 8, H, W) outputs of the network.
     """
-    offsets = torch.maximum(offsets, (_LEAST - 1) * pair.shift)
+    offsets = torch.maximum(offsets, (_MIN_DISPARITY - 1) * pair.shift)
     depth = pair.depth(offsets)
     solid = pair.solid[:, 0]
     parts = raw.permute(0, 2, 3, 1)[solid].split(tuple(HEADS.values()), dim=1)
     part = dict(zip(HEADS, parts, strict=True))
     pixel = (depth[:, 0][solid] / pair.focal)[:, None]
     scales = LARGEST * pixel * (part["scale"] + _SCALE_LOGIT).sigmoid()
-    within = (pair.alpha * pair.seen_by_other(offsets))[solid[:, None]]
+    within = (pair.alpha * pair.alpha_in_other_view(offsets))[solid[:, None]]
     opacities = (part["opacity"][:, 0] + _OPACITY_LOGIT).sigmoid() * within
     opacities = opacities.clamp(1e-4, 1 - 1e-4)
     one = part["rotation"].new_tensor([1.0, 0.0, 0.0, 0.0])
@@ -288,9 +295,9 @@ def surface_gaussians_of_pair(pair: RectifiedPair, offsets: Tensor, raw: Tensor)
 
 
 def offset_loss(pair: RectifiedPair, offsets: Sequence[Tensor], decay: float) -> Tensor:
-    """Return the weighted sum of the mean errors of ``offsets``, px, where the truth is known.
+    """Return the weighted sum of mean offset errors, px, where the truth is known.
 
-    The last ones count 1, each before ``decay`` times the next (Teed and Deng 2020).
+    The last offsets have weight 1, each earlier one ``decay`` times the next (Teed and Deng 2020).
     """
     known = pair.solid & pair.offsets.isfinite()
     truth = pair.offsets[known]
@@ -300,16 +307,16 @@ def offset_loss(pair: RectifiedPair, offsets: Sequence[Tensor], decay: float) ->
     return total
 
 
-DEPTH_FRACTION = 0.4  # of the steps in which depth alone is learned, from depth maps
+DEPTH_FRACTION = 0.4  # of the training steps, which train depth only
 DECAY = 0.9
-"""Weight of the error of an iteration relative to the next."""
-DEPTH_WEIGHT = 0.02  # Of the error of offsets, px, next to that of images
-_AROUND = 8  # px of background around the person in the images that are compared
-_FAINT = 0.02  # Opacity below which a predicted Gaussian is left out
+"""Weight of an iteration's offset error relative to the next."""
+DEPTH_WEIGHT = 0.02  # of the offset error, px, next to the image loss
+_AROUND = 8  # background around the person in target images, px
+_MIN_OPACITY = 0.02  # of predicted Gaussians
 
 
 class GpsPredictor(Predictor[GpsNetwork]):
-    """Predicts the surface that pairs of neighbouring views show."""
+    """Predicts the surface seen by pairs of neighbouring views."""
 
     def __init__(
         self, config: Config, network: GpsNetwork, capture: Capture, data: DataConfig
@@ -322,43 +329,43 @@ class GpsPredictor(Predictor[GpsNetwork]):
 
     @torch.no_grad()
     def predict(self, views: Sequence[int]) -> StaticScene:
-        pairs = neighbours(self.name, self.views, views)
+        pairs = neighbour_pairs(self.name, self.views, views)
         loader = ImageLoader(self.views, self.data)
         images = {i: loader[i] for i in views}
-        found = []
+        surfaces = []
         centers = []
         for pair in pairs:
             left, right = (images[i] for i in pair)
-            found.append(self._surface(left, right))
+            surfaces.append(self._surface(left, right))
             centers.append(torch.cat([left.cameras.centers, right.cameras.centers]).mean(0))
-        gaussians = Gaussians.joined(found)
+        gaussians = Gaussians.joined(surfaces)
         if not len(gaussians):
             raise DyngsError(
-                f"{self.name}: no surface is found inside the silhouettes; is a mask or the calibration wrong?"
+                f"{self.name}: no surface inside the silhouettes; check the masks and the calibration"
             )
         return StaticScene(
             gaussians=gaussians,
-            sides=ViewSides.joined(found, centers) if len(pairs) > 1 else None,
+            sides=ViewSides.joined(surfaces, centers) if len(pairs) > 1 else None,
             options=render_options(self.config.model),
             background=self.background,
         )
 
     def _surface(self, left: Image, right: Image) -> Gaussians:
-        """Return the surface that two views show, inside both silhouettes."""
+        """Return the surface of a pair, limited to both silhouettes."""
         pair = rectify_views(left, right, self.section.person_px)
         offsets, raw = self.network(pair)
         gaussians = surface_gaussians_of_pair(pair, offsets[-1], raw)
         inside = is_inside(left, gaussians.means) & is_inside(right, gaussians.means)
-        return gaussians.select(inside & (gaussians.opacities >= _FAINT))
+        return gaussians.select(inside & (gaussians.opacities >= _MIN_OPACITY))
 
     def run_config(self, views: Sequence[int]) -> Config:
         preset = load_config(packaged_preset("static"), ["data.root=."])
-        same = ("near", "eps2d", "rasterize_mode", "sh_degree")
+        shared_keys = ("near", "eps2d", "rasterize_mode", "sh_degree")
         model = preset.model.model_copy(
-            update={name: getattr(self.config.model, name) for name in same}
+            update={name: getattr(self.config.model, name) for name in shared_keys}
         )
-        shown = all_views({k: x for k, x in self._capture.splits.items() if k != "pose"})
-        times = distinct_times(shown).values()
+        filmed = all_views({k: x for k, x in self._capture.splits.items() if k != "pose"})
+        times = distinct_times(filmed).values()
         data = self.data_at_time(self.views[views[0]].time, times)
         return preset.model_copy(update={"data": data, "model": model})
 
@@ -367,7 +374,7 @@ class GpsPredictor(Predictor[GpsNetwork]):
 
 
 class GpsLearner(Learner[GpsNetwork]):
-    """Training of GPS-Gaussian: depth first, from depth maps, then images of the views between."""
+    """Trains on depth maps first, then also on images of views between those of a pair."""
 
     def __init__(
         self,
@@ -377,7 +384,7 @@ class GpsLearner(Learner[GpsNetwork]):
         device: torch.device = CPU,
     ) -> None:
         super().__init__(config, network, [person.root.name for person in people], device)
-        self._opened = keep_captures_open(_lessons, people)
+        self._opened = keep_captures_open(_open_person, people)
 
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
         images, pairs = self._opened(person)
@@ -385,38 +392,38 @@ class GpsLearner(Learner[GpsNetwork]):
         target = between[random_index(len(between), generator)]
         background = self.sample_background(generator)
         left, right = (images[i] for i in pair)
-        windows = rectify_views(left, right, self.section.person_px)
-        windows = move_fields_to(windows, self.device)
+        rectified = rectify_views(left, right, self.section.person_px)
+        rectified = move_fields_to(rectified, self.device)
         only_depth = step <= round(DEPTH_FRACTION * self.config.train.steps)
-        offsets, raw = self.network(windows, with_gaussians=not only_depth)
-        depth_loss = offset_loss(windows, offsets, DECAY)
+        offsets, raw = self.network(rectified, with_gaussians=not only_depth)
+        depth_loss = offset_loss(rectified, offsets, DECAY)
         if only_depth:
-            found = _picture(windows, offsets[-1].detach())
-            return Example(depth_loss, left, found, _picture(windows, windows.offsets))
-        gaussians = surface_gaussians_of_pair(windows, offsets[-1], raw)
+            predicted = _offset_image(rectified, offsets[-1].detach())
+            return Example(depth_loss, left, predicted, _offset_image(rectified, rectified.offsets))
+        gaussians = surface_gaussians_of_pair(rectified, offsets[-1], raw)
         image = crop_to_person(images[target], _AROUND).to(self.device)
         options = replace(render_options(self.config.model), nonfinite="trust")
-        drawn = StaticScene(gaussians=gaussians).render(
+        render = StaticScene(gaussians=gaussians).render(
             image.cameras, options=options, background=background
         )
         truth = image.composite(background)
-        loss = image_loss(drawn.rgb[0], drawn.alpha[0], image, truth, self.config.train)
+        loss = image_loss(render.rgb[0], render.alpha[0], image, truth, self.config.train)
         loss = loss + DEPTH_WEIGHT * depth_loss
-        return Example(loss, image, drawn.rgb[0].detach(), truth, len(gaussians))
+        return Example(loss, image, render.rgb[0].detach(), truth, len(gaussians))
 
 
-def _lessons(data: DataConfig) -> tuple[ImageLoader, list[tuple[tuple[int, int], list[int]]]]:
-    """Return the images of a person with depth maps, and pairs of them with the views in between."""
+def _open_person(data: DataConfig) -> tuple[ImageLoader, list[tuple[tuple[int, int], list[int]]]]:
+    """Return the images of a person with depth maps, and its training pairs."""
     views = _with_silhouettes(data).splits["train"]
     pairs = training_pairs(views)
     if not pairs:
         raise DyngsError(
-            f"{data.root}: no view stands between two others that are at most {MAX_ANGLE:g} degrees apart, which a "
-            "network is trained on; give a ring of 16 cameras or more"
+            f"{data.root}: no view lies between two others at most {MAX_ANGLE:g} degrees apart, as training "
+            "needs; use a ring of 16 or more cameras"
         )
     if any(view.depth_path is None for view in views):
         raise DyngsError(
-            f"{data.root}: has no depth maps, from which depth is learned; `dyngs data synth people` writes them"
+            f"{data.root}: no depth maps, which training needs; `dyngs data synth people` writes them"
         )
     return ImageLoader(views, data, with_maps=True), pairs
 
@@ -424,21 +431,18 @@ def _lessons(data: DataConfig) -> tuple[ImageLoader, list[tuple[tuple[int, int],
 def _with_silhouettes(data: DataConfig) -> Capture:
     capture = read_capture(data)
     if not capture.has_alpha:
-        raise DyngsError(
-            f"{data.root}: the images have no silhouettes; give them alpha, see `dyngs docs people`"
-        )
+        raise DyngsError(f"{data.root}: no silhouettes; add alpha or masks, see docs/human.md")
     return capture
 
 
-def _picture(pair: RectifiedPair, offsets: Tensor) -> Tensor:
-    """Return (H, W, 3) offsets of the left view as a picture, grey in the middle, black outside of
-    the person."""
+def _offset_image(pair: RectifiedPair, offsets: Tensor) -> Tensor:
+    """Visualise the offsets of the left view as grey levels (H, W, 3), black outside the person."""
     grey = (0.5 + offsets[0, 0] / pair.shift).nan_to_num(0.0).clamp(0, 1) * pair.solid[0, 0]
     return grey[..., None].expand(-1, -1, 3)
 
 
 def learner(config: Config, generator: torch.Generator) -> GpsLearner:
-    """Return the network of ``model.kind: gps`` before the first step."""
+    """Return the network in training, before the first step."""
     device = select_device(config.run.device)
     return GpsLearner(config, GpsNetwork(generator).to(device), list_captures(config.data), device)
 
@@ -448,7 +452,7 @@ def predictor(
     checkpoint: Checkpoint,
     data: DataConfig,
     log: Callable[[str], None],
-    report: ProgressCallback,
+    on_progress: ProgressCallback,
 ) -> Predictor[Any]:
     """Return the network of ``checkpoint`` with the capture of ``data``."""
     network = GpsNetwork(torch.Generator())

@@ -13,8 +13,8 @@ from dyngs.human.predict.people import (
     BodyBoundaries,
     Person,
     PosedBody,
+    cameras_in_metres,
     depths,
-    metric,
 )
 
 DISTANCE, RADIUS = 3.0, 0.3
@@ -109,7 +109,7 @@ def test_a_thin_body_ends_behind_its_front() -> None:
 def test_the_surface_of_a_dressed_person_lies_in_between(person: Person) -> None:
     body, scale = person.body_in(person.views[0])
     image = person.images[0]
-    begin, end, met = BodyBoundaries(body).interval(metric(image.cameras, scale))
+    begin, end, met = BodyBoundaries(body).interval(cameras_in_metres(image.cameras, scale))
     assert image.depth is not None
     assert image.alpha is not None
     solid = (image.alpha > 0.99) & (image.depth > 0)

@@ -14,7 +14,13 @@ from dyngs.human.predict.fields.eg_human_nerf import (
     opacities,
 )
 from dyngs.human.predict.fields.network import EncodedPerson
-from dyngs.human.predict.people import BodyBoundaries, Person, crop_source_images, metric, window
+from dyngs.human.predict.people import (
+    BodyBoundaries,
+    Person,
+    cameras_in_metres,
+    crop_source_images,
+    crop_window,
+)
 
 
 def network_with() -> EgHumanNerf:
@@ -23,7 +29,7 @@ def network_with() -> EgHumanNerf:
 
 def known(network: EgHumanNerf, person: Person) -> EncodedPerson:
     body, scale = person.body_in(person.views[0])
-    return network.look(crop_source_images([person.images[i] for i in (0, 2, 4)], scale), body)
+    return network.encode(crop_source_images([person.images[i] for i in (0, 2, 4)], scale), body)
 
 
 def test_the_surface_is_where_the_distance_first_crosses_zero() -> None:
@@ -59,11 +65,12 @@ def test_an_untrained_network_shows_the_body(person: Person) -> None:
     weights are learned."""
     network = network_with()
     body, scale = person.body_in(person.views[0])
-    camera = metric(person.images[1].cameras, scale)
+    camera = cameras_in_metres(person.images[1].cameras, scale)
     with torch.no_grad():
-        whole = network.picture(known(network, person), camera)
-        part = network.picture(
-            known(network, person), metric(window(person.images[1], 8, 10, 16).cameras, scale)
+        whole = network.render(known(network, person), camera)
+        part = network.render(
+            known(network, person),
+            cameras_in_metres(crop_window(person.images[1], 8, 10, 16).cameras, scale),
         )
     torch.testing.assert_close(
         part.transmittance, whole.transmittance[10:26, 8:24], atol=1e-4, rtol=1e-3
@@ -78,12 +85,14 @@ def test_an_untrained_network_shows_the_body(person: Person) -> None:
 
 def test_all_weights_are_learned_alike(person: Person) -> None:
     network = network_with()
-    image = window(person.images[1], 12, 4, 16)
+    image = crop_window(person.images[1], 12, 4, 16)
     _, scale = person.body_in(person.views[0])
     grads = []
     for _ in range(2):
-        picture = network.picture(
-            known(network, person), metric(image.cameras, scale), torch.Generator().manual_seed(1)
+        picture = network.render(
+            known(network, person),
+            cameras_in_metres(image.cameras, scale),
+            torch.Generator().manual_seed(1),
         )
         total = (
             picture.colour.square().sum()
@@ -107,9 +116,9 @@ def test_distances_are_compared_with_depth_maps(person: Person) -> None:
     """None is off where samples say the truth, of rays that meet somebody and of those that
     miss."""
     network = network_with()
-    image = window(person.images[1], 12, 4, 16)
+    image = crop_window(person.images[1], 12, 4, 16)
     _, scale = person.body_in(person.views[0])
-    picture = network.picture(known(network, person), metric(image.cameras, scale))
+    picture = network.render(known(network, person), cameras_in_metres(image.cameras, scale))
     off = float(network.penalty(picture, image, scale).detach())
     assert image.depth is not None
     assert image.alpha is not None

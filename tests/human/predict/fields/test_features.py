@@ -27,7 +27,7 @@ def seen() -> SourceFeatures:
 
 def test_points_show_what_their_pixels_show() -> None:
     points = torch.tensor([[0.5, -0.25, 0.0], [0.2, 0.1, 1.0], [0.0, 0.0, -9.0], [9.0, 0.0, 0.0]])
-    looked = seen().look(points)
+    looked = seen().sample(points)
     for view, sign in ((0, 1.0), (1, -1.0)):
         depth = sign * points[:2, 2] + 4
         column = sign * FOCAL * points[:2, 0] / depth + WIDTH / 2

@@ -18,9 +18,9 @@ from dyngs.human.predict.people import (
     Person,
     PosedBody,
     Sources,
+    cameras_in_metres,
     crop_source_images,
-    metric,
-    window,
+    crop_window,
 )
 
 
@@ -39,7 +39,7 @@ def known(
 ) -> EncodedPerson:
     sources, body, _ = given(person, views)
     with torch.no_grad():
-        return network.look(sources, body)
+        return network.encode(sources, body)
 
 
 def test_the_code_is_that_of_the_paper(person: Person) -> None:
@@ -73,10 +73,10 @@ def test_the_cells_hold_the_body_and_nothing_far_away(
     """What two opposite images leave open is closed by the bones."""
     for views in ((0, 2, 4), (0, 4)):
         own = known(network, person, views)
-        space, occupied = own.own
+        space, occupied = own.extra
         cells = (space.unit(own.body.vertices) * space.cells).long()
         x, y, z = cells.unbind(1)
-        shown = (own.seen.alpha(own.body.vertices) > 0.5).all(0)
+        shown = (own.features.alpha(own.body.vertices) > 0.5).all(0)
         assert float(shown.float().mean()) > 0.5, "at 40 px many vertices lie on the outline"
         assert bool(occupied[0, z, y, x][shown].all())
         assert 0.001 < float(occupied.float().mean()) < 0.15
@@ -87,9 +87,11 @@ def test_a_part_of_a_picture_is_the_same_alone(network: KeypointNerf, person: Pe
     own, (_, _, scale) = known(network, person), given(person)
     image = person.images[1]
     with torch.no_grad():
-        whole = network.picture(own, metric(image.cameras, scale))
-        part = network.picture(own, metric(window(image, 8, 10, 16).cameras, scale))
-        turned = network.picture(known(network, person, (4, 0, 2)), metric(image.cameras, scale))
+        whole = network.render(own, cameras_in_metres(image.cameras, scale))
+        part = network.render(own, cameras_in_metres(crop_window(image, 8, 10, 16).cameras, scale))
+        turned = network.render(
+            known(network, person, (4, 0, 2)), cameras_in_metres(image.cameras, scale)
+        )
     torch.testing.assert_close(part.colour, whole.colour[10:26, 8:24], atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(turned.transmittance, whole.transmittance, atol=1e-4, rtol=1e-3)
     assert image.alpha is not None
@@ -101,11 +103,11 @@ def test_a_part_of_a_picture_is_the_same_alone(network: KeypointNerf, person: Pe
 def test_all_weights_are_learned(network: KeypointNerf, person: Person) -> None:
     """The same random numbers give the same gradients."""
     sources, body, scale = given(person)
-    camera = metric(window(person.images[1], 8, 10, 16).cameras, scale)
+    camera = cameras_in_metres(crop_window(person.images[1], 8, 10, 16).cameras, scale)
     grads = []
     for _ in range(2):
-        picture = network.picture(
-            network.look(sources, body), camera, torch.Generator().manual_seed(1)
+        picture = network.render(
+            network.encode(sources, body), camera, torch.Generator().manual_seed(1)
         )
         total = picture.colour.square().sum() + picture.transmittance.sum()
         grads.append(torch.autograd.grad(total, list(network.parameters())))

@@ -84,10 +84,10 @@ def test_a_prediction_is_a_run(
     assert "this needs a scene of Gaussians" in error_line(
         capsys, "export", str(made.run_dir), "--format", "ply"
     )
-    assert "a predicted field is not trained" in error_line(
+    assert "predicted fields cannot be trained" in error_line(
         capsys, "train", "--resume", str(made.run_dir)
     )
-    assert "is not trained" in error_line(
+    assert "cannot be trained" in error_line(
         capsys, "train", f"data.root={read_captured_person(folder)}", "model.kind=predicted_field"
     )
 
@@ -95,9 +95,7 @@ def test_a_prediction_is_a_run(
 def test_what_cannot_be_predicted_from_is_refused(run: Path, folder: Path, tmp_path: Path) -> None:
     person = read_captured_person(folder)
     out = tmp_path / "out"
-    with pytest.raises(
-        DyngsError, match="p000001: a field is predicted from two views of one moment"
-    ):
+    with pytest.raises(DyngsError, match="p000001: needs at least two views of one time step"):
         predict(run, person, out, 1)
     with pytest.raises(
         DyngsError, match=f"--steps 3: {run.name} is not trained on the images of one person"
@@ -111,7 +109,7 @@ def test_what_cannot_be_predicted_from_is_refused(run: Path, folder: Path, tmp_p
         predict(run, twice, out, tuple(Path(x["file_path"]).name for x in listed["frames"][1:3]))
     for file in (tmp_path / "twice").rglob("images/**/*.png"):
         Image.open(file).convert("RGB").save(file)
-    with pytest.raises(DyngsError, match="twice: has no silhouettes"):
+    with pytest.raises(DyngsError, match="twice: no silhouettes"):
         predict(run, twice, out, 2)
     half = Path(shutil.copytree(run, tmp_path / "half"))
     weights = checkpoint_paths(half)[-1]
@@ -124,7 +122,7 @@ def test_what_cannot_be_predicted_from_is_refused(run: Path, folder: Path, tmp_p
     document = json.loads(file.read_text())
     document["frames"] = [x | {"time": float(i % 2)} for i, x in enumerate(document["frames"])]
     file.write_text(json.dumps(document))
-    with pytest.raises(DyngsError, match="two views of one moment"):
+    with pytest.raises(DyngsError, match="two views of one time step"):
         predict(run, moving, out, tuple(Path(x["file_path"]).name for x in document["frames"][1:3]))
     assert not out.exists()
 
@@ -136,12 +134,12 @@ def test_a_body_is_fitted_where_none_is_given(
     written."""
     asked: list[Path] = []
     monkeypatch.setattr(
-        "dyngs.human.predict.fields.prediction.with_fitted_body",
+        "dyngs.human.predict.fields.prediction.ensure_fitted_body",
         lambda data, **_: (asked.append(data.root), data)[1],
     )
     person = Path(shutil.copytree(read_captured_person(folder), tmp_path / "bare"))
     (person / "body_train.npz").unlink()
-    with pytest.raises(DyngsError, match="bare: has no body parameters"):
+    with pytest.raises(DyngsError, match="bare: no body parameters"):
         predict(run, person, tmp_path / "out", 2)
     assert asked == [person]
     assert not (tmp_path / "out").exists()
@@ -152,5 +150,7 @@ def test_somebody_must_be_seen_from_three_sides(folder: Path, tmp_path: Path) ->
     file = person / "transforms_train.json"
     document = json.loads(file.read_text())
     file.write_text(json.dumps(document | {"frames": document["frames"][:2]}))
-    with pytest.raises(DyngsError, match="ann: shows no moment in three views or more"):
+    with pytest.raises(
+        DyngsError, match="ann: training needs a time step with three or more views"
+    ):
         network_trainer(field_config("keypoint_nerf", tmp_path / "set", tmp_path))

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from dyngs.human.avatar.observations import project_points
-from dyngs.human.predict.gps.rectification import moments, spread
+from dyngs.human.predict.gps.rectification import spread, views_by_time
 from dyngs.human.predict.people import (
     Person,
+    cameras_in_metres,
     crop_source_images,
-    metric,
 )
 
 
@@ -21,7 +21,7 @@ def test_key_points_lie_in_the_person(person: Person) -> None:
     """In all images, once metres are the units of the world."""
     body, scale = person.body_in(person.views[0])
     for image in person.images:
-        at, _, _ = project_points(body.key_points, metric(image.cameras, scale))
+        at, _, _ = project_points(body.key_points, cameras_in_metres(image.cameras, scale))
         column, row = at.long().unbind(1)
         assert image.alpha is not None
         assert float((image.alpha[row, column] > 0).float().mean()) > 0.9
@@ -35,7 +35,7 @@ def test_metres_look_the_same(person: Person) -> None:
     """The silhouette of the body lies where the image shows the person."""
     body, scale = person.body_in(person.views[0])
     image = person.images[0]
-    at, _, _ = project_points(body.vertices, metric(image.cameras, scale))
+    at, _, _ = project_points(body.vertices, cameras_in_metres(image.cameras, scale))
     expected, _, _ = project_points(scale * body.vertices, image.cameras)
     torch.testing.assert_close(at, expected, atol=1e-3, rtol=0)
     column, row = at.long().unbind(1)
@@ -56,7 +56,10 @@ def test_sources_are_the_images_around_the_person(person: Person) -> None:
         whole = torch.cat([image.rgb_premultiplied, image.alpha[..., None]], -1)
         cut = sources.rgba[i].permute(1, 2, 0)
         found = []
-        for camera, rgba in ((sources.camera(i), cut), (metric(image.cameras, scale), whole)):
+        for camera, rgba in (
+            (sources.camera(i), cut),
+            (cameras_in_metres(image.cameras, scale), whole),
+        ):
             at, _, _ = project_points(body.key_points[:12], camera)
             column, row = at.long().unbind(1)
             found.append(rgba[row, column])
@@ -66,11 +69,14 @@ def test_sources_are_the_images_around_the_person(person: Person) -> None:
 
 def test_views_are_spread_around_a_moment(person: Person) -> None:
     views = person.views
-    (ring,) = moments(views).values()
+    (ring,) = views_by_time(views).values()
     assert sorted(ring) == list(range(len(views)))
     angles = np.unwrap([np.arctan2(*views[i].cam_from_world[2, [0, 2]]) for i in ring])
     assert (np.diff(angles) > 0).all() or (np.diff(angles) < 0).all()
     assert spread(range(12), 4) == [0, 3, 6, 9]
     assert spread(range(12), 3, 11) == [11, 3, 7]
     later = [replace(view, frame=1, time=0.5) if i % 2 else view for i, view in enumerate(views)]
-    assert [len(x) for x in moments(later).values()] == [(len(views) + 1) // 2, len(views) // 2]
+    assert [len(x) for x in views_by_time(later).values()] == [
+        (len(views) + 1) // 2,
+        len(views) // 2,
+    ]

@@ -26,7 +26,7 @@ from dyngs.data.loader import ImageLoader
 from dyngs.data.read import list_captures, read_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.gaussians.static_scene import StaticScene
-from dyngs.human.predict.gps.rectification import neighbours
+from dyngs.human.predict.gps.rectification import neighbour_pairs
 from dyngs.human.predict.gps.stereo import learner, predictor
 from dyngs.human.synthetic.capture import PeopleOptions, write_people
 from dyngs.models.prediction import Predictor
@@ -49,7 +49,7 @@ def read_captured_person(folder: Path) -> Path:
 
 
 def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, run: Path, tmp_path: Path) -> None:
-    """Resumed between the two stages: of what is learned in the second alone there are no moments
+    """Resumed between the two stages: of what is learned in the second alone there are no views_by_time
     yet."""
     middle, last = checkpoint_paths(run)
     config = stereo_config(folder, tmp_path / "parts")
@@ -121,7 +121,7 @@ def test_a_ring_is_seen_from_all_round(run: Path, folder: Path, tmp_path: Path) 
         for v in x
         if v.name in all_round.views
     ]
-    pair = neighbours(
+    pair = neighbour_pairs(
         "p", views, [[v.name for v in views].index(name) for name in all_round.views]
     )[side]
     names = tuple(views[i].name for i in pair)
@@ -182,9 +182,9 @@ def without_depth(frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
     [
         (
             lambda frames: frames[::3],
-            "p: no view stands between two others that are at most 50 degrees apart",
+            "p: no view lies between two others at most 50 degrees apart",
         ),
-        (without_depth, "p: has no depth maps, from which depth is learned"),
+        (without_depth, "p: no depth maps, which training needs"),
     ],
 )
 def test_what_cannot_be_trained_on_is_refused(

@@ -12,7 +12,7 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.capture import View
 from dyngs.human.predict.gps.rectification import (
     best_pair,
-    neighbours,
+    neighbour_pairs,
     order_around_person,
     order_as_pair,
     spread_around_person,
@@ -62,19 +62,19 @@ def test_order_around_the_vertical_starts_anywhere() -> None:
 def test_what_does_not_suit_is_refused(one: View, other: View) -> None:
     assert order_as_pair([one, other], 0, 1) is None
     for chosen in ([0, 1], [0]):
-        with pytest.raises(DyngsError, match=rf"^ann: {one.name} has no neighbour"):
-            neighbours("ann", [one, other], chosen)
+        with pytest.raises(DyngsError, match=rf"^ann: {one.name} has no neighbouring view"):
+            neighbour_pairs("ann", [one, other], chosen)
 
 
 def test_views_are_chosen_around_the_ring() -> None:
-    assert len(neighbours("ann", RING, spread_around_person(RING, 8))) == 8
+    assert len(neighbour_pairs("ann", RING, spread_around_person(RING, 8))) == 8
     two = best_pair(RING)
-    assert len(neighbours("ann", RING, two)) == 1
+    assert len(neighbour_pairs("ann", RING, two)) == 1
     dense = [view_at(10 * i) for i in range(36)]
-    left, right = neighbours("ann", dense, best_pair(dense))[0]
+    left, right = neighbour_pairs("ann", dense, best_pair(dense))[0]
     turned = (float(dense[right].name[3:]) - float(dense[left].name[3:])) % 360
     assert turned == 30
-    assert len(neighbours("ann", dense, spread_around_person(dense, 12))) == 12
+    assert len(neighbour_pairs("ann", dense, spread_around_person(dense, 12))) == 12
     later = [replace(view, frame=1, name=f"later_{view.name}") for view in dense]
     assert {dense[i % 36].frame for i in spread_around_person([*dense[:5], *later], 9)} == {0}
     assert all(i >= 5 for i in spread_around_person([*dense[:5], *later], 9)), (

@@ -10,9 +10,9 @@ from dyngs.human.predict.gps.stereo import (
     NUM_OFFSETS,
     QUARTER,
     StereoNetwork,
-    offsets_of,
+    candidate_offsets,
+    convex_upsample,
     plane_sweep_costs,
-    refined,
 )
 from dyngs.models.prediction import Encoder
 
@@ -34,7 +34,7 @@ def plane(offset: int) -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("index", [4, 20, 40])
 def test_colours_agree_at_the_true_offset_in_both_views(index: int) -> None:
-    offsets = offsets_of(SHIFT)
+    offsets = candidate_offsets(SHIFT)
     rgb, alpha = plane(offsets[index])
     colours, beside = plane_sweep_costs(rgb, alpha, offsets).split(NUM_OFFSETS, dim=1)
     both = (alpha[:, :, ::4, ::4] > 0) & (beside[:, index : index + 1] == 0)
@@ -47,7 +47,7 @@ def test_colours_agree_at_the_true_offset_in_both_views(index: int) -> None:
 def test_what_the_other_view_shows_beside_the_person_is_known() -> None:
     """At the left edge of the left view a nearer surface would be seen beside the person in the
     right one."""
-    offsets = offsets_of(SHIFT)
+    offsets = candidate_offsets(SHIFT)
     rgb, alpha = plane(0)
     # of columns 20 to 23 of 128, and two on either side
     beside = plane_sweep_costs(rgb, alpha, offsets)[:, NUM_OFFSETS:, 8, 5]
@@ -65,7 +65,7 @@ def test_the_untrained_network_finds_what_is_plain() -> None:
     torch.manual_seed(0)
     encoder = Encoder(4, WIDTHS)
     stereo = StereoNetwork(WIDTHS)
-    offsets = offsets_of(SHIFT)
+    offsets = candidate_offsets(SHIFT)
     for x in (*stereo.change.parameters(), *stereo.weights.parameters()):
         torch.nn.init.zeros_(x)
     rgb, alpha = plane(offsets[25])
@@ -86,15 +86,17 @@ def test_upsampled_values_are_means_of_those_inside() -> None:
     coarse = torch.arange(12.0).view(1, 1, 3, 4)
     everywhere = torch.ones(1, 1, 3, 4)
     weights = torch.zeros(1, 9 * QUARTER**2, 3, 4)
-    soft = refined(coarse, weights, everywhere)
+    soft = convex_upsample(coarse, weights, everywhere)
     assert soft.shape == (1, 1, 12, 16)
     assert (soft[0, 0, :, 6:10].diff(dim=1) > 0).all()
     weights.view(1, 9, QUARTER, QUARTER, 3, 4)[:, 4] = 50.0
-    fine = refined(coarse, weights, everywhere)
+    fine = convex_upsample(coarse, weights, everywhere)
     torch.testing.assert_close(fine, coarse.repeat_interleave(4, 2).repeat_interleave(4, 3))
     assert (
-        refined(torch.full_like(coarse, 3.0), torch.randn(1, 144, 3, 4), everywhere) - 3
+        convex_upsample(torch.full_like(coarse, 3.0), torch.randn(1, 144, 3, 4), everywhere) - 3
     ).abs().max() < 1e-5
     inside = (torch.arange(4) < 2).float().expand(1, 1, 3, 4)
     wild = torch.where(inside > 0, 3.0, 1e3)
-    assert (refined(wild, torch.randn(1, 144, 3, 4), inside)[..., :8] - 3).abs().max() < 1e-4
+    assert (
+        convex_upsample(wild, torch.randn(1, 144, 3, 4), inside)[..., :8] - 3
+    ).abs().max() < 1e-4

@@ -22,7 +22,9 @@ def test_true_offsets_put_gaussians_on_the_surface(pair: RectifiedPair) -> None:
     raw = torch.zeros(*offsets.shape[:1], 8, *offsets.shape[2:])
     found = surface_gaussians_of_pair(pair, offsets, raw)
     assert len(found) == int(pair.solid.sum())
-    inner = (pair.alpha[pair.solid] > 0.999) & (pair.seen_by_other(offsets)[pair.solid] > 0.999)
+    inner = (pair.alpha[pair.solid] > 0.999) & (
+        pair.alpha_in_other_view(offsets)[pair.solid] > 0.999
+    )
     assert found.opacities[inner].min() > 0.85
     assert ((found.means - CENTER).norm(dim=1) - RADIUS)[inner].abs().max() < 1e-4
     assert found.scales.min() > 0
@@ -42,7 +44,7 @@ def test_what_the_other_view_does_not_show_is_transparent(pair: RectifiedPair) -
     )
     known = pair.alpha[pair.solid] > 0.999
     assert right[known].mean() > 0.8
-    beside = pair.seen_by_other(offsets + 15.0)[pair.solid] == 0
+    beside = pair.alpha_in_other_view(offsets + 15.0)[pair.solid] == 0
     assert 0.1 < beside.float().mean() < 0.9
     assert wrong[beside].max() < 1e-3
 
