@@ -71,7 +71,7 @@ def fix_left_right_swaps(person: Sequence[Detection | None]) -> tuple[list[Detec
     return result, int(was_swapped.sum())
 
 
-def _swapped(points: np.ndarray, pairs: np.ndarray, heights: np.ndarray) -> np.ndarray:
+def _find_swaps(points: np.ndarray, pairs: np.ndarray, heights: np.ndarray) -> np.ndarray:
     """Return the images (F,) bool in which ``pairs`` (P, 2) of ``points`` (F, 17, 3) should be
     swapped."""
     if len(points) < 2:

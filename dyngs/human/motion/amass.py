@@ -89,7 +89,7 @@ def read_amass(
         if not is_fit:
             betas = np.zeros_like(betas) if is_other_model else betas[: body.num_shapes]
         rate = _frame_rate(path, arrays, fps)
-        y_from_file, notes = _y_up_from_file(path, arrays, up, poses[:, 0], is_named)
+        y_from_file, notes = _y_up_from_file(path, arrays, up, poses[:, 0], has_smplx_names)
         if y_from_file is not None:
             pelvis = scale[:, None] * _pelvis(body, betas)
             roots = Rotation.from_matrix(y_from_file) * Rotation.from_rotvec(poses[:, 0])
@@ -215,8 +215,8 @@ def _y_up_from_file(
     guessed.
 
     ``up`` or the key ``up_axis`` decide, else AMASS files are z up. For smplx and ROMP keys
-    (``is_named``), up is the signed axis nearest to the mean up direction of the root ``roots``
-    (F, 3).
+    (``has_smplx_names``), up is the signed axis nearest to the mean up direction of the root
+    ``roots`` (F, 3).
     """
     if up != "auto":
         chosen = up
