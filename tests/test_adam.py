@@ -1,4 +1,4 @@
-"""Adam of named tensors: torch's own, which leaves out rows that it must not touch."""
+"""Adam of named tensors: torch's Adam with skipped rows."""
 
 from __future__ import annotations
 

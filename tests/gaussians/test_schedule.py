@@ -1,5 +1,4 @@
-"""Schedules: exactly the published numbers at 30,000 steps, and sensible ones at any other
-length."""
+"""Schedules: the published values at 30,000 steps, and scaled ones at other lengths."""
 
 from __future__ import annotations
 
@@ -95,7 +94,7 @@ def _config(
 
 
 def test_rates_of_a_static_scene_fit_the_length() -> None:
-    """Those published at their length and beyond, higher ones in a shorter run, positions most."""
+    """Published rates from the published length on. Shorter runs have higher rates, means most."""
     factors = [
         rate_factors(_config(steps)) for steps in (1, 500, 2000, 7000, 29_999, 30_000, 90_000)
     ]
@@ -139,8 +138,9 @@ def test_growth_is_the_published_one_or_more_up_to_a_quarter_at_any_length(steps
 def test_phases_of_a_dynamic_model_come_in_order(
     steps: int, coarse: float, time_window_full_at: float
 ) -> None:
-    """Coarse, fine, all times, splits; each within the run, and never is there none before motion
-    begins."""
+    """The order is coarse, fine, all times, splits. All lie within the run, and the coarse phase
+    is never empty.
+    """
     model = DynamicModel(motion_from=coarse, time_window_full_at=time_window_full_at)
     schedule = deform_schedule(model, RateSchedule(steps))
     assert schedule.rates.steps == steps

@@ -1,5 +1,4 @@
-"""What computes: the choice, and for a GPU that cannot be used one line with the reason and what to
-do."""
+"""Choice of the device, and the message for a GPU that is not usable."""
 
 from __future__ import annotations
 
@@ -30,7 +29,7 @@ from dyngs.ops.device import (
 
 @pytest.fixture
 def machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
-    """One with a usable GPU, of which a test takes away something."""
+    """A machine with a usable GPU; each test removes one requirement."""
     gpu_unavailable_reason.cache_clear()
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
@@ -123,7 +122,7 @@ def test_other_choices_are_refused() -> None:
 
 
 def test_torch_is_deterministic_on_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And only there, only inside, and only if that is wanted."""
+    """Only on a GPU, only inside the context, and only if requested."""
     told: list[tuple[bool, bool]] = []
     monkeypatch.delenv("CUBLAS_WORKSPACE_CONFIG", raising=False)
     monkeypatch.setattr(

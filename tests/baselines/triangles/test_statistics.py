@@ -1,4 +1,4 @@
-"""What images say about triangles."""
+"""Image statistics of triangles: pixel counts and outlines."""
 
 from __future__ import annotations
 

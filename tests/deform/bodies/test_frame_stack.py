@@ -1,5 +1,4 @@
-"""What one moving camera shows: pixels, rays, the pixels on a ball, and what differs from the
-static model."""
+"""Frames of one moving camera: pixels, rays, ball surfaces and residuals of the static model."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ def test_rays_go_through_the_points_that_they_show() -> None:
 
 
 def test_pixels_on_a_ball_see_its_surface() -> None:
-    """They differ from the static model, unless something hides the ball."""
+    """Pixels on the ball differ from the static model unless the ball is occluded."""
     frame_stack, centers, _ = rolling()
     rows, columns, normals = frame_stack.ball_pixels(3, centers[3], 0.28)
     assert len(rows) > 50

@@ -1,5 +1,4 @@
-"""What is learned of colours beside harmonics, its rates, when harmonics are measured, and the
-entropy of opacities."""
+"""Training of colours beyond SH: learning rates, pruning of SH, and opacity entropy."""
 
 from __future__ import annotations
 
@@ -50,7 +49,7 @@ def colours(seed: int = 0, **options: object) -> NetworkTraining:
 
 
 def stored(learner: NetworkTraining) -> dict[str, Tensor]:
-    """What a checkpoint has of colours: of the scene, and of its training."""
+    """Colour tensors in a checkpoint, of the scene and of its optimizer."""
     return {
         name: x.clone()
         for name, x in strip_roles(learner.network.state() | learner.state()).items()
@@ -156,7 +155,7 @@ def _coloured(
 
 @pytest.mark.parametrize("name", COLOURS)
 def test_every_kind_of_colour_learns_and_goes_on_exactly(seven_views: Path, name: str) -> None:
-    """From a checkpoint before the harmonics are measured, and from one after."""
+    """Resumed from a checkpoint before SH pruning, and from one after it."""
     whole = _coloured(seven_views, COLOURS[name])
     losses = []
     for step in range(1, 41):
@@ -175,8 +174,9 @@ def test_every_kind_of_colour_learns_and_goes_on_exactly(seven_views: Path, name
 
 @pytest.mark.parametrize("name", ["none pays", "some pay"])
 def test_harmonics_without_gain_are_dropped(seven_views: Path, name: str) -> None:
-    """For good: they stay zero while the set changes; the view that tells is not trained on
-    before."""
+    """Dropped SH stay zero after later edits. The validation view is excluded from training
+    before.
+    """
     busy = DefaultStrategy(
         start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=1_000_000
     )
