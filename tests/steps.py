@@ -44,7 +44,7 @@ class Counting:
         return report_of(step, message=self.messages.get(step))
 
     def apply(self, edit: TrainingEdit) -> None:
-        """DEL"""
+        """Ignore the edit."""
 
     def checkpoint(self) -> Checkpoint:
         return Checkpoint(CheckpointInfo(self.done, 1.0, (0.0, 0.0, 0.0), "black", "classic"), {})

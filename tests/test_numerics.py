@@ -118,7 +118,7 @@ def gradients_vanish(
 # -----------------------------------------------------------------------------------------------------------
 
 
-def test_scale_1e_minus_12_is_a_dot_of_the_low_pass() -> None:
+def test_scale_1e_minus_12_renders_as_the_low_pass_filter() -> None:
     """Alpha is o exp(-d^2 / (2 eps2d)), whatever the rotation."""
     gaussians = some_gaussians(
         n=1, means=torch.tensor([[0.0, 0.0, 3.0]]), log_scales=math.log(1e-12)
@@ -132,7 +132,7 @@ def test_scale_1e_minus_12_is_a_dot_of_the_low_pass() -> None:
     check_against_float64(some_gaussians(log_scales=math.log(1e-12)), camera())
 
 
-def test_scale_1e12_is_a_uniform_veil() -> None:
+def test_scale_1e12_covers_the_image_uniformly() -> None:
     image = check_against_float64(some_gaussians(log_scales=math.log(1e12)), camera())
     alpha = 1 - (1 - some_gaussians().opacities.clamp_max(0.99)).prod()
     torch.testing.assert_close(image.alpha, alpha.expand(1, 29, 37), rtol=0, atol=2e-6)

@@ -123,7 +123,7 @@ def test_nodes_lie_at_gaussians_after_any_edits(nodes: int, sets: list[list[int]
         assert all(len(x) == len(positions) for x in strip_roles(field.parameters.state()).values())
 
 
-def test_new_nodes_start_with_the_motion_found_there() -> None:
+def test_new_nodes_interpolate_the_motion_of_the_field() -> None:
     """In a field that moves rigidly new nodes get the same motion, and existing ones keep it."""
     means = cloud(30).means
     field = placed(means[:10], nodes=20, pieces=2)
@@ -140,7 +140,7 @@ def test_new_nodes_start_with_the_motion_found_there() -> None:
     torch.testing.assert_close(moved, means @ matrix.T, rtol=0, atol=1e-5)
 
 
-def test_nodes_that_nothing_follows_are_dropped_with_their_moments() -> None:
+def test_unused_nodes_are_removed_with_their_moments() -> None:
     means = torch.tensor([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0]])
     field = placed(means, nodes=3, pieces=1, **MEANS_ONLY)
     field.offsets(means, 0.5).means.square().sum().backward()
@@ -166,7 +166,7 @@ def test_nodes_that_nothing_follows_are_dropped_with_their_moments() -> None:
 # -----------------------------------------------------------------------------------------------
 
 
-def test_motion_goes_on_at_constant_velocity() -> None:
+def test_motion_is_extrapolated_at_constant_velocity() -> None:
     """The velocity is that of the last two intervals on either side. The outermost control points
     are ignored.
     """

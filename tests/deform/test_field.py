@@ -46,7 +46,7 @@ def test_every_field_starts_as_the_identity(kind: str, everything: bool) -> None
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_gradients_reach_all_that_is_learned(kind: str) -> None:
+def test_every_parameter_gets_a_gradient(kind: str) -> None:
     """After some training; before it the last layer is zero, and it alone learns in the first
     step."""
     gaussians = cloud()
@@ -65,7 +65,7 @@ def test_gradients_reach_all_that_is_learned(kind: str) -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(st.sets(st.integers(0, 8)), st.sets(st.sampled_from(ATTRIBUTES)))
-def test_rows_alone_are_changed_and_as_without_rows(chosen: set[int], absent: set[str]) -> None:
+def test_only_selected_rows_are_deformed(chosen: set[int], absent: set[str]) -> None:
     gaussians = cloud()
     rows = torch.tensor(sorted(chosen), dtype=torch.long)
     offsets = Offsets(

@@ -54,7 +54,7 @@ def test_paths_are_straight_and_windows_follow_their_definition() -> None:
     assert torch.autograd.gradcheck(at, (p["centers"], p["log_spans"], p["velocities"]))
 
 
-def test_new_gaussians_are_earlier_and_later_on_the_same_path() -> None:
+def test_new_gaussians_lie_on_the_same_trajectory() -> None:
     """Two of one source get both signs, all stay within the clip, and those that were there before
     keep theirs."""
     field = field_of([0.5, 0.0], [0.1, 0.1], [[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]])

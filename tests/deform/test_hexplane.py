@@ -41,7 +41,7 @@ def outputs_at(field: Hexplane, means: Tensor, time: float) -> Tensor:
     return torch.cat([x.detach().reshape(len(means), -1) for x in offsets if x is not None], dim=1)
 
 
-def test_planes_start_as_published() -> None:
+def test_planes_are_initialized_as_published() -> None:
     """Space uniform in [0.1, 0.5], time at 1; as many rows as the clip asks for."""
     field = tiny_field("hexplane")
     assert isinstance(field, Hexplane)
@@ -53,7 +53,7 @@ def test_planes_start_as_published() -> None:
         assert 0.45 < level.space.max() <= 0.5
 
 
-def test_the_last_time_is_the_last_row() -> None:
+def test_last_time_is_the_last_plane_row() -> None:
     """At time 1 only the last row counts, at time 0 only the first."""
     field = stirred_field("hexplane")
     assert isinstance(field, Hexplane)
@@ -72,9 +72,7 @@ def test_the_last_time_is_the_last_row() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(2, 40), st.lists(st.floats(0, 0.5), min_size=1, max_size=6))
-def test_rows_that_were_seen_never_change_and_at_the_end_none_is_left_over(
-    rows: int, time_offsets: list[float]
-) -> None:
+def test_extrapolation_fills_unseen_time_rows_only(rows: int, time_offsets: list[float]) -> None:
     """For any sequence of growing windows around the middle, up to the whole clip."""
     field = field_with_rows(rows)
     last = rows - 1

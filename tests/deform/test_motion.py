@@ -43,7 +43,7 @@ def static(means: Tensor) -> Tensor:
     return torch.zeros_like(means)
 
 
-def test_a_circle_counts_by_its_radius() -> None:
+def test_score_of_a_circular_path_is_its_radius() -> None:
     def circle(means: Tensor, t: float) -> Offsets:
         turn = Rotation.from_rotvec([0, 0, 2 * torch.pi * t]).apply([0.2, 0.0, 0.0])
         return Offsets(filled(len(means), *turn.tolist()))
@@ -53,7 +53,7 @@ def test_a_circle_counts_by_its_radius() -> None:
     torch.testing.assert_close(found, torch.full((4,), 0.2))
 
 
-def test_turning_and_growing_count_by_the_size_of_the_gaussian() -> None:
+def test_rotation_and_scaling_scores_grow_with_the_size() -> None:
     """A rotation by 0.02 rad moves the end of the longest axis by 0.02 of its length. Its
     quaternion offset is (0, 0, 0, 0.01).
     """
@@ -69,7 +69,7 @@ def test_turning_and_growing_count_by_the_size_of_the_gaussian() -> None:
     torch.testing.assert_close(score(growth), 0.1 * longest)
 
 
-def test_opacity_and_colour_count_whatever_the_size_of_a_pixel() -> None:
+def test_opacity_and_colour_scores_ignore_the_pixel_size() -> None:
     gaussians = cloud(4)
 
     def fade(means: Tensor, t: float) -> Offsets:

@@ -154,7 +154,7 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_gradients_that_are_not_finite_are_left_out(kind: str) -> None:
+def test_nonfinite_gradients_are_skipped(kind: str) -> None:
     """Rows with non-finite gradients are skipped and logged as ``bad_gradients``. Parameters stay
     finite.
     """
@@ -171,7 +171,7 @@ def test_gradients_that_are_not_finite_are_left_out(kind: str) -> None:
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 @pytest.mark.parametrize("kind", ALL_KINDS)
-def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> None:
+def test_nonfinite_parameters_stop_training(capture: Path, kind: str, bad: float) -> None:
     """The next step raises before any update, and names step, view, attributes and time."""
     trainer = fine_trainer(capture, kind)
     scene = trainer.model.scene

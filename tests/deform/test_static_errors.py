@@ -172,7 +172,7 @@ def views(*cameras: int) -> list[View]:
     return [place(str(i), cam_from_world=poses[at], time=i / 1000) for i, at in enumerate(cameras)]
 
 
-def test_of_cameras_in_place_few_are_chosen_with_many_moments() -> None:
+def test_few_fixed_cameras_with_many_frames_are_selected() -> None:
     chosen = select_comparison_views(views(*[0, 1, 2] * 40), 20)
     assert chosen == [*range(0, 120, 12), *range(1, 120, 12)]
     assert select_comparison_views(views(0, 0, 0, 1), 50) == [0, 1, 2]
@@ -190,7 +190,7 @@ def test_of_cameras_in_place_few_are_chosen_with_many_moments() -> None:
     st.lists(st.floats(0.6, 0.7), min_size=2, max_size=40),
     st.floats(1e-3, 10),
 )
-def test_two_clear_groups_are_parted(low: list[float], high: list[float], scale: float) -> None:
+def test_threshold_separates_two_groups(low: list[float], high: list[float], scale: float) -> None:
     """At any scale and in any order, to 1/256 of the range (the histogram bin), if no group is
     tiny.
     """

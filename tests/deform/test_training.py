@@ -41,7 +41,7 @@ from dyngs.gaussians.schedule import RateSchedule
 
 
 @pytest.mark.parametrize(("step", "tracks"), [(FINE + 2, True), (FINE + 3, False)])
-def test_on_the_newest_views_only_the_motion_learns(step: int, tracks: bool) -> None:
+def test_newest_views_train_only_the_deformation(step: int, tracks: bool) -> None:
     """Views of new times must not change the canonical Gaussians before their motion is fitted."""
     gaussians = flat_cloud()
     run = begun(gaussians, time_window=0.3, full=FINE + 10)
@@ -302,7 +302,7 @@ def test_copies_of_moving_gaussians_move(data: st.DataObject) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("phase", ["coarse", "fine", "split"])
-def test_state_goes_round(kind: str, phase: str) -> None:
+def test_training_state_round_trip(kind: str, phase: str) -> None:
     gaussians = flat_cloud()
     deform = tiny_options(kind)
     run = (

@@ -57,7 +57,7 @@ def test_signal_is_the_mean_norm_in_ndc_units_over_the_views_that_see_it() -> No
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 3e38])
-def test_a_view_with_a_gradient_that_is_not_finite_does_not_count(bad: float) -> None:
+def test_views_with_nonfinite_gradients_are_not_counted(bad: float) -> None:
     densifier = _densifier(DefaultStrategy())
     _signal(densifier, [0.1, 0.2])
     grad = torch.tensor([[[bad, bad, 0.0, 0.0], [0.002, 0.0, 0.0, 0.0]]])
@@ -66,7 +66,7 @@ def test_a_view_with_a_gradient_that_is_not_finite_does_not_count(bad: float) ->
     assert densifier.state()["seen"].tolist() == [1, 2]
 
 
-def test_each_kind_of_gaussian_meets_its_fate() -> None:
+def test_gaussians_are_split_cloned_pruned_or_kept() -> None:
     #             calm    clone  split  faint   faint and wanted
     gaussians = _gaussians([SMALL, SMALL, LARGE, SMALL, LARGE], [0.5, 0.5, 0.5, 0.001, 0.001])
     densifier = _densifier()
@@ -120,7 +120,7 @@ def test_reset_lowers_opacities_and_clears_their_moments() -> None:
     )
 
 
-def test_one_gaussian_always_stays() -> None:
+def test_pruning_keeps_at_least_one_gaussian() -> None:
     densifier = _densifier()
     _signal(densifier, [1.0, 1.0, 1.0])
     result = densifier.edit(
@@ -133,7 +133,7 @@ def test_one_gaussian_always_stays() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**31), cap=st.integers(1, 60), n=st.integers(1, 40))
-def test_the_cap_holds_and_the_best_come_first(seed: int, cap: int, n: int) -> None:
+def test_cap_keeps_the_largest_gradients(seed: int, cap: int, n: int) -> None:
     generator = torch.Generator().manual_seed(seed)
 
     def draw(low: float, high: float) -> list[float]:
@@ -156,8 +156,8 @@ def test_the_cap_holds_and_the_best_come_first(seed: int, cap: int, n: int) -> N
         assert score[chosen].min() >= score[wanted & ~chosen].max()
 
 
-def test_which_side_the_limits_are_on() -> None:
-    """A Gaussian exactly at a limit stays, is wanted, and counts as small."""
+def test_gaussians_exactly_at_a_threshold() -> None:
+    """A Gaussian exactly at a limit is kept, is densified, and counts as small."""
     options = DefaultStrategy(prune_opacity=0.5, grad_threshold=0.25)
     for score, extent, max_scale, expected in (
         (0.24, 100.0, 1.0, "kept"),
@@ -168,7 +168,7 @@ def test_which_side_the_limits_are_on() -> None:
         (0.25, 10.0, 1 / 1.6 - 1e-3, ""),  # and here they are not
         (0.25, 10.0, 1 / 1.6 + 1e-3, "split"),
     ):
-        # log scale and logit 0; the second sees to it that one is left
+        # log scale and logit 0; the second keeps the set from being empty
         two = _gaussians([1.0, 0.1], [0.5, 0.9])
         plan = plan_edit(two, torch.tensor([score, 0.0]), options, extent, max_scale)
         found = " ".join(
@@ -205,7 +205,7 @@ def test_without_growth_gaussians_are_only_removed(seed: int, n: int) -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_bad_values_are_never_multiplied(bad: float) -> None:
+def test_nonfinite_gaussians_are_never_densified(bad: float) -> None:
     gaussians = _gaussians([SMALL, SMALL], [0.5, 0.5])
     logits = gaussians.logit_opacities.clone()
     logits[0] = math.nan
@@ -219,7 +219,7 @@ def test_bad_values_are_never_multiplied(bad: float) -> None:
     assert plan.kept.tolist() == [False, True]
 
 
-def test_huge_ones_go_only_after_the_first_reset() -> None:
+def test_large_gaussians_are_pruned_only_after_the_first_reset() -> None:
     gaussians = _gaussians([1.1, 0.9], [0.5, 0.5])  # limit: 0.1 * extent = 1
     for step, left in ((200, [0, 1]), (300, [0, 1]), (400, [1])):
         densifier = _densifier()

@@ -46,7 +46,7 @@ def test_merged_moments_are_those_of_the_mixture() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 64, 1000])
-def test_every_level_holds_the_one_below(count: int, small_blocks: None) -> None:
+def test_each_level_merges_the_level_below(count: int, small_blocks: None) -> None:
     gaussians = cloud(count)
     levels = build_levels(gaussians)
     assert len(levels.levels[-1]) <= 16
@@ -85,7 +85,7 @@ def test_cut_covers_every_gaussian_once(small_blocks: None) -> None:
         assert sum(levels.count(block) for block in cut) <= most
 
 
-def test_the_finest_cut_is_the_scene_to_the_bit(small_blocks: None) -> None:
+def test_finest_cut_equals_the_scene_bitwise(small_blocks: None) -> None:
     """The whole scene is in view. No two depths are equal, since ties are blended in index order."""
     gaussians = cloud(300)
     levels = build_levels(gaussians)
@@ -105,7 +105,7 @@ def test_blocks_outside_the_image_stay_coarse(small_blocks: None) -> None:
         assert levels.cut(away, pixels=0.0) == [(len(levels.levels) - 1, 0)]
 
 
-def test_from_afar_fewer_look_the_same(small_blocks: None) -> None:
+def test_distant_cut_needs_fewer_gaussians(small_blocks: None) -> None:
     """The cloud is a few pixels wide. The cut has a fifth of the Gaussians and is closer to a
     supersampled image.
     """

@@ -174,7 +174,7 @@ def test_cache_is_cleared_after_in_place_changes(kind: str) -> None:
 # -------------------------------------------------------------------------------------------------
 
 
-def test_all_that_is_computed_with_moves_to_a_device(kind: str) -> None:
+def test_scene_tensors_move_to_a_device(kind: str) -> None:
     """The meta device stands in for a GPU. Tensors that are read by the host stay on the CPU."""
     moved = scene_of_kind(kind).to("meta")
     on_cpu = {name for name, x in moved.state().items() if x.tensor.device.type == "cpu"}

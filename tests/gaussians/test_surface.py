@@ -114,7 +114,7 @@ def piece(center: tuple[float, float, float], count: int) -> tuple[Tensor, Tenso
     return corners, torch.stack([torch.zeros(count, dtype=torch.long), k + 1, k + 2], 1)
 
 
-def test_small_pieces_go_and_faces_keep_their_corners() -> None:
+def test_small_components_are_removed() -> None:
     (large, first), (small, second) = piece((0, 0, 0), 200), piece((9, 0, 0), 2)
     mesh = Mesh(torch.cat([small, large]).numpy(), torch.cat([second, first + len(small)]).numpy())
     kept = keep_largest_components(mesh)

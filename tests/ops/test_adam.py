@@ -99,7 +99,7 @@ def test_rows_with_non_finite_gradient_are_left_out_and_counted(
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_seen_rows(dtype: torch.dtype) -> None:
+def test_only_seen_rows_are_updated(dtype: torch.dtype) -> None:
     grads = torch.zeros(2000, 4, 3, dtype=dtype)
     grads[5, 3, 2] = 1e-40
     grads[700, 0, 0] = -1

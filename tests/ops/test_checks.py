@@ -73,7 +73,7 @@ def test_options_out_of_range_are_refused_by_name(kind: type, name: str, value: 
         },
     ],
 )
-def test_the_ends_of_the_ranges_are_allowed(options: dict[str, Any]) -> None:
+def test_range_limits_are_inclusive(options: dict[str, Any]) -> None:
     assert RenderOptions(**options).projection.near >= 0
 
 
@@ -87,7 +87,7 @@ DTYPES = [torch.float32, torch.float64]
     places=st.sets(st.tuples(st.integers(0, 49), st.integers(0, 2)), max_size=9),
     bad=st.sampled_from(BAD),
 )
-def test_counts_elements_and_rows(
+def test_nonfinite_elements_and_rows_are_counted(
     dtype: torch.dtype, places: set[tuple[int, int]], bad: float
 ) -> None:
     x = torch.randn(50, 3, dtype=dtype)
@@ -135,7 +135,7 @@ def veils(count: int = 1) -> Projection:
 
 
 @pytest.mark.parametrize("side", [-1, 0, MAX_SIDE + 1, 10**9, 2**31 - 8, 2**31, 2**63, 10**30])
-def test_sides_that_cannot_be_are_refused(side: int) -> None:
+def test_impossible_image_sizes_are_refused(side: int) -> None:
     """2^31 - 8 + 15 overflows an int; 2^63 does not fit the kernels' arguments."""
     message = f"^render refused: an image of {side}x5 px; its sides can be 1 to 8388608 px$"
     with pytest.raises(DyngsError, match=message):
@@ -150,7 +150,7 @@ def test_sides_that_cannot_be_are_refused(side: int) -> None:
             project(torch.ones(1, 3), torch.ones(1, 4), torch.ones(1, 3), torch.ones(1), cameras)
 
 
-def test_a_image_larger_than_memory_is_refused() -> None:
+def test_image_larger_than_memory_is_refused() -> None:
     side = MAX_SIDE
     with pytest.raises(
         DyngsError,
@@ -165,7 +165,7 @@ def test_a_image_larger_than_memory_is_refused() -> None:
         rasterize(veils(), torch.ones(1, 1), torch.ones(1, 1, 3), (side, side), entries=nothing)
 
 
-def test_pairs_beyond_counting_are_refused_soon() -> None:
+def test_too_many_tile_pairs_are_refused_early() -> None:
     """A million Gaussians on 8 million tiles are 8e12 pairs, of which only some are counted."""
     count = 10**6
     with pytest.raises(
@@ -190,7 +190,7 @@ def test_memory_of_the_machine(tmp_path: Path) -> None:
     assert core.available_memory(system(tmp_path, {})) == 8_192_000_000
 
 
-def test_the_narrowest_control_group_counts(tmp_path: Path) -> None:
+def test_smallest_cgroup_limit_applies(tmp_path: Path) -> None:
     """The page cache, which the kernel can drop, counts as free memory."""
     group = "sys/fs/cgroup/user.slice"
     files = {

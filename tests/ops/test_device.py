@@ -54,7 +54,7 @@ def refused() -> str:
     return line
 
 
-def test_a_gpu_that_can_be_used_is(machine: pytest.MonkeyPatch) -> None:
+def test_usable_gpu_is_chosen(machine: pytest.MonkeyPatch) -> None:
     assert select_device("auto") == select_device("cuda") == torch.device("cuda:0")
     assert select_device("cpu") == torch.device("cpu")
     assert cpu_fallback_reason("auto") is None
@@ -66,7 +66,7 @@ def test_a_gpu_that_can_be_used_is(machine: pytest.MonkeyPatch) -> None:
     }
 
 
-def test_a_torch_for_the_cpu_alone(machine: pytest.MonkeyPatch) -> None:
+def test_cpu_only_torch_is_reported(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(torch.version, "cuda", None)
     assert re.search(
         r"device cuda is not usable: this torch \(.*\) is built without CUDA: install a torch for CUDA",
@@ -75,7 +75,7 @@ def test_a_torch_for_the_cpu_alone(machine: pytest.MonkeyPatch) -> None:
     assert gpu_status()["GPU"] == "none"
 
 
-def test_kernels_that_were_not_built(machine: pytest.MonkeyPatch) -> None:
+def test_missing_kernels_are_reported(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(device, "has_cuda_core", lambda: False)
     assert (
         "built without its kernels for GPUs: install dyngs with `pip install . -C cmake.define"
@@ -84,7 +84,7 @@ def test_kernels_that_were_not_built(machine: pytest.MonkeyPatch) -> None:
     assert gpu_status()["kernels for GPUs"] == "not built"
 
 
-def test_kernels_that_cannot_be_loaded(machine: pytest.MonkeyPatch) -> None:
+def test_unloadable_kernels_are_reported(machine: pytest.MonkeyPatch) -> None:
     def fail() -> None:
         raise DyngsError("the kernels for CUDA GPUs are not there (broken); install them")
 
@@ -92,7 +92,7 @@ def test_kernels_that_cannot_be_loaded(machine: pytest.MonkeyPatch) -> None:
     assert "(broken)" in refused()
 
 
-def test_a_driver_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
+def test_too_old_driver_is_reported(machine: pytest.MonkeyPatch) -> None:
     core = SimpleNamespace(runtime_version=lambda: 13000, driver_version=lambda: 12040)
     machine.setattr(device, "cuda_core", lambda: core)
     assert (
@@ -101,7 +101,7 @@ def test_a_driver_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
     )
 
 
-def test_a_gpu_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
+def test_too_old_gpu_is_reported(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(torch.cuda, "get_device_capability", lambda: (7, 0))
     assert re.search(r"GPU is older than compute capability 7\.5", refused())
 

@@ -47,7 +47,7 @@ def imported_with(isa: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         (("v4",), "v4", "v4", "v4"),
     ],
 )
-def test_the_newest_that_the_processor_runs_is_chosen(
+def test_newest_supported_instruction_set_is_chosen(
     built: tuple[str, ...], newest: str, requested: str | None, chosen: str
 ) -> None:
     assert choose_isa(built, newest, requested) == chosen
@@ -89,7 +89,7 @@ def test_an_unknown_instruction_set_is_refused(monkeypatch: pytest.MonkeyPatch) 
         imported_with("v9", monkeypatch)
 
 
-def test_thread_counts_come_back_after_an_error() -> None:
+def test_thread_counts_are_restored_after_an_error() -> None:
     before = torch.get_num_threads()
     with pytest.raises(RuntimeError), kernel_threads(3):
         raise RuntimeError
@@ -110,7 +110,7 @@ def test_arrays_of_the_wrong_size_are_refused_before_they_are_read() -> None:
         core.project_forward(arrays, sizes, *outputs, torch.zeros(1, 4, 2, dtype=torch.int32))
 
 
-def test_strided_arrays_are_refused_rather_than_filled_elsewhere() -> None:
+def test_strided_arrays_are_refused() -> None:
     means = torch.zeros(4, 3)
     quats = torch.zeros(4, 4)
     scales = torch.zeros(4, 3)
@@ -126,7 +126,7 @@ def test_strided_arrays_are_refused_rather_than_filled_elsewhere() -> None:
         )
 
 
-def test_formulas_need_no_library_but_the_mathematical_one() -> None:
+def test_formulas_link_only_libm() -> None:
     allowed = {"cmath", "cstdint", "limits", "type_traits", "utility"}
     headers = sorted((ROOT / "csrc/math").glob("*.hpp"))
     assert headers
@@ -204,5 +204,5 @@ def test_fork_of_process_with_threads_uses_one_thread_and_warns() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks")
-def test_a_fork_of_a_process_of_one_thread_may_start_some() -> None:
+def test_forked_single_threaded_process_may_use_threads() -> None:
     assert drawn_after_forks(1) == ["True 1 4"] * 3

@@ -102,7 +102,7 @@ def test_a_row_does_not_depend_on_its_place() -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("skip", [None, 2])
-def test_a_bad_row_stays_alone(value: float, skip: int | None) -> None:
+def test_nan_row_does_not_affect_others(value: float, skip: int | None) -> None:
     widths = [11, 20, 30, 5]
     x, layers = cast(make_rows(130, widths[0]), make_layers(widths, skip), torch.float32)
     good = perceptron(x, layers, skip=skip)

@@ -127,7 +127,7 @@ def test_samples_grow_with_the_distance() -> None:
     assert torch.allclose(found.starts[1:], found.ends[:-1])
 
 
-def test_the_unit_cube_holds_everything_and_the_middle_half_what_is_near() -> None:
+def test_contraction_maps_the_inner_cube_to_the_middle_half() -> None:
     points = torch.tensor(
         [[1.0, 0, 0], [2.0, 0, 0], [1e6, 0, 0], [-1.0, 1, 0.5]], dtype=torch.float64
     )
@@ -143,7 +143,7 @@ def test_the_unit_cube_holds_everything_and_the_middle_half_what_is_near() -> No
     least=st.floats(0, 0.5),
 )
 @settings(max_examples=40, deadline=None)
-def test_rays_see_what_a_loop_sees(counts: list[int], seed: int, least: float) -> None:
+def test_composite_equals_a_loop(counts: list[int], seed: int, least: float) -> None:
     densities, colours, samples = some_samples(counts, seed)
     found = composite(densities, colours, samples, least)
     expected = reference_composite(densities, colours, samples, least)
@@ -165,7 +165,7 @@ def test_rays_see_what_a_loop_sees(counts: list[int], seed: int, least: float) -
         )
 
 
-def test_nothing_is_seen_through_a_wall_and_everything_through_air() -> None:
+def test_transmittance_of_opaque_and_empty_space() -> None:
     _, colours, samples = some_samples([3, 3])
     densities = torch.tensor([0.0, 1e9, 1.0, 0, 0, 0], dtype=torch.float64)
     seen = composite(densities, colours, samples)

@@ -38,11 +38,11 @@ def _double_backward(x: Backward) -> list[Tensor]:
 double_op: Any = register("test_double", _double, _double_backward, "x")
 
 
-def test_an_op_of_ones_own() -> None:
+def test_custom_op_can_be_registered() -> None:
     torch.library.opcheck(double_op, (torch.ones(3, requires_grad=True), [1.0, 2.0]))
 
 
-def test_another_device_joins_without_a_change_of_callers() -> None:
+def test_new_device_needs_no_change_of_callers() -> None:
     torch.library.impl("dyngs::test_double", "xpu", lambda x, factors: x * 7)
     found = double_op.redispatch(DispatchKeySet(DispatchKey.XPU), torch.ones(3), [1.0])
     assert found.tolist() == [7, 7, 7]

@@ -45,7 +45,7 @@ flags = st.booleans()
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32), flags, flags, flags, st.sampled_from([torch.float32, torch.float64]))
-def test_it_is_what_torch_says(
+def test_inputs_equal_the_torch_reference(
     seed: int, normals: bool, timed: bool, on_body: bool, dtype: torch.dtype
 ) -> None:
     seen = sight(seed, normals=normals, timed=timed, on_body=on_body, dtype=dtype)

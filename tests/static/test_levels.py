@@ -20,7 +20,7 @@ from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.static_scene import StaticScene, ViewSides
 
 
-def test_near_it_is_the_scene_itself() -> None:
+def test_close_views_use_the_full_scene() -> None:
     still = StaticScene(
         gaussians=cloud(),
         filter_std=torch.full((400,), 0.02),

@@ -57,7 +57,7 @@ def test_nothing_depends_on_time() -> None:
     assert all(x is scene.gaussians for x in drawn)
 
 
-def test_the_set_is_left_to_the_strategy() -> None:
+def test_densification_is_left_to_the_strategy() -> None:
     training = StaticTraining(FilterUpdate())
     assert all(
         training.edit_scene(training.first_scene(_gaussians(2.0)), step) is None
@@ -100,7 +100,7 @@ def test_small_gaussians_are_pruned_once() -> None:
     )
 
 
-def test_the_filter_is_kept_until_it_is_due() -> None:
+def test_filter_is_updated_on_schedule() -> None:
     training = StaticTraining(FilterUpdate([_camera()], range(100, 200, 100)))
     near = _gaussians(2.0)
     far = _gaussians(4.0)
@@ -124,7 +124,7 @@ def test_the_filter_is_kept_until_it_is_due() -> None:
     )
 
 
-def test_state_goes_round() -> None:
+def test_training_state_round_trip() -> None:
     training = StaticTraining(FilterUpdate([_camera()]))
     first = training.first_scene(_gaussians(2.0))
     stored = select_prefix(strip_roles(first.state()), "model")

@@ -35,7 +35,7 @@ def scene() -> FieldScene:
     return FieldScene(Ball(**vars(plain)))
 
 
-def test_a_ball_is_found_with_faces_outwards_and_colours(scene: FieldScene) -> None:
+def test_mesh_of_a_ball_has_outward_faces_and_colours(scene: FieldScene) -> None:
     found = extract_surface(scene, cells=40)
     offsets = found.vertices - MIDDLE.numpy()
     assert np.linalg.norm(offsets, axis=1) == pytest.approx(np.full(len(offsets), 0.5), abs=2e-3)

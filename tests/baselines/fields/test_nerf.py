@@ -12,7 +12,7 @@ from dyngs.ops.rays import Rays, Space
 SPACE = Space((0.0, 0.0, 0.0), 1.5, 1, 1)
 
 
-def test_rays_see_a_slab_of_even_density() -> None:
+def test_rendering_of_a_constant_density_field() -> None:
     """Biases alone give density 2 and one colour everywhere. The last sample is opaque."""
     model = NerfModel(sizes="tiny")
     field = NerfField.new(model, SPACE, torch.Generator().manual_seed(0))
@@ -36,7 +36,7 @@ def test_rays_see_a_slab_of_even_density() -> None:
     assert float(seen.depth[0]) == pytest.approx(2.5 + 0.5, abs=0.1)
 
 
-def test_all_that_is_learned_gets_gradients_and_none_is_of_rounding() -> None:
+def test_every_parameter_gets_a_gradient_free_of_rounding_errors() -> None:
     """The last sample is 1e10 long, which must not amplify rounding errors of the sums."""
     field = NerfField.new(NerfModel(sizes="tiny"), SPACE, torch.Generator().manual_seed(3))
     for x in field.parameters.values():

@@ -31,7 +31,7 @@ def rays_towards_it(count: int = 20) -> Rays:
 
 
 @pytest.mark.parametrize("time", [False, True])
-def test_rays_see_what_places_along_them_are(time: bool) -> None:
+def test_rays_composite_the_samples_along_them(time: bool) -> None:
     """Sample by sample, by the densities and colours of places: occupied ones, up to where nothing
     is left."""
     field = field_of(SMALL.model_copy(update={"time": time}))
@@ -56,7 +56,7 @@ def test_rays_see_what_places_along_them_are(time: bool) -> None:
     assert float(seen.transmittance.min()) < 0.6
 
 
-def test_mist_is_as_thick_in_each_cube() -> None:
+def test_density_is_equal_in_each_cube() -> None:
     field = NgpField.new(
         SMALL, Space((0.1, 0.0, -0.2), 1.2, 4, 8), torch.Generator().manual_seed(0)
     )

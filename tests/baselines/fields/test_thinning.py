@@ -25,7 +25,7 @@ def samples_of(
     return densities.flatten(), samples
 
 
-def test_what_shows_is_kept_and_the_rest_is_thinned() -> None:
+def test_visible_samples_are_kept_and_others_subsampled() -> None:
     generator = torch.Generator().manual_seed(0)
     densities, samples = samples_of(40, 40, generator)
     found, which = thin_samples(
@@ -44,7 +44,7 @@ def test_what_shows_is_kept_and_the_rest_is_thinned() -> None:
     assert torch.equal(found.offsets.diff(), torch.bincount(found.rays, minlength=40))
 
 
-def test_rays_see_the_same_on_average_with_the_same_gradients() -> None:
+def test_thinned_rays_are_unbiased_with_unbiased_gradients() -> None:
     """Over all four choices the mist in front of a wall lets as much through, and gets the same
     gradients."""
     densities, samples = samples_of(2, 40, torch.Generator().manual_seed(0))

@@ -36,7 +36,7 @@ def test_degenerate_triangles_are_prunable() -> None:
         assert prunable(good, sliver, 1.0).tolist() == [goes]
 
 
-def test_those_with_the_largest_gradients_are_split_within_the_limit() -> None:
+def test_largest_gradients_are_split_within_the_limit() -> None:
     patches = bent(6)
     kept, added = densify(patches, seen(6), 1.0, 12, 1)
     assert kept.tolist() == [0, 1, 2, 3]

@@ -43,7 +43,7 @@ def test_training_improves_and_respects_max_triangles(run: Path) -> None:
     assert max_pixels(scene, training_cameras(views, load_resolved(run).data)).min() >= 1
 
 
-def test_a_run_that_is_cut_ends_with_the_same_bytes(capture: Path, tmp_path: Path) -> None:
+def test_resume_equals_uninterrupted_run(capture: Path, tmp_path: Path) -> None:
     # cut right after a change and the first texture
     steps = ["train.steps=112", "train.save_every=56"]
     run = dyngs.train(config_of(capture, *steps, f"run.dir={tmp_path / 'run'}"))
@@ -79,7 +79,7 @@ def test_a_file_that_is_too_small_is_refused(capture: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj"])
-def test_it_is_a_mesh_with_colours(run: Path, tmp_path: Path, suffix: str) -> None:
+def test_export_is_a_coloured_mesh(run: Path, tmp_path: Path, suffix: str) -> None:
     out = tmp_path / f"mesh{suffix}"
     assert main(["export", str(run), "--format", "mesh", "--segments", "2", "--out", str(out)]) == 0
     mesh = trimesh.load(out, force="mesh", process=False)

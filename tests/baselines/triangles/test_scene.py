@@ -46,7 +46,7 @@ def test_edges_are_as_sharp_when_enlarged() -> None:
     assert soft[1] == soft[0]
 
 
-def test_harmonics_tell_directions_apart() -> None:
+def test_harmonics_make_colours_view_dependent() -> None:
     patches = bent(1)
     there = camera()
     back = camera()
@@ -75,7 +75,7 @@ def test_gradients_reach_everything() -> None:
         assert bool(x.grad.isfinite().all())
 
 
-def test_what_has_no_area_is_not_drawn_and_spoils_no_gradient() -> None:
+def test_degenerate_triangles_are_not_drawn_and_keep_gradients_finite() -> None:
     """All points equal, on a line, not a number, behind the camera and much larger than the scene,
     with a good one."""
     nan = SQUARE[0].clone()

@@ -60,7 +60,7 @@ def test_one_camera_shows_each_time_once() -> None:
     assert order_moving_camera([replace(v, cam_from_world=np.eye(4)) for v in views]) is None
 
 
-def test_masked_pixels_are_as_the_static_model_has_them() -> None:
+def test_masked_pixels_have_no_residual() -> None:
     gaussians = cloud()
     camera = one_camera_of(8)
     rgb = torch.rand(8, 8, 3)

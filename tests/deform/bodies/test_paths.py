@@ -9,7 +9,7 @@ from rolling_ball import hopping, rolling
 from dyngs.deform.bodies.paths import find_paths
 
 
-def test_a_ball_is_found_at_all_times() -> None:
+def test_ball_is_detected_at_all_times() -> None:
     frame_stack, centers, _ = rolling()
     (path, *_) = find_paths(frame_stack, frame_stack.differences())
     assert np.linalg.norm(path.centers - centers, axis=1).max() < 0.25 * 0.28

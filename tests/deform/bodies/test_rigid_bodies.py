@@ -13,7 +13,7 @@ from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import create_field
 
 
-def test_a_rolling_ball_begins_on_its_way() -> None:
+def test_rolling_ball_is_initialized_with_its_trajectory() -> None:
     """The seeds lie on the ball in the middle of the clip, and the field takes them along the true
     motion."""
     frame_stack, centers, turns = rolling()

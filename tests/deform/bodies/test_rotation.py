@@ -21,7 +21,7 @@ def errors_deg(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return angles_deg(np.einsum("tij,jk,tlk->til", found, axes, truth))
 
 
-def test_a_rolling_ball_is_followed_in_its_rotation() -> None:
+def test_rotation_of_a_rolling_ball_is_estimated() -> None:
     """The ball makes more than one full turn, and no initial angular velocity is given."""
     frame_stack, centers, truth = rolling()
     rotation = estimate_rotation(frame_stack, Path(centers, RADIUS, 1.0))
@@ -31,7 +31,7 @@ def test_a_rolling_ball_is_followed_in_its_rotation() -> None:
     assert rotation.disagreement < 0.4 * rotation.disagreement_without_rotation
 
 
-def test_two_turns_about_any_axis_are_followed() -> None:
+def test_spin_about_a_tilted_axis_is_estimated() -> None:
     """The ball spins in place, so its path holds no hint of the angular velocity."""
     frame_stack, centers, truth = hopping()
     errors = errors_deg(estimate_rotation(frame_stack, Path(centers, RADIUS, 1.0)).rotations, truth)

@@ -41,7 +41,7 @@ def test_ball_is_found_at_its_position(noise: float) -> None:
     assert np.abs(one.median / 255 - drawn(camera, []).numpy()).mean() < 0.02
 
 
-def test_a_shadow_is_none_of_it() -> None:
+def test_shadows_are_not_changes() -> None:
     """A shadow darkens all channels alike. Coloured, brighter and black patches are objects."""
     assert not detect_changes(with_patch((0.6, 0.62, 0.65))).any()
     for factor in ((0.9, 0.4, 0.4), (1.4, 1.4, 1.4), (0.05, 0.05, 0.05)):

@@ -24,7 +24,7 @@ def hulls(*balls: Ball, count: int = 8) -> list[Blob]:
 
 # of four, three suffice: their hull has corners
 @pytest.mark.parametrize(("count", "fraction"), [(4, 0.3), (8, 0.1)])
-def test_a_ball_is_found(count: int, fraction: float) -> None:
+def test_visual_hull_of_one_ball(count: int, fraction: float) -> None:
     """Its centre to a fraction of its radius, its radius to a fifth."""
     ball = Ball((0.31, -0.22, 0.13))
     (found,) = hulls(ball, count=count)
@@ -35,7 +35,7 @@ def test_a_ball_is_found(count: int, fraction: float) -> None:
         assert np.linalg.norm(found.cubes - np.array(ball.center), axis=1).max() < 1.6 * ball.radius
 
 
-def test_two_balls_are_two() -> None:
+def test_two_balls_have_separate_hulls() -> None:
     found = hulls(Ball((-0.4, 0.0, 0.1)), Ball((0.5, 0.2, -0.1), 0.15, (0.1, 0.2, 0.9)))
     places = np.array([blob.center for blob in found[:2]])
     assert np.abs(places - np.array([[-0.4, 0.0, 0.1], [0.5, 0.2, -0.1]])).max() < 0.05

@@ -21,7 +21,7 @@ def crossing(time: float) -> tuple[float, float, float]:
     return (1.6 * time - 0.8, 0.3, 0.1)
 
 
-def test_one_ball_begins_at_each_time() -> None:
+def test_ball_is_initialized_at_each_time() -> None:
     found = started(lambda t: [Ball(crossing(t))])
     assert found.message is not None
     assert "found moving objects at 12 of 12 times" in found.message

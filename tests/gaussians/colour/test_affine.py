@@ -28,7 +28,7 @@ def image_and_rendering() -> tuple[Image, Rendering]:
     return replace(image, rgb_premultiplied=rgb @ WARM[:, :3].T + WARM[:, 3]), shown_as(rgb)
 
 
-def test_an_affine_is_found_again() -> None:
+def test_known_affine_transform_is_recovered() -> None:
     image, rendering = image_and_rendering()
     found = fit_affine_colour([(image, rendering)], BLACK)
     # the ridge pulls a little to the identity

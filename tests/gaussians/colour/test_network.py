@@ -41,7 +41,7 @@ def plain(gaussians: Gaussians) -> Gaussians:
 
 
 @pytest.mark.parametrize("uses_normals", [False, True])
-def test_a_zero_last_layer_changes_nothing(uses_normals: bool) -> None:
+def test_zero_last_layer_keeps_base_colours(uses_normals: bool) -> None:
     scene = random_scene()
     gaussians = plain(scene.gaussians)
     shader = network(last=0.0, uses_normals=uses_normals).shader(0.3)

@@ -65,7 +65,7 @@ def test_the_rate_warms_up_and_falls_by_thirds() -> None:
     assert factors[1199] == pytest.approx(1 / 27)
 
 
-def test_state_goes_round_and_training_goes_on_alike() -> None:
+def test_resume_equals_uninterrupted_training() -> None:
     cameras = random_scene(views=1).to(torch.float32).cameras
     shown = torch.ones(1, 30, 2, dtype=torch.int32)
 
@@ -89,7 +89,7 @@ def test_state_goes_round_and_training_goes_on_alike() -> None:
     assert torch.equal(found.layers[1].weight, whole.network.layers[1].weight)
 
 
-def test_the_frozen_follow_the_set_and_go_round() -> None:
+def test_frozen_masks_follow_edits_and_are_restored() -> None:
     colours = AutoTraining(AutoColour(), 100, 20)
     assert colours.frozen_harmonics() is None
     colours.freeze(torch.tensor([True, False, True]))
@@ -109,7 +109,7 @@ def test_the_frozen_follow_the_set_and_go_round() -> None:
 
 
 @given(st.floats(-1e4, 1e4))
-def test_the_entropy_and_its_gradient_are_finite_and_right(logit: float) -> None:
+def test_opacity_entropy_and_its_gradient(logit: float) -> None:
     x = torch.tensor([logit], dtype=torch.float64, requires_grad=True)
     value = opacity_entropy(x)
     value.backward()
@@ -154,7 +154,7 @@ def _coloured(
 
 
 @pytest.mark.parametrize("name", COLOURS)
-def test_every_kind_of_colour_learns_and_goes_on_exactly(seven_views: Path, name: str) -> None:
+def test_every_colour_model_trains_and_resumes_exactly(seven_views: Path, name: str) -> None:
     """Resumed from a checkpoint before SH pruning, and from one after it."""
     whole = _coloured(seven_views, COLOURS[name])
     losses = []
