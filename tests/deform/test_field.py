@@ -117,7 +117,7 @@ def turned_quats(quats: Tensor, offsets: Tensor) -> Tensor:
 
 
 def slowly_deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None) -> Gaussians:
-    """``deformed`` by torch's own operators."""
+    """Reference of ``apply_offsets`` by torch's own operators."""
     rows = torch.arange(len(gaussians)) if rows is None else rows
     sh = gaussians.sh
     quats = gaussians.quats
