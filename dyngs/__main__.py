@@ -23,8 +23,7 @@ def main() -> int:
 
 
 def _interrupt(_: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, but end at once while a module is being imported: some swallow it,
-    or print it."""
+    """Raise KeyboardInterrupt, or exit at once during imports, where some modules suppress it."""
     while frame is not None:
         if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
             os.write(2, b"\ndyngs: interrupted\n")

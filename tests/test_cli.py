@@ -183,9 +183,9 @@ def test_names_that_are_no_text_can_be_printed(tmp_path: Path) -> None:
     ("arguments", "part"),
     [
         ("trian", "invalid choice: 'trian'"),
-        ("train", "give a config"),
+        ("train", "a config is required"),
         ("train nowhere.yaml data.root=x", "nowhere.yaml: no such preset"),
-        ("train static", "data.root is missing"),
+        ("train static", "data.root is required"),
         ("train static data.rot=x", "did you mean 'data.root'"),
         ("train static data.root=nowhere train.steps=0", "train.steps must be an integer >= 1"),
         ("train static data.root=nowhere", "nowhere"),
@@ -201,12 +201,12 @@ def test_names_that_are_no_text_can_be_printed(tmp_path: Path) -> None:
         ("render nowhere --out x --split test --path orbit", "not allowed with"),
         (
             "render nowhere",
-            "--out DIR (or --video FILE.mp4 with --path, --time, --times or --view)",
+            "add --out DIR, or --video FILE.mp4 with --path, --time, --times or --view",
         ),
         ("render nowhere --out x --time nan", "'nan' is not a time"),
         ("render nowhere --out x --time noon", "'noon' is not a time; write a number from 0 to 1"),
         ("render nowhere --out x --time 0 --times 0:1:2", "not allowed with"),
-        ("render nowhere --out x --path orbit --view 3", "--view renders from a fixed camera"),
+        ("render nowhere --out x --path orbit --view 3", "--view (fixed camera) and --path"),
         ("render nowhere --out x --times 0:1:2 --frames 3", "--times and --frames both set"),
         ("export nowhere", "nowhere: no such file or folder"),
         ("export nowhere --times 0:1", "'0:1': not a range of times; use START:STOP:COUNT"),
@@ -214,7 +214,10 @@ def test_names_that_are_no_text_can_be_printed(tmp_path: Path) -> None:
         ("export nowhere --time inf", "'inf' is not a time"),
         ("export nowhere --time 0 --times 0:1:2", "not allowed with"),
         ("export nowhere --static --dynamic", "not allowed with"),
-        ("export nowhere --format tracks --static", "--static does not go with --format tracks"),
+        (
+            "export nowhere --format tracks --static",
+            "--static is not supported with --format tracks",
+        ),
         ("export nowhere --format xyz", "invalid choice: 'xyz'"),
         ("data", "COMMAND"),
         ("data inspect nowhere", "nowhere"),
@@ -238,7 +241,7 @@ def test_wrong_usage_and_missing_input_end_in_one_line(
         (DyngsError("two\nlines"), "two lines"),
         (
             OSError(errno.ENOSPC, "No space left on device", "a.png"),
-            "a.png: No space left on device; free some space",
+            "a.png: No space left on device; free disk space",
         ),
         (
             PermissionError(errno.EACCES, "Permission denied", "b"),
@@ -248,7 +251,7 @@ def test_wrong_usage_and_missing_input_end_in_one_line(
         (MemoryError(), "out of memory"),
         (
             RuntimeError("CUDA out of memory. Tried to allocate 2 GiB"),
-            "the GPU is out of memory; lower strategy.max",
+            "GPU out of memory; lower strategy.max",
         ),
     ],
 )
@@ -294,7 +297,7 @@ def test_a_reader_that_leaves_gets_no_traceback() -> None:
     assert process.stderr is not None
     process.stdout.close()
     assert process.stderr.read().splitlines() == [
-        "dyngs: error: Broken pipe; the program that read our output has gone"
+        "dyngs: error: Broken pipe; the program that reads the output has ended"
     ]
     assert process.wait(timeout=60) == 2
 
@@ -440,7 +443,7 @@ def test_a_resumed_run_keeps_its_config_but_for_its_length_and_threads(tmp_path:
     assert parse_config(["train.steps=9", "data.cache_mb=5"], tmp_path).train.steps == 9
     with pytest.raises(
         DyngsError,
-        match=r"'optim.lr_means=1': .* keeps its own config; train.steps=N .*run.threads",
+        match=r"'optim.lr_means=1': the configuration of a run is fixed; --resume accepts train.steps=N.*run.threads",
     ):
         parse_config(["train.steps=9", "optim.lr_means=1"], tmp_path)
 
@@ -511,7 +514,7 @@ def test_export_and_render_of_the_file(run_dir: Path, tmp_path: Path, capsys: Ca
     assert "a number of Gaussians" in error_line(
         capsys, "render", ply, "--out", tmp_path, few[0], 0
     )
-    assert "has no splits" in error_line(
+    assert "have no splits" in error_line(
         capsys, "render", ply, "--out", tmp_path, "--split", "test"
     )
     assert "unknown camera path 'circle'" in error_line(
@@ -551,7 +554,9 @@ def test_words_that_can_name_nothing_are_refused(
     capsys: pytest.CaptureFixture[str], text: str
 ) -> None:
     for words in (("render", ".", "--out", text), ("export", text), ("train", f"run.dir={text}")):
-        assert "holds a character that no name or path may hold" in error_line(capsys, *words)
+        assert "contains a character that is invalid in names and paths" in error_line(
+            capsys, *words
+        )
 
 
 def test_memory_that_torch_cannot_have_is_one_line(

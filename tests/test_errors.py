@@ -117,7 +117,7 @@ def test_what_may_never_end_is_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "link").symlink_to("/dev/zero")
     for name in ("pipe", "link"):
-        with pytest.raises(DyngsError, match=rf"{name}: is no file but a pipe"):
+        with pytest.raises(DyngsError, match=rf"{name}: not a regular file but a pipe"):
             require_regular_file(tmp_path / name)
     (tmp_path / "file").touch()
     for name in ("file", "", "not there", "a\0b"):
@@ -133,7 +133,7 @@ def test_pipes_in_captures_and_runs_stop_nobody(tmp_path: Path) -> None:
         lambda path: read_tensors(path, FileKind("a", "a", 1), ""),
         read_scene,
     ):
-        with pytest.raises(DyngsError, match="is no file but a pipe"):
+        with pytest.raises(DyngsError, match="not a regular file but a pipe"):
             read(tmp_path / "transforms.json")
     assert seconds_at(tmp_path, 1) == 0
 

@@ -94,7 +94,7 @@ def test_a_scene_that_moves_beside_a_static_model_of_it(tmp_path: Path) -> None:
         "strategy.max_gaussians=1500",
         "train.initial_downscale=1",
     )
-    moving = captured.report("dynamic", *keys, "model.choose=false", "optim.rate_factor=1")
+    moving = captured.report("dynamic", *keys, "model.pilot_runs=false", "optim.rate_factor=1")
     static = captured.report("static", *keys, "optim.rate_factor=1")
     assert moving.moving_fraction > 0.7  # 0.81
     assert moving.psnr > 23.5  # 24.44
@@ -123,7 +123,7 @@ def test_a_ball_that_rolls_is_followed_as_a_body(
         "dynamic",
         *few,
         "train.steps=300",
-        "model.choose=false",
+        "model.pilot_runs=false",
         "train.initial_downscale=1",
         "run.seed=4",
     )

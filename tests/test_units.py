@@ -31,7 +31,7 @@ SCENES = {
     "static_mcmc": [*SHORT, "strategy.max_gaussians=300"],
     "mip": SHORT,
     "blender": SHORT,
-    "dynamic": [*SHORT, "model.choose=false", "strategy.max_gaussians=300"],
+    "dynamic": [*SHORT, "model.pilot_runs=false", "strategy.max_gaussians=300"],
     "human": ["train.steps=8", "run.threads=1", "model.resolution=32", "data.train_cameras=[0]"],
     "ngp": ["train.steps=4", "run.threads=1", "model.sizes=tiny"],
     "nerf": ["train.steps=3", "run.threads=1", "model.sizes=tiny"],

@@ -101,7 +101,7 @@ smaller of two models' errors is smallest."""
 SQUARES = 8  # The halves of an image are the two colours of a chess board of so many squares a side
 
 
-_TOO_SHORT = "not taken: too short a run, or too few views, to compare"
+_TOO_SHORT = "not used: the run is too short, or has too few views, for pilot runs"
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Choice:
 
     def __str__(self) -> str:
         return (
-            f"{self.setting} {'taken' if self.taken else 'not taken'}: {self.gain:+.2f} dB (standard error "
+            f"{self.setting} {'used' if self.taken else 'not used'}: {self.gain:+.2f} dB (standard error "
             f"{self.error:.2f}) to {self.without:.2f} dB on {format_count(self.views, 'view')} ({self.seconds:.0f} s)"
         )
 
@@ -144,19 +144,19 @@ def resolve_auto_settings(config: Config, capture: Capture) -> tuple[Config, lis
     if problem is not None:
         raise DyngsError(f"{config.data.root}: {problem}")
     model: Any = config.model
-    if capability(model, HasMotion) is None or not model.choose:
+    if capability(model, HasMotion) is None or not model.pilot_runs:
         return _with_settings(config, capture)
     moves = _motion_of_fixed_cameras(capture, config)
     if moves is False:
         return _with_settings(as_static(config), capture)
-    moving = _with(config, "model", choose=False)
+    moving = _with(config, "model", pilot_runs=False)
     views = capture.splits["train"]
     at_once = len(views) / len({view.time for view in views})
     if moves and at_once >= FILTERED_VIEWS:
         moving = _before_fixed_cameras(moving, at_once)
     choice = _motion(moving, capture)
     if choice is None:
-        log_info(f"model.kind=dynamic {_TOO_SHORT}; model.choose=false trains a moving scene")
+        log_info(f"model.kind=dynamic {_TOO_SHORT}; model.pilot_runs=false trains a moving scene")
         return _with_settings(as_static(config), capture)
     log_info(f"  {choice}")
     found = moving if choice.taken else as_static(config)

@@ -1,5 +1,4 @@
-"""One command's edits of a run or a file of Gaussians, in their order, and the file or run that
-they end in."""
+"""Edit a run or a file of Gaussians (clean, crop, merge, coordinate frame) and write the result."""
 
 from __future__ import annotations
 
@@ -70,17 +69,17 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Edits:
-    """What is to be done, in this order; the defaults do nothing.
+    """Edits in the order in which they are applied; the defaults change nothing.
 
     Attributes:
-        max_loss: PSNR that cleaning may cost, dB; None: it is not cleaned.
-        region: part that is kept, or left out where ``outside``.
-        merge: files or runs whose Gaussians are added.
-        frame, geo: the frame that all of it gets.
-        gps: ``geo`` is found from the positions in the photos of the run.
-        undo: it gets the frame that it had before it was edited first.
-        time: in [0, 1], at which a moving scene is written.
-        threads: number of them that cleaning takes; 0: one per core.
+        max_loss: largest PSNR loss by cleaning, dB; None: no cleaning.
+        region: region to keep, or to remove if ``outside``.
+        merge: files or runs to add.
+        frame, geo: new coordinate frame.
+        gps: whether ``geo`` is estimated from the GPS positions of the photos.
+        undo: whether to restore the original coordinate frame.
+        time: time in [0, 1] at which a moving scene is written.
+        threads: number of threads for cleaning; 0: one per core.
     """
 
     max_loss: float | None = None
@@ -96,17 +95,13 @@ class Edits:
 
     @property
     def has_frame(self) -> bool:
-        """Whether the scene gets another frame."""
+        """Whether the coordinate frame changes."""
         return self.geo is not None or self.frame != Frame()
 
 
 @dataclass(frozen=True)
 class EditedFile:
-    """A file that was written, how it differs from the edited scene when drawn, and what the format
-    does not hold.
-
-    Of a run, which holds all of it, there is only the path.
-    """
+    """Written file or run, with the PSNR between renderings of file and scene, and format notes."""
 
     path: Path
     redrawn: float | None = None
@@ -115,10 +110,9 @@ class EditedFile:
 
 @dataclass(frozen=True)
 class EditSource:
-    """What is edited: a scene; of a file also its contents, and what is up in files of its format
-    by default.
+    """Scene to edit, with the contents and the default up axis of its file, if it is a file.
 
-    ``rows``: (N,) indices of the Gaussians that are left, of a run; None: all.
+    ``rows``: (N,) indices of the remaining Gaussians of a run; None: all.
     """
 
     opened: OpenedScene
@@ -128,7 +122,7 @@ class EditSource:
 
     @property
     def fixed(self) -> bool:
-        """Whether its axes stay, as control points have left them."""
+        """Whether the axes are fixed, as by control points."""
         if self.splat is not None:
             return self.splat.up != self.usual
         return self.opened.edited is not None and self.opened.edited.fixed
@@ -158,11 +152,10 @@ def edit_scene(
     data_root: Path | None = None,
     tell: Tell = log_info,
 ) -> EditedFile:
-    """Edit a run or a file of Gaussians, and write the result; the suffix of ``out`` names the
-    format, none is a run.
+    """Edit a run or a file of Gaussians, and write the result to ``out``.
 
-    ``reads``: more files that ``edits`` come from. Raises DyngsError: something cannot be done, and
-    nothing is written.
+    The suffix of ``out`` selects the format; without a suffix a run is written. ``reads`` are
+    additional input files. Raises DyngsError for impossible edits, before anything is written.
     """
     moves = out.name.lower().endswith(FOURDGS_SUFFIX)
     if find_format(out) is None and not moves and out.suffix:
@@ -190,10 +183,10 @@ def edit_scene(
 def write_part(
     opened: OpenedScene, rows: torch.Tensor, out: Path, time: float | None = None
 ) -> EditedFile:
-    """Write the Gaussians ``rows`` (N,) of a scene, at ``time`` if it moves, upright for viewers of
+    """Write the Gaussians ``rows`` (N,) of a scene, at ``time`` if it moves, with the up axis of
     the format.
 
-    Raises DyngsError: it was opened from no file or run, or cannot be written.
+    Raises DyngsError: a scene without a file or run, or an output that cannot be written.
     """
     if opened.path is None:
         raise DyngsError("this scene has no file or run of its own yet, so it cannot be edited")
@@ -233,9 +226,7 @@ def _written(found: EditSource, out: Path, edits: Edits, tell: Tell) -> EditedFi
     """Write a file of Gaussians, at one time of what moves."""
     moving = not found.opened.scene.is_static
     if moving and edits.merge:
-        raise DyngsError(
-            "--merge adds to still scenes, and this one moves; `dyngs export --time T` makes one of it"
-        )
+        raise DyngsError("--merge requires static scenes; make one with `dyngs export --time T`")
     if moving and edits.time is None:
         tell(
             "time 0 of a moving scene is used; choose with --time T, or write all times with "
@@ -247,10 +238,10 @@ def _written(found: EditSource, out: Path, edits: Edits, tell: Tell) -> EditedFi
     if edits.undo:
         if splat.edited == IDENTITY:
             raise DyngsError(
-                "--undo: nothing says that this was edited; `dyngs edit` stores it in what it writes"
+                "--undo: the coordinate frame of this file was not changed by `dyngs edit`"
             )
         edited = undo_transforms(splat)
-        tell("the frame is that of before the first edit")
+        tell("restored the original coordinate frame")
     else:
         how, up = _frame(found, edits, format_for_path(out).up, tell)
         is_new = edits.has_frame
@@ -292,9 +283,9 @@ def _written_run(
     frame = opened.edited
     if edits.undo:
         if frame is None:
-            raise DyngsError("--undo: the frame of this run was not edited")
+            raise DyngsError("--undo: the coordinate frame of this run was not changed")
         frame = None
-        tell("the frame is that of before the first edit")
+        tell("restored the original coordinate frame")
     elif edits.has_frame:
         how, up = _frame(found, edits, "z", tell)
         offset = (0.0, 0.0, 0.0) if edits.geo is None else edits.geo.offset
@@ -375,6 +366,6 @@ def _frame(
     else:
         how = frame.similarity(direction, parse_axis(wanted))
         up = None if direction is None else wanted
-    about = "nothing says which way is up, so nothing is turned; --up tells it"
-    tell(about if up is None else f"up is {up} in what is written")
+    about = "up direction unknown, the scene is not rotated; set it with --up"
+    tell(about if up is None else f"up axis of the output: {up}")
     return how, up

@@ -15,10 +15,10 @@ from dyngs.runs.opened import open_scene
 
 
 def load_initial_gaussians(config: Config, capture: Capture) -> InitialGaussians | None:
-    """Return the Gaussians that ``init.scene`` names, as the capture has them; None: the run begins
-    with points.
+    """Load the Gaussians of ``init.scene`` in the coordinates of the capture; None for other kinds
+    of initialisation.
 
-    Raises DyngsError: it cannot be read, or nothing of it lies in ``init.box``.
+    Raises DyngsError: an unreadable scene, or no Gaussians in ``init.box``.
     """
     init = config.init
     if not isinstance(init, SceneInit):
@@ -27,7 +27,8 @@ def load_initial_gaussians(config: Config, capture: Capture) -> InitialGaussians
     scene = opened.scene.to("cpu")
     if not scene.is_static:
         raise DyngsError(
-            f"{init.scene}: moves; a training goes on from a still scene (dyngs export --time T makes one)"
+            f"{init.scene}: a moving scene; training starts from static scenes, "
+            "make one with `dyngs export --time T`"
         )
     has_filter = isinstance(scene, StaticScene) and scene.filter_std is not None
     keeps_filter = has_filter and config.model.filter_3d

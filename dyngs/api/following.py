@@ -1,9 +1,8 @@
-"""A run in several processes: the first one leads, the others do what it says.
+"""Training in several processes: rank 0 leads, the other ranks follow its commands.
 
-The first process reads what was asked for, chooses, limits, prunes, evaluates and writes, as if it
-were alone. Before each step it tells the others to do the same step, and where it has changed the
-scene outside of one it sends them all that a checkpoint holds. So the others need no run folder,
-and write nothing.
+Rank 0 runs as in a single process: it reads the config, evaluates, prunes and writes files. Before
+each step it sends the other ranks a command, and after changes of the scene outside of a step also
+a checkpoint. The other ranks need no run folder and write nothing.
 """
 
 from __future__ import annotations
@@ -30,19 +29,18 @@ from dyngs.training.trainer import Trainer
 
 
 class Order(IntEnum):
-    """What the first process tells the others to do."""
+    """Command from rank 0 to the other ranks."""
 
     BUILD = 1
     """Build the trainer of the configuration that follows."""
     RESTORE = 2
-    """Take over the checkpoint that follows."""
+    """Restore the checkpoint that follows."""
     STEP = 3
     END = 4
 
 
 class Leader:
-    """The first process of a run: a listener, and what is to be called before each step of the
-    loop."""
+    """Rank 0: a listener that sends commands to the other ranks before each step."""
 
     def __init__(self, processes: Processes, config: Config, threads: int) -> None:
         self.processes = processes
@@ -56,22 +54,22 @@ class Leader:
             self._is_stale = True
 
     def before_step(self, trainer: Trainable) -> None:
-        """Let the others begin the step that ``trainer`` is about to do."""
+        """Start the next step of ``trainer`` on the other ranks."""
         if self.processes.size == 1 or not isinstance(trainer, Trainer):
             return
         if not self._has_built:
             config = json.dumps(self._config.model_dump(mode="json"))
-            _tell(self.processes, Order.BUILD, config.encode())
+            _send(self.processes, Order.BUILD, config.encode())
             self._has_built = True
             trainer.join(self.processes)
         if self._is_stale:
-            _tell(self.processes, Order.RESTORE, _packed(trainer.checkpoint()))
+            _send(self.processes, Order.RESTORE, _packed(trainer.checkpoint()))
             self._is_stale = False
-        _tell(self.processes, Order.STEP)
+        _send(self.processes, Order.STEP)
 
 
 def run_processes(lead: Callable[[Processes], int]) -> int:
-    """Return the exit code of the processes that ``torchrun`` started: the first calls ``lead``,
+    """Run in the processes started by ``torchrun`` and return the exit code: rank 0 calls ``lead``,
     the others follow."""
     with Processes.from_torchrun() as processes:
         if not processes.is_rank_zero:
@@ -79,18 +77,17 @@ def run_processes(lead: Callable[[Processes], int]) -> int:
         try:
             code = lead(processes)
         except KeyboardInterrupt as stopped:
-            if stopped.args:  # between two steps, where the others wait to be told
-                _tell(processes, Order.END)
+            if stopped.args:  # between two steps, when the others wait for a command
+                _send(processes, Order.END)
             raise
-        _tell(processes, Order.END)
+        _send(processes, Order.END)
     return code
 
 
 def run_follower(processes: Processes) -> bool:
-    """Do what the first process says until it says that all is done; nothing is printed.
+    """Execute the commands of rank 0 until the end, without output.
 
-    Returns whether a signal told this process to stop, which the first process then does after the
-    next step.
+    Returns whether this process received a stop signal; rank 0 then stops after the next step.
     """
     keep_freed_memory()
     with (
@@ -99,7 +96,7 @@ def run_follower(processes: Processes) -> bool:
         redirect_stderr(nowhere),
         Interrupts() as interrupts,
     ):
-        order, payload = _heard(processes)
+        order, payload = _receive(processes)
         while order is Order.BUILD:
             order, payload = _follow_run(
                 processes, Config.model_validate(json.loads(payload)), interrupts
@@ -115,7 +112,7 @@ def _follow_run(
         trainer = build_trainer(config, restored=True)
         trainer.join(processes)
         while True:
-            order, payload = _heard(processes)
+            order, payload = _receive(processes)
             if interrupts.requested:
                 processes.request_stop()
             match order:
@@ -128,7 +125,7 @@ def _follow_run(
                     return order, payload
 
 
-def _tell(processes: Processes, order: Order, payload: bytes = b"") -> None:
+def _send(processes: Processes, order: Order, payload: bytes = b"") -> None:
     if processes.size == 1:
         return
     processes.broadcast_(torch.tensor([order, len(payload)], dtype=torch.int64, device="cpu"))
@@ -136,7 +133,7 @@ def _tell(processes: Processes, order: Order, payload: bytes = b"") -> None:
         processes.broadcast_(torch.frombuffer(bytearray(payload), dtype=torch.uint8))
 
 
-def _heard(processes: Processes) -> tuple[Order, bytes]:
+def _receive(processes: Processes) -> tuple[Order, bytes]:
     head = torch.zeros(2, dtype=torch.int64, device="cpu")
     processes.broadcast_(head)
     order, length = head.tolist()

@@ -1,4 +1,4 @@
-"""What Python users read: scenes and captures, in the unit of the capture's files."""
+"""Load scenes and captures from Python, in the unit of the capture's files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from dyngs.runs.opened import open_scene
 
 
 def load(path: Path | str) -> GaussianScene:
-    """Load a scene, to be drawn from anywhere, at any time.
+    """Load a scene for rendering.
 
     Coordinates are those of the capture's files, as in ``read_capture``.
 

@@ -1,5 +1,4 @@
-"""Prediction of a person from a few images by a trained network of any kind, as a run folder like
-that of training."""
+"""Predict a person from a few images with a trained network, and write a run folder."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Pruning of a finished run into a smaller one: by a share that is given, or as far as a loss
-allows."""
+"""Prune a finished run: by a given fraction, or within a given loss of PSNR."""
 
 from __future__ import annotations
 
@@ -78,8 +77,7 @@ def prune_to_loss(
     overrides: Sequence[str],
     tell: Callable[[str], None] = log_info,
 ) -> PruneResult:
-    """Take as much from the run in ``run_dir`` as ``max_loss`` allows, and write the rest to
-    ``out``: a run and a file.
+    """Prune the run in ``run_dir`` within ``max_loss`` and write a run and its file to ``out``.
 
     Nothing is written before the end: an interruption leaves nothing behind, and the next call
     begins anew.

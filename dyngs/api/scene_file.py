@@ -1,4 +1,4 @@
-"""A finished run as one small file, and what that does to its images."""
+"""Export of a finished run as a compressed .dyngs file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stages that make the plan of a run before its first step."""
+"""Stages that build the plan of a run before its first step."""
 
 from __future__ import annotations
 
@@ -99,10 +99,10 @@ def continue_scene(plan: RunPlan) -> tuple[RunPlan, None]:
         raise DyngsError(
             f"init.kind=scene goes with model.kind=static, not with {config.model.kind}"
         )
-    keeps = init.trains == "colour" or init.box is not None
+    keeps = init.trainable == "colour" or init.box is not None
     train = {"initial_downscale": 1} | ({"remove_floaters": False} if keeps else {})
     changes: dict[str, object] = {"train": config.train.model_copy(update=train)}
-    if init.trains == "colour":
+    if init.trainable == "colour":
         changes["strategy"] = FixedStrategy()
     if keeps and isinstance(config.colour, AutoColour):
         changes["colour"] = ShColour(opacity_entropy=config.colour.opacity_entropy)
@@ -142,9 +142,9 @@ def find_first_gaussians(plan: RunPlan) -> tuple[RunPlan, str | None]:
     first = load_initial_gaussians(plan.resolved, plan.capture)
     assert first is not None
     frozen = 0 if first.frozen is None else int(first.frozen.sum())
-    held = f", of which {frozen:,} stay as they are" if frozen else ""
+    held = f", of which {frozen:,} are frozen" if frozen else ""
     count = format_count(len(first.gaussians), "Gaussian")
-    return replace(plan, first=first), f"begins with {count} of {init.scene}{held}"
+    return replace(plan, first=first), f"starting from {count} of {init.scene}{held}"
 
 
 def set_limits(plan: RunPlan) -> tuple[RunPlan, None]:

@@ -1,12 +1,12 @@
-"""The `dyngs` command: one module per subcommand, progress, tables, the demo.
+"""The ``dyngs`` command: one module per subcommand, progress bars, tables and the demo.
 
-Every module offers ``add_parser(commands)``, which adds its command, and a ``run(arguments) ->
-int``. What is heavy (torch, the native core, readers) is imported inside ``run``, so that ``dyngs
---help`` is instant.
+Each module has ``add_parser(commands)``, which adds its subcommand, and ``run(arguments) -> int``.
+Heavy modules (torch, the native core, readers) are imported inside ``run`` to keep ``dyngs --help``
+fast.
 
-Exit codes: 0 done; 2 bad input or usage, after one line on stderr; 130 interrupted. Anything
-unexpected keeps its traceback, because it is a bug. With ``--debug`` the traceback of any error
-comes before its line, with ``--quiet`` results and errors alone are printed.
+Exit codes: 0 success; 2 bad input or usage, with one line on stderr; 130 interrupted. Unexpected
+exceptions keep their traceback, because they are bugs. ``--debug`` prints the traceback of every
+error, ``--quiet`` suppresses notes and warnings.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ from dyngs.io.containment import allow_run_links
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
 _ADVICE = {
-    errno.ENOSPC: "; free some space and run the command again, earlier results are untouched",
-    errno.EDQUOT: "; your quota is used up, free some space and run the command again",
-    errno.EPIPE: "; the program that read our output has gone",
+    errno.ENOSPC: "; free disk space and run the command again, earlier results are kept",
+    errno.EDQUOT: "; your disk quota is used up, free space and run the command again",
+    errno.EPIPE: "; the program that reads the output has ended",
     errno.EACCES: "; choose another folder or change its permissions",
-    errno.EROFS: "; choose a folder that can be written",
+    errno.EROFS: "; choose a writable folder",
 }
 _COMMANDS: dict[str, Callable[[Any], None]] = {
     "demo": demo.add_parser,
@@ -78,33 +78,34 @@ _COMMANDS: dict[str, Callable[[Any], None]] = {
     "docs": docs.add_parser,
     "doctor": doctor.add_parser,
 }
-"""What adds each command, in the order in which they are listed."""
+"""Functions that add the subcommands, in the order of ``dyngs --help``."""
 _OVERRIDE = re.compile(r"[a-z]\w*(\.\w+)+=.*", re.DOTALL)
 
 
 _NEXT = f"""\
-dyngs {__version__}: Gaussian splatting of what stands, what moves, and people, on the CPU.
+dyngs {__version__}: Gaussian splatting for static scenes, moving scenes and people, on the CPU.
 
-  dyngs demo                            a small moving scene from start to end, in minutes
-  dyngs train static data.root=PHOTOS   a scene from a folder of photos, or a video
-  dyngs train dynamic data.root=CAPTURE one that moves
-  dyngs train human data.root=VIDEO     a person
-  dyngs view runs/NAME                  look at it
-  dyngs render runs/NAME --out images   images and videos; `dyngs export` writes files for others
+  dyngs demo                             train and render a small moving scene in minutes
+  dyngs train static data.root=PHOTOS    train a scene from a folder of photos or a video
+  dyngs train dynamic data.root=CAPTURE  train a moving scene
+  dyngs train human data.root=VIDEO      train an avatar of a person
+  dyngs view runs/NAME                   view a run in a browser
+  dyngs render runs/NAME --out images    render images and videos
+  dyngs export runs/NAME                 write .ply and other formats
 
-`dyngs --help` lists all commands, `dyngs docs` is the manual, `dyngs doctor` checks what is here.\
+`dyngs --help` lists all commands, `dyngs docs` the manual; `dyngs doctor` checks the installation.\
 """
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line ``argv`` (default: ``sys.argv``) and return the exit code."""
-    if "_ARGCOMPLETE" in os.environ:  # a shell asks, at the Tab key
+    if "_ARGCOMPLETE" in os.environ:  # tab completion of a shell
         from argcomplete import autocomplete
 
         autocomplete(make_parser(), always_complete_options=False)
     words, flags = _without_flags(list(sys.argv[1:] if argv is None else argv))
     print_messages(quiet="--quiet" in flags)
-    _show_any_name()
+    _escape_invalid_names()
     try:
         code = _dispatch(words)
         sys.stdout.flush()
@@ -124,37 +125,41 @@ def main(argv: Sequence[str] | None = None) -> int:
         _abandon_if_broken(sys.stdout)
         if "--debug" in flags:
             traceback.print_exception(error)
-        with suppress(OSError):  # stderr may lie on a full disk
+        with suppress(OSError):  # stderr may be a file on a full disk
             print(f"dyngs: error: {format_one_line(message)}", file=sys.stderr)
         _abandon_if_broken(sys.stderr)
         return EXIT_ERROR
 
 
 def _message_of(error: Exception) -> str | None:
-    """Return the line for the user; None of an error that is a bug."""
+    """Return the message for the user; None for an unexpected error."""
     if isinstance(error, DyngsError):
         return str(error)
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename is not None else ""
         return f"{where}{error.strerror or error}{_ADVICE.get(error.errno or 0, '')}"
     if "CUDA out of memory" in str(error):
-        return "the GPU is out of memory; lower strategy.max_gaussians or data.longest_side, or give --device cpu"
+        return (
+            "GPU out of memory; lower strategy.max_gaussians or data.longest_side, "
+            "or use --device cpu"
+        )
     if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
-        return "out of memory; use smaller images (data.longest_side) or a smaller cache (data.cache_mb)"
+        return (
+            "out of memory; lower the image size (data.longest_side) or the cache (data.cache_mb)"
+        )
     return None
 
 
 def _without_flags(arguments: list[str]) -> tuple[list[str], set[str]]:
-    """Return the arguments without ``--debug`` and ``--quiet``, which may stand anywhere before
-    ``--``, and those of the two that were given."""
+    """Split off ``--debug`` and ``--quiet``, which are accepted anywhere before ``--``."""
     end = arguments.index("--") if "--" in arguments else len(arguments)
     flags = {"--debug", "--quiet"} & set(arguments[:end])
     return [word for word in arguments[:end] if word not in flags] + arguments[end:], flags
 
 
-def _show_any_name() -> None:
-    """Print file names that are not valid text with escapes on stdout, as stderr does; a closed one
-    takes nothing."""
+def _escape_invalid_names() -> None:
+    """Escape file names that are not valid text on stdout; replace closed streams by the null
+    device."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # as after >&-
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - for the life of the process
@@ -187,12 +192,11 @@ def _dispatch(arguments: list[str]) -> int:
         if not getattr(parsed, "takes_root", False) or names_root:
             raise
         again = " ".join(map(quote_word, ["dyngs", *arguments, "data.root=FOLDER"]))
-        raise DyngsError(f"{error}; if it was moved: `{again}`") from error
+        raise DyngsError(f"{error}; if the capture was moved, run `{again}`") from error
 
 
 def _parsed(parser: argparse.ArgumentParser, arguments: list[str]) -> argparse.Namespace:
-    """Parse arguments; overrides may stand anywhere, also after options, where argparse allows
-    none."""
+    """Parse arguments, with overrides also after options, which argparse does not support."""
     parsed, rest = parser.parse_known_args(arguments)
     overrides = getattr(parsed, "overrides", None)
     unknown = [word for word in rest if overrides is None or not _OVERRIDE.fullmatch(word)]
@@ -204,8 +208,7 @@ def _parsed(parser: argparse.ArgumentParser, arguments: list[str]) -> argparse.N
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line; what it returns also holds the ``parser`` of the command
-    itself."""
+    """Argument parser with one-line errors that adds itself to the namespace as ``parser``."""
 
     def parse_known_args(
         self, args: Any = None, namespace: Any = None
@@ -220,13 +223,13 @@ class _Parser(argparse.ArgumentParser):
 
 
 def make_parser(only: str = "") -> argparse.ArgumentParser:
-    """Return the parser of all commands, or, in a fraction of the time, of the command ``only``
-    where there is one."""
+    """Build the parser of all commands, or faster, only of the command ``only`` if it exists."""
     parser = _Parser(
-        prog="dyngs", description="Gaussian splatting that runs where people are: on the CPU."
+        prog="dyngs",
+        description="Gaussian splatting for static scenes, moving scenes and people, on the CPU.",
     )
     parser.add_argument("--debug", action="store_true", help="print the traceback of an error")
-    about = "print results and errors alone, no notes and warnings"
+    about = "print results and errors only, no notes and warnings"
     parser.add_argument("--quiet", action="store_true", help=about)
     parser.add_argument("--version", action="version", version=f"dyngs {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
@@ -236,8 +239,7 @@ def make_parser(only: str = "") -> argparse.ArgumentParser:
 
 
 def _abandon_if_broken(stream: TextIO) -> None:
-    """Redirect a broken stream to the null device, because the interpreter would fail to flush it
-    at exit."""
+    """Redirect a broken stream to the null device, so that flushing it at exit does not fail."""
     try:
         stream.flush()
     except OSError:

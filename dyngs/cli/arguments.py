@@ -1,4 +1,4 @@
-"""Arguments and their types that several commands share."""
+"""Command-line arguments and argument types shared by several commands."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def add_command(
     description: str | None = None,
     epilog: str | None = None,
 ) -> argparse.ArgumentParser:
-    """Add a command that ``run`` carries out; return its parser."""
+    """Add a subcommand executed by ``run``; return its parser."""
     formatter = argparse.HelpFormatter if epilog is None else argparse.RawDescriptionHelpFormatter
     parser = commands.add_parser(
         name, help=help, description=description, epilog=epilog, formatter_class=formatter
@@ -47,23 +47,25 @@ def add_command(
 
 
 def input_path(text: str) -> Path:
-    """Type of an argument that names what a command reads."""
+    """Argument type of an input path."""
     return Path(text)
 
 
 def input_word(text: str) -> str:
-    """Type of an argument that names what a command reads, or something else, as a preset."""
+    """Argument type of an input path or a name, such as a preset."""
     return text
 
 
 def output_path(text: str) -> Path:
-    """Type of an argument that names what a command writes."""
+    """Argument type of an output path."""
     return Path(text)
 
 
 def integer_type(what: str, low: int, high: int, more: str = "") -> Callable[[str], int]:
-    """Return the type of an argument that is a whole number; ``what`` is its name with an article,
-    for messages."""
+    """Return the argument type of an integer in [``low``, ``high``].
+
+    ``what`` names it in messages, with an article.
+    """
 
     def parse(text: str) -> int:
         if not (text.isascii() and text.isdigit() and len(text) < 10 and low <= int(text) <= high):
@@ -76,7 +78,7 @@ def integer_type(what: str, low: int, high: int, more: str = "") -> Callable[[st
 
 
 def scene_time(text: str) -> float:
-    """Return a finite time; values outside [0, 1] are clamped later, with a warning."""
+    """Parse a finite time; values outside [0, 1] are clamped later, with a warning."""
     try:
         time = float(text)
     except ValueError:
@@ -89,7 +91,7 @@ def scene_time(text: str) -> float:
 
 
 def image_size(text: str) -> tuple[int, int]:
-    """Return width and height from ``WIDTHxHEIGHT``."""
+    """Parse ``WIDTHxHEIGHT``."""
     match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.lower())
     if not match or "0" in match.groups():
         raise argparse.ArgumentTypeError(
@@ -109,24 +111,26 @@ def add_threads(parser: argparse.ArgumentParser) -> None:
 
 
 def add_device(parser: argparse.ArgumentParser, default: str = "auto") -> None:
-    about = f"what computes; auto: a CUDA GPU that can be used, else the CPU (default {default})"
+    about = f"device; auto: a supported CUDA GPU if there is one, else the CPU (default {default})"
     parser.add_argument("--device", choices=_DEVICES, default=default, help=about)
 
 
 def add_run_device(parser: argparse.ArgumentParser) -> None:
     """Add ``--device`` to a command that trains: it sets ``run.device``."""
     parser.add_argument(
-        "--device", choices=_DEVICES, help="what computes, as run.device=... (default auto)"
+        "--device",
+        choices=_DEVICES,
+        help="device to train on, same as run.device=... (default auto)",
     )
 
 
 def run_device(arguments: argparse.Namespace) -> list[str]:
-    """Return the override that ``--device`` of ``add_run_device`` means."""
+    """Return ``--device`` of ``add_run_device`` as an override."""
     return [] if arguments.device is None else [f"run.device={arguments.device}"]
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
-    about = "print the result as JSON on stdout, all else on stderr"
+    about = "print the result as JSON on stdout and everything else on stderr"
     parser.add_argument("--json", action="store_true", help=about)
 
 
@@ -139,32 +143,29 @@ def add_split(
 
 
 def add_up(parser: argparse.ArgumentParser, of: str = "") -> None:
-    """Add ``--up``, the axis that is up in the scene."""
-    usual = "default: up for the cameras of a run; of a file what it says, or what is usual for its format"
+    """Add ``--up``, the up axis of the scene."""
+    usual = "default: from the cameras of a run, or from the file or its format"
     parser.add_argument("--up", choices=AXES, help=f"up axis{of} ({usual})")
 
 
 def add_motion(parser: argparse._ActionsContainer) -> None:
-    about = "motion for a person: .npz (AMASS, SMPL-X), .bvh, .glb, .gltf, .vrma"
+    about = "motion file for a person: .npz (AMASS, SMPL-X), .bvh, .glb, .gltf, .vrma"
     parser.add_argument("--motion", type=input_path, metavar="FILE", help=about)
 
 
 def add_keep_feet(parser: argparse.ArgumentParser) -> None:
-    about = "of --motion: move the person along the floor so that feet that touch it do not slide"
+    about = "with --motion: adjust the root position so that feet on the floor do not slide"
     parser.add_argument("--keep-feet", action="store_true", help=about)
 
 
 def require_motion_for_feet(arguments: argparse.Namespace) -> None:
     """Raise DyngsError for ``--keep-feet`` without ``--motion``."""
     if arguments.keep_feet and arguments.motion is None:
-        raise DyngsError(
-            "--keep-feet goes with --motion FILE: it is about feet in a motion; add one, or leave it out"
-        )
+        raise DyngsError("--keep-feet requires --motion FILE; add a motion or remove --keep-feet")
 
 
 def play_motion(arguments: argparse.Namespace, opened: OpenedScene) -> OpenedScene:
-    """Return the person in ``--motion``, or all as it is without; print what was found of its
-    feet."""
+    """Apply ``--motion`` to the person, if given, and print the notes about it."""
     if arguments.motion is None:
         return opened
     moved = opened.play_motion(arguments.motion, keep_feet=arguments.keep_feet)
@@ -178,14 +179,16 @@ def add_overrides(parser: argparse.ArgumentParser, metavar: str, about: str) -> 
 
 def add_data_root(parser: argparse.ArgumentParser) -> None:
     """Add the overrides of a command that reads the capture of a run."""
-    about = "where the capture of the run lies by now; data.follow_links=true: its files may lie elsewhere"
+    about = "current folder of the capture, if it was moved; data.follow_links=true allows links out of it"
     add_overrides(parser, "data.root=FOLDER", about)
     parser.set_defaults(takes_root=True)
 
 
 def data_root(arguments: argparse.Namespace) -> Path | None:
-    """Return the folder of ``add_data_root``; None: the capture was not moved. Raises DyngsError:
-    another word."""
+    """Return the folder given as ``data.root``; None if not given.
+
+    Raises DyngsError: any other override.
+    """
     found = None
     for word in arguments.overrides:
         key, equals, value = word.partition("=")
@@ -193,15 +196,15 @@ def data_root(arguments: argparse.Namespace) -> Path | None:
             continue
         if key.strip() != "data.root" or not equals or not value.strip():
             raise DyngsError(
-                f"{word!r}: the run keeps its own configuration; only data.root=FOLDER, where its capture was moved "
-                "to, and data.follow_links=true may be given"
+                f"{word!r}: the configuration of a run is fixed; only data.root=FOLDER (a moved "
+                "capture) and data.follow_links=true are accepted"
             )
         found = Path(value.strip())
     return found
 
 
 def follows_links(overrides: Sequence[str]) -> bool:
-    """Return whether overrides say that files of captures may lie outside their folders."""
+    """Return whether overrides set ``data.follow_links=true``."""
     from dyngs.config.yaml_reader import read_override
 
     leaves = [
@@ -214,12 +217,14 @@ def follows_links(overrides: Sequence[str]) -> bool:
 
 
 def data_section(overrides: list[str], capture_format: str = "auto") -> DataConfig:
-    """Return the data section with overrides ``data.key=value``; its root has no meaning."""
+    """Build the data section from ``data.key=value`` overrides; its root is a placeholder."""
     from dyngs.config.io import load_config
 
     for word in overrides:
         if not word.startswith("data.") or word.startswith(("data.root=", "data.format=")):
-            raise DyngsError(f"{word!r}: give keys of data here, such as data.follow_links=true")
+            raise DyngsError(
+                f"{word!r}: only keys of data are accepted, such as data.follow_links=true"
+            )
     return load_config(None, ["data.root=.", f"data.format={capture_format}", *overrides]).data
 
 
@@ -227,8 +232,7 @@ def data_section(overrides: list[str], capture_format: str = "auto") -> DataConf
 
 
 def require_outputs_apart(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
-    """Check that no output of a command would replace what it reads, as far as its arguments and
-    overrides say.
+    """Check that no output path in the arguments or overrides would replace an input.
 
     Raises DyngsError: see ``dyngs.io.outputs.Inputs.require_output``.
     """
@@ -256,7 +260,7 @@ def require_outputs_apart(parser: argparse.ArgumentParser, arguments: argparse.N
 def _values(
     parser: argparse.ArgumentParser, arguments: argparse.Namespace, kind: object
 ) -> Iterator[str | Path]:
-    """Yield the values of the arguments of a type."""
+    """Yield the values of all arguments of a type."""
     for action in parser._actions:
         value = getattr(arguments, action.dest, None)
         if action.type is kind and value is not None:
@@ -264,10 +268,9 @@ def _values(
 
 
 def computing_device(choice: str) -> torch.device:
-    """Return the device that ``--device`` or ``run.device`` means; where that may surprise, a line
-    on stderr says why.
+    """Resolve ``--device`` or ``run.device``; print the reason if an available GPU is not used.
 
-    Raises DyngsError: ``cuda`` where no GPU can be used.
+    Raises DyngsError: ``cuda`` without a supported GPU.
     """
     from dyngs.ops.device import cpu_fallback_reason, select_device
 
@@ -284,17 +287,16 @@ def add_max_gaussians_drawn(parser: argparse.ArgumentParser, about: str) -> None
 
 
 def is_avatar_file(path: Path) -> bool:
-    """Whether a path is an avatar file, as opposed to a run folder or a .ply."""
+    """Return whether a path is an avatar file."""
     return path.is_file() and path.suffix.lower() == ".safetensors"
 
 
 def run_of_scene_file(path: Path) -> Path:
-    """Return the run folder of a ``scene.dyngs``, and any other path as it is.
+    """Return the run folder of a ``scene.dyngs``, and any other path unchanged.
 
-    A run with checkpoints is drawn from those, which a note says.
+    If the folder has checkpoints, these are used instead of the file and a note is printed.
 
-    Raises:
-        DyngsError: the file has another name.
+    Raises DyngsError: a .dyngs file with another name.
     """
     if path.suffix.lower() != ".dyngs" or not path.is_file():
         return path
@@ -302,8 +304,8 @@ def run_of_scene_file(path: Path) -> Path:
 
     if path.name != SCENE_FILE:
         raise DyngsError(
-            f"{path}: must be called {SCENE_FILE}, with the config.yaml of its run beside it"
+            f"{path}: must be named {SCENE_FILE} and be in a folder with its config.yaml"
         )
     if checkpoint_paths(path.parent):
-        print_notes((f"{path.parent} has checkpoints: the newest one is drawn, not {SCENE_FILE}",))
+        print_notes((f"using the newest checkpoint of {path.parent} instead of {SCENE_FILE}",))
     return path.parent

@@ -1,5 +1,4 @@
-"""``dyngs config``: every key of a preset or a run, with its value, its default and what it
-means."""
+"""``dyngs config``: print all configuration keys of a preset or a run."""
 
 from __future__ import annotations
 
@@ -10,8 +9,8 @@ from dyngs.cli.arguments import Commands, add_command, add_overrides, input_path
 
 def add_parser(commands: Commands) -> None:
     about = (
-        "Print the configuration of a preset, a YAML file or a run: every key with its value, its default and what it "
-        "means. The output is a preset itself: save it, change it, train with it."
+        "Print all configuration keys of a preset, a YAML file or a run with value, default and "
+        "description. The output is a valid preset, to be saved, edited and trained with."
     )
     parser = add_command(
         commands, "config", run, "print all configuration keys of a preset or a run", about

@@ -1,4 +1,4 @@
-"""``dyngs convert``: read a file of Gaussians and write it in another format."""
+"""``dyngs convert``: convert a file of Gaussians to another format."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from dyngs.core.errors import format_count
 
 _EPILOG = """\
 examples:
-  dyngs convert garden.ply garden.spz                 upright in viewers of either
-  dyngs convert garden.spz garden.ply --sh-degree 3   for programs that insist on degree 3
-  dyngs convert garden.ply room.glb --from-up=z       a .ply whose z points up
+  dyngs convert garden.ply garden.spz                 rotated to the up axis of the format
+  dyngs convert garden.spz garden.ply --sh-degree 3   for programs that require degree 3
+  dyngs convert garden.ply room.glb --from-up=z       the input has z up
 """
 
 
 def add_parser(commands: Commands) -> None:
     about = (
-        "Read a file of Gaussians, of dyngs or of any other program, and write it in another format; the suffixes name "
-        "the formats."
+        "Convert a file of Gaussians, from dyngs or another program, to another format. The file "
+        "suffixes select the formats."
     )
     parser = add_command(
-        commands, "convert", run, "write a file of Gaussians in another format", about, _EPILOG
+        commands, "convert", run, "convert a file of Gaussians to another format", about, _EPILOG
     )
     parser.add_argument(
         "source", type=input_path, metavar="IN", help="file to read, such as a .ply or .spz"
@@ -35,7 +35,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Convert the file, and print how much that changes what it shows."""
+    """Convert the file, and print the PSNR between renderings of both files."""
     from dataclasses import replace
 
     from dyngs.export.images import compare_file_with_source
@@ -51,10 +51,10 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.from_up is not None:
         splat = replace(splat, up=arguments.from_up)
     rotated = orient_to_axis(splat, arguments.up, arguments.target)
-    said = f"up is {rotated.up} in the file" + (
-        f", it was {splat.up}" if rotated.up != splat.up else ", as it was"
-    )
-    print_notes((*splat.notes, f"{format_count(len(splat.gaussians), 'Gaussian')}; {said}"))
+    axis = f"up axis {rotated.up}"
+    if rotated.up != splat.up:
+        axis = f"up axis rotated from {splat.up} to {rotated.up}"
+    print_notes((*splat.notes, f"{format_count(len(splat.gaussians), 'Gaussian')}, {axis}"))
     written = write_splats(arguments.target, rotated, sh_degree=arguments.sh_degree)
     print_image_difference(written.notes, [compare_file_with_source(splat, written)])
     print_written(written.path)

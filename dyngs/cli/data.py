@@ -1,5 +1,4 @@
-"""``dyngs data``: inspect a capture, estimate poses, fit a body, convert a motion, write a
-synthetic capture."""
+"""``dyngs data``: inspect captures, estimate poses, fit bodies, convert motions, synthesise captures."""
 
 from __future__ import annotations
 
@@ -15,31 +14,31 @@ if TYPE_CHECKING:
     from dyngs.human.fit.fitted_capture import KnownAvatar
 
 SYNTHETIC_SCENES = ("still", "spin", "room", "roll", "human", "people")
-"""The scenes of ``dyngs data synth``: named here because the parser must not import numpy."""
+"""Scenes of ``dyngs data synth``, listed here because the parser must not import numpy."""
 _OF_A_FIT = {
-    "keypoints": ("PATH", "key points: a folder of OpenPose files, or a COCO file"),
-    "masks": ("DIR", "masks of the person (white), named as the images"),
+    "keypoints": ("PATH", "2D key points: a folder of OpenPose files, or a COCO file"),
+    "masks": ("DIR", "masks of the person (white), with the names of the images"),
     "background": (
         "PATH",
-        "an image of the scene without the person, or a folder of one for each camera: masks are made by it",
+        "image of the empty scene, or a folder with one per camera, from which masks are computed",
     ),
     "joints": (
         "PATH",
-        "a fit of another program: 3D joints (.npz), or a folder of SAM 3D Body",
+        "3D joints of another program (.npz), or an output folder of SAM 3D Body",
     ),
     "person": (
         "PATH",
-        "a fitted capture of the same person, or the run of their avatar: the shape is kept, poses are found, by the "
-        "avatar's silhouette if there is one",
+        "fitted capture or avatar run of the same person: the shape is kept and only poses are "
+        "fitted, to the silhouettes of the avatar if given",
     ),
 }
-"""Options of ``dyngs data fit``, which are fields of ``FitInputs``."""
+"""Options of ``dyngs data fit`` that are fields of ``FitInputs``."""
 _OF_A_TEMPLATE = {
     "template": (
         "FILE",
-        "fit this body file of SMPL, SMPL-H or SMPL-X instead of the free template",
+        "SMPL, SMPL-H or SMPL-X file to fit instead of the free template",
     ),
-    "uv": ("FILE", ".obj with the texture coordinates of --template, if it has none"),
+    "uv": ("FILE", ".obj with the texture coordinates of --template if it has none"),
 }
 
 
@@ -63,9 +62,9 @@ def _add_inspect(verbs: args.Commands) -> None:
         verbs,
         "inspect",
         run_inspect,
-        "report the contents of a capture or a video and its problems",
-        "Report views, sizes, intrinsics, times, points, masks, and all problems. Of videos without poses: "
-        "size, rate, length, sound, sharpness, motion, and what to run next.",
+        "print the contents and problems of a capture or a video",
+        "Print views, sizes, intrinsics, times, points, masks and detected problems. For videos "
+        "without poses: size, frame rate, length, sound, sharpness, motion and the next command.",
     )
     path = "capture (folder or .zip), video, or folder of videos"
     parser.add_argument("path", type=args.input_path, metavar="PATH", help=path)
@@ -73,15 +72,15 @@ def _add_inspect(verbs: args.Commands) -> None:
     parser.add_argument(
         "--format",
         default="auto",
-        help="format of the capture (default: detected; `dyngs docs captures`)",
+        help="format of the capture (default: detected)",
     )
     parser.add_argument(
         "--image",
         type=args.output_path,
         metavar="FILE",
-        help="draw cameras and points to this image",
+        help="write an image of cameras and points",
     )
-    parser.add_argument("--deep", action="store_true", help="decode every image in full (slow)")
+    parser.add_argument("--deep", action="store_true", help="decode all images in full (slow)")
 
 
 def _add_sfm(verbs: args.Commands) -> None:
@@ -89,14 +88,14 @@ def _add_sfm(verbs: args.Commands) -> None:
     parser = args.add_command(
         verbs, "sfm", run_sfm, "estimate camera poses of photos or a video", about
     )
-    images = "folder or .zip of photos, a video file, or folder of videos that ran at once"
+    images = "folder or .zip of photos, a video file, or a folder of simultaneous videos"
     parser.add_argument("images", type=args.input_path, metavar="IMAGES", help=images)
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     parser.add_argument("--matching", choices=("auto", "exhaustive", "sequential"), default="auto")
     parser.add_argument(
         "--masks", type=args.input_path, metavar="DIR", help="masks of the photos, white = keep"
     )
-    frames = "frames to take of a video (default 100; of each of several: up to 300)"
+    frames = "number of video frames to use (default 100; with several videos up to 300 each)"
     kind = args.integer_type("a number of frames", 2, 10**6)
     parser.add_argument("--frames", type=kind, metavar="N", help=frames)
     args.add_threads(parser)
@@ -108,11 +107,11 @@ def _add_fit(verbs: args.Commands) -> None:
         verbs,
         "fit",
         run_fit,
-        "fit the body template to images of a person",
-        "Fit the free body template, or one of SMPL's family, to the silhouettes of a person: one shape and skeleton, "
-        "and the pose of every frame. OUT is a capture for `dyngs train human`.",
+        "fit a body template to images of a person",
+        "Fit the free body template or an SMPL model to the silhouettes of a person: one shape and "
+        "skeleton, and a pose per frame. OUT is a capture for `dyngs train human`.",
     )
-    about = "folder of a capture; or a video, or a folder of images, of one fixed camera"
+    about = "capture folder, or a video or image folder of one fixed camera"
     parser.add_argument("capture", type=args.input_path, metavar="CAPTURE", help=about)
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     for name, (metavar, about) in (_OF_A_FIT | _OF_A_TEMPLATE).items():
@@ -125,12 +124,12 @@ def _add_people(verbs: args.Commands) -> None:
         verbs,
         "people",
         run_people,
-        "find a person in a video and fit the body to them",
-        "Find a person in every frame, their silhouette and key points, follow them through the clip, and fit the body "
-        "as `data fit` does. OUT is a capture for `dyngs train human`. MediaPipe detects the person, in an environment "
-        "of its own (`dyngs docs people`).",
+        "detect a person in a video and fit a body template",
+        "Detect a person, their silhouette and key points with MediaPipe, track them through the "
+        "clip, and fit the body as `dyngs data fit`. OUT is a capture for `dyngs train human`. "
+        "MediaPipe runs in a separate Python environment.",
     )
-    about = "a video, or a folder of images, of one camera that stands; or a capture with cameras"
+    about = "video or image folder of one fixed camera, or a capture with cameras"
     parser.add_argument("clip", type=args.input_path, metavar="CLIP", help=about)
     parser.add_argument("out", type=args.output_path, metavar="OUT", help="a new folder")
     about = "Python interpreter of an environment with MediaPipe (default: $DYNGS_MEDIAPIPE)"
@@ -143,9 +142,9 @@ def _add_motion(verbs: args.Commands) -> None:
         verbs,
         "motion",
         run_motion,
-        "convert an AMASS, BVH or glTF motion to the body template",
-        "Read a motion, retarget it to the template if it has another skeleton, and write it as .npz in the layout of "
-        "AMASS SMPL-X, y up.",
+        "retarget an AMASS, BVH or glTF motion to the body template",
+        "Read a motion, retarget it to the skeleton of the template, and write it as .npz in the "
+        "layout of AMASS SMPL-X, y up.",
     )
     parser.add_argument(
         "file",
@@ -155,13 +154,16 @@ def _add_motion(verbs: args.Commands) -> None:
     )
     parser.add_argument("out", type=args.output_path, metavar="OUT.npz", help="a new file")
     parser.add_argument(
-        "--fps", type=float, metavar="F", help="resample to this rate; that of an .npz without one"
+        "--fps",
+        type=float,
+        metavar="F",
+        help="frame rate to resample to, or of an .npz without one",
     )
     parser.add_argument(
         "--up", choices=("auto", "y", "z"), default="auto", help="up axis of an .npz (default auto)"
     )
     parser.add_argument(
-        "--clip", metavar="NAME", help="name of the animation if a glTF file has several"
+        "--clip", metavar="NAME", help="name of the animation in a glTF file with several"
     )
     parser.add_argument(
         "--body",
@@ -176,12 +178,12 @@ def _add_synth(verbs: args.Commands) -> None:
         verbs,
         "synth",
         run_synth,
-        "write a small synthetic scene as a capture",
-        "Ray trace a built-in scene to a capture in the layout of NeRF-synthetic, or of D-NeRF if it moves. still: a "
-        "still life. spin: a turning die and a rolling ball. room: videos of a static room with one hopping ball, "
-        "from fixed cameras. roll: a striped ball rolls alone. human: a walking person from all around, with exact "
-        "body parameters. people: many people, a capture each, with depth maps and key points, for networks that "
-        "predict people.",
+        "write a synthetic capture",
+        "Ray trace a built-in scene as a capture in the layout of NeRF-synthetic, or D-NeRF for "
+        "moving scenes. still: a still life. spin: a rotating die and a rolling ball. room: videos "
+        "of a static room with a hopping ball, from fixed cameras. roll: a rolling striped ball. "
+        "human: a walking person with exact body parameters. people: one capture per person with "
+        "depth maps and key points, to train networks that predict people.",
     )
     parser.add_argument(
         "scene", choices=SYNTHETIC_SCENES, metavar="NAME", help=", ".join(SYNTHETIC_SCENES)
@@ -190,24 +192,24 @@ def _add_synth(verbs: args.Commands) -> None:
     number = args.integer_type("a number", 1, 10**6)
     for name, about in (
         ("size", "width and height in pixels (default 128, for people 256)"),
-        ("views", "training views; for fixed cameras, human and people: times (48, 12 and 1)"),
-        (
-            "cameras",
-            "training cameras for human and people, fixed ones of scenes that move (8, 24, 8)",
-        ),
-        ("people", "for people: how many (default 100)"),
+        ("views", "training views; time steps for fixed cameras, human and people (48, 12 and 1)"),
+        ("cameras", "training cameras of human, people and fixed cameras (8, 24 and 8)"),
+        ("people", "number of people of the scene people (default 100)"),
     ):
         parser.add_argument(f"--{name}", type=number, metavar="N", help=about)
-    style = "of scenes that move: another camera at each time (default), one on a smooth arc, or fixed ones (room)"
+    style = (
+        "cameras of moving scenes: a new position at each time (teleport, default), one moving "
+        "camera, or fixed cameras (default of room)"
+    )
     parser.add_argument("--style", choices=("teleport", "moving", "fixed"), help=style)
-    seed = "random seed of cameras, for human of the clothes, for people of everything (default 0)"
+    seed = "random seed of cameras, clothes (human) and people (default 0)"
     parser.add_argument(
         "--seed", type=args.integer_type("a seed", 0, 10**9), metavar="N", help=seed
     )
 
 
 def run_inspect(arguments: argparse.Namespace) -> int:
-    """Print a report on a capture, or on videos without poses."""
+    """Print a report on a capture or on videos without poses."""
     from dyngs.capture.inspection import format_report, inspect_capture
     from dyngs.capture.sfm.unposed import is_videos
     from dyngs.data.read import capture_folder
@@ -237,7 +239,7 @@ def _inspect_videos(arguments: argparse.Namespace) -> int:
 
     if arguments.image is not None:
         raise DyngsError(
-            f"{arguments.path}: has no poses to draw; estimate them with `dyngs data sfm` first"
+            f"{arguments.path}: videos have no poses to draw; run `dyngs data sfm` first"
         )
     print_lines(video_report(arguments.path))
     return 0
@@ -256,7 +258,7 @@ def run_sfm(arguments: argparse.Namespace) -> int:
     images = capture_folder(arguments.images)
     several = is_several_videos(images)
     if several and (arguments.matching != "auto" or arguments.masks is not None):
-        raise DyngsError(f"{images}: --matching and --masks are for photos and one video")
+        raise DyngsError(f"{images}: --matching and --masks are not supported for several videos")
     options = SfmOptions(
         matching=arguments.matching,
         num_frames=arguments.frames,
@@ -275,7 +277,7 @@ def run_sfm(arguments: argparse.Namespace) -> int:
 
 
 def run_fit(arguments: argparse.Namespace) -> int:
-    """Fit a body and print how good the fit is, and the next command."""
+    """Fit a body; print the quality of the fit and the next command."""
     from dyngs.human.fit.fitted_capture import FitInputs, write_fitted_capture
     from dyngs.human.keys import HumanModel
 
@@ -283,7 +285,7 @@ def run_fit(arguments: argparse.Namespace) -> int:
     passed = {name: getattr(arguments, name) for name in _OF_A_FIT}
     if arguments.uv is not None and arguments.template is None:
         raise DyngsError(
-            f"--uv {arguments.uv} goes with --template; the free template has its own texture coordinates"
+            f"--uv {arguments.uv} requires --template; the free template has texture coordinates"
         )
     with ProgressBar() as report:
         template = HumanModel(body=arguments.template, uv=arguments.uv)
@@ -298,7 +300,7 @@ def run_fit(arguments: argparse.Namespace) -> int:
 
 
 def run_people(arguments: argparse.Namespace) -> int:
-    """Find a person and fit a body; print what was found, and the next command."""
+    """Detect a person and fit a body; print a summary and the next command."""
     from dyngs.human.detect.detect_person import write_detected_person
     from dyngs.human.detect.detector import MediaPipe
 
@@ -311,7 +313,7 @@ def run_people(arguments: argparse.Namespace) -> int:
 
 
 def _avatar_in(person: Path | None) -> KnownAvatar | None:
-    """Return the avatar of a run, None of anything else."""
+    """Return the avatar if ``person`` is an avatar run, else None."""
     from dyngs.config.io import RESOLVED_NAME
 
     if person is None or not (person / RESOLVED_NAME).is_file():
@@ -333,9 +335,9 @@ def run_motion(arguments: argparse.Namespace) -> int:
 
     out: Path = arguments.out
     if out.exists():
-        raise DyngsError(f"{out} exists already; name a new file for the motion")
+        raise DyngsError(f"{out}: already exists; give the name of a new file")
     if out.suffix.lower() != ".npz":
-        raise DyngsError(f"cannot write {out}: a motion is written as .npz")
+        raise DyngsError(f"{out}: motions are written as .npz; give a name with this suffix")
     body = default_template() if arguments.body is None else read_body(arguments.body)
     motion = read_motion(arguments.file, body, arguments.fps, arguments.up, arguments.clip)
     write_amass(motion, out)
@@ -374,7 +376,7 @@ def run_synth(arguments: argparse.Namespace) -> int:
     for option in ("size", "views", "cameras", "people", "style", "seed"):
         value = getattr(arguments, option)
         if value is not None and option not in names:
-            raise DyngsError(f"--{option} is not for the scene {scene}; leave it out")
+            raise DyngsError(f"--{option} does not apply to the scene {scene}; remove it")
         if value is not None:
             given[names[option]] = value
     if scene == "people":

@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from dyngs.training.events import Listener
 
 SIZE, NUM_TIMES, NUM_POINTS = 160, 60, 6000
-"""Width and height of the images in pixels, number of training images, one camera and one time each,
-and of random initial points."""
+"""Image width and height, px; number of training images, each from its own camera and time; number
+of random initial points."""
 
 
 def add_parser(commands: Commands) -> None:
-    about = "Ray trace a small moving scene, train on it, evaluate, render images and a video, write a .ply."
+    about = "Ray trace a small moving scene, train it, evaluate it, render images and a video, write a .ply."
     parser = add_command(
         commands, "demo", run, "train, evaluate and render a built-in moving scene", about
     )
@@ -37,7 +37,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the demo in ``--out``, or in ``OUT-2`` and so on if that is not empty."""
+    """Run the demo in ``--out``, or in ``OUT-2``, ``OUT-3`` ... if it is not empty."""
     from dyngs.cli.training_progress import TrainingProgress
     from dyngs.io.outputs import lock_folder
 
@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def is_unused(folder: Path) -> bool:
-    """Whether ``folder`` can be made, or holds at most a lock file."""
+    """Return whether ``folder`` does not exist or contains only a lock file."""
     from dyngs.io.outputs import LOCK_NAME
 
     return not folder.exists() or (
@@ -62,7 +62,7 @@ def is_unused(folder: Path) -> bool:
 def run_demo(
     folder: Path, steps: int, threads: int = 0, listeners: Sequence[Listener] = ()
 ) -> None:
-    """Run the demo in an empty folder; print the results and the paths of the files."""
+    """Run the demo in an empty folder; print the metrics and the paths of the files."""
     from dyngs.api.train import train
     from dyngs.cli.evaluate import report_rows
     from dyngs.data.synthetic.captures import DynamicOptions, write_dynamic_capture
@@ -76,15 +76,15 @@ def run_demo(
     images = folder / "images"
     video = folder / "orbit.mp4"
     capture = folder / "capture"
-    log_info(f"[1/4] ray tracing the images of the demo scene into {capture}")
+    log_info(f"[1/4] ray tracing the demo scene to {capture}")
     write_dynamic_capture(
         "spin", capture, DynamicOptions(size=SIZE, num_times=NUM_TIMES, samples=3)
     )
-    log_info(f"[2/4] training {format_count(steps, 'step')} into {run_dir}")
+    log_info(f"[2/4] training {format_count(steps, 'step')} to {run_dir}")
     train(demo_config(capture, run_dir, steps, threads), listeners=listeners)
     log_info("[3/4] evaluating on held-out views")
     report = evaluate_run(run_dir, threads=threads)
-    log_info("[4/4] rendering the test views and an orbit around the moving scene")
+    log_info("[4/4] rendering the test views and an orbit video")
     opened = open_run(run_dir)
     write_split_images(opened, "test", images)
     path = choose_path(opened, PathOptions("orbit", 90))
@@ -92,16 +92,16 @@ def run_demo(
     ply = write_run_splats(opened, folder / "splats.ply").path
     title = format_count(report.num_views, "test view")
     print_tables(numbers_table(title, ("metric", "value"), report_rows(report)))
-    print(f"truth, render, error  {images / 'sheet.png'}")
+    print(f"contact sheet         {images / 'sheet.png'}")
     print(f"orbit video           {video}")
-    print(f"for other viewers     {ply}")
+    print(f"Gaussians             {ply}")
     print(f"run folder            {run_dir}")
     print(f"to look around        dyngs view {quote_path(run_dir)}    (pip install 'dyngs[view]')")
     print(f"one page to share     dyngs export {quote_path(run_dir)} --out scene.html")
 
 
 def demo_config(capture: Path, run_dir: Path, steps: int = 3000, threads: int = 0) -> Config:
-    """Return the preset ``dynamic`` for the capture and size of the demo."""
+    """Return the config of the demo, based on the preset ``dynamic``."""
     from dyngs.config.io import load_config, packaged_preset
 
     overrides = (
@@ -109,8 +109,8 @@ def demo_config(capture: Path, run_dir: Path, steps: int = 3000, threads: int = 
         f"init.num_random={NUM_POINTS}",
         f"model.num_random_moving={NUM_POINTS // 3}",
         f"train.steps={steps}",
-        "model.choose=false",  # the scene is made to move
-        "train.initial_downscale=2",  # the images are small, and soon as large as they get
+        "model.pilot_runs=false",  # the scene is known to move
+        "train.initial_downscale=2",  # the images are small already
         "train.resolution_grows_from=0.35",
         "train.resolution_full_at=0.45",
         "run.name=demo",

@@ -1,4 +1,4 @@
-"""``dyngs doctor``: versions and state of this installation."""
+"""``dyngs doctor``: check the installation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dyngs.core.errors import DyngsError
 
 @dataclass(frozen=True)
 class Check:
-    """One row of the report; ``verdict`` is "ok", "absent" (optional and missing) or "broken"."""
+    """One row of the report; the verdict "absent" marks missing optional parts."""
 
     name: str
     value: str
@@ -27,7 +27,7 @@ class Check:
 
 
 def add_parser(commands: Commands) -> None:
-    about = "report versions, cores, instruction set and optional packages"
+    about = "check the installation: versions, cores, instruction set, GPU, optional packages"
     add_json(add_command(commands, "doctor", run, about))
 
 
@@ -49,9 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     Console().print(table)
     broken = [finding.name for finding in findings if finding.verdict == "broken"]
     if broken:
-        raise DyngsError(
-            f"this installation cannot work: {', '.join(broken)} (see the rows marked broken)"
-        )
+        raise DyngsError(f"the installation is broken: {', '.join(broken)}; install dyngs again")
     return 0
 
 
@@ -65,7 +63,7 @@ def examine() -> Iterator[Check]:
 
 
 def _examine_packages() -> Iterator[Check]:
-    """Yield the versions of the packages that dyngs requires, and of those that its extras do."""
+    """Yield the versions of required and optional packages."""
     requirements = metadata.requires("dyngs") or [] if _version("dyngs") else []
     for line in requirements:
         name = re.split(r"[^\w.-]", line, maxsplit=1)[0]
@@ -89,7 +87,10 @@ def _examine_core() -> Iterator[Check]:
     newest = core.best_isa()
     value = f"instruction set {isa} ({ISA_NAMES[isa]}), compiled: {', '.join(built_isas())}"
     if newest not in built_isas():
-        value += f"; this processor also runs {newest} ({ISA_NAMES[newest]}): install again on it for more speed"
+        value += (
+            f"; this CPU supports {newest} ({ISA_NAMES[newest]}): reinstall dyngs from source "
+            "for more speed"
+        )
     yield Check("native core", value)
     runtimes = openmp_runtimes()
     if runtimes:
@@ -97,7 +98,7 @@ def _examine_core() -> Iterator[Check]:
 
 
 def _examine_gpu() -> Iterator[Check]:
-    """Yield what there is of a CUDA GPU; without one dyngs works, too."""
+    """Yield the state of the CUDA GPU, which is optional."""
     try:
         from dyngs.ops.device import gpu_status, gpu_unavailable_reason
     except (ImportError, DyngsError):
@@ -108,11 +109,11 @@ def _examine_gpu() -> Iterator[Check]:
     if reason is None:
         yield Check("device", "cuda")
     else:
-        yield Check("device", f"cpu; for a GPU: {reason}", "absent")
+        yield Check("device", f"cpu; no GPU: {reason}", "absent")
 
 
 def openmp_runtimes() -> list[str]:
-    """Return the OpenMP runtimes loaded in this process: several compete for the cores."""
+    """Return the OpenMP runtimes loaded in this process; several would compete for the cores."""
     maps = Path("/proc/self/maps")
     text = maps.read_text() if maps.is_file() else ""
     return sorted(set(re.findall(r"/(lib(?:g|i)?omp[^/\n]*)$", text, re.MULTILINE)))

@@ -1,5 +1,4 @@
-"""``dyngs edit``: another frame for a scene, a part of it, what spoils it taken away, several
-scenes in one."""
+"""``dyngs edit``: change the coordinate frame of a scene, crop, clean and merge scenes."""
 
 from __future__ import annotations
 
@@ -23,14 +22,14 @@ examples:
   dyngs edit runs/room --up auto --scale "0,0,0 1,0,0 1.25m" --out room.ply   upright, in metres
   dyngs edit room.ply --crop -1,-1,-1 1,1,1 --out table.spz                   a box, by two corners
   dyngs edit room.ply --crop 0,0,0 1.5 --outside --out rest.ply               all but a sphere
-  dyngs edit runs/room --clean --out clean.ply                                without what spoils it, for 0.1 dB at most
+  dyngs edit runs/room --clean --out clean.ply                                remove floaters, at most 0.1 dB loss
   dyngs edit runs/site --geo points.csv --out site.ply                        in the coordinates of control points
-  dyngs edit runs/site --geo exif --out runs/site_m                           north, up and metres by GPS of the photos
+  dyngs edit runs/site --geo exif --out runs/site_m                           metres, north and up from photo GPS
   dyngs edit room.ply --merge chair.ply lamp.spz --out all.ply
-  dyngs edit table.ply --undo --out before.ply                                the frame of before
-  dyngs edit runs/room --up auto --scale 2 --out runs/upright                 a run: its cameras, motion, exports, too
+  dyngs edit table.ply --undo --out before.ply                                the original coordinate frame
+  dyngs edit runs/room --up auto --scale 2 --out runs/upright                 a new run with cameras and motion
 
-What is asked for is done in this order: --clean, --crop, --merge, the frame. Guide: `dyngs docs edit`.
+Edits are applied in this order: --clean, --crop, --merge, coordinate frame. Details: dyngs docs edit.
 """
 
 
@@ -39,37 +38,42 @@ def add_parser(commands: args.Commands) -> None:
         commands,
         "edit",
         run,
-        "another frame, a part, cleaned, several in one: a scene as an edited file",
-        "Edit a run or a file of Gaussians, and write the result as another file or run. Points are given in the "
-        "coordinates of a file, or of the capture of a run. How the frame was changed is stored: it can be undone.",
+        "transform, crop, clean and merge scenes",
+        "Edit a run or a file of Gaussians, and write the result as another file or run. Points are "
+        "in the coordinates of the file, or of the capture of a run. Changes of the coordinate frame "
+        "are stored and can be undone.",
         _EPILOG,
     )
-    parser._negative_number_matcher = _NEGATIVE  # else "-1,0,2" would be taken for an option
+    parser._negative_number_matcher = _NEGATIVE  # otherwise "-1,0,2" is parsed as an option
     parser.add_argument(
         "source", type=args.input_path, metavar="RUN|FILE", help="run folder, or file of Gaussians"
     )
-    about = "file to write, such as a .ply, .spz, .glb, or .4dgs of what moves; without a suffix the folder of a run"
+    about = "file to write (.ply, .spz, .glb, .4dgs for moving scenes ...); without a suffix: new run folder"
     parser.add_argument(
         "--out", type=args.output_path, required=True, metavar="FILE|RUN2", help=about
     )
     frame = parser.add_argument_group("frame")
-    about = "direction that is up: an axis such as -y, x,y,z, or auto, by the cameras of the run"
+    about = (
+        "up direction: an axis such as -y, a vector x,y,z, or auto (from the cameras of the run)"
+    )
     frame.add_argument("--up", metavar="DIRECTION", help=about)
     frame.add_argument("--origin", metavar="X,Y,Z", help="point that becomes the origin")
-    about = 'factor, or "x,y,z x,y,z LENGTH": two points, and what their distance is to be'
+    about = 'scale factor, or "x,y,z x,y,z LENGTH": two points and their distance after scaling'
     frame.add_argument("--scale", metavar="FACTOR", help=about)
-    about = "control points: rows of x,y,z in the scene and X,Y,Z in the world, three or more; exif: GPS of the photos"
+    about = (
+        "control points: three or more rows of scene x,y,z and world X,Y,Z; exif: GPS of the photos"
+    )
     frame.add_argument("--geo", type=args.input_path, metavar="FILE|exif", help=about)
-    frame.add_argument("--undo", action="store_true", help="the frame from before the first edit")
+    frame.add_argument("--undo", action="store_true", help="restore the original coordinate frame")
     part = parser.add_argument_group("Gaussians")
-    about = "what stays: two corners x,y,z x,y,z of a box, or centre and radius of a sphere"
+    about = "region to keep: two corners x,y,z x,y,z of a box, or centre and radius of a sphere"
     part.add_argument("--crop", nargs="+", metavar="REGION", help=about)
-    part.add_argument("--outside", action="store_true", help="--crop leaves out what lies inside")
-    about = "take away floaters, needles, faint veils, and what no camera ever saw"
+    part.add_argument("--outside", action="store_true", help="keep what is outside of --crop")
+    about = "remove floaters, needles, faint and isolated Gaussians, and those that no camera sees"
     part.add_argument("--clean", action="store_true", help=about)
-    about = "largest loss of PSNR of views held out by --clean, dB (default 0.1)"
+    about = "largest loss of PSNR by --clean on held-out views, dB (default 0.1)"
     part.add_argument("--max-loss", metavar="DB", help=about)
-    about = "files of Gaussians, or runs, to be added; all still"
+    about = "static files of Gaussians or runs to add"
     part.add_argument(
         "--merge", nargs="+", default=[], type=args.input_path, metavar="FILE", help=about
     )
@@ -84,7 +88,7 @@ def add_parser(commands: args.Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Edit, and print what was done and how the file differs from the scene."""
+    """Edit, and print the changes and the PSNR between renderings of the file and the scene."""
     with heavy_imports():
         from dyngs.api.edit import edit_scene
         from dyngs.cli.splats import print_image_difference
@@ -108,8 +112,7 @@ def _note(text: str) -> None:
 
 
 def _edits(arguments: argparse.Namespace) -> Edits:
-    """Return what the options ask for. Raises DyngsError: they do not go together, or are no points
-    or numbers."""
+    """Parse the options. Raises DyngsError: incompatible options, or invalid points or numbers."""
     from dyngs.api.edit import Edits
     from dyngs.export.edit.crop import parse_region
     from dyngs.export.edit.frame import (
@@ -127,15 +130,16 @@ def _edits(arguments: argparse.Namespace) -> Edits:
     whole = [f"--{name}" for name in ("geo", "undo") if getattr(arguments, name)]
     if len(whole) + bool(alone) > 1 and whole:
         raise DyngsError(
-            f"{whole[0]} gives the whole frame, so leave out {' and '.join([*whole[1:], *alone])}"
+            f"{whole[0]} defines the whole coordinate frame; "
+            f"remove {' and '.join([*whole[1:], *alone])}"
         )
     if arguments.outside and arguments.crop is None:
-        raise DyngsError("--outside goes with --crop, which names what is left out")
+        raise DyngsError("--outside requires --crop")
     if arguments.max_loss is not None and not arguments.clean:
-        raise DyngsError("--max-loss goes with --clean")
+        raise DyngsError("--max-loss requires --clean")
     max_loss = 0.1 if arguments.max_loss is None else parse_number(arguments.max_loss, "--max-loss")
     if max_loss < 0:
-        raise DyngsError(f"--max-loss {max_loss:g}: give the dB that may be lost, 0 or more")
+        raise DyngsError(f"--max-loss {max_loss:g}: must be 0 dB or more")
     return Edits(
         max_loss=max_loss if arguments.clean else None,
         region=None if arguments.crop is None else parse_region(arguments.crop),

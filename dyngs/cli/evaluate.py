@@ -1,4 +1,4 @@
-"""``dyngs eval``: quality metrics of a run on held-out views."""
+"""``dyngs eval``: evaluate a run on held-out views."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOST_THINGS = 5
 
 
 def add_parser(commands: args.Commands) -> None:
-    about = "Evaluate a run. Prints a table and writes metrics.json (metrics_SPLIT.json for another split)."
+    about = "Evaluate a run. Prints a table and writes metrics.json (metrics_SPLIT.json for other splits)."
     parser = args.add_command(commands, "eval", run, "evaluate a run on held-out views", about)
     parser.add_argument(
         "run_dir", type=args.input_path, metavar="RUN", help="run folder written by `dyngs train`"
@@ -36,8 +36,8 @@ def add_parser(commands: args.Commands) -> None:
     args.add_device(parser)
     args.add_data_root(parser)
     about = (
-        "also score from poses refined on the images themselves: of a person's body, otherwise of the cameras; always "
-        "done after camera.refine"
+        "also evaluate with camera poses (or body poses of a person) refined on the evaluated "
+        "images; always on for runs with camera.refine"
     )
     parser.add_argument("--refine", action="store_true", help=about)
     args.add_json(parser)
@@ -50,9 +50,9 @@ def run(arguments: argparse.Namespace) -> int:
         from dyngs.evaluate.report import evaluate_run, report_path
 
     if arguments.refine and arguments.split != "train":
-        load_resolved(arguments.run_dir)  # what is no run is refused before anything is announced
+        load_resolved(arguments.run_dir)  # fails for anything but a run before the message
         print(
-            "refining poses on the tested images, beside the scores as given: this takes a while",
+            "refining the poses of the evaluated images, this takes a while",
             file=sys.stderr,
         )
     report = evaluate_run(
@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def report_rows(report: EvalReport) -> list[tuple[str, str]]:
-    """Return labels and values of the mean metrics, with the reason where one is missing."""
+    """Return labels and values of the mean metrics, or the reason why one is missing."""
 
     def known(name: str, shown: str = "{:.4f}") -> str:
         value = getattr(report, name)
@@ -128,8 +128,8 @@ def report_rows(report: EvalReport) -> list[tuple[str, str]]:
 
 
 def _rows_of_person(report: EvalReport) -> list[tuple[str, str]]:
-    """Return labels and values of the scores of a person: as given, from silhouettes, refined on
-    the images."""
+    """Return labels and values of the scores of a person: with given, silhouette-fitted and refined
+    poses."""
     rows: list[tuple[str, str]] = []
     for scores, suffix in (
         (report, ""),
@@ -149,8 +149,7 @@ def _rows_of_person(report: EvalReport) -> list[tuple[str, str]]:
 
 
 def _rows_of_regions(report: EvalReport) -> list[tuple[str, str]]:
-    """Return labels and values of the PSNR of parts of images; of a static capture only what is
-    known."""
+    """Return labels and values of the PSNR of image regions."""
     rows = []
     if report.psnr_foreground is not None:
         rows.append(("on the foreground", f"{report.psnr_foreground:.2f} dB"))

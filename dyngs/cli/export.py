@@ -1,5 +1,5 @@
-"""``dyngs export``: write a run as Gaussians in many formats, a page, tracks, a person, cameras, or
-a .dyngs file."""
+"""``dyngs export``: export a run as Gaussians, mesh, web page, tracks, avatar, cameras or .dyngs
+file."""
 
 from __future__ import annotations
 
@@ -43,27 +43,27 @@ _TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree") | {
     "bodies": "time up from_up",
     "joints": "motion",
 }
-"""The options that formats take, and exports in another way: ``--bodies`` and ``--joints``."""
+"""Options that each format accepts."""
 
 _EPILOG = """\
 examples:
   dyngs export runs/bench                                         runs/bench/splats.ply
   dyngs export runs/dance --time 0.5 --out middle.ply             the scene at one time
-  dyngs export runs/bench --out bench.spz                         the suffix names the format: .glb, .sog, .splat ...
-  dyngs export runs/dance --times 0:1:30 --out frames             frame_0000.ply ... for players of sequences
+  dyngs export runs/bench --out bench.spz                         the suffix selects the format: .glb, .sog ...
+  dyngs export runs/dance --times 0:1:30 --out frames             a sequence frame_0000.ply ...
   dyngs export runs/dance --out dance.4dgs                        all training times in one file
-  dyngs export runs/balls --bodies --out balls.glb                balls that roll as animated nodes
+  dyngs export runs/balls --bodies --out balls.glb                rolling balls as animated nodes
   dyngs export runs/ann --motion walk.npz --out walk              a person (model.kind=human), one file per frame
-  dyngs export runs/ann --format avatar --out ann.safetensors     a person as one file, for `render` and `export`
+  dyngs export runs/ann --format avatar --out ann.safetensors     an avatar file, for `render` and `export`
   dyngs export runs/ann --format mesh --motion walk.npz --out ann.glb   skinned and textured, for Blender, three.js ...
-  dyngs export runs/bench --format mesh --out bench.glb           the surface, with colours of vertices
+  dyngs export runs/bench --format mesh --out bench.glb           a mesh with vertex colours
   dyngs export runs/ann --joints --out ann.ply                    Gaussians of a person with joints and weights
   dyngs export runs/dance --format tracks --dynamic               positions of all moving Gaussians over time, as .npz
   dyngs export runs/dance --format dyngs --out dance_export       a small file, for `eval`, `render` and `export`
   dyngs export runs/refined --format cameras                      runs/refined/cameras/transforms.json
-  dyngs export runs/stereo --format network --out net.safetensors   the weights of a network, for `dyngs predict`
-  dyngs export runs/dance --out dance.html                        a page that plays in any browser, offline
-  dyngs export town.ply --format html --folder --out town         a large scene, fetched as it is looked at
+  dyngs export runs/stereo --format network --out net.safetensors   network weights, for `dyngs predict`
+  dyngs export runs/dance --out dance.html                        a web page that works offline
+  dyngs export town.ply --format html --folder --out town         a large scene, streamed on demand
   dyngs export town.ply --format sog --folder --out town_sog      the same for PlayCanvas and SuperSplat
 """
 
@@ -73,9 +73,9 @@ def add_parser(commands: args.Commands) -> None:
         commands,
         "export",
         run,
-        "write a run as .ply, .spz, .glb and the like, tracks, avatar, mesh, small .dyngs file, page or cameras",
-        "Write the Gaussians of a run as files that viewers and editors read, as tracks of their centres, as one small "
-        ".dyngs file, as a page that plays by itself, a person as an avatar or a mesh, or the cameras.",
+        "export a run as .ply, .spz, .glb ..., mesh, web page, tracks, avatar, cameras or .dyngs file",
+        "Export a run: Gaussians in the formats of other viewers and editors, tracks of their "
+        "centres, a mesh, a web page, a compressed .dyngs file, an avatar, or the cameras.",
         _EPILOG,
     )
     parser.add_argument(
@@ -95,40 +95,40 @@ def add_parser(commands: args.Commands) -> None:
         "cameras",
         "network",
     )
-    about = "file format (default: what the suffix of --out names, else ply)"
+    about = "file format (default: from the suffix of --out, else ply)"
     parser.add_argument("--format", choices=formats, help=about)
-    about = "file, or folder of a sequence (default: splats... in RUN)"
+    about = "file, or folder of a sequence (default: splats.ply and the like in RUN)"
     parser.add_argument("--out", type=args.output_path, metavar="PATH", help=about)
     when = parser.add_mutually_exclusive_group()
     when.add_argument(
         "--time", type=args.scene_time, metavar="T", help="time to export, from 0 to 1 (default 0)"
     )
     when.add_argument(
-        "--times", metavar="A:B:N", help="N times from A to B (tracks: default the training times)"
+        "--times", metavar="A:B:N", help="N times from A to B (default for tracks: training times)"
     )
     args.add_motion(parser)
     args.add_keep_feet(parser)
     about = (
-        "--format dyngs: largest root-mean-square change of the images, in grey levels of 255 (default: what costs "
-        "0.025 dB on training views)"
+        "--format dyngs: largest RMS change of the images, in grey levels of 255 (default: a loss "
+        "of 0.025 dB on training views)"
     )
     parser.add_argument("--max-change", type=float, metavar="X", help=about)
-    about = "--format mesh of a radiance field: density of the surface (default: 25 per half extent / 1.5)"
+    about = "--format mesh of a radiance field: density of the surface (default: 25 / (half extent / 1.5))"
     parser.add_argument("--level", type=float, metavar="X", help=about)
-    about = "--format mesh of Gaussians or a field: cells along the longest side of the scene (default 192)"
+    about = "--format mesh: grid cells along the longest side of the scene (default 192)"
     kind = args.integer_type("a number of cells", 8, 1024)
     parser.add_argument("--cells", type=kind, metavar="N", help=about)
-    about = "--format mesh of curved triangles: segments of an edge of each (default 6)"
+    about = "--format mesh of curved triangles: segments per edge (default 6)"
     kind = args.integer_type("a number of segments", 1, 64)
     parser.add_argument("--segments", type=kind, metavar="N", help=about)
-    about = "--format html, sog: a folder for a web server, of which a page or PlayCanvas fetches what is seen"
+    about = "--format html, sog: write a folder for a web server, streamed on demand"
     parser.add_argument("--folder", action="store_true", help=about)
     args.add_max_gaussians_drawn(
-        parser, "--folder: so many Gaussians of an image are drawn at most, as on phones"
+        parser, "--folder: maximum number of Gaussians drawn per image, for example for phones"
     )
-    about = "a person at rest, with joints and skinning weights: .ply, .glb"
+    about = "Gaussians of a person in rest pose, with joints and skinning weights: .ply, .glb"
     parser.add_argument("--joints", action="store_true", help=about)
-    about = "what moves rigidly as animated nodes of a .glb; the rest stands as at --time"
+    about = "rigidly moving bodies as animated nodes of a .glb; all else is static, as at --time"
     parser.add_argument("--bodies", action="store_true", help=about)
     add_axes(parser)
     part = parser.add_mutually_exclusive_group()
@@ -138,7 +138,7 @@ def add_parser(commands: args.Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the files and print where they are and how large."""
+    """Write the files and print their paths and sizes."""
     with heavy_imports():
         import dyngs.runs.opened  # noqa: F401
 
@@ -153,10 +153,10 @@ def run(arguments: argparse.Namespace) -> int:
     for name in (*dict.fromkeys(" ".join(_TAKES.values()).split()), "bodies", "joints"):
         given = getattr(arguments, name)
         if name not in taken and given is not None and given is not False:
-            raise DyngsError(f"--{name.replace('_', '-')} does not go with --format {kind}")
+            raise DyngsError(f"--{name.replace('_', '-')} is not supported with --format {kind}")
     if args.is_avatar_file(arguments.run_dir) and kind in ("dyngs", "avatar", "network"):
         raise DyngsError(
-            f"{arguments.run_dir}: an avatar file is exported as Gaussians, mesh, page or tracks"
+            f"{arguments.run_dir}: avatar files can be exported as Gaussians, mesh, page or tracks"
         )
     writers = {
         "html": _export_page,
@@ -176,7 +176,7 @@ def run(arguments: argparse.Namespace) -> int:
     opened = _moved(arguments, _open(arguments))
     times = opened.scene.times if arguments.motion is not None and times is None else times
     if opened.scene.is_static and times is not None:
-        print_notes(("nothing moves in this run: it is the same at all times",))
+        print_notes(("the scene is static: all times are the same",))
     if kind == "tracks":
         files = _export_tracks(arguments, opened, times)
     elif kind == MOVING:
@@ -188,10 +188,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _kind(arguments: argparse.Namespace) -> str:
-    """Return the name of the format: what --format says, else what the suffix of --out names, else
-    ply.
+    """Return the format from --format, else from the suffix of --out, else ply.
 
-    Raises DyngsError: an unknown suffix, or one of another format than --format.
+    Raises DyngsError: an unknown suffix, or a suffix that contradicts --format.
     """
     from dyngs.io.formats.formats import all_suffixes, find_format
 
@@ -212,24 +211,26 @@ def _kind(arguments: argparse.Namespace) -> str:
     ):
         known = f"{all_suffixes()}, {', '.join(_OTHER_SUFFIXES)}"
         raise DyngsError(
-            f"{out}: which format? Give --format, or a name that ends in one of {known}"
+            f"{out}: unknown format; add --format, or a suffix: {known}"
             if stated is None
-            else f"{out}: --format {stated} does not write files of that suffix"
+            else f"{out}: wrong suffix for --format {stated}"
         )
     return usual
 
 
 def _target(arguments: argparse.Namespace, name: str) -> Path:
-    """Return the file to write: --out, or ``name`` in the folder --out, by default RUN. Raises
-    DyngsError: there is none, or --out has another suffix."""
+    """Return the file to write: --out, or ``name`` in the folder --out or RUN.
+
+    Raises DyngsError: no output file can be derived, or --out has another suffix.
+    """
     out: Path = arguments.out or arguments.run_dir
     suffix = Path(name).suffix
     if out == arguments.run_dir and out.is_file():
-        raise DyngsError(f"{out}: where to? Give --out FILE{suffix}")
+        raise DyngsError(f"{out}: an output file is required; add --out FILE{suffix}")
     if out.is_dir():
         return out / name
     if out.suffix.lower() != suffix:
-        raise DyngsError(f"{out}: one file is written; give --out {out.stem}{suffix}")
+        raise DyngsError(f"{out}: must be a {suffix} file; use --out {out.stem}{suffix}")
     return out
 
 
@@ -245,8 +246,12 @@ def _is_sequence(arguments: argparse.Namespace) -> bool:
 
 def _moved(arguments: argparse.Namespace, opened: OpenedScene) -> OpenedScene:
     if getattr(opened.renderable, "sides", None) is not None:
-        line = "of the sides that it was found from dyngs draws the one nearest to the camera, a file all: less sharply"
-        print_notes((line,))
+        print_notes(
+            (
+                "the file holds the Gaussians of all source views, less sharp than dyngs, which "
+                "draws those of the nearest view",
+            )
+        )
     return args.play_motion(arguments, opened)
 
 
@@ -270,8 +275,7 @@ def _part(arguments: argparse.Namespace) -> Part:
 def _export_splats(
     arguments: argparse.Namespace, opened: OpenedScene, times: tuple[float, ...] | None, kind: str
 ) -> list[Path]:
-    """Write a sequence if several times of a moving scene are requested, else one file; return the
-    paths."""
+    """Write a sequence for several times of a moving scene, else one file; return the paths."""
     from dyngs.export.images import compare_file_with_run
     from dyngs.export.splat_files import (
         choose_write_options,
@@ -287,9 +291,7 @@ def _export_splats(
     suffix = own.suffixes[0]
     scene = scene_part(opened.scene, part)
     if opened.scene.colour is not None:
-        line = (
-            "the colours of the run are a network; spherical harmonics of degree 3 are fitted to it"
-        )
+        line = "the colour network of the run is approximated by spherical harmonics of degree 3"
         print_notes((line,))
     how, line = choose_write_options(
         opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree
@@ -302,7 +304,7 @@ def _export_splats(
         is_file and is_sequence and not arguments.static
     ):
         raise DyngsError(
-            f"{out}: --times writes a folder of files, --folder one of one time; give --out FOLDER, or --time T"
+            f"{out}: --times and --folder write a folder; use --out FOLDER, or --time T for one file"
         )
     print_notes((line,))
     if arguments.folder:
@@ -317,7 +319,9 @@ def _export_splats(
         written = write_run_sequence(opened, folder, moments, part, how, suffix)
     else:
         if times is None and not arguments.static and not opened.scene.is_static:
-            line = "this is time 0 of a moving scene; --time T gives another, --times 0:1:30 a sequence"
+            line = (
+                "exporting time 0 of a moving scene; use --time T, or --times 0:1:30 for a sequence"
+            )
             print_notes((line,))
         moments = (0.0 if times is None else times[0],)
         if out is None or (is_sequence and not is_file and not out.is_dir()):
@@ -336,14 +340,14 @@ def _export_splats(
 
 
 def _shown(count: int) -> list[int]:
-    """Return which of several files or times are drawn, to be compared with the scene."""
+    """Return the indices of the files or times that are rendered for comparison."""
     return sorted({0, count // 2, count - 1})
 
 
 def _export_moving(
     arguments: argparse.Namespace, opened: OpenedScene, times: tuple[float, ...]
 ) -> list[Path]:
-    """Write all times as one file of moving Gaussians."""
+    """Write all times as one .4dgs file."""
     from dyngs.export.images import compare_file_with_run
     from dyngs.export.splat_files import (
         FOURDGS_SUFFIX,
@@ -384,19 +388,20 @@ def _export_tracks(
 
 
 def _export_dyngs(arguments: argparse.Namespace) -> None:
-    """Write the run as a .dyngs file and print how much its images change."""
+    """Write the run as a .dyngs file and print the change of its images."""
     from dyngs.api.scene_file import write_scene_file
     from dyngs.compress.measure import SMALLEST_CHANGE
 
     max_change: float | None = arguments.max_change
     if max_change is not None and not SMALLEST_CHANGE <= max_change <= 64:
         raise DyngsError(
-            f"--max-change {max_change:g}: give {SMALLEST_CHANGE:g} to 64 grey levels of 255"
+            f"--max-change {max_change:g}: must be from {SMALLEST_CHANGE:g} to 64 (grey levels of 255)"
         )
     out: Path = arguments.out or arguments.run_dir
     if out.suffix == ".dyngs":
         raise DyngsError(
-            f"{out}: --format dyngs writes a folder (config.yaml and scene.dyngs); give --out {out.with_suffix('')}"
+            f"{out}: --format dyngs writes a folder with config.yaml and scene.dyngs; "
+            f"use --out {out.with_suffix('')}"
         )
     written = write_scene_file(
         arguments.run_dir, out, max_change, data_root=args.data_root(arguments)
@@ -404,17 +409,15 @@ def _export_dyngs(arguments: argparse.Namespace) -> None:
     change = written.precision.change
     if change is None:
         warning = (
-            "the capture cannot be read: quantisation steps are fixed, and the change of images is not measured; if it "
-            "was moved, add data.root=FOLDER"
+            "capture not found: using default quantisation steps, without measuring the change of "
+            "images; if the capture was moved, add data.root=FOLDER"
         )
         print_notes((), (warning,))
     else:
-        print_notes(
-            (f"images change by {change:.2f} grey levels of 255 (rms over some training views)",)
-        )
+        print_notes((f"RMS change of training views: {change:.2f} grey levels of 255",))
     ratio = written.num_bytes_exact / written.num_bytes
     print(
-        f"written: {written.path} ({written.num_bytes / 1e6:.2f} MB, {ratio:.1f} times smaller than before)"
+        f"written: {written.path} ({written.num_bytes / 1e6:.2f} MB, {ratio:.1f} times smaller than uncompressed)"
     )
 
 
@@ -440,7 +443,7 @@ def _export_network(arguments: argparse.Namespace) -> None:
 
 
 def _export_bodies(arguments: argparse.Namespace) -> None:
-    """Write a moving scene with its bodies as animated nodes."""
+    """Write a moving scene with its rigid bodies as animated nodes."""
     from dyngs.export.images import compare_file_with_run
     from dyngs.export.splat_files import choose_write_options, write_rigid_bodies
     from dyngs.io.formats.formats import format_by_name, read_splats
@@ -471,7 +474,7 @@ def _export_rigged(arguments: argparse.Namespace) -> None:
     motion = arguments.motion
     if is_ply and motion is not None:
         raise DyngsError(
-            "--motion does not go with --joints in a .ply, which has the rest pose; give --out FILE.glb"
+            "--joints writes the rest pose to a .ply, without --motion; use --out FILE.glb"
         )
     opened = _moved(arguments, _open(arguments)).in_edit_frame()
     played = None if motion is None else AnimationInfo(motion.stem, opened.fps or FRAME_RATE)
@@ -480,14 +483,13 @@ def _export_rigged(arguments: argparse.Namespace) -> None:
 
 
 def _has_surface(arguments: argparse.Namespace) -> bool:
-    """Return whether the run is of something whose surface is looked for: all but people, who have
-    a body."""
+    """Return whether the mesh is extracted from depth; False for people, whose body is a mesh."""
     from dyngs.config.io import load_resolved
 
     source: Path = arguments.run_dir
     if source.is_file() and not args.is_avatar_file(source):
         raise DyngsError(
-            f"{source}: a file has no training views, whose depths make a surface; give the run"
+            f"{source}: a mesh needs the depth of training views; give a run instead of a file"
         )
     from dyngs.models.kind import HasBody, capability
 
@@ -495,7 +497,7 @@ def _has_surface(arguments: argparse.Namespace) -> bool:
 
 
 def _export_surface(arguments: argparse.Namespace) -> None:
-    """Write the surface of a scene, at several times one file each."""
+    """Write the mesh of a scene, one file per time."""
     from dyngs.export.surface_file import surface_write_options, write_surface
     from dyngs.gaussians.surface import count_holes
     from dyngs.models.renderable import SurfaceOptions
@@ -503,7 +505,7 @@ def _export_surface(arguments: argparse.Namespace) -> None:
     out: Path = arguments.out or arguments.run_dir / ("mesh" if arguments.times else "mesh.ply")
     if arguments.times and out.suffix:
         raise DyngsError(
-            f"{out}: a sequence is a folder of files; give --out {out.with_suffix('')}, or --time for one"
+            f"{out}: --times writes a folder; use --out {out.with_suffix('')}, or --time for one file"
         )
     opened = _open(arguments)
     options = SurfaceOptions(arguments.level, arguments.cells, arguments.segments)
@@ -515,28 +517,27 @@ def _export_surface(arguments: argparse.Namespace) -> None:
         path = out / f"mesh_{i:04d}.ply" if arguments.times else out
         surface = write_surface(opened, path, time=time, options=options, how=how)
         holes = count_holes(surface)
-        closed = "closed" if holes == 0 else f"open at {format_count(holes, 'place')}"
+        closed = "closed" if holes == 0 else f"{format_count(holes, 'hole')}"
         faces = format_count(len(surface.faces), "triangle")
-        print_notes((f"{faces} with colours of {len(surface.vertices):,} vertices, {closed}",))
+        print_notes((f"{faces}, {len(surface.vertices):,} vertices, {closed}",))
         print_written(path)
 
 
 def _export_page(arguments: argparse.Namespace) -> None:
-    """Write a page that plays in a browser by itself, or a folder whose page fetches a scene as it
-    is seen."""
+    """Write a self-contained web page, or a folder whose page streams the scene."""
     from dyngs.export.html.page import write_page, write_page_folder
 
     most = arguments.max_gaussians_drawn
     if most is not None and not arguments.folder:
-        raise DyngsError("--max-gaussians-drawn goes with --folder")
+        raise DyngsError("--max-gaussians-drawn requires --folder")
     if arguments.folder:
         out = arguments.out or arguments.run_dir / "scene"
         if out.suffix.lower() == ".html":
-            raise DyngsError(f"{out}: --folder writes a folder; give --out {out.with_suffix('')}")
-        where = f"for any web server, such as `python -m http.server -d {quote_path(out)}`"
+            raise DyngsError(f"{out}: --folder writes a folder; use --out {out.with_suffix('')}")
+        where = f"serve it with `python -m http.server -d {quote_path(out)}`"
     else:
         out = _target(arguments, "scene.html")
-        where = "it plays in any browser with WebGL 2, offline"
+        where = "open it in any browser with WebGL 2"
     opened = _moved(arguments, _open(arguments))
     opened = opened if arguments.from_up is None else replace(opened, stated_up=arguments.from_up)
     time = arguments.time or 0.0
@@ -549,7 +550,7 @@ def _export_page(arguments: argparse.Namespace) -> None:
 
 
 def _export_cameras(arguments: argparse.Namespace) -> None:
-    """Write the cameras of a run as a transforms.json, refined where training refined them."""
+    """Write the cameras of a run as a transforms.json, refined if training refined them."""
     from dyngs.data.capture import all_views
     from dyngs.evaluate.report import load_camera_corrections
     from dyngs.export.cameras import NAME, write_cameras
@@ -561,20 +562,18 @@ def _export_cameras(arguments: argparse.Namespace) -> None:
     run = open_run(source, data_root=args.data_root(arguments))
     capture = run.capture
     if path.resolve().parent == capture.root.resolve():
-        raise DyngsError(
-            f"{path}: would stand in for the cameras of the capture; give another folder"
-        )
+        raise DyngsError(f"{path}: would override the cameras of the capture; use another folder")
     found = load_camera_corrections(source, run, capture.splits["train"])
     if found is None and run.config.camera.refine == "always":
         raise DyngsError(
-            f"{source}: refined cameras lie in checkpoints, and there is none; restore one or train again"
+            f"{source}: refined cameras are stored in checkpoints, but there are none; train again"
         )
     splits: dict[Split, Sequence[View]] = {
         name: views for name, views in capture.splits.items() if name != "pose"
     }
-    line = "camera.refine was not used in this run: these are the cameras of the capture"
+    line = "exporting the cameras of the capture, because camera.refine was not used"
     if found is not None:
-        line = "training cameras as training found them; others have the capture's poses, and known lenses"
+        line = "exporting refined training cameras; other cameras keep the poses of the capture"
         for name, views in splits.items():
             splits[name] = [found.correct_view(view) for view in views]
     print_notes((line,))

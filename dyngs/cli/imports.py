@@ -1,4 +1,4 @@
-"""Imports of what is heavy, inside the commands that need it."""
+"""Fast imports of heavy modules inside commands."""
 
 from __future__ import annotations
 
@@ -10,12 +10,10 @@ from contextlib import contextmanager
 
 @contextmanager
 def heavy_imports() -> Iterator[None]:
-    """Import torch and what needs it in the block, with the garbage collector at rest.
+    """Disable the garbage collector while torch is imported in the block, then freeze its objects.
 
-    Nearly all of the 200,000 objects that this makes live until the exit. Looking through them
-    takes a quarter of the time of import and exit, so that they are left out of later collections,
-    too. Where torch is imported already, the collector stays as it is: what is there need not be
-    for good.
+    Scanning these objects, which stay until exit, would take a quarter of the time of import and
+    exit. Nothing is changed if torch is already imported.
     """
     if "torch" in sys.modules or not gc.isenabled():
         yield

@@ -1,4 +1,4 @@
-"""Output of commands: results on stdout, messages of the package, tables, and a progress bar."""
+"""Output of commands: results, log messages, tables and progress bars."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 _WIDTH = 100
-"""Columns of the tables where there is no terminal."""
+"""Width of tables without a terminal, columns."""
 SECONDS_BETWEEN_LINES = 10.0
-"""Where there is no terminal, a line of progress is printed this often."""
+"""Interval of progress lines without a terminal."""
 
 
 class _Messages(logging.Handler):
-    """Prints information on stdout, warnings on stderr."""
+    """Log handler that prints information on stdout and warnings on stderr."""
 
     def emit(self, record: logging.LogRecord) -> None:
         if record.levelno < logging.WARNING:
@@ -36,24 +36,23 @@ _MESSAGES = _Messages()
 
 
 def print_messages(*, quiet: bool = False) -> None:
-    """Print the messages of the package from now on; ``quiet``: neither information nor
-    warnings."""
+    """Print log messages of the package; with ``quiet`` only errors."""
     LOGGER.addHandler(_MESSAGES)
     LOGGER.setLevel(logging.ERROR if quiet else logging.INFO)
 
 
 def print_lines(text: str) -> None:
-    """Print lines that may quote names of others, without anything that a terminal would obey."""
+    """Print lines with control characters escaped."""
     print("\n".join(map(escape_control_characters, text.split("\n"))), flush=True)
 
 
 def redirect_messages(is_json: bool) -> AbstractContextManager[object]:
-    """Return a block in which all that is printed goes to stderr, where stdout is for JSON."""
+    """Return a context that redirects stdout to stderr if stdout is reserved for JSON."""
     return redirect_stdout(sys.stderr) if is_json else nullcontext()
 
 
 def print_notes(notes: Sequence[str], warnings: Sequence[str] = ()) -> None:
-    """Print notes and warnings, unless the command is quiet."""
+    """Log notes and warnings."""
     for note in notes:
         log_info(f"note: {note}")
     for warning in warnings:
@@ -61,7 +60,7 @@ def print_notes(notes: Sequence[str], warnings: Sequence[str] = ()) -> None:
 
 
 def print_written(*paths: Path) -> None:
-    """Print where files, or a folder of them, are and how large."""
+    """Print the paths and the total size of written files or folders."""
     files = [file for path in paths for file in ((path,) if path.is_file() else path.rglob("*"))]
     where = paths[0] if len(paths) == 1 else f"{len(paths)} files, {paths[0]} to {paths[-1].name}"
     print(f"written: {where} ({sum(file.stat().st_size for file in files) / 1e6:.1f} MB)")
@@ -76,7 +75,7 @@ def print_tables(*tables: Table) -> None:
 
 
 def numbers_table(title: str, head: Sequence[str], cells: Sequence[Sequence[str]]) -> Table:
-    """Return a table of numbers whose first column is text."""
+    """Return a table with a first column of text and right-aligned numbers."""
     from rich import box
     from rich.markup import escape
     from rich.table import Table
@@ -92,8 +91,7 @@ def numbers_table(title: str, head: Sequence[str], cells: Sequence[Sequence[str]
 class ProgressBar:
     """Context manager that shows how far work has come, to be called as a ``ReportProgress``.
 
-    On a terminal, one bar for each kind of work; elsewhere plain lines, none for work that is soon
-    done.
+    Shows one bar per kind of work on a terminal, else a line every ``SECONDS_BETWEEN_LINES``.
     """
 
     def __init__(self, stream: IO[str] | None = None) -> None:
@@ -106,7 +104,7 @@ class ProgressBar:
 
     def __call__(self, what: str, done: int, total: int) -> None:
         if self._is_terminal:
-            if self._bars is None:  # not before: work that needs no bar leaves no line
+            if self._bars is None:  # created late, so that work without progress leaves no line
                 self._bars = _rich_bars(self._stream)
                 self._bars.start()
             if what not in self._tasks:

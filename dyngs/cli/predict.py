@@ -1,4 +1,4 @@
-"""``dyngs predict``: predict a person from a few images with a network trained on other people."""
+"""``dyngs predict``: predict a person from a few images with a trained network."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def add_parser(commands: Commands) -> None:
         "predict",
         run,
         "predict a person from a few images, without training",
-        "Predict a person from one or a few training views of a capture with silhouettes. A network of "
-        "model.kind=human_predictor makes an avatar; where there is no body one is fitted first, as by `dyngs data "
-        "fit`; one of gps the surface that pairs of neighbouring views show; others a field. Writes a "
-        "run folder for all other commands.",
+        "Predict a person from one or a few training views of a capture with silhouettes. Networks "
+        "of model.kind=human_predictor predict an avatar (a missing body is fitted first, as by "
+        "`dyngs data fit`), gps the Gaussians of neighbouring views, others a radiance field. Writes "
+        "a run folder.",
         _EPILOG,
     )
-    about = "run folder of a network, a file of its weights, or gps or human_predictor where these are installed"
+    about = "run folder or weights file of a network, or gps or human_predictor if installed"
     parser.add_argument("network", type=input_path, metavar="NET", help=about)
     parser.add_argument("capture", type=input_path, metavar="CAPTURE", help="capture of a person")
     parser.add_argument(
@@ -43,9 +43,7 @@ def add_parser(commands: Commands) -> None:
     )
     views = "number or names of the views to predict from (default: model.source_views of the network; gps: 2)"
     parser.add_argument("--views", type=parse_views, metavar="N|NAME,..", help=views)
-    steps = (
-        "human_predictor: first train the network on these images for so many steps (default 10)"
-    )
+    steps = "human_predictor: steps of fine-tuning the network on these images (default 10)"
     parser.add_argument("--steps", type=int, metavar="N", help=steps)
 
 
@@ -70,9 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
             steps=arguments.steps,
             report=report,
         )
-    trained = (
-        f", after {made.seconds_steps:.2f} s of training on these images" if made.steps else ""
-    )
+    trained = f", after {made.seconds_steps:.2f} s of fine-tuning" if made.steps else ""
     what = format_count(made.num_gaussians, "Gaussian") if made.num_gaussians else "a field"
     word = quote_path(out)
     # fields are not trained

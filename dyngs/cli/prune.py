@@ -1,4 +1,4 @@
-"""``dyngs prune``: take from a run as much as a given loss allows, and write a run and its file."""
+"""``dyngs prune``: prune a run within a given loss of PSNR."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 MAX_LOSS = 0.2
 _EPILOG = """\
 examples:
-  dyngs prune runs/dance --out runs/dance_pruned                 the most that costs 0.2 dB
+  dyngs prune runs/dance --out runs/dance_pruned                 as much as possible for 0.2 dB
   dyngs prune runs/dance --out runs/tiny --max-loss 1 --steps 2000
-  dyngs prune runs/dance --out runs/fifth --prune 0.8            just this fraction of the Gaussians, whatever it costs
+  dyngs prune runs/dance --out runs/fifth --prune 0.8            a fixed fraction of the Gaussians
   dyngs prune runs/dance model.alpha_min=0.02 --out runs/fast --prune 0.8
   dyngs train --resume runs/fifth                                continue an interrupted fine-tuning
 
@@ -35,10 +35,10 @@ def add_parser(commands: args.Commands) -> None:
         commands,
         "prune",
         run,
-        "take from a run as much as a loss of 0.2 dB allows: a smaller, faster run and its file",
-        "Remove Gaussians, faint blending, control nodes, pieces of splines, harmonics and precision as far as views "
-        "that fine-tuning does not see lose no more than --max-loss. Every trial is fine-tuned. Writes a new run "
-        "folder with its file and prints quality, speed and size before and after.",
+        "prune a run within a loss of 0.2 dB: a smaller, faster run and its file",
+        "Remove Gaussians, faint contributions, SH coefficients and precision until the PSNR of "
+        "held-out views drops by --max-loss. Every trial is fine-tuned. Writes a new run folder with "
+        "its compressed file; prints quality, speed and size before and after.",
         _EPILOG,
     )
     parser.add_argument(
@@ -47,18 +47,18 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument(
         "--out", type=args.output_path, required=True, metavar="RUN2", help="folder of the new run"
     )
-    about = f"largest loss of PSNR on views that fine-tuning does not see, drawn from the file (default {MAX_LOSS})"
+    about = f"largest loss of PSNR of the file on held-out views, dB (default {MAX_LOSS})"
     parser.add_argument("--max-loss", type=_decibels, metavar="DB", help=about)
-    about = "no search: remove just this fraction of the Gaussians, in [0, 1), and nothing else"
+    about = "remove this fraction of the Gaussians, in [0, 1), without a search"
     parser.add_argument("--prune", metavar="R", help=about)
     scores = ("variation", "sensitivity", "contribution")
     parser.add_argument(
         "--score", choices=scores, help="importance score of a Gaussian (default sensitivity)"
     )
-    about = "no search: number of key times of visibility masks (default: no masks)"
+    about = "number of key times of visibility masks, without a search (default: no masks)"
     parser.add_argument("--masks", metavar="K", help=about)
     parser.add_argument(
-        "--steps", metavar="N", help="fine-tuning steps: of each trial 1000, with --prune 2000"
+        "--steps", metavar="N", help="fine-tuning steps (default 1000 per trial, 2000 with --prune)"
     )
     args.add_threads(parser)
     args.add_run_device(parser)
@@ -68,15 +68,15 @@ def add_parser(commands: args.Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Prune, compare with the run before, and print a table."""
+    """Prune, and print a table that compares both runs."""
     from dyngs.api.prune import export_folder
     from dyngs.api.train import num_cores
     from dyngs.evaluate.report import compare_runs
     from dyngs.runs.checkpoint import load_run
 
     keys = {"prune": "fraction", "score": "score", "masks": "mask_times", "steps": "steps"}
-    asked = {key: getattr(arguments, option) for option, key in keys.items()}
-    overrides = [f"prune.{key}={value}" for key, value in asked.items() if value is not None]
+    requested = {key: getattr(arguments, option) for option, key in keys.items()}
+    overrides = [f"prune.{key}={value}" for key, value in requested.items() if value is not None]
     overrides += [
         f"run.threads={arguments.threads}",
         *args.run_device(arguments),
@@ -98,9 +98,7 @@ def run(arguments: argparse.Namespace) -> int:
     head = ("", "before", "pruned file", "")
     print_tables(numbers_table("", head, cost_cells(before, after, promise)))
     if pruned.config.prune.mask_times > 1 and pruned.scene.masks is None:
-        print(
-            "note: --masks was ignored; they are for scenes in which a deformation field moves something"
-        )
+        print("note: --masks was ignored, because the scene is static")
     print(
         f"written: {folder}, and the file in {export_folder(folder)}\n"
         f"next:    dyngs eval {quote_path(folder)}\n         dyngs render {quote_path(export_folder(folder))} "
@@ -110,15 +108,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _pruned(arguments: argparse.Namespace, overrides: list[str]) -> tuple[Path, PruneResult | None]:
-    """Prune as requested; return the new folder, and what is promised of it where the fraction was
-    searched for."""
+    """Prune; return the new folder, and the result of the search if there was one."""
     from dyngs.api.prune import prune_run, prune_to_loss
 
     chosen = any(text.startswith(("prune.fraction=", "prune.mask_times=")) for text in overrides)
     if chosen and arguments.max_loss is not None:
-        raise DyngsError(
-            "--max-loss finds what can go; leave out --prune and --masks, which say it"
-        )
+        raise DyngsError("--max-loss searches the fraction to prune; remove --prune and --masks")
     if chosen:
         return prune_run(arguments.run_dir, arguments.out, overrides), None
     most = MAX_LOSS if arguments.max_loss is None else arguments.max_loss
@@ -130,14 +125,14 @@ def _pruned(arguments: argparse.Namespace, overrides: list[str]) -> tuple[Path, 
 def _decibels(text: str) -> float:
     value = float(text)
     if not 0 <= value <= 100:
-        raise argparse.ArgumentTypeError(f"{text!r}: give a number from 0 to 100, dB")
+        raise argparse.ArgumentTypeError(f"{text!r}: must be from 0 to 100 dB")
     return value
 
 
 def cost_cells(
     before: RunMetrics, after: RunMetrics, promise: PruneResult | None = None
 ) -> list[list[str]]:
-    """Return the rows of a table that compares a run with the file of a pruned one."""
+    """Return the rows of a table that compares a run with the file of its pruned version."""
     ratio = before.num_gaussians / after.num_gaussians
     cells = [
         [

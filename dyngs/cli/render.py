@@ -20,11 +20,11 @@ _EPILOG = """\
 examples:
   dyngs render runs/bench --out images                          the test views and a contact sheet
   dyngs render runs/bench --out frames --path orbit --video orbit.mp4
-  dyngs render runs/street --path along --video along.mp4                  as it was filmed, smoothed
+  dyngs render runs/street --path along --video along.mp4                  along the smoothed training cameras
   dyngs render runs/dance --path orbit --time 0.5 --video frozen.mp4       moving camera, frozen scene
   dyngs render runs/dance --times 0:1:60 --view 3 --video fixed.mp4        fixed camera, moving scene
-  dyngs render runs/ann --motion walk.npz --video walk.mp4                 a person (model.kind=human) walks
-  dyngs render runs/ann --pose rest --path orbit --video rest.mp4          the person in the rest pose of the template
+  dyngs render runs/ann --motion walk.npz --video walk.mp4                 animate a person (model.kind=human)
+  dyngs render runs/ann --pose rest --path orbit --video rest.mp4          a person in rest pose
   dyngs render ann.safetensors --motion walk.npz --video walk.mp4          an avatar file
   dyngs render dance_export/scene.dyngs --path orbit --video orbit.mp4     what `export --format dyngs` wrote
   dyngs render splats.ply --path spiral --video spiral.mp4 --up=-y --size 1280x720
@@ -32,7 +32,7 @@ examples:
 
 
 def add_parser(commands: args.Commands) -> None:
-    about = "Render the views of a split beside their ground truth, a camera path, or a fixed camera over time."
+    about = "Render the views of a split next to the ground truth, a camera path, or a fixed camera over time."
     short = "render images and videos of a run, an avatar or a file of Gaussians"
     parser = args.add_command(commands, "render", run, short, about, _EPILOG)
     source = "run folder, avatar file (.safetensors), or any 3DGS .ply"
@@ -40,7 +40,7 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument("--out", type=args.output_path, metavar="DIR", help="folder for the images")
     cameras = parser.add_mutually_exclusive_group()
     args.add_split(cameras, "render the views of this split (default: test)", None)
-    path = "camera path: orbit (default for a file), spiral, along (as the capture was filmed), or a .json file"
+    path = "camera path: orbit (default for files), spiral, along (the training cameras), or a .json file"
     cameras.add_argument("--path", type=args.input_word, metavar="PATH", help=path)
     when = parser.add_mutually_exclusive_group()
     when.add_argument(
@@ -55,27 +55,27 @@ def add_parser(commands: args.Commands) -> None:
     person = parser.add_mutually_exclusive_group()
     args.add_motion(person)
     person.add_argument(
-        "--pose", choices=("rest",), help="show a person in the rest pose of the template"
+        "--pose", choices=("rest",), help="render a person in the rest pose of the template"
     )
     args.add_keep_feet(parser)
     parser.add_argument(
-        "--video", type=args.output_path, metavar="FILE.mp4", help="write a video as well"
+        "--video", type=args.output_path, metavar="FILE.mp4", help="also write a video"
     )
     frames = "number of frames of orbit, spiral and along (default 120)"
     kind = args.integer_type("a number of frames", 1, 10**9)
     parser.add_argument("--frames", type=kind, metavar="N", help=frames)
     fps = "frames per second of the video (default 30, or as in the .json)"
     parser.add_argument("--fps", type=float, metavar="F", help=fps)
-    depth = "write depth as well: coloured .png, and .exr in the unit of the capture"
+    depth = "also write depth: coloured .png, and .exr in the unit of the capture"
     parser.add_argument("--depth", action="store_true", help=depth)
-    parser.add_argument("--alpha", action="store_true", help="write opacity as well")
+    parser.add_argument("--alpha", action="store_true", help="also write opacity")
     size = "image size for a path or fixed camera, in pixels"
     parser.add_argument("--size", type=args.image_size, metavar="WxH", help=size)
     background = "background of all images (default: that of training)"
     parser.add_argument("--background", choices=("white", "black"), help=background)
     args.add_up(parser, " of the path")
     args.add_max_gaussians_drawn(
-        parser, "of a still scene: draw far parts coarser, and N Gaussians of each image at most"
+        parser, "static scenes: levels of detail with at most N Gaussians per image"
     )
     args.add_threads(parser)
     args.add_device(parser)
@@ -83,7 +83,7 @@ def add_parser(commands: args.Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Render and print which files were written."""
+    """Render and print the written files."""
     _check(arguments)
     written = _render(arguments)
     folders = sorted({str(path.parent) for path in written})
@@ -95,47 +95,44 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    """Raise DyngsError for nothing to render, nowhere to write, or an option that does not
-    apply."""
+    """Raise DyngsError for a missing source or output, or options that do not apply."""
     from dyngs.io.outputs import suggest_command
 
     args.require_motion_for_feet(arguments)
     arguments.source = args.run_of_scene_file(arguments.source)
     known = suggest_command(arguments.source)
     if known is not None and not (arguments.source / "config.yaml").is_file():
-        raise DyngsError(f"{arguments.source}: nothing that can be drawn; {known}")
+        raise DyngsError(f"{arguments.source}: not a scene; {known}")
     is_file = arguments.source.is_file()
     if is_file and arguments.split:
         raise DyngsError(
-            f"{arguments.source}: a file has no splits; use --path orbit, spiral or FILE.json"
+            f"{arguments.source}: files have no splits; use --path orbit, spiral or FILE.json"
         )
     if arguments.view is not None and arguments.path:
-        raise DyngsError(
-            "--view renders from a fixed camera, --path from a moving one; give one of them"
-        )
+        raise DyngsError("--view (fixed camera) and --path (moving camera) exclude each other")
     if arguments.times is not None and arguments.frames is not None:
-        raise DyngsError("--times and --frames both set the number of frames; give one of them")
+        raise DyngsError("--times and --frames both set the number of frames; use one of them")
     if arguments.out is None and (arguments.video is None or not _is_path(arguments)):
         raise DyngsError(
-            "where to? Give --out DIR (or --video FILE.mp4 with --path, --time, --times or --view)"
+            "no output given; add --out DIR, or --video FILE.mp4 with --path, --time, --times or --view"
         )
     if not arguments.source.exists():
         raise DyngsError(
-            f"{arguments.source}: no such run or file; give a folder that `dyngs train` wrote, or a file"
+            f"{arguments.source}: no such run or file; give a run folder written by `dyngs train`"
         )
     if arguments.up and not (is_file or arguments.path):
-        raise DyngsError("--up goes with --path orbit, spiral or along")
+        raise DyngsError("--up requires --path orbit, spiral or along")
     if arguments.size and not _is_path(arguments):
-        raise DyngsError("--size goes with --path; the views of a split keep their size")
+        raise DyngsError("--size requires --path; the views of a split keep their size")
 
 
 def _is_path(arguments: argparse.Namespace) -> bool:
-    """Whether a camera path or a fixed camera is requested, instead of the views of a split."""
+    """Return whether to render a camera path or a fixed camera instead of a split."""
     return arguments.source.is_file() or bool(arguments.path) or _has_fixed_camera(arguments)
 
 
 def _has_fixed_camera(arguments: argparse.Namespace) -> bool:
-    """Whether one fixed camera is requested, at one or many times."""
+    """Return whether to render from one fixed camera, at one or many times."""
     passed = (arguments.time, arguments.times, arguments.view, arguments.motion, arguments.pose)
     return not arguments.path and any(x is not None for x in passed)
 
@@ -173,7 +170,7 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
 
 
 def _opened(arguments: argparse.Namespace) -> OpenedScene:
-    """Return what is rendered, in the motion and before the background that are requested."""
+    """Open the scene with the requested motion or pose, background and up axis."""
     from dyngs.runs.opened import open_scene
 
     opened = open_scene(arguments.source, nonfinite="skip", data_root=args.data_root(arguments))
@@ -188,12 +185,12 @@ def _opened(arguments: argparse.Namespace) -> OpenedScene:
 
 
 def _before(arguments: argparse.Namespace, opened: OpenedScene) -> OpenedScene:
-    """Return the scene before the background that is requested, if one is."""
+    """Return the scene with the requested background, if any."""
     return opened if arguments.background is None else opened.on_background(arguments.background)
 
 
 def _coarser(arguments: argparse.Namespace, opened: OpenedScene) -> OpenedScene:
-    """Return the scene with levels of detail, if they are asked for."""
+    """Return the scene with levels of detail, if requested."""
     from dyngs.gaussians.levels import LevelScene
 
     most: int | None = arguments.max_gaussians_drawn

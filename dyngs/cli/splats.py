@@ -1,5 +1,4 @@
-"""What commands that write files of Gaussians share: names of formats, options about axes, lines
-about the result."""
+"""Options and messages shared by commands that write files of Gaussians."""
 
 from __future__ import annotations
 
@@ -17,21 +16,20 @@ MOVING = "4dgs"
 
 
 def add_axes(parser: argparse.ArgumentParser) -> None:
-    """Add the options about which way is up, and the degree of the harmonics."""
+    """Add the options of the up axis and the SH degree."""
     about = (
-        "axis that points up in the file; the scene is rotated (default: what viewers of the format take for up: -y, "
-        "but y for .spz, .glb and USD); keep: nothing is rotated"
+        "up axis of the file, to which the scene is rotated (default: y for .spz, .glb and USD, -y "
+        "for other formats); keep: no rotation"
     )
     parser.add_argument("--up", choices=(*AXES, "keep"), help=about)
-    about = "axis that points up in what is read (default: found out)"
+    about = "up axis of the input (default: detected)"
     parser.add_argument("--from-up", choices=AXES, metavar="AXIS", help=about)
-    about = "degree of the harmonics in the file, 0 to 4: higher ones are left out, missing ones are zero"
+    about = "SH degree of the file, 0 to 4: higher coefficients are dropped, missing ones are zero"
     parser.add_argument("--sh-degree", type=int, choices=range(5), metavar="N", help=about)
 
 
 def print_image_difference(notes: tuple[str, ...], found: Sequence[float]) -> None:
-    """Print what the format could not hold, and the worst PSNR, dB, of files drawn again and the
-    scene."""
+    """Print notes about the format, and the lowest PSNR, dB, between renderings of file and scene."""
     worst = min(found)
     figure = "the same images" if worst >= 99.9 else f"{worst:.1f} dB (PSNR)"
     print_notes((*notes, f"drawn again: {figure} compared with the scene"))

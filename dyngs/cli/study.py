@@ -1,5 +1,5 @@
-"""``dyngs compare``: several models on one capture. ``dyngs tradeoff``: the PSNR cost, speed and
-size of each setting of a run."""
+"""``dyngs compare``: compare models on one capture. ``dyngs tradeoff``: quality, speed and size of
+the settings of a run."""
 
 from __future__ import annotations
 
@@ -27,8 +27,7 @@ examples:
   dyngs compare scans/dance --models static,dynamic,mine.yaml --steps 7000 data.longest_side=400
   dyngs compare scans/bench --models static,mip --max-mb 2 --out study
 
-Each model is a preset or a YAML file. An interrupted command continues when it is given again.
-Guide: `dyngs docs compare`.
+Each model is a preset or a YAML file. Run an interrupted command again to continue it.
 """
 _TRADEOFF = """\
 examples:
@@ -36,11 +35,10 @@ examples:
   dyngs tradeoff runs/dance --vary prune=0.5,0.8 --vary storage --finetune 2000
   dyngs tradeoff runs/dance --require 'psnr>=30,fps>=20,mb<=5' --minimize mb
 
-An interrupted or repeated command continues and measures only what is missing.
-Guide: `dyngs docs compare`.
+Run an interrupted command again to continue it; only missing results are measured.
 """
 _FRONT = "* Pareto front of PSNR, speed and size"
-_CONTINUES = "what is finished is kept; the same command continues"
+_CONTINUES = "finished results are kept; run the same command again to continue"
 
 
 def add_parser(commands: args.Commands) -> None:
@@ -50,8 +48,9 @@ def add_parser(commands: args.Commands) -> None:
         "compare",
         run_compare,
         "train several models on one capture with the same time, steps or size, and compare them",
-        "Train each model on the same views and evaluate all on the same held-out ones. Writes comparison.csv, .json, "
-        ".md, a page with synchronised crops (.html) and, with the extra plots, quality over seconds (.svg).",
+        "Train each model on the same views and evaluate it on the same held-out views. Writes "
+        "comparison.csv, .json, .md, a page with synchronised crops (.html) and, with the extra "
+        "plots, quality over time (.svg).",
         _COMPARE,
     )
     about = "capture with cameras, in any format"
@@ -60,14 +59,14 @@ def add_parser(commands: args.Commands) -> None:
     names = "presets and YAML files, separated by commas"
     parser.add_argument("--models", required=True, metavar="A,B,...", help=names)
     limit = parser.add_mutually_exclusive_group()
-    about = "train each for so many minutes"
+    about = "train each model for this many minutes"
     limit.add_argument("--minutes", type=amount, metavar="M", help=about)
     kind = args.integer_type("a number of steps", 1, 10**8)
-    limit.add_argument("--steps", type=kind, metavar="N", help="or so many steps")
-    about = "or to a file of at most so many 1e6 bytes"
+    limit.add_argument("--steps", type=kind, metavar="N", help="train each model for N steps")
+    about = "limit the file size of each model, 1e6 bytes"
     limit.add_argument("--max-mb", type=amount, metavar="MB", help=about)
     kind = args.integer_type("a number of views", 1, 20)
-    about = "views on the page (default 4)"
+    about = "number of views on the page (default 4)"
     parser.add_argument("--views", type=kind, default=4, metavar="N", help=about)
     _add_common(parser, "compare/CAPTURE")
 
@@ -78,26 +77,29 @@ def add_tradeoff_parser(commands: args.Commands) -> None:
         "tradeoff",
         run_tradeoff,
         "measure quality, speed and size of a run with other settings, and pick the best one",
-        "Vary the settings of a run one at a time and then several together. Writes tradeoff.csv, .json, .md, .html "
-        "and, with the extra plots, .svg, and picks the best run that meets requirements.",
+        "Vary the settings of a run one at a time, then several together. Writes tradeoff.csv, "
+        ".json, .md, .html and, with the extra plots, .svg, and selects the best run that meets the "
+        "requirements.",
         _TRADEOFF,
     )
     parser.add_argument("run_dir", type=args.input_path, metavar="RUN", help="run folder")
-    vary = "vary only this setting, weaker values first; repeatable (default: all settings)"
+    vary = "vary only this setting, weaker values first; may be repeated (default: all settings)"
     parser.add_argument("--vary", action="append", default=[], metavar="SETTING[=A,B]", help=vary)
     for name, low, default, about in (
         ("finetune", 0, 0, "fine-tuning steps after pruning (default: none)"),
-        ("combine", 0, 4, "combinations in each of three directions (default 4)"),
+        ("combine", 0, 4, "number of combinations in each of three directions (default 4)"),
         ("rounds", 1, 5, "renders of each timed view (default 5)"),
     ):
         kind = args.integer_type("a number", low, 10**9)
         parser.add_argument(f"--{name}", type=kind, default=default, metavar="N", help=about)
-    require = "requirements such as 'psnr>=30,fps>=20,mb<=5'; names the best run"
+    require = "requirements of the selected run, such as 'psnr>=30,fps>=20,mb<=5'"
     parser.add_argument("--require", metavar="LIST", help=require)
     goal = parser.add_mutually_exclusive_group()
-    metrics = "choose by psnr, ssim, lpips, fps, mb or gaussians"
-    goal.add_argument("--minimize", metavar="METRIC", help=metrics)
-    goal.add_argument("--maximize", metavar="METRIC", help="likewise (default psnr)")
+    metrics = "psnr, ssim, lpips, fps, mb or gaussians"
+    goal.add_argument(
+        "--minimize", metavar="METRIC", help=f"select the run with the lowest {metrics}"
+    )
+    goal.add_argument("--maximize", metavar="METRIC", help="or with the highest (default psnr)")
     _add_common(parser, "RUN/tradeoff")
 
 
@@ -108,8 +110,8 @@ def _add_common(parser: argparse.ArgumentParser, out: str) -> None:
     args.add_threads(parser)
     args.add_device(parser)
     about = (
-        "do several at once by Ray (pip install 'dyngs[ray]'), with so many cores for each, on this machine or the "
-        "cluster of RAY_ADDRESS, whose machines must share the files"
+        "run several jobs in parallel with Ray (pip install 'dyngs[ray]'), each with this many "
+        "cores, on this machine or the cluster of RAY_ADDRESS with a shared file system"
     )
     kind = args.integer_type("a number of cores", 1, 1024)
     parser.add_argument("--ray", type=kind, metavar="CORES", help=about)
@@ -119,13 +121,12 @@ def _add_common(parser: argparse.ArgumentParser, out: str) -> None:
 def amount(text: str) -> float:
     value = float(text)
     if not 0 < value < 1e6:
-        raise argparse.ArgumentTypeError(f"{text!r}: write a number above 0, for instance 2")
+        raise argparse.ArgumentTypeError(f"{text!r}: must be a number above 0, for instance 2")
     return value
 
 
 def run_compare(arguments: argparse.Namespace) -> int:
-    """Train, compare, print the table and write the report; the folder is locked against other
-    commands."""
+    """Train and compare the models, print the table and write the report; locks the folder."""
     from dyngs.io.outputs import lock_folder
     from dyngs.runs.folder import collect_inputs
     from dyngs.study.compare import ModelComparison
@@ -135,7 +136,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
     capture = Path(os.path.abspath(arguments.capture))  # so that it has a name, also as . or ..
     out = (arguments.out or Path("compare", capture.name)).absolute()
     if arguments.minutes is None and arguments.steps is None and arguments.max_mb is None:
-        raise DyngsError("give all models the same --minutes M, --steps N or --max-mb MB")
+        raise DyngsError("a common limit is required: --minutes M, --steps N or --max-mb MB")
     args.computing_device(arguments.device)
     comparison = ModelComparison(
         capture,
@@ -175,7 +176,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
 
 
 def _print_report(report: Report, stem: Path, *, is_json: bool) -> None:
-    """Write the files of a study and print its tables, or its .json alone."""
+    """Write the files of a study, and print its tables or only its .json."""
     from dyngs.study.report import MATPLOTLIB_MISSING, can_plot, write_report
 
     paths = write_report(stem, report)
@@ -191,13 +192,12 @@ def _print_report(report: Report, stem: Path, *, is_json: bool) -> None:
 
 
 def run_tradeoff(arguments: argparse.Namespace) -> int:
-    """Measure, print and write the tables, and choose a run; the folder is locked against other
-    commands."""
+    """Measure, print and write the tables, and select a run; locks the folder."""
     from dyngs.io.outputs import lock_folder
 
     if not arguments.run_dir.is_dir():
         raise DyngsError(
-            f"{arguments.run_dir}: not a run folder; give one that `dyngs train` wrote"
+            f"{arguments.run_dir}: not a run folder; give a folder written by `dyngs train`"
         )
     out: Path = arguments.out or arguments.run_dir / "tradeoff"
     with lock_folder(out):
@@ -249,5 +249,5 @@ def _tradeoff(arguments: argparse.Namespace, out: Path) -> int:
         folder = study.folder(variants[number])
         if not arguments.json:
             scores = f"{best['psnr']:.2f} dB, {best['fps']:.1f} fps, {best['mb']:.2f} MB"
-            print(f"chosen:  {best['name']}: {scores}\n         {folder}")
+            print(f"selected: {best['name']}: {scores}\n          {folder}")
     return 0

@@ -28,19 +28,18 @@ examples:
   dyngs train --resume runs/bench
   dyngs train --resume runs/bench train.steps=60000
   dyngs train configs/static.yaml data.root=scans/bench --view
-  dyngs train configs/static.yaml data.root=scans/bench --from runs/bench init.trains=colour run.dir=runs/recoloured
+  dyngs train configs/static.yaml data.root=scans/bench --from runs/bench init.trainable=colour run.dir=runs/recoloured
   torchrun --nproc-per-node 4 -m dyngs train configs/static.yaml data.root=scans/bench
 
 CONFIG is a YAML file or the name of a packaged preset: static, blender, colmap, static_mcmc, mip, dynamic,
-human, human_predictor.
-All keys: `dyngs docs config`.
+human, human_predictor. `dyngs config static` lists all keys.
 """
 _LOGGING = tuple(
     f"train.{name}"
     for name in ("save_minutes", "save_every", "eval_every", "log_every", "tensorboard")
 )
 _FOR_THIS_CALL = ("run.threads", "run.device", "run.deterministic", "data.cache_mb", *_LOGGING)
-"""Keys that change nothing that a run ends with."""
+"""Keys that do not change the result of a run."""
 WITH_RESUME = ("train.steps", "data.root", "data.follow_links", *_FOR_THIS_CALL)
 """Keys that may be given with ``--resume``."""
 
@@ -51,14 +50,16 @@ def add_parser(commands: args.Commands) -> None:
         commands, "train", run, "train a model from a capture", about, _EPILOG
     )
     args.add_overrides(parser, "CONFIG key=value", "preset or YAML file, and overrides")
-    resume = "continue an interrupted run; with train.steps=N: go on to N steps, also from a finished one"
+    resume = "continue an interrupted run, or with train.steps=N extend a run to N steps"
     parser.add_argument("--resume", type=args.input_path, metavar="RUN", help=resume)
-    about = "begin with the Gaussians of a scene; init.trains=colour, init.box=[x,y,z,x,y,z] freeze a part of it"
+    about = (
+        "start from the Gaussians of a scene; init.trainable=colour or init.box freeze parts of it"
+    )
     parser.add_argument(
         "--from", dest="begun", type=args.input_path, metavar="RUN|FILE", help=about
     )
     parser.add_argument(
-        "--view", action="store_true", help="show the scene in a browser while it trains"
+        "--view", action="store_true", help="view the scene in a browser during training"
     )
     add_serving_arguments(parser)
     args.add_run_device(parser)
@@ -66,8 +67,7 @@ def add_parser(commands: args.Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Train and print the next commands; with others, where ``torchrun`` has started several
-    processes."""
+    """Train and print the next commands, in several processes if started by ``torchrun``."""
     if os.environ.get("WORLD_SIZE", "1") == "1":
         return _run(arguments)
     from dyngs.api.following import run_processes
@@ -76,12 +76,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> int:
-    """Train as the first of ``processes``, or alone."""
+    """Train as rank 0 of ``processes``, or in a single process."""
     words = [*arguments.overrides, *args.run_device(arguments)]
     config = parse_config(words, arguments.resume, arguments.begun)
-    args.computing_device(config.run.device)  # where none is, before anything else is done
+    args.computing_device(config.run.device)  # fails early without a GPU
     if arguments.port is not None and not arguments.view:
-        raise DyngsError("--port goes with --view")
+        raise DyngsError("--port requires --view")
     from dyngs.api.train import train
     from dyngs.cli.training_progress import TrainingProgress
 
@@ -131,21 +131,20 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
     run = load_run(folder)
     scene = run.scene
     if capability(run.config.model, HasMotion) is None:
-        return ["motion:  none, so this is a static model, like those of configs/static.yaml"]
+        return ["motion:  none, trained as a static scene"]
     if scene.is_static:
-        return ["motion:  nothing moves, so this became a static model"]
+        return ["motion:  none, the scene is static"]
     return [
         f"motion:  {len(scene.rows):,} of {format_count(len(scene), 'Gaussian')} move ({scene.moving_fraction:.1%})"
     ]
 
 
 def parse_config(words: Sequence[str], resume: Path | None, begun: Path | None = None) -> Config:
-    """Return the configuration for the words after ``dyngs train``; ``begun``: of ``--from``.
-    Raises DyngsError."""
+    """Return the configuration for the words after ``dyngs train`` and the path of ``--from``."""
     from dyngs.config.io import load_config, load_resolved
 
     if begun is not None and resume is not None:
-        raise DyngsError("--from begins a run, --resume goes on with one: give one of them")
+        raise DyngsError("--from starts a new run, --resume continues a run: use one of them")
     if begun is not None:
         words = [*words, "init.kind=scene", f"init.scene={begun}"]
     has_preset = bool(words) and "=" not in words[0]
@@ -153,19 +152,19 @@ def parse_config(words: Sequence[str], resume: Path | None, begun: Path | None =
     paths = [word for word in overrides if "=" not in word and Path(word).exists()]
     if paths:
         raise DyngsError(
-            f"{paths[0]!r}: a capture, photos or a video are given as data.root={quote_path(paths[0])}"
+            f"{paths[0]!r}: unexpected path; for a capture use data.root={quote_path(paths[0])}"
         )
     if resume is None:
         if not words:
             raise DyngsError(
-                "give a config, for instance `dyngs train configs/static.yaml data.root=FOLDER`"
+                "a config is required, for instance `dyngs train static data.root=FOLDER`"
             )
         return load_config(preset, overrides)
     other = [word for word in words if word.partition("=")[0].strip() not in WITH_RESUME]
     if other:
         raise DyngsError(
-            f"{other[0]!r}: a resumed run keeps its own config; train.steps=N goes on to N steps, data.root=FOLDER "
-            f"names a capture that was moved, and for this call alone may be given {', '.join(_FOR_THIS_CALL)}"
+            f"{other[0]!r}: the configuration of a run is fixed; --resume accepts train.steps=N, "
+            f"data.root=FOLDER (a moved capture) and {', '.join(_FOR_THIS_CALL)}"
         )
     config = load_resolved(resume, overrides)
     return config.model_copy(update={"run": config.run.model_copy(update={"dir": resume})})

@@ -1,4 +1,4 @@
-"""The progress of a training, for people."""
+"""Progress display of a training run."""
 
 from __future__ import annotations
 
@@ -19,14 +19,13 @@ PLAIN_LINES = 10
 
 
 class TrainingProgress:
-    """Listener that shows a bar with loss, PSNR, Gaussians, steps per second and time left; a
-    context manager.
+    """Listener that shows loss, PSNR, Gaussians, steps per second and remaining time.
 
-    Where there is no terminal, plain lines. Output that cannot be written is dropped: a terminal
-    that was closed must not end the run.
+    A context manager. Shows a bar on a terminal, else plain lines. Errors of the stream are
+    ignored, so that a closed terminal does not end the run.
 
     Args:
-        stream: where to; None: standard error.
+        stream: output stream; None: standard error.
     """
 
     def __init__(self, stream: IO[str] | None = None) -> None:
@@ -76,7 +75,7 @@ class TrainingProgress:
             self._forecast = TimeForecast(step, now, count, pixels)
         self._forecast.observe(config, step, now, count)
         record = log_record(event)
-        if record.psnr is not None:  # one image says little: views differ by several dB
+        if record.psnr is not None:  # smoothed, because single views differ by several dB
             before = record.psnr if self._psnr is None else self._psnr
             self._psnr = 0.95 * before + 0.05 * record.psnr
         if self._bar is None and step < self._next_line and not event.is_last:

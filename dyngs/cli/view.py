@@ -1,4 +1,4 @@
-"""``dyngs view``: look at a run, a file or a folder of runs in a browser."""
+"""``dyngs view``: view a run, a file or a folder of runs in a browser."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from dyngs.core.errors import DyngsError
 
 _EPILOG = """\
 examples:
-  dyngs view runs/bench                          opens http://localhost:8080/ (Ctrl-C ends it)
-  dyngs view splats.ply --up=-y                  any file that dyngs reads
-  dyngs view runs                                a folder of runs, with a picker
-  dyngs view runs/ann --motion motions           a person, with the motions in a folder
-  dyngs view runs/bench --host 0.0.0.0           for other machines; the link that is printed has a token
+  dyngs view runs/bench                          serve http://localhost:8080/ until Ctrl-C
+  dyngs view splats.ply --up=-y                  any supported file of Gaussians
+  dyngs view runs                                choose between the runs of a folder
+  dyngs view runs/ann --motion motions           a person with the motions in a folder
+  dyngs view runs/bench --host 0.0.0.0           for other machines, with a token in the link
 
-Needs viser: pip install 'dyngs[view]'. Guide: `dyngs docs view-and-share`.
+Requires viser: pip install 'dyngs[view]'.
 """
 
 
 def add_parser(commands: args.Commands) -> None:
-    about = "Serve a page that shows a scene from anywhere at any time, next to the truth of its capture."
+    about = "Serve an interactive viewer that compares a scene with the images of its capture."
     parser = args.add_command(
-        commands, "view", run, "look at a run or a file in a browser", about, _EPILOG
+        commands, "view", run, "view a run or a file in a browser", about, _EPILOG
     )
     parser.add_argument(
         "source", type=args.input_path, metavar="RUN_OR_FILE", help="run, file, or a folder of runs"
     )
     add_serving_arguments(parser)
-    about = "motion file for a person, or a folder of them"
+    about = "motion file for a person, or a folder of motion files"
     parser.add_argument("--motion", type=args.input_path, metavar="PATH", help=about)
     args.add_max_gaussians_drawn(
-        parser, "of a large still scene: so many are drawn at most while anything moves"
+        parser, "large static scenes: maximum number of Gaussians drawn while the camera moves"
     )
     args.add_up(parser)
     args.add_threads(parser)
@@ -43,8 +43,8 @@ def add_parser(commands: args.Commands) -> None:
 
 
 def add_serving_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of how the page is served."""
-    about = "address to listen on (default: this machine only); others get a link with a token"
+    """Add the options of the web server."""
+    about = "address to listen on (default: this machine only); other addresses require a token"
     parser.add_argument("--host", default="127.0.0.1", help=about)
     kind = args.integer_type("a port", 1, 65535)
     parser.add_argument(
@@ -53,7 +53,7 @@ def add_serving_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Serve the page until Ctrl-C."""
+    """Serve the viewer until Ctrl-C."""
     from dyngs.view.server import require_viser
 
     require_viser()
@@ -74,14 +74,14 @@ def run(arguments: argparse.Namespace) -> int:
     first = load_first(source)
     if motions and first.person is None:
         raise DyngsError(
-            f"--motion goes with a person (model.kind=human), {first.name} is none; leave it out"
+            f"--motion requires a person (model.kind=human), but {first.name} is none; remove it"
         )
     print_notes(first.notes)
     serving = ServerOptions(arguments.host, arguments.port, motions)
     with Viewer(source, first, serving) as viewer:
-        print_lines(f"viewing: {first.name}\n         {viewer.link}\n         Ctrl-C ends it")
+        print_lines(f"viewing: {first.name}\n         {viewer.link}\n         press Ctrl-C to stop")
         wait_for_interrupt()
-    print("\nended")
+    print("\nviewer stopped")
     return 0
 
 

@@ -1,1 +1,1 @@
-"""Fewer Gaussians (4DGS-1K), cleaning, and the precision of the file `scene.dyngs`."""
+"""Pruning (4DGS-1K), cleaning, and storage precision of the file `scene.dyngs`."""

@@ -54,10 +54,9 @@ def remove_floaters(loop: Loop) -> TrainingEdit | None:
     if not count:
         return None
     before = format_count(len(found), "Gaussian")
-    message = f"{count:,} of {before} hang close before single cameras"
     if count > MOST * len(found):
-        return TrainingEdit(f"{message}: too many to be floaters, none is removed")
-    return TrainingEdit(f"{message}: removed (train.remove_floaters)", ~found)
+        return TrainingEdit(f"kept {count:,} of {before} close to cameras: too many for floaters")
+    return TrainingEdit(f"removed {format_count(count, 'floater')} of {before}", ~found)
 
 
 @torch.no_grad()
@@ -133,9 +132,7 @@ def clean_file(gaussians: Gaussians, tell: Tell) -> Tensor:
         tell(f"clean: {kind}: {format_count(int((found[kind] & ~gone).sum()), 'Gaussian')}")
         gone |= found[kind]
     if bool(gone.all()):
-        raise DyngsError(
-            "--clean: nothing would be left; this scene consists of needles, or of what hardly shows"
-        )
+        raise DyngsError("--clean would remove all Gaussians; leave it out for this scene")
     tell(
         f"clean: {int(gone.sum()):,} of {format_count(len(gone), 'Gaussian')} go; without the "
         "cameras of a run neither what "

@@ -1,4 +1,4 @@
-"""The most that can be taken from a run for a given loss, found by bisection.
+"""Search for the strongest pruning within a given loss of PSNR, by bisection.
 
 Every candidate is fine-tuned equally long from the same checkpoint, with the same views in the same
 order. What it loses is the larger of two losses of mean PSNR: on views that the run and fine-tuning
@@ -89,9 +89,9 @@ def _drop_harmonics(trainer: GaussianTrainer, tolerance: float) -> None:
     found = find_view_dependent(
         _looks(trainer, seen, background), looks, trainer.model.options, background, tolerance
     )
-    trainer.model.drop_harmonics(~found.keeps, found.offsets)
+    trainer.model.drop_harmonics(~found.kept_harmonics, found.offsets)
     trainer.model.freeze_plain_harmonics(
-        ~found.keeps, AutoColour(opacity_entropy=trainer.config.colour.opacity_entropy)
+        ~found.kept_harmonics, AutoColour(opacity_entropy=trainer.config.colour.opacity_entropy)
     )
 
 

@@ -1,11 +1,8 @@
-"""The last stage of a run: few of its Gaussians are kept, masks say when they are seen, and
-training goes on with them.
+"""Pruning stage after training: remove Gaussians, compute visibility masks, and fine-tune.
 
-The fraction that goes is input here; ``dyngs.compress.search`` finds it, and what else can go, with
-the same functions.
-
-It begins where training ends, from that checkpoint, and lasts ``prune.steps``: a finished run that
-is pruned ends with the same bytes as one that had the stage in its configuration.
+The fraction is given here; ``dyngs.compress.search`` finds it for a given loss. The stage starts
+from the last checkpoint and takes ``prune.steps``. Pruning a finished run gives the same bytes as
+training with the stage in its configuration.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The typed configuration of a run, its YAML files and overrides."""
+"""Typed configuration of a run, with YAML presets and overrides."""
 
 from dyngs.config.keys.colour import AutoColour, ColourSection, NetworkColour, ShColour
 from dyngs.config.keys.config import BudgetConfig, CameraConfig, Config, PruneConfig, RunConfig

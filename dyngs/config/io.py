@@ -1,9 +1,7 @@
-"""Configurations from and to YAML: presets, ``a.b=c`` overrides, and errors that say what is
-allowed.
+"""Load and save configurations: YAML presets, ``section.key=value`` overrides, validation errors.
 
-A preset is a short YAML file; overrides are laid over it; ``dyngs.config.Config`` checks the result
-and fills in the rest. What was resolved is saved with every run and is all that later commands
-read.
+Overrides are applied on top of a preset; ``dyngs.config.Config`` validates the result and fills in
+defaults. Every run stores its resolved configuration, which later commands read.
 """
 
 from __future__ import annotations
@@ -68,8 +66,11 @@ REMOVED_KEYS: dict[str, object] = {
     "optim.sparse": False,
     "model.deform.time_resolution": 0,
 }
-"""Keys of earlier versions that configurations of runs may still have, with the value at which they
-had no effect."""
+"""Removed keys that stored configurations may still contain. Maps each key to the value at which it
+had no effect; only that value is accepted."""
+RENAMED_KEYS = {"model.choose": "model.pilot_runs", "init.trains": "init.trainable"}
+"""Former to current key names. Stored configurations are converted; presets and overrides with a
+former name are refused."""
 REMOVED_MODEL_KEYS: dict[str, dict[str, object]] = {
     "human": {
         "refine_from": 0.1,
@@ -98,13 +99,13 @@ REMOVED_MODEL_KEYS: dict[str, dict[str, object]] = {
         "visibility": True,
     },
 }
-"""The same for keys of the section ``model`` of one kind."""
+"""``REMOVED_KEYS`` of the section ``model``, by kind of model."""
 _FOLLOW_LINKS = ("data", "follow_links")
 _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
 
 
 def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Config:
-    """Return the configuration of a preset with overrides laid over it.
+    """Return the configuration of a preset with overrides applied.
 
     Example:
 
@@ -115,16 +116,17 @@ def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Con
     Args:
         preset: a YAML file, or the name of a packaged preset (``static``, ``configs/static.yaml``)
             where no such file exists; None starts from the defaults.
-        overrides: ``section.key=value`` with the value in YAML. A changed ``kind`` replaces its
-            whole section and nothing outside it, whatever the order of the overrides.
+        overrides: ``section.key=value`` with the value in YAML. A changed ``kind`` resets its
+            section to the defaults of that kind, in any order of the overrides.
 
     Returns:
-        the checked configuration; ``data.root`` and ``data.body`` are made absolute, so that later
-        commands work from any folder. ``model_fields_set`` of its sections has the keys of
-        overrides, and those of a file that differ from the packaged presets of its model.
+        the validated configuration, with absolute ``data.root`` and ``data.body``. In each section
+        ``model_fields_set`` holds the keys that the user set: overrides, and values of a file that
+        differ from the packaged presets.
 
     Raises:
-        DyngsError: naming the file and line or the override, the key, and what is allowed.
+        DyngsError: an unknown key or invalid value; the message has the file and line or the
+            override, the key, and the allowed values.
     """
     layers = _Layers()
     own: set[tuple[str, ...]] = set()
@@ -138,8 +140,8 @@ def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Con
     config = _validated(layers)
     if config.data.follow_links and _FOLLOW_LINKS not in given:
         raise DyngsError(
-            f"{layers.origin_of(_FOLLOW_LINKS)}only the command line may set data.follow_links; remove it here and, "
-            "if you trust the capture, give data.follow_links=true there"
+            f"{layers.origin_of(_FOLLOW_LINKS)}data.follow_links is allowed on the command line "
+            "only; remove it here and, if you trust the capture, add data.follow_links=true there"
         )
     _note_requested(config, (), own)
     body = config.data.body
@@ -154,25 +156,25 @@ def load_resolved(
     """Return the configuration of a finished or interrupted run.
 
     Args:
-        path: a run folder, or the YAML file in it; a relative ``data.body`` there is one next to
-            the file. ``data.follow_links`` has no effect there, see ``following_links_of_runs``.
+        path: a run folder, or the YAML file in it; a relative ``data.body`` is relative to the
+            file. A stored ``data.follow_links`` is ignored, see ``allow_run_links``.
         overrides: as in ``load_config``.
-        data_root: where the capture lies by now, if it was moved.
+        data_root: current folder of the capture, if it was moved.
     """
     file = path / RESOLVED_NAME if path.is_dir() else path
     found = suggest_command(path)
     if not file.is_file() or (file == path and found):
         hint = f"{found}; then " if found else ""
         raise DyngsError(
-            f"{path}: not a run folder (no {RESOLVED_NAME} there); {hint}give the folder that `dyngs train` wrote"
+            f"{path}: not a run folder (no {RESOLVED_NAME}); "
+            f"{hint}give a folder written by `dyngs train`"
         )
     layers = _Layers()
     layers.add(read_file(file))
+    _convert_renamed_keys(layers.tree)
     data = layers.tree.get("data")
     if not data:
-        raise DyngsError(
-            f"{file}: does not say which capture the run was trained on (data.root); restore the file"
-        )
+        raise DyngsError(f"{file}: data.root, the capture of the run, is missing; restore the file")
     stored_root = None
     if isinstance(data, dict):
         stored_root = data.get("root")
@@ -188,18 +190,26 @@ def load_resolved(
     return config.model_copy(update={"data": data})
 
 
-def update_model_keys(model: dict[str, object]) -> dict[str, object]:
-    """Return the section ``model`` of an earlier version without the keys of
-    ``REMOVED_MODEL_KEYS``."""
+def _convert_renamed_keys(tree: dict[str, Any]) -> None:
+    """Replace former key names by the current ones, in place."""
+    for former, current in RENAMED_KEYS.items():
+        section_name, key = former.split(".")
+        section = tree.get(section_name)
+        if isinstance(section, dict) and key in section:
+            section[current.split(".")[1]] = section.pop(key)
+
+
+def drop_removed_model_keys(model: dict[str, object]) -> dict[str, object]:
+    """Return a stored section ``model`` without the keys in ``REMOVED_MODEL_KEYS``."""
     removed = REMOVED_MODEL_KEYS.get(str(model.get("kind")), {})
     return {key: x for key, x in model.items() if not _is_removed(key, x, removed)}
 
 
 def save_config(config: Config, path: Path) -> None:
-    """Write every value of ``config`` as YAML, atomically: ``path`` is either the old file or the
-    new one.
+    """Write all values of ``config`` as YAML, atomically.
 
-    A ``data.body`` next to the file is written relative to it, so that their folder may be moved.
+    A ``data.body`` inside the folder of ``path`` is stored relative to it, so that the run folder
+    may be moved.
     """
     values = config.model_dump(mode="json")
     package = package_of(config.model.kind)
@@ -211,18 +221,16 @@ def save_config(config: Config, path: Path) -> None:
         values["data"]["body"] = body.relative_to(beside).as_posix()
     text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True)
     if not _ODD_LINE_BREAKS.isdisjoint(text):
-        # escapes, where YAML would fold them
+        # unescaped, YAML would fold these line breaks
         text = yaml.safe_dump(values, sort_keys=False, allow_unicode=False)
     write_text(path, text, durable=True)
 
 
 def find_preset(path: Path) -> Path:
-    """Return the preset file meant by ``path``: itself if it exists, else the packaged preset of
-    that name.
+    """Return ``path`` if the file exists, else the packaged preset of that name.
 
-    Only a bare name or one below ``configs/`` is looked for in the package, so that a mistyped path
-    of the user's own is an error. In a source checkout the package's presets are those in the
-    repository's ``configs``.
+    Only a bare name or one below ``configs/`` matches a packaged preset, so that other mistyped
+    paths are errors. A source checkout uses the presets in the repository's ``configs``.
     """
     found = suggest_command(path)
     if path.is_file() and found is None:
@@ -232,20 +240,19 @@ def find_preset(path: Path) -> Path:
     if is_bare and path.stem in packaged:
         return packaged[path.stem]
     if found is not None:
-        raise DyngsError(f"{path}: no configuration; {found}")
+        raise DyngsError(f"{path}: not a configuration; {found}")
     close = get_close_matches(path.stem, packaged, n=1)
     hint = f" (did you mean {close[0]!r}?)" if close else ""
     raise DyngsError(
-        f"{path}: no such preset{hint}; the packaged ones are {', '.join(sorted(packaged))}"
+        f"{path}: no such preset{hint}; packaged presets: {', '.join(sorted(packaged))}"
     )
 
 
 def packaged_preset(name: str) -> Path:
-    """Return the file of the preset ``name`` that comes with dyngs. Raises DyngsError where there
-    is none."""
+    """Return the file of the packaged preset ``name``. Raises DyngsError: unknown name."""
     packaged = packaged_presets()
     if name not in packaged:
-        raise DyngsError(f"no packaged preset {name!r}; there are {', '.join(sorted(packaged))}")
+        raise DyngsError(f"no packaged preset {name!r}; available: {', '.join(sorted(packaged))}")
     return packaged[name]
 
 
@@ -258,7 +265,7 @@ def packaged_presets() -> dict[str, Path]:
 
 @dataclass
 class _Layers:
-    """Nested texts of a preset and overrides, and for each where it was written."""
+    """Nested values of a preset and overrides as text, and the origin (file and line) of each."""
 
     tree: dict[str, Any] = field(default_factory=dict)
     origins: dict[tuple[str, ...], str] = field(default_factory=dict)
@@ -268,9 +275,9 @@ class _Layers:
             self._set(leaf)
 
     def add_overrides(self, overrides: Iterable[str]) -> set[tuple[str, ...]]:
-        """Lay overrides over what is there, and return the keys that they set."""
+        """Apply overrides, and return the keys that they set."""
         leaves = [leaf for text in overrides for leaf in read_override(text)]
-        # what empties a section goes first, outer sections before inner ones
+        # a ``kind`` or {} clears its section, so these come first, outer sections before inner ones
         for leaf in sorted(
             leaves, key=lambda o: (o.keys[-1] != "kind" and o.value != {}, len(o.keys))
         ):
@@ -280,7 +287,7 @@ class _Layers:
         return {leaf.keys for leaf in leaves}
 
     def _drop_other_kind(self, keys: tuple[str, ...], kind: Any) -> None:
-        """Empty the section at ``keys`` if it is of another kind than ``kind``."""
+        """Clear the section at ``keys`` if its kind is not ``kind``."""
         section = self.value_at(keys)
         info = self.field_at(keys)
         if not isinstance(section, dict) or info is None or not has_kinds(info):
@@ -290,14 +297,14 @@ class _Layers:
             self.origins = {k: v for k, v in self.origins.items() if k[: len(keys)] != keys}
 
     def section_at(self, keys: tuple[str, ...], info: FieldInfo) -> type[BaseModel] | None:
-        """Return the class of the section at ``keys``, of the chosen kind; None: it is a value."""
+        """Return the section class of the selected kind at ``keys``; None if it is a value."""
         if not is_section(info):
             return None
         node = self.value_at(keys)
         return section_class(info, node.get("kind") if isinstance(node, dict) else None)
 
     def field_at(self, keys: tuple[str, ...]) -> FieldInfo | None:
-        """Return the field at ``keys``, in the sections of the chosen kinds; None: no such field."""
+        """Return the field at ``keys`` in the sections of the selected kinds; None if unknown."""
         section: type[BaseModel] | None = Config
         info: FieldInfo | None = None
         for depth, key in enumerate(keys, 1):
@@ -306,7 +313,7 @@ class _Layers:
         return info
 
     def names(self, section: type[BaseModel], above: tuple[str, ...]) -> Iterator[str]:
-        """Yield the dotted names of all keys in the sections of the chosen kinds."""
+        """Yield the dotted names of all keys in the sections of the selected kinds."""
         for key, info in section.model_fields.items():
             inner = self.section_at((*above, key), info)
             if inner is None:
@@ -335,22 +342,22 @@ class _Layers:
         self.origins[keys] = leaf.origin
 
     def value_at(self, keys: tuple[str, ...]) -> Any:
-        """Return the value or section at ``keys``; None where there is none."""
+        """Return the value or section at ``keys``; None if missing."""
         node: Any = self.tree
         for key in keys:
             node = node.get(key) if isinstance(node, dict) else None
         return node
 
     def origin_of(self, keys: tuple[str, ...]) -> str:
-        """Return where the value at ``keys``, or else the first one below it, was written; with a
-        colon."""
+        """Return the origin of the value at ``keys``, or of the first value below it, as a message
+        prefix."""
         below = (origin for k, origin in self.origins.items() if k[: len(keys)] == keys)
         origin = self.origins.get(keys) or next(below, "")
         return f"{origin}: " if origin else ""
 
 
 def _is_removed(key: str, written: object, removed: Mapping[str, object]) -> bool:
-    """Return whether ``removed`` has a key with the value that ``written`` in a file means."""
+    """Return whether ``removed`` lists ``key`` with the value ``written`` in a file."""
     if key not in removed:
         return False
     value = removed[key]
@@ -363,10 +370,10 @@ def _is_removed(key: str, written: object, removed: Mapping[str, object]) -> boo
 
 
 def _own_keys(layers: _Layers) -> set[tuple[str, ...]]:
-    """Return the keys of a preset file to which no packaged preset of the same ``model.kind`` gives
-    the same value.
+    """Return the keys of a preset file whose values differ from all packaged presets of its
+    ``model.kind``.
 
-    A copy of a packaged preset is that preset: its user has requested nothing.
+    Only these count as requested by the user: a copy of a packaged preset requests nothing.
     """
     own = set(layers.origins)
     kind = layers.value_at(("model", "kind"))
@@ -388,8 +395,8 @@ def _validated(layers: _Layers) -> Config:
     package = model.pop("package", None) if isinstance(model, dict) else None
     if isinstance(model, dict) and package is not None and not is_kind(model.get("kind")):
         raise DyngsError(
-            f"model.kind={model.get('kind')} is of the package {package}, which is not installed; "
-            f"pip install {package}"
+            f"model.kind={model.get('kind')} needs the package {package}, which is not installed; "
+            f"run `pip install {package}`"
         )
     return cast(Config, _section(Config, tree, (), layers))
 
@@ -397,7 +404,7 @@ def _validated(layers: _Layers) -> Config:
 def _section(
     section: type[BaseModel], given: dict[str, Any], above: tuple[str, ...], layers: _Layers
 ) -> BaseModel:
-    """Return the section of the texts in ``given``. Raises DyngsError: the first fault."""
+    """Validate the values in ``given`` as a section. Raises DyngsError: the first error."""
     prefix = ".".join(above)
     removed = {name.removeprefix(f"{prefix}."): x for name, x in REMOVED_KEYS.items()}
     if prefix == "model":
@@ -410,7 +417,7 @@ def _section(
     for key in values:
         was_flag = key.startswith("move_") and "moves" in section.model_fields  # see FieldSection
         if key not in section.model_fields and not was_flag:
-            raise DyngsError(_about_unknown(section, (*above, key), layers))
+            raise DyngsError(_describe_unknown(section, (*above, key), layers))
     for name, info in section.model_fields.items():
         keys = (*above, name)
         if not is_section(info):
@@ -419,7 +426,7 @@ def _section(
         if not isinstance(inner, dict):
             where = layers.origin_of(keys)
             raise DyngsError(
-                f"{where}{'.'.join(keys)} is a section, not a value; give one of its keys"
+                f"{where}{'.'.join(keys)} is a section, not a value; set one of its keys"
             )
         kind = inner.get("kind") or default_kind(info)
         if has_kinds(info) and not allows_kind(info, kind):
@@ -437,7 +444,7 @@ def _section(
     if problem["type"] == "missing":
         name = ".".join(keys)
         example = "data.root=FOLDER" if name == "data.root" else f"{name}=..."
-        raise DyngsError(f"{where}{name} is missing ({info.description}); give {example}")
+        raise DyngsError(f"{where}{name} is required ({info.description}); add {example}")
     if problem["type"] == "value_error":
         raise DyngsError(f"{where}{'.'.join(keys)} {problem.get('ctx', {}).get('error')}")
     choices = list_choices(info.annotation)
@@ -450,12 +457,13 @@ def _not_allowed(keys: tuple[str, ...], allowed: str, value: object, choices: li
     return f"{'.'.join(keys)} must be {allowed}, not {format_one_line(format_yaml_value(value), 60)}{hint}"
 
 
-def _about_unknown(section: type[BaseModel], keys: tuple[str, ...], layers: _Layers) -> str:
-    """Return a message about a key that the chosen kinds do not have: which kind has it, or which
-    key is similar."""
+def _describe_unknown(section: type[BaseModel], keys: tuple[str, ...], layers: _Layers) -> str:
+    """Return the error about an unknown key: its new name, the kind that has it, or a similar key."""
     *above, key = keys
     name = ".".join(keys)
     where = layers.origin_of(keys)
+    if name in RENAMED_KEYS:
+        return f"{where}{name} was renamed; use {RENAMED_KEYS[name]}"
     holder = layers.field_at(tuple(above))
     variants = [] if holder is None else section_classes(holder)
     owners = [x.model_fields["kind"].default for x in variants if key in x.model_fields]
@@ -468,7 +476,7 @@ def _about_unknown(section: type[BaseModel], keys: tuple[str, ...], layers: _Lay
     known = list(layers.names(Config, ()))
     last = written.rpartition(".")[2]
     same = [x for x in known if x.rpartition(".")[2] == last]
-    # the section alone makes keys alike, so the last word must be close, too
+    # a shared section makes names similar, so the last word must be similar as well
     close = get_close_matches(written, same or known, n=1)
     found = [x for x in close if get_close_matches(last, [x.rpartition(".")[2]])] or same
     hint = f"; did you mean {' or '.join(map(repr, found))}?" if found else ""
@@ -478,7 +486,7 @@ def _about_unknown(section: type[BaseModel], keys: tuple[str, ...], layers: _Lay
 def _note_requested(
     section: BaseModel, above: tuple[str, ...], requested: set[tuple[str, ...]]
 ) -> None:
-    """Leave only what was ``requested`` in ``model_fields_set`` of a section and those in it."""
+    """Keep only ``requested`` keys in ``model_fields_set``, recursively."""
     for name in type(section).model_fields:
         inner = getattr(section, name)
         if isinstance(inner, BaseModel):

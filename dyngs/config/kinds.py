@@ -1,9 +1,8 @@
-"""The kinds of model that are installed: ours, and those of other packages.
+"""Registry of the installed kinds of model: built-in ones and plugins.
 
-A kind is an object with the class of its section, see ``dyngs.models.kind``. Other packages name
-theirs as entry points of the group ``dyngs.models``, as pyproject.toml does ours. A kind is
-imported when it is first asked for, and packages are looked through only for a name that is not
-ours.
+A kind is a ``dyngs.models.kind.ModelKind`` with the class of its config section. Plugins register
+kinds as entry points of the group ``dyngs.models``. A kind is imported on first use, and entry
+points are searched only for names that are not built in.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from dyngs.core.section import ModelSection
 
 GROUP = "dyngs.models"
 
-OWN = {
+BUILT_IN = {
     "static": "dyngs.static.kind:STATIC",
     "dynamic": "dyngs.deform.kind:DYNAMIC",
     "human": "dyngs.human.kind:HUMAN",
@@ -30,7 +29,7 @@ OWN = {
     "nerf": "dyngs.baselines.fields.kind:NERF",
     "bg_triangle": "dyngs.baselines.triangles.kind:BG_TRIANGLE",
 }
-"""Entry points of dyngs itself, which a source tree that is not installed has, too."""
+"""Entry points of dyngs itself, listed here so that a source tree works without installation."""
 
 
 class InstalledKind(Protocol):
@@ -41,21 +40,23 @@ class InstalledKind(Protocol):
 
 
 def kind_names() -> list[str]:
-    """Return the names of all installed kinds, ours first."""
-    return [*OWN, *(name for name in sorted(plugin_kinds()) if name not in OWN)]
+    """Return the names of all installed kinds, built-in ones first."""
+    return [*BUILT_IN, *(name for name in sorted(plugin_kinds()) if name not in BUILT_IN)]
 
 
 def is_kind(name: object) -> bool:
     """Return whether a kind with this name is installed."""
-    return name in OWN or name in plugin_kinds()
+    return name in BUILT_IN or name in plugin_kinds()
 
 
 @cache
 def installed_kind(name: str) -> InstalledKind:
-    """Return the kind with this name. Raises DyngsError: its package cannot be imported; KeyError:
-    there is none."""
-    if name in OWN:
-        return cast("InstalledKind", EntryPoint(name, OWN[name], GROUP).load())
+    """Return the kind with this name.
+
+    Raises DyngsError: its package cannot be imported; KeyError: unknown kind.
+    """
+    if name in BUILT_IN:
+        return cast("InstalledKind", EntryPoint(name, BUILT_IN[name], GROUP).load())
     entry = plugin_kinds()[name]
     try:
         return cast("InstalledKind", entry.load())
@@ -71,8 +72,8 @@ def section_of_kind(name: str) -> type[ModelSection]:
 
 
 def package_of(name: str) -> str | None:
-    """Return the name of the package that a kind is from; None: it is ours, or not installed."""
-    entry = None if name in OWN else plugin_kinds().get(name)
+    """Return the name of the plugin package of a kind; None if it is built in or not installed."""
+    entry = None if name in BUILT_IN else plugin_kinds().get(name)
     return entry.dist.name if entry is not None and entry.dist is not None else None
 
 

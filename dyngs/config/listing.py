@@ -1,5 +1,4 @@
-"""A configuration as YAML in which every key stands with its value, its default and what it
-means."""
+"""Format a configuration as YAML with the value, default and description of every key."""
 
 from __future__ import annotations
 
@@ -24,7 +23,7 @@ _NO_ROOT = "FOLDER"
 def format_config(source: Path, overrides: list[str]) -> str:
     """Return the resolved configuration of a preset, a YAML file or a run, as YAML with comments.
 
-    It is a preset itself. Where it says no ``data.root``, that key stands in a comment.
+    The output is a valid preset. A missing ``data.root`` is written as a comment.
 
     Raises:
         DyngsError: no such preset or run, or a wrong key or value.

@@ -1,5 +1,4 @@
-"""Descriptions of the configuration keys: allowed values, default, meaning; and look-up of sections
-by kind.
+"""Describe the configuration keys (allowed values, default, meaning) and look up sections by kind.
 
 Error messages and docs/reference/config.md are generated from this, so that neither can disagree
 with ``dyngs.config``.
@@ -25,14 +24,14 @@ from dyngs.core.section import ModelSection
 
 @dataclass(frozen=True)
 class ConfigKey:
-    """One key of the configuration, described for users.
+    """Description of one configuration key.
 
     Attributes:
         name: dotted, for instance ``train.steps``.
-        kinds: the variants that have the key, outermost first, as ``("dynamic", "mlp")``; empty
-            where all have it.
-        allowed: what it may be, in words.
-        default: as YAML, "" where the key is required.
+        kinds: kinds that have the key, outermost first, such as ``("dynamic", "mlp")``; empty if
+            all kinds have it.
+        allowed: allowed values in words.
+        default: as YAML; "" if the key is required.
         description: one line.
     """
 
@@ -53,8 +52,7 @@ def config_keys() -> list[ConfigKey]:
 
 
 def _keys_below(section: type[BaseModel], prefix: str) -> Iterator[ConfigKey]:
-    """Yield the keys of ``section``, named with ``prefix``; their kinds are those of the sections
-    inside it."""
+    """Yield the keys of ``section`` with ``prefix`` before their names."""
     for key, info in section.model_fields.items():
         name = prefix + key
         variants = section_classes(info)
@@ -81,7 +79,7 @@ def _keys_below(section: type[BaseModel], prefix: str) -> Iterator[ConfigKey]:
 
 
 def _kind_key(name: str, info: FieldInfo, variants: list[type[BaseModel]]) -> ConfigKey:
-    """Return the key ``kind`` of the section ``name``; its description says what each kind is."""
+    """Return the key ``kind`` of the section ``name``, with the descriptions of all kinds."""
     kinds = [variant.model_fields["kind"] for variant in variants]
     meanings = "; ".join(
         f"{', '.join(list_choices(kind.annotation))}: {kind.description}" for kind in kinds
@@ -145,7 +143,7 @@ def default_text(info: FieldInfo) -> str:
 
 
 def format_yaml_value(value: object) -> str:
-    """Return a value as one writes it in YAML."""
+    """Format a value as YAML text."""
     match value:
         case Enum():
             return str(value.value)
@@ -166,7 +164,7 @@ def is_section(info: FieldInfo) -> bool:
 
 
 def has_kinds(info: FieldInfo) -> bool:
-    """Return whether a section may be of several kinds."""
+    """Return whether a section has several kinds."""
     return _is_any_kind(info) or len(section_classes(info)) > 1
 
 
@@ -175,8 +173,7 @@ def _is_any_kind(info: FieldInfo) -> bool:
 
 
 def section_classes(info: FieldInfo) -> list[type[BaseModel]]:
-    """Return the section classes that a field may hold: several for a section with a ``kind``, none
-    for a value."""
+    """Return the section classes of a field: several for a section with kinds, none for a value."""
     if _is_any_kind(info):
         return [section_of_kind(name) for name in kind_names()]
     options = get_args(info.annotation) or (info.annotation,)
@@ -184,7 +181,7 @@ def section_classes(info: FieldInfo) -> list[type[BaseModel]]:
 
 
 def list_kinds(info: FieldInfo) -> list[str]:
-    """Return the kinds that a section may have; empty where there is only one class."""
+    """Return the kinds of a section; empty if there is only one class."""
     if _is_any_kind(info):
         return kind_names()
     variants = section_classes(info) if has_kinds(info) else []
@@ -192,19 +189,18 @@ def list_kinds(info: FieldInfo) -> list[str]:
 
 
 def allows_kind(info: FieldInfo, kind: object) -> bool:
-    """Return whether a section may be of this kind."""
+    """Return whether ``kind`` is a kind of this section."""
     return is_kind(kind) if _is_any_kind(info) else kind in list_kinds(info)
 
 
 def default_kind(info: FieldInfo) -> str | None:
-    """Return the default kind of a section with several kinds; None: it has only one."""
+    """Return the default kind of a section; None if it has only one class."""
     default = info.get_default(call_default_factory=True)
     return getattr(default, "kind", None)
 
 
 def section_class(info: FieldInfo, kind: object) -> type[BaseModel]:
-    """Return the class of a section of this ``kind``; the default one where there is no such
-    kind."""
+    """Return the section class of ``kind``, or of the default kind if ``kind`` is unknown."""
     kind = kind if allows_kind(info, kind) else default_kind(info)
     if _is_any_kind(info):
         return section_of_kind(str(kind))

@@ -1,7 +1,7 @@
-"""Read YAML of presets and overrides as texts with their origin (file, line).
+"""Read YAML presets and overrides as text values with their origin (file and line).
 
-Values stay as they were written (``007``, ``2024-02-30``); the keys of the configuration say what
-is a number. What is no YAML is a DyngsError of one line.
+Values stay text (``007``, ``2024-02-30``) because the schema decides their types. Invalid YAML
+raises a one-line DyngsError.
 """
 
 from __future__ import annotations
@@ -18,18 +18,20 @@ from dyngs.core.errors import DyngsError, describe_error, format_one_line, wrap_
 from dyngs.io.fields import read_limited
 
 MAX_BYTES = 2**18
-"""Largest size of a preset or an override; the longest that we know has 5 KB."""
+"""Largest size of a preset or an override, bytes; packaged presets have less than 5 KB."""
 MAX_BRACKETS = 500
-"""Most brackets of a file; thousands take the scanner seconds. A configuration has ten."""
+"""Most brackets in a file: the YAML scanner takes seconds for thousands."""
 _SHOWN = 100
-"""Characters of an override that a message repeats."""
+"""Characters of an override quoted in a message."""
 _NULL = ("", "~", "null", "Null", "NULL")
 
 
 @dataclass(frozen=True)
 class Leaf:
-    """One value of a file or an override: a text, a list of values, None, or {} for a section
-    without keys; ``origin`` is for messages."""
+    """One value of a file or an override: text, a list, None, or {} for an empty section.
+
+    ``origin`` is the file and line, for messages.
+    """
 
     keys: tuple[str, ...]
     value: Any
@@ -37,7 +39,7 @@ class Leaf:
 
 
 def read_file(path: Path) -> list[Leaf]:
-    """Read the values of a file in its order; an empty section is a leaf of value None."""
+    """Return the values of a file in order; an empty section has the value None."""
     with wrap_read_errors(path, "give a YAML preset in UTF-8"):
         text = read_limited(path, MAX_BYTES).decode("utf-8-sig")
     root = _root(text, str(path))
@@ -49,8 +51,7 @@ def read_file(path: Path) -> list[Leaf]:
 
 
 def read_override(text: str) -> list[Leaf]:
-    """Read the values that ``section.key=value`` sets: one, or several where it sets a full
-    section."""
+    """Return the values that ``section.key=value`` sets; several if the value is a mapping."""
     key, equals, written = (part.strip() for part in text.partition("="))
     keys = tuple(key.split("."))
     origin = format_one_line(text, _SHOWN)
@@ -60,23 +61,23 @@ def read_override(text: str) -> list[Leaf]:
             f"{shown} is not an override; write section.key=value, for instance train.steps=2000"
         )
     if len(written) > MAX_BYTES:
-        raise DyngsError(f"{origin}: has {len(written)} characters; no value is as long")
+        raise DyngsError(f"{origin}: value too long ({len(written)} characters)")
     try:
         node = _root(written, origin)
     except DyngsError:
-        return [Leaf(keys, written, origin)]  # a path or a name that happens not to be YAML
+        return [Leaf(keys, written, origin)]  # some paths and names are not valid YAML
     if isinstance(node, yaml.MappingNode) and node.flow_style and node.value:
         return list(_leaves(node, keys, origin))
     is_flow = isinstance(node, yaml.CollectionNode) and node.flow_style
     is_quoted = isinstance(node, yaml.ScalarNode) and node.style is not None
     is_null = node is None or (not is_quoted and node.value in _NULL)
-    # a block such as "10:" only looks like one
+    # a block mapping such as "10:" is taken as text
     value = _value(node) if node is not None and (is_flow or is_quoted) else written
     return [Leaf(keys, None if is_null else value, origin)]
 
 
 def _root(text: str, origin: str) -> yaml.Node | None:
-    """Return the node of a YAML text. Raises DyngsError: its line and what is wrong there."""
+    """Parse YAML text. Raises DyngsError with the line and the problem."""
     if text.count("[") + text.count("{") > MAX_BRACKETS:
         raise DyngsError(f"{origin}: nested too deeply for a configuration")
     try:
@@ -90,7 +91,7 @@ def _root(text: str, origin: str) -> yaml.Node | None:
         line = f":{mark.line + 1}" if mark is not None else ""
         problem = getattr(error, "problem", None) or describe_error(error)
         if "'\\t'" in problem:
-            problem = "a tab where YAML wants spaces; indent with spaces"
+            problem = "tabs are not allowed for indentation; use spaces"
         raise DyngsError(
             f"{origin}{line}: not valid YAML: {format_one_line(problem, 2 * _SHOWN)}"
         ) from error
@@ -118,7 +119,7 @@ def _leaves(
 
 
 def _value(node: yaml.Node) -> Any:
-    """Return the text of a node, or the list of those in it; None for a plain null."""
+    """Return the text of a node, or a list or mapping of texts; None for a plain null."""
     if isinstance(node, yaml.ScalarNode):
         return None if node.style is None and node.value in _NULL else node.value
     if isinstance(node, yaml.SequenceNode):

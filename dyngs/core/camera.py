@@ -79,7 +79,7 @@ class Cameras:
     ) -> Cameras:
         """Return the same cameras on another device or in another precision."""
         pose, intrinsics = (
-            # no GPU waits for them
+            # asynchronous copies from the CPU do not stall the GPU
             x.to(device=device, dtype=dtype, non_blocking=x.device.type == "cpu")
             for x in (self.cam_from_world, self.intrinsics)
         )

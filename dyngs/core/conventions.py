@@ -30,12 +30,11 @@ SH_C0 = 0.28209479177387814
 MAX_SH_DEGREE = 4
 
 ProgressCallback = Callable[[str, int, int], None]
-"""Function that is told how far long work has come: what is being done, how many parts of it are
-done, of how many."""
+"""Progress callback, called with a description, the completed steps and the total steps."""
 
 
 def ignore_progress(what: str, done: int, total: int) -> None:
-    """Tell nobody: the default of functions that report their progress."""
+    """Default ``ProgressCallback`` that does nothing."""
 
 
 class RasterizeMode(str, Enum):

@@ -1,5 +1,4 @@
-"""The exception type that users see as a single line, the boundary at which a reader's faults
-become it, and messages to users."""
+"""One-line errors for users, conversion of reader errors to them, and logging."""
 
 from __future__ import annotations
 
@@ -18,7 +17,7 @@ _MAX_REASON = 160
 
 
 class DyngsError(Exception):
-    """Bad input or an impossible request: says what, where and what to do, in one line.
+    """Invalid input or request. The message is one line: what, where, what to do.
 
     The command line prints the message and exits with code 2; library callers catch it.
 
@@ -33,26 +32,22 @@ class DyngsError(Exception):
     """
 
     def __str__(self) -> str:
-        """The message on one line without anything that a terminal would obey, whatever names and
-        values it quotes."""
+        """Return the message on one line with control characters escaped."""
         return format_one_line(super().__str__())
 
 
 class NoCaptureError(DyngsError):
-    """There is no folder where a capture should be: it may have been moved."""
+    """The folder of a capture does not exist; it may have been moved."""
 
 
 @contextmanager
 def wrap_read_errors(
     path: str | os.PathLike[str], advice: str = "copy or export it again"
 ) -> Generator[None]:
-    """A block in which whatever goes wrong is a DyngsError that names ``path``, with the first
-    error as its cause.
+    """Convert all exceptions in the block to a DyngsError that names ``path``.
 
-    For the readers of files from others: their parsers raise more kinds of errors than anybody can
-    list. A DyngsError passes as it is. What the file has no part in belongs outside the block,
-    because a fault of our own would be blamed on the file there (``dyngs --debug`` shows the
-    cause).
+    For parsers of external files, which raise many types of exceptions. A DyngsError is passed on.
+    Keep unrelated code out of the block, because its bugs would be reported as a bad file.
     """
     where = os.fspath(path)
     try:
@@ -60,9 +55,7 @@ def wrap_read_errors(
     except DyngsError:
         raise
     except MemoryError as cause:
-        raise DyngsError(
-            f"{where}: reading it takes more memory than there is; {advice}"
-        ) from cause
+        raise DyngsError(f"{where}: too large for the available memory; {advice}") from cause
     except Exception as cause:
         raise DyngsError(
             f"{where}: cannot be read ({describe_error(cause).removesuffix(f': {where}')}); {advice}"
@@ -70,34 +63,31 @@ def wrap_read_errors(
 
 
 def validate_file_name(text: str) -> None:
-    """Nothing, if ``text`` may name a file: no NUL, nothing that is no character. Raises
-    DyngsError."""
+    """Raise DyngsError if ``text`` cannot be a file name: NUL bytes or invalid characters."""
     try:
         if b"\0" not in os.fsencode(text):
             return
     except UnicodeEncodeError:
         pass
     raise DyngsError(
-        f"{format_one_line(text, _MAX_REASON)!r} holds a character that no name or path may hold; remove it"
+        f"{format_one_line(text, _MAX_REASON)!r} contains a character that is invalid in names and paths; remove it"
     )
 
 
 def require_regular_file(path: str | os.PathLike[str]) -> None:
-    """Nothing, if ``path`` is a file, a folder or not there: what reads a pipe or a device may
-    never end."""
+    """Raise DyngsError if ``path`` is a pipe or a device, which reading might never finish."""
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):
         return
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise DyngsError(
-            f"{os.fspath(path)}: is no file but a pipe, a device or the like; put a file there"
+            f"{os.fspath(path)}: not a regular file but a pipe or a device; use a file"
         )
 
 
 def describe_error(error: BaseException) -> str:
-    """Return the text of ``error`` on one short line of printable characters; its type where it
-    does not say much."""
+    """Return the message of ``error`` on one short line, with its type unless it is an OSError."""
     if isinstance(error, OSError) and error.strerror:
         where = f": {error.filename}" if error.filename is not None else ""
         text = f"{error.strerror}{where}"
@@ -107,14 +97,13 @@ def describe_error(error: BaseException) -> str:
 
 
 def quote_path(path: str | os.PathLike[str]) -> str:
-    """Return a path as a word of a command that can be copied to a shell, whatever characters it
-    holds."""
+    """Quote a path for a shell command."""
     text = os.fspath(path)
     return quote_word(f"./{text}" if text.startswith("-") else text)
 
 
 def quote_word(text: str) -> str:
-    """Return ``text`` as a word for a shell, with escapes ($'...') where stdout cannot show it."""
+    """Quote ``text`` for a shell command, as $'...' if stdout cannot show it."""
     encoding = getattr(sys.stdout, "encoding", None) or "ascii"
     if format_one_line(text) == text and text == text.encode(encoding, "replace").decode(
         encoding, "replace"
@@ -129,19 +118,18 @@ def quote_word(text: str) -> str:
 
 
 def format_count(number: int, noun: str) -> str:
-    """Return a number with what it counts, for people: "1 image", "1,200 images"."""
+    """Format a number with its noun: "1 image", "1,200 images"."""
     return f"{number:,} {noun}{'s' * (number != 1)}"
 
 
 def format_one_line(text: str, length: int | None = None) -> str:
-    """``text`` on one line, what a terminal would obey or cannot show as escapes, with ``...``
-    beyond ``length``."""
+    """Return ``text`` on one line with control characters escaped, shortened to ``length``."""
     shown = escape_control_characters(" ".join(text.split()))
     return shown if length is None or len(shown) <= length else f"{shown[: length - 3]}..."
 
 
 def log_info(text: str) -> None:
-    """Log lines as information, without anything that a terminal would obey."""
+    """Log lines as information, with control characters escaped."""
     LOGGER.info("\n".join(map(escape_control_characters, text.split("\n"))))
 
 
@@ -151,7 +139,7 @@ def log_warning(text: str) -> None:
 
 
 def escape_control_characters(line: str) -> str:
-    """Return a line with escapes for all that a terminal would obey or cannot show."""
+    """Escape the control and unprintable characters of a line."""
     return "".join(
         c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line
     )

@@ -1,5 +1,4 @@
-"""The set of Gaussians in the parametrisation that is optimised, edits of its topology, and its
-order in memory and in files."""
+"""Gaussians in the optimised parametrisation, topology edits, and Morton order."""
 
 from __future__ import annotations
 
@@ -60,30 +59,30 @@ class Gaussians:
 
     @staticmethod
     def stored(tensors: Mapping[str, Tensor]) -> Gaussians:
-        """Return the Gaussians stored in a file as tensors by field name.
+        """Restore Gaussians from the tensors of a file, by field name.
 
         Raises:
             KeyError: a tensor is missing.
-            ValueError: one is not finite float32, or a size; they do not fit together, or no degree
-                has so many terms.
+            ValueError: values that are not finite float32, invalid scales, mismatching shapes, or
+                an invalid number of SH coefficients.
         """
         found = Gaussians(**{f.name: tensors[f.name] for f in fields(Gaussians)})
         for name, x in found.tensors().items():
             require_tensor(name, x, x.shape)
         if bool((found.log_scales > LARGEST_LOG_SCALE).any()):
             raise ValueError(
-                f"'log_scales' holds sizes beyond e^{LARGEST_LOG_SCALE}, which no float32 can hold"
+                f"'log_scales' has values above {LARGEST_LOG_SCALE}, which overflow float32"
             )
         if found.sh.shape[1] not in [num_sh_terms(degree) for degree in range(MAX_SH_DEGREE + 1)]:
-            raise ValueError(f"'sh' has {found.sh.shape[1]} terms, which no degree has")
+            raise ValueError(f"'sh' has an invalid number of coefficients ({found.sh.shape[1]})")
         return found
 
     @staticmethod
     def isotropic(
         means: Tensor, log_scales: Tensor | float, logit: float, base: Tensor, num_terms: int
     ) -> Gaussians:
-        """Return balls at ``means`` (N, 3), of one size or (N, 1), with the harmonics ``base`` (N,
-        3) of degree 0 among ``num_terms``."""
+        """Create isotropic Gaussians at ``means`` (N, 3) with the given log scale(s), opacity logit,
+        and degree-0 SH coefficients ``base`` (N, 3); the other of the ``num_terms`` are zero."""
         count = len(means)
         sh = means.new_zeros(count, num_terms, 3)
         sh[:, 0] = base
@@ -93,7 +92,7 @@ class Gaussians:
 
     @staticmethod
     def joined(parts: Sequence[Gaussians]) -> Gaussians:
-        """Return the Gaussians of all parts, whose harmonics are of one degree."""
+        """Concatenate sets of Gaussians of the same SH degree."""
         tensors = [part.tensors() for part in parts]
         return Gaussians(**{name: torch.cat([x[name] for x in tensors]) for name in tensors[0]})
 
@@ -129,8 +128,7 @@ class Gaussians:
         return Gaussians(**{name: x[index] for name, x in self.tensors().items()})
 
     def picked(self, rows: Tensor) -> Gaussians:
-        """Return the Gaussians at ``rows`` (long); its gradient costs less than that of
-        ``select``."""
+        """Return the Gaussians at ``rows`` (long), with a faster backward pass than ``select``."""
         return Gaussians(**{name: x.index_select(0, rows) for name, x in self.tensors().items()})
 
     def apply_edit(self, edit: TopologyEdit) -> Gaussians:
@@ -140,8 +138,7 @@ class Gaussians:
     def to(
         self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> Gaussians:
-        """Return the same Gaussians on another device or in another precision; tensors that fit are
-        shared."""
+        """Return the Gaussians on another device or in another precision, without needless copies."""
         return Gaussians(
             **{name: x.to(device=device, dtype=dtype) for name, x in self.tensors().items()}
         )
@@ -157,10 +154,10 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class TopologyEdit:
-    """Rearrangement by a densification step of everything that is stored per Gaussian.
+    """Mapping of old to new rows by densification or pruning, applied to all per-Gaussian tensors.
 
-    Row ``i`` of the new set descends from row ``source[i]`` of the old one: clone, split, prune and
-    relocate are all ``x[source]``. Where ``is_new`` is set, optimizer moments start at zero.
+    Row ``i`` of the new set comes from row ``source[i]`` of the old set: clone, split, prune and
+    relocate are all ``x[source]``. Rows with ``is_new`` start with zero optimizer moments.
     """
 
     source: Tensor  # (N_new,) long indices into the old set
@@ -189,8 +186,7 @@ class TopologyEdit:
 
 MORTON_BITS = 20  # Bits per coordinate; 60 in all
 INNER, OUTLYING = 0.01, 64.0
-"""Quantile and multiple of the box: points farther out than so many of its sides count as its
-edge."""
+"""Outliers are clamped: points beyond ``OUTLYING`` sides of the box of the inner quantiles."""
 SPREADING = (
     (32, 0x001F00000000FFFF),
     (16, 0x001F0000FF0000FF),
@@ -198,12 +194,11 @@ SPREADING = (
     (4, 0x10C30C30C30C30C3),
     (2, 0x1249249249249249),
 )
-"""Shifts and masks that put two zeros before every bit of a number of up to 21 bits."""
+"""Shifts and masks that insert two zero bits between the bits of a 21-bit number."""
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:
-    """Return (N,) indices of ``points`` (N, 3) along a Z-order curve through their box (Morton
-    1966); ties by index."""
+    """Return (N,) indices that sort ``points`` (N, 3) in Morton order; ties by index."""
     if not len(points):
         return np.zeros(0, dtype=np.int64)
     places = points.astype(np.float64)
@@ -221,11 +216,11 @@ def morton_order(points: np.ndarray) -> np.ndarray:
 
 
 def storage_order(means: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return (N,) indices of ``means`` (N, 3): moving ones (``rows``, (M,)), then the others, both
-    in Morton order."""
-    still = np.ones(len(means), dtype=bool)
-    still[rows] = False
-    rest = np.flatnonzero(still)
+    """Return (N,) indices that sort ``means`` (N, 3): moving ``rows`` (M,) first, then the static
+    ones, both in Morton order."""
+    is_static = np.ones(len(means), dtype=bool)
+    is_static[rows] = False
+    static = np.flatnonzero(is_static)
     return np.concatenate(
-        [rows[morton_order(means[rows])], rest[morton_order(means[rest])]]
+        [rows[morton_order(means[rows])], static[morton_order(means[static])]]
     ).astype(np.int64)

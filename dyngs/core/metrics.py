@@ -1,9 +1,8 @@
-"""Image metrics: PSNR, SSIM, FLIP and LPIPS, with the conventions written out.
+"""Image metrics: PSNR, SSIM, FLIP and LPIPS.
 
-All functions take images (H, W, 3), display-referred sRGB, clamped here to [0, 1]; nothing is
-rounded to 8 bit. ``mask`` (H, W) holds weights in [0, 1], 1 = counts, 0 = ignore; a mask of zeros
-gives NaN. FLIP and LPIPS depend on optional packages: where one is missing, the result is a
-``MetricValue`` with the reason and no value. Nothing is ever downloaded.
+Images are (H, W, 3), display-referred sRGB, clamped to [0, 1] and not rounded to 8 bit. ``mask``
+(H, W) holds weights in [0, 1]; a mask of zeros gives NaN. FLIP and LPIPS need optional packages;
+without them the result is a ``MetricValue`` with a reason. Nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -21,8 +20,7 @@ from torch import Tensor
 LpipsNet = Literal["alex", "vgg", "squeeze"]
 
 MAX_PSNR = 100.0
-"""Reported for images that agree to a mean squared error of 1e-10 or better, so that no infinity
-enters a mean."""
+"""Upper bound of PSNR, dB, so that identical images do not give infinity."""
 
 _WINDOW, _SIGMA = 11, 1.5
 _C1 = 0.01**2
@@ -33,7 +31,7 @@ _FLIP_PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * math.pi / 180
 
 @dataclass(frozen=True)
 class MetricValue:
-    """A number, or None with the reason why there is none."""
+    """Value of a metric, or None with the reason."""
 
     value: float | None
     reason: str | None = None
@@ -60,9 +58,9 @@ def ssim(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
 def ssim_map(rendered: Tensor, truth: Tensor) -> Tensor:
     """Return (H, W, 3) structural similarity per pixel and channel; see ``ssim``.
 
-    By way of the difference d and the sum s, whose variances do not cancel where the images agree
-    or are white: with P = mean_a^2 + mean_b^2 + C1 and Q = var_a + var_b + C2 it is (1 - mean_d^2 /
-    P) (1 - var_d / Q).
+    Computed from the difference d and the sum s of the images, which avoids cancellation in equal
+    or white regions: (1 - mean_d^2 / P) (1 - var_d / Q) with P = mean_a^2 + mean_b^2 + C1 and
+    Q = var_a + var_b + C2.
     """
     a, b = (_clamped(x).permute(2, 0, 1)[:, None] for x in (rendered, truth))
     offsets = torch.arange(_WINDOW, dtype=a.dtype, device="cpu") - _WINDOW // 2
@@ -71,7 +69,7 @@ def ssim_map(rendered: Tensor, truth: Tensor) -> Tensor:
 
     def blur(x: Tensor) -> Tensor:
         for axis in (-1, -2):
-            # added up shift by shift: a sixth of the time of conv2d with one channel
+            # a sum of shifted images takes a sixth of the time of a one-channel conv2d
             shifts = [x.narrow(axis, k, x.shape[axis] - _WINDOW + 1) for k in range(_WINDOW)]
             x = shifts[0] * taps[0]
             for shift, tap in zip(shifts[1:], taps[1:], strict=True):
@@ -118,7 +116,7 @@ def flip(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> MetricV
 
 
 def fill_ignored_pixels(rendered: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
-    """Return (H, W, 3) the rendered image with ignored pixels replaced by the truth."""
+    """Return the rendered image (H, W, 3) with ignored pixels replaced by the ground truth."""
     return (
         rendered
         if mask is None
@@ -128,7 +126,7 @@ def fill_ignored_pixels(rendered: Tensor, truth: Tensor, mask: Tensor | None) ->
 
 @dataclass(frozen=True)
 class Lpips:
-    """LPIPS with one backbone, or the reason why it cannot be had here."""
+    """LPIPS with one backbone, or the reason why it is unavailable."""
 
     net: LpipsNet
     reason: str | None = None
@@ -152,10 +150,9 @@ class Lpips:
 
 
 def load_lpips(net: LpipsNet = "alex", device: torch.device | str = "cpu") -> Lpips:
-    """Return LPIPS on ``device`` from the package ``lpips``, only if the weights are already in
-    torch's cache.
+    """Load LPIPS on ``device`` from the package ``lpips``, if its weights are in torch's cache.
 
-    The package would download missing weights, hence the check before it is constructed.
+    The check prevents the package from downloading missing weights.
     """
     if find_spec("lpips") is None or find_spec("torchvision") is None:
         return Lpips(net, "the packages lpips and torchvision are not installed (dyngs[metrics])")
@@ -169,13 +166,12 @@ def load_lpips(net: LpipsNet = "alex", device: torch.device | str = "cpu") -> Lp
 
         return Lpips(net, None, LPIPS(net=net, verbose=False).eval().to(device))
     except Exception as error:
-        # whatever a third-party package raises is a reason, never a failed evaluation
+        # errors of a third-party package must not fail the evaluation
         return Lpips(net, f"lpips could not be set up: {' '.join(str(error).split())[:200]}")
 
 
 def _backbone_file(net: LpipsNet) -> Path:
-    """Return the path where torch looks for the ImageNet weights of ``net`` before it downloads
-    them."""
+    """Return the path of the ImageNet weights of ``net`` in torch's cache."""
     from torchvision import models  # pyright: ignore[reportMissingImports]
 
     weights = {
@@ -187,11 +183,8 @@ def _backbone_file(net: LpipsNet) -> Path:
 
 
 def _weighted_mean(values: Tensor, mask: Tensor | None) -> float:
-    """Return the mean of ``values`` (H, W, C) weighted with ``mask`` (H, W), in float64; NaN where
-    all weights are 0.
-
-    Of all numbers at once: a mean over three channels first takes torch several times as long.
-    """
+    """Return the mean of ``values`` (H, W, C) weighted by ``mask`` (H, W), in float64; NaN if all
+    weights are 0."""
     values = values.double()
     if mask is None:
         return values.mean().item()

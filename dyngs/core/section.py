@@ -1,5 +1,4 @@
-"""The base classes of all sections of the configuration, and ranges of numbers that several of them
-use."""
+"""Base classes of the configuration sections, and number ranges that several of them use."""
 
 from __future__ import annotations
 
@@ -18,12 +17,12 @@ CutOff = Annotated[float, Field(ge=1e-6, le=0.5)]
 
 
 def parse_digits(value: object) -> object:
-    """Return the number that a text of digits is, for choices between numbers."""
+    """Convert a text of digits to int, for ``Literal`` choices between integers."""
     return int(value) if isinstance(value, str) and value.isdecimal() else value
 
 
 class Section(BaseModel):
-    """Base of every section: immutable, unknown keys are errors."""
+    """Base class of all sections: immutable, unknown keys are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -44,55 +43,58 @@ class ModelSection(Section):
 
     @property
     def num_added_for_motion(self) -> int:
-        """Number of Gaussians that are added when motion begins."""
+        """Number of Gaussians added at the step where motion starts."""
         return 0
 
     @property
     def bytes_per_moving_gaussian(self) -> int:
-        """Bytes of memory of a Gaussian in training next to its own values, where it moves."""
+        """Additional training memory of a moving Gaussian, bytes."""
         return 0
 
     def size_key(self, count: int) -> tuple[str, float, float]:
-        """Return the key that limits the number of Gaussians, its value at ``count`` of them, and
-        the power of the number with which that goes."""
+        """Return the key that limits the number of Gaussians, its value for ``count`` Gaussians,
+        and the exponent with which the value grows with the number."""
         return "strategy.max_gaussians", count, 1.0
 
     def motion_start_step(self, steps: int) -> int | None:
-        """Return the last step without motion in a run of ``steps``; None: nothing moves."""
+        """Return the last static step in a run of ``steps``; None for a static model."""
         return None
 
 
 class SceneModel(ModelSection):
-    """Keys that all models of Gaussians share: how these are coloured and drawn."""
+    """Keys shared by all models of Gaussians: colour and rasterization."""
 
     sh_degree: int = Field(
         default=3,
         ge=0,
         le=4,
-        description="degree of the spherical harmonics of a colour; 0: the same from all sides",
+        description="degree of the spherical harmonics; 0: view-independent colours",
     )
     rasterize_mode: RasterizeMode = Field(
         default=RasterizeMode.CLASSIC,
-        description="classic: 3DGS; antialiased: opacity makes up for the low-pass filter (2D filter of Mip-Splatting)",
+        description="how the 2D low-pass filter treats opacity; classic: unchanged (3DGS); "
+        "antialiased: scaled to compensate for the filter (2D filter of Mip-Splatting)",
     )
     eps2d: float = Field(
         default=0.3,
         ge=0,
         le=3.4e38,
-        description="variance of the 2D low-pass filter, px^2; Mip-Splatting: 0.1 with antialiased",
+        description="variance of the 2D low-pass filter, px^2; Mip-Splatting uses 0.1 with antialiased",
     )
     filter_3d: bool = Field(
-        default=False, description="3D smoothing filter of Mip-Splatting (Yu et al. 2024)"
+        default=False,
+        description="whether to apply the 3D smoothing filter of Mip-Splatting (Yu et al. 2024)",
     )
     near: Length = Field(
         default="auto",
-        description="near plane, in the unit of the capture; auto: a fraction of the scene extent",
+        description="distance of the near plane, in the unit of the capture; "
+        "auto: a fraction of the scene extent",
     )
     alpha_min: CutOff = Field(
         default=1 / 255,
-        description="a pixel skips Gaussians with an alpha below this there; 1/255 in 3DGS",
+        description="alpha below which a Gaussian is not blended into a pixel; 3DGS: 1/255",
     )
     transmittance_min: CutOff = Field(
         default=1e-4,
-        description="blending of a pixel ends when its transmittance falls below this; 1e-4 in 3DGS",
+        description="transmittance below which blending of a pixel stops; 3DGS: 1e-4",
     )

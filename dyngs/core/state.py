@@ -1,5 +1,4 @@
-"""Named tensors with a role: what a scene, an optimizer or a strategy must keep to go on from where
-it is."""
+"""Named tensors with roles: the state of a scene, an optimizer or a strategy in a checkpoint."""
 
 from __future__ import annotations
 
@@ -14,13 +13,13 @@ from torch import Tensor
 
 
 class Role(Enum):
-    """Role of a tensor: the meaning of its rows, and whether only training needs it."""
+    """Role of a tensor: the meaning of its rows, or that it is needed for training only."""
 
     PER_GAUSSIAN = "per Gaussian"
     PER_MOVING = "per moving Gaussian"
     SHARED = "shared"
     TRAINING = "training only"
-    """Whatever its rows are, nothing is drawn from it."""
+    """Not needed for rendering."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +58,10 @@ def select_prefix(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tenso
 
 
 def move_to_device(value: T, device: torch.device | str) -> T:
-    """Return a copy of ``value`` with its tensors on ``device``: by its own ``to`` if it has one,
-    else by its parts."""
+    """Return a copy of ``value`` with all its tensors on ``device``.
+
+    Uses the ``to`` method of ``value`` if it has one, else recurses into fields and items.
+    """
     own: Any = value
     if hasattr(value, "to"):
         return own.to(device=device)
@@ -80,9 +81,9 @@ def move_fields_to(
     them.
 
     Args:
-        value: tensors, and parts with tensors.
-        device: None leaves everything where it is.
-        dtype: of the floating-point tensors among the fields; None leaves them as they are.
+        value: dataclass with tensors and nested values.
+        device: target device; None: unchanged.
+        dtype: dtype of floating-point tensors; None: unchanged.
     """
 
     def moved(x: Any) -> Any:

@@ -57,7 +57,8 @@ def read_seconds(root: Path) -> dict[str, float]:
     if not path.is_file():
         return {}
     with wrap_read_errors(
-        path, "it needs an object 'seconds' that maps image names to seconds; see docs/formats.md"
+        path,
+        "it needs an object 'seconds' that maps image names to seconds; see `dyngs docs captures`",
     ):
         seconds: Any = read_json_object(path)["seconds"]
         return {name: float(second) for name, second in seconds.items()}

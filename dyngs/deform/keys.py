@@ -131,7 +131,7 @@ class DynamicModel(SceneModel):
             discriminator="kind", description="deformation field that moves the canonical Gaussians"
         ),
     ] = HexplaneField()
-    choose: bool = Field(
+    pilot_runs: bool = Field(
         default=False,
         description="decide by short pilot runs, compared on held-out training views, whether to model motion "
         "(else the scene is trained as with the preset static) and, if not requested, the colour "

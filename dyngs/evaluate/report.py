@@ -126,7 +126,7 @@ def load_split_images(
     images = ImageLoader(views, run.config.data)
     corrections = load_camera_corrections(run_dir, run, capture.splits["train"])
     if corrections is not None:
-        images.corrected = lambda index, cameras: corrections.correct_cameras(
+        images.camera_correction = lambda index, cameras: corrections.correct_cameras(
             images.views[index], cameras
         )
     return images

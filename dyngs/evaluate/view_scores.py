@@ -98,7 +98,7 @@ class Regions:
 
     def moving(self, image: Image) -> Tensor | None:
         """Return the moving pixels (H, W) bool, or None if unknown."""
-        if image.moves is not None:
+        if image.motion_mask is not None:
             self._moving_from.add("motion masks")
             return image.motion_mask >= 0.5
         indices = self._cameras.get(image.name)

@@ -89,9 +89,7 @@ def camera_path_file(path: str) -> Path | None:
         return None
     if not path.endswith(".json"):
         names = ", ".join(AUTOMATIC_PATHS)
-        raise DyngsError(
-            f"unknown camera path {path!r}; use {names}, or a .json file (docs/camera_paths.md)"
-        )
+        raise DyngsError(f"unknown camera path {path!r}; use {names}, or a .json file")
     return Path(path)
 
 
@@ -117,10 +115,10 @@ def parse_times(text: str) -> tuple[float, ...]:
 def read_path(
     file: Path, world_offset: np.ndarray | None = None, size: tuple[int, int] | None = None
 ) -> CameraPath:
-    """Read a camera path from a JSON file (docs/camera_paths.md). Cameras are float32 on the CPU.
+    """Read a camera path from a JSON file (docs/reference/camera-paths.md).
 
-    The file uses the coordinates of the capture. The returned cameras are in the world shifted by
-    ``world_offset``.
+    The file uses the coordinates of the capture. The returned cameras are float32 on the CPU, in
+    the world shifted by ``world_offset``.
 
     Args:
         world_offset: (3,), see ``Capture.world_offset``.
@@ -174,7 +172,7 @@ def _as_document(found: Any, file: Path) -> tuple[dict[str, Any], tuple[str, ...
             "frames": [_convert_3dgs_frame(x, f"{file}: [{i}]") for i, x in enumerate(found)]
         }, ()
     if not isinstance(found, dict):
-        raise DyngsError(f"{file}: must be a JSON object; see docs/camera_paths.md")
+        raise DyngsError(f"{file}: must be a JSON object; see docs/reference/camera-paths.md")
     kind = str(found.get("camera_type", found.get("camera_model")))
     panoramic = ("fisheye", "equirectangular", "spherical", "omni", "vr180")
     if any(name in kind.lower() for name in panoramic):

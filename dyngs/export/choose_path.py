@@ -38,7 +38,7 @@ _RING = 24  # Cameras around a scene, one of which faces a person
 class PathOptions:
     """Cameras and times to render."""
 
-    # "orbit", "spiral", "along" (the training cameras), a JSON file (docs/camera_paths.md), or
+    # "orbit", "spiral", "along" (the training cameras), a JSON file, or
     # None for one fixed camera
     path: str | None = "orbit"
     # frames of an automatic path; None uses the frames of a motion, else 120

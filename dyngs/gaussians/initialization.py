@@ -223,7 +223,7 @@ def load_or_create_gaussians(run: StartContext) -> Gaussians:
     if run.first is not None:
         return run.first.gaussians
     config = run.config
-    start = InitialValues.for_strategy(run.asked.strategy)
+    start = InitialValues.for_strategy(run.uncapped.strategy)
     where = scene_geometry(run.capture)
     return initial_gaussians(where, config.init, start, config.stored_sh_degree, run.generator)
 

@@ -145,7 +145,7 @@ class StaticTraining(SceneTraining[StaticScene]):
 def _build_frozen_mask(run: StartContext) -> FrozenMask | None:
     init = run.config.init
     rows = None if run.first is None else run.first.frozen
-    return FrozenMask(rows, init.trains == "colour") if isinstance(init, SceneInit) else None
+    return FrozenMask(rows, init.trainable == "colour") if isinstance(init, SceneInit) else None
 
 
 def start(run: StartContext) -> GaussianModel:

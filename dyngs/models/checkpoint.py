@@ -1,4 +1,4 @@
-"""Checkpoints as values: the state of a training run, and the scene that it describes."""
+"""Checkpoints: the state of a training run, and the scene restored from it."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from dyngs.data.scene_space import change_coordinates
 from dyngs.models.kind import find_kind
 from dyngs.models.renderable import Renderable
 
-CONFIG_ADVICE = "was its config changed? Otherwise train anew"
-"""Advice where a checkpoint and its run do not fit together."""
+CONFIG_ADVICE = "was its config changed? Otherwise train again"
+"""Advice for a checkpoint that does not match the config of its run."""
 
 _MAX_STEP = 2**53
 _BACKGROUNDS = ("white", "black", "random")
@@ -37,12 +37,12 @@ _SETTINGS = (
     "train.robust",
     "train.exposure",
 )
-"""Keys of the configuration that decide what a checkpoint holds."""
+"""Configuration keys that determine the contents of a checkpoint."""
 
 
 def checkpoint_settings(config: Config) -> dict[str, Any]:
-    """Return the settings that decide what a checkpoint holds, by dotted key; None where a section
-    has no such key."""
+    """Return the settings that determine the contents of a checkpoint, by dotted key; None if a
+    section lacks the key."""
     found = {}
     for name in _SETTINGS:
         value: Any = config
@@ -60,13 +60,15 @@ class CheckpointInfo:
     extent: float  # of the scene, scene units
     world_offset: tuple[float, float, float]  # as ``Capture.world_offset``
     background: str  # resolved choice: "white", "black" or "random"
-    rasterize_mode: str  # how the Gaussians want to be drawn
+    rasterize_mode: str  # "classic" or "antialiased"
     world_scale: float = 1.0  # as ``Capture.world_scale``
 
 
 def parse_info(header: Mapping[str, Any]) -> CheckpointInfo:
-    """Return the metadata in the header of a file. Raises KeyError, ValueError, TypeError or
-    OverflowError."""
+    """Parse the metadata in a file header.
+
+    Raises KeyError, ValueError, TypeError or OverflowError for an invalid header.
+    """
     step, (x, y, z) = header["step"], (float(value) for value in header["world_offset"])
     extent = float(header["extent"])
     background = header["background"]
@@ -87,17 +89,16 @@ def parse_info(header: Mapping[str, Any]) -> CheckpointInfo:
 
 
 def read_run_capture(data: DataConfig, info: CheckpointInfo) -> Capture:
-    """Return the capture of a run in the scene coordinates that the run was trained in.
+    """Read the capture of a run in the scene coordinates that the run was trained in.
 
-    Those of ``read_capture`` may differ: the capture has changed since, or another version of dyngs
-    trained the run.
+    ``read_capture`` may give other coordinates if the capture or the version of dyngs has changed.
     """
     return change_coordinates(read_capture(data), info.world_scale, info.world_offset)
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Everything that a run needs to go on: named tensors and a few values."""
+    """State of a run from which training resumes: named tensors and metadata."""
 
     info: CheckpointInfo
     tensors: dict[str, Tensor]
@@ -111,8 +112,7 @@ class Checkpoint:
         return f"the checkpoint of step {self.info.step}" if self.path is None else str(self.path)
 
     def require_settings(self, config: Config) -> None:
-        """Raise where ``config`` has another value of a setting that decided what the checkpoint
-        holds."""
+        """Raise DyngsError if ``config`` differs in a setting of ``checkpoint_settings``."""
         for name, now in checkpoint_settings(config).items():
             before = self.settings.get(name, now)
             if before != now:
@@ -127,11 +127,9 @@ class Checkpoint:
 
 
 def restore_model(checkpoint: Checkpoint, model: ModelSection) -> Renderable:
-    """Return the scene of a checkpoint of ``model``.
+    """Restore the scene of a checkpoint of ``model``.
 
-    Raises:
-        DyngsError: a tensor is missing, or is not as the model or the other tensors have it; names
-            the file.
+    Raises DyngsError: a missing or invalid tensor.
     """
     with wrap_read_errors(checkpoint.name, CONFIG_ADVICE):
         try:

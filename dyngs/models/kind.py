@@ -46,12 +46,12 @@ C = TypeVar("C", bound="ModelKind")
 
 @dataclass(frozen=True)
 class StartContext:
-    """What a model begins with."""
+    """Inputs from which a kind builds its model before the first step."""
 
     config: Config
-    # the same without limits: a run may begin with more Gaussians than it may end with
-    asked: Config
-    capture: Capture  # that is trained on, with its first points
+    # config before limits are applied: a run may start with more Gaussians than it may end with
+    uncapped: Config
+    capture: Capture  # training capture with initial points
     images: ImageLoader
     background: str
     extent: float
@@ -64,9 +64,9 @@ class ModelKind(ABC):
     """A kind of model.
 
     Attributes:
-        section: class of its configuration.
-        uses: keys of other sections, and sections, that have an effect on it; where one of these is
-            given and not used, the run is refused. "init": it begins at the points of the capture.
+        section: class of its config section.
+        uses: keys of other sections, or whole sections, that affect this kind; a run that sets an
+            unused one is refused.
     """
 
     uses: ClassVar[frozenset[str]] = frozenset({"train.minutes", "train.batch_size"})
@@ -79,27 +79,24 @@ class ModelKind(ABC):
         return self.section.model_fields["kind"].default
 
     def refusal(self, capture: Capture) -> str | None:
-        """Return why it cannot be trained on ``capture``, to follow its folder and a colon; None:
-        it can."""
+        """Return why the kind cannot be trained on ``capture``; None if it can."""
         return None
 
     @abstractmethod
     def functions(self) -> tuple[Start, Restore]:
-        """Import the model; return the function that returns it before the first step, and the one
-        that returns the scene of a checkpoint (KeyError or ValueError: its tensors do not fit)."""
+        """Import the model; return the functions behind ``start`` and ``restore``."""
 
     def start(self, run: StartContext) -> Model[Any]:
         """Return the model before the first step."""
         return self.functions()[0](run)
 
     def restore(self, section: ModelSection, checkpoint: Checkpoint) -> Renderable:
-        """Return the scene of a checkpoint. Raises KeyError or ValueError where its tensors do not
-        fit."""
+        """Restore the scene of a checkpoint. Raises KeyError or ValueError for invalid tensors."""
         return self.functions()[1](section, checkpoint)
 
 
 class PredictsScenes(ModelKind):
-    """A network that predicts scenes from a few images, and is trained on several captures."""
+    """Capability: a network that predicts scenes from images, trained on several captures."""
 
     uses: ClassVar[frozenset[str]] = frozenset()
 
@@ -108,21 +105,20 @@ class PredictsScenes(ModelKind):
 
     def restore(self, section: ModelSection, checkpoint: Checkpoint) -> Renderable:
         raise DyngsError(
-            f"{checkpoint.name}: a network, not a scene; `dyngs predict RUN CAPTURE --out RUN` makes one"
+            f"{checkpoint.name}: a network, not a scene; use `dyngs predict RUN CAPTURE --out RUN`"
         )
 
     @abstractmethod
     def num_views(self, section: Any) -> int:
-        """Return the number of images that it usually predicts from."""
+        """Return the default number of source images."""
 
     @abstractmethod
     def networks(self) -> tuple[MakeLearner, MakePredictor]:
-        """Import the network; return the function that returns it in training before the first
-        step, and the one that returns it with the weights of a checkpoint and with a capture."""
+        """Import the network; return the factories of its learner and of its predictor."""
 
 
 class HasGaussians(ModelKind):
-    """Made of Gaussians, which a strategy adds and limits remove."""
+    """Capability: made of Gaussians, with densification, pruning and limits."""
 
     uses: ClassVar[frozenset[str]] = ModelKind.uses | {
         "init",
@@ -136,36 +132,35 @@ class HasGaussians(ModelKind):
         "prune.mask_times",
     }
     speeds_up_short_runs: ClassVar[bool] = False
-    """Learning rates are higher in shorter runs, see ``optim.rate_factor``."""
+    """Whether shorter runs use higher learning rates, see ``optim.rate_factor``."""
 
     def with_added_gaussians(self, section: SceneModel, most: int) -> SceneModel:
-        """Return the section with at most ``most`` Gaussians added beside the strategy."""
+        """Return the section with at most ``most`` Gaussians added outside of the strategy."""
         return section
 
 
 class HasSizeLimit(HasGaussians):
-    """The size of its file follows from the number of its Gaussians."""
+    """Capability: the file size follows from the number of Gaussians."""
 
     def num_shared(self, section: Any, num_times: int, num_moving: int = 0) -> int:
-        """Return the number of values that it learns next to those of its Gaussians."""
+        """Return the number of learned values that are not per Gaussian."""
         return 0
 
 
 class HasMotion(ModelKind):
-    """Moves over the times of the capture, after a while as a static model."""
+    """Capability: moves over time, after a static first phase of training."""
 
 
 class HasSchedules(ModelKind):
-    """A kind whose section has schedules that depend on the length of the run."""
+    """Capability: the section has schedules that depend on the length of the run."""
 
     @abstractmethod
     def extend_schedules(self, section: Any, length: LengthChange) -> ModelSection:
-        """Return the section for a run that goes on to another length. Raises DyngsError: it
-        cannot."""
+        """Return the section for an extended run. Raises DyngsError if it cannot be extended."""
 
 
 class HasBody(ModelKind):
-    """A person, whose body is found and fitted in place of camera poses, and plays motions."""
+    """Capability: a person, whose body is detected, fitted and animated."""
 
     @abstractmethod
     def find_body(
@@ -175,30 +170,27 @@ class HasBody(ModelKind):
         log: Callable[[str], None],
         report: ProgressCallback,
     ) -> DataConfig:
-        """Return the options of a capture with body parameters: found, and fitted to the
-        silhouettes."""
+        """Detect and fit the body if the capture has no body parameters; return its data config."""
 
     @abstractmethod
     def play_motion(
         self, section: Any, scene: Posable, info: CheckpointInfo, path: Path, *, keep_feet: bool
     ) -> PlayedMotion:
-        """Return a person in the motion of a file (AMASS, SMPL-X, BVH, glTF or VRM animation).
+        """Animate a person by a motion file (AMASS, SMPL-X, BVH, glTF or VRM animation).
 
-        A file with ``scale`` is a fit to this person in the world of the capture; any other motion
-        is adapted to the size, position and up direction of the person. With ``keep_feet`` the root
-        moves so that feet on the floor stay where they are; a note says by how much they slide
-        before and after. Raises DyngsError: the file cannot be read.
+        Motions are adapted to the size, position and up direction of the person, except files with
+        ``scale``, which are fits in the world of the capture. ``keep_feet`` adjusts the root
+        position so that feet on the floor do not slide. Raises DyngsError: an unreadable file.
         """
 
     @abstractmethod
     def read_person(self, path: Path) -> tuple[SceneModel, Posable, CheckpointInfo]:
-        """Return the person of an avatar file, with its section and its metadata. Raises
-        DyngsError."""
+        """Load an avatar file: config section, person and metadata. Raises DyngsError."""
 
 
 @dataclass(frozen=True)
 class PlayedMotion:
-    """A person who plays the motion of a file."""
+    """A person animated by a motion file."""
 
     scene: Posable
     fps: float
@@ -206,11 +198,11 @@ class PlayedMotion:
 
 
 def find_kind(section: ModelSection) -> ModelKind:
-    """Return the kind of a section of the configuration."""
+    """Return the kind of a section ``model``."""
     return cast(ModelKind, installed_kind(section.kind))
 
 
 def capability(section: ModelSection, wanted: type[C]) -> C | None:
-    """Return the kind of a section if it has a capability, else None."""
+    """Return the kind of a section if it has the capability ``wanted``, else None."""
     kind = find_kind(section)
     return kind if isinstance(kind, wanted) else None

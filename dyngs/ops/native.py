@@ -1,7 +1,7 @@
 """Loading of the compiled kernels for the CPU and CUDA, thread counts, and passing of tensors.
 
 There is one module per x86-64 level; the newest that the processor supports is imported.
-``DYNGS_ISA=v2|v3|v4`` selects an older one for tests. The CUDA module (docs/gpu.md) is imported
+``DYNGS_ISA=v2|v3|v4`` selects an older one for tests. The CUDA module (docs/guides/gpu.md) is imported
 for the first tensor on a GPU.
 """
 

@@ -1,5 +1,4 @@
-"""Record of the capture that a run is trained on. A resumed run compares it with the capture
-there."""
+"""Record of the capture that a run was trained on, checked when the run is resumed."""
 
 from __future__ import annotations
 
@@ -17,14 +16,14 @@ from dyngs.io.fields import first_few, read_limited
 from dyngs.io.write import write_text
 
 RECORD_NAME = "capture.json"
-"""In a run folder: the cameras of the training views."""
+"""File in a run folder with the cameras of the training views."""
 TOLERANCE = 1e-6
-"""Largest change of a number that is a rounding error; of positions in extents of all positions."""
+"""Largest difference that counts as rounding error; positions are relative to the camera extent."""
 _CENTRE = slice(3, 6)
 
 
 def write_record(folder: Path, data: DataConfig, capture: Capture | None) -> None:
-    """Write the record of a run that begins; ``capture`` None: of a network, trained on people."""
+    """Write the record of a new run; ``capture`` is None for networks trained on many captures."""
     write_text(folder / RECORD_NAME, json.dumps({"views": _views(data, capture)}) + "\n")
 
 
@@ -38,17 +37,17 @@ def require_same_capture(folder: Path, data: DataConfig, capture: Capture | None
     try:
         change = _change(json.loads(read_limited(path))["views"], now)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        # of an earlier version, or damaged
+        # written by an earlier version, or damaged
         return
     if change is not None:
         raise DyngsError(
             f"{data.root}: not the capture that the run was trained on ({change}); restore it, or "
-            f"train anew with another run.dir; to go on all the same remove {path}"
+            f"train a new run with another run.dir; to continue anyway, delete {path}"
         )
 
 
 def _change(before: dict[str, list[float]], now: dict[str, list[float]]) -> str | None:
-    """Return what differs between the views of two records; None where nothing does."""
+    """Describe the difference between the views of two records; None if they are equal."""
     if before.keys() != now.keys():
         return f"other training views, such as {first_few(sorted(before.keys() ^ now.keys()))}"
     extent = np.ptp([row[_CENTRE] for row in before.values()], axis=0).max(initial=0.0)
@@ -57,7 +56,7 @@ def _change(before: dict[str, list[float]], now: dict[str, list[float]]) -> str 
 
 
 def _is_close(one: list[float], other: list[float], extent: float) -> bool:
-    """Return whether the numbers of two views differ by no more than rounding errors."""
+    """Return whether the numbers of two views are equal within rounding errors."""
     tolerance = np.full(len(one), TOLERANCE)
     tolerance[_CENTRE] *= extent
     return len(one) == len(other) and np.allclose(one, other, rtol=1e-9, atol=tolerance)
@@ -74,7 +73,7 @@ def _numbers(view: View, capture: Capture) -> list[float]:
     centre = capture.world_scale * camera_center(view.cam_from_world) + capture.world_offset
     rotation = view.cam_from_world[:3, :3]
     size = (view.width, view.height, -1.0 if view.time is None else view.time)
-    # Earlier versions had another number there, which was 1.
+    # Earlier versions stored another parameter here, which was always 1.
     lens = (*view.lens.params, 1.0)
     return np.concatenate(
         [size, centre, rotation.ravel(), view.intrinsics[:2].ravel(), lens]

@@ -38,7 +38,7 @@ _KIND = FileKind("dyngs", "a checkpoint", 1)
 
 @dataclass(frozen=True)
 class LoadedRun:
-    """A trained model, ready to be drawn; ``seconds_train`` is 0 where ``timing.json`` is lost."""
+    """A trained model ready for rendering; ``seconds_train`` is 0 without ``timing.json``."""
 
     config: Config
     renderable: Renderable
@@ -48,7 +48,7 @@ class LoadedRun:
 
     @property
     def scene(self) -> GaussianScene:
-        """Its scene of Gaussians. Raises DyngsError: it is made of something else."""
+        """The scene of Gaussians. Raises DyngsError for other kinds of model."""
         return require_gaussians(self.renderable, f"a run of model.kind={self.config.model.kind}")
 
 
@@ -65,16 +65,15 @@ def remove_old_checkpoints(run_dir: Path) -> None:
 
 
 def checkpoint_step(path: Path) -> int:
-    """Return the number of steps done, from the name of a checkpoint."""
+    """Return the step of a checkpoint, from its file name."""
     return int(path.stem.removeprefix("step_"))
 
 
 def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float) -> Path:
-    """Write a checkpoint atomically, remove all but the newest ``KEEP_CHECKPOINTS``, and return its
+    """Write a checkpoint atomically, remove all but the newest ``KEEP_CHECKPOINTS``, return its
     path.
 
-    Raises DyngsError: a model with values that are not finite (earlier checkpoints stay), a full
-    disk, and the like.
+    Raises DyngsError: non-finite values in the model (earlier checkpoints are kept), a full disk.
     """
     tensors = {name: x.detach().contiguous() for name, x in checkpoint.tensors.items()}
     for name, x in tensors.items():
@@ -85,8 +84,7 @@ def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float)
                 f"{run_dir}: {field} is not finite after step {step}; not saved. {describe_last_checkpoint(run_dir)}"
             )
     path = run_dir / "checkpoints" / f"step_{checkpoint.info.step:07d}.safetensors"
-    # Its time first: a checkpoint whose time is lost by a kill between the two would go on as if it
-    # had taken none.
+    # The time is written first: if the process is killed in between, no checkpoint lacks its time.
     _write_seconds(run_dir, checkpoint.info.step, seconds_train)
     header = asdict(checkpoint.info) | {"settings": checkpoint.settings}
     write_tensors(path, _KIND, tensors, header, ", then `dyngs train --resume`")
@@ -95,36 +93,36 @@ def save_checkpoint(run_dir: Path, checkpoint: Checkpoint, seconds_train: float)
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Return the checkpoint in ``path``. Raises DyngsError, which names an older one if there
-    is."""
+    """Load the checkpoint ``path``. Raises DyngsError, which names an older checkpoint if any."""
     header, tensors = read_tensors(path, _KIND, _instead_of(path))
     with wrap_read_errors(path, _instead_of(path).removeprefix("; ")):
         return Checkpoint(parse_info(header), tensors, path, dict(header.get("settings", {})))
 
 
 def latest_checkpoint(run_dir: Path) -> Checkpoint:
-    """Return the newest checkpoint of a run, also while it trains. Raises DyngsError for none or a
-    damaged one."""
+    """Load the newest checkpoint of a run, even during training.
+
+    Raises DyngsError: no checkpoint, or a damaged one.
+    """
     while True:
         paths = checkpoint_paths(run_dir)
         if not paths:
-            raise DyngsError(
-                f"{run_dir}: no checkpoints there; give the folder of a run that has trained"
-            )
+            raise DyngsError(f"{run_dir}: no checkpoints found; give the folder of a trained run")
         try:
             return load_checkpoint(paths[-1])
         except DyngsError:
-            if os.path.lexists(paths[-1]):  # also a link to nothing
-                raise  # otherwise its run has saved twice since it was found
+            if os.path.lexists(paths[-1]):  # including broken links
+                raise  # otherwise the run has replaced it by a newer checkpoint
 
 
 def load_run(run_dir: Path, data_root: Path | None = None) -> LoadedRun:
-    """Return the model of a run folder at its newest checkpoint, or of its .dyngs file if it has
-    none."""
+    """Load the model of a run from its newest checkpoint, or from its .dyngs file without
+    checkpoints."""
     config = load_resolved(run_dir, data_root=data_root)
     if capability(config.model, PredictsScenes) is not None:
         raise DyngsError(
-            f"{run_dir}: a network, not a scene; `dyngs predict {quote_path(run_dir)} CAPTURE --out RUN` makes one"
+            f"{run_dir}: a network, not a scene; "
+            f"predict a scene with `dyngs predict {quote_path(run_dir)} CAPTURE --out RUN`"
         )
     checkpoint = (
         replace(read_scene(run_dir / SCENE_FILE), path=run_dir / SCENE_FILE)
@@ -138,20 +136,18 @@ def load_run(run_dir: Path, data_root: Path | None = None) -> LoadedRun:
 
 
 def has_only_scene_file(run_dir: Path) -> bool:
-    """Return whether the run is only there as the file that ``dyngs export --format dyngs``
-    writes."""
+    """Return whether the folder has a ``scene.dyngs`` but no checkpoints."""
     return (run_dir / SCENE_FILE).is_file() and not checkpoint_paths(run_dir)
 
 
 def describe_last_checkpoint(run_dir: Path) -> str:
-    """Return a sentence that names the newest checkpoint, or says that there is none."""
+    """Return a sentence that names the newest checkpoint, if any."""
     paths = checkpoint_paths(run_dir)
     return f"The last good checkpoint is {paths[-1]}" if paths else "There is no checkpoint yet"
 
 
 def seconds_at(run_dir: Path, step: int) -> float:
-    """Return the training time up to the checkpoint of ``step``, over all resumes; 0 where it is
-    not known."""
+    """Return the total training time up to the checkpoint of ``step``, seconds; 0 if unknown."""
     return _read_seconds(run_dir).get(str(step), 0.0)
 
 
@@ -162,7 +158,7 @@ def _read_seconds(run_dir: Path) -> dict[str, float]:
             str(int(step)): float(seconds) for step, seconds in stored["seconds_train"].items()
         }
         return {step: seconds for step, seconds in known.items() if math.isfinite(seconds)}
-    except Exception:  # a lost or damaged file costs no more than the times
+    except Exception:  # a missing or damaged file only loses the times
         return {}
 
 
@@ -173,12 +169,12 @@ def _write_seconds(run_dir: Path, step: int, seconds: float) -> None:
 
 
 def _instead_of(path: Path) -> str:
-    """Return the end of a message on what to do about a damaged checkpoint."""
+    """Return the advice about a damaged checkpoint, as the end of a message."""
     older = [
         p
         for p in checkpoint_paths(path.parent.parent)
         if checkpoint_step(p) < checkpoint_step(path)
     ]
     if older:
-        return f"; delete it to go on from the previous one, {older[-1].name}"
-    return "; there is no older one, train anew"
+        return f"; delete it to continue from the previous one, {older[-1].name}"
+    return "; there is no older checkpoint, train again"

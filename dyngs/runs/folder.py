@@ -1,8 +1,5 @@
-"""Contents of a run folder.
-
-Its configuration with the fitted body that it names, checks before a new run begins, removal of
-unfinished files of killed processes, the files that a command reads, and the frame that `dyngs edit`
-gave it.
+"""Contents of a run folder: configuration with a copy of the fitted body, checks before a new run,
+clean-up after killed processes, list of input files, and the coordinate frame set by ``dyngs edit``.
 """
 
 from __future__ import annotations
@@ -39,18 +36,16 @@ from dyngs.runs.checkpoint import (
 )
 
 BODY_FOLDER = "body"
-"""In a run folder: the fit that ``data.body`` named when the run began."""
+"""Copy of the fit ``data.body`` in a run folder."""
 _PARAMETERS = ("body_train.npz", "body_pose.npz")
 _KEPT = (*_PARAMETERS, "fit_report.json")
-"""Files of a fit that are kept; images are not."""
+"""Files of a fit that are copied; images are not."""
 
 
 def write_config(config: Config, folder: Path) -> None:
-    """Write the configuration of the run in ``folder``, with a copy of the fit that ``data.body``
-    names.
+    """Write the configuration of the run in ``folder``, with a copy of the fit ``data.body``.
 
-    The fit is copied once: where the folder has one it is the run's. Where the fit is gone, as that
-    of a run of former versions may be, its path stays as it is.
+    An existing copy is kept. If the fit no longer exists, its path is stored unchanged.
     """
     body = config.data.body
     own = folder.absolute() / BODY_FOLDER
@@ -62,7 +57,7 @@ def write_config(config: Config, folder: Path) -> None:
 
 
 def share_body_path(config: Config, stored: Config) -> Config:
-    """Return ``config`` with the path of the fit of ``stored``, where both have the same."""
+    """Return ``config`` with ``data.body`` of ``stored`` if both fits are equal."""
     return (
         _with_body(config, stored.data.body)
         if is_same_body(config.data.body, stored.data.body)
@@ -71,8 +66,7 @@ def share_body_path(config: Config, stored: Config) -> Config:
 
 
 def is_same_body(one: Path | None, other: Path | None) -> bool:
-    """Return whether two values of ``data.body`` give the same body parameters, wherever they
-    lie."""
+    """Return whether two values of ``data.body`` have the same body parameters."""
     if one == other or one is None or other is None:
         return one == other
     return (one / _PARAMETERS[0]).is_file() and all(
@@ -85,7 +79,7 @@ def _with_body(config: Config, body: Path | None) -> Config:
 
 
 def _copy_fit(body: Path, own: Path) -> None:
-    """Copy a fit to the new folder ``own``, which appears complete or not at all."""
+    """Copy a fit to the new folder ``own``, atomically."""
     started = temporary_folder_beside(own)
     try:
         for name in _KEPT:
@@ -107,12 +101,11 @@ def _content(path: Path) -> bytes | None:
 
 LOG_NAME = "log.jsonl"
 EXPORT_FOLDER = "export"
-"""In a run folder: the run as one .dyngs file of at most ``budget.max_mb``."""
+"""Folder of the exported .dyngs file of at most ``budget.max_mb`` in a run folder."""
 CHOICES_NAME = "choices.json"
-"""In a run folder: what small runs before it said."""
+"""Results of the pilot runs in a run folder."""
 REQUESTED_NAME = "asked.yaml"
-"""In a run folder: the configuration as it was asked for, where training has chosen something else
-(config.yaml)."""
+"""Requested configuration in a run folder, if it differs from the resolved one (config.yaml)."""
 _BEGUN = (
     RESOLVED_NAME,
     REQUESTED_NAME,
@@ -122,41 +115,37 @@ _BEGUN = (
     RECORD_NAME,
     BODY_FOLDER,
 )
-"""Files that a run stopped before its first checkpoint may have written."""
+"""Files of a run that was stopped before its first checkpoint."""
 
 
 def default_run_dir(name: str) -> Path:
-    """Return the run folder of a run that has only a name."""
+    """Return the default run folder, ``runs/NAME``."""
     parts = Path(name).parts
     if not parts or ".." in parts or Path(name).is_absolute():
         raise DyngsError(
-            f"run.name={name!r}: must name a folder below runs; for another place give run.dir=FOLDER"
+            f"run.name={name!r}: must name a folder below runs; for another place use run.dir=FOLDER"
         )
     return Path("runs", name)
 
 
 def require_empty(folder: Path) -> None:
-    """Raise unless ``folder`` does not exist or is empty; a lock file whose owner was killed is
-    removed."""
+    """Raise DyngsError unless ``folder`` does not exist or is empty; removes a stale lock file."""
     if (
         folder.is_dir()
         and not folder.is_symlink()
         and [path.name for path in folder.iterdir()] == [LOCK_NAME]
     ):
-        with lock_folder(folder):  # it removes the file at its end
+        with lock_folder(folder):  # removes the stale lock file at its end
             pass
     if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
-        raise DyngsError(f"{folder}: exists already; give another --out")
+        raise DyngsError(f"{folder}: exists already; use another --out")
     if folder.exists() and not os.access(folder, os.W_OK):
-        raise DyngsError(
-            f"{folder}: cannot be written; give another --out or change its permissions"
-        )
+        raise DyngsError(f"{folder}: not writable; use another --out or change its permissions")
 
 
 @contextmanager
 def open_export_folder(out: Path, run_dir: Path, config: Config) -> Iterator[Path]:
-    """Yield the folder to write the stored scene and configuration of a run to: ``out``, or one
-    that becomes it."""
+    """Yield the folder to export a run to: ``out``, or a temporary folder that replaces it."""
     if not out.exists():
         with atomic_folder(out, require_empty) as started:
             yield started
@@ -168,8 +157,7 @@ def open_export_folder(out: Path, run_dir: Path, config: Config) -> Iterator[Pat
 
 
 def _require_export_of(config: Config, folder: Path) -> None:
-    """Raise unless a run can be exported to ``folder``: no run is there, or a former export of the
-    same one."""
+    """Raise DyngsError if ``folder`` has another run; an earlier export of the same run is fine."""
     found = _found(folder)
     if not found and not checkpoint_paths(folder):
         return
@@ -178,56 +166,52 @@ def _require_export_of(config: Config, folder: Path) -> None:
     except DyngsError:
         same = False
     if not same or checkpoint_paths(folder):
-        raise DyngsError(
-            f"{folder}: holds another run, which an export would replace; give another --out"
-        )
+        raise DyngsError(f"{folder}: contains another run; use another --out")
 
 
 def require_startable(folder: Path, config: Config) -> None:
-    """Raise unless the run of ``config`` would replace nothing in ``folder`` but what the same run
-    has only begun."""
+    """Raise DyngsError if ``folder`` has files of another run, or checkpoints of this run."""
     begun = _config_of_begun(folder)
     paths = checkpoint_paths(folder)
     found = _found(folder)
     go_on = f"`dyngs train --resume {quote_path(folder)}`, or give another run.dir"
     if paths:
         raise DyngsError(
-            f"{folder} already holds a run, stopped after step {checkpoint_step(paths[-1]):,}; go on with {go_on}"
+            f"{folder} already contains a run, stopped after step {checkpoint_step(paths[-1]):,}; "
+            f"continue with {go_on}"
         )
     if begun is not None:
-        if not (_is_same_run(begun, config) or _is_as_asked(folder, config)):
+        if not (_is_same_run(begun, config) or _matches_request(folder, config)):
             raise DyngsError(
-                f"{folder} already holds another run, stopped before its first checkpoint; "
-                f"begin that again with {go_on}"
+                f"{folder} already contains another run, stopped before its first checkpoint; "
+                f"restart it with {go_on}"
             )
     elif found:
         raise DyngsError(
-            f"{folder} already holds {found[0]}, which a new run would replace; give another run.dir"
+            f"{folder} already contains {found[0]}, which a new run would replace; use another run.dir"
         )
 
 
 def is_finished(folder: Path, config: Config) -> bool:
-    """Return whether ``folder`` holds the finished run of just this configuration, as it was asked
-    for."""
+    """Return whether ``folder`` has the finished run of this requested configuration."""
     paths = checkpoint_paths(folder)
-    if not paths or not _is_as_asked(folder, config):
+    if not paths or not _matches_request(folder, config):
         return False
     return checkpoint_step(paths[-1]) >= load_resolved(folder).total_steps
 
 
-def write_requested_config(folder: Path, asked: Config) -> None:
-    """Write the configuration that was requested next to that of the run, if the two differ."""
+def write_requested_config(folder: Path, requested: Config) -> None:
+    """Write the requested configuration if it differs from the resolved one."""
     path = folder / REQUESTED_NAME
     stored = load_resolved(folder)
-    if _is_same_run(stored, asked):
+    if _is_same_run(stored, requested):
         path.unlink(missing_ok=True)
     else:
-        save_config(share_body_path(asked, stored), path)
+        save_config(share_body_path(requested, stored), path)
 
 
 def update_data_root(folder: Path, data: DataConfig) -> None:
-    """Write into the configuration of a run where its capture lies by now; it must be the same
-    capture."""
+    """Store the new folder of a moved capture in the configuration of a run, after checking it."""
     for path in (folder / RESOLVED_NAME, folder / REQUESTED_NAME):
         stored = load_resolved(path) if path.is_file() else None
         if stored is not None and stored.data.root != data.root:
@@ -243,36 +227,34 @@ def update_data_root(folder: Path, data: DataConfig) -> None:
 
 
 def load_requested_config(folder: Path) -> Config:
-    """Return the configuration of a run as it was asked for."""
+    """Load the requested configuration of a run."""
     path = folder / REQUESTED_NAME
     return load_resolved(path if path.is_file() else folder)
 
 
-def _is_as_asked(folder: Path, config: Config) -> bool:
+def _matches_request(folder: Path, config: Config) -> bool:
     try:
         return _is_same_run(load_requested_config(folder), config)
-    except DyngsError:  # a file of that name, but not of a run
+    except DyngsError:  # a file of that name that is not of a run
         return False
 
 
 def is_stopped_before_checkpoint(folder: Path) -> bool:
-    """Return whether a run began in ``folder`` and was stopped before its first checkpoint."""
+    """Return whether ``folder`` has a run that was stopped before its first checkpoint."""
     return _config_of_begun(folder) is not None
 
 
 def write_new_config(folder: Path, config: Config) -> None:
-    """Write the configuration of a run, unless the same one is there already."""
+    """Write the configuration of a new run, unless ``folder`` has it already."""
     begun = _config_of_begun(folder)
     if begun is None or not _is_same_run(begun, config):
         write_config(config, folder)
 
 
 def remove_partial_files(folder: Path, *, sole_writer: bool) -> None:
-    """Remove what killed processes left half written in a run folder; its owner calls this before
-    it writes.
+    """Remove partially written files of killed processes from a run folder.
 
-    ``sole_writer``: no other process writes into it, so that checkpoints that nobody goes on
-    writing can be told.
+    With ``sole_writer`` no other process writes to the folder, so all temporary files are stale.
     """
     remove_leftovers(folder, _BEGUN.__contains__ if sole_writer else None)
     for inner in (folder / "checkpoints", folder / EXPORT_FOLDER):
@@ -281,8 +263,7 @@ def remove_partial_files(folder: Path, *, sole_writer: bool) -> None:
 
 
 def _found(folder: Path) -> list[str]:
-    """Return the names in ``folder`` that a run writes, whatever lies there under them; those of a
-    begun run last."""
+    """Return the names of existing files of a run in ``folder``, those of ``_BEGUN`` last."""
     metrics = sorted(path.name for path in folder.glob("metrics*.json"))
     names = [SCENE_FILE, EXPORT_FOLDER, *metrics, *_BEGUN]
     found = [name for name in names if (folder / name).exists() or (folder / name).is_symlink()]
@@ -292,8 +273,8 @@ def _found(folder: Path) -> list[str]:
 
 
 def _config_of_begun(folder: Path) -> Config | None:
-    """Return the configuration of a run stopped before its first checkpoint; None where there is no
-    such run."""
+    """Return the configuration of a run stopped before its first checkpoint; None if there is
+    none."""
     found = _found(folder)
     if (
         RESOLVED_NAME not in found
@@ -303,17 +284,17 @@ def _config_of_begun(folder: Path) -> Config | None:
         return None
     try:
         return load_resolved(folder)
-    except DyngsError:  # a file of that name, but not of a run
+    except DyngsError:  # a file of that name that is not of a run
         return None
 
 
 def _is_same_run(one: Config, other: Config) -> bool:
-    """Return whether two runs have the same bytes, whatever they are called, wherever they are, by
-    how many threads."""
-    return _what_counts(one) == _what_counts(share_body_path(other, one))
+    """Return whether two configurations give the same result; names, folders and threads are
+    ignored."""
+    return _relevant_config(one) == _relevant_config(share_body_path(other, one))
 
 
-def _what_counts(config: Config) -> Config:
+def _relevant_config(config: Config) -> Config:
     data = config.data.model_copy(update={"follow_links": False})
     return config.model_copy(update={"run": RunConfig(seed=config.run.seed), "data": data})
 
@@ -322,29 +303,28 @@ Read = Path | BaseModel | LoadedRun | Capture | None
 
 
 def collect_inputs(*read: Read) -> Inputs:
-    """Return what is read of files, folders, runs, configurations and captures, with all that these
-    name.
+    """Collect the input files of a command, including those that runs and configurations refer to.
 
-    Of a run, its folder or its ``scene.dyngs``, these are its own files and what its configuration
-    names: other files in its folder are outputs.
+    For a run these are its own files and the paths in its configuration; other files in its folder
+    are outputs.
     """
-    return Inputs(path for one in read for path in _named_by(one))
+    return Inputs(path for one in read for path in _input_paths(one))
 
 
-def _named_by(one: Read) -> Iterator[Path]:
+def _input_paths(one: Read) -> Iterator[Path]:
     match one:
         case Path() if (one / RESOLVED_NAME).is_file():
             yield from _files_of_run(one)
-            with suppress(DyngsError):  # the command that reads it refuses it
-                yield from _named_by(load_resolved(one))
+            with suppress(DyngsError):  # reported by the command that reads it
+                yield from _input_paths(load_resolved(one))
         case Path():
             yield one
             if one.name == SCENE_FILE and (one.parent / RESOLVED_NAME).is_file():
-                yield from _named_by(one.parent)
+                yield from _input_paths(one.parent)
         case LoadedRun():
             if one.config.run.dir is not None and (one.config.run.dir / RESOLVED_NAME).is_file():
                 yield from _files_of_run(one.config.run.dir)
-            yield from _named_by(one.config)
+            yield from _input_paths(one.config)
         case Capture():
             yield one.root
         case RunConfig():
@@ -352,7 +332,7 @@ def _named_by(one: Read) -> Iterator[Path]:
         case BaseModel():
             for name in type(one).model_fields:
                 value = getattr(one, name)
-                yield from _named_by(value) if isinstance(value, Path | BaseModel) else ()
+                yield from _input_paths(value) if isinstance(value, Path | BaseModel) else ()
 
 
 def _files_of_run(run_dir: Path) -> Iterator[Path]:
@@ -372,13 +352,13 @@ _MOST_BYTES = 4096
 
 @dataclass(frozen=True)
 class RunFrame:
-    """The frame that people mean when they speak of a run that was edited.
+    """User-defined coordinate frame of a run, set by ``dyngs edit``.
 
     Attributes:
-        similarity: from the coordinates of training to those of the frame, less ``offset``.
-        offset: (3,) in the frame, for coordinates that are too large for float32.
-        up: axis of the frame that is up, such as "z"; None: nothing says.
-        fixed: exports keep the axes, as those of control points.
+        similarity: transform from training coordinates to the frame, without ``offset``.
+        offset: (3,) added in the frame, for coordinates that are too large for float32.
+        up: up axis of the frame, such as "z"; None: unknown.
+        fixed: whether exports keep the axes, as for control points.
     """
 
     similarity: Similarity = IDENTITY
@@ -396,21 +376,21 @@ def write_frame(folder: Path, frame: RunFrame) -> None:
 
 
 def read_frame(folder: Path) -> RunFrame | None:
-    """Return the frame of the run in ``folder``, None where it was not edited. Raises DyngsError:
-    it is damaged."""
+    """Return the coordinate frame of the run in ``folder``; None if it was not edited.
+
+    Raises DyngsError: a damaged file.
+    """
     path = folder / FRAME_NAME
     if not path.exists():
         return None
     try:
-        told = json.loads(read_limited(path, _MOST_BYTES))
-        similarity = similarity_from_numbers([float(a) for a in told["similarity"]])
-        x, y, z = map(float, told["offset"])
-        up = told["up"]
-        fixed = told["fixed"]
+        stored = json.loads(read_limited(path, _MOST_BYTES))
+        similarity = similarity_from_numbers([float(a) for a in stored["similarity"]])
+        x, y, z = map(float, stored["offset"])
+        up = stored["up"]
+        fixed = stored["fixed"]
         if not math.isfinite(x + y + z) or up not in (None, *AXES) or not isinstance(fixed, bool):
             raise ValueError("no offset or no axis")
     except (DyngsError, ValueError, KeyError, TypeError, RecursionError):
-        raise DyngsError(
-            f"{path}: is no frame of `dyngs edit`; edit the original run again"
-        ) from None
+        raise DyngsError(f"{path}: damaged coordinate frame; edit the original run again") from None
     return RunFrame(similarity, (x, y, z), up, fixed)

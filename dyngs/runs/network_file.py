@@ -1,7 +1,5 @@
-"""Weights of a network in one file, to be published: what `dyngs predict` needs, without the run.
-
-Weights are stored as float16, and the section ``model`` of the configuration with them.
-"""
+"""Weights file of a network for ``dyngs predict``: float16 weights and the config section
+``model``."""
 
 from __future__ import annotations
 
@@ -12,7 +10,7 @@ from pathlib import Path
 import torch
 
 from dyngs.config import Config
-from dyngs.config.io import update_model_keys
+from dyngs.config.io import drop_removed_model_keys
 from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.io.tensor_file import FileKind, read_tensors, write_tensors
 from dyngs.models.checkpoint import Checkpoint
@@ -22,25 +20,24 @@ from dyngs.runs.folder import collect_inputs
 
 SUFFIX = ".safetensors"
 PUBLISHED = "dyngs_people_weights"
-"""Package of weights that are known by a name; packaging/weights makes it."""
+"""Package of published weights, built by packaging/weights."""
 
 _KIND = FileKind("dyngs network", "the weights of a network", 1)
 _ADVICE = "; write it again with `dyngs export NET_RUN --format network`"
-_PARTS = "model."  # Of a checkpoint, what is no state of its training
+_PARTS = "model."  # prefix of the weights in a checkpoint, as opposed to training state
 
 
 def write_network(run_dir: Path, config: Config, checkpoint: Checkpoint, path: Path) -> Path:
-    """Write the network of a run; return ``path``.
+    """Write the weights of a run; return ``path``.
 
-    Raises DyngsError: values that float16 cannot hold, a body template of the user's own, or a path
-    that is an input.
+    Raises DyngsError: weights beyond float16, a custom body template, or a path that is an input.
     """
     if path.suffix.lower() != SUFFIX:
         raise DyngsError(f"{path}: a network is written as {SUFFIX}")
     collect_inputs(run_dir).require_output(path)
     if getattr(config.model, "body", None) is not None:
         raise DyngsError(
-            f"{run_dir}: a file of a network holds no template, and model.body names one; give the run"
+            f"{run_dir}: networks with a custom template (model.body) cannot be exported; use the run"
         )
     tensors = {name: x for name, x in checkpoint.tensors.items() if name.startswith(_PARTS)}
     small = {
@@ -49,7 +46,7 @@ def write_network(run_dir: Path, config: Config, checkpoint: Checkpoint, path: P
     for name, x in small.items():
         if not bool(torch.isfinite(x).all()):
             raise DyngsError(
-                f"{run_dir}: {name.removeprefix(_PARTS)} is beyond what float16 holds; lower model.lr"
+                f"{run_dir}: {name.removeprefix(_PARTS)} overflows float16; lower model.lr"
             )
     write_tensors(
         path,
@@ -61,9 +58,9 @@ def write_network(run_dir: Path, config: Config, checkpoint: Checkpoint, path: P
 
 
 def read_network(path: Path) -> tuple[Config, Checkpoint]:
-    """Return the configuration and the weights of a file; the configuration names no capture.
+    """Load the configuration (without a capture) and the weights of a file.
 
-    Raises DyngsError: the file is missing, damaged, altered or something else.
+    Raises DyngsError: a missing, damaged or invalid file.
     """
     header, tensors = read_tensors(path, _KIND, _ADVICE)
     with wrap_read_errors(path, _ADVICE.removeprefix("; ")):
@@ -71,7 +68,7 @@ def read_network(path: Path) -> tuple[Config, Checkpoint]:
         model = header["model"]
         if not isinstance(model, dict) or model.get("body") is not None:
             raise ValueError("its section model is not that of a network")
-        model = update_model_keys(model)
+        model = drop_removed_model_keys(model)
         config = Config.model_validate({"data": {"root": path.parent}, "model": model})
         if capability(config.model, PredictsScenes) is None:
             raise ValueError(f"it is of model.kind={config.model.kind}")
@@ -81,8 +78,7 @@ def read_network(path: Path) -> tuple[Config, Checkpoint]:
 
 
 def published_network(name: str) -> Path:
-    """Return the file of the weights ``name`` in the package of published ones. Raises DyngsError:
-    it is not there."""
+    """Return the file of the published weights ``name``. Raises DyngsError if not installed."""
     package = find_spec(PUBLISHED)
     if package is None:
         advice = "install the package dyngs-people-weights, see `dyngs docs people`, to use published weights"

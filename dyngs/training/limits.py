@@ -14,7 +14,7 @@ from dyngs.models.kind import HasGaussians, HasSizeLimit, capability, find_kind
 # Fraction of the limit reserved for the random Gaussians that are added when motion begins
 RANDOM_FRACTION = 0.1
 # Bytes per Gaussian, per SH coefficient, per value of a deformation field: slightly more than
-# measured (docs/storage.md).
+# measured.
 SHAPE_BYTES, HARMONIC_BYTES, FIELD_BYTES = 16.0, 0.35, 1.0
 FEWEST = 500  # Smallest number of Gaussians that a size limit must allow
 

@@ -335,13 +335,15 @@ class Trainer(Generic[M]):
 
     def _image(self, index: int, step: int) -> Image:
         """Return the image of view ``index`` for ``step``, and prefetch the following ones."""
-        image = self.images.shrunk(index, image_divisor(self.config.train, step))
+        image = self.images.downscaled(index, image_divisor(self.config.train, step))
         if self.images.num_prefetched:
             batch = self.config.train.batch_size
             count = self.images.num_prefetched * self.processes.size
             own_views = self.processes.views_of_process(batch)
             upcoming = self.sampler.peek(count, self._eligible_views(step))
-            self.images.expect([view for i, view in enumerate(upcoming) if i % batch in own_views])
+            self.images.prefetch(
+                [view for i, view in enumerate(upcoming) if i % batch in own_views]
+            )
         return image
 
     def _eligible_views(self, step: int) -> Callable[[int], bool]:

@@ -139,8 +139,7 @@ class Recording:
         return Cameras(pose, matrix, *size), time
 
     def document(self, size: tuple[int, int], fps: float, opened: OpenedScene) -> str:
-        """Return the path as JSON for ``dyngs render --path`` (docs/camera_paths.md), in capture
-        coordinates.
+        """Return the path as JSON for ``dyngs render --path``, in capture coordinates.
 
         Args:
             size: image size in px.

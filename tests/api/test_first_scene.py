@@ -149,7 +149,7 @@ def test_what_is_outside_the_box_keeps_its_bytes(capture: Path, run: Path, tmp_p
 
 
 def test_colour_only(capture: Path, run: Path, tmp_path: Path) -> None:
-    new = train(going_on(capture, run, tmp_path / "new", "init.trains=colour"))
+    new = train(going_on(capture, run, tmp_path / "new", "init.trainable=colour"))
     before = open_run(run).scene.gaussians.tensors()
     after = open_run(new).scene.gaussians.tensors()
     assert not torch.equal(before["sh"], after["sh"])

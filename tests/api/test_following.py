@@ -40,7 +40,7 @@ def _still(capture: Path, run: Path, **options: object) -> Config:
 
 
 def _moving(capture: Path, run: Path, batch: int) -> Config:
-    config = busy_config(capture, run, "control_nodes", choose=False)
+    config = busy_config(capture, run, "control_nodes", pilot_runs=False)
     return config.model_copy(update={"train": TrainConfig(steps=24, log_every=1, batch_size=batch)})
 
 

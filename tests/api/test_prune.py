@@ -123,7 +123,7 @@ def test_what_cannot_be_done_is_refused(tmp_path: Path) -> None:
     taken.mkdir()
     (taken / "file").write_text("mine")
     for out, overrides, message in (
-        (taken, ["prune.fraction=0.5"], "exists already; give another --out"),
+        (taken, ["prune.fraction=0.5"], "exists already; use another --out"),
         (taken / "file", ["prune.fraction=0.5"], "exists already"),
         (run_dir, ["prune.fraction=0.5"], "exists already"),
         (tmp_path / "new", ["prune.fraction=1"], "prune.fraction"),
@@ -138,10 +138,10 @@ def test_what_cannot_be_done_is_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(DyngsError, match=message):
             prune_run(run_dir, out, overrides)
-    with pytest.raises(DyngsError, match="no checkpoints there"):
+    with pytest.raises(DyngsError, match="no checkpoints found"):
         prune_run(tmp_path / "nowhere", tmp_path / "new", ["prune.fraction=0.5"])
     for out, overrides, message in (
-        (taken, [], "exists already; give another --out"),
+        (taken, [], "exists already; use another --out"),
         (tmp_path / "new", ["prune.fraction=0.5"], "are chosen with --prune R"),
         (tmp_path / "new", ["model.alpha_min=0.1"], "losses are counted from RUN as it is"),
     ):

@@ -38,7 +38,7 @@ WORDS = {
     "tradeoff": {"vary", "require", "minimize", "maximize"},
     "compare": {"overrides", "models"},
     "config": {"overrides"},
-    "docs": {"topic"},
+    "docs": {"page", "search"},
 }
 """Arguments that are plain words, no paths; the paths among overrides are found by their keys."""
 
@@ -128,7 +128,7 @@ def require_refused(line: list[str], capsys: pytest.CaptureFixture[str]) -> None
     captured = capsys.readouterr()
     assert captured.err.startswith("dyngs: error: "), line
     assert captured.err.count("\n") == 1, line
-    assert "is read" in captured.err, line
+    assert "is an input" in captured.err, line
     assert captured.out == "", line
 
 

@@ -32,7 +32,7 @@ def test_overrides_count_and_every_key_has_its_default_and_meaning(
 ) -> None:
     text = _printed(capsys, "static", "train.steps=123", "strategy.kind=mcmc")
     assert "  steps: 123  # default 7000" in text
-    assert "  # optimisation steps; all schedules follow this number (an integer >= 1)" in text
+    assert "  # number of training steps; all schedules scale with it (an integer >= 1)" in text
     assert "kind is one of default, mcmc, fixed" in text
     assert "  noise: " in text
     assert "reset_every" not in text

@@ -95,8 +95,8 @@ def test_a_motion_of_romp_without_a_rate_is_read_with_one_and_what_is_assumed_is
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        ("in.npz used.npz", "used.npz exists already; name a new file"),
-        ("in.npz new.bvh", "new.bvh: a motion is written as .npz"),
+        ("in.npz used.npz", "used.npz: already exists; give the name of a new file"),
+        ("in.npz new.bvh", "new.bvh: motions are written as .npz"),
         ("nowhere.npz new.npz", "nowhere.npz: cannot be read (No such file"),
         ("in.txt new.npz", "in.txt: unknown motion format"),
         ("in.npz new.npz --clip walk", "remove the clip name 'walk'"),
@@ -181,7 +181,7 @@ def test_options_of_one_video_are_refused_for_several(
     for name in ("a.mp4", "b.mp4"):
         (tmp_path / name).write_bytes(b"")
     assert main(["data", "sfm", str(tmp_path), str(tmp_path / "out"), *words]) == 2
-    assert "--matching and --masks are for photos and one video" in capsys.readouterr().err
+    assert "--matching and --masks are not supported for several videos" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
@@ -308,7 +308,7 @@ def test_a_body_file_that_cannot_be_fitted_is_refused_in_one_line(
         (str(damaged), uv, "damaged.npz: "),
         (body, None, "smpl.npz: has no UV map"),
         (body, str(wrong), "wrong.obj: cannot be read"),
-        (None, uv, "goes with --template"),
+        (None, uv, "requires --template"),
     ):
         out = tmp_path / "out"
         words = (["--template", file] if file else []) + (["--uv", atlas] if atlas else [])

@@ -31,7 +31,7 @@ def test_doctor_reports_kernels_that_this_processor_cannot_run() -> None:
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert re.search(r"native core +broken +DYNGS_ISA=v9", done.stdout)
-    assert done.stderr.startswith("dyngs: error: this installation cannot work: native core")
+    assert done.stderr.startswith("dyngs: error: the installation is broken: native core")
 
 
 def test_doctor_reports_a_faster_instruction_set(
@@ -42,6 +42,6 @@ def test_doctor_reports_a_faster_instruction_set(
     assert main(["doctor"]) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert (
-        "compiled: v2; this processor also runs v4 (AVX-512): install again on it for more speed"
+        "compiled: v2; this CPU supports v4 (AVX-512): reinstall dyngs from source for more speed"
         in text
     )

@@ -48,7 +48,7 @@ def test_options_one_after_another(plain: Path, capsys: Capture) -> None:
         "without the cameras of a run",
         "crop: ",
         "plain.ply: 400 Gaussians added",
-        "up is -y",
+        "up axis of the output: -y",
     ):
         assert line in said
     assert "next:    dyngs view a.ply" in said
@@ -105,11 +105,11 @@ def test_what_is_refused(plain: Path, capsys: Capture) -> None:
         (["--scale", "-2"], "--scale: '-2' is not a factor"),
         (["--scale", "nan"], "--scale: 'nan' is not a number"),
         (["--geo", "line.csv"], "lie on one line"),
-        (["--geo", "line.csv", "--up=y"], "--geo gives the whole frame, so leave out --up"),
-        (["--undo", "--scale", "2"], "--undo gives the whole frame, so leave out --scale"),
-        (["--undo"], "nothing says that this was edited"),
-        (["--outside"], "--outside goes with --crop"),
-        (["--max-loss", "1"], "--max-loss goes with --clean"),
+        (["--geo", "line.csv", "--up=y"], "--geo defines the whole coordinate frame; remove --up"),
+        (["--undo", "--scale", "2"], "--undo defines the whole coordinate frame; remove --scale"),
+        (["--undo"], "was not changed by"),
+        (["--outside"], "--outside requires --crop"),
+        (["--max-loss", "1"], "--max-loss requires --clean"),
         (["--clean", "--max-loss", "-1"], "--max-loss -1"),
         (["--up", "auto"], "--up auto needs the cameras of a run"),
         (["--merge", "half.ply"], "half.ply: cannot be read (ValueError: it is truncated"),
@@ -118,6 +118,6 @@ def test_what_is_refused(plain: Path, capsys: Capture) -> None:
         out = [] if "--out" in words else ["--out", "a.ply"]
         assert said in error_line(capsys, "edit", "plain.ply", *words, *out), words
     assert "it is truncated" in error_line(capsys, "edit", "half.ply", "--out", "a.ply")
-    assert "holds no Gaussians" in error_line(capsys, "edit", "none.ply", "--out", "a.ply")
+    assert "no Gaussians" in error_line(capsys, "edit", "none.ply", "--out", "a.ply")
     assert "no such file or folder" in error_line(capsys, "edit", "nothing", "--out", "a.ply")
     assert {path: path.read_bytes() for path in Path().iterdir()} == before

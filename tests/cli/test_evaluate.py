@@ -63,7 +63,7 @@ def test_only_the_command_line_lets_a_capture_name_files_elsewhere(
     preset.write_text(
         f"data:\n  root: {tmp_path / 'capture'}\n  follow_links: true\nrun: {{dir: {tmp_path / 'new'}}}\n"
     )
-    assert "preset.yaml:3: only the command line may set data.follow_links" in error_line(
+    assert "preset.yaml:3: data.follow_links is allowed on the command line only" in error_line(
         capsys, "train", preset
     )
     assert not (tmp_path / "new").exists()

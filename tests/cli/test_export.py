@@ -49,7 +49,7 @@ def test_refined_cameras_are_a_capture_of_their_own(
     assert main(["export", str(refined), "--format", "cameras"]) == 0
     said = capsys.readouterr()
     assert f"written: {refined / 'cameras' / 'transforms.json'}" in said.out
-    assert "as training found them" in said.err + said.out
+    assert "refined training cameras" in said.err + said.out
     given = read_capture(still).splits
     found = read_capture(DataConfig(root=refined / "cameras", follow_links=True)).splits
     for moves in (True, False):
@@ -76,9 +76,9 @@ def test_cameras_of_a_run_that_refined_none_are_those_of_the_capture(
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        ("--format cameras --time 0", "--time does not go with"),
-        ("--format cameras --static", "--static does not go with"),
-        ("--format cameras --out cameras.ply", "--format cameras does not write"),
+        ("--format cameras --time 0", "--time is not supported with"),
+        ("--format cameras --static", "--static is not supported with"),
+        ("--format cameras --out cameras.ply", "wrong suffix for --format cameras"),
     ],
 )
 def test_what_does_not_go_with_cameras_is_one_line(
@@ -101,7 +101,7 @@ def test_cameras_of_the_capture_are_not_written_over(
         )
         == 2
     )
-    assert "stand in for the cameras of the capture" in capsys.readouterr().err
+    assert "override the cameras of the capture" in capsys.readouterr().err
     assert not (still / "transforms.json").exists()
 
 
@@ -143,11 +143,11 @@ def test_sog_in_levels_is_a_folder(
     assert main([*words, str(tmp_path / "town"), "--time", "0.5"]) == 0
     assert (tmp_path / "town" / "lod-meta.json").is_file()
     assert f"written: {tmp_path / 'town'}" in capsys.readouterr().out
-    for more, part in (("town.sog", "give --out FOLDER"), ("town", "exists already")):
+    for more, part in (("town.sog", "use --out FOLDER"), ("town", "exists already")):
         assert main([*words, str(tmp_path / more), "--time", "0.5"]) == 2
         assert part in capsys.readouterr().err
     assert main([*words, str(tmp_path / "several"), "--times", "0:1:3"]) == 2
-    assert "one of one time" in capsys.readouterr().err
+    assert "--times and --folder write a folder" in capsys.readouterr().err
     assert not (tmp_path / "several").exists()
 
 
@@ -160,17 +160,17 @@ def test_a_page_has_the_full_name_of_its_run(run: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        ("--format html --times 0:1:3", "--times does not go with"),
-        ("--format html --static", "--static does not go with"),
-        ("--format html --up y", "--up does not go with"),
-        ("--format html --sh-degree 3", "--sh-degree does not go with"),
-        ("--format html --max-change 3", "--max-change does not go with --format html"),
-        ("--format html --out page.pdf", "give --out page.html"),
+        ("--format html --times 0:1:3", "--times is not supported with"),
+        ("--format html --static", "--static is not supported with"),
+        ("--format html --up y", "--up is not supported with"),
+        ("--format html --sh-degree 3", "--sh-degree is not supported with"),
+        ("--format html --max-change 3", "--max-change is not supported with --format html"),
+        ("--format html --out page.pdf", "use --out page.html"),
         ("--format html --motion walk.bvh", "needs the run of a person"),
-        ("--format html --folder --max-gaussians-drawn 9", "need a static scene"),
-        ("--format html --folder --out page.html", "writes a folder; give --out page"),
-        ("--format html --max-gaussians-drawn 9", "goes with --folder"),
-        ("--folder", "--folder does not go with --format ply"),
+        ("--format html --folder --max-gaussians-drawn 9", "for still scenes"),
+        ("--format html --folder --out page.html", "writes a folder; use --out page"),
+        ("--format html --max-gaussians-drawn 9", "requires --folder"),
+        ("--folder", "--folder is not supported with --format ply"),
     ],
 )
 def test_what_does_not_go_with_a_page_is_one_line(
@@ -230,22 +230,25 @@ def test_gaussians_with_joints(avatar: Path, tmp_path: Path, suffix: str) -> Non
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ("--format mesh", r"ann\.safetensors: where to\? Give --out FILE\.glb"),
-        ("--format mesh --out x.ply", r"one file is written; give --out x\.glb"),
-        ("--format mesh --time 0 --out x.glb", "--time does not go with --format mesh of a person"),
-        ("--format mesh --up y --out x.glb", "--up does not go with --format mesh"),
+        ("--format mesh", r"ann\.safetensors: an output file is required; add --out FILE\.glb"),
+        ("--format mesh --out x.ply", r"must be a .glb file; use --out x"),
+        (
+            "--format mesh --time 0 --out x.glb",
+            "--time is not supported with --format mesh of a person",
+        ),
+        ("--format mesh --up y --out x.glb", "--up is not supported with --format mesh"),
         ("--format mesh --motion no.npz --out x.glb", r"error: no\.npz: "),
         (
             "--format mesh --cells 30 --out x.glb",
-            "--cells does not go with --format mesh of a person",
+            "--cells is not supported with --format mesh of a person",
         ),
         (
             "--format mesh --joints --out x.glb",
-            "--joints does not go with --format mesh",
+            "--joints is not supported with --format mesh",
         ),
-        ("--joints --out x.spz", "--joints does not go with --format spz"),
-        ("--joints --static --out x.ply", "--static does not go with --format joints"),
-        ("--joints --motion no.npz --out x.ply", "--motion does not go with --joints in a .ply"),
+        ("--joints --out x.spz", "--joints is not supported with --format spz"),
+        ("--joints --static --out x.ply", "--static is not supported with --format joints"),
+        ("--joints --motion no.npz --out x.ply", "without --motion"),
     ],
 )
 def test_wrong_options_end_in_one_line(
@@ -291,7 +294,7 @@ def test_export_of_a_moving_run(
     every = (0, 1, 2, 3, 4)
     moving = (1, 3)
     still = (0, 2, 4)
-    assert "note: this is time 0" in export()
+    assert "note: exporting time 0" in export()
     assert x_of(moving_run / "splats.ply") == pytest.approx(
         moved_x(every, 0.0).tolist(), abs=ROUNDING
     )
@@ -318,7 +321,7 @@ def test_export_of_a_moving_run(
         export(*words)
         assert x_of(path) == pytest.approx(moved_x(still, 0.0).tolist(), abs=ROUNDING)
     wrong = ["--times", "0:1:3", "--out", tmp_path / "a.ply"]
-    assert "--times writes a folder of files" in error_line(capsys, "export", moving_run, *wrong)
+    assert "--times and --folder write a folder" in error_line(capsys, "export", moving_run, *wrong)
 
 
 def test_export_of_tracks(
@@ -352,7 +355,7 @@ def test_export_accepts_every_suffix_that_its_help_names(
 ) -> None:
     assert main(["export", "--help"]) == 0
     text = capsys.readouterr().out
-    motions = re.search(r"motion for a person: (.*?)--max", text, re.DOTALL)
+    motions = re.search(r"motion file for a person: (.*?)--max", text, re.DOTALL)
     assert motions is not None
     others = {".kind", ".js", ".root", ".follow_links"}  # model.kind, three.js, data.root
     found = (

@@ -47,7 +47,7 @@ def test_a_smaller_run_its_file_and_a_table(
     assert load_resolved(tmp_path / "half").prune.fraction == 0.5
     assert "exists already" in error_line(capsys, *words, str(tmp_path / "half"))
     assert "prune.fraction" in error_line(capsys, *words, str(tmp_path / "x"), "--prune", "1.5")
-    assert "leave out --prune" in error_line(
+    assert "remove --prune" in error_line(
         capsys, *words, str(tmp_path / "x"), "--prune", "0.5", "--max-loss", "1"
     )
     assert "--max-loss" in error_line(capsys, *words, str(tmp_path / "x"), "--max-loss", "-1")

@@ -41,7 +41,7 @@ def test_render_of_a_split(run_dir: Path, tmp_path: Path, capsys: Capture) -> No
     assert any(n.endswith("_alpha.png") for n in names)
     assert any(n.endswith("_depth.exr") for n in names)
     assert "sheet.png" in capsys.readouterr().out
-    assert "--size goes with --path" in error_line(
+    assert "--size requires --path" in error_line(
         capsys, "render", run_dir, "--out", tmp_path, "--size", "8x8"
     )
 
@@ -134,7 +134,7 @@ def test_times_where_nothing_moves(run_dir: Path, tmp_path: Path, capsys: Captur
     assert "note: nothing moves in this run" in capsys.readouterr().out
     ply = tmp_path / "splats.ply"
     assert main(["export", str(run_dir), "--out", str(ply), "--time", "0.5"]) == 0
-    assert "note: nothing moves in this run" in capsys.readouterr().out
+    assert "note: the scene is static" in capsys.readouterr().out
     for words in (["--time", "0"], ["--times", "0:1:2"], ["--view", "0"]):
         assert "has no times and no views" in error_line(
             capsys, "render", ply, "--out", tmp_path, *words

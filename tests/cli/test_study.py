@@ -98,7 +98,7 @@ def test_the_same_command_trains_nothing(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    monkeypatch.delattr(compare, "finished")
+    monkeypatch.delattr(compare, "train_to_end")
     words = [
         "compare",
         str(capture),
@@ -148,11 +148,11 @@ def test_what_was_stopped_goes_on(
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        ("--models static --minutes 0", "argument --minutes: '0': write a number above 0"),
-        ("--models static --minutes nan", "write a number above 0"),
+        ("--models static --minutes 0", "argument --minutes: '0': must be a number above 0"),
+        ("--models static --minutes nan", "must be a number above 0"),
         ("--models statik --steps 3", "statik: no such preset (did you mean 'static'?)"),
-        ("--models static,static --steps 3", "two models are named static"),
-        ("--models static", "give all models the same --minutes M, --steps N or --max-mb MB"),
+        ("--models static,static --steps 3", "two models called static"),
+        ("--models static", "a common limit is required: --minutes M, --steps N or --max-mb MB"),
         ("--models static --steps 3 --minutes 2", "not allowed with"),
         (
             "--models dynamic,human,human_predictor --steps 3",
@@ -194,7 +194,7 @@ def test_a_model_whose_images_were_shrunk_is_left_out(
     monkeypatch.setattr(budget_time, "SMALLEST_SIDE", 8)
     words = ["compare", str(capture), "--models", "static", "--minutes", "0.001", "--threads", "1"]
     assert main([*words, "init.num_random=100", "--out", str(tmp_path / "out")]) == 2
-    said = "static: too few steps fit into 0.001 minutes of training, so its images were shrunk to 8 px"
+    said = "static: too few steps fit into 0.001 minutes of training, so its images were resized to 8 px"
     assert said in capsys.readouterr().err
 
 
@@ -235,7 +235,7 @@ def test_variants_and_the_best_run(tmp_path: Path, capsys: pytest.CaptureFixture
     words = ["tradeoff", run, "--out", str(out), *vary, "--rounds", "1", "--threads", "1"]
     assert main([*words, "--require", "fps>=0.001,mb<=1", "--minimize", "mb"]) == 0
     text = capsys.readouterr().out
-    for word in ("original", "alpha_min=0.02", "each setting alone", "tradeoff.csv", "chosen:"):
+    for word in ("as it is", "alpha_min=0.02", "each setting alone", "tradeoff.csv", "selected:"):
         assert word in text
     assert max(len(line) for line in text.splitlines() if str(out) not in line) <= 100
     assert {f.name for f in out.iterdir()} >= {

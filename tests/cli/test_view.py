@@ -21,7 +21,7 @@ def test_a_page_is_served_until_it_is_ended(
     monkeypatch.setattr("dyngs.cli.view.wait_for_interrupt", look)
     assert main(["view", str(write_moving_run(tmp_path))]) == 0
     assert b"<html" in seen[0]
-    assert "ended" in capsys.readouterr().out
+    assert "viewer stopped" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_a_taken_port_and_motions_of_no_person_are_refused(
         assert main(["view", run, "--port", str(other.getsockname()[1])]) == 2
     assert "cannot listen" in capsys.readouterr().err
     assert main(["view", run, "--motion", str(tmp_path / "walk.npz")]) == 2
-    assert "goes with a person" in capsys.readouterr().err
+    assert "requires a person" in capsys.readouterr().err
 
 
 def test_without_viser_one_line_names_the_extra(

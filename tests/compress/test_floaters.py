@@ -68,7 +68,7 @@ def test_they_are_removed_before_the_run_is_saved(
     """Unless they are too many to be floaters."""
     monkeypatch.setattr(module, "FEWEST_VIEWS", 3)
     monkeypatch.setattr(
-        module, "floaters", lambda trainer: torch.arange(len(trainer.model.scene)) < count
+        module, "find_floaters", lambda trainer: torch.arange(len(trainer.model.scene)) < count
     )
     run = train(config_of(still, "train.remove_floaters=true", f"run.dir={tmp_path / 'run'}"))
     assert len(load_run(run).scene) == 300 - removed

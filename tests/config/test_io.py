@@ -94,6 +94,30 @@ def test_a_mistyped_path_is_not_taken_for_a_packaged_preset(tmp_path: Path) -> N
         find_preset(Path("blendr"))
 
 
+@pytest.mark.parametrize(
+    ("former", "value", "current"),
+    [("model.choose", "true", "model.pilot_runs"), ("init.trains", "colour", "init.trainable")],
+)
+def test_renamed_keys_are_refused_with_their_new_names(
+    former: str, value: str, current: str, tmp_path: Path
+) -> None:
+    assert refusal(None, ROOT, f"{former}={value}").endswith(f"{former} was renamed; use {current}")
+    section, key = former.split(".")
+    preset = write(tmp_path, f"{section}:\n  {key}: {value}\n")
+    assert f"mine.yaml:2: {former} was renamed" in refusal(preset, ROOT)
+
+
+def test_stored_configurations_with_renamed_keys_still_load(tmp_path: Path) -> None:
+    path = tmp_path / RESOLVED_NAME
+    path.write_text(
+        "data: {root: capture}\nmodel: {kind: dynamic, choose: true}\n"
+        "init: {kind: scene, scene: old.ply, trains: colour}\n"
+    )
+    config = load_resolved(path)
+    assert config.model.pilot_runs
+    assert config.init.trainable == "colour"
+
+
 # ---------------------------------------------------------------------------------------------------- overrides
 
 
@@ -205,7 +229,7 @@ def test_wrong_overrides_are_named_with_what_is_allowed(overrides: str, part: st
 
 
 def test_paths_hold_no_nul() -> None:
-    assert "holds a character that no name or path may hold" in refusal(
+    assert "contains a character that is invalid in names and paths" in refusal(
         None, 'data.root="/a/\\x00"'
     )
 
@@ -251,7 +275,7 @@ def test_empty_means_the_defaults(text: str, tmp_path: Path) -> None:
 
 
 def test_a_missing_capture_is_asked_for() -> None:
-    assert "data.root is missing" in refusal(None)
+    assert "data.root is required" in refusal(None)
 
 
 @settings(max_examples=25, deadline=None)
@@ -322,7 +346,7 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["", "train: {steps: 3}", "data:"])
 def test_an_emptied_config_of_a_run_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / "config.yaml").write_text(text)
-    with pytest.raises(DyngsError, match=r"config\.yaml: does not say which capture .*restore"):
+    with pytest.raises(DyngsError, match=r"config\.yaml: data\.root, .* is missing; restore"):
         load_resolved(tmp_path)
 
 

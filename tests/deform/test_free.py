@@ -115,7 +115,7 @@ def test_a_rolling_ball_before_fixed_cameras_is_learned(tmp_path: Path) -> None:
         "train.steps=360",
         "train.initial_downscale=1",
         "train.alpha_weight=0.1",
-        "model.choose=false",
+        "model.pilot_runs=false",
     ]
     keys += ["model.deform.kind=free", "model.num_random_moving=400", "strategy.max_gaussians=3000"]
     places = [

@@ -147,7 +147,7 @@ def test_an_unfinished_run_says_so(tmp_path) -> None:
         config.model_copy(update={"train": TrainConfig(steps=7000)}), run_dir / RESOLVED_NAME
     )
     (note,) = evaluate_run(run_dir).notes
-    assert "stands at step 7 of 7,000" in note
+    assert "unfinished run: step 7 of 7,000" in note
     assert json.loads((run_dir / "metrics.json").read_text())["notes"] == [note]
 
 
@@ -157,7 +157,7 @@ def test_other_splits_and_backgrounds(tmp_path) -> None:
     assert report_path(run_dir, "train") == run_dir / "metrics_train.json"
     stored = json.loads((run_dir / "metrics_train.json").read_text())
     assert (stored["split"], stored["num_views"], stored["background"]) == ("train", 2, "black")
-    assert report.notes == ("trained on random backgrounds, evaluated on black",)
+    assert report.notes == ("trained with random backgrounds, evaluated on black",)
     assert report.lpips_net == "vgg"
     assert not (run_dir / "metrics.json").exists()
     with pytest.raises(
@@ -236,13 +236,13 @@ def test_parts_of_a_moving_scene_are_measured(tmp_path, capsys) -> None:
 def test_still_models_of_moving_captures(tmp_path) -> None:
     report = evaluate_run(write_moving_run(tmp_path / "static", moves=False))
     assert (report.flicker, report.num_moving, report.notes) == (0.0, 0, ())
-    assert "stands still" in report.reasons["flicker_error"]
+    assert "no static camera" in report.reasons["flicker_error"]
     assert len(report.psnr_per_time) == len(TEST_TIMES)
     run_dir = write_moving_run(tmp_path / "dynamic", moves=False)
     config = (run_dir / RESOLVED_NAME).read_text().replace("kind: static", "kind: dynamic")
     (run_dir / RESOLVED_NAME).write_text(config)
     (note,) = evaluate_run(run_dir).notes
-    assert "nothing moves" in note
+    assert "dynamic model without motion" in note
 
 
 @pytest.fixture(scope="module", params=["always", "never"])

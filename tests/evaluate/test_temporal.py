@@ -131,4 +131,4 @@ def test_reasons_where_there_is_nothing_to_measure(split) -> None:
     untimed = [replace(v, time=None) for v in views]
     for found in temporal_scores(scene, loader, untimed).values():
         assert (found.value, found.reason) == (None, "the images have no times")
-    assert "stands still" in (flicker_error(scene, loader, views[:1]).reason or "")
+    assert "no static camera" in (flicker_error(scene, loader, views[:1]).reason or "")

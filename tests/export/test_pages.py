@@ -200,7 +200,7 @@ def test_only_a_new_folder_is_written_and_no_moving_scene(tmp_path: Path) -> Non
     (tmp_path / "full" / "mine").touch()
     with pytest.raises(DyngsError, match="exists already"):
         write_page_folder(still, tmp_path / "full")
-    with pytest.raises(DyngsError, match="for still scenes"):
+    with pytest.raises(DyngsError, match="need a static scene"):
         write_page_folder(wrap_scene(sliding_scene()), tmp_path / "new", most=9)
     assert [path.name for path in tmp_path.rglob("*")] == ["full", "mine"]
 

@@ -17,9 +17,9 @@ from bare_person import (
     bands,
     bare_run,
     bare_scene,
-    playing,
     random_clip,
     template,
+    with_motion,
 )
 from gltf_skins import SkinnedGlb
 from moving_scene import write_moving_run
@@ -69,7 +69,7 @@ def test_another_reader_finds_mesh_and_texture(tmp_path: Path) -> None:
     """Each vertex has the colour of its place."""
     run = bare_run()
     notes = write_mesh(run, tmp_path / "ann.glb")
-    assert notes[0].startswith("texture of 256 x 256; ")
+    assert notes[0].startswith("texture 256 x 256; ")
     assert "silhouette IoU" in notes[1]
     loaded = trimesh.load(tmp_path / "ann.glb", process=False)
     (mesh,) = loaded.geometry.values()  # pyright: ignore[reportAttributeAccessIssue]
@@ -91,7 +91,7 @@ def test_a_motion_becomes_an_animation(tmp_path: Path) -> None:
     """The same bytes on every run; a skin has no offsets that depend on the pose."""
     shapes = PoseBlendShapes(torch.zeros(486, 3 * len(template().vertices)), template().faces)
     scene = replace(bare_scene(resolution=24), shapes=shapes)
-    run = playing(bare_run(scene), random_clip(4, seed=5))
+    run = with_motion(bare_run(scene), random_clip(4, seed=5))
     notes = write_mesh(run, tmp_path / "ann.glb", AnimationInfo("dance", 10.0))
     assert notes[-1] == "pose-dependent offsets are not exported: glTF skins have none"
     found = SkinnedGlb(tmp_path / "ann.glb")
@@ -111,7 +111,7 @@ GREY = np.full((4, 4, 3), 128, np.uint8)
 
 
 def scene_of(scale: float = 1.0) -> HumanScene:
-    scene = playing(bare_run(), random_clip(4, scale, seed=3)).scene
+    scene = with_motion(bare_run(), random_clip(4, scale, seed=3)).scene
     assert isinstance(scene, HumanScene)
     return scene
 
@@ -260,7 +260,7 @@ def test_other_readers_see_the_rest_pose(tmp_path: Path, suffix: str) -> None:
 
 
 def test_the_skin_moves_gaussians_as_the_avatar_does(tmp_path: Path) -> None:
-    run = playing(bare_run(), random_clip(3, 0.7, seed=2))
+    run = with_motion(bare_run(), random_clip(3, 0.7, seed=2))
     scene = run.scene
     assert isinstance(scene, HumanScene)
     notes = write_rigged_splats(run, tmp_path / "ann.glb", AnimationInfo("walk", 25.0))

@@ -15,7 +15,7 @@ from toy_plugin import FOLDER, installed
 import dyngs
 from dyngs.cli import main
 from dyngs.config.io import load_config
-from dyngs.config.kinds import GROUP, OWN
+from dyngs.config.kinds import BUILT_IN, GROUP
 from dyngs.config.schema import config_keys
 from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
@@ -56,7 +56,7 @@ def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_our_own_kinds_are_entry_points_of_the_package() -> None:
     tomllib = pytest.importorskip("tomllib")  # Python 3.11
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert project["entry-points"][GROUP] == OWN
+    assert project["entry-points"][GROUP] == BUILT_IN
 
 
 def dyngs_command(*words: str, plugin: bool) -> subprocess.CompletedProcess[str]:
@@ -78,7 +78,7 @@ def test_a_run_needs_the_package_of_its_kind(capture: Path, tmp_path: Path) -> N
     without = dyngs_command("eval", str(run), plugin=False)
     assert without.returncode == 2
     assert without.stderr.strip().count("\n") == 0
-    assert "model.kind=toy is of the package toy-splats, which is not installed" in without.stderr
+    assert "model.kind=toy needs the package toy-splats, which is not installed" in without.stderr
 
 
 def test_its_keys_are_listed_and_validated(capture: Path, tmp_path: Path) -> None:

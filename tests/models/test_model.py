@@ -30,7 +30,7 @@ TRAINED = {
     "dynamic": (
         "moving",
         [
-            "model.choose=false",
+            "model.pilot_runs=false",
             "init.num_random=40",
             "model.motion_from=0.3",
             "model.motion_threshold=0",

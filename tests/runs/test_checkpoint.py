@@ -297,15 +297,15 @@ def test_contents_that_do_not_fit_end_in_one_line_or_a_finite_image(
 @pytest.mark.parametrize(
     ("name", "change", "said"),
     [
-        ("model.rows", lambda x: x.flip(0), "'rows' does not ascend"),
-        ("model.rows", lambda x: x + 6, "'rows' names something beyond the 9"),
+        ("model.rows", lambda x: x.flip(0), "'rows' is not strictly ascending"),
+        ("model.rows", lambda x: x + 6, "'rows' has indices outside"),
         ("model.rows", lambda x: x.int(), "'rows' is int32"),
         ("model.times", lambda x: x + 0.5, "outside"),
         ("model.filter_std", lambda x: -x, "negative"),
         (
             "model.field.buffers.followed",
             lambda x: x + 5,
-            "'followed' names something beyond the 4",
+            "'followed' has indices outside",
         ),
         ("model.field.buffers.followed", lambda x: x[1:], r"'followed' is int64 \(3, 4\)"),
         ("model.field.buffers.radii", torch.zeros_like, "'radii' must be above 0"),
@@ -314,8 +314,8 @@ def test_contents_that_do_not_fit_end_in_one_line_or_a_finite_image(
         ("model.field.learned.exp_avg.means", lambda x: x.double(), "'exp_avg.means' is float64"),
         ("model.field.box", torch.zeros_like, "'box' must be above 0"),
         ("model.field.numbers", lambda x: -x, "'numbers' must be above 0"),
-        ("gaussians.sh", lambda x: x[:, :3], "'sh' has 3 terms"),
-        ("gaussians.means", lambda x: x * torch.nan, "'means' holds NaN"),
+        ("gaussians.sh", lambda x: x[:, :3], "'sh' has an invalid number"),
+        ("gaussians.means", lambda x: x * torch.nan, "'means' has NaN"),
     ],
 )
 def test_what_does_not_fit_is_named(

@@ -90,7 +90,7 @@ def test_bodies_are_the_same_by_their_contents(person: Path, tmp_path: Path) -> 
 
 def test_another_fit_is_another_run(person: Path, tmp_path: Path) -> None:
     dyngs.train(config_of(person, fit_of(person, tmp_path / "one"), tmp_path / "run"))
-    with pytest.raises(DyngsError, match="already holds a run"):
+    with pytest.raises(DyngsError, match="already contains a run"):
         dyngs.train(
             config_of(person, fit_of(person, tmp_path / "two", raised=0.02), tmp_path / "run")
         )

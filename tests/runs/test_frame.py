@@ -39,6 +39,6 @@ def test_a_damaged_one_is_told_in_one_line(change: dict[str, object], tmp_path: 
     write_frame(tmp_path, FRAME)
     told = json.loads((tmp_path / FRAME_NAME).read_text())
     (tmp_path / FRAME_NAME).write_text(json.dumps(told | change))
-    with pytest.raises(DyngsError, match=r"frame\.json: is no frame of `dyngs edit`") as caught:
+    with pytest.raises(DyngsError, match=r"frame\.json: damaged coordinate frame") as caught:
         read_frame(tmp_path)
     assert "\n" not in str(caught.value)

@@ -112,7 +112,7 @@ def test_no_function_replaces_a_file_of_the_capture(tmp_path: Path) -> None:
         root,
     ):
         for name, write in write_all(run, out).items():
-            with pytest.raises(DyngsError, match="is read") as caught:
+            with pytest.raises(DyngsError, match="is an input") as caught:
                 write()
             assert "\n" not in str(caught.value), name
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
@@ -123,12 +123,12 @@ def test_what_a_run_reads(tmp_path: Path) -> None:
     own = [run / RESOLVED_NAME, *checkpoint_paths(run)]
     for path in own:
         for named in (run, run / "checkpoints" / ".." / ".." / "run"):
-            with pytest.raises(DyngsError, match="which is read"):
+            with pytest.raises(DyngsError, match="which is an input"):
                 collect_inputs(named).require_output(path)
     for name in ("splats.ply", "metrics.json", "scene.dyngs"):
         (run / name).write_text("an export")
         collect_inputs(run).require_output(run / name)
     checkpoint_paths(run)[0].rename(run / "kept")
     for named in (run, run / "scene.dyngs"):
-        with pytest.raises(DyngsError, match="which is read"):
+        with pytest.raises(DyngsError, match="which is an input"):
             collect_inputs(named).require_output(run / "scene.dyngs")

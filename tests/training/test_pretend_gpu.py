@@ -41,7 +41,7 @@ def trained(config: Config, monkeypatch: pytest.MonkeyPatch, device: torch.devic
 STATIC = ("train.steps=12", "init.kind=random", "init.num_random=100")
 DYNAMIC = (
     "train.steps=16",
-    "model.choose=false",
+    "model.pilot_runs=false",
     "model.num_random_moving=100",
     "init.kind=random",
     "init.num_random=300",

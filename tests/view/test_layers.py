@@ -90,7 +90,7 @@ def test_many_gaussians_are_drawn_in_levels_while_anything_moves(
     assert np.array_equal(draw(opened, request), draw(whole, request))
     edited = opened.with_scene(opened.scene.select(torch.arange(1000)))
     assert np.array_equal(draw(edited, moving), draw(edited, request))
-    with pytest.raises(DyngsError, match="for still scenes"):
+    with pytest.raises(DyngsError, match="need a static scene"):
         with_levels(balls(), 300)
 
 

@@ -101,7 +101,7 @@ def test_training_gives_the_same_bytes_whoever_looks(
             f"run.dir={tmp_path / name}",
         ]
         overrides += ["train.steps=12", "init.num_random=40", "run.threads=1"]
-        overrides += ["model.choose=false"] if preset == "dynamic" else []
+        overrides += ["model.pilot_runs=false"] if preset == "dynamic" else []
         folder = dyngs.train(dyngs.load_config(preset, overrides), listeners=listeners)
         found.append(checkpoint_paths(folder)[-1].read_bytes())
     assert found[0] == found[1]

@@ -1,1 +1,1 @@
-"""Limits of a run: a number of Gaussians, megabytes, minutes."""
+"""Limits of a run: number of Gaussians, file size, training time."""

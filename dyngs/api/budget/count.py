@@ -1,7 +1,7 @@
-"""The number of Gaussians at the end, which ``budget.max_gaussians`` or the size of a file limits.
+"""Limit on the final number of Gaussians, from ``budget.max_gaussians`` or the file size.
 
-Growth ends at the limit, but a run may begin with more, most of which show nothing: those that
-matter least are removed late, with steps left for the others to adapt.
+Densification stops at the limit, but a run may start with more Gaussians. The least important ones
+are removed late in the run, with steps left for the others to adapt.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from dyngs.core.errors import format_count
 from dyngs.training.loop import Loop
 from dyngs.training.trainer import Trainer, TrainingEdit
 
-REMOVED_FROM = 0.7  # Fraction of the run from which Gaussians beyond the limit are removed
+REMOVED_FROM = 0.7  # fraction of the run after which Gaussians beyond the limit are removed
 
 
 class CountLimit:
-    """Editor that keeps the number of Gaussians within ``most``.
+    """Editor that limits the number of Gaussians to ``most``.
 
     Attributes:
-        before: their number before the first removal; 0: there was none.
-        lost: dB of training images by all removals, before anything was trained again.
+        before: number of Gaussians before the first removal; 0: none was needed.
+        lost: PSNR lost on training images by all removals, before fine-tuning, dB.
     """
 
     def __init__(self, most: int, seconds: float | None = None) -> None:
@@ -66,18 +66,19 @@ class CountLimit:
             self.lost = float(stored["lost"])
 
     def reached(self, config: Config, count: int) -> str:
-        """Return the line about the limit after a run."""
-        cost = "it cost nothing"
+        """Return the message about the limit at the end of a run."""
+        cost = ""
         if self.before:
-            cost = f"{self.before:,} before, {-self.lost:+.2f} dB on training views when they were removed"
-        asked = f"asked for at most {format_count(self.most, 'Gaussian')}, got {count:,}"
-        return f"{_name(config, self.most)}: {asked}; {cost}"
+            cost = (
+                f"; {self.before:,} before, {-self.lost:+.2f} dB on training views by the removal"
+            )
+        return f"{_name(config, self.most)}: limit {self.most:,}, used {count:,}{cost}"
 
 
 def is_late(config: Config, step: int, used: float) -> bool:
     """Return whether Gaussians beyond the limit are removed after ``step``.
 
-    Where pruning follows training, that is after its beginning. ``used``: fraction of the time.
+    With a pruning stage, removal starts in that stage. ``used``: used fraction of the time limit.
     """
     steps = config.train.steps
     if config.total_steps > steps:

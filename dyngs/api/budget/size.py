@@ -1,4 +1,4 @@
-"""``budget.max_mb``: the file of a finished run, no larger than allowed, and what that costs."""
+"""``budget.max_mb``: export of a finished run to a file of limited size."""
 
 from __future__ import annotations
 
@@ -24,22 +24,21 @@ from dyngs.runs.stored_file import decode_scene, encode_scene, round_step_down, 
 from dyngs.training.trainer import Trainer
 
 KEPT = 0.7
-"""Fraction of the Gaussians that each trial keeps of those of the trial before."""
+"""Fraction of the Gaussians that each trial keeps from the previous one."""
 
 
 @dataclass(frozen=True)
 class SizeReport:
-    """Size and quality of the file, and how it was stored.
+    """Size and quality of the exported file.
 
     Attributes:
-        asked, megabytes: 1e6 bytes.
-        before, after: mean PSNR of at most 16 training images, dB: as trained, and as read from the
-            file.
-        num_gaussians, num_kept: as trained, and in the file.
-        coarser: than usual by this factor are the steps to which values are rounded.
+        limit, megabytes: allowed and actual size, 1e6 bytes.
+        before, after: mean PSNR of at most 16 training images before and after storage, dB.
+        num_gaussians, num_kept: number of trained and of stored Gaussians.
+        coarser: factor on the default quantisation steps.
     """
 
-    asked: float
+    limit: float
     megabytes: float
     before: float
     after: float
@@ -48,30 +47,29 @@ class SizeReport:
     coarser: float
 
     def __str__(self) -> str:
-        how = [f"{self.coarser:.3g} times coarser than usual"] if self.coarser > 1 else []
+        how = [f"{self.coarser:.3g} times the default quantisation"] if self.coarser > 1 else []
         if self.num_kept < self.num_gaussians:
             how += [f"{self.num_kept:,} of {format_count(self.num_gaussians, 'Gaussian')}"]
         return (
-            f"budget.max_mb: asked {self.asked:g}, got {self.megabytes:.3g} ({EXPORT_FOLDER}/{SCENE_FILE}"
+            f"budget.max_mb: limit {self.limit:g}, used {self.megabytes:.3g} ({EXPORT_FOLDER}/{SCENE_FILE}"
             f"{''.join(f', {x}' for x in how)}); {self.after - self.before:+.2f} dB on training views "
             f"({self.before:.2f} -> {self.after:.2f})"
         )
 
 
 def has_file(run_dir: Path) -> bool:
-    """Return whether a run has its file of limited size."""
+    """Return whether a run has its exported file."""
     folder = run_dir / EXPORT_FOLDER
     return (folder / SCENE_FILE).is_file() and (folder / RESOLVED_NAME).is_file()
 
 
 @torch.no_grad()
 def write_limited_file(trainer: Trainer[Any], run_dir: Path, megabytes: float) -> SizeReport:
-    """Write ``scene.dyngs``, of at most so many 1e6 bytes, into a folder of ``run_dir``, and return
-    a report.
+    """Write ``scene.dyngs`` of at most ``megabytes`` (1e6 bytes) into ``run_dir/export``.
 
-    Stored as exactly as is usual if that fits. Otherwise more coarsely, and with fewer Gaussians,
-    as long as the latter makes training images better than the former alone; triangles, which would
-    leave holes, all stay. The ``trainer`` is at the end of its run and left as it is.
+    If the default precision does not fit, values are quantised more coarsely, and Gaussians are
+    removed as long as this improves the PSNR of training images. Triangles are never removed. The
+    ``trainer`` must be at the end of its run, and is not changed.
     """
     full = trainer.checkpoint()
     config = trainer.config
@@ -107,7 +105,7 @@ def write_limited_file(trainer: Trainer[Any], run_dir: Path, megabytes: float) -
             fraction = fraction * KEPT
     if chosen is None:
         raise DyngsError(
-            f"budget.max_mb={megabytes:g}: what is trained does not fit; the run itself is in {run_dir}"
+            f"budget.max_mb={megabytes:g}: too small for this scene; the run is saved in {run_dir}"
         )
     after, factor, data, num_kept = chosen
     write_scene(run_dir / EXPORT_FOLDER / SCENE_FILE, data)
@@ -116,8 +114,8 @@ def write_limited_file(trainer: Trainer[Any], run_dir: Path, megabytes: float) -
 
 
 def _fitted(encode: Callable[[float], bytes], most: int) -> tuple[bytes, float] | None:
-    """Return the largest file of at most ``most`` bytes, and its factor on the usual steps; None:
-    none fits."""
+    """Return the largest file of at most ``most`` bytes and its factor on the default steps; None
+    if none fits."""
     data = encode(1.0)
     if len(data) <= most:
         return data, 1.0

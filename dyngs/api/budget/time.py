@@ -1,7 +1,7 @@
-"""``train.minutes``: the number of steps that fit into a time, and what all steps would cost.
+"""``train.minutes``: number of steps that fit into a time limit.
 
-Steps are measured before training, and the number is corrected once by the first quarter of the
-run. How the cost of steps goes on is foreseen by ``dyngs.training.clock``.
+Steps are timed before training, and the number is corrected once after a quarter of the run.
+``dyngs.training.clock`` forecasts the cost of later steps.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from dyngs.training.loop import Loop
 from dyngs.training.plan import RunPlan, with_steps
 from dyngs.training.trainer import Trainer, TrainingEdit
 
-FEWEST = 200  # Steps that must fit; otherwise the images are shrunk
-SMALLEST_SIDE = 64  # Longest side, px, below which images are not shrunk
-AIM = 0.96  # Fraction of the time that a run is planned to use
-WARM_UP = 2  # Steps before those that are measured before training
+FEWEST = 200  # smallest number of steps; if fewer fit, the images are downscaled
+SMALLEST_SIDE = 64  # longest side below which images are not downscaled, px
+AIM = 0.96  # planned fraction of the time limit
+WARM_UP = 2  # untimed steps before the timed steps
 
 
 def fit_minutes(
     plan: RunPlan, stopwatch: Stopwatch, build: Callable[[RunPlan], Trainer[Any]]
 ) -> tuple[RunPlan, str | None, ImageLoader]:
-    """Return the plan with as many steps as fit into its time, a message, and its training images.
+    """Return the plan with as many steps as fit its time limit, a message, and its training images.
 
-    Where fewer than ``FEWEST`` steps fit, the images are halved until they do, or are small.
+    If fewer than ``FEWEST`` steps fit, the image size is halved repeatedly.
 
     Args:
-        watch: seconds of training so far.
-        build: returns a new trainer of a plan, which measures and is thrown away.
+        stopwatch: training time so far.
+        build: returns a new trainer for a plan, used for timing only.
     """
     seconds = plan.limits.seconds or math.inf
     asked = plan.resolved.train.steps
@@ -52,8 +52,8 @@ def fit_minutes(
         halvings = math.ceil(math.log2(FEWEST / max(steps, 1)) / 2)
         smaller = max(side >> halvings, SMALLEST_SIDE)
         message = (
-            f"train.minutes={seconds / 60:g}: {format_count(steps, 'step')} would fit at {side} px, so images are "
-            f"shrunk to {smaller} px (data.longest_side)"
+            f"train.minutes={seconds / 60:g}: {format_count(steps, 'step')} fit at {side} px; images are "
+            f"downscaled to {smaller} px (data.longest_side)"
         )
         trainer.images.stop_prefetching()
         data = plan.resolved.data.model_copy(update={"longest_side": smaller})
@@ -87,7 +87,7 @@ def _forecast(trainer: Trainer[Any], now: float) -> TimeForecast:
 def fitting_steps(
     forecast: TimeForecast, config: Config, done: int, seconds: float, most: int
 ) -> int:
-    """Return the largest number of steps, ``done`` to ``most``, whose rest after ``done`` fits in
+    """Return the largest number of steps in [``done``, ``most``] whose remaining steps take at most
     ``seconds``."""
     low = done
     high = max(most, done)
@@ -101,11 +101,11 @@ def fitting_steps(
 
 
 class TimeLimit:
-    """Editor that corrects the number of steps once, and ends a run in time.
+    """Editor that corrects the number of steps once, and stops a run at the time limit.
 
     Args:
-        most_steps: that were requested.
-        corrects: the number of steps may change; otherwise only the end of the time ends the run.
+        most_steps: requested number of steps.
+        corrects: whether the number of steps may be corrected.
     """
 
     def __init__(self, seconds: float, most_steps: int, *, corrects: bool) -> None:
@@ -122,7 +122,7 @@ class TimeLimit:
         now = loop.stopwatch.seconds
         if done >= loop.total:
             return None
-        if self._forecast is None:  # the first step loads and compiles what others find there
+        if self._forecast is None:  # the first step includes loading and compilation
             self._forecast = _forecast(trainer, now)
             return None
         self._forecast.observe(config, done, now, trainer.num_gaussians)
@@ -142,14 +142,13 @@ class TimeLimit:
         )
 
     def reached(self, loop: Loop) -> str:
-        """Return the line about ``train.minutes`` after a run."""
+        """Return the message about ``train.minutes`` at the end of a run."""
         done = loop.trainer.done
-        asked = f"asked {self.seconds / 60:g}, got {loop.stopwatch.seconds / 60:.2f}"
-        line = f"train.minutes: {asked}: {done:,} of {format_count(self.most_steps, 'step')}"
-        return line if done < self.most_steps else f"{line}: all, it cost nothing"
+        used = f"limit {self.seconds / 60:g}, used {loop.stopwatch.seconds / 60:.2f}"
+        return f"train.minutes: {used}; {done:,} of {format_count(self.most_steps, 'step')}"
 
     def cost_of_all(self, loop: Loop) -> str | None:
-        """Return what all steps would cost; None where too few were done to tell, or all were."""
+        """Return the forecast for all requested steps; None if unknown or if all were done."""
         trainer = loop.trainer
         steps = self.most_steps
         if self._forecast is None or trainer.done >= steps:
@@ -159,7 +158,7 @@ class TimeLimit:
 
 
 def events_before(config: Config, done: int) -> list[bool]:
-    """Return which of the events that happen once in a run have happened after ``done`` steps."""
+    """Return which one-time events of a run have happened after ``done`` steps."""
     steps = config.train.steps
     once = (config.model.motion_start_step(steps), config.colour.measurement_step(steps))
     return [done >= step for step in once if step is not None]

@@ -136,7 +136,7 @@ def _train_gaussians(run: StartContext, steps: int) -> GaussianModel:
         "colour": ShColour(),
     }
     own = config.model_copy(update=changed)
-    start = replace(run, config=own, asked=own)
+    start = replace(run, config=own, uncapped=own)
     scene = StaticScene(gaussians=load_or_create_gaussians(start))
     colour = ColourTraining(ShColour())
     model = GaussianModel(start, scene, SceneTraining(), build_densifier(start), colour)
@@ -154,7 +154,7 @@ def _train_gaussians(run: StartContext, steps: int) -> GaussianModel:
 
 
 def _downscale(image: Image) -> Image:
-    return image.shrunk(-(-max(image.cameras.width, image.cameras.height) // LONGEST_SIDE))
+    return image.downscaled(-(-max(image.cameras.width, image.cameras.height) // LONGEST_SIDE))
 
 
 def _flat_patches(corners: Tensor, colours: Tensor, model: BgTriangleModel) -> Patches:

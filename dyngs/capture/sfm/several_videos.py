@@ -417,7 +417,7 @@ def _posed(
         raise DyngsError(
             f"could not estimate poses for {len(images)} cameras: neighbouring cameras must "
             "overlap, with at most 30 degrees between them, and see textured static surfaces; "
-            "add cameras between them, or give the poses in cameras.json (docs/formats.md)"
+            "add cameras between them, or give the poses in cameras.json (`dyngs docs captures`)"
         )
     line = (
         f"{len(names)} of {len(images)} cameras registered, {model.num_points3D():,} points, "

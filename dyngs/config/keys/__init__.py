@@ -1,2 +1,1 @@
-"""The keys of a configuration: one module per section of the YAML file, put together in
-``config.Config``."""
+"""Configuration keys: one module per section of the YAML file, combined in ``config.Config``."""

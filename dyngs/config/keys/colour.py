@@ -1,4 +1,4 @@
-"""Section ``colour``: what the colour of a Gaussian is made of."""
+"""Section ``colour``: colour representation of the Gaussians."""
 
 from __future__ import annotations
 
@@ -8,65 +8,64 @@ from pydantic import Field
 
 from dyngs.core.section import Section
 
-MEASURED_AT = 0.6  # Fraction of a run after which it is measured whose harmonics pay
+MEASURED_AT = 0.6  # fraction of the run after which view dependence is measured
 
 
 class ColourSection(Section):
-    """Keys that all kinds of colour share."""
+    """Keys shared by all colour representations."""
 
     opacity_entropy: float = Field(
         default=0.0,
         ge=0,
-        description="weight of the mean of -o ln o over opacities o, which removes faint Gaussians; MEGA: 5e-4",
+        description="weight of the opacity entropy loss, the mean of -o ln o over opacities o, "
+        "which removes faint Gaussians; MEGA: 5e-4",
     )
 
     def stored_degree(self, sh_degree: int) -> int:
-        """Return the degree of the harmonics that training begins with, of ``model.sh_degree``."""
+        """Return the degree of the trained SH coefficients for ``model.sh_degree``."""
         return sh_degree
 
     def measurement_step(self, steps: int) -> int | None:
-        """Return the step after which it is measured whose harmonics pay; None where it never
-        is."""
+        """Return the step after which view dependence is measured; None if it never is."""
         return None
 
 
 class ShColour(ColourSection):
-    """Spherical harmonics of degree ``model.sh_degree`` for every Gaussian."""
+    """Spherical harmonics of degree ``model.sh_degree`` for all Gaussians."""
 
     kind: Literal["sh"] = Field(
-        default="sh", description="spherical harmonics of degree model.sh_degree for every Gaussian"
+        default="sh", description="spherical harmonics of degree model.sh_degree for all Gaussians"
     )
 
 
 class NetworkColour(ColourSection):
-    """Three base values per Gaussian and one small network for all (MEGA, Zhang et al. 2024); no
-    harmonics."""
+    """A base colour per Gaussian and a shared network for view and time dependence (MEGA, Zhang et
+    al. 2024)."""
 
     kind: Literal["network"] = Field(
         default="network",
-        description="a base colour (DC) per Gaussian, to which one small network for all adds what depends on "
-        "direction and time (AC; MEGA, Zhang et al. 2024); no harmonics",
+        description="a base colour per Gaussian plus a small shared network that adds view and time "
+        "dependence (MEGA, Zhang et al. 2024)",
     )
     width: int = Field(default=32, ge=1, description="neurons per hidden layer; MEGA: 64")
-    depth: int = Field(default=2, ge=1, le=8, description="hidden layers")
+    depth: int = Field(default=2, ge=1, le=8, description="number of hidden layers")
     lr: ClassVar[float] = 0.01
     """Learning rate of the network; divided by 3 after 1/6, 1/2 and 5/6 of the run."""
 
     def stored_degree(self, sh_degree: int) -> int:
-        """Return 0: the network gives what depends on the view."""
+        """Return 0, because the network models view dependence."""
         return 0
 
 
 class AutoColour(ColourSection):
-    """Harmonics only for the Gaussians whose dependence on the view pays on held-out training
-    views."""
+    """Spherical harmonics only for Gaussians whose view dependence improves held-out views."""
 
     kind: Literal["auto"] = Field(
         default="auto",
-        description="harmonics only for the Gaussians where dependence on the view pays, measured after 0.6 of the run "
-        "on every 8th training view",
+        description="spherical harmonics only for Gaussians whose view dependence improves every "
+        "8th training view, measured after 60 % of the run",
     )
-    tolerance: float = Field(default=0.05, ge=0, description="PSNR that may be lost by it, dB")
+    tolerance: float = Field(default=0.05, ge=0, description="largest loss of PSNR, dB")
 
     def measurement_step(self, steps: int) -> int:
         return max(1, round(MEASURED_AT * steps))

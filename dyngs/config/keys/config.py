@@ -1,5 +1,4 @@
-"""All sections together: ``Config``, everything that decides a run, and those of its sections that
-are short."""
+"""``Config``, the complete configuration of a run, and its short sections."""
 
 from __future__ import annotations
 
@@ -19,14 +18,14 @@ from dyngs.core.section import ModelSection, SceneModel, Section
 
 
 def _model_section(value: object) -> object:
-    """Return ``value`` as the section of the kind that it names; sections are returned unchanged."""
+    """Validate a mapping as the section of its ``kind``; return sections unchanged."""
     if not isinstance(value, dict):
         return value
     given = cast("dict[str, Any]", value)
     try:
         section = section_of_kind(given.get("kind", "static"))
     except KeyError:
-        raise PydanticCustomError("union_tag_invalid", "no such kind of model") from None
+        raise PydanticCustomError("union_tag_invalid", "unknown kind of model") from None
     return section.model_validate(given)
 
 
@@ -36,39 +35,37 @@ else:
     AnyModel = SerializeAsAny[ModelSection]
 
 
-def _still() -> AnyModel:
+def _default_model() -> AnyModel:
     return cast(SceneModel, section_of_kind("static")())
 
 
 class CameraConfig(Section):
-    """Whether the cameras of a capture are taken as they are."""
+    """Refinement of the cameras."""
 
     refine: Literal["never", "auto", "always"] = Field(
         default="never",
-        description="correct poses, focal lengths and principal points of the training views while the scene is "
-        "trained; of Gaussians alone, not of people; auto: where two small runs beforehand say that it pays",
+        description="whether to refine poses, focal lengths and principal points of the training "
+        "views during training; only for scenes of Gaussians; auto: decided by pilot runs",
     )
 
 
 class PruneConfig(Section):
-    """A last stage with fewer Gaussians, after ``train.steps``; off by default.
-
-    Guide: docs/guides/smaller-and-faster.md.
-    """
+    """Pruning and fine-tuning after ``train.steps``; off by default."""
 
     fraction: float = Field(
         default=0.0, ge=0, lt=1, description="fraction of the Gaussians to remove; 0: none"
     )
     score: Literal["variation", "sensitivity", "contribution"] = Field(
         default="sensitivity",
-        description="importance of a Gaussian (`dyngs docs smaller-and-faster`); the lowest are removed",
+        description="importance score; the Gaussians with the lowest scores are removed",
     )
     mask_times: int = Field(
         default=0,
         ge=0,
-        description="key times of masks over time (4DGS-1K), which leave out what hardly shows then; 0, 1: none",
+        description="number of key times of the visibility masks (4DGS-1K), which skip Gaussians "
+        "that hardly contribute at a time; 0 or 1: no masks",
     )
-    steps: int = Field(default=2000, ge=1, description="steps of fine-tuning after pruning")
+    steps: int = Field(default=2000, ge=1, description="number of fine-tuning steps after pruning")
 
     @property
     def is_enabled(self) -> bool:
@@ -76,50 +73,54 @@ class PruneConfig(Section):
 
 
 class BudgetConfig(Section):
-    """Limits that a run keeps (docs/reference/limits.md); null: none."""
+    """Limits of a run; null: no limit."""
 
     max_gaussians: int | None = Field(
-        default=None, ge=1, description="most Gaussians at the end of the run"
+        default=None, ge=1, description="maximum number of Gaussians at the end of the run"
     )
     max_mb: float | None = Field(
         default=None,
         gt=0,
-        description="largest size of `export/scene.dyngs`, 1e6 bytes; the file is then written",
+        description="maximum size of the exported file `export/scene.dyngs`, 1e6 bytes; null: no "
+        "file is written",
     )
 
 
 class RunConfig(Section):
-    """Where the run goes and how it is executed."""
+    """Output folder and execution of a run."""
 
-    name: str = Field(default="static", description="name of the run; names its folder")
+    name: str = Field(default="static", description="name of the run, used for its default folder")
     dir: Path | None = Field(default=None, description="run folder; null: runs/NAME")
     seed: int = Field(default=42, ge=0, lt=2**63, description="seed of all random numbers")
-    threads: int = Field(default=0, ge=0, le=1024, description="CPU threads; 0: one per core")
+    threads: int = Field(
+        default=0, ge=0, le=1024, description="number of CPU threads; 0: one per core"
+    )
     device: Literal["auto", "cpu", "cuda"] = Field(
         default="auto",
-        description="what computes; auto: a CUDA GPU that can be used (`dyngs docs gpu`), else the CPU",
+        description="device to train on; auto: a supported CUDA GPU if there is one, else the CPU",
     )
     deterministic: bool = Field(
         default=True,
-        description="on a GPU: the same bytes on every run; false may be faster (the CPU's always are)",
+        description="whether runs on a GPU are reproducible to the byte; false may be faster; runs "
+        "on the CPU always are",
     )
 
 
 class Config(Section):
-    """Everything that decides a run."""
+    """Complete configuration of a run."""
 
     data: DataConfig
     camera: CameraConfig = CameraConfig()
     model: Annotated[
-        AnyModel, BeforeValidator(_model_section), Field(description="what is trained")
-    ] = Field(default_factory=_still)
+        AnyModel, BeforeValidator(_model_section), Field(description="model to train")
+    ] = Field(default_factory=_default_model)
     init: Annotated[
         PointsInit | RandomInit | SceneInit,
-        Field(discriminator="kind", description="where the first Gaussians come from"),
+        Field(discriminator="kind", description="source of the initial Gaussians"),
     ] = PointsInit()
     colour: Annotated[
         ShColour | NetworkColour | AutoColour,
-        Field(discriminator="kind", description="what colours are made of"),
+        Field(discriminator="kind", description="colour representation"),
     ] = ShColour()
     strategy: Annotated[
         Strategy,

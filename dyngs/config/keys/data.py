@@ -1,4 +1,4 @@
-"""Section ``data``: where the images are and how they are read."""
+"""Section ``data``: location and reading of the capture."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dyngs.core.section import Section
 
 
 class DataConfig(Section):
-    """Where the images are and how they are read."""
+    """Location and reading of the capture."""
 
     root: Path = Field(description="folder or .zip of the capture")
     format: Literal[
@@ -33,60 +33,64 @@ class DataConfig(Section):
         "camera_folders",
     ] = Field(
         default="auto",
-        description="layout of the capture's files (`dyngs docs captures`); auto: detected",
+        description="format of the capture; auto: detected from its files",
     )
     frames: str | None = Field(
         default=None,
-        description="start:stop:step over the capture's times, as a Python slice; null: all",
+        description="time steps to use, as a Python slice start:stop:step; null: all",
     )
     pose_frames: str | None = Field(
         default=None,
-        description="start:stop:step over the times that data.frames leaves: images of a person that are held out as "
-        "the split pose; -20:: is the last 20; null: none",
+        description="time steps of a person to hold out as the split pose, as a slice of those "
+        "that data.frames selects; -20:: for the last 20; null: none",
     )
     train_cameras: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(
         default=None,
         min_length=1,
-        description="cameras whose images are trained on, by index from 0 as the capture has them; those of all "
-        "others are for testing; null: as the capture says",
+        description="indices of the training cameras, from 0; all other cameras become test "
+        "cameras; null: the split of the capture",
     )
     times: Literal["files", "order"] = Field(
         default="files",
-        description="when the images were taken; files: as the capture says; order: in the order of their names, by "
-        "the numbers that these end in",
+        description="source of the image times; files: stored in the capture; order: the numbers "
+        "at the end of the image names",
     )
     frames_per_second: float | None = Field(
         default=None,
         gt=0,
-        description="with times=order: so many numbers, or places in the order, are a second; null: not known",
+        description="frame rate of the numbered images with times=order; null: unknown",
     )
     skip_missing: bool = Field(
         default=False,
-        description="leave out views whose images are missing, instead of stopping with an error",
+        description="whether to skip views whose images are missing instead of raising an error",
     )
     downscale: float = Field(
-        default=1.0, ge=1.0, description="divide width and height of the images by this"
+        default=1.0, ge=1.0, description="factor by which image width and height are divided"
     )
     longest_side: int | None = Field(
         default=None,
         ge=1,
-        description="shrink images so that the longer side has at most this many px; null: do not",
+        description="maximum length of the longer image side, px; larger images are downscaled; "
+        "null: no limit",
     )
     test_every: int = Field(
         default=8,
         ge=0,
-        description="hold out every n-th image by name where the capture has no split; 0: none",
+        description="hold out every n-th image, sorted by name, if the capture defines no split; "
+        "0: none",
     )
     background: Literal["auto", "white", "black", "random"] = Field(
         default="auto",
-        description="colour behind the Gaussians; auto: white where the images have alpha, black otherwise; "
-        "random: another one in each step",
+        description="background colour; auto: white if the images have alpha, else black; "
+        "random: a new random colour in each step",
     )
     body: Path | None = Field(
         default=None,
-        description="folder of a fit by `dyngs data fit`, read in place of the capture's body parameters",
+        description="output folder of `dyngs data fit` whose body parameters replace those of the "
+        "capture",
     )
-    cache_mb: float = Field(default=4096, ge=0, description="memory for decoded images, MB")
+    cache_mb: float = Field(default=4096, ge=0, description="size of the image cache, MB")
     follow_links: bool = Field(
-        default=False, description="allow files of the capture that lie outside its folder"
+        default=False,
+        description="whether to follow links to files outside the folder of the capture",
     )

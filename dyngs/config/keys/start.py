@@ -1,4 +1,4 @@
-"""Section ``init``: the first Gaussians."""
+"""Section ``init``: the initial Gaussians."""
 
 from __future__ import annotations
 
@@ -11,64 +11,75 @@ from dyngs.core.section import Length, Section
 
 
 class PointsInit(Section):
-    """Start from the capture's sparse points, else from triangulated ones, else from random
-    ones."""
+    """Initial Gaussians at the sparse points of the capture, else at triangulated or random
+    points."""
 
     kind: Literal["auto", "points"] = Field(
-        default="auto", description="the capture's points, else triangulated, else random ones"
+        default="auto",
+        description="sparse points of the capture, else triangulated points, else random points",
     )
     triangulate: int = Field(
         default=24,
         ge=0,
-        description="images of one time step to triangulate points from where the capture has none; 0: do not",
+        description="number of images of one time step from which initial points are triangulated "
+        "if the capture has none; 0: no triangulation",
     )
     dense: int = Field(
         default=0,
         ge=0,
-        description="points of depth maps, added in still captures to fewer than half as many; preset static: 10000",
+        description="number of points from depth maps, added in static captures with fewer than "
+        "half as many sparse points; preset static: 10000",
     )
     num_random: int = Field(
-        default=20_000, ge=1, description="number of random points; auto: where there are no others"
+        default=20_000,
+        ge=1,
+        description="number of random points; with kind=auto used only without other points",
     )
     half_extent: Length = Field(
         default="auto",
-        description="half the side of their cube around the origin (Blender scenes), in the unit of the capture; auto: "
-        "a quarter of the scene extent, 1.3 in NeRF-synthetic scenes",
+        description="half the side length of the cube of random points, in the unit of the capture; "
+        "auto: a quarter of the scene extent, 1.3 in NeRF-synthetic scenes",
     )
 
 
 class RandomInit(Section):
-    """Start from uniformly random points in a cube around the origin (Blender scenes of 3DGS)."""
+    """Initial Gaussians at random points in a cube around the origin (Blender scenes of 3DGS)."""
 
     kind: Literal["random"] = Field(
-        default="random", description="points drawn uniformly in a cube around the origin"
+        default="random", description="uniformly random points in a cube around the origin"
     )
     num_random: int = Field(
-        default=20_000, ge=1, description="number of random points; auto: where there are no others"
+        default=20_000,
+        ge=1,
+        description="number of random points; with kind=auto used only without other points",
     )
     half_extent: Length = Field(
         default="auto",
-        description="half the side of their cube around the origin (Blender scenes), in the unit of the capture; auto: "
-        "a quarter of the scene extent, 1.3 in NeRF-synthetic scenes",
+        description="half the side length of the cube of random points, in the unit of the capture; "
+        "auto: a quarter of the scene extent, 1.3 in NeRF-synthetic scenes",
     )
 
 
 class SceneInit(Section):
-    """Go on from a scene that was trained before; a model of a still scene."""
+    """Initial Gaussians from an existing static scene."""
 
     num_random: ClassVar[int] = 1
     half_extent: ClassVar[Length] = "auto"
-    """Of a placeholder, where a checkpoint is read instead."""
+    """Unused; ``num_random`` and ``half_extent`` only size the placeholder of a restored run."""
 
     kind: Literal["scene"] = Field(
-        default="scene", description="the Gaussians of a scene (`dyngs train --from`)"
+        default="scene", description="Gaussians of an existing scene (`dyngs train --from`)"
     )
-    scene: Path = Field(description="run or file of Gaussians, in the world of the capture")
-    trains: Literal["all", "colour"] = Field(
+    scene: Path = Field(
+        description="run folder or file of Gaussians, in the coordinates of the capture"
+    )
+    trainable: Literal["all", "colour"] = Field(
         default="all",
-        description="what is trained; colour: positions, shapes and opacities stay, none are added",
+        description="parameters to train; colour: positions, shapes and opacities are frozen and "
+        "no Gaussians are added",
     )
     box: tuple[float, float, float, float, float, float] | None = Field(
         default=None,
-        description="low and high corner [x,y,z,x,y,z]: what is outside stays as it is; null: nothing",
+        description="box [x,y,z,x,y,z] of the lowest and highest corner; Gaussians outside are "
+        "frozen; null: all are trained",
     )

@@ -1,4 +1,4 @@
-"""Section ``train``: length, loss and logging of a run."""
+"""Section ``train``: length, losses, checkpoints and logging of a run."""
 
 from __future__ import annotations
 
@@ -10,89 +10,88 @@ from dyngs.core.section import Fraction, Section, parse_digits
 
 
 class TrainConfig(Section):
-    """Length, loss and logging of a run."""
+    """Length, losses, checkpoints and logging of a run."""
 
     steps: int = Field(
-        default=7000, ge=1, description="optimisation steps; all schedules follow this number"
+        default=7000, ge=1, description="number of training steps; all schedules scale with it"
     )
     minutes: float | None = Field(
         default=None,
         gt=0,
-        description="longest time of training on this machine, min; fewer than train.steps are done if need be, with "
-        "schedules to match, in smaller images where too few fit, and a line at the end says what all would cost; 1 is "
-        "a preview; null: no limit",
+        description="maximum training time, minutes; lowers train.steps, and the image size if too "
+        "few steps fit; null: no limit",
     )
     batch_size: int = Field(
         default=1,
         ge=1,
-        description="views per step, whose gradients are averaged; processes that torchrun starts share them "
-        "(`dyngs docs clusters`), and 1 means one for each process there",
+        description="number of views per step, whose gradients are averaged; split among the "
+        "processes of torchrun, where 1 means one view per process",
     )
     initial_downscale: Annotated[Literal[1, 2, 4, 8, 16], BeforeValidator(parse_digits)] = Field(
         default=1,
-        description="sides of the training images are divided by this at first; 1: full resolution",
+        description="downscale factor of the training images at the start; 1: full resolution",
     )
     resolution_grows_from: Fraction = Field(
         default=0.4,
-        description="fraction of the run after which initial_downscale is halved for the first time",
+        description="fraction of the run after which the image resolution starts to grow",
     )
     resolution_full_at: Fraction = Field(
-        default=0.7, description="fraction of the run after which images have their full resolution"
+        default=0.7, description="fraction of the run after which images have full resolution"
     )
     ssim_weight: Fraction = Field(
-        default=0.2, description="weight w of 1 - SSIM; the loss is (1 - w) L1 + w (1 - SSIM)"
+        default=0.2, description="weight w of the SSIM loss, (1 - w) L1 + w (1 - SSIM)"
     )
     alpha_weight: float = Field(
         default=0.1,
         ge=0,
-        description="weight of the mean error of opacity, where images have alpha, so that a scene is right on any "
-        "background; a fifth of it in the first 60 % of a run on images with times, unless 5 % of the opaque pixels "
-        "have the background's colour; published: 0",
+        description="weight of the alpha loss for images with alpha; 3DGS: 0; reduced to a fifth in "
+        "the first 60 % of moving scenes, unless 5 % of the opaque pixels have the background colour",
     )
     priors: tuple[Literal["depth", "flow", "tracks", "motion_masks"], ...] = Field(
         default=("depth", "flow", "tracks", "motion_masks"),
-        description="what is used in addition to images where the capture has it: depth maps, optical flow, 2D tracks, "
-        "and masks that say what moves (`dyngs docs captures`)",
+        description="priors to use if the capture has them: depth maps, optical flow, 2D tracks, "
+        "motion masks",
     )
     robust: Literal["never", "auto", "always"] = Field(
         default="never",
-        description="leave out pixels that disagree with the other views (people who walk by); static scenes only; "
-        "auto: where small runs beforehand say that it pays",
+        description="whether to mask pixels that are inconsistent with the other views, such as "
+        "passers-by; static scenes only; auto: decided by pilot runs",
     )
     exposure: Literal["never", "auto", "always"] = Field(
         default="never",
-        description="learn exposure and white balance of each training image (an affine colour, the mean one is the "
-        "identity); auto: where small runs beforehand say that it pays",
+        description="whether to learn exposure and white balance of each training image as an "
+        "affine colour transform; auto: decided by pilot runs",
     )
     remove_floaters: bool = Field(
         default=True,
-        description="when training ends, remove Gaussians that hang close before a camera and show mostly there; still "
-        "scenes of 20 views or more",
+        description="whether to remove floaters close to single cameras at the end of training; "
+        "static scenes of 20 or more views",
     )
     sh_every: int = Field(
         default=1000,
         ge=1,
-        description="steps, of a 30,000-step run, after which one more degree of harmonics is trained each time",
+        description="steps of a 30,000-step run between increases of the active SH degree",
     )
-    log_every: int = Field(default=10, ge=1, description="steps between lines of log.jsonl")
+    log_every: int = Field(default=10, ge=1, description="steps between entries of log.jsonl")
     save_minutes: float = Field(
         default=5.0,
         ge=0,
-        description="minutes of training between checkpoints, longer where saving takes more than a twentieth of that; "
-        "the newest two are kept; 0: only the last",
+        description="minutes between checkpoints, more if saving takes over 5 % of the time; the "
+        "newest two are kept; 0: only at the end",
     )
     save_every: int = Field(
-        default=0, ge=0, description="steps between checkpoints, in addition; 0: none by steps"
+        default=0, ge=0, description="steps between additional checkpoints; 0: none"
     )
     eval_every: int = Field(
-        default=0, ge=0, description="steps between evaluations; 0: only by `dyngs eval`"
+        default=0, ge=0, description="steps between evaluations on the test split; 0: none"
     )
     tensorboard: bool = Field(
-        default=False, description="also log to RUN/tensorboard (pip install dyngs[tensorboard])"
+        default=False,
+        description="whether to log to RUN/tensorboard (pip install 'dyngs[tensorboard]')",
     )
 
     @field_validator("alpha_weight", mode="before")
     @classmethod
     def _read_unset(cls, value: object) -> object:
-        """Return the default for null, which runs of earlier versions have."""
+        """Replace null, stored by runs of earlier versions, by the default."""
         return cls.model_fields["alpha_weight"].default if value is None else value

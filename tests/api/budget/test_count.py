@@ -74,7 +74,7 @@ def test_no_run_ends_with_more_and_a_resumed_one_knows(
     config = config_of(kind, captures, tmp_path / "run", BudgetConfig(max_gaussians=100))
     saves = config.train.model_copy(update={"save_every": config.train.steps - 1})
     folder, messages = trained(config.model_copy(update={"train": saves}))
-    assert "dB on training views when they were removed" in messages[-1]
+    assert "dB on training views by the removal" in messages[-1]
     end = checkpoint_paths(folder)[-1]
     wanted = end.read_bytes()
     assert len(load_run(folder).scene) <= 100
@@ -93,7 +93,7 @@ def test_room_in_a_file_is_a_limit(
     config = config_of("default", captures, tmp_path / "run", BudgetConfig(max_mb=0.001))
     folder, messages = trained(config)
     assert len(load_run(folder).scene) == 1000 // (16 + 0.35 * 9)
-    assert any("asked for at most 52 Gaussians, got 52; 150 before" in x for x in messages)
+    assert any("limit 52, used 52; 150 before" in x for x in messages)
     compact = PruneConfig(fraction=0.7, steps=3)
     other = RunConfig(dir=tmp_path / "other", threads=1)
     folder, _ = trained(config.model_copy(update={"prune": compact, "run": other}))

@@ -77,7 +77,7 @@ def test_a_file_is_never_larger_and_shows_what_is_said(trainer: Trainer, tmp_pat
         assert file.stat().st_size == round(1e6 * report.megabytes) <= 1e6 * asked
         assert report.coarser > 1 or report.num_kept < 500
         assert report.before == usual.before
-        assert f"asked {asked:g}" in str(report)
+        assert f"limit {asked:g}" in str(report)
         scene = load_run(file.parent).scene
         assert len(scene) == report.num_kept
         drawn = mean_psnr(trainer, scene, [trainer.images[i] for i in range(4)])
@@ -88,7 +88,7 @@ def test_a_file_is_never_larger_and_shows_what_is_said(trainer: Trainer, tmp_pat
 
 
 def test_what_cannot_fit_is_said(trainer: Trainer, tmp_path: Path) -> None:
-    with pytest.raises(DyngsError, match=r"budget.max_mb=0.0001: what is trained does not fit"):
+    with pytest.raises(DyngsError, match=r"budget.max_mb=0.0001: too small for this scene"):
         write_limited_file(trainer, tmp_path, 0.0001)
     assert not (tmp_path / EXPORT_FOLDER).exists()
 

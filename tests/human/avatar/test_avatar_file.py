@@ -160,7 +160,7 @@ Change = Callable[[dict[str, Tensor]], object]
             "'anchors.joints' is float32",
         ),
         (lambda x: x["gaussians.means"].fill_(torch.nan), "'means' holds NaN"),
-        (lambda x: x["anchors.joints"].fill_(55), "'anchors.joints' names something beyond the 55"),
+        (lambda x: x["anchors.joints"].fill_(55), "'anchors.joints' has indices outside"),
         (lambda x: x["anchors.weights"].neg_(), "negative or sum to 0"),
         (lambda x: x["skeleton.parents"].fill_(7), "joint 0 has parent 7"),
         (lambda x: x["reference.scale"].zero_(), "'clip.scale' must be above 0"),
