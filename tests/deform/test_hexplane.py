@@ -1,5 +1,4 @@
-"""Planes: what they start from, what lies outside them, and how they continue to times not seen
-yet."""
+"""HexPlane grids: initialization, clamping, and extrapolation to unseen times."""
 
 from __future__ import annotations
 
@@ -16,7 +15,7 @@ from dyngs.deform.networks import Hexplane
 
 
 def field_with_rows(rows: int) -> Hexplane:
-    """Planes whose row i over time holds the number i everywhere."""
+    """Planes whose time row i has the value i everywhere."""
     options = tiny_options("hexplane")
     assert isinstance(options, HexplaneField)
     field = Hexplane(options, tiny_setup(num_times=2 * rows), torch.Generator().manual_seed(0))
@@ -26,7 +25,7 @@ def field_with_rows(rows: int) -> Hexplane:
 
 
 def rows_of(field: Hexplane) -> list[float]:
-    """The number in each row, which must be the same in all its places."""
+    """The value of each time row, which must be constant within the row."""
     found = torch.stack([level.time.detach()[:, :, 0, 0] for level in field.levels])
     for level in field.levels:
         assert torch.equal(
@@ -42,7 +41,7 @@ def outputs_at(field: Hexplane, means: Tensor, time: float) -> Tensor:
 
 
 def test_planes_are_initialized_as_published() -> None:
-    """Space uniform in [0.1, 0.5], time at 1; as many rows as the clip asks for."""
+    """Space planes uniform in [0.1, 0.5], time planes at 1; the clip sets the number of time rows."""
     field = tiny_field("hexplane")
     assert isinstance(field, Hexplane)
     for level, side in zip(field.levels, (5, 10), strict=True):
@@ -89,8 +88,7 @@ def test_extrapolation_fills_unseen_time_rows_only(rows: int, time_offsets: list
 
 
 def test_penalties_vanish_on_smooth_planes_only() -> None:
-    """Second differences of planes that are linear in each axis, and the distance of the planes
-    with time from 1."""
+    """Second differences vanish on planes linear in each axis; time planes are compared with 1."""
     field = tiny_field("hexplane")
     assert isinstance(field, Hexplane)
     for level in field.levels:

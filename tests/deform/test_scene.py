@@ -25,7 +25,7 @@ NOTHING = torch.zeros(0, dtype=torch.long)
 def scene_of(
     rows: Tensor, field: DeformationField | None = None, filter_std: Tensor | None = None
 ) -> DynamicScene:
-    """The cloud, ``rows`` of which a field moves."""
+    """A scene of the cloud in which a field moves ``rows``."""
     times = (0.0, 0.5, 1.0)
     return DynamicScene(
         gaussians=cloud(), training_times=times, field=field, moving=rows, filter_std=filter_std
@@ -80,7 +80,7 @@ def test_moving_and_static_parts_make_the_scene(kind: str, is_filtered: bool) ->
 @pytest.mark.parametrize("kind", ALL_KINDS)
 @pytest.mark.parametrize("rows", [ROWS, None, NOTHING], ids=["some", "all", "none"])
 def test_scene_loads_from_a_checkpoint(kind: str, rows: Tensor | None) -> None:
-    """As the model stored it; without rows all Gaussians move."""
+    """As stored by the model; without rows all Gaussians move."""
     gaussians = cloud()
     num_moving = 9 if rows is None else len(rows)
     field = stirred_field(kind, num_moving)

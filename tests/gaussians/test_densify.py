@@ -1,5 +1,4 @@
-"""Clone, split, prune and reset: the published rules on hand-made sets, and invariants on random
-ones."""
+"""Clone, split, prune and reset: the published rules on small examples, and invariants."""
 
 from __future__ import annotations
 
@@ -85,8 +84,9 @@ def test_gaussians_are_split_cloned_pruned_or_kept() -> None:
 
 
 def test_distant_gaussians_may_be_larger() -> None:
-    """Sky and far hills stay, and are copied where nearer ones would be split; ``center`` is what
-    they are far from."""
+    """Sky and distant hills are kept, and cloned where near ones are split. Distance is from
+    ``center``.
+    """
     # distances 60, which is the reach, and 50, five extents: not yet far
     center = torch.tensor([-60.0, 0.0, 0.0])
     for scale, score, step, source in (
@@ -179,7 +179,7 @@ def test_gaussians_exactly_at_a_threshold() -> None:
 
 
 def test_split_of_pruned_gaussian_costs_two() -> None:
-    """One that is too large to stay frees no room by being split."""
+    """Splitting a Gaussian that is pruned for its size frees no capacity."""
     huge = _gaussians([1.5, 0.1, 0.1], [0.5, 0.5, 0.5])
     for cap, split in ((3, False), (4, True)):
         plan = plan_edit(
@@ -191,7 +191,7 @@ def test_split_of_pruned_gaussian_costs_two() -> None:
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 40))
 def test_without_growth_gaussians_are_only_removed(seed: int, n: int) -> None:
-    """The same ones as with a cap that leaves no room."""
+    """Equal to the result with a cap that leaves no capacity."""
     generator = torch.Generator().manual_seed(seed)
     scales, opacities, score = (
         torch.rand(n, generator=generator) * high + 1e-3 for high in (2.0, 0.02, 4e-4)

@@ -1,4 +1,4 @@
-"""Depths of a ball, seen from all around, as one surface, and that as few triangles."""
+"""Fusion of depth maps of a ball into one surface, and mesh simplification."""
 
 from __future__ import annotations
 

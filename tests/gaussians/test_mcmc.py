@@ -1,5 +1,4 @@
-"""Relocation keeps the image, the set grows to its cap, noise moves only what is nearly
-transparent."""
+"""MCMC: relocation keeps the image, growth stops at the cap, noise affects transparent Gaussians."""
 
 from __future__ import annotations
 

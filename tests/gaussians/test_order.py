@@ -1,4 +1,4 @@
-"""Storage order: a permutation that keeps neighbours together, with what moves in front."""
+"""Storage order: a permutation that keeps neighbours together, moving Gaussians first."""
 
 from __future__ import annotations
 

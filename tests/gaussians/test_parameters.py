@@ -1,5 +1,4 @@
-"""Adam of a field: torch's own, with a schedule, rows that can be rearranged, and a state that can
-be stored."""
+"""Adam of a field: torch's Adam with a schedule, reordered rows and checkpoints."""
 
 from __future__ import annotations
 
@@ -53,7 +52,7 @@ def test_equals_adam_with_decaying_rate(decay: float) -> None:
 
 
 def test_edited_rows_keep_moments_and_new_rows_start_without() -> None:
-    """Those of the tensors that have that role; the parameters before stay as they were."""
+    """Only tensors with rows per Gaussian are edited; the previous parameters are unchanged."""
     roles = dict.fromkeys(SHAPES, Role.SHARED) | {"weight": Role.PER_MOVING}
     learned = Parameters(start_values(), RATES, roles=roles)
     give_gradients(learned, 1)
@@ -79,7 +78,7 @@ def test_edited_rows_keep_moments_and_new_rows_start_without() -> None:
 
 
 def test_reordered_rows_keep_their_moments() -> None:
-    """The source of a row that is new need not exist."""
+    """The source index of a new row need not exist."""
     learned = Parameters(start_values(), RATES)
     give_gradients(learned, 1)
     learned.step(1, 0.0)

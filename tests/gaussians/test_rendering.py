@@ -1,4 +1,4 @@
-"""The one verb: that it is the ops in a row, its options, and that torch can compile it."""
+"""``render``: equality with the single ops, its options, and torch.compile."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_render_equals_project_harmonics_rasterize(mode: RasterizeMode) -> None:
 
 
 def test_a_shader_gives_the_colours() -> None:
-    """Instead of the harmonics; it sees what is drawn and where from, and its gradients go on."""
+    """The shader replaces SH, gets the visible Gaussians and cameras, and is differentiable."""
     scene = random_scene(degree=1)
     gaussians = leaves(scene.gaussians)
     asked = []

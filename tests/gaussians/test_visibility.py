@@ -1,4 +1,4 @@
-"""Bits in, the same bits out, and the right ones around a time."""
+"""Packed visibility masks: round trip, and interpolation around a time."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Every op on the core for CUDA GPUs, which runs here over the emulation of its kernels, beside the
-core for CPUs."""
+"""Every op on the emulated GPU compared with the CPU."""
 
 from __future__ import annotations
 

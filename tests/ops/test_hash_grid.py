@@ -1,5 +1,4 @@
-"""Hash grids against their formula in float64, and their promises: same bits on any threads, what
-lies outside."""
+"""Hash grids against their formula in float64: determinism, and points outside."""
 
 from __future__ import annotations
 

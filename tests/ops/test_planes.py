@@ -1,5 +1,4 @@
-"""The HexPlane look-up and the penalties of its planes against plain torch, finite differences and
-known answers."""
+"""HexPlane features and penalties against torch, finite differences and known values."""
 
 from __future__ import annotations
 

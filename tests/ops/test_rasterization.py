@@ -1,5 +1,4 @@
-"""The native blending against the reference: values, gradients, probe, contributions, and what must
-not matter."""
+"""Blending against the reference: values, gradients, probe, contributions, invariances."""
 
 from __future__ import annotations
 
@@ -216,8 +215,9 @@ def test_pixel_tally_counts_blended_pixels() -> None:
 @pytest.mark.parametrize("channels", [1, 3, 5])
 @pytest.mark.parametrize("exact", [True, False])
 def test_squared_slopes_equal_autograd_pixel_for_pixel(channels: int, exact: bool) -> None:
-    """Some pixels fill up, some alphas are clamped; 1e-10 because the light behind is what is left
-    of a sum."""
+    """Some pixels saturate and some alphas are clamped. Tolerance 1e-10, since the light behind is
+    a difference of sums.
+    """
     scene = random_scene(n=30, views=2, seed=13)
     scene = replace(scene, opacities=scene.opacities**0.2, scales=2 * scene.scales)
     projection, opacities, colors, background = with_channels(scene, channels)
@@ -278,7 +278,7 @@ def test_no_gaussians_leave_the_background() -> None:
 
 
 def test_more_gaussians_in_a_tile_than_are_copied_at_a_time() -> None:
-    """Chunks of 256: 700 faint ones on one tile, every one of which counts."""
+    """700 faint Gaussians on one tile, in chunks of 256, all contribute."""
     scene = random_scene(n=700, views=1, size=(13, 11), seed=6)
     scene = replace(scene, opacities=0.02 * scene.opacities)
     ours = draw(scene, NATIVE, EXACT)

@@ -1,4 +1,4 @@
-"""Samples along rays, and what is seen along them, against loops in float64 and known answers."""
+"""Ray samples and volume rendering against loops in float64 and known values."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def towards(*direction: float, origin: tuple[float, float, float] = (-5.0, 0.13,
 
 
 def some_rays(count: int, seed: int = 0) -> Rays:
-    """From around a sphere of radius 3 to near its middle."""
+    """Rays from around a sphere of radius 3 towards its middle."""
     generator = torch.Generator().manual_seed(seed)
     origins = (
         torch.nn.functional.normalize(
@@ -46,7 +46,7 @@ def shifts_of(rays: Rays, value: float = 0.5) -> torch.Tensor:
 
 
 def some_samples(counts: list[int], seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, Samples]:
-    """Densities, colours and samples of rays with so many each."""
+    """Densities, colours and samples of rays, with the given number per ray."""
     generator = torch.Generator().manual_seed(seed)
     total = sum(counts)
     densities = torch.rand(total, generator=generator, dtype=torch.float64) * 3

@@ -1,4 +1,4 @@
-"""The native ops as ops of the dispatcher: differentiable once."""
+"""Registration of native ops in torch's dispatcher: differentiable once."""
 
 from __future__ import annotations
 
@@ -88,14 +88,15 @@ DO_NOT_FIT: list[Callable[[], object]] = [
 
 @pytest.mark.parametrize("call", DO_NOT_FIT)
 def test_arrays_that_do_not_fit_are_refused(call: Callable[[], object]) -> None:
-    """By the core: before it reads or writes beyond their ends."""
+    """The core raises before it accesses memory out of bounds."""
     with pytest.raises(DyngsError):
         call()
 
 
 def test_drawing_imports_neither_the_compiler_of_torch_nor_another_openmp() -> None:
-    """The former takes 2 s of CPU, which every command would pay; torch and the core share one pool
-    of threads."""
+    """Importing torch's compiler would cost every command 2 s. Torch and the core share one thread
+    pool.
+    """
     code = (
         "import sys, torch\n"
         "from dyngs import Cameras, Gaussians, render\n"

@@ -1,5 +1,4 @@
-"""A still scene in levels of detail is drawn as the scene is, by every camera in the detail that it
-needs."""
+"""Levels of detail of a static scene: the camera chooses the level."""
 
 from __future__ import annotations
 

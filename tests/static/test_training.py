@@ -1,5 +1,4 @@
-"""How a static scene is trained: on every image, with its 3D filter kept until it is due, and rid
-of what is small."""
+"""Training of a static scene: periodic 3D filter, and pruning of small Gaussians."""
 
 from __future__ import annotations
 
@@ -66,8 +65,7 @@ def test_densification_is_left_to_the_strategy() -> None:
 
 
 def _sized(pixels: list[float]) -> Gaussians:
-    """Faint Gaussians side by side at depth 2 that make up so many pixels, 2 pi o s^2 (50 px are a
-    unit there)."""
+    """Faint Gaussians side by side at depth 2 with given areas 2 pi o s^2 in px (50 px per unit)."""
     n = len(pixels)
     std = 3.0
     means = torch.stack([torch.linspace(-0.6, 0.6, n), torch.zeros(n), torch.full((n,), 2.0)], 1)

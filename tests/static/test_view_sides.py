@@ -1,5 +1,4 @@
-"""Of Gaussians that were found from several sides a camera sees those of the side that it stands
-nearest to."""
+"""Gaussians observed from several sides: a camera renders those of its nearest side."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cells that no camera sees stay empty."""
+"""Cells outside all view frusta stay empty."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dyngs.ops.rays import Space
 
 
 def view_from(position: tuple[float, float, float], turn: float) -> View:
-    """A camera with a field of view of 53 by 37 degrees, turned about the vertical axis."""
+    """A camera with a field of view of 53 by 37 degrees, rotated about the vertical axis."""
     rotation = np.array(
         [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
     )

@@ -1,5 +1,4 @@
-"""Fields through the commands: trained, resumed, evaluated, drawn, exported as a mesh; what is
-refused, in a line."""
+"""Radiance fields by the commands: training, resuming, evaluation, rendering, mesh export, errors."""
 
 from __future__ import annotations
 

@@ -18,8 +18,7 @@ MIDDLE = torch.tensor([0.3, -0.1, 0.2])
 
 @dataclass(frozen=True)
 class Ball(NgpField):
-    """Density exp(10 (radius - distance)) around a point, of radius 0.5, and colours that are the
-    direction."""
+    """A ball with density exp(10 (0.5 - distance)), coloured by direction."""
 
     def densities(self, points: torch.Tensor, time: float) -> torch.Tensor:
         return 25 * torch.exp(10 * (0.5 - (points - MIDDLE).norm(dim=1))) * (1.5 / self.space.half)

@@ -1,4 +1,4 @@
-"""Instant-NGP: sizes, what rays see by the kernels and by a loop, what is stored."""
+"""Instant-NGP: sizes, rendering by the kernels and by a loop, and checkpoints."""
 
 from __future__ import annotations
 
@@ -32,8 +32,7 @@ def rays_towards_it(count: int = 20) -> Rays:
 
 @pytest.mark.parametrize("time", [False, True])
 def test_rays_composite_the_samples_along_them(time: bool) -> None:
-    """Sample by sample, by the densities and colours of places: occupied ones, up to where nothing
-    is left."""
+    """Compared sample by sample with densities and colours in occupied cells, until a ray ends."""
     field = field_of(SMALL.model_copy(update={"time": time}))
     rays = rays_towards_it()
     with torch.no_grad():

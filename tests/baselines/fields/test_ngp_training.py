@@ -1,4 +1,4 @@
-"""Instant-NGP learns a small capture, on rays that fill its steps; its schedule."""
+"""Instant-NGP training on a small capture: ray batches and schedule."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def held_out_psnr(trainer: Trainer[NgpTraining]) -> float:
 
 
 def test_training_improves_held_out_views(capture: Path) -> None:
-    """The floor is 1 dB below what came out when this was written; a white image has 10 dB."""
+    """The threshold is 1 dB below the measured PSNR; a white image has 10 dB."""
     trainer = trained(capture, 150)
     assert held_out_psnr(trainer) > 15.5
     field = trainer.model.scene.field

@@ -1,4 +1,4 @@
-"""Where fields lie, and rays: through pixel centres, as a camera projects."""
+"""Bounds of fields, and camera rays through pixel centres."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def still(capture: Path) -> Capture:
 
 
 def real(still: Capture, points: np.ndarray | None) -> Capture:
-    """The same cameras, of images without alpha."""
+    """The same cameras with images without alpha."""
     cloud = None if points is None else PointCloud(points, np.zeros((len(points), 3), np.uint8))
     return replace(still, has_alpha=False, points=cloud)
 

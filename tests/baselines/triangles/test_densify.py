@@ -1,4 +1,4 @@
-"""Which triangles are split, which removed."""
+"""Splitting and pruning of triangles."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dyngs.baselines.triangles.training import TriangleStatistics, densify, prun
 
 
 def seen(count: int) -> TriangleStatistics:
-    """All triangles, everywhere, in each of 10 views."""
+    """Statistics of triangles that cover everything in each of 10 views."""
     tallies = TriangleStatistics(count)
     tallies.views += 10
     tallies.seen += 10

@@ -1,4 +1,4 @@
-"""Where triangles begin: on a surface, in the first step, and not again after that."""
+"""Initial triangles: created on a surface in the first step only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Harmonics fitted to a network: exact where they can be, with an error that is told where not."""
+"""Baking of a colour network into SH: exact where representable, with a residual otherwise."""
 
 from __future__ import annotations
 
