@@ -167,8 +167,8 @@ def build_pruning_edit(trainer: GaussianTrainer) -> TrainingEdit:
         return replace(
             edit, message=f"{message}{format_count(len(scene), 'Gaussian')}{_let_through(edit)}"
         )
-    gain = mean_psnr(trainer, scene.select(edit.kept)) - mean_psnr(trainer, scene)
-    left = format_count(int(edit.kept.sum()), "Gaussian")
+    gain = mean_psnr(trainer, scene.select(edit.keep)) - mean_psnr(trainer, scene)
+    left = format_count(int(edit.keep.sum()), "Gaussian")
     cost = f"{gain:+.2f} dB before it is trained again"
     return replace(edit, message=f"{message}{left}, {cost}{_let_through(edit)}")
 

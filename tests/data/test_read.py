@@ -51,7 +51,7 @@ def test_readers_configuration_and_docs_name_the_same_formats() -> None:
     names = {format.name for format in FORMATS}
     assert (len(names), {format.name for format in declared}) == (len(FORMATS), names)
     assert set(get_args(DataConfig.model_fields["format"].annotation)) == {"auto", *names}
-    table = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "formats.md").read_text(
+    table = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "captures.md").read_text(
         encoding="utf-8"
     )
     assert [name for name in names if f"\n| `{name}` |" not in table] == []

@@ -86,7 +86,7 @@ def test_a_linear_change_does_not_flicker_however_it_is_sampled() -> None:
 def test_too_few_times_are_a_reason(count: int) -> None:
     found = flicker(drawing(moving_scene(Sliding())), camera(), (0.0, 1.0)[:count])
     assert found.value is None
-    assert f"there are {count}" in (found.reason or "")
+    assert f"found {count}" in (found.reason or "")
 
 
 def test_flicker_error_is_that_of_the_differences(split) -> None:

@@ -102,7 +102,7 @@ def test_a_finished_run_goes_on_to_the_same_bytes_also_when_it_is_stopped(
     shutil.copytree(one, other)
     capsys.readouterr()
     _to(one, 2 * done)
-    assert f"from step {done} to {2 * done} instead of {done}" in capsys.readouterr().out
+    assert f"resuming at step {done}, extended from {done} to {2 * done}" in capsys.readouterr().out
     with monkeypatch.context() as patch:
         _stop_after(done + 5, patch)
         with pytest.raises(KeyboardInterrupt, match="--resume"):
@@ -124,7 +124,7 @@ def test_a_run_that_was_stopped_may_become_longer_or_shorter(
         _stop_after(6, patch)
         with pytest.raises(KeyboardInterrupt):
             train(_config(captures, run, "default"))
-    with pytest.raises(DyngsError, match="6 steps are done"):
+    with pytest.raises(DyngsError, match="already has 6 steps"):
         _to(run, 6)
     for steps in (20, 9):
         copy = tmp_path / str(steps)
@@ -180,7 +180,7 @@ def test_exposures_that_are_learned_stay_so() -> None:
     options = TrainConfig(steps=1000, exposure="always")
     config = Config(data=DataConfig(root=Path("x")), train=options)
     assert extend_config(config, 1000, 3000).train.exposure == "always"
-    with pytest.raises(DyngsError, match="exposures were learned after"):
+    with pytest.raises(DyngsError, match="exposures were learned from"):
         extend_config(config, 1000, 1_000_000)
 
 

@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 
 from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
-from dyngs.data.body_frames import merge_root_rotation, rows_of
+from dyngs.data.body_frames import match_frames, merge_root_rotation
 from dyngs.data.capture import Capture, View
 from dyngs.human.body.body import BodyTemplate, posed_vertices
 from dyngs.human.body.body_reader import default_template
@@ -79,7 +79,7 @@ def test_the_parameters_pose_the_template_as_the_images_show_it(root: Path) -> N
         if not views:
             continue
         own = merge_root_rotation(capture.body[split], exact.joints[0].numpy())
-        rows = rows_of(root, own, views)
+        rows = match_frames(root, own, views)
         poses, trans, scale = (torch.from_numpy(x[rows]) for x in (own.poses, own.trans, own.scale))
         assert (scale == 1).all()
         for view, vertices, shift in zip(
