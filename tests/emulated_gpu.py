@@ -1,5 +1,4 @@
-"""The core for CUDA GPUs, compiled over the emulation of csrc/tests, so that a CPU runs its whole
-Python path."""
+"""The CUDA core compiled for the emulated GPU of csrc/tests, so that CPUs run its Python path."""
 
 from __future__ import annotations
 
@@ -36,8 +35,7 @@ OWN_NAME = re.compile(
 
 
 def compiler() -> str:
-    """The C++ compiler: Clang, if it is here, in two thirds of the time of GCC. Skips the test
-    where there is none."""
+    """The C++ compiler, preferably Clang, which is faster. Skips the test if there is none."""
     found = shutil.which("clang++") or shutil.which("c++") or shutil.which("g++")
     if found is None:
         pytest.skip("no C++ compiler here")
@@ -58,10 +56,9 @@ def compiled(folder: Path, sources: Iterable[Path], flags: Iterable[str]) -> lis
 
 
 def as_one(file: Path, sources: Iterable[Path]) -> Path:
-    """A source that includes the others: what their headers hold is compiled once, in a quarter of
-    the time.
+    """One source that includes the others, so that shared headers are compiled once.
 
-    Headers come first, so that names that a source defines for itself alone can be made its own.
+    Headers come first, so that names local to one source can be made unique.
     """
     texts = {source: source.read_text(encoding="utf-8") for source in sources}
     lines = dict.fromkeys(
@@ -80,7 +77,7 @@ def as_one(file: Path, sources: Iterable[Path]) -> Path:
 
 
 def digest_of_all(folders: Iterable[Path]) -> str:
-    """A number that differs as soon as a source, this file, the compiler, or Python does."""
+    """A digest of the sources, this file, the compiler and the Python version."""
     found = hashlib.sha256()
     below = (
         x
@@ -100,7 +97,7 @@ def digest_of_all(folders: Iterable[Path]) -> str:
 
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Other processes wait."""
+    """A lock that excludes other processes."""
     with open(folder / "lock", "w", encoding="utf-8") as lock:
         if sys.platform != "win32":
             import fcntl
@@ -110,9 +107,9 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 
 def build_module(cache: Path) -> ModuleType:
-    """The module, compiled unless that of the same sources is in the folder ``cache``.
+    """The module, compiled unless ``cache`` holds one of the same sources.
 
-    Skips the test where nanobind or Python's headers are missing.
+    Skips the test if nanobind or the Python headers are missing.
     """
     nanobind = pytest.importorskip("nanobind")
     python = Path(sysconfig.get_paths()["include"])
@@ -156,7 +153,7 @@ def build_module(cache: Path) -> ModuleType:
 
 
 def loaded(library: Path) -> ModuleType:
-    """The module in a file."""
+    """The module loaded from a file."""
     spec = util.spec_from_file_location(NAME, library)
     assert spec is not None
     assert spec.loader is not None
@@ -166,8 +163,7 @@ def loaded(library: Path) -> ModuleType:
 
 
 def on_emulated_gpu(monkeypatch: pytest.MonkeyPatch, module: ModuleType) -> None:
-    """Make ops of CPU tensors run on the emulated GPU: kernels see only memory that an op has
-    handed to them."""
+    """Run ops of CPU tensors on the emulated GPU, whose kernels only access memory passed to them."""
     to_dlpack: Callable[[Tensor], object] = native.to_dlpack
 
     def noted(x: Tensor) -> object:

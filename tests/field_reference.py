@@ -1,4 +1,4 @@
-"""Radiance fields in plain torch, sample by sample: what the kernels are tested against."""
+"""Radiance fields in plain torch, sample by sample: the reference of the kernels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PRIMES = 1, 2654435761, 805459861
 
 
 def reference_features(coords: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
-    """The value of ``hash_features`` by its formula, any order of derivatives by the table."""
+    """Reference of ``hash_features``; the table can be differentiated any number of times."""
     found = []
     first = 0
     for scale, size, rows in zip(levels.scales, levels.sizes, levels.rows, strict=True):
@@ -40,7 +40,7 @@ def reference_features(coords: Tensor, table: Tensor, levels: HashLevels) -> Ten
 def reference_composite(
     densities: Tensor, colours: Tensor, samples: Samples, transmittance_min: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Colour, transmittance and depth of rays, one after the other."""
+    """Colour, transmittance and depth of rays, in a loop over rays."""
     seen = []
     for begin, end in zip(samples.offsets[:-1].tolist(), samples.offsets[1:].tolist(), strict=True):
         through = torch.ones((), dtype=densities.dtype)
@@ -60,7 +60,7 @@ def reference_composite(
 
 
 def cell_of(space: Space, point: Tensor) -> tuple[int, int, int, int] | None:
-    """The cell that a point of the world lies in, None outside of all cubes."""
+    """The cell that contains a world point, or None outside all cubes."""
     y = (point - torch.tensor(space.centre, dtype=point.dtype)) / space.half
     for cascade in range(space.cascades):
         if float(y.abs().max()) <= 2**cascade:
@@ -79,7 +79,7 @@ def reference_march(
     occupied: Tensor,
     steps: MarchSteps,
 ) -> list[float]:
-    """Starts of the samples of a ray with samples of one length: every step is tried."""
+    """Start distances of the samples of a ray with constant sample length; tries every step."""
     assert steps.cone == 0
     offset = origin - torch.tensor(space.centre, dtype=origin.dtype)
     walls = torch.stack(

@@ -1,4 +1,4 @@
-"""Scenes whose motion is known exactly, in memory and as a run on disk."""
+"""Scenes with known motion, in memory and as a run on disk."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SETUP = FieldSetup(torch.zeros(3), torch.ones(3), len(TRAIN_TIMES), len(MOVING_R
 
 @dataclass
 class Sliding(DeformationField):
-    """Everything goes ``speed`` along x from time 0 to 1; counts how often it is asked."""
+    """All Gaussians move ``speed`` along x from time 0 to 1; counts its evaluations."""
 
     speed: float = 1.0
     calls: int = 0
@@ -52,7 +52,7 @@ class Sliding(DeformationField):
 
 @dataclass
 class Blinking(Sliding):
-    """Everything is brighter by ``speed`` at every other of ``num_times`` even moments."""
+    """All Gaussians are brighter by ``speed`` at every other of ``num_times`` uniform times."""
 
     num_times: int = 5
 
@@ -65,8 +65,7 @@ class Blinking(Sliding):
 
 
 class Lines(DeformationField):
-    """Each of M Gaussians goes along a line of its own, from -x at time 0 to x at time 1; what is
-    learned is x."""
+    """Each of M Gaussians moves from -x at time 0 to x at time 1; x is the parameter."""
 
     def __init__(self, setup: FieldSetup = SETUP) -> None:
         self.setup = setup
@@ -98,7 +97,7 @@ SLIDING = ControlNodesField(nodes=2, pieces=1, moves=())
 
 
 def sliding_nodes() -> ControlNodes:
-    """Two of the balls go 1 along x over time, and are where they are at its middle."""
+    """Two balls move by 1 along x over time; the middle time is their canonical position."""
     points = torch.zeros(2, 4, 3)
     points[..., 0] = torch.arange(4) - 1.5  # the spline of these is t - 0.5
     moved = row_of_balls().means[list(MOVING_ROWS)]
@@ -109,7 +108,7 @@ def sliding_nodes() -> ControlNodes:
 
 
 def still_scene(count: int = 5, times: tuple[float, ...] = ()) -> StaticScene:
-    """A scene in which nothing moves."""
+    """A static scene."""
     return StaticScene(gaussians=row_of_balls(count), training_times=times)
 
 
@@ -118,14 +117,14 @@ def moving_scene(
     rows: tuple[int, ...] = MOVING_ROWS,
     times: tuple[float, ...] = TRAIN_TIMES,
 ) -> DynamicScene:
-    """Five balls of which ``rows`` follow ``motion``."""
+    """Five balls, of which ``rows`` move by ``motion``."""
     return DynamicScene(
         gaussians=row_of_balls(), training_times=times, field=motion, moving=torch.tensor(rows)
     )
 
 
 def camera(width: int = 20, height: int = 14) -> Cameras:
-    """One camera, 4 in front of the balls."""
+    """A camera at distance 4 in front of the balls."""
     pose = torch.eye(4)
     pose[2, 3] = 4.0
     intrinsics = torch.tensor([[20.0, 0, width / 2], [0, 20, height / 2], [0, 0, 1]])
@@ -133,8 +132,9 @@ def camera(width: int = 20, height: int = 14) -> Cameras:
 
 
 def write_timed_capture(root: Path, *, standing: bool = False) -> Path:
-    """A capture of 16x16 px at ``TRAIN_TIMES`` and ``TEST_TIMES``; ``standing``: all test images
-    from one pose."""
+    """A capture of 16x16 px at ``TRAIN_TIMES`` and ``TEST_TIMES``; with ``standing`` all test
+    images share one pose.
+    """
     options = StaticOptions(
         size=16, num_train=len(TRAIN_TIMES), num_test=len(TEST_TIMES), samples=1
     )
@@ -157,8 +157,7 @@ def write_moving_run(
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
     standing: bool = False,
 ) -> Path:
-    """A run with a capture beside it: of five balls the second and fourth go 1 along x over time,
-    if ``moves``."""
+    """A run and its capture: if ``moves``, the second and fourth of five balls move by 1 along x."""
     root = write_timed_capture(
         folder / "at_origin" if any(offset) else folder / "capture", standing=standing
     )

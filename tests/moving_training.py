@@ -1,4 +1,4 @@
-"""A dynamic scene and how it is trained, driven as the trainer does."""
+"""A dynamic scene and its training strategy, driven like the trainer does."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def unmeasured(gaussians_at: Callable[[float], Gaussians]) -> StaticErrors:
 
 @dataclass
 class Run:
-    """A scene and how it is trained, driven as the trainer does."""
+    """A scene and its training strategy."""
 
     training: DynamicTraining
     scene: DynamicScene
@@ -77,12 +77,13 @@ class Run:
         return self.training.time_step(self.scene, image(time), step)
 
     def drawn_at(self, time: float) -> Gaussians:
-        """At the end of the run."""
+        """Rendered at the end of the run."""
         return self.time_step(time, STEPS).gaussians.detach()
 
     def after_step(self, step: int, result: EditResult | None = None) -> int:
-        """Optimize, follow ``result``, bring up to date; the number of rows left out for bad
-        gradients."""
+        """Run optimizer and strategy after ``result``; return the number of rows with bad
+        gradients.
+        """
         left_out = self.training.optimize(self.scene, step)
         if result is not None and result.edit is not None:
             edited = self.scene.apply_edit(result.edit)
@@ -99,7 +100,7 @@ class Run:
 
     @property
     def model_state(self) -> dict[str, Tensor]:
-        """What is stored beside the Gaussians."""
+        """Checkpoint entries other than the Gaussians."""
         return select_prefix(strip_roles(self.scene.state()), "model")
 
 
@@ -112,7 +113,7 @@ def new_run(
     full: int = FULL,
     **options: object,
 ) -> Run:
-    """Before the first step."""
+    """A run before its first step."""
     defaults = {
         "deform": ControlNodesField(nodes=4),
         "num_random_moving": 0,
@@ -129,9 +130,9 @@ def new_run(
 
 
 def begun(gaussians: Gaussians, **options: object) -> Run:
-    """After the coarse phase, as if the errors had said that all of the Gaussians move.
+    """A run after the coarse phase in which all Gaussians were marked as moving.
 
-    Along a straight line each unless told otherwise.
+    By default each moves along a straight line.
     """
     run = new_run(gaussians, **options)  # type: ignore[arg-type]
     setup = FieldSetup(*box_of(gaussians, 1.0), len(run.scene.times), len(gaussians), 1.0)
@@ -142,7 +143,7 @@ def begun(gaussians: Gaussians, **options: object) -> Run:
 
 
 def move(run: Run, speeds: Tensor) -> None:
-    """Let Gaussian i go from -speeds[i] to speeds[i] along x, world units."""
+    """Move Gaussian i from -speeds[i] to speeds[i] along x, in world units."""
     assert run.scene.field is not None
     run.scene.field.parameters["means"].data[:, 0, 0] = speeds
 

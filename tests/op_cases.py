@@ -1,4 +1,4 @@
-"""Every op, in a few calls that reach all of them: the table of the tests that all ops share."""
+"""Example calls of every op, for the tests that all ops share."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from dyngs.ops.skinning import add_offsets_, blend_skinning, offset_gradients
 
 @dataclass(frozen=True)
 class Case:
-    """A function of leaf tensors that returns tensors, some of which depend on these."""
+    """A function from leaf tensors to tensors, some of which depend on the leaves."""
 
     run: Callable[..., Sequence[Tensor]]
     inputs: tuple[Tensor, ...] = ()
@@ -44,8 +44,7 @@ class Case:
     num_signals: int = 0
 
     def results(self) -> list[Tensor]:
-        """Return the outputs, and the gradients by all inputs of a sum in which every output has
-        its own weight."""
+        """Return the outputs, and the gradients of all inputs for a weighted sum of the outputs."""
         outputs = list(self.run(*self.inputs))
         if not self.inputs:
             return outputs
@@ -55,7 +54,7 @@ class Case:
 
 
 class Numbers:
-    """Random tensors of one type, the same each time."""
+    """Reproducible random tensors of one dtype."""
 
     def __init__(self, dtype: torch.dtype) -> None:
         self.dtype = dtype
@@ -76,7 +75,7 @@ def leaf(x: Tensor) -> Tensor:
 
 
 def render_case(count: int, dtype: torch.dtype, *, alpha_min: float = 0.0) -> Case:
-    """Images with depth of wide Gaussians; the last input is the probe."""
+    """Images with depth of large Gaussians; the last input is the probe."""
     side = 5 if count < 10 else 36
     scene = random_scene(count, 2, (side + 1, side), degree=3 if count < 10 else 4).to(dtype)
     gaussians = scene.gaussians.replace(log_scales=(3 * scene.scales).log())
@@ -107,7 +106,7 @@ def tally_case(count: int, dtype: torch.dtype) -> Case:
 
 
 def loss_case(count: int, dtype: torch.dtype) -> Case:
-    """Losses of images with and without a mask, and of SSIM alone."""
+    """Losses with and without a mask, and SSIM alone."""
     numbers = Numbers(dtype)
     shape = 20 if count > 4 else count, 31 if count > 4 else count
     x, y = (numbers.uniform(*shape, 3) for _ in range(2))
@@ -117,7 +116,7 @@ def loss_case(count: int, dtype: torch.dtype) -> Case:
 
 
 def adam_case(count: int, dtype: torch.dtype) -> Case:
-    """Three steps on rows of which some are not asked for and some have no usable gradient."""
+    """Three steps on rows, some of which are skipped or have non-finite gradients."""
 
     def run() -> list[Tensor]:
         numbers = Numbers(dtype)
@@ -140,7 +139,7 @@ def adam_case(count: int, dtype: torch.dtype) -> Case:
 
 
 def offsets_case(count: int, dtype: torch.dtype) -> Case:
-    """Rows of Gaussians moved in place, and the gradients by their offsets."""
+    """Gaussians offset in place, and the gradients of their offsets."""
 
     def run() -> list[Tensor]:
         numbers = Numbers(dtype)
@@ -157,7 +156,7 @@ def offsets_case(count: int, dtype: torch.dtype) -> Case:
 
 
 def nodes_case(count: int, dtype: torch.dtype) -> Case:
-    """Nodes at a time, and their penalties."""
+    """Control nodes at one time, and their penalties."""
     numbers = Numbers(dtype)
     heads = [leaf(numbers.normal(count, 7, size)) for size in HEAD_SIZES]
     near = (torch.arange(count) + 1)[:, None] % count
@@ -172,8 +171,7 @@ def nodes_case(count: int, dtype: torch.dtype) -> Case:
 
 
 def shading_case(count: int, dtype: torch.dtype) -> Case:
-    """Inputs of a colour network, of a body at rest with all that there is, and of a scene with the
-    least."""
+    """Inputs of a colour network: of a posed body with all arguments, and of a minimal scene."""
     scene = random_scene(count + 10).to(dtype)
     rows = (3 * torch.arange(count)) % (count + 10)
     numbers = [[0.0, 0.1, 0.2], [1.0, 2.0, 3.0], [0.0, 0.0, -4.0]]
@@ -186,7 +184,7 @@ def shading_case(count: int, dtype: torch.dtype) -> Case:
 
 
 def planes_case(count: int, dtype: torch.dtype) -> Case:
-    """Features of space-time grids and their penalty."""
+    """Features of space-time planes and their penalty."""
     numbers = Numbers(dtype)
     sizes = [(rows, size) for size in (4, 6) for rows in (size, 5)]
     planes = [leaf(0.5 + numbers.uniform(3, *size, 8 if count > 4 else 2)) for size in sizes]
@@ -200,7 +198,7 @@ def planes_case(count: int, dtype: torch.dtype) -> Case:
 
 
 def skinning_case(count: int, dtype: torch.dtype) -> Case:
-    """Points that follow nodes; they are the last input, as their weights count as constant."""
+    """Points skinned by nodes. The points are the last input; skinning weights count as constant."""
     numbers = Numbers(dtype)
     points = leaf(numbers.normal(count, 3))
     positions = numbers.normal(9, 3)
@@ -242,7 +240,7 @@ def perceptron_case(count: int, dtype: torch.dtype, skip: int | None = 2) -> Cas
 
 
 def field_case(count: int, dtype: torch.dtype) -> Case:
-    """Samples of rays through occupied cells, their features in a hash grid, and what is seen."""
+    """Ray samples in occupied cells, their hash-grid features, and the composited colours."""
     numbers = Numbers(dtype)
     space = Space((0.1, 0.2, -0.1), 1.0, 2, 8)
     levels = HashLevels.geometric(3, 4, 24, 64)
@@ -266,7 +264,7 @@ def field_case(count: int, dtype: torch.dtype) -> Case:
 
 
 def patches_case(count: int, dtype: torch.dtype) -> Case:
-    """Two views of bent triangles; the gradient by control points is that of moving outlines."""
+    """Two views of curved triangles; control point gradients come from moving outlines."""
     numbers = Numbers(dtype)
     points = leaf(numbers.uniform(count, 1, 3) - 0.5 + 0.3 * numbers.normal(count, 6, 3))
     colours = leaf(numbers.uniform(count, 6, 3))

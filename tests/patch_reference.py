@@ -1,4 +1,4 @@
-"""Bezier patches in plain torch, pixel by pixel: what the kernels are tested against."""
+"""Bezier patches in plain torch, pixel by pixel: the reference of the kernels."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ def reference_values(values: Tensor, ids: Tensor, uv: Tensor) -> Tensor:
 def reference_visible(
     points: Tensor, cameras: Cameras, near: float, segments: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(V, H, W) ids, (V, H, W, 2) places and (V, H, W) depth: each ray with each face, by Cramer's
-    rule."""
+    """(V, H, W) ids, (V, H, W, 2) patch coordinates and depth: each ray with each face, by
+    Cramer's rule.
+    """
     places, faces = lattice(segments)
     corners = torch.einsum("kb,pbc->pkc", bernstein(places[:, 0], places[:, 1]), points.double())
     shape = len(cameras), cameras.height, cameras.width
@@ -65,8 +66,7 @@ def reference_visible(
 def reference_blend(
     colours: Tensor, crossings: Tensor, places: PatchSamples
 ) -> tuple[Tensor, Tensor]:
-    """As ``blend_patches``, by its definition; what a pixel shows is a row of colours and of how
-    much is nothing."""
+    """Reference of ``blend_patches``; a pixel holds a row of colours and a transmittance."""
     views, height, width = places.rows.shape
     shown = torch.cat([colours, torch.zeros_like(colours[:, :1])], 1)
     nothing = torch.nn.functional.pad(colours.new_zeros(colours.shape[1]), (0, 1), value=1.0)

@@ -1,9 +1,7 @@
-"""Tensors that lie on a device of their own, computed with on the CPU: what a GPU does not forgive
-shows without one.
+"""A simulated GPU for tests: its tensors have a device of their own and compute on the CPU.
 
-As torch does with real ones, an operator refuses tensors of both devices (but for numbers, and for
-indices and copies, for which torch takes both), and NumPy gets none. Whatever makes the host wait
-for a GPU is counted.
+As in torch, an operator raises for tensors on both devices, except scalars, indices and copies.
+Conversion to NumPy raises. Operations that synchronise with the host are counted.
 """
 
 from __future__ import annotations
@@ -44,11 +42,11 @@ READS_BACK = {
 
 
 class MixedDevices(RuntimeError):
-    """An operator was given tensors of both devices."""
+    """An operator was called with tensors on both devices."""
 
 
 class OnGpu(Tensor):
-    """A tensor of the GPU; ``held`` is where its numbers are."""
+    """A tensor on the simulated GPU; ``held`` is its CPU storage."""
 
     held: Tensor
 
@@ -80,7 +78,7 @@ class OnGpu(Tensor):
 
 
 def computed(func: Any, args: Any, kwargs: dict[str, Any], waits: Counter[str]) -> Any:
-    """The result of an operator, on the device where torch would put it."""
+    """The result of an operator on the device that torch would choose."""
     each = (
         y for x in (*args, *kwargs.values()) for y in (x if isinstance(x, list | tuple) else (x,))
     )
@@ -112,7 +110,7 @@ def computed(func: Any, args: Any, kwargs: dict[str, Any], waits: Counter[str]) 
 
 
 def lies_there(x: Any) -> Any:
-    """A result of an operator, with tensors of the GPU in place of those of the CPU."""
+    """An operator's result with CPU tensors replaced by simulated GPU tensors."""
     if isinstance(x, list | tuple):
         return type(x)(map(lies_there, x))
     return OnGpu(x) if isinstance(x, Tensor) and not isinstance(x, OnGpu) else x
@@ -120,12 +118,12 @@ def lies_there(x: Any) -> Any:
 
 @cache
 def returns_given(func: Any) -> bool:
-    """Whether what an operator returns is, or lies in, what it was given."""
+    """True if an operator's result is, or contains, one of its arguments."""
     return any(x.alias_info is not None for x in func._schema.returns)
 
 
 def held(x: Any) -> Any:
-    """An argument of an operator, with tensors of the CPU in place of those of the GPU."""
+    """An operator's argument with simulated GPU tensors replaced by their CPU storage."""
     if isinstance(x, OnGpu):
         return x.held
     return [held(y) for y in x] if isinstance(x, list | tuple) else x
@@ -134,8 +132,7 @@ def held(x: Any) -> Any:
 def note(
     packet: Any, args: Any, kwargs: dict[str, Any], on_gpu: bool, to_gpu: bool, waits: Counter[str]
 ) -> None:
-    """Count what makes the host wait: numbers read from the GPU, sizes that depend on them; and
-    what is queued."""
+    """Count host synchronisations (values read, data-dependent sizes) and queued operations."""
     if on_gpu and packet in READS_BACK:
         waits[READS_BACK[packet]] += 1
     elif on_gpu and not to_gpu:
@@ -154,7 +151,7 @@ def note(
 
 
 class PretendGpu(TorchDispatchMode):
-    """The GPU is there inside this mode; ``waits`` counts by what the host waits for it."""
+    """A mode in which the simulated GPU exists; ``waits`` counts synchronisations by reason."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -166,7 +163,7 @@ class PretendGpu(TorchDispatchMode):
 
 @contextmanager
 def pretend_gpu() -> Iterator[PretendGpu]:
-    """Inside, tensors may lie on ``CARD``, where all ops compute."""
+    """Return a context in which tensors may lie on ``CARD`` and all ops support it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torch, "tensor", made)
         patch.setattr(
@@ -184,7 +181,7 @@ def pretend_gpu() -> Iterator[PretendGpu]:
 
 
 def _indices(x: Tensor, index: Any) -> Any:
-    """``index`` with tensors in place of lists, for which torch would make some without numbers."""
+    """``index`` with lists replaced by tensors, because torch would create meta tensors for lists."""
     if isinstance(index, tuple):
         return tuple(_indices(x, each) for each in index)
     return made(index, device=x.device) if isinstance(index, list) else index
@@ -194,6 +191,5 @@ _torch_tensor = torch.tensor
 
 
 def made(data: Any, *, device: Any = None, requires_grad: bool = False, **how: Any) -> Tensor:
-    """``torch.tensor``, which as it is makes one without numbers where the device is called
-    meta."""
+    """``torch.tensor`` for ``CARD``; the original returns meta tensors without values."""
     return _torch_tensor(data, **how).to(device or "cpu").requires_grad_(requires_grad)

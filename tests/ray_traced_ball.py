@@ -1,4 +1,4 @@
-"""A ball that is ray traced exactly, as two cameras see it, for tests of stereo."""
+"""An exactly ray-traced ball in two cameras, for tests of stereo."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RADIUS = 0.5
 def pose_at(
     degrees: float, height: float = 1.1, distance: float = 3.0, roll: float = 0.0
 ) -> Tensor:
-    """(4, 4) cam_from_world, OpenCV axes, y up in the world, towards (0, 0.9, 0)."""
+    """(4, 4) cam_from_world in OpenCV axes that looks at (0, 0.9, 0); y is up in the world."""
     turn = np.radians(degrees)
     center = np.array([distance * np.sin(turn), height, distance * np.cos(turn)])
     forward = np.array([0, 0.9, 0]) - center
@@ -36,7 +36,7 @@ def pose_at(
 
 
 def ball(pose: Tensor, focal: float = 130.0, name: str = "a") -> Image:
-    """A ball ray traced exactly: colours are the points on it, depth along the view axis."""
+    """A ray-traced ball: colours are its surface points, depth is along the view axis."""
     intrinsics = torch.tensor(
         [[focal, 0, 0.5 * SIZE + 3], [0, 1.1 * focal, 0.5 * SIZE - 2], [0, 0, 1]]
     )
@@ -64,8 +64,7 @@ def ball(pose: Tensor, focal: float = 130.0, name: str = "a") -> Image:
 
 
 def hit(origin: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Depth along ``rays`` (..., 3) of the ball, in units of their length, and whether they hit
-    it."""
+    """Depth of the ball along ``rays`` (..., 3) in units of their length, and the hit mask."""
     a = (rays * rays).sum(-1)
     b = (rays * (origin - CENTER)).sum(-1)
     inside = b * b - a * (((origin - CENTER) ** 2).sum() - RADIUS**2)
@@ -73,7 +72,7 @@ def hit(origin: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def exact_depth(pair: RectifiedPair) -> Tensor:
-    """(2, 1, H, W) depth of the ball in the axes of the windows."""
+    """(2, 1, H, W) depth of the ball in the rectified windows."""
     ones = torch.ones_like(pair.alpha)
     rays = pair.points(ones) - pair.centers[:, None, None]
     return torch.stack(

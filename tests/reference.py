@@ -1,4 +1,4 @@
-"""Slow, obvious versions of the native ops in plain torch: what the kernels are tested against.
+"""Reference versions of the native ops in plain torch, for the tests of the kernels.
 
 Everything is dense: every pixel looks at every Gaussian. Meant for float64 and a few Gaussians on a
 few pixels. Gradients come from autograd. Sources: Zwicker et al. 2001, Kerbl et al. 2023, Yu et al.
@@ -26,8 +26,9 @@ from dyngs.ops.rasterization import BlendedImages, BlendOptions
 def covariances2d(
     means: Tensor, quats: Tensor, scales: Tensor, cameras: Cameras
 ) -> tuple[Tensor, Tensor]:
-    """Return 2D covariances (V, N, 2, 2) in px^2 without low-pass, and centres in the camera (V, N,
-    3)."""
+    """Return 2D covariances (V, N, 2, 2) in px^2 without low-pass filter, and camera-space means
+    (V, N, 3).
+    """
     rotation = cameras.cam_from_world[:, :3, :3]
     translation = cameras.cam_from_world[:, :3, 3]
     centers = torch.einsum("vij,nj->vni", rotation, means) + translation[:, None]
@@ -60,7 +61,7 @@ def project(
     cameras: Cameras,
     options: ProjectionOptions = ProjectionOptions(),
 ) -> Projection:
-    """As ``dyngs.ops.projection.project``."""
+    """Reference of ``dyngs.ops.projection.project``."""
     bare, centers = covariances2d(means, quats, scales, cameras)
     low_pass = options.eps2d * torch.eye(2, dtype=means.dtype, device=means.device)
     cov = bare + low_pass
@@ -113,7 +114,7 @@ def project(
 def evaluate_harmonics(
     means: Tensor, centers: Tensor, sh: Tensor, radii: Tensor, degree: int
 ) -> Tensor:
-    """As ``dyngs.ops.harmonics.evaluate_harmonics``."""
+    """Reference of ``dyngs.ops.harmonics.evaluate_harmonics``."""
     offsets = means[None] - centers[:, None]
     directions = offsets / offsets.norm(dim=-1, keepdim=True).clamp_min(1e-12)
     basis = harmonics_basis(directions, degree)
@@ -130,8 +131,7 @@ def rasterize(
     background: Tensor | None = None,
     options: BlendOptions = BlendOptions(),
 ) -> BlendedImages:
-    """As ``dyngs.ops.rasterization.rasterize``, without probe: a loop over Gaussians, vectorised
-    over pixels."""
+    """Reference of ``dyngs.ops.rasterization.rasterize`` without probe: a loop over Gaussians."""
     raised = colors.new_zeros(*opacities.shape, size[1], size[0])
     return _rasterize(projection, opacities, colors, raised, background, options)
 
@@ -145,8 +145,9 @@ def squared_slopes(
     background: Tensor | None = None,
     options: BlendOptions = BlendOptions(),
 ) -> Tensor:
-    """As ``dyngs.ops.rasterization.tally`` of ``SQUARED_SLOPES``: (V, N), from autograd pixel for
-    pixel."""
+    """Reference of ``dyngs.ops.rasterization.tally`` for ``SQUARED_SLOPES``: (V, N), by autograd
+    per pixel.
+    """
     raised = colors.new_zeros(*opacities.shape, size[1], size[0], requires_grad=True)
     image = _rasterize(
         projection, opacities.detach(), colors.detach(), raised, background, options
@@ -163,8 +164,7 @@ def _rasterize(
     background: Tensor | None,
     options: BlendOptions,
 ) -> BlendedImages:
-    """As ``rasterize``, with ``raised`` (V, N, H, W) added to each 2D Gaussian's value in each
-    pixel."""
+    """``rasterize`` with ``raised`` (V, N, H, W) added to the value of each 2D Gaussian per pixel."""
     height, width = raised.shape[2:]
     rows, columns = (
         torch.arange(n, dtype=colors.dtype, device=colors.device) + 0.5 for n in (height, width)
@@ -197,7 +197,7 @@ def _rasterize(
 
 
 class Sight(NamedTuple):
-    """Arguments of ``shading_inputs`` of dyngs after ``base``."""
+    """Arguments of ``dyngs.ops.shading.shading_inputs`` after ``base``."""
 
     means: Tensor
     quats: Tensor
@@ -212,11 +212,11 @@ class Sight(NamedTuple):
 
 
 def shading_inputs(base: Tensor, *arguments: Any) -> Tensor:
-    """As ``dyngs.ops.shading.shading_inputs``.
+    """Reference of ``dyngs.ops.shading.shading_inputs``.
 
-    Place in the box (contracted), direction from the eye, |cosine| between the shortest axis and
-    the direction, the direction mirrored at that axis, base colour less 1/2, time in [-1, 1]. A
-    body at rest knows places, directions and normals as they are there.
+    Contracted position in the box, view direction, |cosine| between the shortest axis and the view
+    direction, reflected direction, base colour less 1/2, and time in [-1, 1]. Bodies use
+    positions, directions and normals of the rest pose.
     """
     sight = Sight(*arguments)
     means = sight.means[sight.rows]
@@ -239,18 +239,15 @@ def shading_inputs(base: Tensor, *arguments: Any) -> Tensor:
 
 
 def contracted(points: Tensor) -> Tensor:
-    """Return ``points`` (M, 3) with all of space contracted into a ball of radius 2; the unit ball
-    stays as it is.
+    """Return ``points`` (M, 3) contracted into a ball of radius 2; the unit ball is unchanged.
 
-    (2 - 1 / |x|) x / |x|, the contraction of Barron et al. 2022 (mip-NeRF 360): far things stay
-    bounded inputs.
+    (2 - 1 / |x|) x / |x| (Barron et al. 2022, mip-NeRF 360) bounds distant points.
     """
     length = points.norm(dim=1, keepdim=True).clamp_min(1)
     return points * (2 - 1 / length) / length
 
 
 def shortest_axes(quats: Tensor, log_scales: Tensor) -> Tensor:
-    """Return (M, 3) unit vectors along the shortest axis of each Gaussian: the normal of a flat
-    one, up to its sign."""
+    """Return (M, 3) unit vectors along the shortest axes: normals of flat Gaussians up to sign."""
     shortest = log_scales.argmin(dim=1)
     return rotation_matrices(quats).gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]

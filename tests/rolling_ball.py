@@ -1,5 +1,4 @@
-"""A textured ball that moves on or above a plate before a camera that is elsewhere at each time:
-exact images."""
+"""Exact images of a textured ball that moves on or above a plate before one moving camera."""
 
 from __future__ import annotations
 
@@ -27,8 +26,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 def rolling(
     count: int = 24, size: int = 72, turns: bool = True
 ) -> tuple[FrameStack, np.ndarray, np.ndarray]:
-    """The images, and the ball's true (T, 3) centres and (T, 3, 3) rotations; without ``turns`` it
-    slides."""
+    """Images, true (T, 3) centres and (T, 3, 3) rotations; without ``turns`` the ball slides."""
     balls = []
     for time in np.linspace(0.0, 1.0, count):
         _, ball = scene_at("roll", 0.45 * time).primitives
@@ -41,8 +39,7 @@ def rolling(
 
 @functools.cache
 def hopping(count: int = 48, size: int = 64) -> tuple[FrameStack, np.ndarray, np.ndarray]:
-    """The same of a ball that hops on the spot four times, and spins by two turns about a tilted
-    axis."""
+    """The same for a ball that bounces four times in place and spins twice about a tilted axis."""
     balls = []
     for time in np.linspace(0.0, 1.0, count):
         _, ball = scene_at("roll", 0.0).primitives
@@ -57,7 +54,7 @@ def hopping(count: int = 48, size: int = 64) -> tuple[FrameStack, np.ndarray, np
 
 
 def seen(balls: Sequence[PaintedBall], size: int) -> tuple[FrameStack, np.ndarray, np.ndarray]:
-    """The images of ``balls``, one at each time, and their centres and rotations."""
+    """Images of ``balls``, one per time, with their centres and rotations."""
     count = len(balls)
     times = np.linspace(0.0, 1.0, count)
     plate, _ = scene_at("roll", 0.0).primitives

@@ -1,4 +1,4 @@
-"""A ball as cameras all around it see it, exactly."""
+"""Exact images of a ball by cameras around it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HIGH = torch.full((3,), 1.0)  # Corners of a box around it
 
 
 def seen_from(turn: torch.Tensor) -> DepthView:
-    """A ball around the origin, red where x > 0; ``turn`` (3, 3) of the camera."""
+    """A ball at the origin, red where x > 0; ``turn`` (3, 3) rotates the camera."""
     looking = camera(SIZE)
     pose = looking.cam_from_world.clone()
     pose[0, :3, :3] = turn

@@ -1,4 +1,4 @@
-"""Few curved triangles, and runs with few, for tests."""
+"""Few curved triangles, and runs with them, for tests."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def bent(count: int = 3, seed: int = 0, degree: int = 1) -> Patches:
 
 
 def camera(size: int = 32, distance: float = 4.0) -> Cameras:
-    """Looking along z at the origin."""
+    """A camera at the origin that looks along z."""
     pose = torch.eye(4)[None].clone()
     pose[0, 2, 3] = distance
     inner = torch.tensor([[[size * 1.2, 0, size / 2], [0, size * 1.2, size / 2], [0, 0, 1]]])

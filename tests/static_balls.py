@@ -1,4 +1,4 @@
-"""Balls of known places before cameras that stand still, drawn ray by ray without any Gaussians."""
+"""Ray-traced balls at known positions before fixed cameras."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ BLACK = torch.zeros(3)
 
 @dataclass(frozen=True)
 class Ball:
-    """A ball of one colour, or with one of another colour on the side of +x turned by ``turn``
-    radians about z."""
+    """A ball of one colour; an optional second colour covers the side of +x rotated by ``turn``
+    radians about z.
+    """
 
     center: tuple[float, float, float]
     radius: float = 0.2
@@ -35,7 +36,7 @@ others."""
 
 
 def cameras(count: int) -> list[Cameras]:
-    """Around the origin, at distance 3, high and low in turn; all look at it."""
+    """Cameras at distance 3, alternately high and low, that look at the origin."""
     intrinsics = torch.tensor([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]])
     found = []
     for i in range(count):
@@ -56,8 +57,7 @@ def cameras(count: int) -> list[Cameras]:
 def drawn(
     camera: Cameras, balls: Sequence[Ball], noise: float = 0.0, seed: int = 0
 ) -> torch.Tensor:
-    """Return the (H, W, 3) image before a wall of grey stripes, which each camera sees
-    elsewhere."""
+    """Return the (H, W, 3) image before a wall of grey stripes."""
     pose = camera.cam_from_world[0].double().numpy()
     intrinsics = camera.intrinsics[0].double().numpy()
     y, x = np.mgrid[:SIZE, :SIZE] + 0.5

@@ -1,4 +1,4 @@
-"""Steps of a training that learns nothing, for what listens to them."""
+"""Training steps without a model, for tests of event listeners."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CONFIG = Config(data=DataConfig(root=Path("x")), train=TrainConfig(log_every=1))
 
 @dataclass
 class Counting:
-    """Counts its steps; ``findings`` and ``failures`` say what happens in which."""
+    """A step counter; ``messages`` and ``failures`` hold messages and errors by step."""
 
     done: int = 0
     bad_gradients: int = 0
@@ -44,7 +44,7 @@ class Counting:
         return report_of(step, message=self.messages.get(step))
 
     def apply(self, edit: TrainingEdit) -> None:
-        """Do nothing."""
+        """Ignore the edit."""
 
     def checkpoint(self) -> Checkpoint:
         return Checkpoint(CheckpointInfo(self.done, 1.0, (0.0, 0.0, 0.0), "black", "classic"), {})
@@ -54,8 +54,7 @@ class Counting:
 
 
 def report_of(step: int, difference: float = 0.1, message: str | None = None) -> StepReport:
-    """The report of ``step``: a loss of 0.5 and an image that is wrong by ``difference``
-    everywhere."""
+    """The report of ``step`` with loss 0.5 and an image that is off by ``difference``."""
     truth = torch.zeros(2, 2, 3)
     return StepReport(step, 0.5, IMAGE, truth + difference, truth, message)
 

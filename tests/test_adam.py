@@ -1,4 +1,4 @@
-"""Adam of named tensors: torch's own, which leaves out rows that it must not touch."""
+"""Adam of named tensors: torch's Adam with skipped rows."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_map_changes_both_moments_of_named_tensors() -> None:
             assert torch.equal(same[name], x)
 
 
-def test_a_restored_one_goes_on_as_if_never_stopped() -> None:
+def test_resumed_optimizer_equals_uninterrupted_one() -> None:
     adam, tensors = stepped(2)
     copies = {name: x.detach().clone().requires_grad_() for name, x in tensors.items()}
     other = AdamState.from_state(strip_roles(adam.state()), tensors)

@@ -1,7 +1,7 @@
-"""Numbers at the extremes: one test per row of the table in docs/contributing/numerics.md.
+"""Numerical limits: one test per row of the table in docs/contributing/numerics.md.
 
-Each compares float32 with float64 on the same numbers, or with the analytic answer, or asserts the
-exact error; and in each every gradient is finite.
+Each compares float32 with float64 or with an analytic result, or asserts the exact error.
+Gradients are always finite.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ BACKGROUND = torch.tensor([0.1, 0.2, 0.4])
 
 
 def camera(width: int = 37, height: int = 29, focal: float = 30.0) -> Cameras:
-    """At the origin, looking along +z, float32."""
+    """A float32 camera at the origin that looks along +z."""
     intrinsics = torch.tensor([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]])
     return Cameras(torch.eye(4)[None], intrinsics, width, height)
 
 
 def some_gaussians(n: int = 6, z: float = 3.0, **changes: Tensor | float) -> Gaussians:
-    """n float32 Gaussians in front of ``camera()``; numbers in ``changes`` fill a whole field."""
+    """n float32 Gaussians in front of ``camera()``; scalars in ``changes`` fill a whole field."""
     scene = random_scene(n=n, views=1, seed=11).to(torch.float32)
     means = 0.5 * scene.means + torch.tensor([0.0, 0.0, z])
     gaussians = replace(scene, means=means, opacities=0.5 + 0.4 * scene.opacities).gaussians
@@ -82,12 +82,11 @@ def check_against_float64(
     tolerance: float = 1e-5,
     gradient_tolerance: float = 1e-4,
 ) -> Rendering:
-    """The float32 image, after comparing it and its gradients with float64 of the same numbers.
+    """The float32 image, after comparing it and its gradients with float64.
 
-    Tolerances are those without thresholds: colours absolutely (rounding of 6e-8 times up to a
-    hundred operations), gradients relative to the largest of their kind (terms of both signs
-    cancel) or to 0.01 (the pixels' own gradients are of size 1: less is noise). With thresholds a
-    pixel within rounding of one may differ by 1/255.
+    Colours are compared absolutely: rounding of 6e-8 times up to a hundred operations. Gradients
+    are compared relative to the largest of their kind, or to 0.01. With thresholds, a pixel within
+    rounding of one may differ by 1/255.
     """
     unlimited = replace(options, alpha_min=0.0, transmittance_min=0.0)
     image, slopes = drawn_with_gradients(gaussians, cameras, unlimited, torch.float32)
@@ -108,7 +107,7 @@ def check_against_float64(
 def gradients_vanish(
     gaussians: Gaussians, cameras: Cameras, options: RenderOptions = USUAL
 ) -> bool:
-    """Nothing is drawn, and every gradient is exactly zero."""
+    """Assert that the image is empty and every gradient exactly zero."""
     image, slopes = drawn_with_gradients(gaussians, cameras, options, torch.float32)
     return torch.equal(image.rgb, BACKGROUND.expand_as(image.rgb)) and not any(
         x.any() for x in slopes.values()
@@ -119,7 +118,7 @@ def gradients_vanish(
 # -----------------------------------------------------------------------------------------------------------
 
 
-def test_scale_1e_minus_12_is_a_dot_of_the_low_pass() -> None:
+def test_scale_1e_minus_12_renders_as_the_low_pass_filter() -> None:
     """Alpha is o exp(-d^2 / (2 eps2d)), whatever the rotation."""
     gaussians = some_gaussians(
         n=1, means=torch.tensor([[0.0, 0.0, 3.0]]), log_scales=math.log(1e-12)
@@ -133,7 +132,7 @@ def test_scale_1e_minus_12_is_a_dot_of_the_low_pass() -> None:
     check_against_float64(some_gaussians(log_scales=math.log(1e-12)), camera())
 
 
-def test_scale_1e12_is_a_uniform_veil() -> None:
+def test_scale_1e12_covers_the_image_uniformly() -> None:
     image = check_against_float64(some_gaussians(log_scales=math.log(1e12)), camera())
     alpha = 1 - (1 - some_gaussians().opacities.clamp_max(0.99)).prod()
     torch.testing.assert_close(image.alpha, alpha.expand(1, 29, 37), rtol=0, atol=2e-6)
@@ -180,8 +179,7 @@ def test_needle_keeps_its_width() -> None:
 
 
 def blended_with(opacities: list[float], dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-    """Alpha of a ball, and the gradients of opacity and position, through the ops that take
-    opacities."""
+    """Alpha of a ball, and the gradients of opacity and position, by the ops that take opacities."""
     n = len(opacities)
     cameras = camera().to(dtype=dtype)
     opacity = torch.tensor(opacities, dtype=dtype, requires_grad=True)
@@ -247,8 +245,9 @@ def test_distance_of_1e7_units() -> None:
 
 
 def test_thousands_of_coincident_opaque_gaussians() -> None:
-    """The first by index covers the rest: 0.99 of its colour; the next would leave less than 1e-4
-    (0.01 squared, rounded down in float32) and is not added."""
+    """The first by index covers the others with 0.99 of its colour. The next would leave a
+    transmittance below 1e-4 and is skipped.
+    """
     n = 5000
     gaussians = one_gaussian((0.0, 0.0, 3.0), 1e4)
     gaussians = gaussians.select(torch.zeros(n, dtype=torch.long))
@@ -293,8 +292,7 @@ def test_images_of_one_pixel_or_one_line(size: tuple[int, int]) -> None:
 
 
 def test_more_than_2_to_the_31_intersections_are_refused_before_anything_is_allocated() -> None:
-    """2100 veils on 16384 x 16384 px (a million tiles): 2.2e9 pairs, which alone would take 17
-    GB."""
+    """2100 Gaussians on 16384 x 16384 px (a million tiles) are 2.2e9 pairs, or 17 GB."""
     gaussians = one_gaussian((0.0, 0.0, 3.0), 1e6).select(torch.zeros(2100, dtype=torch.long))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     message = (
@@ -335,7 +333,7 @@ def test_nonfinite_views_are_named_whatever_the_policy(name: str, nonfinite: str
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
 def test_skipping_nonfinite_gaussians_equals_leaving_them_out(bad: float) -> None:
-    """Bitwise; and exactly zero gradients where they were."""
+    """Bitwise, with exactly zero gradients for the skipped Gaussians."""
     gaussians = some_gaussians(n=12)
     for row, name in enumerate(FIELDS):
         getattr(gaussians, name).view(12, -1)[2 * row, 0] = bad

@@ -11,8 +11,9 @@ from dyngs.gaussians import Gaussians
 
 
 def two_balls(distance: float = 4.0) -> Gaussians:
-    """A big red ball left, a small green one right, both ``distance`` from the camera of
-    ``cameras_around``."""
+    """A large red ball on the left and a small green one on the right, at ``distance`` from the
+    cameras.
+    """
     means = torch.tensor([[-0.5, 0.0, 0.0], [0.7, 0.0, 0.0]])
     colours = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     sizes = torch.tensor([0.3, 0.15]).log()[:, None].expand(2, 3)
@@ -27,7 +28,7 @@ def two_balls(distance: float = 4.0) -> Gaussians:
 
 
 def cameras_around(count: int, width: int = 24, height: int = 18, distance: float = 4.0) -> Cameras:
-    """Cameras turning about the vertical, all looking at the origin."""
+    """Cameras on a circle about the vertical axis that look at the origin."""
     poses = torch.eye(4).repeat(count, 1, 1)
     for i in range(count):
         angle = 0.3 * i

@@ -1,7 +1,6 @@
-// What all bindings share: the type of arrays, C-contiguous ones of NumPy and torch, in the memory of the device whose module
-// this is: the CPU's, or with DYNGS_GPU that of a CUDA GPU. With DYNGS_EMULATED the GPU's memory is the CPU's, too.
-// And the last line of defence before raw pointers: `checked` returns an array's pointer, null where it is left out, and
-// refuses other sizes.
+// The array type of all bindings: C-contiguous NumPy or torch arrays in the memory of the module's device. That is the
+// CPU, or with DYNGS_GPU a CUDA GPU; with DYNGS_EMULATED the emulated GPU uses the memory of the CPU.
+// `checked` returns the pointer of an array, null for an omitted one, and throws for wrong sizes.
 #pragma once
 
 #include <nanobind/nanobind.h>

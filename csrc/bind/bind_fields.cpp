@@ -60,7 +60,7 @@ void hash_backward(Rows<const S> coords, const LevelSizes& sizes, Rows<const S> 
   hash_grid_backward(grid, from, to);
 }
 
-// Whether the samples of each ray lie within `count`, where offsets can be read, see bind/arrays.hpp.
+// True if the samples of each ray lie within `count`. Offsets on a GPU are not read, see bind/arrays.hpp.
 bool offsets_fit(const int64_t* offsets, int64_t rays, int64_t count) {
   return kOnGpu || (offsets[0] == 0 && offsets[rays] == count && std::is_sorted(offsets, offsets + rays + 1));
 }

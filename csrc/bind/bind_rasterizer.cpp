@@ -198,14 +198,14 @@ struct SplatArrays {
 
 using EntryArrays = std::tuple<Array<const int64_t>, Array<const int32_t>, Array<const int32_t>, Array<const int32_t>>;
 
-// Whether all of `count` indices are in [0, bound).
+// True if all of `count` indices are in [0, bound).
 bool all_within(const int32_t* indices, int64_t count, int64_t bound) {
   uint32_t largest = 0;  // negative indices are larger than any other
   for (int64_t i = 0; i < count; ++i) largest = std::max(largest, static_cast<uint32_t>(indices[i]));
   return count == 0 || largest < static_cast<uint64_t>(bound);
 }
 
-// Whether all ranges of the lists of tiles and splats are ascending and within the list of entries.
+// True if all ranges of the lists of tiles and splats are ascending and within the list of entries.
 bool in_order(const Entries& e, int64_t tiles, int64_t splats) {
   bool good = e.tile_offsets[0] >= 0 && e.tile_offsets[tiles] <= e.count;
   for (int64_t t = 0; t < tiles; ++t) good &= e.tile_offsets[t] <= e.tile_offsets[t + 1];

@@ -1,4 +1,4 @@
-// Results as the CPU hands them over.
+// Results of the CPU module.
 #include "bind/results.hpp"
 
 #include <algorithm>

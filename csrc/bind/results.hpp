@@ -1,5 +1,5 @@
-// Results that are handed over in another way on a GPU than on the CPU: numbers are left in its memory, because reading them
-// back would wait for it, and the lists of tile entries are allocated by torch.
+// Results that differ between CPU and GPU: scalars stay in GPU memory, because reading them back would synchronise, and
+// the lists of tile entries are allocated by torch.
 #pragma once
 
 #include "bind/arrays.hpp"

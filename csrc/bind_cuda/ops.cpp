@@ -1,5 +1,5 @@
-// The ops of core/api.hpp, core/fields.hpp and core/triangles.hpp that the bindings call, on a GPU: those of cuda/api.hpp, queued where use_queue says, with memory
-// that torch lends. They compute in float32; dyngs/ops/native.py refuses float64.
+// The ops of core/api.hpp, core/fields.hpp and core/triangles.hpp that the bindings call, on a GPU: those of cuda/api.hpp, queued on the
+// stream set by use_queue, with memory allocated by torch. They compute in float32; dyngs/ops/native.py rejects float64.
 #include "core/api.hpp"
 
 #include "bind/results.hpp"

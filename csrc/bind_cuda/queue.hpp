@@ -1,4 +1,4 @@
-// Where the calls of this module go, for each thread: a GPU, one of its streams, and torch, which lends memory of the GPU.
+// The target of calls per thread: a GPU, one of its streams, and torch as the allocator of GPU memory.
 #pragma once
 
 #include <nanobind/nanobind.h>

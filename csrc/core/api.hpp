@@ -306,7 +306,7 @@ struct SkinGrads {
   S* values;  // (S, width)
 };
 
-// Whether all indices are in [0, num_nodes).
+// True if all indices are in [0, num_nodes).
 bool follow_within(const int64_t* followed, int64_t size, int64_t num_nodes);
 
 template <class S>
@@ -318,7 +318,7 @@ void skinning_backward(const SkinNodes<S>& nodes, const SkinPoints<S>& points, c
                        const SkinGrads<S>& grads, int threads);
 
 // Control nodes -------------------------------------------------------------------------------------------------------
-// What nodes do at a time, along uniform cubic B-splines, and what is asked of their motion.
+// Poses of nodes at a time, along uniform cubic B-splines, and the penalties of their motion.
 inline constexpr int kHeads = 5;  // means, quaternions less the identity, log scales, opacity logits, colours
 
 template <class S>

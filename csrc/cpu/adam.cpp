@@ -50,8 +50,8 @@ void update(const Piece& piece, const int32_t* active, int64_t count, const Coef
   update_floats<masked>(piece.param, piece.grad, piece.exp_avg, piece.exp_avg_sq, piece.step, active, count, c);
 }
 
-// Whether no element is NaN or at least 2^63 in magnitude: its square would make the second moment infinite, or nearly so,
-// and stop the parameter for ever. Without their sign, floats sort as integers, NaN on top.
+// True if no element is NaN or at least 2^63 in magnitude. The square of such an element would make the second moment
+// infinite and freeze the parameter. Without their sign, floats sort as integers, NaN on top.
 bool all_usable(const float* x, int64_t count) {
   constexpr int32_t kMagnitude = 0x7fffffff, kTooLarge = 0x5f000000;
   int32_t bad = 0;
@@ -63,7 +63,7 @@ bool all_usable(const float* x, int64_t count) {
   return bad == 0;
 }
 
-// Whether all elements are zero, of either sign.
+// True if all elements are zero, of either sign.
 bool all_zero(const float* x, int64_t count) {
   uint32_t magnitude = 0;
   for (int64_t i = 0; i < count; ++i) {
@@ -156,7 +156,7 @@ int64_t update_block(const Plan& plan, Block block) {
   } else {
     std::memset(active, true, block.num_rows);
   }
-  // Where rows are long and only some are updated, only the gradients of these should be read.
+  // If rows are long and few are updated, only the gradients of those are read.
   const bool check_each = rows != nullptr && size >= kLongRow;
   const bool check = check_each || !all_usable(plan.state.grad + block.first_row * size, block.num_rows * size);
   const int64_t skipped = check ? drop_unusable(plan, block, active) : 0;

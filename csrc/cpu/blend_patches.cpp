@@ -1,5 +1,5 @@
-// Pixels as means of what they and the pixels next to them show, and the vjp (math/patch_blend.hpp). Bands of rows are tasks;
-// all is gathered, so that results have the same bytes on any number of threads.
+// Pixels as weighted means of themselves and their neighbours, and the vjp (math/patch_blend.hpp). Bands of rows are tasks
+// that gather, so that results have the same bytes on any number of threads.
 #include "core/triangles.hpp"
 #include "cpu/parallel.hpp"
 #include "math/patch_blend.hpp"

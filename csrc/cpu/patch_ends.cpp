@@ -1,4 +1,4 @@
-// Where patches end between neighbouring pixels. Each place is one task's.
+// Outlines of patches between neighbouring pixels. Each sample is written by one task.
 #include "core/triangles.hpp"
 #include "cpu/parallel.hpp"
 

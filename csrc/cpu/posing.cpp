@@ -76,7 +76,7 @@ std::vector<S> joint_rows(const Posing<S>& in) {
   return rows;
 }
 
-// As many of a packet's lanes as a register holds: a covariance needs dozens of numbers at a time.
+// The lanes of a packet that fill one register, because a covariance needs dozens of registers.
 template <class S>
 Native<S> part(const Packet<S>& x, int lane) {
   return Native<S>::load(reinterpret_cast<const S*>(&x) + lane);

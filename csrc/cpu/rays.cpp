@@ -1,4 +1,4 @@
-// Samples along rays through the occupied cells of a field's space, and what is seen along them. Each ray is one task's.
+// Samples along rays through the occupied cells of a field's space, and volume rendering. Each ray is one task.
 #include <algorithm>
 
 #include "core/fields.hpp"

@@ -98,8 +98,8 @@ struct Simd<S, kCount> {  // with the alignment of its vector
 template <class S>
 using Packet = Simd<S, kLanes>;
 
-// As many numbers as one register holds. Packets fill two or four on older processors, too many where a kernel keeps many
-// values alive.
+// A vector that fills one register. Packets fill two or four on older processors, which spills registers in kernels with
+// many live values.
 template <class S>
 using Native = Simd<S, kRegisterBytes / static_cast<int>(sizeof(S))>;
 

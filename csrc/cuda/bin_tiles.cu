@@ -176,7 +176,7 @@ __global__ void __launch_bounds__(kThreads)
   global(out.tile_offsets)[i] = first_of(tiles, num_entries, i);
 }
 
-// What bin_count leaves for bin_emit, and what it needs besides.
+// Results of bin_count for bin_emit, and its scratch memory.
 struct CountBuffers {
   Pairs order, other;
   int32_t* first_slots;

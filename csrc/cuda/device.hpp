@@ -1,5 +1,5 @@
-// What every kernel of this folder includes: CUDA where nvcc compiles it; elsewhere its emulation, in which the tests run the
-// same source. Beside CUDA's own language a kernel uses four things, which cost nothing on a GPU:
+// The common header of all kernels: CUDA under nvcc, otherwise the emulation in which the tests run the same source.
+// Beside CUDA itself a kernel uses four wrappers, which cost nothing on a GPU:
 //   Array<T>, global(pointer)                arrays whose accesses the emulation checks; plain pointers for nvcc
 //   atomic_add(array, index, value)
 //   DYNGS_SHARED(T, name, count), DYNGS_DYNAMIC_SHARED(T, name)   arrays in shared memory

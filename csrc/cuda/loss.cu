@@ -175,7 +175,7 @@ __device__ float gradient_of(const LossInput& in, double mask_sum, T weight, con
   return static_cast<float>(weight * (l1 - scale * ssim_weight * ssim));
 }
 
-// Whether the tile or one beside it is not precise in float.
+// True if float precision is too low for this tile or a neighbour.
 __device__ bool beside_flag(const TilePixels& tile, const int32_t* flags) {
   const int64_t column = blockIdx.x % tile.columns, row = blockIdx.x / tile.columns;
   bool flagged = false;

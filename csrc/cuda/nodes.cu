@@ -59,7 +59,7 @@ __device__ float bend_at(const Array<const float>& path, int64_t i, int64_t size
   return static_cast<float>(path[i]) - 2.f * static_cast<float>(path[i + 3]) + static_cast<float>(path[i + 6]);
 }
 
-// What makes a mean of a sum of squares over squared radii.
+// The weight that turns a sum of squares into a mean in units of squared radii.
 __device__ double weight_of(const NodeGraph<float>& graph, int64_t node, double count) {
   const double radius = static_cast<float>(global(graph.radii)[node]);
   return 1 / (radius * radius * count);

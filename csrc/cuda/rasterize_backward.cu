@@ -34,7 +34,7 @@ struct Layout {
   DYNGS_HD int fields() const { return kBlendSums + channels + (absolute ? 2 : 0); }
 };
 
-// What a pixel keeps from one Gaussian to the next.
+// The state of a pixel between Gaussians.
 template <int kCap>
 struct PixelState {
   BlendBehind<float> behind;

@@ -26,7 +26,7 @@ struct PixelState {
   bool open;
 };
 
-// What a Gaussian adds to the tally at one pixel. `step`: already without what full pixels do not take.
+// The contribution of a Gaussian to the tally at one pixel. `step` is already zero for saturated pixels.
 template <int kCap, Tally kTally>
 __device__ float tally_of(const Splats<float>& s, float log2_opacity, float alpha, float before,
                           const BlendStep<float>& step, const Array<const float>& color, PixelState<kCap>& state) {

@@ -1,5 +1,5 @@
-// Samples along rays, and what is seen along them (math/volume.hpp): one thread per ray, which goes from sample to sample as the
-// CPU does. One kernel both counts samples and writes them, so that both round alike.
+// Samples along rays and volume rendering (math/volume.hpp): one thread per ray, which visits its samples in order like
+// the CPU. One kernel both counts samples and writes them, so that both round alike.
 //
 // Limits, H100 (3.35 TB/s; some 0.5 us for a read that must be waited for). Per sample: marching 24 bytes, and per step a byte of
 // a grid that stays in the second-level cache; compositing 28 bytes forward, 40 backward: 7 to 12 ps. Rays of a step, thousands,

@@ -17,7 +17,7 @@ namespace {
 constexpr int kThreads = 128;
 constexpr int kTurnSums = 12;  // by the columns of R - I and by the shift
 
-// What points read of a node.
+// The values of a node that points read.
 struct alignas(16) NodeRow {
   Vec3<float> place;
   float decay;

@@ -86,7 +86,7 @@ __device__ __forceinline__ void stage_entries(const Splats<float>& s, const Entr
   }
 }
 
-// Whether alpha may reach alpha_min in the pixels of this warp.
+// True if alpha may reach alpha_min in the pixels of this warp.
 __device__ __forceinline__ bool touches_block(const StagedGaussian& staged, const TilePlace& tile,
                                               const PixelPlace& pixel, float log2_alpha_min) {
   const BlendGaussian<float>& g = staged.gaussian;

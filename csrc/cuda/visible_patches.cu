@@ -82,7 +82,7 @@ __global__ void __launch_bounds__(kThreads) place_patches_kernel(PatchViews<floa
   for (int k = 0; k < 4; ++k) global(b.boxes)[4 * patch + k] = box[k];
 }
 
-// What a pixel shows so far.
+// The nearest face at a pixel so far.
 struct Nearest {
   double z = kEndless, u = 0, v = 0;
   int32_t patch = -1;

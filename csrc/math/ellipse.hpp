@@ -1,4 +1,4 @@
-// Where a splat's alpha reaches alpha_min: the ellipse u^2 + v^2 <= t with u = U dx + W dy, v = V dy (math/covariance.hpp),
+// The outline of a splat where alpha is alpha_min: the ellipse u^2 + v^2 <= t with u = U dx + W dy, v = V dy (math/covariance.hpp),
 // its bounds, and the pixels between them. Templates over a scalar or a vector of lanes.
 #pragma once
 

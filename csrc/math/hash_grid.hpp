@@ -1,4 +1,4 @@
-// Where a point lies in one level of a multiresolution hash grid (Mueller et al. 2022, "Instant Neural Graphics Primitives"):
+// Corners and weights of a point in one level of a multiresolution hash grid (Mueller et al. 2022, "Instant Neural Graphics Primitives"):
 // the rows of the eight corners of its cell, and their trilinear weights. Many points at a time, in plain loops over lanes.
 #pragma once
 

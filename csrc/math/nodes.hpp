@@ -1,4 +1,4 @@
-// What control nodes do at a time, and how far they are from moving rigidly with their neighbours.
+// Poses of control nodes at a time, and their as-rigid-as-possible penalty.
 #pragma once
 
 #include "math/skinning.hpp"

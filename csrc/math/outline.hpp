@@ -1,4 +1,4 @@
-// Where a Bezier patch ends between two pixels, and how much of a pixel its neighbour covers by that: the boundary-aware
+// The outline of a Bezier patch between two pixels, and the coverage of a pixel by its neighbour: the boundary-aware
 // weights of BG-Triangle (Wu et al. 2025), linear, in the distance along a row or column. A patch counts 1 inside, a half at
 // its outline, 0 outside.
 #pragma once
@@ -22,7 +22,7 @@ inline constexpr double kLeastSine = 0.7071067811865476;
 // Steps beyond the next pixel that still count as at it, since patches are drawn as flat faces.
 inline constexpr double kEndSlack = 0.25;
 
-// Where a patch ends, going from a place on it by one step.
+// The end of a patch within one step from a point on it.
 template <class S>
 struct PatchEnd {
   bool is_found;

@@ -1,5 +1,5 @@
-// A pixel as the mean of what it and the four pixels next to it show, and the vjp, which gathers: each pixel, and each
-// crossing, is written by one caller. `In` has the arrays of core/triangles.hpp's PatchImage.
+// A pixel as the weighted mean of itself and its four neighbours, and the vjp. Both gather: each pixel and each crossing
+// is written by one caller. `In` has the arrays of core/triangles.hpp's PatchImage.
 #pragma once
 
 #include "math/outline.hpp"
@@ -23,7 +23,7 @@ class PixelStar {
   // Share of what it shows itself, and of what the neighbour `k` shows, of the pixel.
   DYNGS_HD S own() const { return own_ * scale_; }
   DYNGS_HD S share(int k) const { return shares_[k] * scale_; }
-  // Whether more is covered by neighbours than there is.
+  // True if the neighbours cover the whole pixel or more.
   DYNGS_HD bool is_full() const { return !(own_ > S(0)); }
   DYNGS_HD S scale() const { return scale_; }
 

@@ -43,8 +43,8 @@ DYNGS_HD inline PixelBox pixels_of(const Pinhole<double>& cam, double near, cons
   return {first_pixel(x0, cam.width), first_pixel(y0, cam.height), end_pixel(x1, cam.width), end_pixel(y1, cam.height)};
 }
 
-// As many segments of an edge, up to `most`, as keep flat faces within kFlat px of a patch with these control points in the
-// camera: a parabola over n segments is farthest from its chords by a quarter of its second difference over n^2.
+// The number of segments per edge, at most `most`, that keeps flat faces within kFlat px of a patch with these camera-space
+// control points: a parabola over n segments is farthest from its chords by a quarter of its second difference over n^2.
 DYNGS_HD inline int segments_for(const Pinhole<double>& cam, double near, int most,
                                  const Vec3<double> (&points)[kPatchPoints]) {
   const int edges[3][3] = {{0, 1, 3}, {0, 2, 5}, {3, 4, 5}};

@@ -7,7 +7,7 @@
 
 namespace dyngs {
 
-// Where a coordinate falls between samples: index (as a real) and fraction.
+// The position of a coordinate between samples: index (as a real) and fraction.
 template <class R>
 struct Cell {
   R index, frac;

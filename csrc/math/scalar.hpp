@@ -40,7 +40,7 @@ inline constexpr S kNaN = std::numeric_limits<S>::quiet_NaN();
 template <class S>
 inline constexpr S kEpsilon = std::numeric_limits<S>::epsilon();
 
-// Whether a comparison holds anywhere: of numbers there is one.
+// True if a comparison holds in any lane. A scalar has one lane.
 DYNGS_INLINE bool any(bool condition) { return condition; }
 
 DYNGS_INLINE float select(bool condition, float a, float b) { return condition ? a : b; }
@@ -87,7 +87,7 @@ DYNGS_INLINE A dot3(const A& a0, const B& b0, const A& a1, const B& b1, const A&
   return first + second + a2 * b2;
 }
 
-// As R; exact for the integers and fractions that formulas hold.
+// Conversion to R, exact for the constants in the formulas.
 template <class R>
 DYNGS_INLINE R real(double value) {
   return R(static_cast<Scalar<R>>(value));

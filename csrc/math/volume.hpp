@@ -1,5 +1,5 @@
-// The space of a field, nested cubes around a centre, each twice the one inside it; samples of a ray in it, and what is seen along
-// them (Max 1995). Arrays are anything with []: pointers, or those of cuda/device.hpp.
+// The space of a field, nested cubes around a centre, each twice the one inside it; ray samples in it, and their
+// volume rendering (Max 1995). Arrays are anything with []: pointers, or those of cuda/device.hpp.
 #pragma once
 
 #include "math/scalar.hpp"
@@ -109,7 +109,7 @@ struct RaySteps {
     at = from + shift * max(march.step, from * march.cone);
   }
 
-  // Whether there is another one: from `start` to `end` along the ray, and its middle x (3) in the world.
+  // True if there is another sample, from `start` to `end` along the ray with midpoint x (3) in the world.
   template <class In, class Cells>
   DYNGS_HD bool next(const In& march, const Cells& occupied, S& start, S& end, S* x) {
     while (left > 0 && at < to) {
@@ -140,7 +140,7 @@ DYNGS_HD S middle_of(const In& in, int64_t i) {
   return S(0.5) * (in.starts[i] + in.ends[i]);
 }
 
-// What a ray sees of its samples, or gradients by that.
+// Rendered values of a ray, or their gradients.
 template <class S>
 struct Sight {
   S colour[3], transmittance, depth;

@@ -1,5 +1,4 @@
-// Runs kernels of training once each on a random scene, on one thread: what benchmarks/instructions.py counts the
-// instructions of.
+// Runs each training kernel once on a random scene and one thread, for benchmarks/instructions.py.
 #include "tests/fields.hpp"
 #include "tests/scene.hpp"
 #include "tests/triangles.hpp"

@@ -44,14 +44,14 @@ struct Access {
     return {running.thread, running.block_interval, running.warp_intervals[running.thread / kWarp]};
   }
   bool same_warp() const { return thread >= 0 && thread / kWarp == running.thread / kWarp; }
-  // Whether a barrier, or the program of one thread, stands between this access and the running thread.
+  // True if a barrier or program order separates this access from the running thread.
   bool ordered() const {
     if (thread == kNobody || thread == running.thread || block_interval != running.block_interval) return true;
     return same_warp() && warp_interval != running.warp_intervals[running.thread / kWarp];
   }
 };
 
-// What was done to one granule (four bytes, or one where elements are smaller) in the running launch.
+// Accesses to one granule (four bytes, or one for smaller elements) in the running launch.
 class Shadow {
  public:
   enum class Kind { kRead, kWrite, kAtomic };

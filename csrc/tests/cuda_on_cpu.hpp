@@ -66,7 +66,7 @@ struct Schedule {
   unsigned seed = 0;
 };
 
-// What a kernel is launched with.
+// The launch configuration of a kernel.
 struct Grid {
   int64_t blocks;
   int threads;
@@ -172,7 +172,7 @@ class Machine {
     shared_.push_back({tag, std::move(memory), std::move(region), running.block});
     return shared_.back().region.get();
   }
-  // What another block wrote is not there any more.
+  // Values written by another block are undefined in this one.
   void enter(SharedArray& array) {
     if (std::exchange(array.block, running.block) != running.block) array.region->forget_values();
   }

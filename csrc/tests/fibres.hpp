@@ -109,8 +109,8 @@ class Fibres {
     __asan_unpoison_memory_region(context.stack.get(), kStackBytes);
 #endif
 #if defined(DYNGS_OWN_SWITCH)
-    // As dyngs_switch_stacks leaves a stack: six registers, then where to return to. A function expects the stack 8 bytes
-    // off a multiple of 16, as after a call.
+    // The layout that dyngs_switch_stacks leaves: six registers, then the return address. A function expects the stack
+    // pointer 8 bytes off a multiple of 16, as after a call.
     char* end = context.stack.get() + kStackBytes;
     end -= reinterpret_cast<uintptr_t>(end) % 16;
     uintptr_t slots[8] = {};

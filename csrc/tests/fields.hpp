@@ -1,4 +1,4 @@
-// Inputs of the tests of radiance fields, in float64, and what the CPU's kernels make of them in either precision.
+// Inputs of the tests of radiance fields, in float64, and the CPU kernels' results in either precision.
 #pragma once
 
 #include <cmath>

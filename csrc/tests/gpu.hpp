@@ -1,4 +1,4 @@
-// Where the tests of the CUDA kernels run them: on the emulated GPU, or, with DYNGS_ON_GPU, on a real one.
+// The device of the CUDA kernel tests: the emulated GPU, or with DYNGS_ON_GPU a real one.
 #pragma once
 
 #include <string>

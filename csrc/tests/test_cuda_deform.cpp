@@ -204,7 +204,7 @@ void test_posing(int64_t count, int64_t joints) {
   expect_same_bits("gradient by scales alone, " + what, pose_on_gpu(c, false).by_log_scales, gpu.by_log_scales);
 }
 
-void test_nothing_posed() {
+void test_no_gaussians_posed() {
   const PosedCase<float> gpu = pose_on_gpu(posing_case(0, 3));
   expect(std::all_of(gpu.by_transforms.begin(), gpu.by_transforms.end(), [](float x) { return x == 0; }),
          "no Gaussians, no gradients by transforms");
@@ -439,7 +439,7 @@ int main() {
   skip_without_gpu();
   test_skinning(5, 3, 40, 3), test_skinning(300, 7, 500, 4), test_skinning(2, 0, 300, 1);
   test_far_points();
-  test_posing(1, 1), test_posing(150, 24), test_posing(700, 3), test_nothing_posed();
+  test_posing(1, 1), test_posing(150, 24), test_posing(700, 3), test_no_gaussians_posed();
   test_planes("two levels", plane_case(5, 150, 0.37, {{7, 4}, {17, 3}}));
   test_planes("more channels than a warp has lanes", plane_case(40, 60, 1, {{4, 5}}));
   test_planes("one sample", plane_case(3, 30, 0, {{1, 1}, {2, 2}}));

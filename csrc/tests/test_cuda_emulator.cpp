@@ -1,6 +1,5 @@
 // The emulation of CUDA itself: it must give the known values of warp operations, run every block and thread once in every
-// order, and find what it is there to find. Each kind of mistake has a small kernel that makes it, and one beside it that
-// does not.
+// order, and detect invalid accesses and races. Each kind of error has a small kernel with it, and one without.
 #include <functional>
 
 #include "cuda/device.hpp"
@@ -14,7 +13,7 @@ using emulated::machine;
 using emulated::Memory;
 using Order = emulated::Schedule::Order;
 
-// What a launch fails with, or nothing.
+// The error message of a launch, or empty.
 std::string failure_of(const std::function<void()>& run) {
   try {
     run();
@@ -295,7 +294,7 @@ __global__ void dynamic_shared(int* out) {
   global(out)[threadIdx.x] = static_cast<int>(numbers[31 - threadIdx.x]);
 }
 
-void test_waiting() {
+void test_barriers_and_shared_memory() {
   Memory<int> out(32);
   expect_failure("deadlock, 32 of 64 threads wait", [&] { launch("half", {1, 64}, nullptr, half_waits); });
   expect_failure("__syncthreads of lines", [&] { launch("two", {1, 64}, nullptr, two_barriers); });
@@ -321,6 +320,6 @@ int main() {
   test_races();
   test_bounds();
   test_parts_of_a_workspace();
-  test_waiting();
+  test_barriers_and_shared_memory();
   return report();
 }

@@ -44,7 +44,7 @@ void test_hash_grid(const std::vector<HashLevel>& levels, int64_t features, int6
     expect_close("gradient in parts, " + what, grid_on_gpu(c, at_once).by_table, cpu.by_table, 2e-5);
 }
 
-void test_points_outside_and_spoilt() {
+void test_points_outside_and_nan() {
   const auto levels = levels_of({1, 4, 30}, 256);
   GridCase c = grid_case(levels, 2, 70, 3.0);
   c.coords[3 * 7 + 1] = kNone, c.coords[0] = 1e30, c.table[2] = kNone;
@@ -125,7 +125,7 @@ void test_march(int64_t cascades, double cone) {
 }
 
 // From nowhere, of no direction, along an edge, from so far away that a step is lost in rounding, and past the cube.
-void test_hard_rays() {
+void test_degenerate_rays() {
   MarchCase c{{{0, 0, 0}, 1, 1, 4}, std::vector<bool>(64, true), {}, {}, Values(6, 0.25), 0, 0.125, 0, 100};
   c.origins = {kNone, 0, 0, 0, 0, 0, -5, 1, 1, -1e9, 0, 0, -5, 0.125, 2, -5, 0.125, 0.25};
   for (const double x : {1, 0, 1, 1, 1, 1}) c.directions.insert(c.directions.end(), {x, 0, 0});
@@ -205,8 +205,8 @@ int main() {
   const auto levels = levels_of({3, 6, 17, 24}, 512);
   test_hash_grid(levels, 4, 700, 0.6), test_hash_grid(levels, 1, 60, 0.6), test_hash_grid(levels, 8, 90, 0.6);
   test_hash_grid(levels_of({2, 40}, 256), 2, 900, 0.01);
-  test_points_outside_and_spoilt(), test_no_points();
-  test_march(1, 0), test_march(3, 0.0625), test_hard_rays();
+  test_points_outside_and_nan(), test_no_points();
+  test_march(1, 0), test_march(3, 0.0625), test_degenerate_rays();
   test_composition(0.5, 0), test_composition(3, 0.01), test_known_rays();
   return report();
 }

@@ -95,7 +95,7 @@ void test_many_tiles() {
 }
 
 // A row with NaN has NaN in its outputs, and no other row has.
-void test_spoilt_row() {
+void test_nan_row() {
   NetworkCase c = network_case({5, 8, 8, 3}, 0, 40);
   const NetworkResults<float> good = network_on_gpu(c);
   c.x[7 * 5 + 2] = std::numeric_limits<double>::quiet_NaN();
@@ -104,7 +104,7 @@ void test_spoilt_row() {
     expect(at / 3 == 7 ? std::isnan(bad.y[at]) : bad.y[at] == good.y[at], "NaN in its own row alone");
 }
 
-// What the network makes of the zeros after the last row, here infinity, is in no sum.
+// Padding rows, whose outputs are infinite here, are not part of any sum.
 void test_padding() {
   const NetworkCase c{{1, 1, 1, 1}, 0, 3, {-1e30, 1e30, 1e30, 1, 1, 0}, {1, 1, 1}, {1, 1, 1}};
   const NetworkResults<float> gpu = network_on_gpu(c);
@@ -132,6 +132,6 @@ int main() {
   skip_without_gpu();
   test_perceptron({5, 24, 24, 3}, 2, 301), test_perceptron({4, 1}, 0, 30), test_perceptron({13, 32, 32, 3}, 0, 700);
   test_perceptron({33, 70, 41, 70, 9}, 3, 150), test_perceptron({100, 256, 130, 11}, 2, 37);
-  test_no_rows(), test_many_tiles(), test_spoilt_row(), test_padding(), test_large_networks();
+  test_no_rows(), test_many_tiles(), test_nan_row(), test_padding(), test_large_networks();
   return report();
 }

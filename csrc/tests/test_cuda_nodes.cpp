@@ -48,7 +48,7 @@ void test_offset_gradients(bool picked, unsigned parts) {
 
 constexpr int64_t kHeadSizes[kHeads] = {3, 4, 3, 1, 3};
 
-// What nodes do at a time and the gradients by their splines; `kept`: which heads there are, bit by bit.
+// Node poses at a time and gradients of their splines. `kept` is a bit mask of the heads.
 void test_nodes(int64_t count, int64_t points, unsigned kept) {
   NodeSplines<double> splines{{}, count, points, points - 4, {0.1, 0.4, 0.3, 0.2}};
   NodeSplines<float> on_gpu{{}, count, points, points - 4, {0.1f, 0.4f, 0.3f, 0.2f}};

@@ -29,7 +29,7 @@ void expect_same_lists(const std::string& what, const Binning& gpu, const Binnin
 }
 
 // Lists for splats that the CPU projected, so that both start from the same bits.
-void test_lists(const std::string& what, const Scene& s) {
+void test_tile_lists(const std::string& what, const Scene& s) {
   const Inputs<float> in(s, 1);
   Drawn<float> d;
   project_all(in, d);
@@ -54,7 +54,7 @@ void expect_same_drawing(const std::string& what, const Drawn<float>& a, const D
   for (int k = 0; k < 4; ++k) expect_same_bits("tally, " + what, a.tallies[k], b.tallies[k]);
 }
 
-// As expect_close; where nothing but zeros and rounding is wanted, nothing else will do.
+// expect_close, but where all expected values are zero up to rounding, so must be all results.
 template <class A, class B>
 void expect_as(const std::string& what, const std::vector<A>& got, const std::vector<B>& wanted, double tolerance) {
   const auto is_nothing = [](auto x) { return std::abs(static_cast<double>(x)) < 1e-15; };
@@ -177,19 +177,19 @@ void test_orders() {
   in_other_orders([&] { expect_same_drawing("in another order", forward, draw_on_gpu(s, &cotangents)); });
 }
 
-void test_all_lists() {
-  test_lists("thresholds", with_thresholds(random_scene(500, 90, 70, 3, 0.1)));
-  test_lists("no thresholds", random_scene(100, 90, 70, 3, 0.1));
-  test_lists("several pieces to sort", with_thresholds(random_scene(3000, 75, 50, 3, 0.05)));
+void test_all_tile_lists() {
+  test_tile_lists("thresholds", with_thresholds(random_scene(500, 90, 70, 3, 0.1)));
+  test_tile_lists("no thresholds", random_scene(100, 90, 70, 3, 0.1));
+  test_tile_lists("several pieces to sort", with_thresholds(random_scene(3000, 75, 50, 3, 0.05)));
   Scene tall =
       with_thresholds(random_scene(60, 33, 900, 3, 0.5));  // 57 tile rows: those of large splats by whole warps
-  test_lists("large splats", tall);
+  test_tile_lists("large splats", tall);
   Scene equal = with_thresholds(random_scene(200, 40, 40, 3, 0.2));
   for (int64_t i = 0; i < equal.n; ++i) equal.means[3 * i + 2] = 4;
   for (int k = 0; k < 32; ++k) equal.viewmats[k] = k % 16 % 5 == 0 ? 1 : 0;
-  test_lists("equal depths", equal);
-  test_lists("more than 65536 tiles", with_thresholds(random_scene(8, 4099, 4200, 3, 0.0002)));
-  test_lists("a image of one pixel", random_scene(5, 1, 1, 3, 0.5));
+  test_tile_lists("equal depths", equal);
+  test_tile_lists("more than 65536 tiles", with_thresholds(random_scene(8, 4099, 4200, 3, 0.0002)));
+  test_tile_lists("a image of one pixel", random_scene(5, 1, 1, 3, 0.5));
 }
 
 #if !defined(DYNGS_ON_GPU)
@@ -221,7 +221,7 @@ void test_limit_of_entries() {
          "more entries than allowed are refused: " + message);
 }
 
-void test_nothing_to_draw() {
+void test_empty_scene() {
   Scene s = random_scene(3, 20, 18, 3, 0.1);
   for (int64_t i = 0; i < s.n; ++i) s.means[3 * i + 2] = -5;  // behind the cameras
   compare("behind the cameras", s);
@@ -299,7 +299,7 @@ int main() {
   skip_without_gpu();
   for (int channels : {1, 3, 4, 7, 13, kMaxChannels})
     compare("D=" + std::to_string(channels), random_scene(40, 37, 19, channels, 0.2));
-  test_all_lists();
+  test_all_tile_lists();
   test_thresholds();
   test_extents();
   test_gradients_with_thresholds();
@@ -309,7 +309,7 @@ int main() {
   test_host_reads();
 #endif
   test_limit_of_entries();
-  test_nothing_to_draw();
+  test_empty_scene();
   test_extremes();
   return report();
 }

@@ -38,7 +38,7 @@ void test_values(int64_t count, int64_t patches, int64_t channels, int basis) {
   });
 }
 
-void test_no_places() {
+void test_no_samples() {
   const auto gpu = values_on_gpu(value_case(0, 5, 3, 0));
   expect(std::all_of(gpu.g_values.begin(), gpu.g_values.end(), [](float x) { return x == 0; }), "no places");
 }
@@ -62,7 +62,7 @@ Shown<float> shown_on_gpu(const PatchCase& c) {
   return {ids.values(), uv.values()};
 }
 
-void test_shown(int64_t patches, int width, int height, double size) {
+void test_visible_patches(int64_t patches, int width, int height, double size) {
   PatchCase c = patch_case(patches, width, height, size);
   if (patches > 2) c.points[7] = std::numeric_limits<double>::quiet_NaN();
   const auto cpu = shown_on_cpu<float>(c), gpu = shown_on_gpu(c);
@@ -93,7 +93,7 @@ Ends<float> ends_on_gpu(const PatchCase& c, const StepCase& from) {
   return {{which.begin(), which.end()}, steps.values(), places.values(), slopes.values()};
 }
 
-void test_ends() {
+void test_outlines() {
   const PatchCase c = patch_case(9, 40, 30, 0.5);
   const auto from = step_case(c, shown_on_cpu<float>(c));
   const auto cpu = ends_on_cpu<float>(c, from), gpu = ends_on_gpu(c, from);
@@ -145,8 +145,8 @@ void test_blending(int channels) {
 
 int main() {
   skip_without_gpu();
-  test_values(700, 9, 3, 0), test_values(60, 400, 1, -1), test_values(300, 5, 4, 3), test_no_places();
-  test_shown(9, 40, 30, 0.5), test_shown(600, 24, 20, 0.1), test_shown(1, 17, 33, 2.0);
-  test_ends(), test_blending(1), test_blending(4);
+  test_values(700, 9, 3, 0), test_values(60, 400, 1, -1), test_values(300, 5, 4, 3), test_no_samples();
+  test_visible_patches(9, 40, 30, 0.5), test_visible_patches(600, 24, 20, 0.1), test_visible_patches(1, 17, 33, 2.0);
+  test_outlines(), test_blending(1), test_blending(4);
   return report();
 }

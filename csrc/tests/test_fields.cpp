@@ -1,5 +1,5 @@
 // The kernels of radiance fields, as a program without Python: against plain formulas in double, their gradients against central
-// differences of these, float against double, several threads against one; points outside, NaN, and rays that see nothing.
+// differences of these, float against double, several threads against one; points outside, NaN, and rays that miss all samples.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -111,7 +111,7 @@ void test_points_outside() {
   expect_same_bits("gradient outside", one.by_table, other.by_table);
 }
 
-void test_spoilt_points_and_rows() {
+void test_nan_points_and_rows() {
   const auto levels = levels_of({4, 30}, 256);
   const GridCase good = grid_case(levels, 2, 50, 0.45);
   const auto clean = grid_on_cpu<float>(good);
@@ -261,7 +261,7 @@ MarchCase one_ray(const Values& ray, bool occupied = true) {
 }
 
 template <class S>
-void test_hard_rays() {
+void test_degenerate_rays() {
   const auto count = [](const MarchCase& c) {
     const auto found = march_on_cpu<S>(c);
     for (const S x : found.starts) expect(std::isfinite(x), "samples of a hard ray are written");
@@ -348,8 +348,8 @@ void test_composition_threads() {
   }
 }
 
-// What is not reached has no part in anything.
-void test_reached_alone() {
+// Samples that are not reached have no effect.
+void test_reached_samples_only() {
   const SampleCase c = sample_case({64, 64, 20}, 3, 0.01);
   const auto all = composite_on_cpu<float>(c);
   SampleCase rest = c;
@@ -386,11 +386,12 @@ void test_known_rays() {
 int main() {
   skip_unless_supported();
   for (const int64_t features : {1, 2, 4, 8}) test_hash_grid(features);
-  test_hash_grid_threads(), test_samples_of_a_level(), test_points_outside(), test_spoilt_points_and_rows(),
+  test_hash_grid_threads(), test_samples_of_a_level(), test_points_outside(), test_nan_points_and_rows(),
       test_no_points();
   test_march(1), test_march(3), test_growing_samples<double>(1e-11), test_growing_samples<float>(1e-5);
-  test_march_threads<float>(), test_march_threads<double>(), test_hard_rays<float>(), test_hard_rays<double>();
+  test_march_threads<float>(), test_march_threads<double>(), test_degenerate_rays<float>(),
+      test_degenerate_rays<double>();
   test_composition(0.5, 0), test_composition(3, 0.01), test_composition_threads();
-  test_reached_alone(), test_known_rays();
+  test_reached_samples_only(), test_known_rays();
   return report();
 }

@@ -335,7 +335,7 @@ void test_planes() {
   expect_vjp("plane_product_vjp", plane_feature, v, {0.7}, gradient);
 }
 
-void test_places_in_planes() {
+void test_plane_cells() {
   for (double u : {-0.9, -0.1, 0.35, 0.98}) {
     const auto place = [](const Values& x) {
       const Cell<double> cell = locate(x[0], 12);
@@ -413,7 +413,7 @@ int main() {
   skip_unless_supported();
   for (int trial = 0; trial < 10; ++trial) {
     test_vectors(), test_blend_vjp(), test_blend_packets(), test_ellipse();
-    test_skinning(), test_posing(), test_planes(), test_places_in_planes();
+    test_skinning(), test_posing(), test_planes(), test_plane_cells();
     test_shading(), test_ssim(), test_adam();
   }
   return report();

@@ -124,7 +124,7 @@ void test_limit_of_entries() {
   expect(refused, "more entries than allowed are refused");
 }
 
-void test_nothing_to_draw() {
+void test_empty_scene() {
   Scene s = random_scene(3, 20, 18, 3, 0.1);
   for (int64_t i = 0; i < s.n; ++i) s.means[3 * i + 2] = -5;  // behind the cameras
   const Cotangents cotangents = random_cotangents(s);
@@ -143,6 +143,6 @@ int main(int argc, char** argv) {
   test_threads<float>(3000, 0.05), test_threads<double>(500, 0.05);  // spans are shared out beyond 2048
   if (argc > 1 && std::string(argv[1]) == "large") test_threads<float>(300000, 0.003);
   test_limit_of_entries();
-  test_nothing_to_draw();
+  test_empty_scene();
   return report();
 }

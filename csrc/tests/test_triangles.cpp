@@ -1,5 +1,5 @@
 // The kernels of curved triangles, as a program without Python: against plain formulas in double, their gradients against central
-// differences, float against double, several threads against one; what cannot be drawn.
+// differences, float against double, several threads against one; degenerate patches.
 #include <algorithm>
 #include <limits>
 
@@ -34,7 +34,7 @@ void test_values(int basis, int64_t channels) {
 }
 
 // Every place that is shown is on its pixel's ray, on the smooth patch to kFlat px where segments are enough.
-void test_places() {
+void test_visible_points() {
   PatchCase c = patch_case(9, 60, 44, 0.5);
   c.segments = 16;
   const auto shown = shown_on_cpu<double>(c);
@@ -56,7 +56,7 @@ void test_places() {
   }
 }
 
-void test_what_cannot_be_drawn() {
+void test_degenerate_patches() {
   PatchCase c = patch_case(6, 20, 16, 0.5);
   const auto set = [&](int64_t patch, const Values& points) {
     for (int i = 0; i < 18; ++i) c.points[18 * patch + i] = points[i % points.size()];
@@ -73,7 +73,7 @@ void test_what_cannot_be_drawn() {
 }
 
 // A flat patch with an upright edge at a known column.
-void test_known_end() {
+void test_known_outline() {
   for (const double edge : {10.125, 10.5, 10.9375}) {
     PatchCase c = patch_case(1, 20, 16, 0.5);
     c.viewmats[3] = 0, c.viewmats.resize(16), c.intrinsics.resize(9);
@@ -91,7 +91,7 @@ void test_known_end() {
   }
 }
 
-void test_ends() {
+void test_outlines() {
   const PatchCase c = patch_case(9, 60, 44, 0.5);
   const auto steps = step_case(c, shown_on_cpu<float>(c));
   const auto d = ends_on_cpu<double>(c, steps);
@@ -170,7 +170,7 @@ void test_moving_colours() {
 int main() {
   skip_unless_supported();
   for (const int basis : {0, -1, -2, 1, 3}) test_values(basis, 3);
-  test_values(0, 1), test_places(), test_what_cannot_be_drawn(), test_known_end(), test_ends();
+  test_values(0, 1), test_visible_points(), test_degenerate_patches(), test_known_outline(), test_outlines();
   test_blending(1), test_blending(4), test_moving_colours();
   return report();
 }

@@ -1,4 +1,4 @@
-// Inputs of the tests of curved triangles, in float64, and what the CPU's kernels make of them in either precision.
+// Inputs of the tests of curved triangles, in float64, and the CPU kernels' results in either precision.
 #pragma once
 
 #include <cmath>
@@ -139,7 +139,7 @@ ValueResults<S> values_on_cpu(const ValueCase& c, int threads = 1) {
   return found;
 }
 
-// What is shown as an image, with colours and crossings at random.
+// Arguments of blending, with random colours and crossings.
 struct ImageCase {
   std::vector<int32_t> rows, ids;
   Values colours, crossings, g_image, g_transmittance;

@@ -166,7 +166,7 @@ def _random_points(
 
 
 def _sample_frusta(views: Sequence[View], count: int, generator: torch.Generator) -> Tensor:
-    """Sample ``count`` points (N, 3) float64 from the view frusta, see ``points_in_frusta``.
+    """Sample ``count`` points (N, 3) float64 from the view frusta, see ``sample_points_in_frusta``.
 
     The probability of a candidate is proportional to the square of the number of views that see
     it. Candidates seen by fewer than ``MIN_VIEWS`` views come last. Most points thus lie where

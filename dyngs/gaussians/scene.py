@@ -217,7 +217,7 @@ def require_gaussians(scene: Renderable, what: str) -> GaussianScene:
 
 
 def restore_scene(checkpoint: Checkpoint, model: ModelSection) -> GaussianScene:
-    """Return the scene in a checkpoint of ``model``; see ``restored_model``."""
+    """Return the scene in a checkpoint of ``model``; see ``restore_model``."""
     return require_gaussians(restore_model(checkpoint, model), checkpoint.name)
 
 

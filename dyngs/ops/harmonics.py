@@ -99,7 +99,7 @@ def _light_terms_vjp(directions: Tensor, by_terms: Tensor) -> Tensor:
 
 
 class _Lit(torch.autograd.Function):
-    """``shade_harmonics`` for autograd; component-major layout, because row sums of three are slow
+    """``lit`` for autograd; component-major layout, because row sums of three are slow
     in torch."""
 
     @staticmethod

@@ -1,7 +1,7 @@
 """Fused L1 + SSIM loss, and SSIM as a metric.
 
-In float32 one native call computes value and gradient. Other dtypes and devices use a plain torch
-version, which is also the reference of the tests.
+In float32 one native call computes value and gradient. Other dtypes and devices use the plain
+torch version, which is also the reference of the tests.
 """
 
 from __future__ import annotations
@@ -45,16 +45,18 @@ float32, contiguous.
 def l1_ssim_loss(
     rendered: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None
 ) -> Tensor:
-    """Return the training loss ``(1 - ssim_weight) * L1 + ssim_weight * (1 - SSIM)``,
-    differentiable in ``rendered``.
+    """Return the loss ``(1 - ssim_weight) * L1 + ssim_weight * (1 - SSIM)``, differentiable in
+    ``rendered``.
 
-    L1 is the mean of ``|x - y|``; SSIM the mean of the SSIM map with an 11x11 Gaussian window of
-    sigma 1.5, zero padding and data range 1, as in 3DGS. A mask (H, W) in [0, 1] multiplies both
-    images and weights both means: ``sum(m
-    |x - y|) / (3 sum m)``; a mask of zeros gives 0. In float32 on the CPU only first derivatives exist. Where values go
-    beyond about 2, SSIM is computed in float64. ``rendered`` x and the constant ``target`` y are
-    (H, W, 3), any strides; half precision is computed in float32. Raises DyngsError: shapes that do
-    not fit, an empty image, or integer images.
+    L1 is the mean of ``|x - y|``. SSIM is the mean of the SSIM map with an 11x11 Gaussian window
+    of sigma 1.5, zero padding and data range 1, as in 3DGS. A mask m (H, W) in [0, 1] multiplies
+    both images and weights both means: L1 is ``sum(m |x - y|) / (3 sum m)``; a mask of zeros gives
+    0.
+
+    In float32 on the CPU only first derivatives exist. For values beyond about 2, SSIM is computed
+    in float64. ``rendered`` x and the constant ``target`` y are (H, W, 3), any strides; half
+    precision is computed in float32. Raises DyngsError: shapes that do not fit, an empty image, or
+    integer images.
     """
     if rendered.ndim != 3 or not rendered.numel() or target.shape != rendered.shape:
         shapes = f"{tuple(rendered.shape)} and {tuple(target.shape)}"

@@ -1,11 +1,12 @@
-"""Quadratic triangular Bezier patches: values at places on them, which of them images show, and
-images of these.
+"""Quadratic triangular Bezier patches: evaluation, visibility and anti-aliased rendering.
 
-P patches, N places, V views. A place is (u, v), w = 1 - u - v; control points (i, j, k), i + j + k
-= 2, belong to u^i v^j w^k, in the order 200, 110, 101, 020, 011, 002 (csrc/math/bezier.hpp). The
-boundary-aware weights of BG-Triangle (Wu et al. 2025), 1 inside, a half at an outline, 0 outside,
-are those of pixels here, not of Gaussians on them: between two neighbours that show different
-patches lies an outline, whose place says how much of each the other one covers.
+P patches, N samples, V views. A sample has patch coordinates (u, v), w = 1 - u - v. Control point
+(i, j, k), i + j + k = 2, has the monomial u^i v^j w^k. Their order is 200, 110, 101, 020, 011, 002
+(csrc/math/bezier.hpp).
+
+Boundary-aware weights as in BG-Triangle (Wu et al. 2025) are computed per pixel here. An outline
+lies between two neighbouring pixels that show different patches. Its position gives the fraction
+of each pixel that the other patch covers.
 """
 
 from __future__ import annotations
@@ -26,13 +27,12 @@ NO_CROSSING = 0.5  # Between pixels neither of which covers any of the other
 
 
 def lattice_size(segments: int) -> int:
-    """Return the number of points of a triangular lattice with so many segments along an edge."""
+    """Return the number of points of a triangular lattice with ``segments`` per edge."""
     return (segments + 1) * (segments + 2) // 2
 
 
 def lattice(segments: int) -> tuple[Tensor, Tensor]:
-    """Return (K, 2) float64 places of a lattice's points, in their order, and (segments^2, 3)
-    faces, facing alike."""
+    """Return (K, 2) float64 coordinates of a lattice's points and its (segments^2, 3) faces."""
     uv = [
         (i / segments, j / segments)
         for i in range(segments, -1, -1)
@@ -70,8 +70,7 @@ patch_values_op = register("patch_values", _values, _values_backward, "values")
 
 
 def patch_values(values: Tensor, ids: Tensor, uv: Tensor, segments: int = 0) -> Tensor:
-    """Return (N, C) values of patches at places on them, differentiable in ``values``; the same on
-    any threads.
+    """Return (N, C) values interpolated on patches, differentiable in ``values``; deterministic.
 
     Args:
         values: (P, K, C) of control points; with ``segments`` at the points of a lattice, linear
@@ -88,16 +87,16 @@ def patch_values(values: Tensor, ids: Tensor, uv: Tensor, segments: int = 0) -> 
 def visible_patches(
     points: Tensor, cameras: Cameras, near: float, segments: int = SEGMENTS
 ) -> tuple[Tensor, Tensor]:
-    """Return (V, H, W) int32 patch that each pixel shows, -1 for none, and (V, H, W, 2) where on
-    it.
+    """Return (V, H, W) int32 ids of visible patches, -1 for none, and (V, H, W, 2) coordinates on
+    them.
 
-    A z-buffer of flat faces: perspective-correct, both sides, cut at ``near``; of several as near
-    the first is shown. Patches with a point that is not finite are not. The same on any number of
+    A z-buffer of flat two-sided faces, perspective-correct and clipped at ``near``. Ties show the
+    first patch. Patches with non-finite points are skipped. Results do not depend on the number of
     threads.
 
     Args:
         points: (P, 6, 3) control points, world.
-        segments: of an edge; a patch is ``segments``^2 faces.
+        segments: per edge; a patch has ``segments``^2 faces.
     """
     check_size(cameras.width, cameras.height)
     cameras = cameras.to(dtype=points.dtype)
@@ -153,7 +152,7 @@ blend_patches_op = register("blend_patches", _blend, _blend_backward, "means col
 
 @dataclass(frozen=True)
 class PatchSamples:
-    """The N places on patches that the pixels of V views show."""
+    """N samples on patches, one per covered pixel of V views."""
 
     rows: Tensor  # (V, H, W) int32, which of them a pixel shows; -1: nothing
     ids: Tensor  # (N,) int32 patches
@@ -161,7 +160,7 @@ class PatchSamples:
 
     @staticmethod
     def of(ids: Tensor, uv: Tensor) -> PatchSamples:
-        """Return the places of what ``visible_patches`` returned, view by view, row by row."""
+        """Return the samples of ``visible_patches``'s output, ordered by view and row."""
         shown = ids >= 0
         rows = torch.where(shown, shown.flatten().cumsum(0).view(ids.shape) - 1, -1).to(torch.int32)
         return PatchSamples(rows, ids[shown], uv[shown])
@@ -169,14 +168,14 @@ class PatchSamples:
 
 @dataclass(frozen=True)
 class ProjectedPoints:
-    """Points of patches in an image, differentiable."""
+    """Patch samples projected into an image, differentiable."""
 
     means: Tensor  # (N, 2) px
     depths: Tensor  # (N,)
 
 
 def project_points(points: Tensor, cameras: Cameras, views: Tensor) -> ProjectedPoints:
-    """Return where ``points`` (N, 3) of the world are in the images of ``views`` (N,)."""
+    """Project ``points`` (N, 3) in world units into the images of ``views`` (N,)."""
     which = slice(0, 1) if len(cameras) == 1 else views
     pose = cameras.cam_from_world[which]
     inner = cameras.intrinsics[which]
@@ -192,12 +191,12 @@ def project_points(points: Tensor, cameras: Cameras, views: Tensor) -> Projected
 
 
 def outline_crossings(points: Tensor, cameras: Cameras, places: PatchSamples) -> Tensor:
-    """Return (V, 2, H, W): how far from a pixel's centre to the next in its row, in its column,
-    their outline is.
+    """Return (V, 2, H, W) distances to the outline between a pixel and its next row or column
+    neighbour.
 
-    ``NO_CROSSING`` where both show the same patch, where the outline runs rather along the row or
-    column than across it, or where neither ends in between: then what shows is a fold. Where both
-    end there it is the middle of the two ends. Differentiable in ``points`` (P, 6, 3).
+    ``NO_CROSSING`` if both show the same patch, if the outline is nearly parallel to that
+    direction, or if no patch ends in between (a fold). If both patches end there, the mean of both
+    ends. Differentiable in ``points`` (P, 6, 3).
     """
     views, height, width = places.rows.shape
     out = points.new_full((views, 2, height, width), NO_CROSSING)
@@ -216,8 +215,9 @@ def outline_crossings(points: Tensor, cameras: Cameras, places: PatchSamples) ->
 
 
 def _differing(places: PatchSamples, axis: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return indices of pixels that show another patch than the next along x (axis 0) or y, of
-    those, of crossings."""
+    """Return indices of pixels whose next neighbour along x (axis 0) or y shows another patch, of
+    these neighbours, and of the crossings.
+    """
     rows = places.rows
     _, height, width = rows.shape
     labels = torch.where(rows >= 0, places.ids[rows.clamp_min(0).long()], -1)
@@ -237,8 +237,9 @@ def _differing(places: PatchSamples, axis: int) -> tuple[Tensor, Tensor, Tensor]
 def _ends_between(
     points: Tensor, cameras: Cameras, places: PatchSamples, pixels: Tensor, directions: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return (N,) steps in ``directions`` from ``pixels`` to where what they show ends, and (N,)
-    whether it does."""
+    """Return (N,) steps along ``directions`` from ``pixels`` to the patch outline, and (N,)
+    validity.
+    """
     rows = places.rows.view(-1)[pixels].long()
     ids = torch.where(rows >= 0, places.ids[rows.clamp_min(0)], -1)
     views = (pixels // places.rows[0].numel()).to(torch.int32)
@@ -260,17 +261,16 @@ def _ends_between(
 def blend_patches(
     means: Tensor, colours: Tensor, crossings: Tensor, places: PatchSamples
 ) -> tuple[Tensor, Tensor]:
-    """Return (V, H, W, C) images before black and (V, H, W) transmittance, differentiable once.
+    """Return (V, H, W, C) images on black and (V, H, W) transmittance, differentiable once.
 
-    A pixel is the mean of what it and its four neighbours show, by how much each covers: of a pixel
-    and the next one, with an outline t steps from the first (``crossings``), max(0, 1/2 - t) of the
-    first are the second's, and max(0, t - 1/2) of the second the first's. Where neighbours would
-    cover more than all of a pixel their shares are scaled to it. The same bits on any number of
-    threads.
+    A pixel is the mean of itself and its four neighbours, weighted by coverage. For an outline t
+    steps from the first of two neighbours (``crossings``), the second covers max(0, 1/2 - t) of
+    the first, and the first covers max(0, t - 1/2) of the second. Weights that sum to more than 1
+    are normalised. Results do not depend on the number of threads.
 
     Args:
-        means: (N, 2) px, of the places, which are at the centres of their pixels: not read. Their
-            gradient is that of moving what a patch shows along the image, by differences of
+        means: (N, 2) px positions of the samples (pixel centres). Values are not read. Their
+            gradient is that of moving a patch's colours along the image, by differences of
             neighbours on the same patch.
         colours: (N, C).
         crossings: (V, 2, H, W), see ``outline_crossings``.

@@ -1,7 +1,7 @@
 """Fused evaluation of small multilayer perceptrons over many rows.
 
-The kernel evaluates all layers for a hundred rows while they are in the cache (shared memory on a
-GPU). Results are independent of the number of threads.
+The kernel evaluates all layers for a block of rows in the cache (shared memory on a GPU). Results
+do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -69,14 +69,12 @@ tensor. ``params`` holds weight and bias of each layer, flat; ``skip`` 0 means n
 
 
 def perceptron(x: Tensor, layers: Sequence[Layer], *, skip: int | None = None) -> Tensor:
-    """Return (M, out) outputs of linear layers with a ReLU after each but the last, differentiable
-    once in all of them.
+    """Return (M, out) outputs of linear layers with ReLU in between, differentiable once.
 
-    A row with NaN gives an output row of NaN; gradients by the layers are sums over all rows, so a
-    NaN in one reaches them. ``x`` (M, K), any strides; half precision is computed in float32.
-    ``skip``: layer, from 1 on, whose input is the hidden activations followed by ``x``: its weight
-    is (out, width + K) (Mildenhall et al. 2020, figure 7). Raises DyngsError: no layer, shapes that
-    do not fit, integer tensors, or tensors on different devices.
+    NaN in a row stays in its output row, but gradients of layers sum over all rows. ``x`` (M, K),
+    any strides; half precision is computed in float32. ``skip``: index (from 1) of the layer that
+    also takes ``x``, with weight (out, width + K) (Mildenhall et al. 2020, figure 7). Raises
+    DyngsError: no layer, shapes that do not fit, integer tensors, or tensors on different devices.
     """
     widths = [x.shape[1], *(len(layer.bias) for layer in layers)]
     too_large = x.device.type != "cpu" and (len(layers) > GPU_LAYERS or max(widths) > GPU_WIDTH)

@@ -1,8 +1,6 @@
-"""Samples along rays through the occupied cells of a space, and what is seen along them (Max 1995),
-differentiable.
+"""Ray marching through occupied cells, and volume rendering (Max 1995), differentiable.
 
-R rays, M samples. The samples of a ray lie next to each other, from ``offsets[r]`` to before
-``offsets[r + 1]``.
+R rays, M samples. The samples of ray r are ``offsets[r]`` to ``offsets[r + 1] - 1``.
 """
 
 from __future__ import annotations
@@ -21,8 +19,8 @@ TRANSMITTANCE_MIN = 1e-4  # A ray ends when less than this is left (Müller et a
 
 @dataclass(frozen=True)
 class Space:
-    """Nested cubes around a centre, each twice the one inside it, all cut into as many cells along
-    an axis.
+    """Nested cubes around a centre, each twice as large as the next inner one, with equal numbers
+    of cells.
 
     Example:
 
@@ -42,14 +40,14 @@ class Space:
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """Cubes, and cells along z, y, x."""
+        """(cubes, cells along z, y, x)."""
         return self.cascades, self.cells, self.cells, self.cells
 
     def unit(self, points: Tensor) -> Tensor:
-        """Return points (..., 3) of the world in the unit cube.
+        """Map world points (..., 3) into the unit cube.
 
-        With several cubes what lies outside of the innermost is contracted: y to (2 - 1/|y|) y/|y|
-        in the max-norm (Barron et al. 2022), so that the innermost cube becomes [1/4, 3/4]^3.
+        With several cubes, points outside the innermost are contracted: y to (2 - 1/|y|) y/|y| in
+        the max-norm (Barron et al. 2022). The innermost cube becomes [1/4, 3/4]^3.
         """
         y = (points - points.new_tensor(self.centre)) / self.half
         if self.cascades == 1:
@@ -92,8 +90,9 @@ class Samples:
 
 @dataclass(frozen=True)
 class MarchSteps:
-    """How long samples are: at least ``length``, and at least ``cone`` times their distance; world
-    units."""
+    """Sample lengths in world units: at least ``length``, and at least ``cone`` times the
+    distance.
+    """
 
     near: float
     length: float
@@ -104,8 +103,7 @@ class MarchSteps:
 def _march_arguments(
     rays: list[Tensor], occupied: Tensor, space: list[float], steps: list[float]
 ) -> tuple[Any, ...]:
-    """Return what both kernels take: arrays (of rays: origins, directions, shifts), sizes, cells
-    and options."""
+    """Return the arguments of both kernels: ray arrays, sizes, cells and options."""
     x, y, z, half, cascades, cells = space
     near, length, cone, most = steps
     return (
@@ -152,11 +150,11 @@ march_samples_op = register("march_samples", _march_samples)
 
 @torch.no_grad()
 def march(rays: Rays, shifts: Tensor, space: Space, occupied: Tensor, steps: MarchSteps) -> Samples:
-    """Return the samples of rays whose middle lies in an occupied cell.
+    """Return the samples of rays whose midpoints lie in occupied cells.
 
-    Empty cells are skipped by whole steps. ``shifts`` (R,) in [0, 1): by which fraction of a step
-    those of each ray are shifted. ``occupied``: bool of ``space.shape``. The same samples on any
-    number of threads. The host waits for the number of samples.
+    Empty cells are skipped by whole steps. ``shifts`` (R,) in [0, 1) offset the samples of each
+    ray by a fraction of a step. ``occupied`` is bool of ``space.shape``. Results do not depend on
+    the number of threads. The host waits for the number of samples.
     """
     given = (
         [rays.origins.contiguous(), rays.directions.contiguous(), shifts.contiguous()],
@@ -186,8 +184,9 @@ reached_op = register("reached", _reached)
 def reached(
     densities: Tensor, samples: Samples, transmittance_min: float = TRANSMITTANCE_MIN
 ) -> tuple[Tensor, Tensor]:
-    """Return (M,) bool which samples light gets to through those before them, and the (R + 1,)
-    offsets of these."""
+    """Return an (M,) mask of samples that are not hidden by samples before them, and their (R +
+    1,) offsets.
+    """
     given = (
         densities.contiguous(),
         samples.starts,
@@ -200,7 +199,7 @@ def reached(
 
 
 def offsets_of(counts: Tensor) -> Tensor:
-    """Return (R + 1,) sums of the counts (R,) before each ray, and of all."""
+    """Return (R + 1,) exclusive prefix sums of ``counts`` (R,), ending with the total."""
     return torch.cat([counts.new_zeros(1), counts.cumsum(0)])
 
 
@@ -241,7 +240,7 @@ composite_op = register(
 
 @dataclass(frozen=True)
 class Composited:
-    """What R rays see."""
+    """Rendered values of R rays."""
 
     colour: Tensor  # (R, 3) before black
     transmittance: Tensor  # (R,) that is left
@@ -255,12 +254,12 @@ def composite(
     samples: Samples,
     transmittance_min: float = TRANSMITTANCE_MIN,
 ) -> Composited:
-    """Return what rays see of samples with densities (M,), per world unit, and colours (M, 3);
-    differentiable once.
+    """Volume-render samples with densities (M,) per world unit and colours (M, 3), differentiable
+    once.
 
     alpha = 1 - exp(-density length), weight = alpha times the transmittance before it. A ray ends
-    when less than ``transmittance_min`` is left. The same bits on any number of threads. Raises
-    DyngsError: shapes or dtypes that do not fit.
+    when its transmittance falls below ``transmittance_min``. Results do not depend on the number
+    of threads. Raises DyngsError: shapes or dtypes that do not fit.
     """
     given = (
         densities.contiguous(),

@@ -1,6 +1,6 @@
 """Fused inputs of a colour network for the visible Gaussians of a camera.
 
-In plain torch, thirty operations on narrow arrays would take three times as long as the network.
+In plain torch these thirty small operations take longer than the network.
 """
 
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false

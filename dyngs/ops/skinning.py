@@ -1,6 +1,6 @@
 """Linear blend skinning by sparse control nodes (SC-GS, Huang et al. 2024), and Gaussian offsets.
 
-Local letters: M points, S nodes, B nodes per point, D values per node.
+Shapes: M points, S nodes, B nodes per point, D values per node.
 """
 
 from __future__ import annotations
@@ -58,16 +58,17 @@ def blend_skinning(
     motion: Tensor,
     values: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return offsets (M, 3) of points that follow moving nodes, and the nodes' values (M, D)
-    blended alike.
+    """Return offsets (M, 3) of points skinned by moving nodes, and the blended node values (M, D).
 
     x is offset by sum_b w_b (R_b (x - p_b) - (x - p_b) + d_b) with w = softmax_b(-|x - p_b|^2 / (2
-    radius_b^2)). Differentiable, once, in ``points``, ``motion`` and ``values``; the weights count
-    as constant. The same bits on any number of threads. NaN reaches its point or its node's
-    followers only, and gradients by nodes. ``positions`` (S, 3) p and ``radii`` (S,) positive,
-    constant; ``followed`` (M, B) int64; ``motion`` (S, 7) shift d, then quaternion wxyz of R, of
-    any length; ``values`` (S, D). Half precision is computed in float32. Raises DyngsError: shapes,
-    types or devices that do not fit, or a node that does not exist.
+    radius_b^2)). Differentiable once in ``points``, ``motion`` and ``values``; the weights count
+    as constant. Results do not depend on the number of threads. NaN affects only its own point or
+    the followers of its node, and gradients of nodes.
+
+    ``positions`` (S, 3) p and positive ``radii`` (S,) are constant; ``followed`` (M, B) int64;
+    ``motion`` (S, 7) translation d, then quaternion wxyz of R, unnormalised; ``values`` (S, D).
+    Half precision is computed in float32. Raises DyngsError: shapes, dtypes or devices that do not
+    fit, or a node index out of range.
     """
     floats = (points, positions, radii, motion, values)
     dtype = reduce(torch.promote_types, (x.dtype for x in floats), torch.float32)
@@ -104,12 +105,13 @@ add_offsets_op = register(
 def add_offsets_(
     gaussians: Sequence[Tensor], rows: Tensor | None, offsets: Sequence[Tensor | None]
 ) -> None:
-    """Move M of N Gaussians in place, as ``dyngs.deform.field.deformed`` defines it; no gradient.
+    """Add offsets to M of N Gaussians in place, see ``dyngs.deform.field.apply_offsets``; no
+    gradient.
 
-    ``gaussians``: means, quats, log scales, opacity logits, harmonics (N, K, 3); contiguous where
-    there are offsets. ``rows`` (M,) int64 without repetition; None: the first M. ``offsets`` (M,
-    ...) of each in this order, of the base colour in place of
-    harmonics; None but for the first: none. Raises DyngsError: no such row, or not contiguous.
+    ``gaussians``: means, quats, log scales, opacity logits, harmonics (N, K, 3), contiguous where
+    offsets exist. ``rows`` (M,) int64 without repetition; None selects the first M. ``offsets``
+    (M, ...) in the same order, of the base colour in place of harmonics; only the first may not be
+    None. Raises DyngsError: no such row, or not contiguous.
     """
     changes = [None if x is None else x.detach().to(gaussians[0].dtype) for x in offsets]
     # Unchanged tensors are passed as .data, so that autograd does not count them as modified.
@@ -150,12 +152,12 @@ def offset_gradients(
     quats: Tensor | None,
     offset: Tensor | None,
 ) -> tuple[list[Tensor | None], Tensor | None]:
-    """Return the gradients by the M = ``count`` offsets of ``add_offsets_``, and by the quaternions
-    before it.
+    """Return the gradients of the M = ``count`` offsets of ``add_offsets_``, and of its input
+    quaternions.
 
-    ``grads``: by means, quats, log scales, opacity logits and harmonics after it, None where there
-    is none, and then there is none in what is returned. ``quats`` (N, 4) before it, and their
-    ``offset`` (M, 4), where they were turned.
+    ``grads``: gradients of means, quats, log scales, opacity logits and harmonics after it; None
+    entries stay None. ``quats`` (N, 4) before it and their ``offset`` (M, 4), if quaternions were
+    offset.
     """
     if all(x is None for x in grads):
         return [None] * len(grads), None

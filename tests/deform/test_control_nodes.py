@@ -1,5 +1,4 @@
-"""Control nodes with poses at key times: where they are, how they move, and how they come and
-go."""
+"""Control nodes with poses at key times: placement, motion, insertion and removal."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ MEANS_ONLY = {"moves": ()}
 def control_nodes(
     nodes: int = 5, pieces: int = 4, num_times: int = 10, **options: object
 ) -> ControlNodes:
-    """An untrained one."""
+    """An untrained field of control nodes."""
     return ControlNodes(
         ControlNodesField(nodes=nodes, pieces=pieces, **options),  # type: ignore[arg-type]
         tiny_setup(num_times=num_times),
@@ -32,14 +31,14 @@ def control_nodes(
 
 
 def placed(means: Tensor, **options: object) -> ControlNodes:
-    """One whose nodes are placed."""
+    """A field with placed nodes."""
     field = control_nodes(**options)  # type: ignore[arg-type]
     field.offsets(means, 0.0)
     return field
 
 
 def changed(field: ControlNodes, source: Tensor, is_new: Tensor) -> ControlNodes:
-    """The field after an edit in training."""
+    """The field after an edit of the Gaussians during training."""
     field = field.apply_edit(TopologyEdit(source, is_new))
     field.invalidate()
     return field
@@ -51,15 +50,14 @@ def points_of(field: ControlNodes) -> Tensor:
 
 
 def hold(field: ControlNodes, name: str, values: Tensor) -> None:
-    """Let all nodes keep ``values`` (S, size) of one head at all times: all control points are
-    equal."""
+    """Set one head of all nodes to ``values`` (S, size) at all times, by equal control points."""
     field.parameters[name].data[:] = values[:, None]
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.floats(0, 1), st.integers(1, 6), st.integers(0, 10_000))
 def test_motion_is_a_cubic_spline(time: float, pieces: int, seed: int) -> None:
-    """The one of SciPy with evenly spaced knots."""
+    """Equal to SciPy's cubic B-spline with uniform knots."""
     means = cloud().means
     field = placed(means, nodes=1, pieces=pieces, **MEANS_ONLY)
     values = np.random.default_rng(seed).normal(size=(pieces + 3, 3))
@@ -98,8 +96,9 @@ def test_a_rigid_motion_of_the_nodes_is_one_of_the_gaussians() -> None:
     st.integers(1, 12), st.lists(st.lists(st.integers(0, 11), max_size=15), min_size=1, max_size=4)
 )
 def test_nodes_lie_at_gaussians_after_any_edits(nodes: int, sets: list[list[int]]) -> None:
-    """Never more than asked for, none twice; with as many as places every Gaussian has one of its
-    own."""
+    """Nodes are distinct and at most as many as requested. With as many nodes as positions, each
+    Gaussian has its own node.
+    """
     everything = cloud(12).means
     field = placed(everything, nodes=nodes)
     index = torch.arange(12)
@@ -124,8 +123,8 @@ def test_nodes_lie_at_gaussians_after_any_edits(nodes: int, sets: list[list[int]
         assert all(len(x) == len(positions) for x in strip_roles(field.parameters.state()).values())
 
 
-def test_new_nodes_start_with_the_motion_found_there() -> None:
-    """A field that moves rigidly moves the newcomers alike, and the others as before."""
+def test_new_nodes_interpolate_the_motion_of_the_field() -> None:
+    """In a field that moves rigidly new nodes get the same motion, and existing ones keep it."""
     means = cloud(30).means
     field = placed(means[:10], nodes=20, pieces=2)
     assert len(field.buffers["positions"]) == 10
@@ -141,7 +140,7 @@ def test_new_nodes_start_with_the_motion_found_there() -> None:
     torch.testing.assert_close(moved, means @ matrix.T, rtol=0, atol=1e-5)
 
 
-def test_nodes_that_nothing_follows_are_dropped_with_their_moments() -> None:
+def test_unused_nodes_are_removed_with_their_moments() -> None:
     means = torch.tensor([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0]])
     field = placed(means, nodes=3, pieces=1, **MEANS_ONLY)
     field.offsets(means, 0.5).means.square().sum().backward()
@@ -167,9 +166,10 @@ def test_nodes_that_nothing_follows_are_dropped_with_their_moments() -> None:
 # -----------------------------------------------------------------------------------------------
 
 
-def test_motion_goes_on_at_constant_velocity() -> None:
-    """That of the last two intervals on either side; the outermost points of what was seen do not
-    count."""
+def test_motion_is_extrapolated_at_constant_velocity() -> None:
+    """The velocity is that of the last two intervals on either side. The outermost control points
+    are ignored.
+    """
     field = placed(cloud().means, pieces=10)
     field.parameters["means"].data[0, :, 0] = torch.tensor([-7.0] * 5 + [3, 4, 6, 7] + [-7] * 4)
     field.extend((0.4, 0.6), (0.2, 0.8))
@@ -181,8 +181,8 @@ def test_motion_goes_on_at_constant_velocity() -> None:
 
 
 # --- penalties
-# --------------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 
 # --- rigid groups
-# -----------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------

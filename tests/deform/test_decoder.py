@@ -1,4 +1,4 @@
-"""The decoder is a plain perceptron, its heads have names, and it starts at zero."""
+"""The decoder MLP: named heads, zero at initialization."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIZES = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 1, "colors"
 
 @pytest.mark.parametrize("chosen", list(product([False, True], repeat=len(HEADS))))
 def test_heads_by_name(chosen: tuple[bool, ...]) -> None:
-    """Outputs are consecutive columns in the order of the attributes; what is off has none."""
+    """Outputs are consecutive columns in attribute order; disabled attributes have none."""
     flags = {f"move_{name}": is_on for name, is_on in zip(HEADS, chosen, strict=True)}
     options = FieldSection.model_validate(flags)  # as earlier versions wrote it
     is_on = dict(zip(SIZES, (True, *chosen), strict=True))

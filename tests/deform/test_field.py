@@ -1,4 +1,4 @@
-"""Offsets change what they are named after, only there, and only where they should."""
+"""Deformation offsets affect only their attribute and the selected rows."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def rotations(quats: Tensor) -> Rotation:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("everything", [True, False])
 def test_every_field_starts_as_the_identity(kind: str, everything: bool) -> None:
-    """Bitwise, at any time, whatever it may move."""
+    """Bitwise, at any time and for any set of attributes."""
     gaussians = cloud()
     field = tiny_field(kind, everything=everything)
     for time in TIMES:
@@ -46,9 +46,8 @@ def test_every_field_starts_as_the_identity(kind: str, everything: bool) -> None
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_gradients_reach_all_that_is_learned(kind: str) -> None:
-    """After some training; before it the last layer is zero, and it alone learns in the first
-    step."""
+def test_every_parameter_gets_a_gradient(kind: str) -> None:
+    """After some training, because in the first step only the zero last layer has gradients."""
     gaussians = cloud()
     for field, trained in ((stirred_field(kind), True), (tiny_field(kind), False)):
         outputs = [x for x in vars(field.offsets(gaussians.means, 0.37)).values() if x is not None]
@@ -65,7 +64,7 @@ def test_gradients_reach_all_that_is_learned(kind: str) -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(st.sets(st.integers(0, 8)), st.sets(st.sampled_from(ATTRIBUTES)))
-def test_rows_alone_are_changed_and_as_without_rows(chosen: set[int], absent: set[str]) -> None:
+def test_only_selected_rows_are_deformed(chosen: set[int], absent: set[str]) -> None:
     gaussians = cloud()
     rows = torch.tensor(sorted(chosen), dtype=torch.long)
     offsets = Offsets(
@@ -111,13 +110,14 @@ def test_values_and_gradients_are_those_of_plain_torch(
 
 
 def turned_quats(quats: Tensor, offsets: Tensor) -> Tensor:
-    """Return (M, 4) the rotations ``quats`` followed by identity + ``offsets``: a Hamilton product,
-    not normalised."""
+    """Return (M, 4) ``quats`` multiplied by identity + ``offsets`` (Hamilton product), not
+    normalised.
+    """
     return quat_product(offsets + identity_quat(offsets), quats)
 
 
 def slowly_deformed(gaussians: Gaussians, offsets: Offsets, rows: Tensor | None) -> Gaussians:
-    """``deformed`` by torch's own operators."""
+    """Reference of ``apply_offsets`` by torch's own operators."""
     rows = torch.arange(len(gaussians)) if rows is None else rows
     sh = gaussians.sh
     quats = gaussians.quats

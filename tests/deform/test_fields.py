@@ -1,4 +1,4 @@
-"""From options to fields, and through a checkpoint back."""
+"""Construction of fields from options, and their checkpoints."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dyngs.deform.fields import field_state, restore_field
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
 def test_restored_field_gives_equal_offsets(kind: str) -> None:
-    """Bitwise, also in the next steps of training; the setup comes back, too."""
+    """Bitwise, also in later training steps; the setup is restored, too."""
     field = stirred_field(kind)
     setup = tiny_setup()
     means = cloud().means

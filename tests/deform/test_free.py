@@ -1,4 +1,4 @@
-"""Free primitives: windows with flat tops, straight paths, children in time, rows that rest."""
+"""Free primitives: flat-top time windows, linear trajectories, splits in time, skipped rows."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def field_of(
 
 
 def test_paths_are_straight_and_windows_follow_their_definition() -> None:
-    """In float64, next to the formulas written out, and gradients next to finite differences."""
+    """Compared in float64 with the formulas, and gradients with finite differences."""
     field = field_of([0.2, 0.8], [0.1, 0.3], [[1.0, 0.0, 0.0], [0.0, -2.0, 0.5]])
     stir(field, 0.05)
     p = {name: x.double().requires_grad_() for name, x in field.parameters.values().items()}
@@ -54,9 +54,10 @@ def test_paths_are_straight_and_windows_follow_their_definition() -> None:
     assert torch.autograd.gradcheck(at, (p["centers"], p["log_spans"], p["velocities"]))
 
 
-def test_new_gaussians_are_earlier_and_later_on_the_same_path() -> None:
-    """Two of one source get both signs, all stay within the clip, and those that were there before
-    keep theirs."""
+def test_new_gaussians_lie_on_the_same_trajectory() -> None:
+    """Two copies of one source get both signs. All stay within the clip, and existing ones are
+    unchanged.
+    """
     field = field_of([0.5, 0.0], [0.1, 0.1], [[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]])
     edit = TopologyEdit(
         torch.tensor([1, 0, 0, 1, 1]), torch.tensor([False, True, True, True, True])
@@ -73,8 +74,7 @@ def test_new_gaussians_are_earlier_and_later_on_the_same_path() -> None:
 
 
 def test_unseen_gaussians_are_not_updated() -> None:
-    """Not even Adam's momentum moves it: of two Gaussians only the one with a gradient is
-    updated."""
+    """Adam's momentum does not move them: only the Gaussian with a gradient is updated."""
     field = field_of([0.2, 0.8], [0.1, 0.1], [[0.0, 0.0, 0.0]] * 2)
     for step in range(1, 4):
         shown = slice(0, 2) if step == 1 else slice(0, 1)
@@ -105,8 +105,7 @@ def test_static_gaussians_are_copied_over_the_clip_and_moments_have_their_times(
 
 
 def test_a_rolling_ball_before_fixed_cameras_is_learned(tmp_path: Path) -> None:
-    """What moves, from views between the cameras: 14.8 dB, and 11.3 with control nodes, after as
-    many steps."""
+    """PSNR of moving regions in views between the cameras is higher than with control nodes."""
     options = DynamicOptions(
         size=56, num_times=6, num_cameras=8, num_test=6, samples=1, style="fixed"
     )

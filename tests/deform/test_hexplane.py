@@ -1,5 +1,4 @@
-"""Planes: what they start from, what lies outside them, and how they continue to times not seen
-yet."""
+"""HexPlane grids: initialization, clamping, and extrapolation to unseen times."""
 
 from __future__ import annotations
 
@@ -16,7 +15,7 @@ from dyngs.deform.networks import Hexplane
 
 
 def field_with_rows(rows: int) -> Hexplane:
-    """Planes whose row i over time holds the number i everywhere."""
+    """Planes whose time row i has the value i everywhere."""
     options = tiny_options("hexplane")
     assert isinstance(options, HexplaneField)
     field = Hexplane(options, tiny_setup(num_times=2 * rows), torch.Generator().manual_seed(0))
@@ -26,7 +25,7 @@ def field_with_rows(rows: int) -> Hexplane:
 
 
 def rows_of(field: Hexplane) -> list[float]:
-    """The number in each row, which must be the same in all its places."""
+    """The value of each time row, which must be constant within the row."""
     found = torch.stack([level.time.detach()[:, :, 0, 0] for level in field.levels])
     for level in field.levels:
         assert torch.equal(
@@ -41,8 +40,8 @@ def outputs_at(field: Hexplane, means: Tensor, time: float) -> Tensor:
     return torch.cat([x.detach().reshape(len(means), -1) for x in offsets if x is not None], dim=1)
 
 
-def test_planes_start_as_published() -> None:
-    """Space uniform in [0.1, 0.5], time at 1; as many rows as the clip asks for."""
+def test_planes_are_initialized_as_published() -> None:
+    """Space planes uniform in [0.1, 0.5], time planes at 1; the clip sets the number of time rows."""
     field = tiny_field("hexplane")
     assert isinstance(field, Hexplane)
     for level, side in zip(field.levels, (5, 10), strict=True):
@@ -53,7 +52,7 @@ def test_planes_start_as_published() -> None:
         assert 0.45 < level.space.max() <= 0.5
 
 
-def test_the_last_time_is_the_last_row() -> None:
+def test_last_time_is_the_last_plane_row() -> None:
     """At time 1 only the last row counts, at time 0 only the first."""
     field = stirred_field("hexplane")
     assert isinstance(field, Hexplane)
@@ -72,9 +71,7 @@ def test_the_last_time_is_the_last_row() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(2, 40), st.lists(st.floats(0, 0.5), min_size=1, max_size=6))
-def test_rows_that_were_seen_never_change_and_at_the_end_none_is_left_over(
-    rows: int, time_offsets: list[float]
-) -> None:
+def test_extrapolation_fills_unseen_time_rows_only(rows: int, time_offsets: list[float]) -> None:
     """For any sequence of growing windows around the middle, up to the whole clip."""
     field = field_with_rows(rows)
     last = rows - 1
@@ -91,8 +88,7 @@ def test_rows_that_were_seen_never_change_and_at_the_end_none_is_left_over(
 
 
 def test_penalties_vanish_on_smooth_planes_only() -> None:
-    """Second differences of planes that are linear in each axis, and the distance of the planes
-    with time from 1."""
+    """Second differences vanish on planes linear in each axis; time planes are compared with 1."""
     field = tiny_field("hexplane")
     assert isinstance(field, Hexplane)
     for level in field.levels:

@@ -1,4 +1,4 @@
-"""What a moving scene begins with: how much of a capture its first decisions look at."""
+"""Number of images that the initial motion search reads."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ from dyngs.training.new_trainer import build_trainer
 def test_number_of_searched_images_follows_run_length(
     moving: Path, steps: int, minutes: str, count: int | None
 ) -> None:
-    """The search is to take at most a tenth of the run: of the capture's 16 images a short run
-    looks at fewer."""
+    """The search takes at most a tenth of the run, so a short run reads fewer than 16 images."""
     keys = (
         f"data.root={moving}",
         f"train.steps={steps}",

@@ -1,4 +1,4 @@
-"""The perceptron field: its encoding, its skip, and what it depends on."""
+"""The MLP field: positional encoding, skip connection and inputs."""
 
 from __future__ import annotations
 

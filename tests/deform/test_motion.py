@@ -1,5 +1,4 @@
-"""Motion in pixels: known displacements give known scores, and what does not move is frozen where
-it is."""
+"""Motion scores in pixels for known displacements, and freezing of static Gaussians."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ TIMES = tuple(i / 10 for i in range(11))
 
 
 class Scripted(DeformationField):
-    """A field that follows a function of time; keeps the times at which it was asked."""
+    """A field given by a function of time. Records the times at which it is evaluated."""
 
     def __init__(self, script: Callable[[Tensor, float], Offsets]) -> None:
         self.script, self.asked = script, list[float]()
@@ -44,7 +43,7 @@ def static(means: Tensor) -> Tensor:
     return torch.zeros_like(means)
 
 
-def test_a_circle_counts_by_its_radius() -> None:
+def test_score_of_a_circular_path_is_its_radius() -> None:
     def circle(means: Tensor, t: float) -> Offsets:
         turn = Rotation.from_rotvec([0, 0, 2 * torch.pi * t]).apply([0.2, 0.0, 0.0])
         return Offsets(filled(len(means), *turn.tolist()))
@@ -54,9 +53,10 @@ def test_a_circle_counts_by_its_radius() -> None:
     torch.testing.assert_close(found, torch.full((4,), 0.2))
 
 
-def test_turning_and_growing_count_by_the_size_of_the_gaussian() -> None:
-    """A turn by 0.02 rad moves the end of the longest axis by 0.02 of its length; q there is (0, 0,
-    0, 0.01)."""
+def test_rotation_and_scaling_scores_grow_with_the_size() -> None:
+    """A rotation by 0.02 rad moves the end of the longest axis by 0.02 of its length. Its
+    quaternion offset is (0, 0, 0, 0.01).
+    """
     longest = cloud(4).scales.amax(1)
 
     def turn(means: Tensor, t: float) -> Offsets:
@@ -69,7 +69,7 @@ def test_turning_and_growing_count_by_the_size_of_the_gaussian() -> None:
     torch.testing.assert_close(score(growth), 0.1 * longest)
 
 
-def test_opacity_and_colour_count_whatever_the_size_of_a_pixel() -> None:
+def test_opacity_and_colour_scores_ignore_the_pixel_size() -> None:
     gaussians = cloud(4)
 
     def fade(means: Tensor, t: float) -> Offsets:
@@ -89,7 +89,7 @@ def test_opacity_and_colour_count_whatever_the_size_of_a_pixel() -> None:
 
 @pytest.mark.parametrize("everything", [True, False])
 def test_baking_freezes_at_the_mean(everything: bool) -> None:
-    """Rows that are baked look as the field shows them on average; the others do not change."""
+    """Baked rows take the mean over time of the deformed parameters. Other rows do not change."""
     gaussians = cloud()
     field = stirred_field("control_nodes", everything=everything)
     mean = measure_motion(field, gaussians, TIMES, torch.ones(9))[1]

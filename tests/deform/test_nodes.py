@@ -1,4 +1,4 @@
-"""Control nodes: spread evenly, followed by blending that keeps rigid motions rigid."""
+"""Control nodes: even placement, and skinning that keeps rigid motions rigid."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def points(count: int, seed: int = 0) -> Tensor:
 
 
 def rigid(seed: int) -> tuple[Rotation, Tensor, Tensor]:
-    """A rotation, its quaternion wxyz of any length, and a shift."""
+    """A rotation matrix, its unnormalised quaternion wxyz, and a translation."""
     generator = torch.Generator().manual_seed(seed)
     quat = torch.randn(4, generator=generator, dtype=torch.float64)
     shift = torch.randn(3, generator=generator, dtype=torch.float64)
@@ -63,7 +63,7 @@ def test_a_rigid_motion_of_the_nodes_moves_all_followers_rigidly(
 def test_points_spread_out_are_distinct_and_the_same_each_time(
     places: list[tuple[int, ...]], count: int
 ) -> None:
-    """Also where many points coincide: there are as many as asked for, or as there are places."""
+    """With coincident points the count is limited by the number of distinct positions."""
     x = torch.tensor(places, dtype=torch.float64)
     chosen = farthest_points(x, count, NONE)
     assert torch.equal(chosen, farthest_points(x, count, NONE))

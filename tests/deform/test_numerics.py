@@ -1,4 +1,4 @@
-"""Dynamic scenes at the extremes: one test per row of the second table in docs/contributing/numerics.md."""
+"""Numerical limits of dynamic scenes: a test per row of docs/contributing/numerics.md, table 2."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def values(offsets: Offsets) -> Tensor:
-    """(M, all) numbers of the offsets."""
+    """(M, all) concatenated offsets."""
     parts = [x for x in vars(offsets).values() if x is not None]
     return torch.cat([x.reshape(len(x), -1) for x in parts], dim=1)
 
 
 def scene_of(rows: Tensor, field: DeformationField) -> DynamicScene:
-    """The cloud, ``rows`` of which a field moves."""
+    """A scene of the cloud in which a field moves ``rows``."""
     return DynamicScene(gaussians=cloud(), training_times=(0.0, 1.0), field=field, moving=rows)
 
 
 def fine_trainer(capture: Path, kind: str, **model: object) -> Trainer:
-    """After ten steps, eight of them without motion."""
+    """A trainer after ten steps, eight of them in the coarse phase."""
     trainer = build_trainer(busy_config(capture, capture, kind, **model))
     for _ in range(10):
         trainer.step()
@@ -73,13 +73,14 @@ def timed(capture: Path, times: list[float]) -> Path:
 
 
 # --- times
-# ------------------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
 def test_two_training_times(tmp_path: Path, kind: str) -> None:
-    """Trained on together from the first step on; planes and keys have the least that there can be,
-    two."""
+    """Both times are used from the first step. Planes and key times have their minimum size of
+    two.
+    """
     config = busy_config(timed(tmp_path / "capture", [0.0, 1.0, 0.0, 1.0, 1.0]), tmp_path, kind)
     assert isinstance(config.model, DynamicModel)
     automatic = {"control_nodes": {"pieces": 0}}.get(kind, {})
@@ -98,12 +99,12 @@ def test_two_training_times(tmp_path: Path, kind: str) -> None:
 
 
 # --- sets
-# -------------------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_moving_gaussians(kind: str) -> None:
-    """Of the right shapes, and their gradient is zero."""
+    """The offsets have the right shapes, and their gradient is zero."""
     field = tiny_field(kind, 0)
     gaussians = cloud()
     offsets = field.offsets(gaussians.means[:0], 0.3)
@@ -121,7 +122,7 @@ def test_no_moving_gaussians(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
 def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: str) -> None:
-    """The run goes on with what is left, and its checkpoint can be loaded."""
+    """Training continues with the remaining Gaussians, and its checkpoint loads."""
     trainer = fine_trainer(capture, kind)
     scene = trainer.model.scene
     two = TopologyEdit.select(torch.tensor([0, 3]))
@@ -145,7 +146,7 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
 
 
 # --- rotations
-# --------------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 
 # --- fields that explode
@@ -153,8 +154,10 @@ def test_the_last_moving_gaussian_is_pruned_during_a_run(capture: Path, kind: st
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_gradients_that_are_not_finite_are_left_out(kind: str) -> None:
-    """Row by row, counted in the log as ``bad_gradients``; what is learned stays finite."""
+def test_nonfinite_gradients_are_skipped(kind: str) -> None:
+    """Rows with non-finite gradients are skipped and logged as ``bad_gradients``. Parameters stay
+    finite.
+    """
     field = stirred_field(kind)
     means = cloud().means
     values(field.offsets(means, 0.4)).sum().backward()
@@ -168,8 +171,8 @@ def test_gradients_that_are_not_finite_are_left_out(kind: str) -> None:
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 @pytest.mark.parametrize("kind", ALL_KINDS)
-def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> None:
-    """The next step stops before anything changes, and names step, view, attributes and time."""
+def test_nonfinite_parameters_stop_training(capture: Path, kind: str, bad: float) -> None:
+    """The next step raises before any update, and names step, view, attributes and time."""
     trainer = fine_trainer(capture, kind)
     scene = trainer.model.scene
     assert isinstance(scene, DynamicScene)
@@ -191,8 +194,7 @@ def test_what_is_learned_is_not_finite(capture: Path, kind: str, bad: float) -> 
 
 @pytest.mark.parametrize("is_filtered", [False, True])
 def test_a_run_of_one_step(capture: Path, is_filtered: bool) -> None:
-    """It ends as motion begins: with a field that is the identity, for the random Gaussians too,
-    and filtered."""
+    """The run ends as motion begins, with an identity field and filtered Gaussians."""
     config = busy_config(capture, capture, "hexplane", filter_3d=is_filtered)
     config = config.model_copy(update={"train": TrainConfig(steps=1)})
     trainer = build_trainer(config)

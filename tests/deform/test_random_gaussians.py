@@ -1,4 +1,4 @@
-"""Random Gaussians: where they lie, and that nothing else changes."""
+"""Random Gaussians: their box, and unchanged existing Gaussians."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ NOTHING = torch.zeros(0, dtype=torch.long)
 def scene_of(
     rows: Tensor, field: DeformationField | None = None, filter_std: Tensor | None = None
 ) -> DynamicScene:
-    """The cloud, ``rows`` of which a field moves."""
+    """A scene of the cloud in which a field moves ``rows``."""
     times = (0.0, 0.5, 1.0)
     return DynamicScene(
         gaussians=cloud(), training_times=times, field=field, moving=rows, filter_std=filter_std
@@ -41,7 +41,7 @@ def same(a: Gaussians, b: Gaussians) -> bool:
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
-def test_only_the_rows_move(kind: str) -> None:
+def test_only_moving_rows_are_deformed(kind: str) -> None:
     scene = some_scene(kind)
     early = scene.at(0.1)
     late = scene.at(0.9)
@@ -53,7 +53,7 @@ def test_only_the_rows_move(kind: str) -> None:
 
 
 @pytest.mark.parametrize("time", [1.0001, 7.0, float("inf")])
-def test_times_after_the_clip_are_its_end(time: float) -> None:
+def test_times_after_the_clip_are_clamped(time: float) -> None:
     scene = some_scene()
     assert same(scene.at(time), scene.at(1.0))
     assert not same(scene.at(time), scene.at(0.0))
@@ -79,8 +79,8 @@ def test_moving_and_static_parts_make_the_scene(kind: str, is_filtered: bool) ->
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
 @pytest.mark.parametrize("rows", [ROWS, None, NOTHING], ids=["some", "all", "none"])
-def test_from_a_checkpoint(kind: str, rows: Tensor | None) -> None:
-    """As the model stored it; without rows all Gaussians move."""
+def test_scene_loads_from_a_checkpoint(kind: str, rows: Tensor | None) -> None:
+    """As stored by the model; without rows all Gaussians move."""
     gaussians = cloud()
     num_moving = 9 if rows is None else len(rows)
     field = stirred_field(kind, num_moving)
@@ -105,7 +105,7 @@ def test_from_a_checkpoint(kind: str, rows: Tensor | None) -> None:
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
 @pytest.mark.parametrize("is_filtered", [False, True])
-def test_masks_show_the_same_of_fewer(kind: str, is_filtered: bool) -> None:
+def test_visibility_masks_keep_the_image(kind: str, is_filtered: bool) -> None:
     """Before, between and after key times, in any order of times; parts and sizes are those of all
     Gaussians."""
     scene = some_scene(kind, 0.1 + torch.arange(9.0) / 10 if is_filtered else None)

@@ -1,5 +1,4 @@
-"""How far images disagree with static Gaussians where they show, and the score that parts two
-groups of them."""
+"""Residuals of static Gaussians weighted by visibility, and the threshold between two groups."""
 
 from __future__ import annotations
 
@@ -36,13 +35,13 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def camera(view: int = 0) -> Cameras:
-    """One of three around the origin, 3 away from it."""
+    """One of three cameras around the origin, at distance 3."""
     intrinsics = torch.tensor([[20.0, 0, SIZE / 2], [0, 20, SIZE / 2], [0, 0, 1]])
     return Cameras(look_around(3, torch.float32)[view][None], intrinsics[None], SIZE, SIZE)
 
 
 def balls(*places: tuple[float, float, float]) -> Gaussians:
-    """Grey, dense balls, far smaller than the image."""
+    """Opaque grey Gaussians, far smaller than the image."""
     means = torch.tensor(places)
     count = len(places)
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
@@ -66,7 +65,7 @@ def image(
 
 
 def sideways(x: float) -> tuple[float, float, float]:
-    """A place in the first camera's image plane, ``x`` to the right of the middle."""
+    """A point in the image plane of the first camera, ``x`` to the right of its centre."""
     right = camera().cam_from_world[0, 0, :3]
     down = camera().cam_from_world[0, 1, :3]
     a, b, c = (x * right + 0.0 * down).tolist()
@@ -80,7 +79,7 @@ def left_half() -> Tensor:
 
 
 def scores_of(gaussians: Gaussians, images: list[Image], background: Tensor) -> Tensor:
-    """(N,) of cameras that do not stay in place."""
+    """(N,) scores for moving cameras."""
     found = static_errors(lambda _: gaussians, images, OPTIONS, background)
     assert torch.equal(found.peak, found.typical)
     return found.peak
@@ -89,8 +88,9 @@ def scores_of(gaussians: Gaussians, images: list[Image], background: Tensor) -> 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.floats(-1, 1, width=32), min_size=3, max_size=3))
 def test_error_of_a_known_colour(colour: list[float]) -> None:
-    """Images that differ by a colour all over: its mean over the channels, for all that shows,
-    however little."""
+    """A constant colour error gives its mean over the channels for every visible Gaussian, however
+    faint.
+    """
     ball = balls(sideways(0.0), sideways(0.5)).replace(logit_opacities=torch.tensor([4.0, -4.0]))
     images = [
         image(rendered(ball, view=view) + torch.tensor(colour), view=view) for view in range(3)
@@ -102,8 +102,9 @@ def test_error_of_a_known_colour(colour: list[float]) -> None:
 
 
 def test_errors_are_weighted_by_visibility() -> None:
-    """The left half is wrong by 0.3: one ball is in it, one in the other half, one on the
-    border."""
+    """The left half is wrong by 0.3. One ball lies in it, one in the right half, one on the
+    border.
+    """
     scene = balls(sideways(-0.9), sideways(0.9), sideways(0.0))
     wrong = image(rendered(scene) + 0.3 * left_half()[..., None])
     left, right, border = scores_of(scene, [wrong], BLACK).tolist()
@@ -112,8 +113,9 @@ def test_errors_are_weighted_by_visibility() -> None:
 
 
 def test_detail_cancels_in_a_view_but_not_between_views() -> None:
-    """Stripes that a ball cannot resolve are no error; a ball too bright in one view and too dark
-    in the next is."""
+    """Stripes below the resolution of a ball are no error. A ball too bright in one view and too
+    dark in the next is.
+    """
     ball = balls(sideways(0.0)).replace(log_scales=torch.full((1, 3), -0.7))
     signs = torch.ones(SIZE)
     signs[1::2] = -1.0
@@ -130,14 +132,13 @@ def test_detail_cancels_in_a_view_but_not_between_views() -> None:
 
 
 def in_place(*errors: float, view: int = 0) -> list[Image]:
-    """What one camera shows while all of the image is brighter by ``errors``, one after the
-    other."""
+    """Frames of one fixed camera whose brightness is off by ``errors``, one per frame."""
     ball = balls(sideways(0.0))
     return [image(rendered(ball, view=view) + error, view=view) for error in errors]
 
 
 def test_unlearned_detail_is_not_motion() -> None:
-    """Wrong by far, but in all images alike; with too few images to know, it may be motion."""
+    """The error is large but equal in all images. With too few images it counts as motion."""
     ball = balls(sideways(0.0))
     found = static_errors(lambda _: ball, in_place(*[0.4] * MIN_SAME), OPTIONS, BLACK)
     assert (float(found.peak), float(found.typical)) == pytest.approx((0.0, 0.0), abs=1e-6)
@@ -146,7 +147,7 @@ def test_unlearned_detail_is_not_motion() -> None:
 
 
 def test_occluded_gaussians_do_not_move() -> None:
-    """Something passes in front in two of ten images: seen by ``most``, not by ``usual``."""
+    """An occluder covers two of ten images. It raises ``most`` but not ``usual``."""
     found = static_errors(
         lambda _: balls(sideways(0.0)), in_place(*[0.0] * 8, 0.3, 0.3), OPTIONS, BLACK
     )
@@ -164,14 +165,14 @@ def test_repeated_change_is_motion() -> None:
 
 
 def views(*cameras: int) -> list[View]:
-    """From one of three places each."""
+    """One view from each of three positions."""
     poses = look_around(3, torch.float64).numpy()
     intrinsics = camera().intrinsics[0].double().numpy()
     place = partial(View, image_path=Path("x.png"), intrinsics=intrinsics, width=SIZE, height=SIZE)
     return [place(str(i), cam_from_world=poses[at], time=i / 1000) for i, at in enumerate(cameras)]
 
 
-def test_of_cameras_in_place_few_are_chosen_with_many_moments() -> None:
+def test_few_fixed_cameras_with_many_frames_are_selected() -> None:
     chosen = select_comparison_views(views(*[0, 1, 2] * 40), 20)
     assert chosen == [*range(0, 120, 12), *range(1, 120, 12)]
     assert select_comparison_views(views(0, 0, 0, 1), 50) == [0, 1, 2]
@@ -180,7 +181,7 @@ def test_of_cameras_in_place_few_are_chosen_with_many_moments() -> None:
 
 
 # --- two groups
-# -------------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=80, deadline=None)
@@ -189,9 +190,10 @@ def test_of_cameras_in_place_few_are_chosen_with_many_moments() -> None:
     st.lists(st.floats(0.6, 0.7), min_size=2, max_size=40),
     st.floats(1e-3, 10),
 )
-def test_two_clear_groups_are_parted(low: list[float], high: list[float], scale: float) -> None:
-    """At any scale, in any order, if neither is tiny; to a 256th of the range, which is counted in
-    so many bins."""
+def test_threshold_separates_two_groups(low: list[float], high: list[float], scale: float) -> None:
+    """At any scale and in any order, to 1/256 of the range (the histogram bin), if no group is
+    tiny.
+    """
     scores = scale * torch.tensor(low + high)
     order = torch.randperm(len(scores), generator=torch.Generator().manual_seed(len(scores)))
     threshold = otsu_threshold(scores[order])
@@ -210,7 +212,7 @@ def test_exposure_change_is_not_motion() -> None:
 
 
 # --- motion masks
-# -----------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 
 def masked_image(moves: torch.Tensor | None, mask: torch.Tensor | None = None) -> Image:
@@ -224,8 +226,9 @@ def left() -> torch.Tensor:
 
 
 def test_the_fraction_of_each_gaussian_in_the_mask() -> None:
-    """The left ball lies in the mask, the right one does not; a fraction of one half counts as
-    ``sure``."""
+    """The left ball lies in the mask, the right one outside. A fraction of one half counts as
+    ``sure``.
+    """
     found = static_errors(
         lambda _: two_balls(), [masked_image(left())], RenderOptions(), BLACK, mask_error=0.06
     )

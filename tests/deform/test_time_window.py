@@ -1,5 +1,4 @@
-"""All times before motion begins, then a window that grows from the middle to the whole clip; the
-newest come often."""
+"""Time window of training: grows from the middle to the whole clip, newest views most often."""
 
 from __future__ import annotations
 
@@ -41,8 +40,7 @@ def test_window_grows_to_all_views(times: list[float], first: float) -> None:
 @settings(max_examples=150, deadline=None)
 @given(clips, st.floats(0, 1), st.sampled_from(EVEN_STEPS))
 def test_every_other_step_is_for_the_newest(times: list[float], first: float, step: int) -> None:
-    """The outermost so many views of the window (all of it, if it has no more), and those of the
-    very same moments."""
+    """The newest views are the outermost ones of the window and those at the same times."""
     window = TimeWindow.around_middle(times, first, OPENS, OPENS, FULL)
     newest = held(window, times, step)
     inside = sorted(

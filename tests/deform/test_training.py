@@ -1,5 +1,4 @@
-"""Training of a dynamic scene: its phases, where motion begins, what is frozen, how it follows
-changes of the set."""
+"""Training of dynamic scenes: phases, start of motion, freezing, and edits of the Gaussians."""
 
 from __future__ import annotations
 
@@ -38,12 +37,12 @@ from dyngs.gaussians.rendering import render
 from dyngs.gaussians.schedule import RateSchedule
 
 # --- phases
-# -----------------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("step", "tracks"), [(FINE + 2, True), (FINE + 3, False)])
-def test_on_the_newest_views_only_the_motion_learns(step: int, tracks: bool) -> None:
-    """What is new must not spoil the form before it is followed."""
+def test_newest_views_train_only_the_deformation(step: int, tracks: bool) -> None:
+    """Views of new times must not change the canonical Gaussians before their motion is fitted."""
     gaussians = flat_cloud()
     run = begun(gaussians, time_window=0.3, full=FINE + 10)
     run.time_step(0.6, step).gaussians.means.sum().backward()
@@ -60,7 +59,7 @@ ERRORS = (0.01, 0.3, 0.02, 0.35, 0.03, 0.0, 0.31, 0.02, 0.01)
 
 
 def test_static_residual_marks_moving_gaussians() -> None:
-    """And only after the last step of the coarse phase."""
+    """Gaussians are marked only after the last step of the coarse phase."""
     run = new_run(flat_cloud(), static_errors=lambda _: alike(torch.tensor(ERRORS)))
     result = run.grow(FINE)
     assert run.scene.rows.tolist() == [1, 3, 6]
@@ -92,8 +91,9 @@ def test_static_residual_marks_moving_gaussians() -> None:
 def test_small_errors_are_no_motion(
     errors: tuple[float, ...], motion_threshold: float, rows: list[int]
 ) -> None:
-    """Where nothing stands out the model stays static: the same Gaussians, nothing added, no
-    field."""
+    """Without outliers in the residual the model stays static, with the same Gaussians and no
+    field.
+    """
     gaussians = flat_cloud()
     run = new_run(
         gaussians,
@@ -145,8 +145,9 @@ def test_random_gaussians_move_too(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_motion_is_learned_from_images(kind: str) -> None:
-    """Balls before one camera go 0.3 units (10 px) to the right: the field finds out, by the
-    gradients of rendering."""
+    """Balls move 0.3 units (10 px) to the right before one camera. The field learns this from
+    rendering gradients.
+    """
     gaussians = flat_cloud()
     blobs = {"log_scales": torch.full((9, 3), -2.5), "logit_opacities": torch.full((9,), 2.0)}
     gaussians = gaussians.replace(**{name: x.requires_grad_() for name, x in blobs.items()})
@@ -185,12 +186,12 @@ def test_motion_sparsity_is_the_mean_length_in_extents() -> None:
 
 
 # --- freezing
-# ---------------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("in_place", "kept"), [(True, [2, 3]), (False, [0, 2, 3])])
 def test_fixed_cameras_freeze_unchanged_gaussians(in_place: bool, kept: list[int]) -> None:
-    """Four move by far, the fourth least; the images say of two that they are like the median."""
+    """Four Gaussians move far. Two of them look like the temporal median in the images."""
     static = 0.2 * DynamicModel().motion_threshold
     moving = 0.3 * DynamicModel().motion_threshold
     errors = alike(torch.tensor([static, moving, moving, moving]))
@@ -202,7 +203,7 @@ def test_fixed_cameras_freeze_unchanged_gaussians(in_place: bool, kept: list[int
 
 
 def test_only_visibly_moving_gaussians_stay_moving() -> None:
-    """A pixel covers 0.03 units: 0.3 px are 0.009."""
+    """A pixel covers 0.03 units, so 0.3 px are 0.009 units."""
     gaussians = flat_cloud()
     run = begun(gaussians)
     speeds = torch.tensor([0.0, 0.1, 0.0085, 0.0095, -0.0095, -0.0085, 0.0, 5.0, 1e-6])
@@ -234,8 +235,7 @@ def test_freezing_bakes_a_constant_offset_into_the_canonical_gaussians() -> None
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_can_be_frozen(kind: str) -> None:
-    """Also where a network moves everything: what is left moves as before, except that nodes come
-    and go."""
+    """Remaining rows keep their motion, except for control nodes, which are added and removed."""
     gaussians = flat_cloud()
     run = begun(gaussians, deform=tiny_options(kind), freeze_below_px=1.0)
     assert run.scene.field is not None
@@ -252,13 +252,13 @@ def test_every_kind_can_be_frozen(kind: str) -> None:
 
 
 # --- following
-# --------------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_copies_of_moving_gaussians_move(data: st.DataObject) -> None:
-    """After any sequence of edits; each with the curve of its ancestor."""
+    """Each copy has the trajectory of its ancestor after any sequence of edits."""
     gaussians = flat_cloud()
     run = begun(gaussians)
     moves = torch.tensor(data.draw(st.lists(st.booleans(), min_size=9, max_size=9)))
@@ -297,12 +297,12 @@ def test_copies_of_moving_gaussians_move(data: st.DataObject) -> None:
 
 
 # --- state
-# ------------------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("phase", ["coarse", "fine", "split"])
-def test_state_goes_round(kind: str, phase: str) -> None:
+def test_training_state_round_trip(kind: str, phase: str) -> None:
     gaussians = flat_cloud()
     deform = tiny_options(kind)
     run = (
@@ -331,8 +331,9 @@ def test_state_goes_round(kind: str, phase: str) -> None:
 
 
 def test_motion_starts_at_changes_of_fixed_cameras() -> None:
-    """Free primitives: no random Gaussians, all times from the start, and the ball of each time in
-    its place then."""
+    """Free primitives start without random Gaussians, with all times, and the ball at its position
+    at each time.
+    """
     times = tuple(i / 7 for i in range(8))
     footage = filmed(lambda t: [Ball((0.0, 0.1, 1.6 * t - 0.8))], times)
     errors = alike(torch.tensor(ERRORS))

@@ -1,5 +1,4 @@
-"""Windows in time: nothing changes while they are open, closed ones hide, and nothing is lost when
-they are stored."""
+"""Lifetimes of Gaussians: open windows change nothing, closed ones hide, and checkpoints."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ COUNT = 9
 
 
 def windowed(kind: str = "control_nodes", *, everything: bool = True) -> WindowedField:
-    """A field of which each Gaussian is there for a part of the clip only."""
+    """A field in which each Gaussian is visible during a part of the clip."""
     field = WindowedField(stirred_field(kind, everything=everything), COUNT)
     generator = torch.Generator().manual_seed(1)
     field.edges.data[:] = torch.rand(COUNT, 2, generator=generator).sort(dim=1).values

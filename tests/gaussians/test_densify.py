@@ -1,5 +1,4 @@
-"""Clone, split, prune and reset: the published rules on hand-made sets, and invariants on random
-ones."""
+"""Clone, split, prune and reset: the published rules on small examples, and invariants."""
 
 from __future__ import annotations
 
@@ -57,7 +56,7 @@ def test_signal_is_the_mean_norm_in_ndc_units_over_the_views_that_see_it() -> No
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 3e38])
-def test_a_view_with_a_gradient_that_is_not_finite_does_not_count(bad: float) -> None:
+def test_views_with_nonfinite_gradients_are_not_counted(bad: float) -> None:
     densifier = _densifier(DefaultStrategy())
     _signal(densifier, [0.1, 0.2])
     grad = torch.tensor([[[bad, bad, 0.0, 0.0], [0.002, 0.0, 0.0, 0.0]]])
@@ -66,7 +65,7 @@ def test_a_view_with_a_gradient_that_is_not_finite_does_not_count(bad: float) ->
     assert densifier.state()["seen"].tolist() == [1, 2]
 
 
-def test_each_kind_of_gaussian_meets_its_fate() -> None:
+def test_gaussians_are_split_cloned_pruned_or_kept() -> None:
     #             calm    clone  split  faint   faint and wanted
     gaussians = _gaussians([SMALL, SMALL, LARGE, SMALL, LARGE], [0.5, 0.5, 0.5, 0.001, 0.001])
     densifier = _densifier()
@@ -85,8 +84,9 @@ def test_each_kind_of_gaussian_meets_its_fate() -> None:
 
 
 def test_distant_gaussians_may_be_larger() -> None:
-    """Sky and far hills stay, and are copied where nearer ones would be split; ``center`` is what
-    they are far from."""
+    """Sky and distant hills are kept, and cloned where near ones are split. Distance is from
+    ``center``.
+    """
     # distances 60, which is the reach, and 50, five extents: not yet far
     center = torch.tensor([-60.0, 0.0, 0.0])
     for scale, score, step, source in (
@@ -120,7 +120,7 @@ def test_reset_lowers_opacities_and_clears_their_moments() -> None:
     )
 
 
-def test_one_gaussian_always_stays() -> None:
+def test_pruning_keeps_at_least_one_gaussian() -> None:
     densifier = _densifier()
     _signal(densifier, [1.0, 1.0, 1.0])
     result = densifier.edit(
@@ -133,7 +133,7 @@ def test_one_gaussian_always_stays() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**31), cap=st.integers(1, 60), n=st.integers(1, 40))
-def test_the_cap_holds_and_the_best_come_first(seed: int, cap: int, n: int) -> None:
+def test_cap_keeps_the_largest_gradients(seed: int, cap: int, n: int) -> None:
     generator = torch.Generator().manual_seed(seed)
 
     def draw(low: float, high: float) -> list[float]:
@@ -156,8 +156,8 @@ def test_the_cap_holds_and_the_best_come_first(seed: int, cap: int, n: int) -> N
         assert score[chosen].min() >= score[wanted & ~chosen].max()
 
 
-def test_which_side_the_limits_are_on() -> None:
-    """A Gaussian exactly at a limit stays, is wanted, and counts as small."""
+def test_gaussians_exactly_at_a_threshold() -> None:
+    """A Gaussian exactly at a limit is kept, is densified, and counts as small."""
     options = DefaultStrategy(prune_opacity=0.5, grad_threshold=0.25)
     for score, extent, max_scale, expected in (
         (0.24, 100.0, 1.0, "kept"),
@@ -168,7 +168,7 @@ def test_which_side_the_limits_are_on() -> None:
         (0.25, 10.0, 1 / 1.6 - 1e-3, ""),  # and here they are not
         (0.25, 10.0, 1 / 1.6 + 1e-3, "split"),
     ):
-        # log scale and logit 0; the second sees to it that one is left
+        # log scale and logit 0; the second keeps the set from being empty
         two = _gaussians([1.0, 0.1], [0.5, 0.9])
         plan = plan_edit(two, torch.tensor([score, 0.0]), options, extent, max_scale)
         found = " ".join(
@@ -179,7 +179,7 @@ def test_which_side_the_limits_are_on() -> None:
 
 
 def test_split_of_pruned_gaussian_costs_two() -> None:
-    """One that is too large to stay frees no room by being split."""
+    """Splitting a Gaussian that is pruned for its size frees no capacity."""
     huge = _gaussians([1.5, 0.1, 0.1], [0.5, 0.5, 0.5])
     for cap, split in ((3, False), (4, True)):
         plan = plan_edit(
@@ -191,7 +191,7 @@ def test_split_of_pruned_gaussian_costs_two() -> None:
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 40))
 def test_without_growth_gaussians_are_only_removed(seed: int, n: int) -> None:
-    """The same ones as with a cap that leaves no room."""
+    """Equal to the result with a cap that leaves no capacity."""
     generator = torch.Generator().manual_seed(seed)
     scales, opacities, score = (
         torch.rand(n, generator=generator) * high + 1e-3 for high in (2.0, 0.02, 4e-4)
@@ -205,7 +205,7 @@ def test_without_growth_gaussians_are_only_removed(seed: int, n: int) -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_bad_values_are_never_multiplied(bad: float) -> None:
+def test_nonfinite_gaussians_are_never_densified(bad: float) -> None:
     gaussians = _gaussians([SMALL, SMALL], [0.5, 0.5])
     logits = gaussians.logit_opacities.clone()
     logits[0] = math.nan
@@ -219,7 +219,7 @@ def test_bad_values_are_never_multiplied(bad: float) -> None:
     assert plan.kept.tolist() == [False, True]
 
 
-def test_huge_ones_go_only_after_the_first_reset() -> None:
+def test_large_gaussians_are_pruned_only_after_the_first_reset() -> None:
     gaussians = _gaussians([1.1, 0.9], [0.5, 0.5])  # limit: 0.1 * extent = 1
     for step, left in ((200, [0, 1]), (300, [0, 1]), (400, [1])):
         densifier = _densifier()

@@ -46,7 +46,7 @@ def test_width_follows_the_nearest_camera_that_sees_it() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.floats(-12, 12), st.floats(1e-3, 10), st.floats(1e-3, 10))
-def test_fused_values_are_the_formula(logit: float, scale: float, std: float) -> None:
+def test_fused_filter_equals_the_formula(logit: float, scale: float, std: float) -> None:
     scales = torch.tensor([[scale, 2 * scale, 3 * scale]], dtype=torch.float64)
     gaussians = _gaussians(scales, torch.tensor([logit], dtype=torch.float64))
     fused = fuse_filter(gaussians, torch.tensor([std], dtype=torch.float64))

@@ -1,4 +1,4 @@
-"""Depths of a ball, seen from all around, as one surface, and that as few triangles."""
+"""Fusion of depth maps of a ball into one surface, and mesh simplification."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def radii(mesh: Mesh) -> np.ndarray:
     return np.linalg.norm(mesh.vertices[np.unique(mesh.faces)], axis=1)
 
 
-def test_the_surface_is_where_all_views_see_it() -> None:
+def test_fused_surface_lies_at_the_observed_depth() -> None:
     assert len(ball().faces) > 2000
     assert abs(radii(ball()).mean() - RADIUS) < 0.02
     assert radii(ball()).std() < 0.03
@@ -39,7 +39,7 @@ def test_simplified_mesh_has_requested_faces(most: int) -> None:
     assert len(torch.from_numpy(mesh.faces)) == len(mesh.faces)
 
 
-def test_joined_vertices_lie_where_planes_meet() -> None:
+def test_merged_vertices_lie_on_plane_intersections() -> None:
     """A finely cut cube keeps its corners."""
     axis = np.linspace(-1, 1, 21)
     u, v = (x.reshape(-1) for x in np.meshgrid(axis, axis, indexing="ij"))
@@ -60,7 +60,7 @@ def test_joined_vertices_lie_where_planes_meet() -> None:
             assert distance < 0.1
 
 
-def test_colours_are_those_of_the_views_that_show_a_point() -> None:
+def test_vertex_colours_come_from_unoccluded_views() -> None:
     points = torch.tensor([[RADIUS, 0.0, 0.0], [-RADIUS, 0.0, 0.0], [0.0, 0.0, 9.0]])
     colours = sample_colours(views(), points, 0.1)
     torch.testing.assert_close(colours[0], torch.tensor([1.0, 0, 0]), atol=0.02, rtol=0)

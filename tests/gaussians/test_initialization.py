@@ -1,4 +1,4 @@
-"""Where training starts: sizes from neighbours, published constants, cubes, caps, seeds."""
+"""Initial Gaussians: sizes from neighbours, published constants, random points, caps."""
 
 from __future__ import annotations
 
@@ -111,8 +111,9 @@ def test_random_points_fill_their_cube(
 def test_random_points_lie_in_frusta(
     offset: tuple[float, float, float], by_convention: bool
 ) -> None:
-    """Wherever the scene lies: all in three images or more, most of them near what all cameras look
-    at."""
+    """All lie in three images or more, most near the common focus of the cameras, for any scene
+    origin.
+    """
     scene = SceneGeometry(_views(offset), around_origin=by_convention)
     gaussians = initial_gaussians(
         scene, PointsInit(num_random=2000), InitialValues(), 1, _generator()

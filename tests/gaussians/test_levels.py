@@ -1,5 +1,4 @@
-"""Levels of detail: merged Gaussians keep the moments of what they replace, and a cut is the scene,
-once."""
+"""Levels of detail: merging preserves moments, and a cut covers every Gaussian once."""
 
 from __future__ import annotations
 
@@ -28,8 +27,7 @@ def covariances(gaussians: Gaussians) -> torch.Tensor:
 
 
 def test_merged_moments_are_those_of_the_mixture() -> None:
-    """Checked from samples' moments in closed form: E[x], E[x x^T], and the mean of all colour
-    coefficients."""
+    """Compared in closed form: E[x], E[x x^T], and the mean of all colour coefficients."""
     several = (
         cloud(40, degree=2)
         .to(dtype=torch.float64)
@@ -48,7 +46,7 @@ def test_merged_moments_are_those_of_the_mixture() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 64, 1000])
-def test_every_level_holds_the_one_below(count: int, small_blocks: None) -> None:
+def test_each_level_merges_the_level_below(count: int, small_blocks: None) -> None:
     gaussians = cloud(count)
     levels = build_levels(gaussians)
     assert len(levels.levels[-1]) <= 16
@@ -65,7 +63,7 @@ def test_every_level_holds_the_one_below(count: int, small_blocks: None) -> None
 
 
 def whole(levels: Levels, cut: list[tuple[int, int]]) -> list[int]:
-    """How often the cut shows each block of the finest level."""
+    """Number of times that the cut covers each block of the finest level."""
     shown = np.zeros(len(levels.blocks[0]), int)
     for level, place in cut:
         shown[place * MERGED**level : (place + 1) * MERGED**level] += 1
@@ -87,8 +85,8 @@ def test_cut_covers_every_gaussian_once(small_blocks: None) -> None:
         assert sum(levels.count(block) for block in cut) <= most
 
 
-def test_the_finest_cut_is_the_scene_to_the_bit(small_blocks: None) -> None:
-    """Seen whole; equal depths, which no two here have, would be drawn in another order."""
+def test_finest_cut_equals_the_scene_bitwise(small_blocks: None) -> None:
+    """The whole scene is in view. No two depths are equal, since ties are blended in index order."""
     gaussians = cloud(300)
     levels = build_levels(gaussians)
     seen = levels.select_gaussians(camera(), pixels=0.0)
@@ -107,9 +105,10 @@ def test_blocks_outside_the_image_stay_coarse(small_blocks: None) -> None:
         assert levels.cut(away, pixels=0.0) == [(len(levels.levels) - 1, 0)]
 
 
-def test_from_afar_fewer_look_the_same(small_blocks: None) -> None:
-    """A cloud a few pixels wide: five times fewer, and nearer to what a camera of many more pixels
-    sees."""
+def test_distant_cut_needs_fewer_gaussians(small_blocks: None) -> None:
+    """The cloud is a few pixels wide. The cut has a fifth of the Gaussians and is closer to a
+    supersampled image.
+    """
     gaussians = cloud(2000)
     pose = camera().cam_from_world.clone()
     pose[0, 2, 3] *= 20

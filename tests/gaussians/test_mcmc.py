@@ -1,5 +1,4 @@
-"""Relocation keeps the image, the set grows to its cap, noise moves only what is nearly
-transparent."""
+"""MCMC: relocation keeps the image, growth stops at the cap, noise affects transparent Gaussians."""
 
 from __future__ import annotations
 
@@ -47,7 +46,7 @@ def test_relocation_keeps_the_integral_of_the_profile(opacity: float, copies: in
     torch.testing.assert_close(1 - (1 - thinner) ** copies, o, rtol=1e-12, atol=0)
 
 
-def test_dead_ones_move_onto_living_ones() -> None:
+def test_dead_gaussians_are_relocated_to_live_ones() -> None:
     gaussians = _gaussians([0.001, 0.8, 0.002, 0.004, 0.3])
     densifier = McmcDensifier(McmcStrategy(max_gaussians=5), SCHEDULE, 0.05)
     result = densifier.edit(200, gaussians, torch.Generator().manual_seed(0))
@@ -70,7 +69,7 @@ def test_dead_ones_move_onto_living_ones() -> None:
         assert result.edit.is_new[rows].all() == (len(rows) > 1)
 
 
-def test_the_set_grows_to_its_cap_and_no_further() -> None:
+def test_number_of_gaussians_grows_to_the_cap() -> None:
     for cap, expected in ((1000, 110), (104, 104), (50, 100)):
         densifier = McmcDensifier(McmcStrategy(max_gaussians=cap), SCHEDULE, 0.1)
         result = densifier.edit(200, _gaussians([0.4] * 100), torch.Generator().manual_seed(0))
@@ -105,7 +104,7 @@ def test_noise_has_the_published_size_and_direction() -> None:
     )
 
 
-def test_the_result_does_not_depend_on_threads() -> None:
+def test_equal_results_for_any_number_of_threads() -> None:
     n = 70_001  # above torch's grain of 32,768, so that two threads do share the work
     opacities = (
         torch.rand(n, generator=torch.Generator().manual_seed(1)).clamp(0.001, 0.999).tolist()

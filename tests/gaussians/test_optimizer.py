@@ -1,4 +1,4 @@
-"""Adam per Gaussian: equal to torch's, following edits, skipping what is not seen."""
+"""Adam per Gaussian: equal to torch's, follows edits, skips unseen rows."""
 
 from __future__ import annotations
 
@@ -44,8 +44,7 @@ def _set_gradients(
 
 
 def test_unseen_rows_are_skipped() -> None:
-    """Of two that are not seen only the one that rests; one that is seen moves, be it at rest else
-    or not."""
+    """Rows in ``skip_unseen_rows`` are skipped while unseen; seen rows are always updated."""
     optimizer = GaussianOptimizer(_gaussians(5), OptimConfig())
     skip_unseen_rows = torch.tensor([0, 3])
     for step in (1, 2):
@@ -71,8 +70,7 @@ def test_of_frozen_gaussians_only_the_base_colour_learns() -> None:
 
 @pytest.mark.parametrize("frozen", [(False, True, False), (True, True, True)])
 def test_dropped_harmonics_stay_zero(frozen: tuple[bool, ...]) -> None:
-    """Others keep theirs, with their moments; if nobody keeps them, there are none, in checkpoints
-    neither."""
+    """Other rows keep SH and moments. If no row keeps any, SH are removed, from checkpoints too."""
     optimizer = GaussianOptimizer(_gaussians(3), OptimConfig())
     _set_gradients(optimizer, 1)
     optimizer.step(1, 0.1)

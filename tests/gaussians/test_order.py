@@ -1,4 +1,4 @@
-"""Storage order: a permutation that keeps neighbours together, with what moves in front."""
+"""Storage order: a permutation that keeps neighbours together, moving Gaussians first."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def test_corners_of_a_cube_follow_the_z_curve() -> None:
     )
 
 
-def test_moving_gaussians_come_first() -> None:
+def test_moving_gaussians_are_stored_first() -> None:
     points = np.random.default_rng(1).random((50, 3))
     rows = np.array([3, 10, 40])
     order = storage_order(points, rows)

@@ -1,5 +1,4 @@
-"""Adam of a field: torch's own, with a schedule, rows that can be rearranged, and a state that can
-be stored."""
+"""Adam of a field: torch's Adam with a schedule, reordered rows and checkpoints."""
 
 from __future__ import annotations
 
@@ -52,8 +51,8 @@ def test_equals_adam_with_decaying_rate(decay: float) -> None:
         assert learned[name].grad is None
 
 
-def test_an_edit_moves_rows_and_starts_new_ones_without_moments() -> None:
-    """Those of the tensors that have that role; the parameters before stay as they were."""
+def test_edited_rows_keep_moments_and_new_rows_start_without() -> None:
+    """Only tensors with rows per Gaussian are edited; the previous parameters are unchanged."""
     roles = dict.fromkeys(SHAPES, Role.SHARED) | {"weight": Role.PER_MOVING}
     learned = Parameters(start_values(), RATES, roles=roles)
     give_gradients(learned, 1)
@@ -78,8 +77,8 @@ def test_an_edit_moves_rows_and_starts_new_ones_without_moments() -> None:
     assert all(torch.equal(x, before[name]) for name, x in strip_roles(learned.state()).items())
 
 
-def test_rows_rearranged_take_their_moments_along() -> None:
-    """The source of a row that is new need not exist."""
+def test_reordered_rows_keep_their_moments() -> None:
+    """The source index of a new row need not exist."""
     learned = Parameters(start_values(), RATES)
     give_gradients(learned, 1)
     learned.step(1, 0.0)
@@ -96,7 +95,7 @@ def test_rows_rearranged_take_their_moments_along() -> None:
     assert all(torch.equal(found[name], x) for name, x in before.items() if "weight" not in name)
 
 
-def test_a_restored_one_goes_on_as_if_never_stopped() -> None:
+def test_resumed_optimizer_equals_uninterrupted_one() -> None:
     first, second = (Parameters(start_values(), RATES, 0.1) for _ in range(2))
     for step in (1, 2, 3):
         give_gradients(first, step)

@@ -1,4 +1,4 @@
-"""The one verb: that it is the ops in a row, its options, and that torch can compile it."""
+"""``render``: equality with the single ops, its options, and torch.compile."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def half_transparent_wall(z: float = 4.0) -> tuple[Gaussians, Scene]:
 
 
 @pytest.mark.parametrize("mode", RasterizeMode)
-def test_is_the_three_ops_in_a_row(mode: RasterizeMode) -> None:
+def test_render_equals_project_harmonics_rasterize(mode: RasterizeMode) -> None:
     scene = random_scene(degree=2)
     antialiased = mode == RasterizeMode.ANTIALIASED
     limits = Limits(ProjectionOptions(eps2d=0.1, near=2.5, antialiased=antialiased), BlendOptions())
@@ -56,7 +56,7 @@ def test_is_the_three_ops_in_a_row(mode: RasterizeMode) -> None:
 
 
 def test_a_shader_gives_the_colours() -> None:
-    """Instead of the harmonics; it sees what is drawn and where from, and its gradients go on."""
+    """The shader replaces SH, gets the visible Gaussians and cameras, and is differentiable."""
     scene = random_scene(degree=1)
     gaussians = leaves(scene.gaussians)
     asked = []
@@ -90,7 +90,7 @@ def test_depth_of_a_half_transparent_wall() -> None:
     )
 
 
-def test_depth_where_nothing_is_drawn_is_zero_with_a_finite_gradient() -> None:
+def test_depth_of_empty_pixels_is_zero_with_finite_gradient() -> None:
     scene = random_scene(n=1, views=1)
     scene.means[:] = torch.tensor([-0.9, -0.9, 0.0])
     gaussians = leaves(replace(scene, scales=0.1 * scene.scales).gaussians)
@@ -135,7 +135,7 @@ def test_sensitivity_of_a_half_transparent_wall(shaded: bool) -> None:
 
 
 @pytest.mark.parametrize("mode", RasterizeMode)
-def test_contributions_are_the_shares_of_the_alpha(mode: RasterizeMode) -> None:
+def test_contributions_are_the_fractions_of_alpha(mode: RasterizeMode) -> None:
     scene = random_scene()
     options = RenderOptions(mode=mode)
     sums = contributions(scene.gaussians, scene.cameras, options)
@@ -143,7 +143,7 @@ def test_contributions_are_the_shares_of_the_alpha(mode: RasterizeMode) -> None:
     torch.testing.assert_close(sums.sum(1), alpha.sum((1, 2)), rtol=1e-12, atol=0)
 
 
-def test_world_and_camera_moved_together_see_the_same() -> None:
+def test_moving_world_and_camera_together_keeps_the_image() -> None:
     """Base colours only: harmonics would have to be turned, too."""
     scene = random_scene(degree=0)
     motion = look_around(3)[2]  # 0.6 rad about y and a translation
@@ -207,7 +207,7 @@ NO_ROTATIONS = {
 
 @pytest.mark.parametrize("verb", VERBS)
 @pytest.mark.parametrize("fault", NO_ROTATIONS)
-def test_a_pose_that_is_no_rotation_is_refused(verb: Callable[..., object], fault: str) -> None:
+def test_non_rigid_poses_are_refused(verb: Callable[..., object], fault: str) -> None:
     scene = random_scene()
     matrix, reason = NO_ROTATIONS[fault]
     scene.cam_from_world[1, :3, :3] = matrix.to(scene.cam_from_world)

@@ -1,4 +1,4 @@
-"""What holds for every kind of scene: stored, edited, in parts and moved it draws what it drew."""
+"""Scene interface: stored, edited, split and moved scenes render the same images."""
 
 from __future__ import annotations
 
@@ -57,12 +57,12 @@ def leaves(gaussians: Gaussians) -> Gaussians:
 
 
 # --- what is stored
-# ---------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("drawing", [False, True], ids=["state", "drawing state"])
 def test_restored_scene_renders_equal_images(kind: str, drawing: bool) -> None:
-    """To the bit, but for skinning weights whose corrections are stored within them."""
+    """Bitwise, except for skinning weights, which are stored with their corrections applied."""
     scene = scene_of_kind(kind)
     state = scene.drawing_state() if drawing else scene.state()
     found = replace(
@@ -79,7 +79,7 @@ def test_restored_scene_renders_equal_images(kind: str, drawing: bool) -> None:
 
 
 def test_every_tensor_has_a_role_and_its_rows(kind: str) -> None:
-    """Also after an edit."""
+    """Before and after an edit."""
     scene = scene_of_kind(kind)
     copied = TopologyEdit(
         torch.tensor([8, 1, 1, 5, 0]), torch.tensor([False, False, True, False, False])
@@ -109,7 +109,7 @@ WITHIN_OTHERS = {"model.learned.weights"}
 
 
 # --- parts
-# ------------------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=15, deadline=None)
@@ -152,15 +152,15 @@ def test_moving_and_static_parts_make_the_scene(kind: str) -> None:
 
 
 # --- times
-# ------------------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 
 # --- drawing
-# ----------------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 
 def test_cache_is_cleared_after_in_place_changes(kind: str) -> None:
-    """What is trained is changed in place, and drawn in between."""
+    """Parameters are updated in place between two renderings."""
     scene = scene_of_kind(kind)
     scene.at(0.37)
     scene.gaussians.means.data += 0.25
@@ -171,11 +171,11 @@ def test_cache_is_cleared_after_in_place_changes(kind: str) -> None:
 
 
 # --- devices
-# ----------------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 
-def test_all_that_is_computed_with_moves_to_a_device(kind: str) -> None:
-    """Here one that keeps no values; what is read number by number stays on the CPU."""
+def test_scene_tensors_move_to_a_device(kind: str) -> None:
+    """The meta device stands in for a GPU. Tensors that are read by the host stay on the CPU."""
     moved = scene_of_kind(kind).to("meta")
     on_cpu = {name for name, x in moved.state().items() if x.tensor.device.type == "cpu"}
     assert on_cpu <= {
@@ -195,12 +195,12 @@ def test_all_that_is_computed_with_moves_to_a_device(kind: str) -> None:
 
 
 # --- training
-# ---------------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("model", ["static", *FIELDS])
 def test_loaded_scene_equals_trained_scene(model: str, tmp_path: Path) -> None:
-    """The same class, which draws the same."""
+    """Same class, same image."""
     capture = write_tiny_capture(tmp_path / "capture")
     config = busy_config(capture, tmp_path, "mlp" if model == "static" else model, filter_3d=True)
     config = config.model_copy(update={"strategy": FixedStrategy()})

@@ -1,5 +1,4 @@
-"""Schedules: exactly the published numbers at 30,000 steps, and sensible ones at any other
-length."""
+"""Schedules: the published values at 30,000 steps, and scaled ones at other lengths."""
 
 from __future__ import annotations
 
@@ -62,7 +61,7 @@ def test_published_schedule_at_30000_steps() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 60_000), st.booleans())
-def test_resets_leave_time_to_recover(steps: int, white: bool) -> None:
+def test_opacity_resets_leave_steps_to_recover(steps: int, white: bool) -> None:
     schedule = densify_schedule(DefaultStrategy(), steps, white)
     resets = (*schedule.resets, schedule.stop)
     gaps = [b - a for a, b in pairwise(resets)]
@@ -74,11 +73,11 @@ def test_resets_leave_time_to_recover(steps: int, white: bool) -> None:
 @pytest.mark.parametrize(
     ("steps", "every"), [(1, 1), (500, 25), (1000, 50), (2000, 100), (30_000, 100)]
 )
-def test_short_runs_change_as_often(steps: int, every: int) -> None:
+def test_short_runs_densify_as_often(steps: int, every: int) -> None:
     for strategy in (DefaultStrategy(), McmcStrategy()):
         assert densify_schedule(strategy, steps, white_background=False).every == every
-        asked = strategy.model_copy(update={"every": 7})
-        assert densify_schedule(asked, steps, white_background=False).every == 7
+        requested = strategy.model_copy(update={"every": 7})
+        assert densify_schedule(requested, steps, white_background=False).every == 7
 
 
 def _config(
@@ -95,7 +94,7 @@ def _config(
 
 
 def test_rates_of_a_static_scene_fit_the_length() -> None:
-    """Those published at their length and beyond, higher ones in a shorter run, positions most."""
+    """Published rates from the published length on. Shorter runs have higher rates, means most."""
     factors = [
         rate_factors(_config(steps)) for steps in (1, 500, 2000, 7000, 29_999, 30_000, 90_000)
     ]
@@ -107,7 +106,7 @@ def test_rates_of_a_static_scene_fit_the_length() -> None:
 
 
 @pytest.mark.parametrize("model", [HumanModel(), DynamicModel()])
-def test_rates_of_what_moves_are_the_published_ones_at_any_length(model: SceneModel) -> None:
+def test_deformation_rates_are_the_published_ones_at_any_length(model: SceneModel) -> None:
     assert rate_factors(_config(500, model=model)) == (1, 1)
     assert rate_factors(_config(500, OptimConfig(rate_factor=2), model)) == (2, 2)
 
@@ -130,7 +129,7 @@ def test_sh_degree_rises_at_the_scaled_steps(steps: int, every: int) -> None:
 
 
 @pytest.mark.parametrize("steps", [1, 20, 7000, 30_000, 300_000])
-def test_growth_is_the_published_one_or_more_up_to_a_quarter_at_any_length(steps: int) -> None:
+def test_growth_is_the_published_one_or_up_to_a_quarter_more(steps: int) -> None:
     assert GROWTH <= growth_per_change(steps) <= MAX_GROWTH
 
 
@@ -139,8 +138,9 @@ def test_growth_is_the_published_one_or_more_up_to_a_quarter_at_any_length(steps
 def test_phases_of_a_dynamic_model_come_in_order(
     steps: int, coarse: float, time_window_full_at: float
 ) -> None:
-    """Coarse, fine, all times, splits; each within the run, and never is there none before motion
-    begins."""
+    """The order is coarse, fine, all times, splits. All lie within the run, and the coarse phase
+    is never empty.
+    """
     model = DynamicModel(motion_from=coarse, time_window_full_at=time_window_full_at)
     schedule = deform_schedule(model, RateSchedule(steps))
     assert schedule.rates.steps == steps
@@ -189,7 +189,7 @@ def test_rates_fall_once_over_training(steps: int, fraction: float) -> None:
     assert progress[steps - 1] < 1
 
 
-def test_a_stage_goes_back_and_falls_again() -> None:
+def test_rate_restarts_and_decays_again_in_a_new_stage() -> None:
     rates = RateSchedule(1000, 200)
     assert rates.progress(1000) == 1
     assert rates.progress(1001) == pytest.approx(0.3 + 0.7 / 200)

@@ -1,4 +1,4 @@
-"""The surface of a ball of Gaussians, seen from all around."""
+"""Surface extraction from a ball of Gaussians."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def surface() -> Surface:
 
 
 def volume(found: Surface | Mesh) -> float:
-    """Positive where faces are anticlockwise from outside."""
+    """Signed volume, positive for outward-facing faces."""
     a, b, c = found.vertices[found.faces].transpose(1, 0, 2)
     return float((a * np.cross(b, c)).sum() / 6)
 
@@ -83,7 +83,7 @@ def test_a_ball_of_gaussians_has_the_surface_of_a_ball() -> None:
 
 @pytest.mark.parametrize("factor", [2.0**-20, 2.0**-13, 2.0**10])
 def test_the_surface_is_the_same_in_any_unit(factor: float) -> None:
-    """But for the rounding of the logarithms of sizes."""
+    """Up to rounding of the log scales."""
     whole = ball()
     options = replace(whole.options, near=factor * whole.options.near)
     scene = replace(whole, gaussians=scaled(whole.gaussians, factor), options=options)
@@ -97,7 +97,7 @@ def test_the_surface_is_the_same_in_any_unit(factor: float) -> None:
 
 
 def test_surface_ends_at_unobserved_space() -> None:
-    """From one side half a ball is seen, and nothing closes it."""
+    """Views from one side give half a ball with an open boundary."""
     half = fuse_depths(views()[:1], *BOX, 40, unseen_is_solid=False)
     assert half is not None
     assert count_holes(Surface(half.vertices, half.faces, half.vertices)) > 0
@@ -114,7 +114,7 @@ def piece(center: tuple[float, float, float], count: int) -> tuple[Tensor, Tenso
     return corners, torch.stack([torch.zeros(count, dtype=torch.long), k + 1, k + 2], 1)
 
 
-def test_small_pieces_go_and_faces_keep_their_corners() -> None:
+def test_small_components_are_removed() -> None:
     (large, first), (small, second) = piece((0, 0, 0), 200), piece((9, 0, 0), 2)
     mesh = Mesh(torch.cat([small, large]).numpy(), torch.cat([second, first + len(small)]).numpy())
     kept = keep_largest_components(mesh)

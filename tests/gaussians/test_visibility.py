@@ -1,4 +1,4 @@
-"""Bits in, the same bits out, and the right ones around a time."""
+"""Packed visibility masks: round trip, and interpolation around a time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def some_masks(count: int = 19, seed: int = 0) -> tuple[VisibilityMasks, torch.T
 
 
 @given(st.integers(0, 40), st.integers(0, 5))
-def test_packing_loses_nothing(count: int, seed: int) -> None:
+def test_packing_round_trip(count: int, seed: int) -> None:
     masks, seen = some_masks(count, seed)
     assert torch.equal(masks.seen, seen)
     assert masks.bits.shape == (4, (count + 7) // 8)
@@ -33,7 +33,7 @@ def test_a_time_lies_between_two_key_times(time: float, interval: int) -> None:
     assert some_masks()[0].interval(time) == interval
 
 
-def test_they_follow_the_gaussians() -> None:
+def test_visibility_masks_follow_edits() -> None:
     masks, seen = some_masks()
     index = torch.tensor([18, 3, 3, 0])
     assert torch.equal(masks.select(index).seen, seen[:, index])

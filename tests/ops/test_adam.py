@@ -1,4 +1,4 @@
-"""The fused Adam step against torch.optim.Adam, and what it does with rows left out."""
+"""Fused Adam step compared with torch.optim.Adam, and skipped rows."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SHAPES = [(1,), (700,), (5000,), (701, 3), (1, 4), (90, 15, 3), (130, 16, 3), (3
 def make_state(
     shape: tuple[int, ...], dtype: torch.dtype = torch.float32, seed: int = 0
 ) -> tuple[Tensor, ...]:
-    """A parameter, its gradient, and moments as they are in the middle of a training."""
+    """A parameter, its gradient, and moments as in the middle of training."""
     generator = torch.Generator().manual_seed(seed)
     param, grad, exp_avg, exp_avg_sq = (
         torch.randn(shape, generator=generator, dtype=dtype) for _ in range(4)
@@ -30,7 +30,7 @@ def make_state(
 
 
 def assert_within(actual: Tensor, expected: Tensor, allowed: Tensor) -> None:
-    """No element is further off than ``allowed``, which says for each how much rounding can do."""
+    """Assert that no element differs by more than ``allowed``, a bound on rounding per element."""
     excess = (actual.double() - expected.double()).abs() - allowed
     assert excess.numel() == 0 or excess.max() <= 0, (
         f"{excess.max():.3g} more than rounding explains"
@@ -38,7 +38,7 @@ def assert_within(actual: Tensor, expected: Tensor, allowed: Tensor) -> None:
 
 
 def train(param: Tensor, lr: float | Tensor, steps: int, eps: float) -> Tensor:
-    """The parameter after some steps with gradients of very different sizes."""
+    """The parameter after some steps with gradients of very different magnitude."""
     generator = torch.Generator().manual_seed(1)
     param = param.clone()
     moments = torch.zeros_like(param), torch.zeros_like(param)
@@ -99,7 +99,7 @@ def test_rows_with_non_finite_gradient_are_left_out_and_counted(
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_seen_rows(dtype: torch.dtype) -> None:
+def test_only_seen_rows_are_updated(dtype: torch.dtype) -> None:
     grads = torch.zeros(2000, 4, 3, dtype=dtype)
     grads[5, 3, 2] = 1e-40
     grads[700, 0, 0] = -1

@@ -1,5 +1,4 @@
-"""Options in range, finite tensors, and sizes that kernels and memory can hold: errors say what,
-where and how much."""
+"""Validation of options, finite tensors and sizes: errors name the argument and its value."""
 
 from __future__ import annotations
 
@@ -56,7 +55,7 @@ CASES = [
 
 @pytest.mark.parametrize(("kind", "name", "value"), CASES)
 def test_options_out_of_range_are_refused_by_name(kind: type, name: str, value: Any) -> None:
-    """NaN gave an empty image, an unknown word the last of the choices."""
+    """NaN used to give an empty image, and an unknown word the last choice."""
     with pytest.raises(DyngsError, match=f"^{name} must "):
         kind(**{name: value})
 
@@ -74,7 +73,7 @@ def test_options_out_of_range_are_refused_by_name(kind: type, name: str, value: 
         },
     ],
 )
-def test_the_ends_of_the_ranges_are_allowed(options: dict[str, Any]) -> None:
+def test_range_limits_are_inclusive(options: dict[str, Any]) -> None:
     assert RenderOptions(**options).projection.near >= 0
 
 
@@ -88,7 +87,7 @@ DTYPES = [torch.float32, torch.float64]
     places=st.sets(st.tuples(st.integers(0, 49), st.integers(0, 2)), max_size=9),
     bad=st.sampled_from(BAD),
 )
-def test_counts_elements_and_rows(
+def test_nonfinite_elements_and_rows_are_counted(
     dtype: torch.dtype, places: set[tuple[int, int]], bad: float
 ) -> None:
     x = torch.randn(50, 3, dtype=dtype)
@@ -125,7 +124,7 @@ def test_rows_are_finite_only_if_they_are_in_every_tensor() -> None:
 
 
 def veils(count: int = 1) -> Projection:
-    """Splats that cover any image."""
+    """Gaussians that cover any image."""
     return Projection(
         means2d=torch.full((1, count, 2), 32.0),
         depths=torch.ones(1, count),
@@ -136,8 +135,8 @@ def veils(count: int = 1) -> Projection:
 
 
 @pytest.mark.parametrize("side", [-1, 0, MAX_SIDE + 1, 10**9, 2**31 - 8, 2**31, 2**63, 10**30])
-def test_sides_that_cannot_be_are_refused(side: int) -> None:
-    """2^31 - 8 + 15 overflowed an int; 2^63 does not reach the kernels at all."""
+def test_impossible_image_sizes_are_refused(side: int) -> None:
+    """2^31 - 8 + 15 overflows an int; 2^63 does not fit the kernels' arguments."""
     message = f"^render refused: an image of {side}x5 px; its sides can be 1 to 8388608 px$"
     with pytest.raises(DyngsError, match=message):
         check_size(side, 5)
@@ -151,7 +150,7 @@ def test_sides_that_cannot_be_are_refused(side: int) -> None:
             project(torch.ones(1, 3), torch.ones(1, 4), torch.ones(1, 3), torch.ones(1), cameras)
 
 
-def test_a_image_larger_than_memory_is_refused() -> None:
+def test_image_larger_than_memory_is_refused() -> None:
     side = MAX_SIDE
     with pytest.raises(
         DyngsError,
@@ -166,8 +165,8 @@ def test_a_image_larger_than_memory_is_refused() -> None:
         rasterize(veils(), torch.ones(1, 1), torch.ones(1, 1, 3), (side, side), entries=nothing)
 
 
-def test_pairs_beyond_counting_are_refused_soon() -> None:
-    """A million veils on 8 million tiles: 8e12 pairs, of which some are counted."""
+def test_too_many_tile_pairs_are_refused_early() -> None:
+    """A million Gaussians on 8 million tiles are 8e12 pairs, of which only some are counted."""
     count = 10**6
     with pytest.raises(
         DyngsError, match=r"meet at least \d+ tiles, more than the limit of 2147483647"
@@ -191,8 +190,8 @@ def test_memory_of_the_machine(tmp_path: Path) -> None:
     assert core.available_memory(system(tmp_path, {})) == 8_192_000_000
 
 
-def test_the_narrowest_control_group_counts(tmp_path: Path) -> None:
-    """Files that the kernel can drop are not used up."""
+def test_smallest_cgroup_limit_applies(tmp_path: Path) -> None:
+    """The page cache, which the kernel can drop, counts as free memory."""
     group = "sys/fs/cgroup/user.slice"
     files = {
         "proc/self/cgroup": "1:name=systemd:/x\n0::/user.slice/app\n",
@@ -244,8 +243,7 @@ print(float(draw(3, 64)))
 
 @pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_AS")
 def test_render_beyond_memory_is_refused() -> None:
-    """Pairs, an image, gradients, and scratch memory that threads used to allocate; after which all
-    is well."""
+    """Pairs, an image, gradients and scratch memory of threads. Smaller renders work afterwards."""
     path = os.pathsep.join([str(Path(dyngs.__file__).parents[1]), *(p for p in sys.path if p)])
     environment = os.environ | {"PYTHONPATH": path}
     run = subprocess.run(

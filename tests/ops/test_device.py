@@ -1,5 +1,4 @@
-"""What computes: the choice, and for a GPU that cannot be used one line with the reason and what to
-do."""
+"""Choice of the device, and the message for a GPU that is not usable."""
 
 from __future__ import annotations
 
@@ -30,7 +29,7 @@ from dyngs.ops.device import (
 
 @pytest.fixture
 def machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
-    """One with a usable GPU, of which a test takes away something."""
+    """A machine with a usable GPU; each test removes one requirement."""
     gpu_unavailable_reason.cache_clear()
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
@@ -55,7 +54,7 @@ def refused() -> str:
     return line
 
 
-def test_a_gpu_that_can_be_used_is(machine: pytest.MonkeyPatch) -> None:
+def test_usable_gpu_is_chosen(machine: pytest.MonkeyPatch) -> None:
     assert select_device("auto") == select_device("cuda") == torch.device("cuda:0")
     assert select_device("cpu") == torch.device("cpu")
     assert cpu_fallback_reason("auto") is None
@@ -67,7 +66,7 @@ def test_a_gpu_that_can_be_used_is(machine: pytest.MonkeyPatch) -> None:
     }
 
 
-def test_a_torch_for_the_cpu_alone(machine: pytest.MonkeyPatch) -> None:
+def test_cpu_only_torch_is_reported(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(torch.version, "cuda", None)
     assert re.search(
         r"device cuda is not usable: this torch \(.*\) is built without CUDA: install a torch for CUDA",
@@ -76,7 +75,7 @@ def test_a_torch_for_the_cpu_alone(machine: pytest.MonkeyPatch) -> None:
     assert gpu_status()["GPU"] == "none"
 
 
-def test_kernels_that_were_not_built(machine: pytest.MonkeyPatch) -> None:
+def test_missing_kernels_are_reported(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(device, "has_cuda_core", lambda: False)
     assert (
         "built without its kernels for GPUs: install dyngs with `pip install . -C cmake.define"
@@ -85,7 +84,7 @@ def test_kernels_that_were_not_built(machine: pytest.MonkeyPatch) -> None:
     assert gpu_status()["kernels for GPUs"] == "not built"
 
 
-def test_kernels_that_cannot_be_loaded(machine: pytest.MonkeyPatch) -> None:
+def test_unloadable_kernels_are_reported(machine: pytest.MonkeyPatch) -> None:
     def fail() -> None:
         raise DyngsError("the kernels for CUDA GPUs are not there (broken); install them")
 
@@ -93,7 +92,7 @@ def test_kernels_that_cannot_be_loaded(machine: pytest.MonkeyPatch) -> None:
     assert "(broken)" in refused()
 
 
-def test_a_driver_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
+def test_too_old_driver_is_reported(machine: pytest.MonkeyPatch) -> None:
     core = SimpleNamespace(runtime_version=lambda: 13000, driver_version=lambda: 12040)
     machine.setattr(device, "cuda_core", lambda: core)
     assert (
@@ -102,7 +101,7 @@ def test_a_driver_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
     )
 
 
-def test_a_gpu_older_than_the_kernels(machine: pytest.MonkeyPatch) -> None:
+def test_too_old_gpu_is_reported(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(torch.cuda, "get_device_capability", lambda: (7, 0))
     assert re.search(r"GPU is older than compute capability 7\.5", refused())
 
@@ -123,7 +122,7 @@ def test_other_choices_are_refused() -> None:
 
 
 def test_torch_is_deterministic_on_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And only there, only inside, and only if that is wanted."""
+    """Only on a GPU, only inside the context, and only if requested."""
     told: list[tuple[bool, bool]] = []
     monkeypatch.delenv("CUBLAS_WORKSPACE_CONFIG", raising=False)
     monkeypatch.setattr(

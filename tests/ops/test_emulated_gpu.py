@@ -1,5 +1,4 @@
-"""Every op on the core for CUDA GPUs, which runs here over the emulation of its kernels, beside the
-core for CPUs."""
+"""Every op on the emulated GPU compared with the CPU."""
 
 from __future__ import annotations
 
@@ -72,10 +71,10 @@ def test_only_the_number_of_tile_entries_is_read_back(gpu: Callable) -> None:
         assert reads == {"render": 1, "tally": 3}.get(name, 0), name
 
 
-def test_lent_memory_is_new_wherever_other_arrays_lay_before(
+def test_recycled_memory_counts_as_new_arrays(
     gpu: Callable, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Torch lends memory of arrays that are gone; the emulation must not take it for theirs."""
+    """Torch recycles memory of freed arrays; the emulation must not attribute it to them."""
     pool = torch.zeros(1 << 20, dtype=torch.uint8)
     with gpu() as module:
         monkeypatch.setattr(native, "lend", lambda size, _: pool[:size])

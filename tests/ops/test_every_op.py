@@ -1,5 +1,8 @@
-"""What all ops share: exact gradients, the same bytes on any number of threads, the same numbers on
-every instruction set, and good behaviour in torch's dispatcher and compiler."""
+"""Checks common to all ops.
+
+Exact gradients, equal bytes for any number of threads, equal values on every instruction set, and
+support of torch's dispatcher and compiler.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +52,7 @@ def test_any_number_of_threads_gives_the_same_bytes(name: str) -> None:
 
 @pytest.mark.parametrize("name", [name for name in CASES if name != "field"])
 def test_float_on_every_isa_is_near_double(isa: str, name: str) -> None:
-    """Samples of rays may differ in number: those are compared in test_rays.py."""
+    """Ray samples may differ in number; test_rays.py compares those."""
     found = CASES[name](40, torch.float32).results()
     expected = CASES[name](40, torch.float64).results()
     for a, b in zip(found, expected, strict=True):
@@ -70,7 +73,7 @@ def test_strides_do_not_matter(name: str) -> None:
 
 
 class Recorder(TorchDispatchMode):
-    """Arguments of the first call of each op, and of each in which other arguments are None."""
+    """Arguments of the first call of each op, and of each call with other arguments set to None."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -87,7 +90,7 @@ class Recorder(TorchDispatchMode):
 
 
 def detached(x: Any) -> Any:
-    """A copy of an argument of an op."""
+    """A detached copy of an op's argument."""
     if isinstance(x, list):
         return [detached(y) for y in x]
     return x.detach().clone() if isinstance(x, Tensor) else x
@@ -101,7 +104,7 @@ def with_gradients(x: Any) -> Any:
 
 @pytest.mark.usefixtures("one_thread")
 def test_every_op_is_well_behaved() -> None:
-    """By ``torch.library.opcheck``: schema, fake kernel, registration of the gradient, tracing."""
+    """Runs ``torch.library.opcheck``: schema, fake kernel, autograd registration, tracing."""
     for path in Path(dyngs.ops.__path__[0]).glob("[a-z]*.py"):
         import_module(f"dyngs.ops.{path.stem}")
     with Recorder() as recorder:

@@ -1,5 +1,4 @@
-"""Hash grids against their formula in float64, and their promises: same bits on any threads, what
-lies outside."""
+"""Hash grids against their formula in float64: determinism, and points outside."""
 
 from __future__ import annotations
 
@@ -80,7 +79,7 @@ def test_known_features_have_the_gradient_of_a_look_up() -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_coordinate_that_is_no_number_shows(bad: float) -> None:
+def test_nan_coordinate_gives_nan_features(bad: float) -> None:
     coords = some(5)
     coords[2, 1] = bad
     found = hash_features(coords, table_of(LEVELS, 2), LEVELS)

@@ -1,4 +1,4 @@
-"""The fused loss against plain float64 torch, known answers and its promises at the extremes."""
+"""The fused loss against float64 torch, known values and extremes."""
 
 from __future__ import annotations
 

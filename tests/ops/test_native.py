@@ -1,4 +1,4 @@
-"""Which kernels are loaded, on how many threads they run, and the C++ tests of their formulas."""
+"""Selection of the compiled kernels, thread counts, and the C++ unit tests."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def imported_with(isa: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """A second ``dyngs.ops.native``, as it would be imported in a new process."""
+    """A second ``dyngs.ops.native``, imported as in a new process."""
     monkeypatch.setenv("DYNGS_ISA", isa)
     monkeypatch.setattr(os, "register_at_fork", lambda **_: None)
     spec = util.spec_from_file_location("native_again", native.__file__)
@@ -47,7 +47,7 @@ def imported_with(isa: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         (("v4",), "v4", "v4", "v4"),
     ],
 )
-def test_the_newest_that_the_processor_runs_is_chosen(
+def test_newest_supported_instruction_set_is_chosen(
     built: tuple[str, ...], newest: str, requested: str | None, chosen: str
 ) -> None:
     assert choose_isa(built, newest, requested) == chosen
@@ -89,7 +89,7 @@ def test_an_unknown_instruction_set_is_refused(monkeypatch: pytest.MonkeyPatch) 
         imported_with("v9", monkeypatch)
 
 
-def test_thread_counts_come_back_after_an_error() -> None:
+def test_thread_counts_are_restored_after_an_error() -> None:
     before = torch.get_num_threads()
     with pytest.raises(RuntimeError), kernel_threads(3):
         raise RuntimeError
@@ -110,7 +110,7 @@ def test_arrays_of_the_wrong_size_are_refused_before_they_are_read() -> None:
         core.project_forward(arrays, sizes, *outputs, torch.zeros(1, 4, 2, dtype=torch.int32))
 
 
-def test_strided_arrays_are_refused_rather_than_filled_elsewhere() -> None:
+def test_strided_arrays_are_refused() -> None:
     means = torch.zeros(4, 3)
     quats = torch.zeros(4, 4)
     scales = torch.zeros(4, 3)
@@ -126,7 +126,7 @@ def test_strided_arrays_are_refused_rather_than_filled_elsewhere() -> None:
         )
 
 
-def test_formulas_need_no_library_but_the_mathematical_one() -> None:
+def test_formulas_link_only_libm() -> None:
     allowed = {"cmath", "cstdint", "limits", "type_traits", "utility"}
     headers = sorted((ROOT / "csrc/math").glob("*.hpp"))
     assert headers
@@ -140,7 +140,7 @@ def test_formulas_need_no_library_but_the_mathematical_one() -> None:
 
 
 # --- after a fork
-# -----------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 FORKED = """
 import os, signal, sys, warnings
@@ -180,8 +180,7 @@ fork(draw(5000))
 
 
 def drawn_after_forks(threads: int) -> list[str]:
-    """What is said after a fork of a process without threads, and after two when it has drawn on so
-    many."""
+    """Warnings after forking a single-threaded process, and after two forks of one with threads."""
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
         "OMP_NUM_THREADS": str(threads),
@@ -194,8 +193,9 @@ def drawn_after_forks(threads: int) -> list[str]:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks")
 def test_fork_of_process_with_threads_uses_one_thread_and_warns() -> None:
-    """It used to wait for ever for threads that only the parent has, the second one too, as the
-    first fork ends the threads of OpenBLAS; without any, it may start some."""
+    """Kernels used to wait forever for threads that exist only in the parent. A second fork is
+    also tested, since the first one ends the threads of OpenBLAS.
+    """
     told = (
         "True 1 1 dyngs and torch use one thread: this process was forked from a process with "
         "threads; use multiprocessing's 'spawn' start method for more threads"
@@ -204,5 +204,5 @@ def test_fork_of_process_with_threads_uses_one_thread_and_warns() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks")
-def test_a_fork_of_a_process_of_one_thread_may_start_some() -> None:
+def test_forked_single_threaded_process_may_use_threads() -> None:
     assert drawn_after_forks(1) == ["True 1 4"] * 3

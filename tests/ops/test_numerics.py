@@ -1,5 +1,4 @@
-"""Numbers at the extremes of the rasterizer's kernels, on every instruction set: more rows of
-docs/contributing/numerics.md."""
+"""Numerical limits of the rasterizer on every instruction set (docs/contributing/numerics.md)."""
 
 from __future__ import annotations
 
@@ -18,7 +17,7 @@ WIDTH, HEIGHT = 64, 48
 
 
 # --- expected depth
-# ---------------------------------------------------------------------------------------------------
+# -------------------------------------------------------------------------------------------------
 
 
 # --- indices from callers
@@ -26,7 +25,9 @@ WIDTH, HEIGHT = 64, 48
 
 
 def tiny_render(entries: TileEntries | None = None, *, backward: bool = False) -> TileEntries:
-    """Two splats on 2 x 2 tiles, drawn and differentiated with these entries; the right ones."""
+    """Two Gaussians on 2 x 2 tiles, rendered and differentiated with these entries and the valid
+    ones.
+    """
     factors = torch.tensor([0.2, 0, 0.2]).repeat(1, 2, 1).requires_grad_()
     radii = torch.full((1, 2, 2), 20, dtype=torch.int32)
     splats = Projection(

@@ -81,7 +81,7 @@ def test_a_lattice_is_linear_between_its_points(segments: int) -> None:
     assert torch.autograd.gradcheck(lambda x: patch_values(x, some, uv, segments), values)
 
 
-def test_faces_of_a_lattice_face_alike_and_fill_it() -> None:
+def test_lattice_faces_are_oriented_alike_and_cover_it() -> None:
     places, faces = lattice(6)
     a, b, c = places[faces].unbind(1)
     areas = ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2
@@ -99,7 +99,7 @@ def test_pixels_show_the_nearest_patch(seed: int) -> None:
     torch.testing.assert_close(uv, places)
 
 
-def test_what_is_shown_projects_to_its_pixel() -> None:
+def test_visible_points_project_to_their_pixels() -> None:
     """A slanted flat patch: perspective-correct places, on the rays of the pixels' centres."""
     cameras = camera()
     points = flat((-1, -0.8, -1), (1, -0.5, 2), (0, 0.9, 0))
@@ -112,7 +112,7 @@ def test_what_is_shown_projects_to_its_pixel() -> None:
     torch.testing.assert_close(21 * y / (z + 3) + 9, rows[:, 0].double() + 0.5)
 
 
-def test_neighbours_leave_no_gap() -> None:
+def test_adjacent_patches_leave_no_gap() -> None:
     corners = [(-1.0, -1.0, 0.3), (1.0, -1.0, -0.2), (1.0, 1.0, 0.1), (-1.0, 1.0, 0.0)]
     both = torch.cat(
         [flat(corners[0], corners[1], corners[2]), flat(corners[0], corners[2], corners[3])]
@@ -209,7 +209,7 @@ def test_an_outline_covers_the_area_that_it_encloses(turn: float) -> None:
     assert abs(float(image.sum()) - 0.75 * 3**0.5 * 20 * 21) < 0.01 * crossed + 1
 
 
-def test_the_nearer_one_covers_the_other_along_its_own_outline() -> None:
+def test_nearer_patch_covers_the_farther_along_its_outline() -> None:
     """A strip before a wall: only the strip's edges are outlines, and only they get a gradient."""
     wall = flat((-9, -9, 1), (9, -9, 1), (0, 18, 1))
     strip = flat((-0.4, -9, 0), (0.41, 0, 0), (-0.4, 9, 0))

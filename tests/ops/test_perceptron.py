@@ -1,5 +1,4 @@
-"""The fused perceptron against plain torch in float64, and its promises: same bits on any threads,
-NaN in its row."""
+"""The fused perceptron against torch in float64: determinism, and NaN confined to its row."""
 
 from __future__ import annotations
 
@@ -61,7 +60,7 @@ def value_and_gradients(function, x: Tensor, layers: list[Layer], skip: int | No
 
 
 def assert_close(got: list[Tensor], expected: list[Tensor], tolerance: float) -> None:
-    """Relative to the largest element: sums of terms of that size are rounded at that size."""
+    """Assert closeness relative to the largest element, the scale of rounding in the sums."""
     for a, b in zip(got, expected, strict=True):
         assert a.shape == b.shape
         if b.numel():
@@ -92,8 +91,7 @@ def test_double_equals_torch(
 
 
 def test_a_row_does_not_depend_on_its_place() -> None:
-    """Blocks and tiles are an implementation detail: each row's output is the same bits alone and
-    among others."""
+    """Each row's output is bitwise equal alone and among other rows."""
     x, layers = cast(make_rows(230, 17), make_layers([17, 40, 9], None), torch.float32)
     together = perceptron(x, layers)
     for row in (0, 1, 95, 96, 97, 229):
@@ -102,7 +100,7 @@ def test_a_row_does_not_depend_on_its_place() -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("skip", [None, 2])
-def test_a_bad_row_stays_alone(value: float, skip: int | None) -> None:
+def test_nan_row_does_not_affect_others(value: float, skip: int | None) -> None:
     widths = [11, 20, 30, 5]
     x, layers = cast(make_rows(130, widths[0]), make_layers(widths, skip), torch.float32)
     good = perceptron(x, layers, skip=skip)

@@ -1,5 +1,4 @@
-"""The HexPlane look-up and the penalties of its planes against plain torch, finite differences and
-known answers."""
+"""HexPlane features and penalties against torch, finite differences and known values."""
 
 from __future__ import annotations
 
@@ -186,7 +185,7 @@ def test_first_and_last_time(time: float) -> None:
     assert not torch.cat([g_time[:, :row], g_time[:, row + 1 :]], dim=1).any()
 
 
-def test_outside_the_box_is_its_border() -> None:
+def test_points_outside_the_box_are_clamped() -> None:
     levels = make_levels((6,), 3, 4)
     outside = torch.tensor([[-7.0, 0.3, 1e30], [math.inf, -math.inf, 0.1]], dtype=torch.float64)
     features, g_coords, *_ = run_features(hexplane_features, outside, 0.2, levels)
@@ -195,7 +194,7 @@ def test_outside_the_box_is_its_border() -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_nan_stays_where_it_is(dtype: torch.dtype) -> None:
+def test_nan_does_not_spread(dtype: torch.dtype) -> None:
     levels = make_levels((6, 1), 3, 20, dtype)
     coords = make_coords(40, dtype)
     coords[17, 1] = math.nan
@@ -232,7 +231,7 @@ def test_penalty_equals_reference(
     )
 
 
-def test_known_penalty() -> None:
+def test_penalty_of_a_known_plane() -> None:
     space = torch.zeros(3, 3, 3, 1)
     time = torch.ones(3, 3, 3, 1)
     # bends of -2 in the middle of one row and of one column, out of three each

@@ -1,7 +1,6 @@
-"""Gaussians moved by joints against T S T^T in float64, and gradients that are exact, and finite
-where axes are alike.
+"""Gaussians posed by joints compared with T S T^T in float64, and their gradients.
 
-In the tests, N Gaussians follow J joints.
+Shapes: N Gaussians, J joints. Gradients stay finite for Gaussians with equal axes.
 """
 
 from __future__ import annotations
@@ -25,8 +24,7 @@ def normal(*shape: int, seed: int = 0) -> Tensor:
 
 
 def random_case(count: int, joints: int, seed: int = 0) -> list[Tensor]:
-    """Arguments of ``pose_by_joints``, all of them leaves; every Gaussian follows three joints, in
-    all ways."""
+    """Leaf arguments of ``pose_by_joints``; every Gaussian follows three joints."""
     weights = normal(count, joints, seed=seed).exp()
     weights = weights * (
         weights >= weights.sort(descending=True).values[:, min(2, joints - 1), None]
@@ -42,8 +40,7 @@ def random_case(count: int, joints: int, seed: int = 0) -> list[Tensor]:
 
 
 def moved_alone(linear: Tensor, quats: Tensor, log_scales: Tensor) -> PosedGaussians:
-    """Gaussians at the origin of which each follows a joint of its own, with the linear map (N, 3,
-    3)."""
+    """Gaussians at the origin, each with its own joint and linear map (N, 3, 3)."""
     transforms = torch.cat([linear, torch.zeros_like(linear[..., :1])], dim=-1)
     weights = torch.eye(len(linear), dtype=linear.dtype)
     return pose_by_joints(torch.zeros_like(log_scales), quats, log_scales, weights, transforms)
@@ -65,20 +62,20 @@ def reference(
 
 
 def posed(*arguments: Tensor) -> list[Tensor]:
-    """The same of ``pose_by_joints``."""
+    """``reference`` computed by ``pose_by_joints``."""
     found = pose_by_joints(*arguments)
     return [found.means, covariances(found.quats, found.log_scales), found.transforms]
 
 
 def results(function, case: list[Tensor]) -> list[Tensor]:
-    """Outputs, and the gradients by all arguments for fixed gradients of these."""
+    """Outputs, and the gradients of all arguments for fixed output gradients."""
     outputs = function(*case)
     grads = [normal(*y.shape, seed=20 + i).to(y.dtype) for i, y in enumerate(outputs)]
     return [*(y.detach() for y in outputs), *torch.autograd.grad(outputs, case, grads)]
 
 
 def assert_close(got: list[Tensor], expected: list[Tensor], tolerance: float) -> None:
-    """Relative to the largest element: sums of terms of that size are rounded at that size."""
+    """Assert closeness relative to the largest element, the scale of rounding in the sums."""
     for a, b in zip(got, expected, strict=True):
         assert a.shape == b.shape
         if b.numel():
@@ -123,8 +120,7 @@ def test_covariances_are_moved_exactly(seed: int, shear: float, spread: float) -
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_rigid_motion_turns_and_leaves_the_axes(dtype: torch.dtype) -> None:
-    """Discs of two equal axes, too: no axis is turned into the other. A larger body has larger
-    Gaussians."""
+    """Equal axes of discs are not swapped. Scaling the body scales its Gaussians."""
     means, quats, log_scales, weights, _ = (x.detach().to(dtype) for x in random_case(60, 4))
     log_scales[::2, 1] = log_scales[::2, 0]
     turn = rotation_matrices(normal(1, 4, seed=9))[0].to(dtype)
@@ -150,7 +146,7 @@ def test_a_reflection_gives_rotations_all_the_same() -> None:
 
 
 def test_the_gradient_of_a_ball_is_that_of_its_size() -> None:
-    """Its rotation has no effect, and the three scales grow alike."""
+    """Rotation of a sphere has no effect, and its three scales have equal gradients."""
     log_scales = torch.full((1, 3), -3.0, dtype=torch.float64, requires_grad=True)
     quats = normal(1, 4).requires_grad_()
     found = moved_alone(rotation_matrices(normal(1, 4, seed=1)), quats, log_scales)

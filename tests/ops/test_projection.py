@@ -1,5 +1,4 @@
-"""The native projection: against the reference in float64, on every instruction set, and what it
-culls."""
+"""Projection against the reference in float64, on every instruction set, and culling."""
 
 from __future__ import annotations
 
@@ -107,7 +106,7 @@ def test_many_cameras_equal_one_at_a_time(scene: Scene) -> None:
 
 @pytest.mark.parametrize("name", ["cam_from_world", "intrinsics"])
 def test_gradient_of_one_part_of_the_camera(name: str, scene: Scene) -> None:
-    """Who optimises poses or lenses alone gets the same numbers."""
+    """Optimising only poses or only intrinsics gives the same gradients."""
     part = getattr(scene, name).clone().requires_grad_()
     p = splats(replace(scene, **{name: part}))
     total = torch.stack([(getattr(p, x) * weights(getattr(p, x))).sum() for x in OUTPUTS]).sum()

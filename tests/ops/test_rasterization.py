@@ -1,5 +1,4 @@
-"""The native blending against the reference: values, gradients, probe, contributions, and what must
-not matter."""
+"""Blending against the reference: values, gradients, probe, contributions, invariances."""
 
 from __future__ import annotations
 
@@ -112,7 +111,7 @@ def test_number_of_channels_is_limited(channels: int, scene: Scene) -> None:
 @pytest.mark.parametrize(
     "size", [(1, 1), (16, 16), (17, 33), (5, 300), (300, 5), (64, 48)], ids=str
 )
-def test_partial_tiles(size: tuple[int, int]) -> None:
+def test_images_with_partial_tiles(size: tuple[int, int]) -> None:
     scene = random_scene(n=12, views=1, size=size, seed=3)
     ours = draw(scene)
     truth = draw(scene, REFERENCE)
@@ -122,7 +121,7 @@ def test_partial_tiles(size: tuple[int, int]) -> None:
         assert relative_error(found[name], x) < 1e-9, name
 
 
-def test_threads_do_not_matter_to_the_sort(set_threads: Callable[[int], None]) -> None:
+def test_sort_is_equal_for_any_number_of_threads(set_threads: Callable[[int], None]) -> None:
     """More than 2^18 Gaussians are sorted in parallel."""
     scene = random_scene(n=280_000, views=1, size=(48, 48)).to(torch.float32)
     scene = replace(
@@ -197,7 +196,7 @@ def test_contributions_and_the_background_make_up_the_image(scene: Scene) -> Non
     )
 
 
-def test_tally_of_pixels_counts_those_that_a_gaussian_was_blended_into() -> None:
+def test_pixel_tally_counts_blended_pixels() -> None:
     """With one colour channel per Gaussian the reference shows who is in which pixel."""
     scene = random_scene(n=30, views=1, seed=13)
     # some pixels fill up
@@ -216,8 +215,9 @@ def test_tally_of_pixels_counts_those_that_a_gaussian_was_blended_into() -> None
 @pytest.mark.parametrize("channels", [1, 3, 5])
 @pytest.mark.parametrize("exact", [True, False])
 def test_squared_slopes_equal_autograd_pixel_for_pixel(channels: int, exact: bool) -> None:
-    """Some pixels fill up, some alphas are clamped; 1e-10 because the light behind is what is left
-    of a sum."""
+    """Some pixels saturate and some alphas are clamped. Tolerance 1e-10, since the light behind is
+    a difference of sums.
+    """
     scene = random_scene(n=30, views=2, seed=13)
     scene = replace(scene, opacities=scene.opacities**0.2, scales=2 * scene.scales)
     projection, opacities, colors, background = with_channels(scene, channels)
@@ -254,7 +254,7 @@ def test_order_of_the_gaussians_does_not_matter(scene: Scene) -> None:
     assert torch.equal(found, truth[order])
 
 
-def test_halves_of_a_image_equal_crops() -> None:
+def test_image_halves_equal_crops() -> None:
     """Shifting cx moves the image; splats must be narrower than the clamp margin (15% of the
     width)."""
     scene = random_scene(n=60, views=1, size=(160, 24), seed=4)
@@ -278,7 +278,7 @@ def test_no_gaussians_leave_the_background() -> None:
 
 
 def test_more_gaussians_in_a_tile_than_are_copied_at_a_time() -> None:
-    """Chunks of 256: 700 faint ones on one tile, every one of which counts."""
+    """700 faint Gaussians on one tile, in chunks of 256, all contribute."""
     scene = random_scene(n=700, views=1, size=(13, 11), seed=6)
     scene = replace(scene, opacities=0.02 * scene.opacities)
     ours = draw(scene, NATIVE, EXACT)

@@ -1,4 +1,4 @@
-"""Samples along rays, and what is seen along them, against loops in float64 and known answers."""
+"""Ray samples and volume rendering against loops in float64 and known values."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def towards(*direction: float, origin: tuple[float, float, float] = (-5.0, 0.13,
 
 
 def some_rays(count: int, seed: int = 0) -> Rays:
-    """From around a sphere of radius 3 to near its middle."""
+    """Rays from around a sphere of radius 3 towards its middle."""
     generator = torch.Generator().manual_seed(seed)
     origins = (
         torch.nn.functional.normalize(
@@ -46,7 +46,7 @@ def shifts_of(rays: Rays, value: float = 0.5) -> torch.Tensor:
 
 
 def some_samples(counts: list[int], seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, Samples]:
-    """Densities, colours and samples of rays with so many each."""
+    """Densities, colours and samples of rays, with the given number per ray."""
     generator = torch.Generator().manual_seed(seed)
     total = sum(counts)
     densities = torch.rand(total, generator=generator, dtype=torch.float64) * 3
@@ -127,7 +127,7 @@ def test_samples_grow_with_the_distance() -> None:
     assert torch.allclose(found.starts[1:], found.ends[:-1])
 
 
-def test_the_unit_cube_holds_everything_and_the_middle_half_what_is_near() -> None:
+def test_contraction_maps_the_inner_cube_to_the_middle_half() -> None:
     points = torch.tensor(
         [[1.0, 0, 0], [2.0, 0, 0], [1e6, 0, 0], [-1.0, 1, 0.5]], dtype=torch.float64
     )
@@ -143,7 +143,7 @@ def test_the_unit_cube_holds_everything_and_the_middle_half_what_is_near() -> No
     least=st.floats(0, 0.5),
 )
 @settings(max_examples=40, deadline=None)
-def test_rays_see_what_a_loop_sees(counts: list[int], seed: int, least: float) -> None:
+def test_composite_equals_a_loop(counts: list[int], seed: int, least: float) -> None:
     densities, colours, samples = some_samples(counts, seed)
     found = composite(densities, colours, samples, least)
     expected = reference_composite(densities, colours, samples, least)
@@ -165,7 +165,7 @@ def test_rays_see_what_a_loop_sees(counts: list[int], seed: int, least: float) -
         )
 
 
-def test_nothing_is_seen_through_a_wall_and_everything_through_air() -> None:
+def test_transmittance_of_opaque_and_empty_space() -> None:
     _, colours, samples = some_samples([3, 3])
     densities = torch.tensor([0.0, 1e9, 1.0, 0, 0, 0], dtype=torch.float64)
     seen = composite(densities, colours, samples)

@@ -1,4 +1,4 @@
-"""The native ops as ops of the dispatcher: differentiable once."""
+"""Registration of native ops in torch's dispatcher: differentiable once."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def _double_backward(x: Backward) -> list[Tensor]:
 double_op: Any = register("test_double", _double, _double_backward, "x")
 
 
-def test_an_op_of_ones_own() -> None:
+def test_custom_op_can_be_registered() -> None:
     torch.library.opcheck(double_op, (torch.ones(3, requires_grad=True), [1.0, 2.0]))
 
 
-def test_another_device_joins_without_a_change_of_callers() -> None:
+def test_new_device_needs_no_change_of_callers() -> None:
     torch.library.impl("dyngs::test_double", "xpu", lambda x, factors: x * 7)
     found = double_op.redispatch(DispatchKeySet(DispatchKey.XPU), torch.ones(3), [1.0])
     assert found.tolist() == [7, 7, 7]
@@ -88,14 +88,15 @@ DO_NOT_FIT: list[Callable[[], object]] = [
 
 @pytest.mark.parametrize("call", DO_NOT_FIT)
 def test_arrays_that_do_not_fit_are_refused(call: Callable[[], object]) -> None:
-    """By the core: before it reads or writes beyond their ends."""
+    """The core raises before it accesses memory out of bounds."""
     with pytest.raises(DyngsError):
         call()
 
 
 def test_drawing_imports_neither_the_compiler_of_torch_nor_another_openmp() -> None:
-    """The former takes 2 s of CPU, which every command would pay; torch and the core share one pool
-    of threads."""
+    """Importing torch's compiler would cost every command 2 s. Torch and the core share one thread
+    pool.
+    """
     code = (
         "import sys, torch\n"
         "from dyngs import Cameras, Gaussians, render\n"

@@ -1,4 +1,4 @@
-"""What a colour network is told: the fused kernel against plain torch, and what the inputs mean."""
+"""Inputs of the colour network: the fused kernel against torch, and their meaning."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dyngs.ops.shading import num_inputs, shading_inputs
 def sight(
     seed: int, *, normals: bool, timed: bool, on_body: bool, dtype: torch.dtype = torch.float64
 ) -> Sight:
-    """Eleven Gaussians, seven of them seen, in no order."""
+    """Eleven Gaussians, seven of them visible, unordered."""
     g = torch.Generator().manual_seed(seed)
 
     def random(*shape: int) -> Tensor:
@@ -45,7 +45,7 @@ flags = st.booleans()
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32), flags, flags, flags, st.sampled_from([torch.float32, torch.float64]))
-def test_it_is_what_torch_says(
+def test_inputs_equal_the_torch_reference(
     seed: int, normals: bool, timed: bool, on_body: bool, dtype: torch.dtype
 ) -> None:
     seen = sight(seed, normals=normals, timed=timed, on_body=on_body, dtype=dtype)
@@ -60,8 +60,7 @@ def test_it_is_what_torch_says(
 
 
 def test_degenerate_input_stays_finite() -> None:
-    """An eye in the centre of a Gaussian, a rotation of length zero, three equal scales, nothing
-    seen."""
+    """A camera at a Gaussian's mean, a zero quaternion, equal scales, and no visible Gaussians."""
     zeros = torch.zeros(1, 3)
     seen = Sight(
         zeros,

@@ -99,7 +99,7 @@ def results(function, case: Case) -> list[Tensor]:
 
 
 def assert_close(got: list[Tensor], expected: list[Tensor], tolerance: float) -> None:
-    """Relative to the largest element: sums of terms of that size are rounded at that size."""
+    """Assert closeness relative to the largest element, the scale of rounding in the sums."""
     for a, b in zip(got, expected, strict=True):
         assert a.shape == b.shape
         if b.numel():
@@ -119,8 +119,7 @@ def assert_close(got: list[Tensor], expected: list[Tensor], tolerance: float) ->
 def test_double_equals_torch(
     isa: str, count: int, num_nodes: int, per_point: int, width: int, seed: int
 ) -> None:
-    """With several parts in the backward pass or one, values that fill registers or not, nodes
-    followed twice."""
+    """Several or one parts in the backward pass, partly filled registers, and repeated nodes."""
     case = random_case(count, num_nodes, per_point, width, seed)
     # gradients grow as quaternions get shorter
     short = case.motion.detach()[:, 3:].norm(dim=1).min()
@@ -132,7 +131,7 @@ def test_double_equals_torch(
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10_000), st.floats(-30, 30))
 def test_a_rigid_motion_of_all_nodes_moves_the_points_rigidly(seed: int, exponent: float) -> None:
-    """Whatever the length of the quaternion."""
+    """For quaternions of any norm."""
     case = random_case(20, 6, 4, 0, seed)
     quat, shift = case.motion.detach()[0].split([4, 3])
     matrix = torch.from_numpy(Rotation.from_quat(quat.roll(-1).numpy()).as_matrix())

@@ -1,5 +1,4 @@
-"""A still scene in levels of detail is drawn as the scene is, by every camera in the detail that it
-needs."""
+"""Levels of detail of a static scene: the camera chooses the level."""
 
 from __future__ import annotations
 
@@ -20,7 +19,7 @@ from dyngs.gaussians.rendering import RenderOptions
 from dyngs.gaussians.static_scene import StaticScene, ViewSides
 
 
-def test_near_it_is_the_scene_itself() -> None:
+def test_close_views_use_the_full_scene() -> None:
     still = StaticScene(
         gaussians=cloud(),
         filter_std=torch.full((400,), 0.02),

@@ -1,5 +1,4 @@
-"""How a static scene is trained: on every image, with its 3D filter kept until it is due, and rid
-of what is small."""
+"""Training of a static scene: periodic 3D filter, and pruning of small Gaussians."""
 
 from __future__ import annotations
 
@@ -57,7 +56,7 @@ def test_nothing_depends_on_time() -> None:
     assert all(x is scene.gaussians for x in drawn)
 
 
-def test_the_set_is_left_to_the_strategy() -> None:
+def test_densification_is_left_to_the_strategy() -> None:
     training = StaticTraining(FilterUpdate())
     assert all(
         training.edit_scene(training.first_scene(_gaussians(2.0)), step) is None
@@ -66,8 +65,7 @@ def test_the_set_is_left_to_the_strategy() -> None:
 
 
 def _sized(pixels: list[float]) -> Gaussians:
-    """Faint Gaussians side by side at depth 2 that make up so many pixels, 2 pi o s^2 (50 px are a
-    unit there)."""
+    """Faint Gaussians side by side at depth 2 with given areas 2 pi o s^2 in px (50 px per unit)."""
     n = len(pixels)
     std = 3.0
     means = torch.stack([torch.linspace(-0.6, 0.6, n), torch.zeros(n), torch.full((n,), 2.0)], 1)
@@ -100,7 +98,7 @@ def test_small_gaussians_are_pruned_once() -> None:
     )
 
 
-def test_the_filter_is_kept_until_it_is_due() -> None:
+def test_filter_is_updated_on_schedule() -> None:
     training = StaticTraining(FilterUpdate([_camera()], range(100, 200, 100)))
     near = _gaussians(2.0)
     far = _gaussians(4.0)
@@ -124,7 +122,7 @@ def test_the_filter_is_kept_until_it_is_due() -> None:
     )
 
 
-def test_state_goes_round() -> None:
+def test_training_state_round_trip() -> None:
     training = StaticTraining(FilterUpdate([_camera()]))
     first = training.first_scene(_gaussians(2.0))
     stored = select_prefix(strip_roles(first.state()), "model")

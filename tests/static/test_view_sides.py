@@ -1,5 +1,4 @@
-"""Of Gaussians that were found from several sides a camera sees those of the side that it stands
-nearest to."""
+"""Gaussians observed from several sides: a camera renders those of its nearest side."""
 
 from __future__ import annotations
 
@@ -26,7 +25,7 @@ def two_sides() -> StaticScene:
 
 
 @pytest.mark.parametrize(("camera", "side"), [(0, 0), (2, 1)])
-def test_a_camera_sees_the_nearest_side_alone(camera: int, side: int) -> None:
+def test_camera_renders_only_the_nearest_side(camera: int, side: int) -> None:
     options = RenderOptions(depth="expected")
     both = two_sides().render(RING, options=options)
     alone = StaticScene(gaussians=PARTS[side]).render(RING.select(camera), options=options)
@@ -41,7 +40,7 @@ def test_a_camera_sees_the_nearest_side_alone(camera: int, side: int) -> None:
     )
 
 
-def test_images_teach_their_own_side_alone() -> None:
+def test_images_train_only_the_visible_sides() -> None:
     scene = two_sides()
     probe = torch.zeros(1, 100, 4, requires_grad=True)
     colours = scene.gaussians.sh.clone().requires_grad_()

@@ -43,7 +43,7 @@ class FrameStack:
     static: np.ndarray  # (T, H, W, 3) float32, renderings of the static model
     alphas: np.ndarray  # (T, H, W) of the images, or of the static model for images without alpha
     static_alphas: np.ndarray  # (T, H, W) of the static model
-    depths: np.ndarray  # (T, H, W) of the static model, ``NEVER`` where it is transparent
+    depths: np.ndarray  # (T, H, W) of the static model, ``NO_DEPTH`` where it is transparent
     poses: np.ndarray  # (T, 4, 4) cam_from_world
     intrinsics: np.ndarray  # (T, 3, 3)
     centers: np.ndarray = field(init=False)  # (T, 3) camera positions

@@ -117,7 +117,7 @@ def detect_changes(images: np.ndarray) -> np.ndarray:
 
 
 def _drop_specks(differs: np.ndarray, certainty: np.ndarray) -> np.ndarray:
-    """Drop small regions, and regions where ``certainty`` is below ``SURE`` everywhere."""
+    """Drop small regions, and regions where ``certainty`` is below ``HYSTERESIS`` everywhere."""
     from skimage.measure import label
 
     labels: np.ndarray = np.asarray(label(differs, connectivity=1))

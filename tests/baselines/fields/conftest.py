@@ -1,4 +1,4 @@
-"""One small capture for all tests of fields."""
+"""A small capture shared by the tests of fields."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 
 @pytest.fixture(scope="session")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """24 views of an object before nothing, 24 px."""
+    """24 views of an object on a transparent background, 24 px."""
     folder = tmp_path_factory.mktemp("fields") / "capture"
     write_static_capture(folder, StaticOptions(size=24, num_train=24, num_test=2, samples=1))
     return folder

@@ -1,4 +1,4 @@
-"""Cells that no camera sees stay empty."""
+"""Cells outside all view frusta stay empty."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dyngs.ops.rays import Space
 
 
 def view_from(position: tuple[float, float, float], turn: float) -> View:
-    """A camera with a field of view of 53 by 37 degrees, turned about the vertical axis."""
+    """A camera with a field of view of 53 by 37 degrees, rotated about the vertical axis."""
     rotation = np.array(
         [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
     )
@@ -27,7 +27,7 @@ VIEWS = [view_from((0.3, 0.1, -2.5), 0.0), view_from((0.5, -0.2, 0.4), 1.9)]
 
 
 @pytest.mark.parametrize("cells", [12, 9])
-def test_all_that_a_camera_sees_may_be_occupied(cells: int) -> None:
+def test_cells_in_any_frustum_may_be_occupied(cells: int) -> None:
     space = Space((0.2, 0.0, -0.3), 1.0, 3, cells)
     seen = cells_in_view(space, VIEWS)
     rng = np.random.default_rng(0)

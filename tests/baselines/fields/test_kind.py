@@ -1,5 +1,4 @@
-"""Fields through the commands: trained, resumed, evaluated, drawn, exported as a mesh; what is
-refused, in a line."""
+"""Radiance fields by the commands: training, resuming, evaluation, rendering, mesh export, errors."""
 
 from __future__ import annotations
 
@@ -30,9 +29,7 @@ def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("keys", [NGP, NERF], ids=["ngp", "nerf"])
-def test_a_run_that_is_cut_ends_with_the_same_bytes(
-    capture: Path, tmp_path: Path, keys: list[str]
-) -> None:
+def test_resume_equals_uninterrupted_run(capture: Path, tmp_path: Path, keys: list[str]) -> None:
     run = dyngs.train(config_of(capture, *keys, *STEPS, f"run.dir={tmp_path / 'run'}"))
     last = checkpoint_paths(run)[-1]
     whole = last.read_bytes()
@@ -41,7 +38,7 @@ def test_a_run_that_is_cut_ends_with_the_same_bytes(
     assert last.read_bytes() == whole
 
 
-def test_it_is_evaluated_drawn_and_viewed(run: Path, tmp_path: Path) -> None:
+def test_run_is_evaluated_rendered_and_viewed(run: Path, tmp_path: Path) -> None:
     report = evaluate_run(run)
     assert report.psnr > 11
     assert report.num_gaussians == 0
@@ -58,7 +55,7 @@ def test_it_is_evaluated_drawn_and_viewed(run: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj"])
-def test_its_surface_is_a_mesh_with_colours(
+def test_exported_surface_is_a_coloured_mesh(
     run: Path, tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("dyngs.baselines.fields.scene.CELLS", 24)

@@ -18,8 +18,7 @@ MIDDLE = torch.tensor([0.3, -0.1, 0.2])
 
 @dataclass(frozen=True)
 class Ball(NgpField):
-    """Density exp(10 (radius - distance)) around a point, of radius 0.5, and colours that are the
-    direction."""
+    """A ball with density exp(10 (0.5 - distance)), coloured by direction."""
 
     def densities(self, points: torch.Tensor, time: float) -> torch.Tensor:
         return 25 * torch.exp(10 * (0.5 - (points - MIDDLE).norm(dim=1))) * (1.5 / self.space.half)
@@ -35,7 +34,7 @@ def scene() -> FieldScene:
     return FieldScene(Ball(**vars(plain)))
 
 
-def test_a_ball_is_found_with_faces_outwards_and_colours(scene: FieldScene) -> None:
+def test_mesh_of_a_ball_has_outward_faces_and_colours(scene: FieldScene) -> None:
     found = extract_surface(scene, cells=40)
     offsets = found.vertices - MIDDLE.numpy()
     assert np.linalg.norm(offsets, axis=1) == pytest.approx(np.full(len(offsets), 0.5), abs=2e-3)

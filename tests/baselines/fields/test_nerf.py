@@ -1,4 +1,4 @@
-"""NeRF's networks: the published encoding and sizes, and what rays see of a known field."""
+"""NeRF networks: published encoding and layer sizes, and rendering of a known density field."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from dyngs.ops.rays import Rays, Space
 SPACE = Space((0.0, 0.0, 0.0), 1.5, 1, 1)
 
 
-def test_rays_see_a_slab_of_even_density() -> None:
-    """Networks of biases alone: density 2 everywhere, one colour; the last sample hides all that is
-    left."""
+def test_rendering_of_a_constant_density_field() -> None:
+    """Biases alone give density 2 and one colour everywhere. The last sample is opaque."""
     model = NerfModel(sizes="tiny")
     field = NerfField.new(model, SPACE, torch.Generator().manual_seed(0))
     with torch.no_grad():
@@ -37,8 +36,8 @@ def test_rays_see_a_slab_of_even_density() -> None:
     assert float(seen.depth[0]) == pytest.approx(2.5 + 0.5, abs=0.1)
 
 
-def test_all_that_is_learned_gets_gradients_and_none_is_of_rounding() -> None:
-    """The last sample is 1e10 long: what is left of sums must not be multiplied by that."""
+def test_every_parameter_gets_a_gradient_free_of_rounding_errors() -> None:
+    """The last sample is 1e10 long, which must not amplify rounding errors of the sums."""
     field = NerfField.new(NerfModel(sizes="tiny"), SPACE, torch.Generator().manual_seed(3))
     for x in field.parameters.values():
         x.requires_grad_()

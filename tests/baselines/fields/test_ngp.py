@@ -1,4 +1,4 @@
-"""Instant-NGP: sizes, what rays see by the kernels and by a loop, what is stored."""
+"""Instant-NGP: sizes, rendering by the kernels and by a loop, and checkpoints."""
 
 from __future__ import annotations
 
@@ -31,9 +31,8 @@ def rays_towards_it(count: int = 20) -> Rays:
 
 
 @pytest.mark.parametrize("time", [False, True])
-def test_rays_see_what_places_along_them_are(time: bool) -> None:
-    """Sample by sample, by the densities and colours of places: occupied ones, up to where nothing
-    is left."""
+def test_rays_composite_the_samples_along_them(time: bool) -> None:
+    """Compared sample by sample with densities and colours in occupied cells, until a ray ends."""
     field = field_of(SMALL.model_copy(update={"time": time}))
     rays = rays_towards_it()
     with torch.no_grad():
@@ -56,7 +55,7 @@ def test_rays_see_what_places_along_them_are(time: bool) -> None:
     assert float(seen.transmittance.min()) < 0.6
 
 
-def test_mist_is_as_thick_in_each_cube() -> None:
+def test_density_is_equal_in_each_cube() -> None:
     field = NgpField.new(
         SMALL, Space((0.1, 0.0, -0.2), 1.2, 4, 8), torch.Generator().manual_seed(0)
     )

@@ -1,4 +1,4 @@
-"""Instant-NGP learns a small capture, on rays that fill its steps; its schedule."""
+"""Instant-NGP training on a small capture: ray batches and schedule."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def held_out_psnr(trainer: Trainer[NgpTraining]) -> float:
     return sum(psnr(x, images[i].composite(white)) for i, x in enumerate(drawn)) / len(drawn)
 
 
-def test_views_that_were_held_out_are_learned(capture: Path) -> None:
-    """The floor is 1 dB below what came out when this was written; a white image has 10 dB."""
+def test_training_improves_held_out_views(capture: Path) -> None:
+    """The threshold is 1 dB below the measured PSNR; a white image has 10 dB."""
     trainer = trained(capture, 150)
     assert held_out_psnr(trainer) > 15.5
     field = trainer.model.scene.field
@@ -56,7 +56,7 @@ def test_views_that_were_held_out_are_learned(capture: Path) -> None:
     assert 0.4 < samples / 2**12 < 2.5, "rays fill a step, about"
 
 
-def test_untouched_rows_stay_as_they_are(capture: Path) -> None:
+def test_unused_table_rows_are_not_updated(capture: Path) -> None:
     trainer = build_trainer(config_of(capture, *NGP))
     table = trainer.model.scene.field.parameters["table"]
     before = table.detach().clone()

@@ -1,4 +1,4 @@
-"""Samples of NeRF: one in each part of the way, then as the weights have it."""
+"""NeRF sampling: stratified samples, then importance samples."""
 
 from __future__ import annotations
 

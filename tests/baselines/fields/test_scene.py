@@ -1,4 +1,4 @@
-"""A field as something to draw: depth, parts of a large image, times."""
+"""A field as a scene: depth, tiles of a large image, times."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def test_depth_is_along_the_axis_of_the_camera_and_expected_is_divided_by_alpha(
 
 
 @pytest.mark.parametrize("keys", [NGP, NERF], ids=["ngp", "nerf"])
-def test_with_time_it_moves(moving: Path, keys: list[str]) -> None:
-    """It learns the times of the capture, and its scene is drawn at any."""
+def test_deformed_field_changes_with_time(moving: Path, keys: list[str]) -> None:
+    """Trained at the times of the capture, rendered at any time."""
     trainer = build_trainer(config_of(moving, *keys, "model.time=true", "train.steps=20"))
     for _ in range(20):
         trainer.step()

@@ -1,4 +1,4 @@
-"""Samples that hardly show are thinned out, and what is seen stays the same on average."""
+"""Subsampling of nearly invisible samples keeps the expected rendering."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dyngs.ops.rays import Samples, composite
 def samples_of(
     num_rays: int, each: int, generator: torch.Generator
 ) -> tuple[torch.Tensor, Samples]:
-    """Return densities and samples: mist, and a wall that half of the rays meet."""
+    """Return densities and samples of fog, and of a wall that half of the rays hit."""
     starts = (torch.arange(each) * 0.1).repeat(num_rays).double()
     densities = 2e-2 * torch.rand(num_rays, each, generator=generator, dtype=torch.float64)
     densities[::2, each // 2 : each // 2 + 5] = 40.0
@@ -25,7 +25,7 @@ def samples_of(
     return densities.flatten(), samples
 
 
-def test_what_shows_is_kept_and_the_rest_is_thinned() -> None:
+def test_visible_samples_are_kept_and_others_subsampled() -> None:
     generator = torch.Generator().manual_seed(0)
     densities, samples = samples_of(40, 40, generator)
     found, which = thin_samples(
@@ -44,9 +44,10 @@ def test_what_shows_is_kept_and_the_rest_is_thinned() -> None:
     assert torch.equal(found.offsets.diff(), torch.bincount(found.rays, minlength=40))
 
 
-def test_rays_see_the_same_on_average_with_the_same_gradients() -> None:
-    """Over all four choices the mist in front of a wall lets as much through, and gets the same
-    gradients."""
+def test_thinned_rays_are_unbiased_with_unbiased_gradients() -> None:
+    """Averaged over all four choices, fog in front of a wall has the same transmittance and
+    gradients.
+    """
     densities, samples = samples_of(2, 40, torch.Generator().manual_seed(0))
     colours = torch.rand(80, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 

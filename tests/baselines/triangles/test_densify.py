@@ -1,4 +1,4 @@
-"""Which triangles are split, which removed."""
+"""Splitting and pruning of triangles."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dyngs.baselines.triangles.training import TriangleStatistics, densify, prun
 
 
 def seen(count: int) -> TriangleStatistics:
-    """All triangles, everywhere, in each of 10 views."""
+    """Statistics of triangles that cover everything in each of 10 views."""
     tallies = TriangleStatistics(count)
     tallies.views += 10
     tallies.seen += 10
@@ -36,7 +36,7 @@ def test_degenerate_triangles_are_prunable() -> None:
         assert prunable(good, sliver, 1.0).tolist() == [goes]
 
 
-def test_those_with_the_largest_gradients_are_split_within_the_limit() -> None:
+def test_largest_gradients_are_split_within_the_limit() -> None:
     patches = bent(6)
     kept, added = densify(patches, seen(6), 1.0, 12, 1)
     assert kept.tolist() == [0, 1, 2, 3]

@@ -1,4 +1,4 @@
-"""Where triangles begin: on a surface, in the first step, and not again after that."""
+"""Initial triangles: created on a surface in the first step only."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dyngs.baselines.triangles.training import TriangleTraining
 from dyngs.training.new_trainer import build_trainer
 
 
-def test_the_first_step_begins_on_the_surface(capture: Path) -> None:
+def test_initial_triangles_lie_on_the_surface(capture: Path) -> None:
     trainer: Any = build_trainer(config_of(capture, "model.gaussian_steps=200"))
     model: TriangleTraining = trainer.model
     before = len(model.scene.patches)

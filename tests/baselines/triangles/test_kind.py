@@ -1,5 +1,4 @@
-"""Curved triangles through the commands: trained, resumed, evaluated, drawn, exported; what is
-refused, in a line."""
+"""Curved triangles by the commands: training, resuming, evaluation, rendering, export, errors."""
 
 from __future__ import annotations
 
@@ -43,7 +42,7 @@ def test_training_improves_and_respects_max_triangles(run: Path) -> None:
     assert max_pixels(scene, training_cameras(views, load_resolved(run).data)).min() >= 1
 
 
-def test_a_run_that_is_cut_ends_with_the_same_bytes(capture: Path, tmp_path: Path) -> None:
+def test_resume_equals_uninterrupted_run(capture: Path, tmp_path: Path) -> None:
     # cut right after a change and the first texture
     steps = ["train.steps=112", "train.save_every=56"]
     run = dyngs.train(config_of(capture, *steps, f"run.dir={tmp_path / 'run'}"))
@@ -55,8 +54,7 @@ def test_a_run_that_is_cut_ends_with_the_same_bytes(capture: Path, tmp_path: Pat
 
 
 def test_file_fits_requested_size(capture: Path, tmp_path: Path) -> None:
-    """Half of what its 72 values a triangle take at the usual precision: it begins with fewer, and
-    is no larger."""
+    """The limit is half the size of 72 values per triangle, so the run starts with fewer."""
     run = tmp_path / "run"
     keys = ["train.steps=60", "model.gaussian_steps=100", "model.max_triangles=1000"]
     dyngs.train(config_of(capture, *keys, "budget.max_mb=0.0125", f"run.dir={run}"))
@@ -79,7 +77,7 @@ def test_a_file_that_is_too_small_is_refused(capture: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj"])
-def test_it_is_a_mesh_with_colours(run: Path, tmp_path: Path, suffix: str) -> None:
+def test_export_is_a_coloured_mesh(run: Path, tmp_path: Path, suffix: str) -> None:
     out = tmp_path / f"mesh{suffix}"
     assert main(["export", str(run), "--format", "mesh", "--segments", "2", "--out", str(out)]) == 0
     mesh = trimesh.load(out, force="mesh", process=False)
@@ -139,7 +137,7 @@ def test_coincident_points_are_refused(capture: Path, tmp_path: Path) -> None:
 def test_a_capture_that_shows_no_surface_is_refused(
     capture: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Gaussians of images that show nothing need hundreds of steps until they have faded."""
+    """Gaussians of empty images take hundreds of steps to become transparent."""
     monkeypatch.setattr("dyngs.baselines.triangles.training.fuse_depths", lambda *_: None)
     few = ["model.gaussian_steps=2", "run.dir=run"]
     assert main(["train", f"data.root={capture}", "model.kind=bg_triangle", *few]) == 2

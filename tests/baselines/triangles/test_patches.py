@@ -1,4 +1,4 @@
-"""Curved triangles: sizes, quarters, textures, and what a file may hold."""
+"""Curved triangles: sizes, subdivision, textures, and validation of files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dyngs.ops.patches import lattice, patch_values
 
 
 def test_quarters_are_the_same_surface() -> None:
-    """Every point of a quarter is the point of the whole at its place."""
+    """Every point of a quarter equals the point of the whole patch at the same coordinates."""
     points = bent(2).points.double()
     parts = subdivide(points)
     assert parts.shape == (8, 6, 3)

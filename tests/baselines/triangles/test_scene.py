@@ -1,5 +1,4 @@
-"""Curved triangles drawn: colour, alpha, depth, directions, and edges that stay sharp when
-enlarged."""
+"""Rendering of curved triangles: colour, alpha, depth, view dependence and sharp edges."""
 
 from __future__ import annotations
 
@@ -15,7 +14,7 @@ PLAIN = TriangleOptions()
 
 
 def scene_of(*triangles: torch.Tensor) -> TriangleScene:
-    """Red ones."""
+    """A scene of red triangles."""
     points = torch.cat(triangles)
     return TriangleScene(
         Patches(points, RED.expand(len(points), 6, 3).clone(), torch.zeros(len(points), 0, 3)), 1.0
@@ -39,14 +38,14 @@ def test_a_square_of_two_triangles_is_opaque_and_of_its_colour() -> None:
 
 
 def test_edges_are_as_sharp_when_enlarged() -> None:
-    """As many pixels are between all and nothing along a row at 8 times the size."""
+    """At 8 times the size, a row has as many pixels of partial alpha."""
     rows = [scene_of(*SQUARE).render(camera(size)).alpha[0, size // 2] for size in (32, 256)]
     soft = [int(((row > 0.01) & (row < 0.99)).sum()) for row in rows]
     assert 0 < soft[0] <= 8
     assert soft[1] == soft[0]
 
 
-def test_harmonics_tell_directions_apart() -> None:
+def test_harmonics_make_colours_view_dependent() -> None:
     patches = bent(1)
     there = camera()
     back = camera()
@@ -75,9 +74,8 @@ def test_gradients_reach_everything() -> None:
         assert bool(x.grad.isfinite().all())
 
 
-def test_what_has_no_area_is_not_drawn_and_spoils_no_gradient() -> None:
-    """All points equal, on a line, not a number, behind the camera and much larger than the scene,
-    with a good one."""
+def test_degenerate_triangles_are_not_drawn_and_keep_gradients_finite() -> None:
+    """Coincident, collinear, NaN, behind the camera, and huge triangles, beside a valid one."""
     nan = SQUARE[0].clone()
     nan[0, 2, 1] = torch.nan
     wide = triangle((-1e5, 1e5, -9), (1e5, 1e5, -9), (0, -1e5, -9))

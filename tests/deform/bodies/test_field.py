@@ -1,5 +1,4 @@
-"""Bodies within another field: they move rigidly, all else as it did, and nothing is lost when they
-are stored."""
+"""Rigid bodies within another field: rigid motion, unchanged other Gaussians, checkpoints."""
 
 from __future__ import annotations
 
@@ -36,7 +35,7 @@ def field_of(kind: str = "control_nodes", points: int = 7) -> BodyField:
 
 @pytest.mark.parametrize("kind", ["control_nodes", "hexplane"])
 def test_bodies_move_rigidly_and_others_as_without_them(kind: str) -> None:
-    """x' = R (x - c) + p in float64; the Gaussians turn with their body, and keep their size."""
+    """x' = R (x - c) + p in float64. The Gaussians rotate with their body and keep their size."""
     field = field_of(kind)
     gaussians = cloud()
     for time in TIMES:
@@ -65,8 +64,7 @@ def test_bodies_move_rigidly_and_others_as_without_them(kind: str) -> None:
 
 
 def test_bodies_turn_into_the_light_and_out_of_it() -> None:
-    """Light from +x: a Gaussian is lit by how far along x it lies from its body's centre, by
-    now."""
+    """Light from +x: irradiance follows the current x of a Gaussian relative to its body's centre."""
     field = field_of()
     means = cloud().means
     field.parameters["light"].data[0] = torch.tensor([0.5, 0.25, 0.0])

@@ -1,5 +1,4 @@
-"""What one moving camera shows: pixels, rays, the pixels on a ball, and what differs from the
-static model."""
+"""Frames of one moving camera: pixels, rays, ball surfaces and residuals of the static model."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ def test_rays_go_through_the_points_that_they_show() -> None:
 
 
 def test_pixels_on_a_ball_see_its_surface() -> None:
-    """They differ from the static model, unless something hides the ball."""
+    """Pixels on the ball differ from the static model unless the ball is occluded."""
     frame_stack, centers, _ = rolling()
     rows, columns, normals = frame_stack.ball_pixels(3, centers[3], 0.28)
     assert len(rows) > 50
@@ -61,7 +60,7 @@ def test_one_camera_shows_each_time_once() -> None:
     assert order_moving_camera([replace(v, cam_from_world=np.eye(4)) for v in views]) is None
 
 
-def test_masked_pixels_are_as_the_static_model_has_them() -> None:
+def test_masked_pixels_have_no_residual() -> None:
     gaussians = cloud()
     camera = one_camera_of(8)
     rgb = torch.rand(8, 8, 3)

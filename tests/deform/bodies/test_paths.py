@@ -1,5 +1,4 @@
-"""Paths of what moves before one moving camera: a ball is found where it is, and nothing where
-nothing moves."""
+"""Detection of moving balls in the frames of one moving camera."""
 
 from __future__ import annotations
 
@@ -10,7 +9,7 @@ from rolling_ball import hopping, rolling
 from dyngs.deform.bodies.paths import find_paths
 
 
-def test_a_ball_is_found_at_all_times() -> None:
+def test_ball_is_detected_at_all_times() -> None:
     frame_stack, centers, _ = rolling()
     (path, *_) = find_paths(frame_stack, frame_stack.differences())
     assert np.linalg.norm(path.centers - centers, axis=1).max() < 0.25 * 0.28
@@ -18,7 +17,7 @@ def test_a_ball_is_found_at_all_times() -> None:
 
 
 def test_a_ball_that_hops_is_followed_through_its_bounces() -> None:
-    """Smoothness alone would cut the corners where it leaves the plate again."""
+    """A smoothness prior alone would round off the bounces."""
     frame_stack, centers, _ = hopping()
     path = find_paths(frame_stack, frame_stack.differences())[0]
     errors = np.linalg.norm(path.centers - centers, axis=1)

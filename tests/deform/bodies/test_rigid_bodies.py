@@ -1,5 +1,4 @@
-"""Bodies to begin motion with: those that turn are taken, with Gaussians on them that follow their
-true motion."""
+"""Initial rigid bodies: rotating bodies are accepted, and their Gaussians follow the true motion."""
 
 from __future__ import annotations
 
@@ -13,9 +12,10 @@ from dyngs.deform.field import FieldSetup
 from dyngs.deform.fields import create_field
 
 
-def test_a_rolling_ball_begins_on_its_way() -> None:
-    """The seeds lie on the ball in the middle of the clip, and the field takes them along the true
-    motion."""
+def test_rolling_ball_is_initialized_with_its_trajectory() -> None:
+    """The seeds lie on the ball at the middle of the clip, and the field moves them along the true
+    path.
+    """
     frame_stack, centers, turns = rolling()
     found = find_bodies(frame_stack, 400, 4)
     assert found is not None
@@ -45,8 +45,9 @@ def test_a_rolling_ball_begins_on_its_way() -> None:
 
 
 def test_sliding_body_is_not_a_rigid_rotation() -> None:
-    """It is left to others, or a body with hardly any turn: its path, too, is found from the
-    images."""
+    """It is left to other models or becomes a body with little rotation. Its path is estimated,
+    too.
+    """
     frame_stack, _, _ = rolling(turns=False)
     found = find_bodies(frame_stack, 400, 4)
     assert found is None or angles_deg(found.bodies[0].rotation.rotations).max() < 12

@@ -1,4 +1,4 @@
-"""How things turn, from the colours of their surfaces alone."""
+"""Estimation of body rotation from surface colours."""
 
 from __future__ import annotations
 
@@ -15,15 +15,14 @@ RADIUS = 0.28
 
 
 def errors_deg(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """(T,) angles between rotations, the body's own axes chosen as the best that fit all."""
+    """(T,) angular errors in degrees after the best alignment of the body axes."""
     u, _, v = np.linalg.svd(np.einsum("tji,tjk->ik", found, truth))
     axes = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
     return angles_deg(np.einsum("tij,jk,tlk->til", found, axes, truth))
 
 
-def test_a_rolling_ball_is_followed_in_its_rotation() -> None:
-    """It turns by more than a full turn; of its turn from image to image nothing is known
-    beforehand."""
+def test_rotation_of_a_rolling_ball_is_estimated() -> None:
+    """The ball makes more than one full turn, and no initial angular velocity is given."""
     frame_stack, centers, truth = rolling()
     rotation = estimate_rotation(frame_stack, Path(centers, RADIUS, 1.0))
     errors = errors_deg(rotation.rotations, truth)
@@ -32,8 +31,8 @@ def test_a_rolling_ball_is_followed_in_its_rotation() -> None:
     assert rotation.disagreement < 0.4 * rotation.disagreement_without_rotation
 
 
-def test_two_turns_about_any_axis_are_followed() -> None:
-    """No rolling and no heading says beforehand how fast."""
+def test_spin_about_a_tilted_axis_is_estimated() -> None:
+    """The ball spins in place, so its path holds no hint of the angular velocity."""
     frame_stack, centers, truth = hopping()
     errors = errors_deg(estimate_rotation(frame_stack, Path(centers, RADIUS, 1.0)).rotations, truth)
     assert np.median(errors) < 6

@@ -1,4 +1,4 @@
-"""Shadows of balls: where light is hidden, how much of it, and what that does to colours."""
+"""Shadows of balls: occluded directions, their amount, and their effect on colours."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Changes in the images of a camera that stands still: what moves, but neither noise nor
-shadows."""
+"""Change detection in the images of a fixed camera, robust to noise and shadows."""
 
 from __future__ import annotations
 
@@ -15,13 +14,13 @@ TIMES = tuple(i / 8 for i in range(9))
 
 
 def static(noise: float = 0.0, count: int = 9) -> np.ndarray:
-    """Images (T, H, W, 3) of one camera, nothing moves."""
+    """Images (T, H, W, 3) of a static scene by one camera."""
     shown = [drawn(cameras(1)[0], [], noise, seed) for seed in range(count)]
     return (255 * torch.stack(shown)).round().to(torch.uint8).numpy()
 
 
 def with_patch(factor: tuple[float, float, float], at: int = 0) -> np.ndarray:
-    """The same with the light in a square changed in the image ``at``."""
+    """The images with the brightness of a square changed in image ``at``."""
     images = static().copy()
     images[at, 20:40, 20:40] = (
         (images[at, 20:40, 20:40] * np.array(factor)).clip(0, 255).astype(np.uint8)
@@ -31,7 +30,7 @@ def with_patch(factor: tuple[float, float, float], at: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_ball_is_found_at_its_position(noise: float) -> None:
-    """Each image: the pixels whose rays meet the ball, but for those at its rim."""
+    """Pixels whose rays hit the ball are marked in each image, except at its rim."""
     path = [Ball((0.0, 1.2 * t - 0.6, 0.0)) for t in TIMES]
     camera = cameras(1)[0]
     one = filmed(lambda t: [path[TIMES.index(t)]], TIMES, 1, noise)[0]
@@ -42,9 +41,8 @@ def test_ball_is_found_at_its_position(noise: float) -> None:
     assert np.abs(one.median / 255 - drawn(camera, []).numpy()).mean() < 0.02
 
 
-def test_a_shadow_is_none_of_it() -> None:
-    """All channels darker alike; but a coloured or a brighter patch is a thing, and so is a black
-    one."""
+def test_shadows_are_not_changes() -> None:
+    """A shadow darkens all channels alike. Coloured, brighter and black patches are objects."""
     assert not detect_changes(with_patch((0.6, 0.62, 0.65))).any()
     for factor in ((0.9, 0.4, 0.4), (1.4, 1.4, 1.4), (0.05, 0.05, 0.05)):
         found = detect_changes(with_patch(factor, 3))

@@ -1,4 +1,4 @@
-"""Visual hulls of balls of known places, from cameras on a ring."""
+"""Visual hulls of balls at known positions, from cameras on a ring."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MOMENTS = 5
 
 
 def hulls(*balls: Ball, count: int = 8) -> list[Blob]:
-    """Of the last of some moments; before, the balls were not there."""
+    """Hulls at the last of several times; the balls appear only then."""
     times = [i / (MOMENTS - 1) for i in range(MOMENTS)]
     clips = filmed(lambda t: balls if t == 1.0 else [], times, count)
     return sorted(
@@ -24,8 +24,8 @@ def hulls(*balls: Ball, count: int = 8) -> list[Blob]:
 
 # of four, three suffice: their hull has corners
 @pytest.mark.parametrize(("count", "fraction"), [(4, 0.3), (8, 0.1)])
-def test_a_ball_is_found(count: int, fraction: float) -> None:
-    """Its centre to a fraction of its radius, its radius to a fifth."""
+def test_visual_hull_of_one_ball(count: int, fraction: float) -> None:
+    """The centre is accurate to a fraction of the radius, the radius to a fifth."""
     ball = Ball((0.31, -0.22, 0.13))
     (found,) = hulls(ball, count=count)
     assert np.linalg.norm(found.center - ball.center) < fraction * ball.radius
@@ -35,7 +35,7 @@ def test_a_ball_is_found(count: int, fraction: float) -> None:
         assert np.linalg.norm(found.cubes - np.array(ball.center), axis=1).max() < 1.6 * ball.radius
 
 
-def test_two_balls_are_two() -> None:
+def test_two_balls_have_separate_hulls() -> None:
     found = hulls(Ball((-0.4, 0.0, 0.1)), Ball((0.5, 0.2, -0.1), 0.15, (0.1, 0.2, 0.9)))
     places = np.array([blob.center for blob in found[:2]])
     assert np.abs(places - np.array([[-0.4, 0.0, 0.1], [0.5, 0.2, -0.1]])).max() < 0.05
@@ -43,7 +43,7 @@ def test_two_balls_are_two() -> None:
 
 
 def test_object_occluded_in_one_camera_is_found() -> None:
-    """Something still hides it there; but of three cameras all must see it."""
+    """Occlusion in one of many cameras is tolerated; with three cameras all must see the object."""
     times = [i / (MOMENTS - 1) for i in range(MOMENTS)]
     for count, number in ((8, 1), (3, 0)):
         clips = filmed(lambda t: [Ball((0.1, 0.0, 0.0))] if t == 1.0 else [], times, count)

@@ -1,4 +1,4 @@
-"""Where motion begins before fixed cameras: nothing, one thing, two."""
+"""Initial motion for fixed cameras: no object, one object, two objects."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def crossing(time: float) -> tuple[float, float, float]:
     return (1.6 * time - 0.8, 0.3, 0.1)
 
 
-def test_one_ball_begins_at_each_time() -> None:
+def test_ball_is_initialized_at_each_time() -> None:
     found = started(lambda t: [Ball(crossing(t))])
     assert found.message is not None
     assert "found moving objects at 12 of 12 times" in found.message
@@ -33,7 +33,7 @@ def test_one_ball_begins_at_each_time() -> None:
 
 @pytest.mark.parametrize(("count", "limit"), [(6, 600), (1, 600), (6, 0)])
 def test_no_motion_without_changes(count: int, limit: int) -> None:
-    """A ball that stands still; one camera, which sees no depth; no Gaussians allowed."""
+    """A static ball, a single camera (no depth), and a budget of no Gaussians."""
     at = (lambda _: (0.0, 0.0, 0.0)) if count == 6 and limit else crossing
     found = started(lambda t: [Ball(at(t))], count, limit)
     assert found == InitialMotion()

@@ -1,4 +1,4 @@
-"""Tracks of blobs of known places: straight, curved, lost for a while, crossing, and noise."""
+"""Linking of blobs into tracks: straight, curved, interrupted, crossing, and noise."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def blob(
 
 
 def along(path: Path, times: Sequence[float] = TIMES) -> list[list[Blob]]:
-    """One blob at each of ``times``, none at the others of ``TIMES``."""
+    """One blob at each of ``times``, no blob at other times of ``TIMES``."""
     return [[blob(path(t))] if t in times else [] for t in TIMES]
 
 
@@ -36,7 +36,7 @@ def along(path: Path, times: Sequence[float] = TIMES) -> list[list[Blob]]:
     ],
 )
 def test_one_object_gives_one_track(path: Path) -> None:
-    """That goes about its own diameter from one time to the next."""
+    """The object moves by about its diameter per time step."""
     (track,) = link_tracks(TIMES, along(path))
     assert track.times == TIMES
     assert track.is_travelling
@@ -61,7 +61,7 @@ def test_track_survives_short_gaps() -> None:
 
 
 def test_crossing_objects_keep_separate_tracks() -> None:
-    """By velocity, where colours are alike; by colour, where they come from one place."""
+    """Equal colours are separated by velocity, equal positions by colour."""
     for color in (RED, BLUE):
         found = [[blob((3 * t, 0.1, 0)), blob((3 - 3 * t, -0.1, 0), color=color)] for t in TIMES]
         tracks = link_tracks(TIMES, found)
@@ -72,7 +72,7 @@ def test_crossing_objects_keep_separate_tracks() -> None:
 
 
 def test_oscillating_object_does_not_travel() -> None:
-    """As parts of a thing that turns in place seem to do."""
+    """Parts of an object that rotates in place seem to oscillate."""
     found = [
         [blob((0.9 * (i % 3 == 0), 0.0, 0.0), 0.1 + 0.1 * (i == 5))] for i in range(len(TIMES))
     ]

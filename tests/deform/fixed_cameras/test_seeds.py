@@ -1,5 +1,4 @@
-"""Gaussians at single times: where the ball is then, in the colours of then, with the velocity of
-its track."""
+"""Initial Gaussians at single times: position, colour and velocity of a tracked ball."""
 
 from __future__ import annotations
 
@@ -15,7 +14,7 @@ BOX = np.full(3, -2.0), np.full(3, 2.0)
 
 
 def ball_at(time: float) -> Ball:
-    """It travels along z, and is of another red in the second half of the clip."""
+    """The ball moves along z and changes its red in the second half of the clip."""
     return Ball(
         (0.1, 0.2, 1.8 * time - 0.9),
         BALL.radius,
@@ -24,7 +23,9 @@ def ball_at(time: float) -> Ball:
 
 
 def test_initial_gaussians_cover_a_ball_at_each_time() -> None:
-    """On its surface, in its colour of that time; at another place or time they would not pay."""
+    """Gaussians lie on its surface with its colour at that time, and fit no other position or
+    time.
+    """
     clips = filmed(lambda t: [ball_at(t)], TIMES, 7)
     (track,) = find_tracks(clips, *BOX)
     timed_gaussians = track_gaussians(track, clips, 4.0, num_terms=4)

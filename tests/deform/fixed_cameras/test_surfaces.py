@@ -1,5 +1,4 @@
-"""Surfaces that look different at a time: found in their colour of then, and not what something
-else hides."""
+"""Surfaces that change their colour at a time, excluding occluded ones."""
 
 from __future__ import annotations
 
@@ -18,7 +17,7 @@ INSIDE = 0.35  # Radius of the Gaussians, which are blurred: none shows what is 
 
 
 def shell(count: int = 400) -> Gaussians:
-    """Flat red Gaussians all over a ball."""
+    """Flat red Gaussians on the surface of a ball."""
     i = torch.arange(count)
     z = 1 - (2 * i + 1) / count
     turn = 2.39996 * i

@@ -1,5 +1,4 @@
-"""Affine colours of images: found again from what they did, and backgrounds are not in front of the
-camera."""
+"""Affine colour transforms of images: recovered from known ones; backgrounds are not transformed."""
 
 from __future__ import annotations
 
@@ -23,13 +22,13 @@ def shown_as(rgb: Tensor, transmittance: Tensor | None = None) -> Rendering:
 
 
 def image_and_rendering() -> tuple[Image, Rendering]:
-    """Return colourful noise as the scene has it, and as a camera with WARM shows it."""
+    """Colour noise as rendered, and as photographed by a camera with WARM."""
     image = seen_from(cameras_before_wall(1))[0]
     rgb = 0.1 + 0.6 * torch.rand(60, 80, 3, generator=torch.Generator().manual_seed(0))
     return replace(image, rgb_premultiplied=rgb @ WARM[:, :3].T + WARM[:, 3]), shown_as(rgb)
 
 
-def test_an_affine_is_found_again() -> None:
+def test_known_affine_transform_is_recovered() -> None:
     image, rendering = image_and_rendering()
     found = fit_affine_colour([(image, rendering)], BLACK)
     # the ridge pulls a little to the identity
@@ -52,7 +51,7 @@ def test_masked_pixels_and_those_of_weight_0_do_not_count() -> None:
 
 
 def test_a_background_behind_a_cut_out_object_keeps_its_colour() -> None:
-    """Exposure makes the object twice as bright; the white that we put behind it stays white."""
+    """Exposure doubles the brightness of the object. The white background stays white."""
     image, rendering = image_and_rendering()
     alpha = torch.zeros(60, 80)
     alpha[:, 20:60], alpha[:, 60:] = 1.0, 0.5

@@ -1,4 +1,4 @@
-"""Harmonics fitted to a network: exact where they can be, with an error that is told where not."""
+"""Baking of a colour network into SH: exact where representable, with a residual otherwise."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def harmonics_shader(sh: Tensor, degree: int) -> Shader:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_harmonics_are_found_again(degree: int) -> None:
+def test_baking_recovers_known_harmonics(degree: int) -> None:
     gaussians = random_scene(n=8, degree=degree).gaussians
     sh = 0.1 * gaussians.sh  # no colour is clamped
     baked = bake_harmonics(gaussians, harmonics_shader(sh, degree), 3)
@@ -39,7 +39,7 @@ def test_harmonics_are_found_again(degree: int) -> None:
     assert torch.equal(baked.gaussians.means, gaussians.means)
 
 
-def test_the_error_is_what_cannot_be_fitted() -> None:
+def test_error_is_the_residual_of_the_fit() -> None:
     """White from one half of all directions, black from the other: degree 0 can only be grey."""
     gaussians = random_scene(n=3, degree=0).gaussians
 

@@ -1,5 +1,4 @@
-"""The shared network: nothing at first, then what it says, only for what is drawn, and no gradient
-to the geometry."""
+"""Colour network: zero at first, evaluated for visible Gaussians, no gradient to geometry."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ from dyngs.ops.shading import num_inputs
 def network(
     *, uses_time: bool = True, uses_normals: bool = True, last: float = 0.3, seed: int = 0
 ) -> ColourNetwork:
-    """8 hidden units, float64; with ``last=0`` an untrained one."""
+    """A float64 network with 8 hidden units; untrained with ``last=0``."""
     g = torch.Generator().manual_seed(seed)
     inputs = num_inputs(uses_time=uses_time, uses_normals=uses_normals)
 
@@ -42,7 +41,7 @@ def plain(gaussians: Gaussians) -> Gaussians:
 
 
 @pytest.mark.parametrize("uses_normals", [False, True])
-def test_a_zero_last_layer_changes_nothing(uses_normals: bool) -> None:
+def test_zero_last_layer_keeps_base_colours(uses_normals: bool) -> None:
     scene = random_scene()
     gaussians = plain(scene.gaussians)
     shader = network(last=0.0, uses_normals=uses_normals).shader(0.3)
@@ -51,7 +50,7 @@ def test_a_zero_last_layer_changes_nothing(uses_normals: bool) -> None:
 
 
 def test_each_gaussian_has_the_colour_of_its_own_inputs() -> None:
-    """View by view and one by one; zero for those that are not drawn."""
+    """Compared view by view and one by one. Culled Gaussians get zero."""
     scene = random_scene(n=6)
     net = network()
     gaussians = plain(scene.gaussians)
@@ -69,7 +68,7 @@ def test_each_gaussian_has_the_colour_of_its_own_inputs() -> None:
 
 
 def test_colours_do_not_move_gaussians() -> None:
-    """Base colours and weights get gradients; places, shapes and cameras none."""
+    """Base colours and weights get gradients; means, shapes and cameras do not."""
     scene = random_scene(n=6)
     gaussians = Gaussians(
         **{k: x.clone().requires_grad_() for k, x in plain(scene.gaussians).tensors().items()}
@@ -88,8 +87,7 @@ def test_colours_do_not_move_gaussians() -> None:
 
 
 def test_colours_turn_with_a_body() -> None:
-    """A body and a camera turned together look the same, if the network is told how the body was at
-    rest."""
+    """A body rotated together with the camera looks the same, given its rest pose."""
     scene = random_scene(n=5)
     net = network(uses_time=False)
     gaussians = plain(scene.gaussians)

@@ -1,5 +1,4 @@
-"""What is learned of colours beside harmonics, its rates, when harmonics are measured, and the
-entropy of opacities."""
+"""Training of colours beyond SH: learning rates, pruning of SH, and opacity entropy."""
 
 from __future__ import annotations
 
@@ -50,7 +49,7 @@ def colours(seed: int = 0, **options: object) -> NetworkTraining:
 
 
 def stored(learner: NetworkTraining) -> dict[str, Tensor]:
-    """What a checkpoint has of colours: of the scene, and of its training."""
+    """Colour tensors in a checkpoint, of the scene and of its optimizer."""
     return {
         name: x.clone()
         for name, x in strip_roles(learner.network.state() | learner.state()).items()
@@ -66,7 +65,7 @@ def test_the_rate_warms_up_and_falls_by_thirds() -> None:
     assert factors[1199] == pytest.approx(1 / 27)
 
 
-def test_state_goes_round_and_training_goes_on_alike() -> None:
+def test_resume_equals_uninterrupted_training() -> None:
     cameras = random_scene(views=1).to(torch.float32).cameras
     shown = torch.ones(1, 30, 2, dtype=torch.int32)
 
@@ -90,7 +89,7 @@ def test_state_goes_round_and_training_goes_on_alike() -> None:
     assert torch.equal(found.layers[1].weight, whole.network.layers[1].weight)
 
 
-def test_the_frozen_follow_the_set_and_go_round() -> None:
+def test_frozen_masks_follow_edits_and_are_restored() -> None:
     colours = AutoTraining(AutoColour(), 100, 20)
     assert colours.frozen_harmonics() is None
     colours.freeze(torch.tensor([True, False, True]))
@@ -110,7 +109,7 @@ def test_the_frozen_follow_the_set_and_go_round() -> None:
 
 
 @given(st.floats(-1e4, 1e4))
-def test_the_entropy_and_its_gradient_are_finite_and_right(logit: float) -> None:
+def test_opacity_entropy_and_its_gradient(logit: float) -> None:
     x = torch.tensor([logit], dtype=torch.float64, requires_grad=True)
     value = opacity_entropy(x)
     value.backward()
@@ -155,8 +154,8 @@ def _coloured(
 
 
 @pytest.mark.parametrize("name", COLOURS)
-def test_every_kind_of_colour_learns_and_goes_on_exactly(seven_views: Path, name: str) -> None:
-    """From a checkpoint before the harmonics are measured, and from one after."""
+def test_every_colour_model_trains_and_resumes_exactly(seven_views: Path, name: str) -> None:
+    """Resumed from a checkpoint before SH pruning, and from one after it."""
     whole = _coloured(seven_views, COLOURS[name])
     losses = []
     for step in range(1, 41):
@@ -175,8 +174,9 @@ def test_every_kind_of_colour_learns_and_goes_on_exactly(seven_views: Path, name
 
 @pytest.mark.parametrize("name", ["none pays", "some pay"])
 def test_harmonics_without_gain_are_dropped(seven_views: Path, name: str) -> None:
-    """For good: they stay zero while the set changes; the view that tells is not trained on
-    before."""
+    """Dropped SH stay zero after later edits. The validation view is excluded from training
+    before.
+    """
     busy = DefaultStrategy(
         start=1, stop=30_000, every=3, grad_threshold=1e-6, reset_every=1_000_000
     )

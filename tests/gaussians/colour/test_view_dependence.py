@@ -1,4 +1,4 @@
-"""Whose harmonics pay: of a matte scene none, of a partly glossy one those of the glossy part."""
+"""SH pruning: a matte scene keeps no SH, a partly glossy one keeps those of its glossy part."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ GLOSSY = torch.arange(24) < 6
 
 
 def camera(angle: float) -> Cameras:
-    """3 from the origin, which it looks at, turned about y."""
+    """A camera at distance 3 that looks at the origin, rotated about y."""
     c = math.cos(angle)
     s = math.sin(angle)
     pose = torch.tensor([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 3], [0, 0, 0, 1]])
@@ -34,7 +34,7 @@ def camera(angle: float) -> Cameras:
 
 
 def balls(rest: Tensor) -> Gaussians:
-    """24 balls on a ring, grey, with harmonics of degree 1 (24, 3, 3)."""
+    """24 grey Gaussians on a ring, with SH of degree 1 (24, 3, 3)."""
     angle = torch.arange(24) * (2 * math.pi / 24)
     means = torch.stack([angle.cos(), 0.7 * (3 * angle).sin(), angle.sin()], dim=1)
     sh = torch.cat([torch.full((24, 1, 3), 0.3), rest], dim=1)
@@ -66,7 +66,7 @@ def find(
 
 
 def test_matte_scene_keeps_no_harmonics() -> None:
-    """What was learned of the view is noise: it is worth less than nothing."""
+    """The learned view dependence is noise, so its gain is negative."""
     found = find(balls(0.05 * noise(0)), balls(torch.zeros(24, 3, 3)))
     assert not found.kept_harmonics.any()
     assert found.gain_all < 0
@@ -86,7 +86,7 @@ def test_only_glossy_gaussians_keep_harmonics() -> None:
 
 
 def test_dropped_harmonics_become_mean_colour() -> None:
-    """A colour that is the same from everywhere it is seen from moves into the base."""
+    """The SH value that is common to all views is added to the base colour."""
     rest = torch.zeros(24, 3, 3)
     model = balls(rest)
     lone = model.replace(sh=model.sh.clone())
