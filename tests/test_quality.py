@@ -116,7 +116,7 @@ def test_a_ball_that_rolls_is_followed_as_a_body(
     So short a run would look for it in six of them. Two of three find it; seeds 2 and 4 do with all
     instruction sets.
     """
-    monkeypatch.setattr("dyngs.deform.start.STEPS_PER_SHOT", 1)
+    monkeypatch.setattr("dyngs.deform.start.STEPS_PER_IMAGE", 1)
     captured = Captured.of(tmp_path, "roll", "--size", "64", "--views", "40")
     few = ("init.num_random=1500", "strategy.max_gaussians=3000", "model.num_random_moving=400")
     report = captured.report(
