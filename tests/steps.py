@@ -25,7 +25,7 @@ CONFIG = Config(data=DataConfig(root=Path("x")), train=TrainConfig(log_every=1))
 
 @dataclass
 class Counting:
-    """Counts its steps; ``findings`` and ``failures`` say what happens in which."""
+    """Counts its steps; ``messages`` and ``failures`` map steps to messages and errors."""
 
     done: int = 0
     bad_gradients: int = 0

@@ -55,7 +55,7 @@ def refusal(preset: Path | None, *overrides: str) -> str:
     return message
 
 
-# ---------------------------------------------------------------------------------------------------- presets
+# -------------------------------------------------------------------------------------- presets
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -118,7 +118,7 @@ def test_stored_configurations_with_renamed_keys_still_load(tmp_path: Path) -> N
     assert config.init.trainable == "colour"
 
 
-# ---------------------------------------------------------------------------------------------------- overrides
+# ------------------------------------------------------------------------------------ overrides
 
 
 def test_overrides_are_laid_over_the_preset(tmp_path: Path) -> None:
@@ -179,7 +179,7 @@ def test_names_and_paths_are_taken_as_written(text: str) -> None:
     assert config.data.root.name == text
 
 
-# ---------------------------------------------------------------------------------------------------- refusals
+# ------------------------------------------------------------------------------------- refusals
 
 DYNAMIC = "model.kind=dynamic"
 
@@ -285,7 +285,7 @@ def test_any_text_gives_a_configuration_or_a_dyngs_error(text: str) -> None:
         load_config(None, [ROOT, text])
 
 
-# ---------------------------------------------------------------------------------------------------- saving
+# --------------------------------------------------------------------------------------- saving
 
 rates = st.floats(min_value=1e-30, max_value=1e30)
 fractions = st.floats(min_value=0, max_value=1)

@@ -66,8 +66,8 @@ def test_the_set_is_left_to_the_strategy() -> None:
 
 
 def _sized(pixels: list[float]) -> Gaussians:
-    """Faint Gaussians side by side at depth 2 that make up so many pixels, 2 pi o s^2 (50 px are a
-    unit there)."""
+    """Return faint Gaussians side by side at depth 2 that cover ``pixels`` px each, 2 pi o s^2. A
+    unit is 50 px at that depth."""
     n = len(pixels)
     std = 3.0
     means = torch.stack([torch.linspace(-0.6, 0.6, n), torch.zeros(n), torch.full((n,), 2.0)], 1)

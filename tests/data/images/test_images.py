@@ -212,7 +212,7 @@ def test_target_size(
     assert target_size(*size, downscale, longest) == wanted
 
 
-# ---------------------------------------------------------------------------------------------------- damaged and huge
+# ----------------------------------------------------------------------------- damaged and huge
 
 
 def write_empty_png(path: Path, side: int) -> None:
