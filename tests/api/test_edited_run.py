@@ -122,6 +122,6 @@ def test_edits_add_up_and_are_undone_to_the_bytes(tmp_path: Path) -> None:
     assert open_run(back).edited is None
     first, last = (next((folder / "checkpoints").iterdir()).read_bytes() for folder in (run, back))
     assert first == last
-    with pytest.raises(DyngsError, match="the frame of this run was not edited"):
+    with pytest.raises(DyngsError, match="coordinate frame of this run was not changed"):
         edited(back, Edits(undo=True), "more")
     assert not (tmp_path / "more").exists()

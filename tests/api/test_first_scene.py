@@ -183,7 +183,7 @@ def test_an_edited_run_goes_on_with_its_own_cameras(
 def test_unsupported_first_scenes_are_refused(capture: Path, run: Path, tmp_path: Path) -> None:
     moving = write_moving_run(tmp_path)
     for source, more, said in (
-        (moving, [], "moves; a training goes on from a still scene"),
+        (moving, [], "a moving scene; training starts from static scenes"),
         (run, ["init.box=[8,8,8,9,9,9]"], "init.box: none of .* Gaussians of .* lie in it"),
         (tmp_path / "none.ply", [], "no such file"),
         (run, ["model.kind=ngp"], "init.kind=scene goes with model.kind=static, not with ngp"),

@@ -214,7 +214,7 @@ def test_a_mesh_that_walks(
     )
     said = capsys.readouterr()
     assert f"written: {out}" in said.out
-    assert "texture of 96 x 96" in said.out + said.err
+    assert "texture 96 x 96" in said.out + said.err
     found = SkinnedGlb(out)
     assert (found.json["animations"][0]["name"], found.num_frames) == ("walk", 3)
     assert abs(min(found.posed(frame)[:, 1].min() for frame in range(3))) < 1e-5

@@ -151,7 +151,7 @@ def test_a_stopped_study_resumes(
         ("--models static --minutes 0", "argument --minutes: '0': must be a number above 0"),
         ("--models static --minutes nan", "must be a number above 0"),
         ("--models statik --steps 3", "statik: no such preset (did you mean 'static'?)"),
-        ("--models static,static --steps 3", "two models called static"),
+        ("--models static,static --steps 3", "two models are named static"),
         ("--models static", "a common limit is required: --minutes M, --steps N or --max-mb MB"),
         ("--models static --steps 3 --minutes 2", "not allowed with"),
         (
@@ -255,7 +255,7 @@ def test_variants_and_the_best_run(tmp_path: Path, capsys: pytest.CaptureFixture
         ("nowhere", "nowhere: not a run folder"),
         (". --vary prun", "unknown setting"),
         (". --require psnr>30", "not a condition"),
-        (". --minimize size", "no such metric"),
+        (". --minimize size", "unknown metric"),
         (". --rounds 0", "argument --rounds: '0' is not a number; write a whole number from 1"),
         (". ", "not a run folder"),
         (". --minimize mb --maximize psnr", "not allowed with"),

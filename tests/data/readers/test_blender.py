@@ -445,7 +445,7 @@ def test_missing_files(root: Path) -> None:
         ({"poses": np.zeros((3, 63))}, r"body_train\.npz: 'poses' has 63 numbers per frame"),
         (
             {"trans": np.zeros((2, 3))},
-            r"body_train\.npz: 'trans' must hold as many numbers for each of 3 frames",
+            r"body_train\.npz: 'trans' must have one row of numbers for each of 3 frames",
         ),
         ({"trans": np.full((3, 3), np.nan)}, r"body_train\.npz: 'trans' of frame 0 contains NaN"),
         ({"scale": -1.0}, r"body_train\.npz: 'scale' must be positive"),

@@ -170,7 +170,7 @@ def test_missing_files(root: Path) -> None:
         ({1: {"pose": fit()["pose"]}}, "cannot be read .*betas"),
         (
             {1: {**fit(), "pose": np.zeros((4, 72))}},
-            "'poses' must hold as many numbers for each of 9",
+            "'poses' must have one row of numbers for each of 9",
         ),
     ],
 )

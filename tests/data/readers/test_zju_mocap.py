@@ -304,7 +304,7 @@ def test_bad_annotations(
 @pytest.mark.parametrize(
     ("change", "line"),
     [
-        ({"poses": np.zeros((1, 87))}, "new_params: 'poses' must hold as many numbers"),
+        ({"poses": np.zeros((1, 87))}, "new_params: 'poses' must have one row of numbers"),
         ({"Th": np.full((1, 3), np.nan)}, r"1\.npy: 'Th' must hold 3 finite numbers"),
         ({"Rh": np.zeros((3, 3))}, r"1\.npy: 'Rh' must hold 3 finite numbers"),
         ({"shapes": None}, r"1\.npy: 'shapes' must hold finite numbers"),
