@@ -97,5 +97,7 @@ def test_wrong_inputs_are_refused(made: Made, tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="-1 steps"):
         predict(made.network, made.capture, tmp_path / "out", 3, steps=-1)
     assert not (tmp_path / "out").exists()
-    with pytest.raises(DyngsError, match="a network, not a scene; predict a scene with `dyngs predict"):
+    with pytest.raises(
+        DyngsError, match="a network, not a scene; predict a scene with `dyngs predict"
+    ):
         load_run(made.network)
