@@ -47,7 +47,7 @@ def test_a_file_is_converted_there_and_back(tmp_path: Path, capsys: Capture) -> 
     assert "visible differences" in captured.err
 
 
-def test_what_convert_refuses(tmp_path: Path, capsys: Capture) -> None:
+def test_unsupported_conversions_are_refused(tmp_path: Path, capsys: Capture) -> None:
     plain = write_splats(tmp_path / "a.ply", SplatFile(cloud(5))).path
     assert "unknown file type; use one of" in refused(capsys, "convert", plain, tmp_path / "b.xyz")
     assert "exists, which is an input" in refused(capsys, "convert", plain, plain)

@@ -81,7 +81,7 @@ def test_cameras_of_a_run_that_refined_none_are_those_of_the_capture(
         ("--format cameras --out cameras.ply", "wrong suffix for --format cameras"),
     ],
 )
-def test_what_does_not_go_with_cameras_is_one_line(
+def test_options_that_conflict_with_cameras_are_refused(
     words: str, part: str, refined: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["export", str(refined), *words.split()]) == 2
@@ -173,7 +173,7 @@ def test_a_page_has_the_full_name_of_its_run(run: Path, tmp_path: Path) -> None:
         ("--folder", "--folder is not supported with --format ply"),
     ],
 )
-def test_what_does_not_go_with_a_page_is_one_line(
+def test_options_that_conflict_with_a_page_are_refused(
     words: str, part: str, run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["export", str(run), *words.split()]) == 2

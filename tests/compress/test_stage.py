@@ -141,7 +141,7 @@ def _all_rows_of(some: Tensor, everything: Tensor) -> bool:
 
 
 def test_masks_are_trained_with(moving: Path, tmp_path: Path) -> None:
-    """What no key time sees is not drawn, and receives no gradient."""
+    """Gaussians that no key time observes are not rendered and receive no gradient."""
     trainer = trained(moving_config(moving, tmp_path, "control_nodes"))
     trainer.apply(build_pruning_edit(trainer))
     scene = trainer.model.scene
