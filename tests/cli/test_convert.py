@@ -98,7 +98,7 @@ def test_axes_of_an_export(tmp_path: Path, capsys: Capture) -> None:
     assert main(["export", str(run), "--out", str(path), "--up", "keep"]) == 0
     kept = read_splats(path).gaussians.means
     assert main(["export", str(run), "--out", str(path), "--from-up=x", "--up=y"]) == 0
-    assert "it was x in the capture" in capsys.readouterr().out
+    assert "rotated from x in the capture" in capsys.readouterr().out
     turned = read_splats(path)
     assert turned.up == "y"
     assert float((turned.gaussians.means[:, 1] - kept[:, 0]).abs().max()) < 1e-5

@@ -167,7 +167,7 @@ def test_a_page_has_the_full_name_of_its_run(run: Path, tmp_path: Path) -> None:
         ("--format html --max-change 3", "--max-change is not supported with --format html"),
         ("--format html --out page.pdf", "use --out page.html"),
         ("--format html --motion walk.bvh", "needs the run of a person"),
-        ("--format html --folder --max-gaussians-drawn 9", "for still scenes"),
+        ("--format html --folder --max-gaussians-drawn 9", "need a static scene"),
         ("--format html --folder --out page.html", "writes a folder; use --out page"),
         ("--format html --max-gaussians-drawn 9", "requires --folder"),
         ("--folder", "--folder is not supported with --format ply"),
@@ -342,7 +342,7 @@ def test_export_of_tracks(
         str(tmp_path / "t.npz"),
     ]
     assert main(["export", str(moving_run), *words]) == 0
-    assert "1 of 3 times lie outside" in capsys.readouterr().err
+    assert "clamped 1 of 3 times" in capsys.readouterr().err
     with np.load(tmp_path / "t.npz", allow_pickle=False) as stored:
         assert stored["positions"][:, 0, 0] == pytest.approx(
             moved_x((1, 3), 0.0).tolist(), abs=ROUNDING

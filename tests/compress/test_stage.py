@@ -181,7 +181,7 @@ def test_what_is_there_for_a_while_is_masked_only_while_it_is_not() -> None:
     centers = torch.tensor([2, 3, 6, 7]) / 9
     spans = torch.full((4,), 0.03)
     start = FreeInitialization(torch.zeros(0), (), centers, spans, torch.zeros(4, 3))
-    field = FreePrimitives(FreeField(), tiny_setup(4), torch.Generator()).started(start)
+    field = FreePrimitives(FreeField(), tiny_setup(4), torch.Generator()).with_initialization(start)
     times = tuple(k / 9 for k in range(10))
     scene = DynamicScene(
         gaussians=cloud(5), training_times=times, field=field, moving=torch.arange(4)
