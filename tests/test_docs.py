@@ -11,6 +11,7 @@ import argparse
 import importlib.util
 import re
 import shlex
+import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -38,7 +39,12 @@ BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CODE = re.compile(r"`([^`\n]*)`")
 LINK = re.compile(r"\]\((?!http|mailto)([^)#\s]*)#?([^)\s]*)\)")
 
-RUN_PAGES = ("README.md",)
+RUN_PAGES = (
+    "README.md",
+    "docs/start/first-scene.md",
+    "docs/guides/masks.md",
+    "docs/guides/smaller-and-faster.md",
+)
 SHORTER = {
     "data synth": ("--size", "16", "--views", "6"),
     "train": ("train.steps=3", "run.threads=1", "init.kind=random", "init.num_random=80"),
@@ -355,12 +361,16 @@ def test_all_packages_are_in_the_table() -> None:
 
 @pytest.fixture
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Enter a folder with a static capture, ``PATH``, and a run of a moving scene."""
+    """Enter a folder with a static capture and a run of a moving scene, under the names in use."""
     write_static_capture(
         tmp_path / "PATH", StaticOptions(size=16, num_train=4, num_test=2, samples=1)
     )
     (tmp_path / "runs").mkdir()
     write_moving_run(tmp_path / "moving").rename(tmp_path / "runs" / "dance")
+    for name in ("plush", "dog"):
+        shutil.copytree(tmp_path / "runs" / "dance", tmp_path / "runs" / name)
+    for name in ("scene", "object"):
+        shutil.copytree(tmp_path / "PATH", tmp_path / name)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

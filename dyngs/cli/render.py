@@ -194,7 +194,11 @@ def _coarser(arguments: argparse.Namespace, opened: OpenedScene) -> OpenedScene:
     from dyngs.gaussians.levels import LevelScene
 
     most: int | None = arguments.max_gaussians_drawn
-    return opened if most is None else opened.with_scene(LevelScene.from_scene(opened.renderable, most))
+    return (
+        opened
+        if most is None
+        else opened.with_scene(LevelScene.from_scene(opened.renderable, most))
+    )
 
 
 def _path_options(arguments: argparse.Namespace) -> PathOptions:

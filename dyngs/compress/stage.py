@@ -169,7 +169,7 @@ def build_pruning_edit(trainer: GaussianTrainer) -> TrainingEdit:
         )
     gain = mean_psnr(trainer, scene.select(edit.keep)) - mean_psnr(trainer, scene)
     left = format_count(int(edit.keep.sum()), "Gaussian")
-    cost = f"{gain:+.2f} dB before it is trained again"
+    cost = f"{gain:+.2f} dB before fine-tuning"
     return replace(edit, message=f"{message}{left}, {cost}{_let_through(edit)}")
 
 
@@ -179,7 +179,7 @@ def _let_through(edit: TrainingEdit) -> str:
         return ""
     times = range(len(masks.times) - 1)
     active = fmean(len(masks.active(k)) / max(masks.count, 1) for k in times)
-    return f"; masks let {active:.0%} of them through"
+    return f"; visibility masks keep {active:.0%} of them"
 
 
 @torch.no_grad()

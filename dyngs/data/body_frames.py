@@ -1,4 +1,4 @@
-"""Body parameters per frame: validation, change of coordinates, and files of fitted parameters.
+"""Body parameters per frame: validation, coordinate transforms, and files of fitted parameters.
 
 Local letters: F frames, J joints, B shape coefficients. Body models are SMPL (Loper et al. 2015),
 SMPL-H and SMPL-X.
@@ -46,10 +46,11 @@ def build_body_frames(
     Args:
         where: file for error messages.
         frames: F distinct frame numbers.
-        poses: F rows of 72, 156 or 165 numbers.
+        poses: F rows of 72, 156 or 165 numbers: axis-angles of the joints, rad.
         trans, origin_rotations: F rows of 3 numbers.
         betas: (B,), or F rows of B, which are averaged.
-        scale: one number, or one per frame.
+        scale: factor from body units to world units: one number, or one per frame.
+        origin_rotations: axis-angles about the origin, applied after posing (``Rh`` of ZJU-MoCap).
     """
     order = np.argsort(np.asarray(frames, dtype=np.int64), kind="stable")
     numbers = tuple(int(frames[i]) for i in order)
@@ -95,17 +96,17 @@ def merge_root_rotation(body: BodyFrames, pelvis: np.ndarray) -> BodyFrames:
     j the rest position of the pelvis of the fitted body (of the given ``pelvis`` (3,) if the files
     do not store it). Hence ``root' = R root`` and ``trans' = trans + scale * (R j - pelvis)``.
     """
-    fitted = pelvis if body.pelvis is None else body.pelvis
+    fitted_pelvis = pelvis if body.pelvis is None else body.pelvis
     poses = body.poses
-    turned = fitted
+    rotated_pelvis = fitted_pelvis
     if body.origin_rotations is not None:
         from scipy.spatial.transform import Rotation  # late: importing it takes a tenth of a second
 
         turns = Rotation.from_rotvec(body.origin_rotations)
-        turned = turns.apply(fitted)
+        rotated_pelvis = turns.apply(fitted_pelvis)
         roots = (turns * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
         poses = np.concatenate([roots[:, None], poses[:, 1:]], axis=1)
-    trans = body.trans + body.scale[:, None] * (turned - pelvis)
+    trans = body.trans + body.scale[:, None] * (rotated_pelvis - pelvis)
     return replace(
         body,
         poses=poses,
@@ -122,7 +123,7 @@ def transform_body(body: BodyFrames, shift: np.ndarray, factor: float) -> BodyFr
 
 
 def match_frames(where: Path, body: BodyFrames, views: Sequence[View]) -> np.ndarray:
-    """Return (V,) the row of ``body`` for each view, by frame number.
+    """Return the row of ``body`` for each of the V views, (V,) int64.
 
     Raises DyngsError if a view has no frame number or its frame has no body parameters.
     """
@@ -148,11 +149,14 @@ def share_body_across_splits(body: BodyFrames) -> dict[Split, BodyFrames]:
 def _rows(
     where: Path, name: str, value: object, frames: Sequence[int], width: int | None = None
 ) -> np.ndarray:
-    """Return (F, width) float64 numbers of magnitude up to ``LARGEST``; any width if None."""
+    """Return the values as (F, width) float64. ``width``: None accepts any.
+
+    Raises DyngsError: another shape, or NaN, infinite or huge values (above ``LARGEST``).
+    """
     array = as_float_array(value)
     if array is None or array.shape[:1] != (len(frames),):
         raise DyngsError(
-            f"{where}: '{name}' must hold as many numbers for each of {len(frames)} frames; "
+            f"{where}: '{name}' must have one row of numbers for each of {len(frames)} frames; "
             "export the file again"
         )
     array = array.reshape(len(frames), -1)
@@ -174,8 +178,9 @@ def read_body_file(path: Path) -> BodyFrames:
     """Read body parameters from an .npz.
 
     Arrays: ``poses`` (F, 72, 156 or 165), ``trans`` (F, 3), ``betas`` and optionally ``scale`` and
-    ``frames`` (F,); by default row n belongs to frame n. ``surface_model_type`` "anny" marks betas
-    of the free template's shape space; ``fitted_to`` identifies the template of a fit by dyngs.
+    ``frames`` (F,). Without ``frames``, row n belongs to frame n. If ``surface_model_type`` is
+    "anny", ``betas`` are shape coefficients of the free template. ``fitted_to`` identifies the
+    template that dyngs fitted.
     """
     found = read_npz(
         path, ("poses", "trans", "betas"), ("scale", "surface_model_type", "frames", "fitted_to")
@@ -196,8 +201,11 @@ def read_body_file(path: Path) -> BodyFrames:
 
 
 def attach_fitted_body(capture: Capture, folder: Path) -> Capture:
-    """Return the capture with the body parameters in ``folder``: ``body_train.npz`` and, if
-    present, ``body_pose.npz``."""
+    """Return the capture with the body parameters in ``folder``.
+
+    These are ``body_train.npz`` and, for the split ``pose``, ``body_pose.npz``. Without the latter,
+    the split ``pose`` is dropped.
+    """
     if not (folder / "body_train.npz").is_file():
         raise DyngsError(
             f"{folder / 'body_train.npz'}: no such file (data.body); to reuse a fit by `dyngs "
@@ -223,6 +231,7 @@ def parse_frame_number(where: Path, name: str) -> int:
     Accepts ``000123.jpg``, ``frame_000123`` and ``Camera (1)_0123_2019-08-23_16.592.jpg``.
     """
     stem = PurePosixPath(name.replace("\\", "/")).name
+    # The number follows "Camera (1)_" in some captures of ZJU-MoCap, else it ends the name.
     found = re.search(r"\)_(\d{1,15})(?!\d)", stem) or re.search(
         r"(?<!\d)(\d{1,15})(?:\.\w+)?$", stem
     )

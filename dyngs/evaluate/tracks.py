@@ -1,6 +1,6 @@
 """Motion errors of a model with respect to ground-truth point tracks.
 
-Local letters: P true points, N Gaussians, K Gaussians that carry a point.
+Local letters: P tracked points, N Gaussians, K Gaussians that a point is attached to.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from dyngs.deform.scene import field_scene_of
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.ops.quaternions import unit_quats
 
-CARRIERS = 4  # K: a point is carried by its nearest Gaussians, weighted by opacity
-MIN_OPACITY = 0.3  # Gaussians below this opacity carry no point
+CARRIERS = 4  # K: nearest Gaussians that a point is attached to, weighted by opacity
+MIN_OPACITY = 0.3  # points are not attached to Gaussians below this opacity
 CLOSE_PX = 5.0  # Distance in px below which a track counts as correct
 
 NO_TRACKS = f"the capture has no {TRACKS_FILE}"
@@ -36,7 +36,7 @@ class TrackScores:
     # mean image distance between predicted and true points
     error_px: float | None = None
     within_5px: float | None = None  # fraction of distances below ``CLOSE_PX``
-    # mean distance for a static model, for comparison
+    # the same error of a static model: how far the true points move
     motion_px: float | None = None
     reason: str | None = None
 
@@ -50,9 +50,9 @@ def track_scores(
     """Return the track errors of a scene in the images of a split.
 
     Each point is attached to its ``CARRIERS`` nearest Gaussians at a reference time, and moves
-    rigidly with them. The reference time is the visible time of the point closest to the middle of
-    the clip. If Gaussians have lifetimes, points are handed over at every time step. Distances are
-    clamped to the image diagonal.
+    rigidly with them. The reference time is the time, of those at which the point is visible, that
+    is nearest to the middle of the clip. If Gaussians have lifetimes, points are attached again at
+    every time step. Distances are clamped to the image diagonal.
 
     Args:
         split: evaluated views and their cameras.
@@ -66,18 +66,18 @@ def track_scores(
         return TrackScores(reason=NONE_OPAQUE)
     rows = {name: row for row, name in enumerate(tracks.views.tolist())}
     shown = [x for x in split if x[0].time is not None and x[0].name in rows]
-    points, bound_at = _reference_points(tracks, views)
+    points, reference_times = _reference_points(tracks, views)
     times = sorted({view.time or 0.0 for view, _ in shown})
-    carried = _track_points(times, scene, points, bound_at, min(CARRIERS, num_opaque))
+    positions = _track_points(times, scene, points, reference_times, min(CARRIERS, num_opaque))
     errors = []
     motions = []
     for view, cameras in shown:
         time = view.time or 0.0
         row = rows[view.name]
-        is_shown = tracks.visible[row] & (np.abs(bound_at - time) > SAME_TIME)
+        is_shown = tracks.visible[row] & (np.abs(reference_times - time) > SAME_TIME)
         limit = float(np.hypot(cameras.width, cameras.height))
         true = _pixels(tracks.points[tracks.moments[row]][is_shown], cameras)
-        for predicted, distances in ((carried[time], errors), (points, motions)):
+        for predicted, distances in ((positions[time], errors), (points, motions)):
             distance = np.linalg.norm(_pixels(predicted[is_shown], cameras) - true, axis=1)
             distances.extend(np.minimum(np.nan_to_num(distance, nan=limit), limit).tolist())
     if not errors:
@@ -133,36 +133,36 @@ def _track_points(
     times: Sequence[float],
     scene: GaussianScene,
     points: np.ndarray,
-    bound_at: np.ndarray,
+    reference_times: np.ndarray,
     count: int,
 ) -> dict[float, np.ndarray]:
-    """Return the positions of ``points`` (P, 3) at ``times``, carried by ``count`` Gaussians each.
+    """Return the positions of ``points`` (P, 3) at ``times``, attached to ``count`` Gaussians.
 
-    Points are carried from their reference times, or from one time step to the next if Gaussians
+    Points move from their reference times directly, or from time step to time step if Gaussians
     have lifetimes.
     """
-    starts = np.unique(bound_at[np.isfinite(bound_at)]).tolist()
+    starts = np.unique(reference_times[np.isfinite(reference_times)]).tolist()
     moved = field_scene_of(scene)
     if moved is None or moved.field is None or not moved.field.has_lifetime:
         found = {time: np.full_like(points, np.nan) for time in times}
         bound = []
         for start in starts:
-            rows = np.flatnonzero(bound_at == start)
+            rows = np.flatnonzero(reference_times == start)
             bound.append((rows, _bind(_states_at(scene, start), points[rows], count)))
         for time in times:
             moment = _states_at(scene, time)
             for rows, binding in bound:
-                found[time][rows] = _carried(moment, *binding)
+                found[time][rows] = _move_points(moment, *binding)
         return found
     steps = sorted({*scene.times, *times, *starts})
     moments = {time: _states_at(scene, time) for time in steps}
-    found = {time: np.where((bound_at == time)[:, None], points, np.nan) for time in steps}
+    found = {time: np.where((reference_times == time)[:, None], points, np.nan) for time in steps}
     for order in (steps, steps[::-1]):
         for now, then in pairwise(order):
             rows = np.flatnonzero(np.isfinite(found[now]).all(1) & ~np.isfinite(found[then]).all(1))
             if len(rows):
                 binding = _bind(moments[now], found[now][rows], count)
-                found[then][rows] = _carried(moments[then], *binding)
+                found[then][rows] = _move_points(moments[then], *binding)
     return found
 
 
@@ -184,20 +184,20 @@ def _bind(
     _, nearest = KDTree(moment.means[opaque]).query(points, k=count)
     rows = opaque[np.reshape(nearest, (len(points), count))]
     weights = moment.opacities[rows]
-    arms = points[:, None] - moment.means[rows]
+    offsets = points[:, None] - moment.means[rows]
     inverse = Rotation.from_quat(moment.quats[rows.ravel()]).inv()
-    arms = inverse.apply(arms.reshape(-1, 3)).reshape(arms.shape)
-    return rows, weights / weights.sum(axis=1, keepdims=True), arms
+    offsets = inverse.apply(offsets.reshape(-1, 3)).reshape(offsets.shape)
+    return rows, weights / weights.sum(axis=1, keepdims=True), offsets
 
 
-def _carried(
-    moment: _GaussianStates, rows: np.ndarray, weights: np.ndarray, arms: np.ndarray
+def _move_points(
+    moment: _GaussianStates, rows: np.ndarray, weights: np.ndarray, offsets: np.ndarray
 ) -> np.ndarray:
     """Return points (P, 3) that move and rotate with the Gaussians they are attached to."""
     from scipy.spatial.transform import Rotation
 
     rotations = Rotation.from_quat(moment.quats[rows.ravel()])
-    turned = rotations.apply(arms.reshape(-1, 3)).reshape(arms.shape)
+    turned = rotations.apply(offsets.reshape(-1, 3)).reshape(offsets.shape)
     return (weights[..., None] * (moment.means[rows] + turned)).sum(axis=1)
 
 

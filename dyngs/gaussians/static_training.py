@@ -32,7 +32,7 @@ from dyngs.models.kind import StartContext
 from dyngs.models.schedule import scale_step
 from dyngs.models.views import training_cameras
 
-# Evenly spaced training views in which contributions are measured before pruning.
+# Largest number of training views, evenly spaced, that measure contributions before pruning.
 MEASURED_VIEWS = 200
 
 
@@ -73,7 +73,7 @@ class SmallGaussianPruning:
 
 
 def build_small_pruning(run: StartContext) -> SmallGaussianPruning:
-    """Build the pruning of small Gaussians, due when densification stops."""
+    """Return the pruning of small Gaussians, scheduled for the end of densification."""
     config = run.config
     strategy = run.config.strategy
     if not (isinstance(strategy, DefaultStrategy) and strategy.prune_pixels > 0):
@@ -90,7 +90,10 @@ def build_small_pruning(run: StartContext) -> SmallGaussianPruning:
 class StaticTraining(SceneTraining[StaticScene]):
     """Training of a static scene, see ``SceneTraining``.
 
-    ``frozen_mask``: parameters that are frozen.
+    Args:
+        update: when and how the 3D smoothing filter of the Gaussians is computed again.
+        pruning: one-time pruning of small Gaussians. Frozen Gaussians are not pruned.
+        frozen_mask: parameters that are not trained.
     """
 
     def __init__(
@@ -99,23 +102,19 @@ class StaticTraining(SceneTraining[StaticScene]):
         build_pruning_edit: SmallGaussianPruning = SmallGaussianPruning(),
         frozen_mask: FrozenMask | None = None,
     ) -> None:
-        self._update, self._pruning, self._build_frozen_mask = (
-            update,
-            build_pruning_edit,
-            frozen_mask,
-        )
+        self._update = update
+        self._pruning = build_pruning_edit
+        self._frozen_mask = frozen_mask
 
     def frozen_mask(self) -> FrozenMask | None:
-        return self._build_frozen_mask
+        return self._frozen_mask
 
     def apply_edit(self, edit: TopologyEdit) -> None:
-        if self._build_frozen_mask is not None and self._build_frozen_mask.rows is not None:
-            self._build_frozen_mask = replace(
-                self._build_frozen_mask, rows=edit.apply(self._build_frozen_mask.rows)
-            )
+        if self._frozen_mask is not None and self._frozen_mask.rows is not None:
+            self._frozen_mask = replace(self._frozen_mask, rows=edit.apply(self._frozen_mask.rows))
 
     def state(self) -> State:
-        rows = None if self._build_frozen_mask is None else self._build_frozen_mask.rows
+        rows = None if self._frozen_mask is None else self._frozen_mask.rows
         return {} if rows is None else {"frozen": StateTensor(rows, Role.TRAINING)}
 
     def first_scene(self, gaussians: Gaussians) -> StaticScene:
@@ -127,18 +126,16 @@ class StaticTraining(SceneTraining[StaticScene]):
         return scene
 
     def edit_scene(self, scene: StaticScene, step: int) -> tuple[StaticScene, EditResult] | None:
-        rows = None if self._build_frozen_mask is None else self._build_frozen_mask.rows
+        rows = None if self._frozen_mask is None else self._frozen_mask.rows
         result = self._pruning.edit(scene, rows) if step == self._pruning.step else None
         if result is None or result.edit is None:
             return None
         return scene.apply_edit(result.edit), result
 
     def restore(self, gaussians: Gaussians, tensors: Mapping[str, Tensor]) -> StaticScene:
-        if self._build_frozen_mask is not None and "frozen" in tensors:
+        if self._frozen_mask is not None and "frozen" in tensors:
             frozen = require_tensor("frozen", tensors["frozen"], (len(gaussians),), torch.bool)
-            self._build_frozen_mask = replace(
-                self._build_frozen_mask, rows=frozen.to(gaussians.means.device)
-            )
+            self._frozen_mask = replace(self._frozen_mask, rows=frozen.to(gaussians.means.device))
         return StaticScene.from_state(gaussians, tensors)
 
 

@@ -1,8 +1,7 @@
-"""glTF 2.0 (``.glb``, ``.gltf``, ``.vrma``): reader of untrusted documents and their numbers,
-writer of ``.glb``.
+"""Reader of untrusted glTF 2.0 files (``.glb``, ``.gltf``, ``.vrma``) and writer of ``.glb``.
 
-Only what meshes of points, skins and animations need is looked at. Local letters: K elements of an
-accessor, D numbers of each.
+Only the parts of glTF that meshes, skins and animations need are supported. Local letters: K
+elements of an accessor, D numbers per element.
 """
 
 from __future__ import annotations
@@ -24,24 +23,24 @@ from dyngs.io.fields import require_at_most
 _TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 VERTICES, INDICES = 34962, 34963
-"""Uses of a buffer view in a mesh."""
+"""``target`` of a buffer view: vertex attributes or triangle indices (OpenGL constants)."""
 MAX_JOINTS = 4096
 """Limit on the joints of a skeleton."""
 _MOST_DOCUMENT_BYTES = 1 << 24
+"""Limit on the JSON chunk of a ``.glb``."""
 _MOST_NUMBERS = 1 << 25
-"""Limit on the numbers read of all accessors together, each of which may be named many times; a
-larger file may have four for each of its bytes. It is 100 joints with rotation, translation and
-scale in 30,000 keys."""
-_KEPT_NUMBERS = 1 << 20
-"""Numbers of an accessor up to which they are kept for the next time, as animations name the same
-times often."""
+"""Limit on the numbers that are read in total: 100 joints with rotation, translation and scale at
+30,000 keys. Repeated reads of an accessor count again. Large files may have four numbers per byte
+of their buffers instead."""
+_MAX_CACHED_NUMBERS = 1 << 20
+"""Largest accessor that is cached, since the channels of an animation share their key times."""
 
 
 class GltfFile:
-    """The document of a file, and access to the numbers in its buffers.
+    """The JSON document of a file, and access to the numbers in its buffers.
 
-    Fields are used as the file has them: wrong ones raise where they are used, inside ``reading``.
-    Raises DyngsError: not glTF 2.0, or damaged.
+    The document is not validated in advance: callers access its fields within ``wrap_read_errors``,
+    which reports wrong ones. Raises DyngsError: not glTF 2.0, or damaged.
 
     Attributes:
         json: the document.
@@ -49,14 +48,14 @@ class GltfFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        text, self._attached = _chunks(path)
+        text, self._binary_chunk = _read_chunks(path)
         with wrap_read_errors(path):
             self.json: dict[str, Any] = json.loads(text)
             if not self.json["asset"]["version"].startswith("2."):
                 raise ValueError("its version is not 2")
         self._buffers: dict[str | None, bytes] = {}
-        self._kept: dict[tuple[int, type], np.ndarray] = {}
-        self._count = 0
+        self._cache: dict[tuple[int, type], np.ndarray] = {}
+        self._num_read = 0
 
     @property
     def nodes(self) -> list[dict[str, Any]]:
@@ -68,10 +67,11 @@ class GltfFile:
         return DyngsError(f"{self.path}: {problem}")
 
     def numbers(self, index: int, kind: str, dtype: type[np.floating] = np.float64) -> np.ndarray:
-        """Return the numbers (K, D) of an accessor, normalised integers in [-1, 1] or [0, 1]; NaN
-        and infinities stay.
+        """Return the numbers (K, D) of an accessor; NaN and infinities are returned unchanged.
 
-        Raises DyngsError: the accessor has another type than ``kind``, or lies outside its buffer.
+        Normalised integers are converted to [-1, 1] or [0, 1]. ``kind``: required type of the
+        accessor, such as "VEC3".
+        Raises DyngsError: the accessor has another type, or lies outside its buffer.
         """
         with wrap_read_errors(self.path, f"accessor {index} is broken; export it again"):
             accessor = self.json["accessors"][index]
@@ -85,24 +85,24 @@ class GltfFile:
             view, data = self._view(accessor["bufferView"])
             stored = np.dtype("<" + _TYPES[accessor["componentType"]])
             shape = accessor["count"], _WIDTHS[kind]
-            self._count += math.prod(shape)
+            self._num_read += math.prod(shape)
             most = max(_MOST_NUMBERS, 4 * sum(map(len, self._buffers.values())))
-            require_at_most(self.path, self._count, most, "numbers")
-            if (index, dtype) in self._kept:
-                return self._kept[index, dtype]
+            require_at_most(self.path, self._num_read, most, "numbers")
+            if (index, dtype) in self._cache:
+                return self._cache[index, dtype]
             stride = view.get("byteStride") or shape[1] * stored.itemsize
             if min(shape[0], stride) < 1:
                 raise ValueError("it has no numbers")
             size = stride * (shape[0] - 1) + shape[1] * stored.itemsize
-            # raises where it lies outside, which ndarray does not for empty data
+            # np.frombuffer raises for data outside the buffer; np.ndarray does not if it is empty.
             part = np.frombuffer(data, np.uint8, size, accessor.get("byteOffset", 0))
             found = np.ndarray(shape, stored, part, 0, (stride, stored.itemsize))
             with np.errstate(invalid="ignore"):
                 values = found.astype(dtype)
             if accessor.get("normalized") and stored.kind in "iu":
                 values = np.maximum(values / np.iinfo(stored).max, -1)
-        if values.size <= _KEPT_NUMBERS:
-            self._kept[index, dtype] = values
+        if values.size <= _MAX_CACHED_NUMBERS:
+            self._cache[index, dtype] = values
         return values
 
     def _view(self, index: int) -> tuple[dict[str, Any], bytes]:
@@ -112,12 +112,12 @@ class GltfFile:
             raise self.error(f"buffer view {index} is compressed; export it without compression")
         uri = self.json["buffers"][view["buffer"]].get("uri")
         if uri not in self._buffers:
-            self._buffers[uri] = self._attached if uri is None else self._fetched(uri)
+            self._buffers[uri] = self._binary_chunk if uri is None else self._load_buffer(uri)
         start = view.get("byteOffset", 0)
         return view, self._buffers[uri][start : start + view["byteLength"]]
 
-    def _fetched(self, uri: str) -> bytes:
-        """Return the bytes of a data URI, or of a file in the same folder or below."""
+    def _load_buffer(self, uri: str) -> bytes:
+        """Return the bytes of a data URI, or of a file in the folder of the document or below."""
         if uri.startswith("data:"):
             return base64.b64decode(uri.partition(";base64,")[2], validate=True)
         name = unquote(uri)
@@ -131,15 +131,15 @@ class GltfFile:
         return beside.read_bytes()
 
 
-def _chunks(path: Path) -> tuple[bytes, bytes]:
-    """Return the JSON chunk and the binary chunk of a file."""
+def _read_chunks(path: Path) -> tuple[bytes, bytes]:
+    """Return the JSON chunk and the binary chunk of a file, which is empty for ``.gltf``."""
     require_regular_file(path)
     with wrap_read_errors(path):
         content = path.read_bytes()
     if content[:4] != b"glTF":  # a .gltf
         return content.removeprefix(b"\xef\xbb\xbf"), b""
     found: dict[bytes, bytes] = {}
-    start = 12
+    start = 12  # bytes of the header
     while start + 8 <= len(content):
         size, kind = struct.unpack_from("<I4s", content, start)
         found.setdefault(kind, content[start + 8 : start + 8 + size])
@@ -154,8 +154,8 @@ class GlbDocument:
     """A glTF document to write, and its buffer.
 
     Attributes:
-        json: the document; all parts but accessors, buffer views and buffers are added by the
-            caller.
+        json: the document. The caller adds nodes, meshes, skins and scenes to it; ``write`` adds
+            accessors, buffer views and buffers.
     """
 
     def __init__(self) -> None:
@@ -168,10 +168,10 @@ class GlbDocument:
         """Add an accessor of (K, D) or (K,) numbers; return its index.
 
         Args:
-            values: float32, uint8, uint16 or uint32; rows of several numbers take a multiple of
-                four bytes.
-            use: ``VERTICES`` or ``INDICES`` for those of a mesh.
-            limits: whether the smallest and the largest number of each column are stated.
+            values: float32, uint8, uint16 or uint32. If D > 1, a row must have a multiple of four
+                bytes.
+            use: ``VERTICES`` or ``INDICES`` for the numbers of a mesh.
+            limits: whether to write the minimum and maximum of each column.
         """
         rows = values.reshape(len(values), -1)
         kind = f"{rows.dtype.kind}{rows.itemsize}"
@@ -196,8 +196,10 @@ class GlbDocument:
     def add_animation(
         self, name: str, seconds: np.ndarray, channels: Sequence[tuple[int, str, np.ndarray]]
     ) -> None:
-        """Add an animation: nodes, each with a path ("translation", ...) and its (F, D) values at
-        (F,) ``seconds``."""
+        """Add an animation with keys at (F,) ``seconds``.
+
+        ``channels``: index of a node, animated property ("translation", ...), its (F, D) values.
+        """
         times = self.add_numbers(seconds.astype(np.float32), limits=True)
         samplers = [
             {"input": times, "output": self.add_numbers(values.astype(np.float32))}

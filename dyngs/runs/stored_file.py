@@ -1,16 +1,16 @@
-"""The file ``scene.dyngs``: a header, tensors as integers in LZMA, a checksum.
+"""The compressed scene file ``scene.dyngs``: quantised tensors in LZMA, and a checksum.
 
-    8 bytes   b"dyngs\\x00\\x01\\n", the last but one is the version
+    8 bytes   b"dyngs\\x00\\x01\\n"; byte 7 is the version
     4 bytes   length of the header, little endian
-    header    LZMA2 of JSON: ``Header``
+    header    ``_Header`` as JSON in LZMA2
     data      of the tensors in the order of the header, then zeros
-    32 bytes  SHA-256 of all before
+    32 bytes  SHA-256 of all preceding bytes
 
-Tensors have the names of checkpoints (``gaussians.means``, ``model.rows``), but for the harmonics,
-which are stored as ``gaussians.sh_base`` (N, 3) and ``gaussians.sh_rest`` (N, K - 1, 3).
+Tensors have their names in checkpoints (``gaussians.means``, ``model.rows``), except for the K
+spherical harmonics: ``gaussians.sh_base`` (N, 3) and ``gaussians.sh_rest`` (N, K - 1, 3).
 
-Nothing in it is run. The checksum finds accidents; everything in the header is checked besides, and
-no more memory is taken than a file of this size can need.
+Files may be untrusted: they contain no code, the header is validated, and the memory to read one is
+bounded by its size. The checksum only detects accidental damage.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from dyngs.models.checkpoint import Checkpoint, CheckpointInfo, parse_info
 from dyngs.models.renderable import Renderable
 from dyngs.ops.quaternions import quat_product
 
-LIMIT = 2**20  # bound on the magnitude of the integers; larger values are stored as they are
+LIMIT = 2**20  # bound on the magnitude of the integers; larger values are stored as float32
 SMALLEST_STEP, LARGEST_STEP = 2.0**-100, 2.0**60
 ROTATION_STEP = 1 / 32
-"""Coarsest step for rotations, at which the component left out stays the largest."""
+"""Coarsest step for rotations, at which the omitted scalar part is still the largest component."""
 SPARSE_ROUNDING = 0.35
-"""Added before rounding down instead of 0.5: a bias to zero, which costs least to store."""
+"""Rounding offset of higher harmonics: below 0.5, it favours zeros, which compress best."""
 
 
 def round_step_down(step: float) -> float:
@@ -52,16 +52,18 @@ def round_step_down(step: float) -> float:
     return math.ldexp(math.floor(8 * fraction) / 8, exponent)
 
 
-Steps = float | np.ndarray  # one step for all, or one per row, of a shape that broadcasts
+Steps = float | np.ndarray  # quantisation step: one for all values, or an array that broadcasts
 
 
 def to_grid(
     values: np.ndarray, step: Steps, rounding: float = 0.5
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return int32 multiples of ``step`` nearest to ``values``, and where they are out of reach
-    (there they are 0).
+    """Quantise ``values`` to int32 multiples of ``step``.
 
-    ``rounding``: is added before rounding down.
+    ``rounding`` is added to magnitudes before rounding down.
+
+    Returns:
+        the multiples, and a mask of values beyond ``LIMIT``, whose multiples are 0.
     """
     scaled = np.asarray(values, dtype=np.float64) / step
     far = ~(np.abs(scaled) < LIMIT - 1)
@@ -76,19 +78,22 @@ def opacities_to_grid(logits: np.ndarray, step: float) -> np.ndarray:
 
 
 def opacities_from_grid(whole: np.ndarray, step: float) -> np.ndarray:
-    """Return float64 logits; finite, as 0 becomes an eighth of a step (not drawn) and 1 a little
-    less than 1."""
+    """Return float64 logits of quantised opacities.
+
+    Opacity 0 becomes an eighth of a step, which is not drawn, and 1 slightly less, so that logits
+    are finite.
+    """
     opacities = np.clip(whole.astype(np.float64) * step, step / 8, 1 - step / 64)
     return np.log(opacities) - np.log1p(-opacities)
 
 
 def rotations_to_grid(quats: np.ndarray, step: float) -> np.ndarray:
-    """Return (N, 3) int32 multiples of ``step``: vector parts of unit quaternions with an about
-    largest scalar part.
+    """Quantise rotations of Gaussians to (N, 3) int32 multiples of ``step``.
 
-    Half turns about its own axes do not change a Gaussian: of the four quaternions one with a large
-    scalar part is taken. A zero quaternion is the identity. Coded again, the result stays the same.
-    ``step``: at most ``ROTATION_STEP``.
+    Half turns about its own axes do not change a Gaussian. Of the four equivalent quaternions, one
+    with a (nearly) largest scalar part is chosen, and only its vector part is stored. A zero
+    quaternion is the identity. Quantising the decoded result again does not change it. ``step``: at
+    most ``ROTATION_STEP``.
     """
     before = None
     while True:
@@ -97,7 +102,7 @@ def rotations_to_grid(quats: np.ndarray, step: float) -> np.ndarray:
         size[:, 0] += 4 * step
         turned = _product(unit, np.eye(4)[size.argmax(1)])
         whole, _ = to_grid(np.where(turned[:, :1] < 0, -turned, turned)[:, 1:], step)
-        # A turn gains four steps of the scalar part, rounding loses fewer: this ends.
+        # The loop ends: each new choice raises the scalar part by more than rounding lowers it.
         if before is not None and np.array_equal(whole, before):
             return whole
         before = whole
@@ -105,7 +110,7 @@ def rotations_to_grid(quats: np.ndarray, step: float) -> np.ndarray:
 
 
 def rotations_from_grid(whole: np.ndarray, step: float) -> np.ndarray:
-    """Return (N, 4) unit quaternions wxyz, float64."""
+    """Return (N, 4) unit quaternions wxyz, float64, from quantised vector parts (N, 3)."""
     vector = whole.astype(np.float64) * step
     scalar = np.sqrt(np.clip(1 - np.square(vector).sum(1), 0, None))
     return np.concatenate([scalar[:, None], vector], axis=1)
@@ -120,8 +125,7 @@ _AXIS_TURNS = {
     15: (0.5, 0.5, 0.5, 0.5),
     19: (0.5, -0.5, -0.5, -0.5),
 }
-"""For each order of the axes, as a number of three digits to the base 3, the rotation wxyz whose
-columns are the axes in this order, up to signs."""
+"""Rotations wxyz that permute the axes, up to signs. Keys are permutations as base-3 numbers."""
 
 
 def sort_axes(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -148,10 +152,10 @@ def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 Kind = Literal["exact", "half", "grid", "sparse", "opacity", "rotation"]
-"""Ways to convert values to integers."""
+"""Ways to convert the values of a tensor to integers."""
 
-TRIANGLES = "triangles.points"  # what a scene of triangles has in place of Gaussians
-# most octaves by which the colour steps of a hardly visible Gaussian exceed those of the others
+TRIANGLES = "triangles.points"  # only scenes of triangles have this tensor
+# Largest log2 factor by which colour steps of hardly visible Gaussians are enlarged
 MAX_COARSENESS = 6
 COARSENESS = "gaussians.coarseness"
 _KINDS: dict[str, Kind] = {
@@ -160,14 +164,13 @@ _KINDS: dict[str, Kind] = {
     "gaussians.sh_rest": "sparse",
     "triangles.harmonics": "sparse",
 }
-# smallest and largest steps; at the smallest for rotations the components are within LIMIT
+# Smallest and largest steps; the smallest one for rotations keeps the integers within LIMIT.
 _LIMITS = {"rotation": (2.0**-19, ROTATION_STEP), "opacity": (2.0**-12, 1 / 8)}
-FEW = 64  # number of values up to which tensors are stored as they are
-LARGEST_HALF = 65504.0
-RELATIVE = "model.filter_std"  # stored in half precision: it spans orders of magnitude
-POSITIVE = "model.field.buffers.radii"
-"""Stored as they are: a radius of influence that is rounded to 0 has no meaning, and there are
-few."""
+FEW = 64  # tensors with at most this many values are stored exactly
+LARGEST_HALF = 65504.0  # largest finite float16
+FILTER_STD = "model.filter_std"  # stored in half precision: it spans orders of magnitude
+NODE_RADII = "model.field.buffers.radii"
+"""Radii of control nodes are stored exactly, since they must not be rounded to 0."""
 FIXED_STEPS = {
     "model.anchors.points": 2.0**-9,
     "model.anchors.size": 2.0**-13,
@@ -175,31 +178,30 @@ FIXED_STEPS = {
     "model.anchors.uv": 2.0**-9,
     "model.anchors.barycentric": 2.0**-6,
 }
-"""Steps of a person's anchors on the template, m or shares: images hardly depend on them."""
+"""Steps of an avatar's anchors on the body template, m or fractions, which hardly affect images."""
 
 
 class Coding(NamedTuple):
     """Kind and precision with which one tensor is stored."""
 
-    kind: Kind  # of its numbers
-    step: float = 0.0  # 0 for the kinds that have none
+    kind: Kind
+    step: float = 0.0  # quantisation step; 0 for exact and half
     by_coarseness: bool = False  # the step of row i is ``2 ** coarseness[i]`` times as large
 
     def steps(self, coarseness: np.ndarray | None, num_axes: int) -> Steps:
-        """Return the step, or one per row, broadcast to ``num_axes`` axes."""
+        """Return the step, or (N, 1, ...) steps with ``num_axes`` axes."""
         if not self.by_coarseness:
             return self.step
         if coarseness is None:
-            raise ValueError("the coarseness of its rows lacks")
+            raise ValueError("the coarseness of its rows is missing")
         return (self.step * 2.0 ** coarseness.astype(np.float64)).reshape(-1, *[1] * (num_axes - 1))
 
 
 def tensors_to_store(scene: Renderable) -> dict[str, Tensor]:
-    """Return the tensors for drawing in an equivalent form that is cheaper to store: axes sorted by
-    length.
+    """Return the tensors that rendering needs, in an equivalent form that compresses better.
 
-    Not those of Gaussians whose axes a field changes one by one. Raises DyngsError: a value is not
-    finite, or there are neither Gaussians nor triangles.
+    The axes of Gaussians are sorted by length, except where a deformation field changes single
+    axes. Raises DyngsError: a value is not finite, or there are neither Gaussians nor triangles.
     """
     kept = strip_roles(scene.drawing_state())
     for name, x in kept.items():
@@ -221,34 +223,36 @@ def tensors_to_store(scene: Renderable) -> dict[str, Tensor]:
 
 
 def to_checkpoint_tensors(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors of a checkpoint that can be drawn, but not trained on, from stored ones.
+    """Convert stored tensors to those of a checkpoint without training state.
 
-    Raises KeyError: one is missing that every scene of Gaussians has. ValueError: the tensors of
-    these do not fit together. Those of triangles are looked at where they are restored.
+    Raises KeyError: a tensor of Gaussians is missing. ValueError: their shapes do not match.
+    Triangles are validated when the scene is restored.
     """
     full = dict(tensors)
     if TRIANGLES in full:
         return full
     base = full.pop("gaussians.sh_base")
     full["gaussians.sh"] = torch.cat([base[:, None], full.pop("gaussians.sh_rest")], dim=1)
-    # they must fit together
+    # The constructor validates the shapes.
     Gaussians(**{field.name: full[f"gaussians.{field.name}"] for field in fields(Gaussians)})
     return full
 
 
 def storage_edit(scene: GaussianScene, means: np.ndarray) -> TopologyEdit:
-    """Return the edit that puts Gaussians next to their neighbours in space, first those that a
-    field moves.
+    """Return the edit that sorts Gaussians so that spatial neighbours have adjacent rows.
 
-    ``means``: (N, 3) as they will be read again, which decide the order.
+    Gaussians that a field deforms come first. ``means``: (N, 3) after quantisation, so that storing
+    a file again keeps the order.
     """
     return TopologyEdit.select(torch.from_numpy(storage_order(means, scene.offset_rows.numpy())))
 
 
 def step_group(name: str, x: Tensor) -> str | None:
-    """Return the name of the group that shares a step, without the number at its end; None where
-    there is no step."""
-    if x.dtype != torch.float32 or name in (RELATIVE, POSITIVE) or name in FIXED_STEPS:
+    """Return the name of the group of tensors that share a step; None if it has no free step.
+
+    Tensors whose names differ only in a final number share a group.
+    """
+    if x.dtype != torch.float32 or name in (FILTER_STD, NODE_RADII) or name in FIXED_STEPS:
         return None
     if x.numel() <= FEW and not name.startswith("gaussians."):
         return None
@@ -260,11 +264,11 @@ def choose_coding(
 ) -> Coding:
     """Return the coding of a tensor.
 
-    ``steps``: group (or name, where it has none) to the largest step, 0 for none: stored as it is;
-    a group that lacks is stored in half precision.
+    ``steps``: largest step by group, or by name for tensors without a group. A step of 0 stores
+    exact values. Groups without an entry are stored in half precision.
     """
     group = step_group(name, x)
-    if name == POSITIVE or steps.get(group or name) == 0:
+    if name == NODE_RADII or steps.get(group or name) == 0:
         return Coding("exact")
     if name in FIXED_STEPS:
         return Coding("grid", FIXED_STEPS[name])
@@ -274,7 +278,7 @@ def choose_coding(
     kind = _KINDS.get(name, "grid")
     low, high = _LIMITS.get(kind, (SMALLEST_STEP, LARGEST_STEP))
     step = round_step_down(min(max(steps[group], low), high))
-    # with more than an eighth of the values out of the integer range, all are stored as they are
+    # If more than an eighth of the values exceed the integer range, all are stored exactly.
     if kind in ("grid", "sparse") and int((x.abs() >= LIMIT * step).sum()) > x.numel() / 8:
         return Coding("exact")
     return Coding(kind, step, by_coarseness and name.startswith("gaussians.sh_"))
@@ -283,11 +287,13 @@ def choose_coding(
 def quantize_tensor(
     x: Tensor, coding: Coding, coarseness: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``x`` as integers, and the values that no whole number reaches.
+    """Return ``x`` as integers, and its values that exceed the integer range.
 
-    ``coarseness``: (N,) of its rows, where they have any. The integers are int64 of the shape of
-    ``x``, (N, 3) for rotations. The values are (K, 2) int64: index into the flat numbers and
-    float32 bits.
+    ``coarseness``: (N,) log2 factors of the steps of its rows.
+
+    Returns:
+        int64 numbers of the shape of ``x``, or (N, 3) for rotations; and (K, 2) int64: flat index
+        and float32 bits of each value out of range.
     """
     values = x.detach().contiguous().numpy()
     far = np.zeros((0, 2), dtype=np.int64)
@@ -315,11 +321,11 @@ def dequantize_tensor(
     dtype: str,
     coarseness: np.ndarray | None = None,
 ) -> Tensor:
-    """Return the tensor that ``to_whole`` turned into integers, of ``dtype`` such as "float32".
+    """Return the tensor that ``quantize_tensor`` encoded; the inverse of that function.
 
-    Raises ValueError, OverflowError, IndexError: numbers that ``to_whole`` does not make.
+    ``dtype``: such as "float32". Raises ValueError, OverflowError, IndexError: invalid numbers.
     """
-    # numbers that were laid out by columns are no flat array until they are copied into one
+    # Numbers that were packed by columns are not contiguous.
     numbers = np.ascontiguousarray(numbers)
     if coding.kind == "rotation":
         values = rotations_from_grid(numbers, coding.step)
@@ -337,40 +343,47 @@ def dequantize_tensor(
 
 
 def round_trip(x: Tensor, coding: Coding, coarseness: np.ndarray | None = None) -> Tensor:
-    """Return ``x`` as it is read back."""
+    """Return ``x`` after quantisation and dequantisation."""
     whole = quantize_tensor(x, coding, coarseness)
-    return dequantize_tensor(*whole, coding, _name_of(x), coarseness)
+    return dequantize_tensor(*whole, coding, _dtype_name(x), coarseness)
 
 
-def _name_of(x: Tensor) -> str:
+def _dtype_name(x: Tensor) -> str:
     return str(x.dtype).removeprefix("torch.")
 
 
 class Packing(NamedTuple):
     """The way an array of integers was packed into bytes."""
 
-    axis: int  # differences along it are stored, -1: the numbers themselves
-    by_rows: bool  # rows follow each other, otherwise columns
-    signed: bool  # there are negative numbers: 0, -1, 1, -2 ... are stored as 0, 1, 2, 3
-    planes: int  # bytes per number; all lowest bytes come first
+    axis: int  # axis along which differences are stored; -1: the numbers themselves
+    by_rows: bool  # row-major, otherwise column-major
+    signed: bool  # zigzag coding: 0, -1, 1, -2 ... are stored as 0, 1, 2, 3
+    planes: int  # bytes per number; the lowest bytes of all numbers come first
 
 
 def pack_integers(whole: np.ndarray) -> tuple[Packing, bytes]:
-    """Return the smallest of some ways to store ``whole`` (int64, any shape) as bytes."""
+    """Compress int64 numbers of any shape with the packing that gives the fewest bytes.
+
+    Large arrays are tried by a sample of their rows.
+    """
     best = -1, True
     if whole.size >= 512:
         sample = whole[: max(2**15 // max(whole[:1].size, 1), 64)]
         axes = [-1, *(axis for axis in range(min(whole.ndim, 2)) if whole.shape[axis] > 1)]
         orders = (True, False) if whole.ndim > 1 else (True,)
         ways = [(axis, by_rows) for axis in axes for by_rows in orders]
-        best = min(ways, key=lambda way: len(compress_lzma(_laid_out(sample, *way)[1], quick=True)))
-    packing, plain = _laid_out(whole, *best)
+        best = min(
+            ways, key=lambda way: len(compress_lzma(_pack_with(sample, *way)[1], quick=True))
+        )
+    packing, plain = _pack_with(whole, *best)
     return packing, compress_lzma(plain)
 
 
 def unpack_integers(packing: Packing, data: bytes, shape: tuple[int, ...]) -> np.ndarray:
-    """Return int64 numbers of ``shape``. Raises DyngsError if the bytes do not hold that many
-    numbers."""
+    """Return int64 numbers of ``shape``; the inverse of ``pack_integers``.
+
+    Raises DyngsError: the bytes contain another number of values.
+    """
     count = math.prod(shape)
     plain = np.frombuffer(decompress_lzma(data, packing.planes * count), dtype=np.uint8)
     wide = np.zeros((count, 8), np.uint8)
@@ -388,17 +401,16 @@ def unpack_integers(packing: Packing, data: bytes, shape: tuple[int, ...]) -> np
 def compress_lzma(plain: bytes, *, room: int | None = None, quick: bool = False) -> bytes:
     """Return ``plain`` as LZMA2 without headers.
 
-    ``room``: the size that it will be read with, where that is not its own.
+    ``room``: the ``size`` that the reader will pass to ``decompress_lzma``, if it is larger.
     """
     filters = _filters(1 if quick else 6, room or len(plain))
     return lzma.compress(plain, format=lzma.FORMAT_RAW, filters=filters)
 
 
 def decompress_lzma(data: bytes, size: int, *, exact: bool = True) -> bytes:
-    """Return the ``size`` bytes that ``data`` holds (at most so many, if not ``exact``); never
-    takes memory for more.
+    """Return the decompressed bytes, which must be ``size``, or at most ``size`` if not ``exact``.
 
-    Raises DyngsError: there are not so many, or something else follows them.
+    Memory is bounded by ``size``. Raises DyngsError: another length, or trailing bytes.
     """
     decoder = lzma.LZMADecompressor(format=lzma.FORMAT_RAW, filters=_filters(6, size))
     try:
@@ -406,11 +418,11 @@ def decompress_lzma(data: bytes, size: int, *, exact: bool = True) -> bytes:
     except (lzma.LZMAError, EOFError):
         raise DyngsError("its data cannot be decoded") from None
     if len(plain) > size or (exact and len(plain) < size) or not decoder.eof or decoder.unused_data:
-        raise DyngsError("its data is not as long as it says")
+        raise DyngsError("its data has another length than stated")
     return plain
 
 
-def _laid_out(whole: np.ndarray, axis: int, by_rows: bool) -> tuple[Packing, bytes]:
+def _pack_with(whole: np.ndarray, axis: int, by_rows: bool) -> tuple[Packing, bytes]:
     if axis >= 0:
         whole = np.diff(whole, axis=axis, prepend=np.int64(0))
     signed = bool((whole < 0).any())
@@ -431,8 +443,9 @@ def _filters(preset: int, size: int) -> list[dict[str, int]]:
 
 MAGIC = b"dyngs\x00\x01\n"
 MAX_HEADER = 2**20
+# Bound on the values that a reader accepts: FREE_VALUES + VALUES_PER_BYTE per byte of the file
 FREE_VALUES = 2**22
-VALUES_PER_BYTE = 64  # largest number of values in any file, and of further values per byte of it
+VALUES_PER_BYTE = 64
 
 
 class _Strict(BaseModel):
@@ -440,8 +453,8 @@ class _Strict(BaseModel):
 
 
 class _Entry(_Strict):
-    """A tensor: fields of ``Coding`` and ``Packing``, bytes of its numbers, and how many values are
-    out of reach."""
+    """Header of a tensor: its fields of ``Coding`` and ``Packing``, the ``size`` of its packed
+    numbers in bytes, and the number of values out of range (``far``)."""
 
     name: str
     dtype: Literal["float16", "float32", "float64", "int32", "int64", "uint8", "bool"]
@@ -463,16 +476,15 @@ class _Header(_Strict):
 
 
 def write_scene(path: Path, data: bytes) -> None:
-    """Write the bytes of ``encode_scene`` atomically. Raises DyngsError for a full disk and the like."""
+    """Write the bytes of ``encode_scene`` atomically. Raises DyngsError: the disk is full, ..."""
     with atomic_file(path, durable=True) as temporary:
         temporary.write_bytes(data)
 
 
 def read_scene(path: Path) -> Checkpoint:
-    """Return the checkpoint in a file: the tensors that drawing needs.
+    """Return the checkpoint in a file, with the tensors that rendering needs.
 
-    Raises DyngsError: a file that is missing, truncated, altered, or of another version; one line
-    that names it.
+    Raises DyngsError: the file is missing, truncated, altered, or of another version.
     """
     require_regular_file(path)
     try:
@@ -489,12 +501,15 @@ def encode_scene(
     steps: Mapping[str, float],
     coarseness: Tensor | None = None,
 ) -> bytes:
-    """Return the bytes of a file; the same for what was read from it. Raises DyngsError: a value is
-    not finite.
+    """Return the bytes of a scene file. Encoding a decoded file again gives the same bytes.
 
-    ``steps`` are of groups of tensors, see ``dyngs.compress.measure``; others are stored in half
-    precision. ``coarseness`` (N,) uint8 of the Gaussians, see ``coarseness_of``; None: all are
-    stored alike.
+    Args:
+        steps: largest steps of groups of tensors, see ``choose_coding``.
+        coarseness: (N,) uint8 of the Gaussians, see ``dyngs.compress.measure.compute_coarseness``.
+            None uses the same colour step for all.
+
+    Raises:
+        DyngsError: a value is not finite.
     """
     kept = tensors_to_store(scene)
     rows = None
@@ -519,18 +534,17 @@ def encode_scene(
 def encode_tensor(
     name: str, x: Tensor, coding: Coding, rows: np.ndarray | None = None
 ) -> tuple[_Entry, bytes]:
-    """Return the entry of a tensor in the header, and its bytes; ``rows`` (N,) is its
-    coarseness."""
+    """Return the header entry of a tensor, and its bytes. ``rows``: (N,) coarseness."""
     numbers, far = quantize_tensor(x, coding, rows)
     packing, block = pack_integers(numbers)
-    own = {"name": name, "dtype": _name_of(x), "shape": tuple(x.shape)}
+    own = {"name": name, "dtype": _dtype_name(x), "shape": tuple(x.shape)}
     own |= {"size": len(block), "far": len(far)}
     entry = _Entry.model_validate(own | coding._asdict() | packing._asdict())
     return entry, block + far.astype("<i8").tobytes()
 
 
 def assemble_file(info: dict[str, Any], entries: list[_Entry], blocks: list[bytes]) -> bytes:
-    """Return the bytes of a file of stored tensors; ``info`` are the fields of ``CheckpointInfo``."""
+    """Return the bytes of a file. ``info``: fields of ``CheckpointInfo``."""
     header = _Header(info=info, tensors=tuple(entries)).model_dump_json()
     packed_header = compress_lzma(header.encode(), room=MAX_HEADER)
     size = len(packed_header).to_bytes(4, "little")
@@ -541,8 +555,10 @@ def assemble_file(info: dict[str, Any], entries: list[_Entry], blocks: list[byte
 
 
 def decode_scene(data: bytes) -> Checkpoint:
-    """Return the checkpoint in the bytes of a file. Raises DyngsError: anything but what
-    ``encode_scene`` makes."""
+    """Return the checkpoint in the bytes of a file; the inverse of ``encode_scene``.
+
+    Raises DyngsError: the bytes are invalid.
+    """
     if data[: len(MAGIC)] != MAGIC:
         is_other = data.startswith(MAGIC[:6]) and len(data) > len(MAGIC)
         raise DyngsError(
@@ -561,17 +577,19 @@ def decode_scene(data: bytes) -> Checkpoint:
         )
         num_values = sum(math.prod(entry.shape) for entry in header.tensors)
         if num_values > FREE_VALUES + VALUES_PER_BYTE * len(body):
-            raise DyngsError(f"it claims {num_values} values, more than a file of its size holds")
+            raise DyngsError(
+                f"its header has {num_values} values, too many for the size of the file"
+            )
         tensors: dict[str, Tensor] = {}
         for entry in header.tensors:
             block = body[end : end + entry.size + 16 * entry.far]
             end += entry.size + 16 * entry.far
             tensors[entry.name] = _tensor(entry, block, tensors.get(COARSENESS))
         if any(body[end:]) or end > len(body):
-            raise DyngsError("it holds something else than its header says")
+            raise DyngsError("its data does not match its header")
         return Checkpoint(parse_info(header.info), to_checkpoint_tensors(tensors))
     except KeyError as missing:
-        raise DyngsError(f"it lacks {format_one_line(str(missing), 60)}") from None
+        raise DyngsError(f"{format_one_line(str(missing), 60)} is missing") from None
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])

@@ -38,14 +38,14 @@ from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import validate_limits
 from dyngs.training.trainer import Trainer
 
-# Requested steps of a run with a time limit, which reduces them to what fits
+# Requested steps of runs with a time limit; training reduces them to the number that fits.
 MOST_STEPS = 1_000_000
 TIMED_VIEWS = 4  # Views used for timing
 ROUNDS = 3  # Renders of each timed view
 CURVE_VIEWS = 6  # Held-out views scored during training
-# Fractions of a run after which they are scored, denser at the start, where quality rises fast
+# Fractions of a run after which these are scored; denser at the start, where PSNR rises fast
 MARKS = tuple((i / 12) ** 2 for i in range(1, 12))
-# Step, seconds of training, mean PSNR in dB of some held-out views
+# Points of a curve: step, seconds of training, mean PSNR in dB of some held-out views
 Curve = list[tuple[int, float, float]]
 _CURVE = TypeAdapter(Curve)
 
@@ -68,6 +68,7 @@ class ModelComparison:
 
     @property
     def limit(self) -> str:
+        """The budget in words."""
         if self.minutes is not None:
             return f"{self.minutes:g} minutes of training"
         return f"{self.steps:,} steps" if self.steps is not None else f"at most {self.max_mb:g} MB"
@@ -76,7 +77,9 @@ class ModelComparison:
         return self.out / "runs" / name
 
     def configs(self, models: Sequence[str]) -> tuple[dict[str, Config], dict[str, str]]:
-        """Return the configs of comparable models, and the reasons why other models are skipped.
+        """Return configs by model, and for models that cannot be compared the reason by model.
+
+        ``models``: names or files of presets.
 
         Raises:
             DyngsError: an unknown model, an invalid override, or a capture that no model supports.
@@ -104,13 +107,13 @@ class ModelComparison:
         capture = read_capture(data)
         split_views(capture, self.split)  # raises for a split without views
         configs = dict[str, Config]()
-        left_out = dict[str, str]()
+        skipped = dict[str, str]()
         for word in models:
             file = find_preset(Path(word))
             # An invalid preset is an error, not a skipped model.
             load_config(file, [fixed[0]])
             name = re.sub(r"[^\w.-]", "_", file.stem).lstrip(".-") or "model"
-            if name in configs or name in left_out:
+            if name in configs or name in skipped:
                 raise DyngsError(
                     f"--models: {format_one_line(word, 60)}: two models are named {name}; rename one "
                     "preset"
@@ -121,28 +124,30 @@ class ModelComparison:
                 validate_limits(config)
                 problem = find_kind(config.model).refusal(capture)
                 if capability(config.model, PredictsScenes) is not None:
-                    problem = "predicts people and needs several captures"
+                    problem = "predicts people; its training needs several captures"
             except DyngsError as error:
                 problem = str(error)
             if problem is None:
                 configs[name] = config.model_copy(update={"data": data})
             else:
-                left_out[name] = problem
+                skipped[name] = problem
         if not configs:
-            name, problem = next(iter(left_out.items()))
+            name, problem = next(iter(skipped.items()))
             raise DyngsError(
                 f"none of the models can be trained on {self.capture}; {name}: {problem}"
             )
-        return configs, left_out
+        return configs, skipped
 
-    def require_same(self, configs: dict[str, Config], left_out: dict[str, str]) -> None:
-        """Store what is compared in the output folder. Raise DyngsError if it holds another
-        comparison."""
+    def require_same(self, configs: dict[str, Config], skipped: dict[str, str]) -> None:
+        """Store models, settings and budget in the output folder.
+
+        Raises DyngsError: the folder contains another comparison.
+        """
         digests = {
             name: hashlib.sha256(config.model_dump_json().encode()).hexdigest()[:12]
             for name, config in configs.items()
         }
-        facts = asdict(self) | {"models": sorted([*configs, *left_out]), "settings": digests}
+        facts = asdict(self) | {"models": sorted([*configs, *skipped]), "settings": digests}
         facts |= {"capture": str(self.capture), "out": None}
         others = [key for key in facts if key != "settings"]
         # Check settings last: they follow from the others unless a preset changed.
@@ -152,7 +157,9 @@ class ModelComparison:
     def run(
         self, configs: dict[str, Config], ray_cores: int | None = None
     ) -> tuple[list[Measurement], dict[str, str], dict[str, Curve]]:
-        """Train and measure the models. Results are stored as soon as they are available.
+        """Train and measure the models. Each result is stored at once; stored ones are reused.
+
+        ``ray_cores``: cores per model with Ray. None trains one model after the other.
 
         Returns:
             measurements in the order of the models, reasons why models were skipped, and quality
@@ -177,25 +184,25 @@ class ModelComparison:
         missing = [
             x for x in study_scenes.values() if not measurer.measurement_path(x.slug).is_file()
         ]
-        left_out = dict[str, str]()
+        skipped = dict[str, str]()
         for study_scene, result in run_tasks(measurer.measure, missing, ray_cores):
             if isinstance(result, DyngsError):
-                left_out[study_scene.name] = str(result)
+                skipped[study_scene.name] = str(result)
                 del study_scenes[study_scene.name]
                 log_info(f"{study_scene.name}: skipped: {result}")
             else:
                 done = f"{result.steps:,} steps in {result.seconds:.0f} s"
                 log_info(f"{study_scene.name}: {result.psnr:.2f} dB, {done}")
         if not study_scenes:
-            name, problem = next(iter(left_out.items()))
+            name, problem = next(iter(skipped.items()))
             raise DyngsError(f"no model could be trained; {name}: {problem}")
         curves = {name: QualityCurve(self, self.run_dir(name)).points() for name in study_scenes}
-        return measurer.with_speeds(list(study_scenes.values())), left_out, curves
+        return measurer.with_speeds(list(study_scenes.values())), skipped, curves
 
     def _train(self, config: Config) -> Path:
         """Train a model unless it is complete. Return the folder to render from.
 
-        With a size limit, that is the exported scene of limited size.
+        With a size limit, this is the folder of the exported scene file.
         """
         folder = config.run.dir
         assert folder is not None

@@ -47,9 +47,9 @@ from dyngs.study.measure import SCORES, Measurement, SceneMeasurer, StudyScene
 from dyngs.study.runs import STORED_CONFIG, require_same_study, run_tasks, train_to_end
 from dyngs.training.new_trainer import build_trainer
 
-MIN_DOUBLINGS = 0.05  # Smaller gains (3.5 %) count as none
-MAX_LOSS_DB = 6.0  # Single changes with a larger loss are not combined with others
-SEVERAL = "several"  # Setting of a variant that changes more than one
+MIN_DOUBLINGS = 0.05  # log2 of the smallest gain that counts (a factor of 1.035)
+MAX_LOSS_DB = 6.0  # changes that lose more PSNR are not combined with others
+SEVERAL = "several"  # ``Variant.setting`` of combinations
 # Columns that a requirement or a goal may name
 METRICS = ("psnr", "ssim", "lpips", "fps", "mb", "gaussians")
 _CONDITION = re.compile(r"\s*([a-z_]+)\s*(>=|<=)\s*(\S+)\s*$")
@@ -63,12 +63,12 @@ class Variant:
 
     Attributes:
         prune: fraction of Gaussians to remove, by sensitivity.
-        mask_times: key times of visibility masks.
+        mask_times: number of key times of visibility masks.
         finetune: training steps after pruning and masking.
         sh_degree: largest degree of spherical harmonics to keep.
-        storage: largest change of images by quantisation in grey levels of 255, or "auto" as in
-            ``dyngs export --format dyngs``. None stores float32.
-        alpha_min: ``model.alpha_min`` for rendering.
+        storage: largest image change by quantisation, in grey levels of 255; "auto" is the default
+            of ``dyngs export --format dyngs``. None stores float32.
+        alpha_min: ``model.alpha_min``, the smallest alpha that is rendered.
     """
 
     prune: Annotated[float, Field(ge=0, lt=1)] = 0.0
@@ -149,7 +149,7 @@ def current_settings(run_dir: Path) -> dict[str, Value | None]:
     """Return the settings of a run that can be varied, with their current values.
 
     Raises:
-        DyngsError: the run has no settings to vary.
+        DyngsError: the run has no Gaussians, or only a scene file.
     """
     if has_only_scene_file(run_dir):
         raise DyngsError(
@@ -240,9 +240,9 @@ class Tradeoff:
         }
         require_same_study(self.out, source, ("sha256", "split", "device"))
         singles = [Variant(), *single_setting_variants(self.settings, own, self.finetune)]
-        idle = self.settings.keys() - {name for variant in singles for name in variant.settings}
-        if idle:
-            log_info(f"settings without effect on this run: {', '.join(sorted(idle))}")
+        unused = self.settings.keys() - {name for variant in singles for name in variant.settings}
+        if unused:
+            log_info(f"settings without effect on this run: {', '.join(sorted(unused))}")
         found = self._measure(singles, self.ray_cores)
         # Combinations share folders, so they are created one by one.
         return self._measure([*singles, *combinations(found, self.combine)], None)
@@ -354,8 +354,9 @@ def pareto_mask(goals: Sequence[Sequence[float]]) -> list[bool]:
 def build_rows(measurements: Sequence[Measurement]) -> list[Row]:
     """Return a table row per measurement.
 
-    ``fps`` is that of the first measurement times the gain, so scenes timed at different hours are
-    comparable. ``on_front`` marks the Pareto front of PSNR, speed and size.
+    ``gain`` is the speed relative to the first measurement, timed side by side. ``fps`` is the
+    frame rate of the first measurement times ``gain``, since absolute speeds vary between sessions.
+    ``on_front`` marks the Pareto front of PSNR, speed and size.
     """
     base = measurements[0].ms
     fps = 0.0 if base is None else 1e3 / base
@@ -371,9 +372,9 @@ def build_rows(measurements: Sequence[Measurement]) -> list[Row]:
 
 
 def db_per_doubling(losses_and_factors: Iterable[tuple[float, float]]) -> float | None:
-    """Return the dB lost per factor 2, by a least-squares line through the origin.
+    """Return the PSNR in dB lost per doubling, by a least-squares line through the origin.
 
-    None if all gains are below 3.5 %.
+    ``losses_and_factors``: PSNR loss in dB and gain as a factor. None if all gains are negligible.
     """
     pairs = [(loss, math.log2(factor)) for loss, factor in losses_and_factors]
     pairs = [(loss, doublings) for loss, doublings in pairs if doublings >= MIN_DOUBLINGS]
@@ -409,7 +410,8 @@ def combinations(found: Mapping[Variant, Measurement], count: int) -> list[Varia
 
     Three greedy sequences of ``count`` variants optimise speed, size, and both. Each starts at the
     original run and adds the change with the smallest PSNR loss per factor 2. A stronger value of a
-    setting, which comes later in ``found``, replaces a weaker one.
+    setting, which comes later in ``found``, replaces a weaker one. Only combinations that are not
+    in ``found`` are returned.
     """
     base = found[Variant()]
     combined: dict[Variant, None] = {}
@@ -443,8 +445,10 @@ def combinations(found: Mapping[Variant, Measurement], count: int) -> list[Varia
 
 @dataclass(frozen=True)
 class Requirement:
-    """A condition ``name >= bound``, or ``name <= bound`` if ``at_most``. Also used as a goal
-    without bound."""
+    """A condition ``name >= bound``, or ``name <= bound`` if ``at_most``.
+
+    A goal to maximise or minimise is a requirement without bound.
+    """
 
     name: str
     at_most: bool
@@ -496,8 +500,8 @@ def choose_variant(
     """Return the index of the best row that meets all requirements. Ties are resolved by PSNR.
 
     Raises:
-        DyngsError: no row meets the requirements. The message names the best values without each
-            one.
+        DyngsError: no row meets the requirements. For each requirement, the message names the best
+            value among rows that meet all others.
     """
 
     def meeting(needed: Sequence[Requirement]) -> list[int]:

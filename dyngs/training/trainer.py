@@ -242,7 +242,7 @@ class Trainer(Generic[M]):
             model.replace_scene(model.scene.without_masks())
             model.stop_growing()
         if edit.keep is not None:
-            model.keep(edit.keep, self.done)
+            model.select_gaussians(edit.keep, self.done)
         if edit.masks is not None:
             model.replace_scene(replace(model.scene, masks=edit.masks))
 

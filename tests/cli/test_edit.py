@@ -98,7 +98,7 @@ def test_what_is_refused(plain: Path, capsys: Capture) -> None:
         (["--out", "plain.ply"], "exists, which is an input"),
         (["--merge", "half.ply", "--out", "half.ply"], "exists, which is an input"),
         (["--geo", "line.csv", "--out", "line.csv"], "exists, which is an input"),
-        (["--crop", "open.obj"], "give two corners"),
+        (["--crop", "open.obj"], "use two corners"),
         (["--crop", "50,50,50", "1"], "--crop leaves none"),
         (["--crop", "-1,0,0"], "use two corners"),
         (["--scale", "0"], "--scale: '0' is not a factor"),

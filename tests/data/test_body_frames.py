@@ -57,7 +57,7 @@ def random_body(seed: int, count: int = 3, turned: bool = True) -> BodyFrames:
 def in_world(
     body: BodyFrames, row: int, points: np.ndarray, joints: np.ndarray, weights: np.ndarray
 ) -> np.ndarray:
-    """Where the points of a template are, as ``BodyFrames`` says it."""
+    """Return the template points in world coordinates, by the definition of ``BodyFrames``."""
     at_rest = posed(points, joints, weights, body.poses[row])
     if body.origin_rotations is not None:
         at_rest = at_rest @ Rotation.from_rotvec(body.origin_rotations[row]).as_matrix().T
@@ -118,10 +118,10 @@ GOOD: dict[str, Any] = {
             "'poses' has 87 numbers per frame; supported bodies: 72",
         ),
         ({"poses": np.zeros((4, 73))}, "'poses' has 73 numbers per frame"),
-        ({"poses": np.zeros((3, 72))}, "'poses' must hold as many numbers for each of 4 frames"),
-        ({"poses": np.zeros(())}, "'poses' must hold as many numbers"),
-        ({"poses": [[0.0] * 72] * 3 + [[0.0]]}, "'poses' must hold as many numbers"),
-        ({"poses": [["a"] * 72] * 4}, "'poses' must hold as many numbers"),
+        ({"poses": np.zeros((3, 72))}, "'poses' must have one row of numbers for each of 4 frames"),
+        ({"poses": np.zeros(())}, "'poses' must have one row of numbers"),
+        ({"poses": [[0.0] * 72] * 3 + [[0.0]]}, "'poses' must have one row of numbers"),
+        ({"poses": [["a"] * 72] * 4}, "'poses' must have one row of numbers"),
         ({"trans": np.zeros((4, 4))}, "'trans' has 4 numbers per frame instead of 3"),
         ({"trans": np.full((4, 3), np.nan)}, "'trans' of frame 0 contains NaN"),
         (
@@ -134,9 +134,9 @@ GOOD: dict[str, Any] = {
         ),
         ({"betas": [0, np.nan]}, "'betas' must hold finite numbers"),
         ({"betas": [0, 1e39]}, "'betas' must hold finite numbers"),
-        ({"betas": np.zeros((3, 10))}, "'betas' must hold as many numbers"),
+        ({"betas": np.zeros((3, 10))}, "'betas' must have one row of numbers"),
         ({"scale": -np.ones(4)}, "'scale' must be positive"),
-        ({"scale": "big"}, "'scale' must hold as many numbers"),
+        ({"scale": "big"}, "'scale' must have one row of numbers"),
         (
             {"origin_rotations": np.zeros((4, 4))},
             "'origin_rotations' has 4 numbers per frame instead of 3",

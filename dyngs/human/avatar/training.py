@@ -200,7 +200,7 @@ class AvatarParams:
     refine_from: float = 0.1  # fraction of the run after which corrections are learned
     # the same for corrections of single frames, after the shared ones have converged
     refine_frames_from: float = 0.25
-    offset_weight: float = 2e-4  # of squared distances from the scaffold
+    offset_weight: float = 2e-4  # of squared distances of Gaussians from their anchors
     scale_weight: float = 1e-2  # of the squared excess of log-scales over the size of the texel
     rigidity: float = 1e-2  # of squared distance changes between neighbours by posing
     smoothness: float = 1e-3  # of squared differences between the offsets of neighbours

@@ -56,7 +56,7 @@ def fix_left_right_swaps(person: Sequence[Detection | None]) -> tuple[list[Detec
     heights = np.array([x.height for x in detections])
     was_swapped = np.zeros(len(points), bool)
     for pairs in _PAIRS.values():
-        swapped = _swapped(points, np.array(pairs), heights)
+        swapped = _find_swaps(points, np.array(pairs), heights)
         for left, right in pairs:
             points[swapped, left], points[swapped, right] = (
                 points[swapped, right],
@@ -71,7 +71,7 @@ def fix_left_right_swaps(person: Sequence[Detection | None]) -> tuple[list[Detec
     return result, int(was_swapped.sum())
 
 
-def _swapped(points: np.ndarray, pairs: np.ndarray, heights: np.ndarray) -> np.ndarray:
+def _find_swaps(points: np.ndarray, pairs: np.ndarray, heights: np.ndarray) -> np.ndarray:
     """Return the images (F,) bool in which ``pairs`` (P, 2) of ``points`` (F, 17, 3) should be
     swapped."""
     if len(points) < 2:

@@ -68,7 +68,7 @@ def read_amass(
         renamed = [key for key, name in _ALIASES.items() if key in arrays and name not in arrays]
         for key in renamed:
             arrays[_ALIASES[key]] = arrays.pop(key)
-        is_named = bool(renamed) or (
+        has_smplx_names = bool(renamed) or (
             "poses" not in arrays and "root_orient" not in arrays and "global_orient" in arrays
         )
         poses, model = _poses(path, arrays)
@@ -89,7 +89,7 @@ def read_amass(
         if not is_fit:
             betas = np.zeros_like(betas) if is_other_model else betas[: body.num_shapes]
         rate = _frame_rate(path, arrays, fps)
-        y_from_file, notes = _y_up_from_file(path, arrays, up, poses[:, 0], is_named)
+        y_from_file, notes = _y_up_from_file(path, arrays, up, poses[:, 0], has_smplx_names)
         if y_from_file is not None:
             pelvis = scale[:, None] * _pelvis(body, betas)
             roots = Rotation.from_matrix(y_from_file) * Rotation.from_rotvec(poses[:, 0])
@@ -148,7 +148,7 @@ def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, str]:
         poses = np.zeros((len(turns[root]), 55, 3))
         start = 0
         for key, count in parts.items():
-            if key in turns:  # SMPL's last two joints are the hands
+            if key in turns:  # omits the last two joints of SMPL, the hands
                 poses[:, start : start + count] = turns[key][:, :count]
             start += count
     require_frame_count(path, len(poses), 55)
@@ -209,14 +209,14 @@ def _frame_rate(path: Path, arrays: dict[str, np.ndarray], fps: float | None) ->
 
 
 def _y_up_from_file(
-    path: Path, arrays: dict[str, np.ndarray], up: UpAxis, roots: np.ndarray, is_named: bool
+    path: Path, arrays: dict[str, np.ndarray], up: UpAxis, roots: np.ndarray, has_smplx_names: bool
 ) -> tuple[np.ndarray | None, tuple[str, ...]]:
     """Return the rotation (3, 3) to y up (None: the identity), and a note if the up axis was
     guessed.
 
     ``up`` or the key ``up_axis`` decide, else AMASS files are z up. For smplx and ROMP keys
-    (``is_named``), up is the signed axis nearest to the mean up direction of the root ``roots``
-    (F, 3).
+    (``has_smplx_names``), up is the signed axis nearest to the mean up direction of the root
+    ``roots`` (F, 3).
     """
     if up != "auto":
         chosen = up
@@ -228,7 +228,7 @@ def _y_up_from_file(
         chosen = "y" if "scale" in arrays else "z"
     direction = np.eye(3)["xyz".index(chosen)]
     notes = ()
-    if up == "auto" and "up_axis" not in arrays and is_named:
+    if up == "auto" and "up_axis" not in arrays and has_smplx_names:
         mean = Rotation.from_rotvec(roots).as_matrix()[:, :, 1].mean(axis=0)
         axis = int(np.abs(mean).argmax())
         direction = np.eye(3)[axis] * (1.0 if mean[axis] >= 0 else -1.0)

@@ -37,8 +37,9 @@ def test_rays_see_a_slab_of_even_density() -> None:
     assert float(seen.depth[0]) == pytest.approx(2.5 + 0.5, abs=0.1)
 
 
-def test_all_that_is_learned_gets_gradients_and_none_is_of_rounding() -> None:
-    """The last sample is 1e10 long: what is left of sums must not be multiplied by that."""
+def test_all_parameters_get_gradients_free_of_rounding_errors() -> None:
+    """Gradients stay exact although the last sample is 1e10 long and would amplify rounding
+    errors."""
     field = NerfField.new(NerfModel(sizes="tiny"), SPACE, torch.Generator().manual_seed(3))
     for x in field.parameters.values():
         x.requires_grad_()

@@ -41,7 +41,7 @@ def held_out_psnr(trainer: Trainer[NgpTraining]) -> float:
 
 
 def test_views_that_were_held_out_are_learned(capture: Path) -> None:
-    """The floor is 1 dB below what came out when this was written; a white image has 10 dB."""
+    """The PSNR floor is 1 dB below the measured value; a white image scores 10 dB."""
     trainer = trained(capture, 150)
     assert held_out_psnr(trainer) > 15.5
     field = trainer.model.scene.field

@@ -1,4 +1,4 @@
-"""Where fields lie, and rays: through pixel centres, as a camera projects."""
+"""Bounds of radiance fields, and camera rays through pixel centres."""
 
 from __future__ import annotations
 
@@ -54,15 +54,14 @@ def test_a_real_capture_has_cubes_up_to_its_points(still: Capture) -> None:
     assert space_of(NgpModel(surroundings="never"), 16, real(still, None)).cascades == 1
 
 
-def test_one_camera_position_tells_no_depth(still: Capture) -> None:
+def test_one_camera_position_gives_no_depth(still: Capture) -> None:
     one = replace(still, splits={"train": still.splits["train"][:1] * 3})
     with pytest.raises(DyngsError, match="the same camera position"):
         space_of(NgpModel(), 16, one)
 
 
 def test_rays_go_through_pixel_centres() -> None:
-    """What lies along the ray of a pixel is projected to its centre; z is what the depth of an
-    image means."""
+    """Points along the ray of a pixel project to its centre; z equals the value in a depth map."""
     turn, _ = torch.linalg.qr(
         torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     )

@@ -25,7 +25,7 @@ def samples_of(
     return densities.flatten(), samples
 
 
-def test_what_shows_is_kept_and_the_rest_is_thinned() -> None:
+def test_visible_samples_are_kept_and_the_rest_is_thinned() -> None:
     generator = torch.Generator().manual_seed(0)
     densities, samples = samples_of(40, 40, generator)
     found, which = thin_samples(

@@ -1,4 +1,4 @@
-"""Where triangles begin: on a surface, in the first step, and not again after that."""
+"""Initialisation of triangles on a surface, once, in the first step."""
 
 from __future__ import annotations
 

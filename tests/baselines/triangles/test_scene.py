@@ -39,7 +39,7 @@ def test_a_square_of_two_triangles_is_opaque_and_of_its_colour() -> None:
 
 
 def test_edges_are_as_sharp_when_enlarged() -> None:
-    """As many pixels are between all and nothing along a row at 8 times the size."""
+    """A row has equally many partly covered pixels at 8 times the resolution."""
     rows = [scene_of(*SQUARE).render(camera(size)).alpha[0, size // 2] for size in (32, 256)]
     soft = [int(((row > 0.01) & (row < 0.99)).sum()) for row in rows]
     assert 0 < soft[0] <= 8
@@ -75,7 +75,7 @@ def test_gradients_reach_everything() -> None:
         assert bool(x.grad.isfinite().all())
 
 
-def test_what_has_no_area_is_not_drawn_and_spoils_no_gradient() -> None:
+def test_triangles_without_area_are_not_drawn_and_keep_gradients_finite() -> None:
     """All points equal, on a line, not a number, behind the camera and much larger than the scene,
     with a good one."""
     nan = SQUARE[0].clone()

@@ -1,4 +1,4 @@
-"""What images say about triangles."""
+"""Per-triangle statistics of rendered images."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def places_of(*triangles: torch.Tensor) -> PatchSamples:
     return PatchSamples.of(*visible_patches(torch.cat(triangles), camera(), 0.2))
 
 
-def test_what_is_seen_is_counted() -> None:
+def test_observed_triangles_are_counted() -> None:
     places = places_of(LARGE, BEHIND)
     tallies = TriangleStatistics(2)
     tallies.count(places, torch.ones(16, 16))

@@ -23,7 +23,7 @@ from dyngs.io.write import cache_folder, write_image
 
 @pytest.fixture(autouse=True)
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """Structure from motion is not done; what it was asked for is listed."""
+    """Replace structure from motion by a stub; return the list of its sources."""
     sources: list[Path] = []
 
     def estimate(source: Path, out: Path, options: SfmOptions, report: object) -> SfmResult:
@@ -63,7 +63,7 @@ def test_photos_get_poses_once(tmp_path: Path, asked: list[Path]) -> None:
     assert "3 of 3 images" in said[1]
     assert ensure_poses(data, log=said.append) == first
     assert asked == [tmp_path / "photos"]
-    assert "of before" in said[-1]
+    assert "using the poses cached" in said[-1]
     write_image(tmp_path / "photos" / "photo_1.png", np.zeros((4, 8, 3), np.uint8))
     assert ensure_poses(data, log=said.append).root != first.root, "a photo has changed"
     assert len(asked) == 2
@@ -77,7 +77,7 @@ def test_no_output_replaces_the_video_that_a_run_is_made_of(
     with video_writer(video, fps=10) as add:
         add(np.zeros((16, 16, 3), np.uint8))
     before = video.read_bytes()
-    for _ in ("estimated", "of before"):
+    for _ in ("estimated", "cached"):
         data = ensure_poses(DataConfig(root=video), log=lambda _: None)
         save_config(Config(data=data), tmp_path / "run" / "config.yaml")
         assert (

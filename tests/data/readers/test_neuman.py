@@ -38,7 +38,7 @@ def alignment(index: int) -> tuple[float, Rotation, np.ndarray]:
 
 
 def matrices() -> dict[str, np.ndarray]:
-    """As ``alignments.npy`` has them: row vectors are multiplied from the left."""
+    """Return the matrices of ``alignments.npy``, which multiply row vectors from the right."""
     found = {}
     for index, name in enumerate(NAMES):
         scale, turn, trans = alignment(index)
@@ -170,7 +170,7 @@ def test_missing_files(root: Path) -> None:
         ({1: {"pose": fit()["pose"]}}, "cannot be read .*betas"),
         (
             {1: {**fit(), "pose": np.zeros((4, 72))}},
-            "'poses' must hold as many numbers for each of 9",
+            "'poses' must have one row of numbers for each of 9",
         ),
     ],
 )

@@ -164,7 +164,7 @@ Change = Callable[[dict[str, Tensor]], object]
             lambda x: x.update({"anchors.joints": x["anchors.joints"].float()}),
             "'anchors.joints' is float32",
         ),
-        (lambda x: x["gaussians.means"].fill_(torch.nan), "'means' holds NaN"),
+        (lambda x: x["gaussians.means"].fill_(torch.nan), "'means' has NaN"),
         (lambda x: x["anchors.joints"].fill_(55), "'anchors.joints' has indices outside"),
         (lambda x: x["anchors.weights"].neg_(), "negative or sum to 0"),
         (lambda x: x["skeleton.parents"].fill_(7), "joint 0 has parent 7"),
