@@ -11,6 +11,7 @@ import argparse
 import ast
 import re
 import sys
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -167,13 +168,18 @@ def describe(name: str, summary: str, parser: argparse.ArgumentParser) -> str:
         if action.help != argparse.SUPPRESS and action.dest != "help"
     ]
     remarks, examples = split_epilog(parser.epilog or "")
-    parts = [f"## {name}", (parser.description or summary).strip(), f"```text\n{usage}```"]
+    description = wrap((parser.description or summary).strip())
+    parts = [f"## {name}", description, f"```text\n{usage}```"]
     if rows:
         parts.append("\n".join(["| argument | meaning |", "|---|---|", *rows]))
-    parts += [remark for remark in remarks if remark]
+    parts += [wrap(remark) for remark in remarks if remark]
     if examples:
         parts.append("```bash\n" + "\n".join(examples) + "\n```")
     return "\n\n".join(parts) + "\n"
+
+
+def wrap(text: str) -> str:
+    return textwrap.fill(text, 98, break_long_words=False, break_on_hyphens=False)
 
 
 def argument_name(action: argparse.Action) -> str:

@@ -60,7 +60,7 @@ needs_browser = pytest.mark.skipif(missing() is not None, reason=missing() or ""
 
 
 class Page:
-    """One page in a browser, with all that it complained about and asked for.
+    """One page in a browser, with its errors, warnings and requests.
 
     Attributes:
         errors: texts of errors in the console, of uncaught exceptions and of failed requests, in

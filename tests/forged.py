@@ -148,8 +148,8 @@ def require_drawable(scene: GaussianScene) -> None:
 
 
 def one_line(error: Exception, path: Path) -> None:
-    """Nothing, if the message is one line of printable characters that names the file or says what
-    is not drawn."""
+    """Assert that the message is one line of printable characters. It names the file or the reason
+    why a scene is not drawn."""
     text = str(error)
     assert text.isprintable(), text
     assert (

@@ -1,4 +1,4 @@
-"""What a call costs: for tests that a small file cannot take much memory or time."""
+"""Time and memory of a call, for tests that a small file cannot exhaust either."""
 
 from __future__ import annotations
 

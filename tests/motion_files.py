@@ -154,7 +154,7 @@ def pelvis_path(body: BodyTemplate, motion: Motion) -> np.ndarray:
 
 
 # --- BVH
-# --------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 def write_bvh(
@@ -210,7 +210,7 @@ def depth_first(parents: Sequence[int]) -> list[int]:
 
 
 # --- GLB
-# --------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -331,7 +331,7 @@ def as_local(motion: Motion, own: Skeleton) -> np.ndarray:
 
 
 # --- VRM animations
-# ---------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 VRM = {
     "pelvis": "hips",
@@ -364,8 +364,7 @@ for _side in ("left", "right"):
 
 
 def vrma_of(own: Skeleton, clip: Clip) -> Glb:
-    """A VRM animation of joints that VRM knows: the extension, not the names of nodes, says which
-    bone each is."""
+    """Return a VRM animation whose bones are named by the extension and not by the nodes."""
     glb = glb_of(own, clip)
     glb.json.pop("skins")
     for i, node in enumerate(glb.json["nodes"]):

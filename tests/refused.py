@@ -8,8 +8,8 @@ from dyngs.cli import main
 
 
 def error_line(capsys: pytest.CaptureFixture[str], *arguments: object, begun: bool = False) -> str:
-    """What stderr says about a command line that must be refused: one line; nothing on stdout,
-    unless it has begun."""
+    """Return the one line that a refused command prints on stderr. stdout is empty, unless the
+    command has ``begun``."""
     capsys.readouterr()  # of earlier commands
     assert main([str(a) for a in arguments]) == 2
     output = capsys.readouterr()

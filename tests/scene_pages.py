@@ -44,7 +44,7 @@ def write(
 
 
 def shown(page: Page, view: Cameras, time: float, which: int = 0) -> torch.Tensor:
-    """What a scene of the page draws, (H, W, 3)."""
+    """Return the image (H, W, 3) that a scene of the page draws."""
     ((fx, _, cx), (_, fy, cy), _) = view.intrinsics[0].tolist()
     asked = {
         "camFromWorld": view.cam_from_world[0].flatten().tolist(),
@@ -58,7 +58,7 @@ def shown(page: Page, view: Cameras, time: float, which: int = 0) -> torch.Tenso
 
 
 def wait_for_line(page: Page, part: str, which: int = 0) -> str:
-    """Wait until a scene of the page says a line with this part, and return the line."""
+    """Wait until the message of a scene contains ``part``, and return the message."""
     line = f"document.querySelectorAll('dyngs-scene')[{which}].parts.message.textContent"
     page.wait_for(f"{line}.includes({part!r})")
     return str(page.evaluate(line))

@@ -111,14 +111,14 @@ def trained(configs: list[Config], fails: str = "") -> int:
 
 
 def trained_on_gpu(configs: list[Config]) -> int:
-    """As ``trained``, with the scene on the pretended GPU."""
+    """Train like ``trained`` with the scene on the pretended GPU."""
     new_trainer.select_device = lambda _: GPU
     with pretend_gpu():
         return trained(configs)
 
 
 def resumed(run: Path) -> int:
-    """Go on with a run by the command line."""
+    """Resume a run from the command line."""
     return main(["train", "--resume", str(run)])
 
 

@@ -65,7 +65,7 @@ def raising(error: BaseException) -> Callable[[], None]:
     return action
 
 
-# ---------------------------------------------------------------------------------------------------- help
+# ----------------------------------------------------------------------------------------- help
 
 
 def test_help_names_every_command(capsys: Capture) -> None:
@@ -123,7 +123,7 @@ def test_module_and_command_are_the_same() -> None:
     assert (done.returncode, done.stdout.strip()) == (0, f"dyngs {dyngs.__version__}")
 
 
-# ---------------------------------------------------------------------------------------------------- debugging
+# ------------------------------------------------------------------------------------ debugging
 
 
 def fail_in_a_reader() -> None:
@@ -143,7 +143,7 @@ def test_debug_shows_the_cause_before_the_line(
     assert sum(line.startswith("Traceback") for line in lines) == 2
 
 
-def test_without_a_command_it_says_what_to_do_next(capsys: Capture) -> None:
+def test_without_a_command_the_next_step_is_printed(capsys: Capture) -> None:
     """On a small screen, and nothing that does not exist."""
     assert main([]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -176,7 +176,7 @@ def test_names_that_are_no_text_can_be_printed(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout.splitlines()[-1]) == (0, "p\\udce9re.png")
 
 
-# ---------------------------------------------------------------------------------------------------- refusals
+# ------------------------------------------------------------------------------------- refusals
 
 
 @pytest.mark.parametrize(
@@ -268,7 +268,9 @@ def test_bugs_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
         main(["doctor"])
 
 
-def test_interruption_says_how_to_go_on(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interruption_prints_how_to_resume(
+    capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     make_doctor(monkeypatch, raising(KeyboardInterrupt("go on with: dyngs train --resume runs/a")))
     assert main(["doctor"]) == 130
     assert (
@@ -363,7 +365,8 @@ def test_ctrl_c_while_a_module_is_imported_gets_no_traceback(module: str) -> Non
         "import builtins, os, sys\n"
         "known = builtins.__import__\n"
         "def interrupted(name, *arguments):\n"
-        f"    if name == {module!r} and sys._getframe(1).f_globals['__name__'].startswith('dyngs'):\n"
+        f"    if name == {module!r} and "
+        "sys._getframe(1).f_globals['__name__'].startswith('dyngs'):\n"
         "        if 'signal' not in sys.modules or name == 'signal':\n"
         "            raise KeyboardInterrupt\n"
         "        os.kill(os.getpid(), 2)\n"
@@ -386,7 +389,7 @@ def test_ctrl_c_while_a_module_is_imported_gets_no_traceback(module: str) -> Non
     )
 
 
-# ---------------------------------------------------------------------------------------------------- train's words
+# -------------------------------------------------------------------------------- train's words
 
 
 @pytest.mark.parametrize(
@@ -443,12 +446,13 @@ def test_a_resumed_run_keeps_its_config_but_for_its_length_and_threads(tmp_path:
     assert parse_config(["train.steps=9", "data.cache_mb=5"], tmp_path).train.steps == 9
     with pytest.raises(
         DyngsError,
-        match=r"'optim.lr_means=1': the configuration of a run is fixed; --resume accepts train.steps=N.*run.threads",
+        match=r"'optim.lr_means=1': the configuration of a run is fixed; "
+        r"--resume accepts train.steps=N.*run.threads",
     ):
         parse_config(["train.steps=9", "optim.lr_means=1"], tmp_path)
 
 
-# ---------------------------------------------------------------------------------------------------- every verb
+# ----------------------------------------------------------------------------------- every verb
 
 
 @pytest.fixture(scope="module")
@@ -522,7 +526,7 @@ def test_export_and_render_of_the_file(run_dir: Path, tmp_path: Path, capsys: Ca
     )
 
 
-def test_eval_of_a_still_run_says_nothing_about_time(run_dir: Path, capsys: Capture) -> None:
+def test_eval_of_a_static_run_prints_no_scores_over_time(run_dir: Path, capsys: Capture) -> None:
     assert main(["eval", str(run_dir)]) == 0
     text = capsys.readouterr().out
     assert not any(word in text for word in ("flicker", "moving", "deforming", "field"))
@@ -567,7 +571,7 @@ def test_memory_that_torch_cannot_have_is_one_line(
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
-def test_an_error_that_cannot_be_said_has_its_exit_code() -> None:
+def test_an_unprintable_error_keeps_its_exit_code() -> None:
     with open("/dev/full", "w") as full:
         done = subprocess.run(
             [sys.executable, "-m", "dyngs", "nothing"], env=ENVIRONMENT, stderr=full, check=False
@@ -589,7 +593,7 @@ def test_long_words_are_cut_in_messages(capsys: pytest.CaptureFixture[str]) -> N
         ["eval", "nothing", "--device", "cuda"],
     ],
 )
-def test_a_gpu_that_is_not_there_is_told_in_one_line(
+def test_a_missing_gpu_is_reported_in_one_line(
     words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("nothing.ply").touch()

@@ -54,9 +54,10 @@ def near_scene() -> Scene:
 def test_parameters_are_those_of_gsplat() -> None:
     """Of gsplat 1.5.3, in its order."""
     assert " ".join(inspect.signature(rasterization).parameters) == (
-        "means quats scales opacities colors viewmats Ks width height near_plane far_plane radius_clip eps2d sh_degree "
-        "packed tile_size backgrounds render_mode sparse_grad absgrad rasterize_mode channel_chunk distributed "
-        "camera_model segmented covars with_ut with_eval3d radial_coeffs tangential_coeffs thin_prism_coeffs "
+        "means quats scales opacities colors viewmats Ks width height near_plane far_plane "
+        "radius_clip eps2d sh_degree packed tile_size backgrounds render_mode sparse_grad absgrad "
+        "rasterize_mode channel_chunk distributed camera_model segmented covars with_ut "
+        "with_eval3d radial_coeffs tangential_coeffs thin_prism_coeffs "
         "ftheta_coeffs rolling_shutter viewmats_rs"
     )
 
@@ -132,7 +133,7 @@ def test_tile_lists_are_sorted_by_depth_and_complete(packed: bool) -> None:
 
 @pytest.mark.parametrize("packed", [True, False])
 def test_means2d_keeps_its_gradient(packed: bool) -> None:
-    """What gsplat's densification reads; signed and absolute parts are those of the probe."""
+    """gsplat's densification reads this gradient; signed and absolute parts match the probe."""
     scene = near_scene()
     means = scene.means.requires_grad_()
     image, _, meta = call(replace(scene, means=means), packed=packed, absgrad=True)
@@ -204,7 +205,9 @@ def test_unsupported_arguments_are_refused_by_name(name: str, scene: Scene) -> N
         ),
     ],
 )
-def test_what_does_not_fit_is_named(options: dict[str, Any], message: str, scene: Scene) -> None:
+def test_mismatched_arguments_are_named(
+    options: dict[str, Any], message: str, scene: Scene
+) -> None:
     with pytest.raises(DyngsError, match=message):
         call(scene, **options)
 
@@ -243,7 +246,7 @@ def test_numbers_out_of_range_are_refused_by_name(name: str, value: Any) -> None
 @pytest.mark.parametrize(
     "name", ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds"]
 )
-def test_what_is_not_finite_is_named(name: str, bad: float, scene: Scene) -> None:
+def test_non_finite_arguments_are_named(name: str, bad: float, scene: Scene) -> None:
     fields = {"viewmats": "cam_from_world", "Ks": "intrinsics"}
     options = {"colors": scene.sh[:, 0].abs(), "backgrounds": scene.background}
     x = (options[name] if name in options else getattr(scene, fields.get(name, name))).clone()

@@ -62,8 +62,8 @@ NOT_RUN = {
 }
 """Commands that are parsed only, with the reason."""
 OTHER_PROGRAMS = (
-    "pip", "pytest", "python", "cmake", "ctest", "git", "mkdocs", "cd", "export", "for", "seq", "done",
-    "eval", "source", "if", "then", "else", "fi", "srun",
+    "pip", "pytest", "python", "cmake", "ctest", "git", "mkdocs", "cd", "export", "for", "seq",
+    "done", "eval", "source", "if", "then", "else", "fi", "srun",
 )  # fmt: skip
 NOT_COMMANDS = {
     "dyngs avatar": "the header of an avatar file",

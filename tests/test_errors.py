@@ -71,7 +71,7 @@ def test_a_line_of_ours_and_interrupts_pass() -> None:
         raise KeyboardInterrupt
 
 
-def test_errors_of_the_system_are_said_in_its_words(tmp_path: Path) -> None:
+def test_system_errors_keep_their_message(tmp_path: Path) -> None:
     path = tmp_path / "none.bin"
     line = re.escape(f"{path}: cannot be read (No such file or directory); copy or export it again")
     with pytest.raises(DyngsError, match=line), wrap_read_errors(path):
@@ -96,7 +96,7 @@ def test_no_message_can_steer_a_terminal() -> None:
 
 
 @pytest.mark.parametrize("text", ["x" * 5000, "9" * 5000, "\x07" * 300, "prune=" + "1" * 5000])
-def test_what_the_command_line_quotes_is_short(text: str) -> None:
+def test_quotes_of_the_command_line_are_short(text: str) -> None:
     from dyngs.data.times import parse_frames
     from dyngs.export.camera_paths import parse_times
     from dyngs.study.tradeoff import parse_requirements, parse_variations
@@ -113,7 +113,7 @@ def test_what_the_command_line_quotes_is_short(text: str) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names here")
-def test_what_may_never_end_is_not_read(tmp_path: Path) -> None:
+def test_endless_files_are_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "link").symlink_to("/dev/zero")
     for name in ("pipe", "link"):
@@ -138,7 +138,7 @@ def test_pipes_in_captures_and_runs_stop_nobody(tmp_path: Path) -> None:
     assert seconds_at(tmp_path, 1) == 0
 
 
-def test_what_is_counted() -> None:
+def test_counts_have_plurals_and_separators() -> None:
     assert [format_count(n, "image") for n in (0, 1, 2, 1200)] == [
         "0 images",
         "1 image",
@@ -167,7 +167,7 @@ ODD_NAMES = (
 def test_names_in_commands_can_be_copied(
     name: str, encoding: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What shows on the terminal, also within an error, is the name again for a shell."""
+    """A quoted name on the terminal, also within an error, expands to the same name in a shell."""
     stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding, errors="backslashreplace")
     monkeypatch.setattr(sys, "stdout", stream)
     print(DyngsError(f"run `{quote_path(name)}`"), end="")
@@ -185,7 +185,10 @@ def test_names_in_commands_can_be_copied(
 @pytest.mark.skipif(os.name != "posix", reason="locales of POSIX")
 def test_names_can_be_copied_in_the_locale_c(tmp_path: Path) -> None:
     (tmp_path / "läufer").mkdir()
-    code = "import sys; from dyngs.core.errors import quote_path; print('next: cd ' + quote_path(sys.argv[1]))"
+    code = (
+        "import sys; from dyngs.core.errors import quote_path; "
+        "print('next: cd ' + quote_path(sys.argv[1]))"
+    )
     locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     done = subprocess.run(
         [sys.executable, "-c", code, "läufer"],
@@ -226,6 +229,9 @@ def test_messages_are_logged_and_can_be_silenced(capsys: pytest.CaptureFixture[s
     log_info("one")
     log_warning("two")
     assert capsys.readouterr() == ("", "")
-    code = "from dyngs.core.errors import log_info, log_warning; log_info('three'); log_warning('four')"
+    code = (
+        "from dyngs.core.errors import log_info, log_warning; "
+        "log_info('three'); log_warning('four')"
+    )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("", "four\n")

@@ -85,7 +85,7 @@ def test_every_capture_format_is_fuzzed(fuzzed: Fuzzed) -> None:
     assert {format.name for format in FORMATS} - fuzzed.tried.keys() == optional
 
 
-def test_what_was_found_stays_mended(fuzzed: Fuzzed) -> None:
+def test_inputs_of_the_corpus_still_pass(fuzzed: Fuzzed) -> None:
     """The corpus: one small input for each kind of failure that was ever seen."""
     tried = [
         int(words[1])
@@ -96,8 +96,8 @@ def test_what_was_found_stays_mended(fuzzed: Fuzzed) -> None:
     assert sum(tried) >= 70
 
 
-def test_what_harms_is_noticed(fuzzed: Fuzzed) -> None:
-    """Readers that do what they must not, each told by its verdict."""
+def test_faulty_readers_are_reported(fuzzed: Fuzzed) -> None:
+    """Each kind of faulty reader is reported by its verdict."""
     assert json.loads(fuzzed.harms) == {
         "quiet": "accepted: ",
         "polite": "refused: ",

@@ -1,4 +1,4 @@
-"""What a configuration is turned into."""
+"""Models and trainers that are built from a configuration."""
 
 from __future__ import annotations
 
@@ -130,7 +130,8 @@ def test_opacity_counts_less_before_motion_is_followed_unless_things_are_white(
 
 
 def test_points_are_triangulated_where_several_cameras_show_a_moment(tmp_path: Path) -> None:
-    """As many Gaussians as points, of the room and not of a cube; without, random ones."""
+    """The scene has one Gaussian per triangulated point of the room. Without triangulation, the
+    points are random."""
     options = DynamicOptions(size=96, num_times=2, num_cameras=8, num_test=0, samples=1)
     root = write_dynamic_capture("room", tmp_path / "room", options)
     config = _dynamic(root, init=PointsInit(num_random=7))

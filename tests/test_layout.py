@@ -129,8 +129,8 @@ FACTORIES = {
 
 
 def test_every_tensor_is_made_on_a_named_device(nodes: dict[str, list[ast.AST]]) -> None:
-    """A tensor made without ``device`` lies on the CPU, whatever it is to be used with. Say
-    ``device="cpu"`` where it belongs there."""
+    """A tensor made without ``device`` is on the CPU, also where another device is needed. Write
+    ``device="cpu"`` where the CPU is right."""
     found = []
     for file, own in nodes.items():
         for node in own:
@@ -142,7 +142,7 @@ def test_every_tensor_is_made_on_a_named_device(nodes: dict[str, list[ast.AST]])
     assert found == []
 
 
-def test_what_other_systems_lack_is_not_relied_on(
+def test_no_code_relies_on_posix(
     nodes: dict[str, list[ast.AST]], trees: dict[str, ast.Module]
 ) -> None:
     """Windows: modules of POSIX are imported where they may be missing, names below a folder are
@@ -196,7 +196,7 @@ def test_every_file_can_lie_on_every_system() -> None:
 
 
 def run_python(code: str) -> str:
-    """What ``code`` prints in a process of its own, with the dyngs that these tests import."""
+    """Return the output of ``code`` in a separate process that imports the dyngs under test."""
     environment = os.environ | {"PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])}
     command = [sys.executable, "-c", code]
     done = subprocess.run(
@@ -223,7 +223,8 @@ def test_every_mutation_names_a_place_and_its_tests() -> None:
 def test_import_is_cheap_and_leaves_heavy_packages_alone() -> None:
     """One of three processes suffices, because a busy machine only ever makes it slower."""
     code = (
-        "import sys, time, torch, numpy; before = set(sys.modules); t = time.process_time(); import dyngs\n"
+        "import sys, time, torch, numpy; before = set(sys.modules); "
+        "t = time.process_time(); import dyngs\n"
         "print(time.process_time() - t); import dyngs.gaussians.rendering\n"
         f"print([m for m in {HEAVY!r} if m in sys.modules and m not in before])\n"
         "import dyngs.evaluate.report, dyngs.export.images, dyngs.export.choose_path\n"

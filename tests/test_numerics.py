@@ -115,7 +115,7 @@ def gradients_vanish(
 
 
 # --- scales
-# -----------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 def test_scale_1e_minus_12_renders_as_the_low_pass_filter() -> None:
@@ -171,11 +171,11 @@ def test_needle_keeps_its_width() -> None:
 
 
 # --- quaternions
-# ------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 # --- opacities
-# --------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 def blended_with(opacities: list[float], dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
@@ -222,7 +222,7 @@ def test_logits_of_plus_and_minus_100(logit: float) -> None:
 
 
 # --- positions
-# --------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 def test_distance_of_1e7_units() -> None:
@@ -241,7 +241,7 @@ def test_distance_of_1e7_units() -> None:
 
 
 # --- many of them
-# -----------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 def test_thousands_of_coincident_opaque_gaussians() -> None:
@@ -277,7 +277,7 @@ def test_one_gaussian_covering_a_4k_image() -> None:
 
 
 # --- sizes
-# ------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 8192), (8192, 1)], ids=str)
@@ -297,7 +297,8 @@ def test_more_than_2_to_the_31_intersections_are_refused_before_anything_is_allo
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     message = (
         r"render refused: 2100 Gaussians in 1 view\(s\) of 16384x16384 px meet 2202009600 tiles, "
-        r"more than the limit of 2147483647; lower the resolution, the scales or the number of views"
+        r"more than the limit of 2147483647; "
+        r"lower the resolution, the scales or the number of views"
     )
     with pytest.raises(DyngsError, match=message):
         render(gaussians, camera(16384, 16384))
@@ -323,7 +324,7 @@ def test_nonfinite_gaussians_are_named(name: str, bad: float, dtype: torch.dtype
 
 @pytest.mark.parametrize("nonfinite", ["error", "skip"])
 @pytest.mark.parametrize("name", ["cam_from_world", "intrinsics", "background"])
-def test_nonfinite_views_are_named_whatever_the_policy(name: str, nonfinite: str) -> None:
+def test_nonfinite_views_are_named_under_any_policy(name: str, nonfinite: str) -> None:
     cameras = camera()
     background = BACKGROUND.clone()
     (background if name == "background" else getattr(cameras, name)).view(-1)[2] = float("nan")

@@ -149,7 +149,7 @@ def test_a_person(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert {split: psnr for split, psnr in found.items() if psnr <= floors[split]} == {}
 
 
-def test_what_stays_before_fixed_cameras_is_trained_as_static(
+def test_a_static_scene_before_fixed_cameras_is_trained_as_static(
     still_life: Captured, tmp_path: Path
 ) -> None:
     """The same bytes as by the static preset, though the dynamic one was requested."""

@@ -67,7 +67,7 @@ def devices(value: Any) -> list[str]:
     return [x.device.type for x in value]
 
 
-def test_what_is_moved_keeps_its_shape() -> None:
+def test_moved_values_keep_their_structure() -> None:
     x = torch.arange(3.0)
     value = {
         "a": (Plain(x, 2.0), Own(x, x)),

@@ -132,7 +132,7 @@ def test_python_users_see_the_unit_of_the_files(captures: Path, tmp_path: Path) 
     torch.testing.assert_close(found.depth, scale * wanted.depth, rtol=0, atol=0)
 
 
-def test_what_leaves_a_run_is_in_the_unit_of_the_capture(captures: Path, tmp_path: Path) -> None:
+def test_exports_are_in_the_unit_of_the_capture(captures: Path, tmp_path: Path) -> None:
     scale = 2.0**-10
     scaled = scaled_capture(captures / "still", tmp_path / "scaled", scale)
     files = []

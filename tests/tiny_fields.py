@@ -70,7 +70,7 @@ def stirred_field(
 
 
 def followed(nodes: Nodes, means: Tensor, at_nodes: Offsets) -> Offsets:
-    """What ``follow`` makes of offsets of the nodes."""
+    """Return the offsets that ``follow`` computes from offsets of the nodes."""
     heads = {name: x.reshape(len(x), -1) for name, x in vars(at_nodes).items() if x is not None}
     shifts = heads.pop("means")
     turns = identity_quat(shifts).expand(len(shifts), 4) + heads.get("quats", 0)

@@ -96,7 +96,7 @@ class Page:
         self.files[name] = data
 
     def set(self, label: str, value: Any = None) -> None:
-        """Change a control, and let the session do what it asks for."""
+        """Change a control, and let the session draw the images that are due."""
         self.controls[label].set(value)
         while self.session.due() == 0.0:
             self.session.draw_next()

@@ -1,5 +1,4 @@
-"""What is decided by small runs: a clear gain wins, within a tenth of the run, and nothing else is
-asked."""
+"""Pilot runs that resolve automatic settings: only clear gains win, within a tenth of the run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Edits of runs and files: what is written, in which frame, and what is left as it was."""
+"""Edits of runs and files: outputs, coordinate frames, and contents that must not change."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ HALF = Edits(frame=Frame(up=(0.0, 0.0, 1.0), origin=(0.5, 0.0, 0.0), scale=0.5))
 
 
 def silent(text: str) -> None:
-    """What is told does not matter here."""
+    """Discard a progress message."""
 
 
 @pytest.fixture

@@ -34,7 +34,7 @@ EDITS = Edits(frame=Frame(up=(0.0, 0.6, 0.8), origin=(0.5, 0.25, 0.0), scale=3.0
 
 
 def silent(text: str) -> None:
-    """What is told does not matter here."""
+    """Discard a progress message."""
 
 
 def edited(run: Path, edits: Edits = EDITS, name: str = "edited") -> Path:
@@ -46,8 +46,7 @@ def expected(run: Path) -> Similarity:
 
 
 def test_files_of_gaussians_cameras_and_tracks_move_as_one(tmp_path: Path) -> None:
-    """What exported cameras see of exported Gaussians is what cameras of the capture see of the
-    scene."""
+    """Exported cameras, Gaussians and tracks of an edited run agree with the edited scene."""
     run = write_moving_run(tmp_path)
     opened = open_run(edited(run))
     how = expected(run)

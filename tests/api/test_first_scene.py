@@ -1,4 +1,4 @@
-"""Trainings that go on from a scene: where they begin, and what stays as it is."""
+"""Training that starts from an existing scene: the initial state and the frozen parameters."""
 
 from __future__ import annotations
 
@@ -83,7 +83,9 @@ def psnr_of(run: Path) -> float:
 
 
 @pytest.mark.parametrize("kind", ["run", "file"])
-def test_it_begins_where_the_scene_was(kind: str, capture: Path, run: Path, tmp_path: Path) -> None:
+def test_training_starts_from_the_scene(
+    kind: str, capture: Path, run: Path, tmp_path: Path
+) -> None:
     source = run if kind == "run" else write_run_splats(open_run(run), tmp_path / "a.ply").path
     config = settled(going_on(capture, source, tmp_path / "new"))
     first = load_initial_gaussians(config, read_capture(config.data))
@@ -124,7 +126,9 @@ class Wild(Densifier):
         parameters.means.detach().add_(0.001)
 
 
-def test_what_is_outside_the_box_keeps_its_bytes(capture: Path, run: Path, tmp_path: Path) -> None:
+def test_gaussians_outside_the_box_keep_their_bytes(
+    capture: Path, run: Path, tmp_path: Path
+) -> None:
     """While the set grows, is shaken and ordered anew around it; also from a checkpoint."""
     config = settled(
         going_on(capture, run, tmp_path / "new", f"init.box={list(BOX)}", "strategy.kind=fixed")
@@ -176,7 +180,7 @@ def test_an_edited_run_goes_on_with_its_own_cameras(
     torch.testing.assert_close(means, moved.means)
 
 
-def test_what_cannot_be_gone_on_from(capture: Path, run: Path, tmp_path: Path) -> None:
+def test_unsupported_first_scenes_are_refused(capture: Path, run: Path, tmp_path: Path) -> None:
     moving = write_moving_run(tmp_path)
     for source, more, said in (
         (moving, [], "a moving scene; training starts from static scenes"),

@@ -114,7 +114,7 @@ def test_a_run_goes_on_in_another_number_of_processes(still: Path, tmp_path: Pat
         ("death", "connection lost, another process was killed"),
     ],
 )
-def test_where_one_fails_all_end_with_one_line(
+def test_a_failure_of_one_process_ends_all_with_one_line(
     fails: str, line: str, still: Path, tmp_path: Path
 ) -> None:
     codes, said = run_in(2, do.trained, tmp_path, [_still(still, tmp_path / "run")], fails)
@@ -127,7 +127,7 @@ def test_where_one_fails_all_end_with_one_line(
 
 
 def test_a_signal_to_any_process_ends_the_run_which_can_go_on(still: Path, tmp_path: Path) -> None:
-    """The last process is told to end during step 4, and the first saves what it has."""
+    """SIGTERM reaches the last process during step 4, and rank 0 saves a checkpoint."""
     run = tmp_path / "run"
     codes, said = run_in(2, do.trained, tmp_path, [_still(still, run, steps=400)], "SIGTERM")
     assert codes == [130, 130], said
@@ -140,7 +140,7 @@ def test_a_signal_to_any_process_ends_the_run_which_can_go_on(still: Path, tmp_p
     )
 
 
-def test_what_needs_one_process_says_so(still: Path, tmp_path: Path) -> None:
+def test_single_process_features_are_refused(still: Path, tmp_path: Path) -> None:
     two = Processes(0, 2)
     with pytest.raises(
         DyngsError, match="minutes=1: is measured with one process; leave it out, or start without"

@@ -81,7 +81,7 @@ def test_an_avatar_is_a_scene(person: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["nothing", "words.txt", "b.safetensors"])
-def test_what_is_no_scene_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+def test_non_scenes_are_refused_in_one_line(name: str, tmp_path: Path) -> None:
     if name != "nothing":
         (tmp_path / name).write_text("words")
     with pytest.raises(dyngs.DyngsError, match=name) as refused:

@@ -1,4 +1,4 @@
-"""Predictions as run folders: other commands take them, and mistakes are told."""
+"""Predictions as run folders: other commands accept them, and wrong inputs raise errors."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_a_prediction_can_be_refined(made: Made, tmp_path: Path) -> None:
     assert not torch.equal(before.scene.gaussians.means, after.scene.gaussians.means)
 
 
-def test_mistakes_are_told(made: Made, tmp_path: Path) -> None:
+def test_wrong_inputs_are_refused(made: Made, tmp_path: Path) -> None:
     run = made.prediction.run_dir
     with pytest.raises(DyngsError, match="exists already"):
         predict(made.network, made.capture, run, 3)
@@ -97,5 +97,7 @@ def test_mistakes_are_told(made: Made, tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="-1 steps"):
         predict(made.network, made.capture, tmp_path / "out", 3, steps=-1)
     assert not (tmp_path / "out").exists()
-    with pytest.raises(DyngsError, match="a network, not a scene; predict a scene with `dyngs predict"):
+    with pytest.raises(
+        DyngsError, match="a network, not a scene; predict a scene with `dyngs predict"
+    ):
         load_run(made.network)

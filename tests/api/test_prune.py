@@ -28,7 +28,7 @@ BRIEFLY = ("prune.steps=4", "run.threads=1")
 
 
 def silent(text: str) -> None:
-    """What is tried does not matter here."""
+    """Discard a progress message."""
 
 
 @pytest.fixture(scope="module")

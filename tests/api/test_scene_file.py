@@ -1,4 +1,4 @@
-"""A run in little space is drawn as before, and is told from one that can be trained on."""
+"""Compact scene files: they render like the run, and training from them is refused."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_without_its_capture_steps_are_assumed(tmp_path: Path) -> None:
     assert len(load_run(tmp_path / "small").scene) == 5
 
 
-def test_it_cannot_be_trained_on_and_damage_is_named(tmp_path: Path) -> None:
+def test_training_from_a_scene_file_and_damaged_files_are_refused(tmp_path: Path) -> None:
     written = write_scene_file(write_moving_run(tmp_path), tmp_path / "small")
     with pytest.raises(DyngsError, match="no checkpoints"):
         latest_checkpoint(tmp_path / "small")

@@ -1,5 +1,4 @@
-"""Whole runs on a tiny capture: they learn, they repeat to the byte, they stop and go on as if
-nothing had happened."""
+"""Whole runs on a tiny capture: loss, byte-identical repetition, interruption and resumption."""
 
 from __future__ import annotations
 
@@ -194,7 +193,7 @@ def interrupted(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_a_resumed_run_refuses_another_capture(
     interrupted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Also where it is said to be the same one at another place; that of a copy goes on to the same
+    """Refuse a different capture when resuming; a copy of the capture resumes to identical
     bytes."""
     other = tmp_path / "other"
     copied = tmp_path / "copied"

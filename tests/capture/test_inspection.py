@@ -57,7 +57,10 @@ def with_points(capture: Capture, xyz: np.ndarray) -> Capture:
 def test_few_images_far_apart_are_ill_posed(count: int, degrees: float, says: bool) -> None:
     """Not those of a video, nor many that jump about as in D-NeRF."""
     lines = check_before_training(clip(count, degrees))
-    expected = "12 images at different times, 31 degrees apart on average: moving objects are seen from one side"
+    expected = (
+        "12 images at different times, 31 degrees apart on average: "
+        "moving objects are seen from one side"
+    )
     assert [line.startswith(expected) for line in lines] == [True] * says
 
 

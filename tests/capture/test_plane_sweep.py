@@ -116,8 +116,7 @@ def test_depth_maps_in_another_unit_have_none(tmp_path: Path) -> None:
 def test_a_still_capture_without_any_points_is_swept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Random candidates say how deep to look; pixels without texture take the depth of their
-    neighbours."""
+    """Random points bound the depth range; untextured pixels take the depth of their neighbours."""
     monkeypatch.setattr(initial_points, "triangulate_from_views", lambda *_: None)
     views = [replace(view, depth_path=None) for view in _views(tmp_path)]
     capture = Capture(tmp_path, "nerfstudio", {"train": tuple(views)})

@@ -1,5 +1,4 @@
-"""Arguments that name files: every command says which it reads and which it writes, and no output
-replaces an input.
+"""Arguments that name files: each is declared as input or output, and no output replaces an input.
 
 The first tests walk the parser, so that a new command, or a new argument, cannot forget it.
 """
@@ -46,7 +45,7 @@ WORDS = {
 def commands(
     parser: argparse.ArgumentParser, name: str = ""
 ) -> Iterator[tuple[str, argparse.ArgumentParser]]:
-    """Every command with arguments of its own."""
+    """Yield every command without subcommands, with its parser."""
     inner = [action for action in parser._actions if action.nargs == argparse.PARSER]
     if not inner:
         yield name, parser
@@ -89,7 +88,7 @@ def known(tmp_path: Path) -> dict[str, Path]:
 
 
 def read_of(known: dict[str, Path], kind: str) -> list[Path]:
-    """What is read of it, and may not be replaced."""
+    """Return the input paths of this kind, which no output may replace."""
     capture = known["capture"]
     run = known["run"]
     own = [run / RESOLVED_NAME, run / "checkpoints" / "step_0000010.safetensors"]

@@ -1,4 +1,4 @@
-"""``dyngs config`` prints a preset that means the same as what it was asked for."""
+"""``dyngs config`` prints a preset that loads as the same configuration."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def _printed(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 
 
 @pytest.mark.parametrize("preset", sorted(packaged_presets()))
-def test_what_is_printed_is_a_preset(
+def test_the_output_is_a_preset(
     preset: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = _printed(capsys, preset)

@@ -47,7 +47,7 @@ def test_a_file_is_converted_there_and_back(tmp_path: Path, capsys: Capture) -> 
     assert "visible differences" in captured.err
 
 
-def test_what_convert_refuses(tmp_path: Path, capsys: Capture) -> None:
+def test_unsupported_conversions_are_refused(tmp_path: Path, capsys: Capture) -> None:
     plain = write_splats(tmp_path / "a.ply", SplatFile(cloud(5))).path
     assert "unknown file type; use one of" in refused(capsys, "convert", plain, tmp_path / "b.xyz")
     assert "exists, which is an input" in refused(capsys, "convert", plain, plain)
@@ -98,7 +98,7 @@ def test_axes_of_an_export(tmp_path: Path, capsys: Capture) -> None:
     assert main(["export", str(run), "--out", str(path), "--up", "keep"]) == 0
     kept = read_splats(path).gaussians.means
     assert main(["export", str(run), "--out", str(path), "--from-up=x", "--up=y"]) == 0
-    assert "it was x in the capture" in capsys.readouterr().out
+    assert "rotated from x in the capture" in capsys.readouterr().out
     turned = read_splats(path)
     assert turned.up == "y"
     assert float((turned.gaussians.means[:, 1] - kept[:, 0]).abs().max()) < 1e-5

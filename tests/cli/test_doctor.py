@@ -1,4 +1,4 @@
-"""``dyngs doctor``: what there is, what is broken, what would be faster."""
+"""``dyngs doctor``: installed components, broken ones, and possible speed-ups."""
 
 from __future__ import annotations
 

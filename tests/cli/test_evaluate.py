@@ -1,4 +1,4 @@
-"""``dyngs eval``: what it says before it begins, and of what moves."""
+"""``dyngs eval``: checks before it starts, and scores of moving scenes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from refused import error_line
 from dyngs.cli import main
 
 
-def test_what_is_no_run_is_refused_in_one_line_before_anything_is_announced(
+def test_a_folder_without_a_run_is_refused_before_any_output(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["eval", str(tmp_path), "--refine"]) == 2
@@ -61,7 +61,8 @@ def test_only_the_command_line_lets_a_capture_name_files_elsewhere(
     assert main(["eval", str(run), "data.follow_links=true"]) == 0
     preset = tmp_path / "preset.yaml"
     preset.write_text(
-        f"data:\n  root: {tmp_path / 'capture'}\n  follow_links: true\nrun: {{dir: {tmp_path / 'new'}}}\n"
+        f"data:\n  root: {tmp_path / 'capture'}\n  follow_links: true\n"
+        f"run: {{dir: {tmp_path / 'new'}}}\n"
     )
     assert "preset.yaml:3: data.follow_links is allowed on the command line only" in error_line(
         capsys, "train", preset

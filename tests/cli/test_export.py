@@ -81,7 +81,7 @@ def test_cameras_of_a_run_that_refined_none_are_those_of_the_capture(
         ("--format cameras --out cameras.ply", "wrong suffix for --format cameras"),
     ],
 )
-def test_what_does_not_go_with_cameras_is_one_line(
+def test_options_that_conflict_with_cameras_are_refused(
     words: str, part: str, refined: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["export", str(refined), *words.split()]) == 2
@@ -167,13 +167,13 @@ def test_a_page_has_the_full_name_of_its_run(run: Path, tmp_path: Path) -> None:
         ("--format html --max-change 3", "--max-change is not supported with --format html"),
         ("--format html --out page.pdf", "use --out page.html"),
         ("--format html --motion walk.bvh", "needs the run of a person"),
-        ("--format html --folder --max-gaussians-drawn 9", "for still scenes"),
+        ("--format html --folder --max-gaussians-drawn 9", "need a static scene"),
         ("--format html --folder --out page.html", "writes a folder; use --out page"),
         ("--format html --max-gaussians-drawn 9", "requires --folder"),
         ("--folder", "--folder is not supported with --format ply"),
     ],
 )
-def test_what_does_not_go_with_a_page_is_one_line(
+def test_options_that_conflict_with_a_page_are_refused(
     words: str, part: str, run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["export", str(run), *words.split()]) == 2
@@ -342,7 +342,7 @@ def test_export_of_tracks(
         str(tmp_path / "t.npz"),
     ]
     assert main(["export", str(moving_run), *words]) == 0
-    assert "1 of 3 times lie outside" in capsys.readouterr().err
+    assert "clamped 1 of 3 times" in capsys.readouterr().err
     with np.load(tmp_path / "t.npz", allow_pickle=False) as stored:
         assert stored["positions"][:, 0, 0] == pytest.approx(
             moved_x((1, 3), 0.0).tolist(), abs=ROUNDING

@@ -122,10 +122,10 @@ def test_the_same_command_trains_nothing(
     assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
 
 
-def test_what_was_stopped_goes_on(
+def test_a_stopped_study_resumes(
     finished: Path, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As if killed while the second model was trained, and before the report."""
+    """Resume a study that was killed during the second model, before the report."""
     out = tmp_path / "comparison"
     shutil.copytree(finished, out)
     (out / "points" / "mip.json").unlink()
@@ -171,7 +171,7 @@ def test_wrong_usage_ends_in_one_line(
     assert not out.exists()
 
 
-def test_what_is_not_made_of_gaussians_takes_part(
+def test_models_without_gaussians_take_part(
     capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     own = tmp_path / "grid.yaml"
@@ -194,7 +194,10 @@ def test_a_model_whose_images_were_shrunk_is_left_out(
     monkeypatch.setattr(budget_time, "SMALLEST_SIDE", 8)
     words = ["compare", str(capture), "--models", "static", "--minutes", "0.001", "--threads", "1"]
     assert main([*words, "init.num_random=100", "--out", str(tmp_path / "out")]) == 2
-    said = "static: too few steps fit into 0.001 minutes of training, so its images were resized to 8 px"
+    said = (
+        "static: too few steps fit into 0.001 minutes of training, "
+        "so its images were resized to 8 px"
+    )
     assert said in capsys.readouterr().err
 
 
@@ -204,7 +207,7 @@ def test_a_comparison_that_comes_to_nothing(
     words = ["--models", "static", "--max-mb", "0.0001", "--out", str(tmp_path / "out")]
     assert main(["compare", str(capture), *words]) == 2
     assert (
-        "no model could be trained; static: budget.max_mb=0.0001: has no room"
+        "no model could be trained; static: budget.max_mb=0.0001: too small for"
         in capsys.readouterr().err
     )
 
@@ -235,7 +238,7 @@ def test_variants_and_the_best_run(tmp_path: Path, capsys: pytest.CaptureFixture
     words = ["tradeoff", run, "--out", str(out), *vary, "--rounds", "1", "--threads", "1"]
     assert main([*words, "--require", "fps>=0.001,mb<=1", "--minimize", "mb"]) == 0
     text = capsys.readouterr().out
-    for word in ("as it is", "alpha_min=0.02", "each setting alone", "tradeoff.csv", "selected:"):
+    for word in ("original", "alpha_min=0.02", "each setting alone", "tradeoff.csv", "selected:"):
         assert word in text
     assert max(len(line) for line in text.splitlines() if str(out) not in line) <= 100
     assert {f.name for f in out.iterdir()} >= {

@@ -33,7 +33,7 @@ def test_a_page_is_served_until_it_is_ended(
         (["."], "no runs found"),
     ],
 )
-def test_what_cannot_be_shown_is_one_line(
+def test_unviewable_inputs_are_refused_in_one_line(
     words: list[str],
     line: str,
     tmp_path: Path,

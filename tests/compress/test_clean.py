@@ -1,5 +1,5 @@
-"""What is told apart by shape and by contribution, and that it costs no more than allowed on views
-held out."""
+"""Gaussians classified by shape and contribution; removal costs at most the allowed PSNR on
+held-out views."""
 
 from __future__ import annotations
 

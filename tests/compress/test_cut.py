@@ -1,5 +1,4 @@
-"""What a cut takes away is gone, stays gone while the rest is trained, and can be restored from its
-checkpoint."""
+"""Pruned Gaussians are removed, stay removed during training, and are restored from checkpoints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What hangs before one camera goes; what many see, however near, stays."""
+"""Floaters in front of one camera are removed; content that many views observe stays."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def trainer(still: Path) -> Trainer:
     return trainer
 
 
-def test_what_hangs_before_one_camera_is_found(trainer: Trainer) -> None:
+def test_floaters_in_front_of_one_camera_are_found(trainer: Trainer) -> None:
     found = find_floaters(trainer)
     assert bool(found[-1])
     assert int(found[:-1].sum()) <= 0.02 * len(found)

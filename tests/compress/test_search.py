@@ -1,4 +1,4 @@
-"""Bisection keeps the most that it may, and holds out what nothing is trained on."""
+"""Bisection for the strongest allowed pruning, scored on views that are held out from training."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_the_last_step_that_keeps_the_promise(
     assert len(tried) <= 4
 
 
-def test_nothing_is_trained_on_what_is_held_out(trainer: Trainer) -> None:
+def test_held_out_views_are_not_trained_on(trainer: Trainer) -> None:
     search = Search(trainer, trainer.checkpoint(), lambda text: None)
     assert search.held_out
     names = {trainer.images[i].name for i in search.held_out}
@@ -70,8 +70,9 @@ def test_nothing_is_trained_on_what_is_held_out(trainer: Trainer) -> None:
     assert search.views == f"{len(names)} training views held out"
 
 
-def test_views_that_are_new_leave_all_others_to_training(trainer: Trainer) -> None:
-    """And the run is compared as it is: nothing of it is memory."""
+def test_new_views_replace_held_out_training_views(trainer: Trainer) -> None:
+    """With new views, no training view is held out, and the reference is the PSNR of the whole
+    run."""
     search = Search(trainer, trainer.checkpoint(), lambda text: None, [trainer.images[0]])
     assert (search.held_out, trainer.held_out) == ((), frozenset())
     assert search.views == "1 view never trained on"
@@ -80,7 +81,7 @@ def test_views_that_are_new_leave_all_others_to_training(trainer: Trainer) -> No
     assert whole[0].psnr == search._reference
 
 
-def test_what_views_trained_on_lose_counts_too(
+def test_losses_on_training_views_count_too(
     trainer: Trainer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Views held out may be kind to a cut by chance."""

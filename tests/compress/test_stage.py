@@ -141,7 +141,7 @@ def _all_rows_of(some: Tensor, everything: Tensor) -> bool:
 
 
 def test_masks_are_trained_with(moving: Path, tmp_path: Path) -> None:
-    """What no key time sees is not drawn, and receives no gradient."""
+    """Gaussians that no key time observes are not rendered and receive no gradient."""
     trainer = trained(moving_config(moving, tmp_path, "control_nodes"))
     trainer.apply(build_pruning_edit(trainer))
     scene = trainer.model.scene
@@ -181,7 +181,7 @@ def test_what_is_there_for_a_while_is_masked_only_while_it_is_not() -> None:
     centers = torch.tensor([2, 3, 6, 7]) / 9
     spans = torch.full((4,), 0.03)
     start = FreeInitialization(torch.zeros(0), (), centers, spans, torch.zeros(4, 3))
-    field = FreePrimitives(FreeField(), tiny_setup(4), torch.Generator()).started(start)
+    field = FreePrimitives(FreeField(), tiny_setup(4), torch.Generator()).with_initialization(start)
     times = tuple(k / 9 for k in range(10))
     scene = DynamicScene(
         gaussians=cloud(5), training_times=times, field=field, moving=torch.arange(4)

@@ -1,5 +1,4 @@
-"""Configuration files: what is read is what was meant, what is wrong is named, what is saved comes
-back."""
+"""Configuration files: presets, overrides, error messages and saving."""
 
 from __future__ import annotations
 
@@ -55,7 +54,7 @@ def refusal(preset: Path | None, *overrides: str) -> str:
     return message
 
 
-# ---------------------------------------------------------------------------------------------------- presets
+# ----------------------------------------------------------------------------------------- presets
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -118,7 +117,7 @@ def test_stored_configurations_with_renamed_keys_still_load(tmp_path: Path) -> N
     assert config.init.trainable == "colour"
 
 
-# ---------------------------------------------------------------------------------------------------- overrides
+# --------------------------------------------------------------------------------------- overrides
 
 
 def test_overrides_are_laid_over_the_preset(tmp_path: Path) -> None:
@@ -179,7 +178,7 @@ def test_names_and_paths_are_taken_as_written(text: str) -> None:
     assert config.data.root.name == text
 
 
-# ---------------------------------------------------------------------------------------------------- refusals
+# ---------------------------------------------------------------------------------------- refusals
 
 DYNAMIC = "model.kind=dynamic"
 
@@ -285,7 +284,7 @@ def test_any_text_gives_a_configuration_or_a_dyngs_error(text: str) -> None:
         load_config(None, [ROOT, text])
 
 
-# ---------------------------------------------------------------------------------------------------- saving
+# ------------------------------------------------------------------------------------------ saving
 
 rates = st.floats(min_value=1e-30, max_value=1e30)
 fractions = st.floats(min_value=0, max_value=1)
@@ -322,7 +321,9 @@ configs = st.builds(
 
 @settings(max_examples=25, deadline=None)
 @given(config=configs)
-def test_what_is_saved_comes_back(config: Config, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_saving_and_loading_round_trips(
+    config: Config, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     folder = tmp_path_factory.mktemp("run")
     save_config(config, folder / "config.yaml")
     assert load_resolved(folder) == config

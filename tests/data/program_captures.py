@@ -60,8 +60,8 @@ def write_metashape(
     labels: Sequence[str] = NAMES,
     unaligned: Sequence[int] = (),
 ) -> Path:
-    """cameras.xml; the chunk is turned, three times smaller and shifted if ``placement`` says where
-    that is written."""
+    """Write cameras.xml; ``placement`` selects where the rotation, scale 1/3 and shift of the chunk
+    are stored."""
     write_photos(root / "images")
     scale = 3.0
     shift = np.array([1.0, -2, 0.5])

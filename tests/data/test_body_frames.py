@@ -57,7 +57,7 @@ def random_body(seed: int, count: int = 3, turned: bool = True) -> BodyFrames:
 def in_world(
     body: BodyFrames, row: int, points: np.ndarray, joints: np.ndarray, weights: np.ndarray
 ) -> np.ndarray:
-    """Where the points of a template are, as ``BodyFrames`` says it."""
+    """Return the template points in world coordinates, by the definition of ``BodyFrames``."""
     at_rest = posed(points, joints, weights, body.poses[row])
     if body.origin_rotations is not None:
         at_rest = at_rest @ Rotation.from_rotvec(body.origin_rotations[row]).as_matrix().T

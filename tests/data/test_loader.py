@@ -86,7 +86,7 @@ def test_a_shrunk_image_is_the_mean_of_its_pixels(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("cache_mb", [0, 1e-3, 1])
 def test_shrunk_images_are_the_same_cached_or_not(cache_mb: float, tmp_path: Path) -> None:
-    """Within the limit, whatever the factors."""
+    """The cache stays within its limit for all factors."""
     images = loader(views_of(tmp_path, 4), cache_mb=cache_mb)
     for factor in (4, 2, 1, 2):
         for i in (0, 1, 0, 3, -1):

@@ -1,4 +1,4 @@
-"""Captures of any format: recognised, finished, with the priors that are there."""
+"""Captures of any format: detection, normalisation, and priors such as depth and flow."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ def names(capture: Capture, split: str) -> list[str]:
 
 
 def test_readers_configuration_and_docs_name_the_same_formats() -> None:
-    """What a module in ``readers/`` declares as a format is in the list."""
+    """Every ``CaptureFormat`` in ``readers/`` is listed in ``FORMATS``, the configuration and the
+    docs."""
     modules = [
         import_module(f"{readers.__name__}.{path.stem}")
         for path in Path(readers.__file__).parent.glob("*.py")
@@ -71,7 +72,7 @@ def test_formats_are_recognised(blender_root: Path) -> None:
 
 
 def test_two_formats_in_one_folder(nerfstudio_root: Path) -> None:
-    """Recognition says which it took; naming the format takes the other."""
+    """A warning names the other format, and ``data.format`` selects it."""
     for path in (nerfstudio_root / "images").iterdir():
         path.rename(path.with_name("x" + path.name))
     edit_json(
@@ -119,7 +120,7 @@ def set_times(root: Path, split: str, times: list[float]) -> None:
 
 
 def test_times_are_stretched_to_the_span_of_all_splits(blender_root: Path) -> None:
-    """As in D-NeRF-like folders whose times run from 0 to 0.055."""
+    """Times of D-NeRF-like folders, which run from 0 to about 0.055, are scaled to [0, 1]."""
     set_times(blender_root, "train", [0.003 * i for i in range(16)])
     set_times(blender_root, "test", [0.015, 0.06])
     edit_json(blender_root / "transforms_train.json", lambda c: c.update(fps=30))
@@ -200,8 +201,8 @@ def loaded(root: Path, **options: object) -> ImageLoader:
 
 
 def test_maps_come_with_the_image(tmp_path: Path) -> None:
-    """Flow in the pixels of the smaller image; depth of its own size; the next view is that of the
-    next time."""
+    """Flow is in pixels of the downscaled image, depth keeps its size, and flow leads to the next
+    time step."""
     images = loaded(with_priors(tmp_path), downscale=2)
     assert [view.flow_to for view in images.views] == [None, "a", "b"]
     first = images[0]

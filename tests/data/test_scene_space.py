@@ -121,8 +121,8 @@ def test_power_of_two_scale_gives_the_same_scene_coordinates(scale: float, offse
 
 @pytest.mark.parametrize("jitter", [0.0, 1e-9])
 def test_fixed_camera_stays_where_it_is(jitter: float) -> None:
-    """All centres coincide, so nothing tells a length; random points around the origin must stay in
-    its view."""
+    """Coinciding camera centres give no scale, and random points around the origin must stay in
+    view."""
     view = capture_at(np.zeros(3)).splits["train"][0]
     moved = [view.cam_from_world + np.diag([jitter * i, 0, 0], 1) for i in range(5)]
     views = tuple(

@@ -56,7 +56,7 @@ def test_no_number(time: object) -> None:
     st.integers(0, 6),
 )
 def test_scaled_over_all_splits(times: list[float], cut: int) -> None:
-    """Whatever the order: one affine map for all splits, onto [0, 1]."""
+    """One affine map scales the times of all splits to [0, 1], in any order."""
     views = [view(f"v{i}", time) for i, time in enumerate(times)]
     cut = min(cut, len(views) - 1)
     splits, notes = normalize_times(ROOT, {"train": tuple(views[cut:]), "test": tuple(views[:cut])})
@@ -109,7 +109,7 @@ def test_span_and_seconds() -> None:
 
 
 def rig(counts: list[int], folder: str = "cam{:02d}/") -> dict[Split, tuple[View, ...]]:
-    """Cameras with so many frames each; the first one is for testing."""
+    """Return views of one camera per entry of ``counts``; the first camera is the test split."""
     views = [
         tuple(
             view(f"{folder.format(camera)}{camera}_{frame}", frame / 30, camera)

@@ -117,7 +117,7 @@ def side_poses(count: int) -> list[np.ndarray]:
 
 
 def pixel_of(view: View, point: Sequence[float]) -> list[float]:
-    """Where a world point appears in the image of a view, without its lens."""
+    """Return the pixel of a world point in a view, without lens distortion."""
     x, y, z = view.intrinsics @ (view.cam_from_world @ [*point, 1.0])[:3]
     return [x / z, y / z]
 
@@ -146,8 +146,7 @@ def cached() -> list[Path]:
 
 
 def packet_places(video: Path) -> list[tuple[int, int]]:
-    """Where the data of each image lies in the file, in order of decoding: first byte and number of
-    bytes."""
+    """Return the first byte and the size of the data of each frame, in decoding order."""
     import av
 
     with av.open(str(video)) as container:

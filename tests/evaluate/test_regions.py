@@ -54,7 +54,7 @@ def regions_of(images: Sequence[Image], *, standing: bool = True) -> Regions:
     return Regions(views_of(images, standing=standing), cast(ImageLoader, images), WHITE)
 
 
-def test_what_changes_before_a_fixed_camera_moves() -> None:
+def test_pixels_that_change_before_a_fixed_camera_are_moving() -> None:
     images = images_of_a_walk()
     regions = regions_of(images)
     for k, image in enumerate(images):

@@ -74,9 +74,18 @@ def test_report_of_a_run(tmp_path) -> None:
     report = evaluate_run(run_dir)
     stored = json.loads((run_dir / "metrics.json").read_text())
     assert stored == json.loads(report.to_json())
-    keys = "split num_views width height background psnr ssim flip lpips lpips_net num_gaussians model_mb fps"
-    over_time = "num_moving moving_fraction field_mb deform_fraction flicker flicker_error psnr_per_time psnr_person"
-    parts = "ssim_person psnr_foreground psnr_moving psnr_static moving_from track_error_px track_within_5px"
+    keys = (
+        "split num_views width height background psnr ssim flip lpips lpips_net "
+        "num_gaussians model_mb fps"
+    )
+    over_time = (
+        "num_moving moving_fraction field_mb deform_fraction flicker flicker_error "
+        "psnr_per_time psnr_person"
+    )
+    parts = (
+        "ssim_person psnr_foreground psnr_moving psnr_static moving_from "
+        "track_error_px track_within_5px"
+    )
     parts += " psnr_things track_motion_px psnr_right psnr_right_fitted psnr_own_poses own_poses"
     parts += " silhouette_poses psnr_white psnr_black ssim_black lpips_black"
     rest = {
@@ -140,7 +149,7 @@ def test_scenes_that_are_worse_on_one_background_are_warned_of(tmp_path) -> None
     assert replace(report, psnr_white=None, psnr_black=None).warnings == ()
 
 
-def test_an_unfinished_run_says_so(tmp_path) -> None:
+def test_an_unfinished_run_is_reported_as_unfinished(tmp_path) -> None:
     run_dir = write_run(tmp_path, some_gaussians())
     config = load_resolved(run_dir)
     save_config(

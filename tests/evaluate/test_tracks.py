@@ -86,7 +86,7 @@ def test_true_motion_has_no_error_and_a_still_model_all_of_it() -> None:
     assert still.error_px == pytest.approx(PX_PER_UNIT * (0.5 + 0.25 + 0.25 + 0.5) / 4, rel=1e-5)
 
 
-def test_what_lies_beside_a_gaussian_turns_with_it() -> None:
+def test_points_beside_a_gaussian_rotate_with_it() -> None:
     """Half a turn about y: the Gaussians alone, 0.5 from each point, would leave them up to 1
     away."""
     rows = [1, 3]
@@ -142,9 +142,9 @@ def turning_back(scale: float) -> tuple[GaussianScene, TrueTracks]:
     )
 
 
-def test_gaussians_that_are_there_for_a_while_hand_points_on() -> None:
-    """None of them goes both ways; what is missing is that the middle one, which stands, hands on
-    nothing at first."""
+def test_gaussians_with_a_lifetime_hand_on_tracked_points() -> None:
+    """Each Gaussian moves one way only. The middle Gaussian is static and hands on no points in the
+    first gap."""
     scene, truth = turning_back(1.0)
     found = track_scores(scene, truth, split(), views())
     assert found.motion_px == pytest.approx(PX_PER_UNIT * (0.5 + 0.25 + 0.25 + 0.5) / 4, rel=1e-4)

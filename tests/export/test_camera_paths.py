@@ -195,7 +195,7 @@ SPINE = keyed([key(0), key(1)])
         (keyed([key(0, at=0), key(1, at=2)], seconds=2, loop=True), "below the length of a loop"),
     ],
 )
-def test_what_cannot_be_read_is_refused(document: Any, problem: str, tmp_path: Path) -> None:
+def test_unreadable_paths_are_refused(document: Any, problem: str, tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match=problem) as refused:
         read_path(written(tmp_path, document))
     assert "\n" not in str(refused.value)

@@ -43,7 +43,7 @@ def still_run(tmp_path_factory: pytest.TempPathFactory) -> OpenedScene:
 
 
 @pytest.mark.parametrize("name", ["orbit", "spiral"])
-def test_time_runs_along_a_path_unless_told_otherwise(
+def test_time_advances_along_a_path_by_default(
     name: str, moving_run: OpenedScene, still_run: OpenedScene
 ) -> None:
     path = choose_path(moving_run, PathOptions(name, 5))
@@ -179,7 +179,7 @@ def directions(centers: torch.Tensor) -> np.ndarray:
     return np.sort(np.degrees(np.arctan2(x, z)) % 360)
 
 
-def test_who_was_filmed_from_one_side_is_seen_from_all(tmp_path: Path) -> None:
+def test_a_person_filmed_from_one_side_gets_a_full_orbit(tmp_path: Path) -> None:
     options = HumanOptions(
         size=32, num_frames=2, num_pose_frames=0, num_cameras=1, num_test=1, samples=1
     )

@@ -1,4 +1,4 @@
-"""Where cameras look, which way is up for them, and the paths that they place."""
+"""Orbits: the centre that cameras face, their up direction and the camera paths."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def test_an_arc_orbit_keeps_the_height_of_the_cameras_near() -> None:
     assert np.ptp(centers[:, 2]) > 1.5
 
 
-def test_cameras_that_look_outwards_are_told_of_another_path() -> None:
+def test_error_for_outward_cameras_names_another_path() -> None:
     eyes = ring_of(12, ORIGIN, radius=0.5, height=0.0).centers.numpy()
     outward = cameras_at(np.stack([look_at(eye, 2 * eye, UP) for eye in eyes]))
     assert "--path along" in orbit_path(outward, 4)[0].notes[0]

@@ -319,7 +319,10 @@ def page_with(
 ) -> Page:
     """Open a page of a site with these elements."""
     head = f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{policy}">'
-    head += f'<link rel="stylesheet" href="site.css"><script src="{ELEMENT}"></script><script src="{ELEMENT}"></script>'
+    head += (
+        f'<link rel="stylesheet" href="site.css"><script src="{ELEMENT}"></script>'
+        f'<script src="{ELEMENT}"></script>'
+    )
     (site / "site.html").write_text(f"<!DOCTYPE html>{head}{''.join(elements)}", encoding="utf-8")
     return browser.open(server.address + "site.html", 320, 240)
 
@@ -363,7 +366,7 @@ SOURCES = (("still.html", ""), ("./moving.html", ""), ("town", ""))
 
 
 @needs_browser
-def test_what_cannot_be_shown_is_one_line_in_its_element(browser: Browser, site: Path) -> None:
+def test_broken_scenes_show_one_line_in_their_element(browser: Browser, site: Path) -> None:
     write(still_scene(), site / "good.html", camera())
     good = (site / "good.html").read_text(encoding="utf-8")
     head, rest = good.split('id="numbers">')

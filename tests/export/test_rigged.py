@@ -1,5 +1,5 @@
-"""People in files of other programs: other readers open them, skins move them as we do, textures and
-surfaces are where clothes are."""
+"""Rigged people in files of other programs: other readers open them, skinning matches dyngs, and
+textures and surfaces cover the clothes."""
 
 from __future__ import annotations
 

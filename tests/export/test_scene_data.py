@@ -1,4 +1,4 @@
-"""The numbers of a page: lists as they are read, motion as splines, uniforms of shaders."""
+"""Scene data of a page: arrays in reading order, motion as splines, uniforms of shaders."""
 
 from __future__ import annotations
 

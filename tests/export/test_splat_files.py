@@ -146,8 +146,8 @@ def test_up_is_what_the_cameras_or_the_user_say(near: OpenedScene) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_edits_of_every_kind_of_scene_are_exact(kind: str) -> None:
-    """What moves, is posed or has a 3D filter: seen by cameras moved with it, at a time in
-    between."""
+    """Scenes that move, are posed or have a 3D filter, rendered between two time steps by cameras
+    that are transformed with them."""
     scene = replace(scene_of_kind(kind), colour=None)
     edit = Similarity((0.6, 0.0, 0.8, 0.0), 2.5, (3.0, -1.0, 0.5))
     splat = splats_at(wrap_scene(scene), scene, 0.3, WriteOptions(edit=edit, up="y"))

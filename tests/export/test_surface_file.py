@@ -100,7 +100,7 @@ def test_a_moving_scene_has_a_mesh_for_each_time(
         ("--static", "--static does not go with --format mesh"),
     ],
 )
-def test_what_does_not_go_is_one_line(
+def test_refusals_are_one_line(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

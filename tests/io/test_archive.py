@@ -1,4 +1,4 @@
-"""Captures in archives: what is unpacked, what is refused, and that nothing is left elsewhere."""
+"""Captures in archives: unpacking, refused archives, and no files left elsewhere."""
 
 from __future__ import annotations
 

@@ -29,7 +29,10 @@ from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
 from dyngs.io.containment import check_inside, check_size, find_escaping_links, restrict_paths_to
 
-PLY = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 1\n"  # noqa: E501
+PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 1\n"
+    "property float x\nproperty float y\nproperty float z\nend_header\n0 0 1\n"
+)
 
 
 def read(root: Path, **options: object) -> Capture:

@@ -1,4 +1,4 @@
-"""Documents of glTF: what is added is found where the document says it is."""
+"""glTF documents: added buffers and accessors are read back from the declared offsets."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ def test_nothing_is_written_through_links_of_a_run(name: str, tmp_path: Path) ->
 def _made_by(
     count: int, folder: Path, make: Callable[[], None]
 ) -> tuple[list[str], list[Exception]]:
-    """Let so many threads make the folder at once; return what they said, and the errors."""
+    """Run ``make_once`` in ``count`` threads at once; return the messages and the errors."""
     said: list[str] = []
     errors: list[Exception] = []
 

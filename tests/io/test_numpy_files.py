@@ -1,4 +1,4 @@
-"""Archives of arrays: what is read, and what is refused before it is allocated."""
+"""Archives of arrays: values, and files refused before memory is allocated."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_arrays_come_back(tmp_path: Path, save: Callable[..., None]) -> None:
 
 
 def write_member(path: Path, shape: object, content: bytes = b"", descr: str = "<f8") -> Path:
-    """An archive of one deflated array whose header says ``shape``."""
+    """Write an archive of one deflated array whose header declares ``shape``."""
     header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}".encode()
     header += b" " * (-(len(header) + 11) % 64) + b"\n"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -58,7 +58,7 @@ def write_member(path: Path, shape: object, content: bytes = b"", descr: str = "
 def test_a_bomb_is_refused_before_it_is_unpacked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The directory says how large it is; with a lower limit, since packing 512 MiB takes
+    """The archive directory declares the size; the limit is lowered because packing 512 MiB takes
     seconds."""
     most = 1 << 26
     monkeypatch.setattr(numpy_files, "MOST_BYTES", most)

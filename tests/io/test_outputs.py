@@ -1,5 +1,4 @@
-"""No output replaces an input, by whatever name; folders that are made appear complete or not at
-all."""
+"""No output replaces an input under any name, and folders appear complete or not at all."""
 
 from __future__ import annotations
 

@@ -80,11 +80,16 @@ def test_arrays_come_back(tmp_path: Path, protocol: int) -> None:
 
 
 def test_pickles_of_python_2(tmp_path: Path) -> None:
-    """As Python 2 wrote ``{'camera_f': numpy.array([1.5, 2.0]), 'width': 1080}`` with protocol
-    2."""
+    """Protocol 2 bytes of Python 2 for ``{'camera_f': numpy.array([1.5, 2.0]), 'width': 1080}``."""
     numbers = np.array([1.5, -2.0]).tobytes()
-    content = b"\x80\x02}q\x00(U\x08camera_fq\x01cnumpy.core.multiarray\n_reconstruct\nq\x02cnumpy\nndarray\nq\x03K\x00\x85"  # noqa: E501
-    content += b"U\x01b\x87Rq\x04(K\x01K\x02\x85cnumpy\ndtype\nq\x05U\x02f8K\x00K\x01\x87Rq\x06(K\x03U\x01<NNN"
+    content = (
+        b"\x80\x02}q\x00(U\x08camera_fq\x01cnumpy.core.multiarray\n_reconstruct\n"
+        b"q\x02cnumpy\nndarray\nq\x03K\x00\x85"
+    )
+    content += (
+        b"U\x01b\x87Rq\x04(K\x01K\x02\x85cnumpy\ndtype\n"
+        b"q\x05U\x02f8K\x00K\x01\x87Rq\x06(K\x03U\x01<NNN"
+    )
     content += (
         b"J\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb\x89U\x10" + numbers + b"tbU\x05widthM8\x04u."
     )
@@ -93,7 +98,7 @@ def test_pickles_of_python_2(tmp_path: Path) -> None:
 
 
 class Wrapper:
-    """What joblib writes instead of an array; the bytes follow behind."""
+    """Placeholder that joblib writes for an array; the bytes of the array follow it."""
 
     __module__, __qualname__ = "joblib.numpy_pickle", "NumpyArrayWrapper"
 
@@ -219,7 +224,7 @@ def test_pickles_made_by_hand(content: bytes, tmp_path: Path) -> None:
 def test_sparse_matrices_come_back_whole(
     tmp_path: Path, make: Callable[[object], object], protocol: int
 ) -> None:
-    """Entries that are there twice add up, as they do in SciPy."""
+    """Duplicate entries are summed, as in SciPy."""
     dense = np.where(np.random.default_rng(0).uniform(size=(5, 7)) < 0.3, 2.5, 0)
     read: Any = read_pickle(pickled(tmp_path, pickle.dumps({"J": make(dense)}, protocol)))
     np.testing.assert_array_equal(read["J"], dense)

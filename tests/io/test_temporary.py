@@ -1,4 +1,4 @@
-"""What a killed process leaves half written goes; what is anybody else's stays."""
+"""Removal of temporary files of killed processes; all other files stay."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_the_next_process_that_writes_there_cleans_up(tmp_path: Path) -> None:
     assert _names(tmp_path) == {"b.txt"}
 
 
-def test_what_lives_and_what_is_not_ours_stays(tmp_path: Path) -> None:
+def test_files_of_running_processes_and_other_files_stay(tmp_path: Path) -> None:
     mine = temporary_beside(tmp_path / "mine.json")
     dead = mine.name.replace(str(os.getpid()), "999999999")
     elsewhere = dead[: dead.index("-") + 1] + "000000.dyngs.json"

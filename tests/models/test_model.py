@@ -1,4 +1,4 @@
-"""What every kind of model promises: all of ours, and one that is not made of Gaussians."""
+"""Contract of all models: the kinds of dyngs, and one that is not made of Gaussians."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def trained(config: Config) -> Trainer:
 
 @pytest.fixture(scope="module")
 def trainer(config: Config) -> Trainer:
-    """Of tests that leave it as it is."""
+    """Return a trainer that the tests share and must not change."""
     return trained(config)
 
 
@@ -103,7 +103,7 @@ def test_every_kind_is_here() -> None:
 
 
 def test_it_is_trained_stored_and_restored(config: Config) -> None:
-    """What a checkpoint holds is taken over as it is, and training goes on with the same bytes."""
+    """A checkpoint is restored exactly, and further training gives identical bytes."""
     trainer = trained(config)
     first = trainer.checkpoint()
     again = build_trainer(config, restored=True)

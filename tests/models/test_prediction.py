@@ -1,4 +1,4 @@
-"""What all networks that predict scenes share: views by name, weights of another network."""
+"""Behaviour shared by all scene predictors: views by name, and weights of another network."""
 
 from __future__ import annotations
 
@@ -46,8 +46,9 @@ def test_weights_of_another_network_are_refused() -> None:
             load_weights(other, stored(own))
 
 
-def test_what_has_had_no_gradient_has_no_moments() -> None:
-    """Nor after they are stored and taken over; what has had one goes on with the same bytes."""
+def test_parameters_without_gradients_have_no_moments() -> None:
+    """Parameters without gradients have no moments after a restore; the others train to identical
+    bytes."""
     networks = [nn.ModuleList([nn.Linear(3, 2), nn.Linear(3, 2)]) for _ in range(2)]
     networks[1].load_state_dict(networks[0].state_dict())
     optimizers = [torch.optim.AdamW(network.parameters()) for network in networks]

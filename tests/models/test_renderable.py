@@ -132,7 +132,8 @@ def test_no_cameras(scene: Renderable) -> None:
 
 @pytest.mark.parametrize("kind", [kind for kind in ALL if kind not in NETWORKS])
 def test_a_background_for_each_view(kind: str) -> None:
-    """As each view alone before its own; cameras of double precision are drawn, too."""
+    """A batch matches single views with their own backgrounds, also for double-precision
+    cameras."""
     scene = scene_of(kind)
     cameras = two_cameras()
     colours = torch.tensor([[1.0, 0.0, 0.5], [0.0, 1.0, 0.25]])

@@ -80,7 +80,10 @@ def add_times(root: Path) -> None:
     [
         (
             resize,
-            r"other sizes, times or cameras of train/r_000, train/r_001, train/r_002, train/r_003\)",
+            (
+                r"other sizes, times or cameras of train/r_000, train/r_001, "
+                r"train/r_002, train/r_003\)"
+            ),
         ),
         (swap_poses, r"other sizes, times or cameras of train/r_000, train/r_001\)"),
         (scale_world, r"other sizes, times or cameras of train/r_000, .*"),
@@ -103,7 +106,7 @@ def test_another_capture_is_refused(
     assert RECORD_NAME in str(refused.value)
 
 
-def test_where_the_reader_puts_the_origin_does_not_matter(capture: Path, tmp_path: Path) -> None:
+def test_the_origin_chosen_by_the_reader_does_not_matter(capture: Path, tmp_path: Path) -> None:
     moved = change_coordinates(read_capture(capture), 4.0, np.array([0.3, -7.0, 1e3]))
     require_same_capture(tmp_path, DataConfig(root=capture), moved)
     elsewhere = replace(moved, world_offset=moved.world_offset + np.array([0.0, 0.0, 0.01]))

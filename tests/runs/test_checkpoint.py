@@ -1,4 +1,4 @@
-"""Checkpoints: equal bytes for equal runs, whole or not at all, and damage is told in one line."""
+"""Checkpoints: equal bytes for equal runs, atomic writes, and one-line errors for damaged files."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_a_link_to_nothing_is_an_error(tmp_path: Path) -> None:
         latest_checkpoint(tmp_path)
 
 
-def test_what_is_saved_is_what_is_loaded(tmp_path: Path) -> None:
+def test_saving_and_loading_round_trips(tmp_path: Path) -> None:
     saved = _checkpoint(7)
     loaded = load_checkpoint(save_checkpoint(tmp_path, saved, 1.5))
     assert loaded.info == saved.info
@@ -318,7 +318,7 @@ def test_contents_that_do_not_fit_end_in_one_line_or_a_finite_image(
         ("gaussians.means", lambda x: x * torch.nan, "'means' has NaN"),
     ],
 )
-def test_what_does_not_fit_is_named(
+def test_mismatched_contents_are_named(
     tmp_path: Path, name: str, change: Callable[[torch.Tensor], torch.Tensor], said: str
 ) -> None:
     tensors, model = contents("control_nodes")

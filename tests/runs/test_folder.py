@@ -1,5 +1,5 @@
-"""Whatever lies in a folder, no command replaces it unasked, and what a killed process left half
-written goes."""
+"""Run folders: no command replaces files without a request, and leftovers of killed runs are
+removed."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def _require(holds: bool) -> None:
 
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("state", OWN)
-def test_what_a_run_would_replace_is_never_replaced(
+def test_no_command_replaces_existing_files(
     still: Path, run_dir: Path, tmp_path: Path, command: str, state: str
 ) -> None:
     out = _filled(tmp_path / "out", OWN[state])
@@ -142,7 +142,7 @@ def test_a_finished_run_is_not_begun_again(still: Path, run_dir: Path) -> None:
     assert _contents(run_dir) == before
 
 
-def test_what_a_kill_leaves_goes_when_the_run_goes_on(run_dir: Path, tmp_path: Path) -> None:
+def test_leftovers_of_a_kill_are_removed_on_resume(run_dir: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(run_dir, run)
     newest = checkpoint_paths(run)[-1]

@@ -1,5 +1,4 @@
-"""What runs, configurations and captures read, and that every function that writes to a path looks
-at it."""
+"""Inputs of runs, configurations and captures, which no function that writes a file may replace."""
 
 from __future__ import annotations
 
@@ -118,7 +117,7 @@ def test_no_function_replaces_a_file_of_the_capture(tmp_path: Path) -> None:
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-def test_what_a_run_reads(tmp_path: Path) -> None:
+def test_inputs_of_a_run(tmp_path: Path) -> None:
     run = write_moving_run(tmp_path)
     own = [run / RESOLVED_NAME, *checkpoint_paths(run)]
     for path in own:

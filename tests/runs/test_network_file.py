@@ -1,5 +1,4 @@
-"""Weights of a network in one file: what it predicts stays what it was, and everything else is
-refused."""
+"""Network weights in one file: predictions are preserved, and other files are refused."""
 
 from __future__ import annotations
 
@@ -51,7 +50,7 @@ def test_weights_are_those_of_the_run_to_float16(config: Config, tmp_path: Path)
     assert path.stat().st_size < 2.2 * sum(x.numel() for x in weights.tensors.values()) + 20_000
 
 
-def test_what_cannot_be_stored_is_refused(config: Config, tmp_path: Path) -> None:
+def test_unsupported_networks_are_refused(config: Config, tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="overflows float16"):
         write_network(tmp_path, config, checkpoint(1e6), tmp_path / "net.safetensors")
     with pytest.raises(DyngsError, match=r"is written as \.safetensors"):
@@ -63,7 +62,7 @@ def test_what_cannot_be_stored_is_refused(config: Config, tmp_path: Path) -> Non
 
 
 def test_other_files_are_refused(config: Config, tmp_path: Path) -> None:
-    """In one line: damaged, of another kind, and with a header that says something else."""
+    """One-line errors for a damaged file, another kind, and a wrong header."""
     good = write_network(tmp_path, config, checkpoint(), tmp_path / "net.safetensors")
     bad = tmp_path / "bad.safetensors"
     half = good.read_bytes()[: good.stat().st_size // 2]

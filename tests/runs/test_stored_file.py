@@ -136,7 +136,7 @@ def test_every_cut_and_every_flip_is_an_error(tmp_path: Path) -> None:
 @given(st.data())
 @settings(deadline=None, max_examples=30)
 def test_a_forged_file_is_an_error_or_a_scene(source: st.DataObject) -> None:
-    """Flips with a checksum that fits: whatever the reader finds, it says it in one line."""
+    """Flip bytes under a valid checksum: decoding returns a scene or raises a one-line error."""
     data = bytearray(stored(small_scene())[:-32])
     for _ in range(source.draw(st.integers(1, 4))):
         data[source.draw(st.integers(len(MAGIC), len(data) - 1))] ^= source.draw(

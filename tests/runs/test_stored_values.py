@@ -120,7 +120,7 @@ def moving(kind: str) -> tuple[DynamicScene, DynamicModel]:
 
 
 def stored(scene: GaussianScene) -> dict[str, torch.Tensor]:
-    """What a file holds of a scene, in its order."""
+    """Return the tensors that a file stores for a scene, in file order."""
     return tensors_to_store(scene.apply_edit(storage_edit(scene, scene.gaussians.means.numpy())))
 
 
@@ -145,7 +145,7 @@ def test_the_stored_form_looks_the_same(kind: str) -> None:
         )
 
 
-def test_what_is_not_finite_is_refused() -> None:
+def test_non_finite_values_are_refused() -> None:
     gaussians = cloud(3)
     gaussians.means[1, 1] = torch.nan
     with pytest.raises(DyngsError, match="means is not finite"):

@@ -1,4 +1,4 @@
-"""All models see the same images, whatever their presets say, and none writes outside the
+"""All models get the same images regardless of their presets, and none writes outside the
 folder."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tasks in turn, and what a study is about: noted once and compared afterwards."""
+"""Tasks run one after another; the inputs of a study are recorded once and compared afterwards."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def found(study: Tradeoff) -> Found:
     return study.run()
 
 
-def test_the_run_itself_is_what_eval_says(found: Found, study: Tradeoff) -> None:
+def test_the_unchanged_variant_has_the_scores_of_eval(found: Found, study: Tradeoff) -> None:
     report = evaluate_run(study.run_dir, "test", threads=1)
     base = found[Variant()]
     assert (base.psnr, base.ssim) == (report.psnr, report.ssim)
@@ -64,7 +64,7 @@ def test_the_run_itself_is_what_eval_says(found: Found, study: Tradeoff) -> None
     assert base.gain == 1.0
 
 
-def test_every_setting_does_what_it_says(found: Found) -> None:
+def test_every_setting_has_its_effect(found: Found) -> None:
     base = found[Variant()]
     pruned = found[Variant(prune=0.5)]
     assert pruned.gaussians == base.gaussians / 2
@@ -137,7 +137,7 @@ def test_a_stored_run_cannot_be_varied(found: Found, study: Tradeoff) -> None:
         current_settings(study.folder(Variant(storage=2.0)))
 
 
-def test_a_damaged_point_says_what_to_do(found: Found, tmp_path: Path) -> None:
+def test_the_error_of_a_damaged_point_names_the_remedy(found: Found, tmp_path: Path) -> None:
     path = tmp_path / "x.json"
     good = json.loads(json.dumps(asdict(found[Variant()])))
     path.write_text(json.dumps(good))
@@ -202,7 +202,7 @@ def test_single_changes_differ_from_the_run() -> None:
         ("storage=fine", "--vary storage=fine"),
     ],
 )
-def test_what_cannot_be_varied_is_refused(word: str, message: str) -> None:
+def test_unknown_variations_are_refused(word: str, message: str) -> None:
     with pytest.raises(DyngsError, match=message):
         parse_variations([word])
 
@@ -263,7 +263,7 @@ def test_exchange_rates_are_those_of_single_settings() -> None:
     assert (storage["db_per_speed"], storage["db_per_size"]) == (None, pytest.approx(0.0))
 
 
-def test_what_is_cheapest_is_put_together_first() -> None:
+def test_cheapest_variants_are_combined_first() -> None:
     singles = {
         Variant(): BASE,
         Variant(prune=0.3): measured(28.0, 1.5),
@@ -310,7 +310,7 @@ def test_conditions() -> None:
         ("psnr>=__import__('os')", "not a condition"),
     ],
 )
-def test_what_is_no_condition_is_refused(text: str, message: str) -> None:
+def test_invalid_requirements_are_refused(text: str, message: str) -> None:
     with pytest.raises(DyngsError, match=message):
         parse_requirements(text)
 
@@ -334,6 +334,6 @@ def test_the_best_of_what_qualifies() -> None:
         ("lpips<=0.5", "meets lpips<=0.5$"),
     ],
 )
-def test_what_is_missed_is_named(asked: str, message: str) -> None:
+def test_unmet_requirements_are_named(asked: str, message: str) -> None:
     with pytest.raises(DyngsError, match=message):
         choose_variant(ROWS, parse_requirements(asked), Requirement("mb", True))

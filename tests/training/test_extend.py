@@ -1,5 +1,5 @@
-"""A run that goes on to another number of steps: it does so to the same bytes however it is
-stopped, of every kind."""
+"""Runs extended to another number of steps end with the same bytes for every model and every kind
+of stop."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def test_a_run_that_was_stopped_may_become_longer_or_shorter(
         assert load_run(copy).step == load_resolved(copy).train.steps == steps
 
 
-def test_what_cannot_be_is_refused_and_changes_nothing(captures: Path, tmp_path: Path) -> None:
+def test_invalid_extensions_are_refused_and_change_nothing(captures: Path, tmp_path: Path) -> None:
     run = train(_config(captures, tmp_path / "run", "default"))
     before = (run / "config.yaml").read_bytes()
     with pytest.raises(DyngsError, match="already has 12 steps"):
@@ -148,7 +148,7 @@ def test_what_cannot_be_is_refused_and_changes_nothing(captures: Path, tmp_path:
         _to(run, 24)
 
 
-def test_what_has_begun_keeps_its_step() -> None:
+def test_started_stages_keep_their_step() -> None:
     options = TrainConfig(steps=1000, initial_downscale=4)
     model = DynamicModel(
         time_window=0.1, time_window_grows_from=0.4, time_window_full_at=0.6, motion_from=0.35
@@ -184,7 +184,7 @@ def test_exposures_that_are_learned_stay_so() -> None:
         extend_config(config, 1000, 1_000_000)
 
 
-def test_what_a_shorter_run_would_have_begun_by_now_begins_next() -> None:
+def test_overdue_stages_start_at_the_next_step() -> None:
     model = DynamicModel(motion_from=0.5)
     config = Config(data=DataConfig(root=Path("x")), model=model, train=TrainConfig(steps=10_000))
     new = extend_config(config, 4000, 5000)

@@ -94,7 +94,7 @@ def test_a_size_without_room_is_refused_and_the_one_named_is_not(
     assert found >= 500
 
 
-def test_what_contradicts_is_refused(tmp_path: Path) -> None:
+def test_contradicting_limits_are_refused(tmp_path: Path) -> None:
     validate_limits(NOTHING)
     network = NOTHING.model_copy(update={"model": HumanPredictorModel()})
     both = NOTHING.model_copy(

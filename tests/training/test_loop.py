@@ -1,4 +1,4 @@
-"""The loop tells what happens in order, to every listener, whoever is trained."""
+"""The loop emits events in order to every listener, for every kind of trainer."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ def looped(
     return loop
 
 
-def test_events_come_in_order_and_all_listeners_hear_them() -> None:
-    """What was found in a step is told before that the step is done; listeners are told in the
-    order they came in."""
+def test_events_reach_all_listeners_in_order() -> None:
+    """Messages of a step are emitted before its end; listeners are called in the order in which
+    they were added."""
     told: list[tuple[str, Event]] = []
     trainer = Counting(messages={2: "something"})
     loop = looped(
@@ -57,7 +57,7 @@ def test_it_stops_between_two_steps() -> None:
 
 
 def test_advice_is_added_to_a_failing_step() -> None:
-    """And is asked for only then."""
+    """Advice is requested only when a step fails."""
     asked = []
 
     def advice() -> str:

@@ -1,4 +1,4 @@
-"""The loss of a step and what is said when something is not finite."""
+"""The loss of a step and the errors about non-finite values."""
 
 from __future__ import annotations
 
@@ -40,11 +40,14 @@ def test_a_term_that_is_not_finite_is_named(
 
 
 def test_gaussians_that_are_not_finite_come_first(image: Image) -> None:
-    """They are the cause of whatever else is not."""
+    """Non-finite Gaussians are reported first, since they cause all other non-finite values."""
     gaussians = random_scene().gaussians
     gaussians.means[3, 1] = torch.nan
     terms = {"image": torch.tensor(torch.nan)}
-    message = r"the field produced non-finite means at time 0\.25; lower the learning rates in model\.deform$"
+    message = (
+        r"the field produced non-finite means at time 0\.25; "
+        r"lower the learning rates in model\.deform$"
+    )
     with pytest.raises(DyngsError, match=rf"^step 3, view 'r_7': {message}"):
         StepCheck(terms, gaussians.tensors(), CPU).loss(3, image, MOVES_BY)
 

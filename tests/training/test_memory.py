@@ -1,5 +1,5 @@
-"""The forecast of memory: of the right size, and a warning with what to set where there is too
-little."""
+"""The memory forecast is accurate. Where memory is short, a warning names the settings to
+change."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_on_a_gpu_the_scene_is_forecast_there_and_the_rest_here(
     assert machine.count == machine.gaussians == 0
 
 
-def test_with_what_a_warning_says_the_run_has_room() -> None:
+def test_settings_of_the_warning_make_the_run_fit() -> None:
     assert PLENTY.warning() is None
     assert replace(PLENTY, free=None).warning() is None
     warning = replace(PLENTY, free=GB).warning()
@@ -86,7 +86,7 @@ def test_more_steps_are_expected_to_end_with_more_gaussians() -> None:
     assert 1000 <= count(500) < count(7000) < count(30_000)
 
 
-def test_what_this_machine_says() -> None:
+def test_memory_of_this_machine_is_measured() -> None:
     free = free_memory()
     assert resident_memory() > 0
     assert free is not None

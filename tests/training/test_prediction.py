@@ -32,8 +32,8 @@ def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, tmp_path: Path) ->
 
 
 def test_a_gradient_too_large_to_square_leaves_the_step_out(folder: Path, tmp_path: Path) -> None:
-    """Its length, which is to be cut, is infinite: weights and moments stay as they are, and the
-    next step is good."""
+    """The gradient norm is infinite: weights and moments do not change, and the next step
+    succeeds."""
     trainer = network_trainer(config(folder, tmp_path))
     assert isinstance(trainer, NetworkTrainer)
     trainer.step()

@@ -1,5 +1,5 @@
-"""Training where the scene lies on a device of its own: nothing of the CPU gets into it, and it
-learns the same."""
+"""Training with the scene on a separate device: no CPU tensor enters it, and the result is the
+same."""
 
 from __future__ import annotations
 

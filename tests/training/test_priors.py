@@ -92,8 +92,8 @@ def terms(
     return {name: float(x.detach()) for name, x in priors(look).items()}
 
 
-def test_flow_of_a_motion_that_is_not_there_costs() -> None:
-    """Flow says that nothing moves: right at speed 0, wrong at another."""
+def test_zero_flow_penalizes_motion() -> None:
+    """Zero flow costs nothing at speed 0 and has a loss at another speed."""
     own = image(flow=torch.zeros(24, 32, 2))
     priors = PriorLosses(flow_to={0: TimedCamera(HERE, 0.5)})
     assert terms(priors, own, speed=0.0)["flow"] < 1e-6
@@ -159,7 +159,7 @@ def test_unknown_transparent_and_masked_pixels_do_not_count() -> None:
     assert depth_error(depth, torch.zeros(12, 16), given) is None
 
 
-def test_what_is_drawn_is_the_displacement_of_the_gaussian_that_shows() -> None:
+def test_displacements_of_the_visible_gaussian_are_rendered() -> None:
     """One ball moves along x at the depth of its centre: focal length times motion over depth."""
     here = camera(32, 24)
     start = row_of_balls(1)

@@ -84,7 +84,7 @@ class _LiftedScene(GaussianScene):
 
 
 class _Lifted(SceneTraining[_LiftedScene]):
-    """How it is trained; what it has done is part of its state."""
+    """Training of a lifted scene; the list of finished steps is part of its state."""
 
     deformation_name = ("field", "model.deform")
 
@@ -180,7 +180,7 @@ def _stops_in_step_3(trainer: GaussianTrainer) -> str:
 
 
 @pytest.mark.parametrize("timed", [False, True])
-def test_what_is_not_finite_is_named_in_one_line(
+def test_non_finite_values_are_named_in_one_line(
     capture: Path, tmp_path: Path, timed: bool
 ) -> None:
     """Step, view, attributes, and the time; the parameters stay as they were."""
@@ -189,7 +189,8 @@ def test_what_is_not_finite_is_named_in_one_line(
     )
     time = "(0|0.25|0.5|0.75|1)" if timed else "0"
     assert re.fullmatch(
-        rf"step 3, view 'train/r_00\d': the field produced non-finite means at time {time}; lower .*model\.deform",
+        rf"step 3, view 'train/r_00\d': the field produced non-finite means at time {time}; "
+        r"lower .*model\.deform",
         _stops_in_step_3(trainer),
     )
 
@@ -273,7 +274,7 @@ def trained_state(root: Path) -> dict[str, Tensor]:
     return trainer.model.scene.gaussians.tensors()
 
 
-def test_what_a_mask_ignores_does_not_matter(capture: Path, tmp_path: Path) -> None:
+def test_pixels_ignored_by_a_mask_have_no_effect(capture: Path, tmp_path: Path) -> None:
     """White counts, black is ignored: other colours below black change nothing, below white they
     do."""
     mask = np.full((16, 16, 1), 255, np.uint8)

@@ -1,4 +1,4 @@
-"""What the controls of the page do, without a browser."""
+"""Controls of the page, tested without a browser."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def wall() -> OpenedScene:
 @pytest.mark.parametrize(
     ("aim", "error"), [((0.3, 0.2, 2.0), 0.003), ((0.8, 0.1, 2.0), 0.03), ((1.5, -0.6, 2.0), 0.03)]
 )
-def test_a_ray_meets_the_wall_where_geometry_says(
+def test_a_ray_meets_the_wall_at_the_exact_point(
     wall: OpenedScene, aim: tuple[float, float, float], error: float
 ) -> None:
     """From the side to the size of its Gaussians, 0.03, of which the nearer ones cover the
@@ -59,7 +59,7 @@ def test_a_ray_meets_the_wall_where_geometry_says(
     np.testing.assert_allclose(found, aim, atol=error)
 
 
-def test_what_moves_is_picked_where_it_is_shown(tmp_path: Path) -> None:
+def test_moving_gaussians_are_picked_at_the_displayed_time(tmp_path: Path) -> None:
     opened = open_run(write_moving_run(tmp_path))
     for time in (0.0, 1.0):
         x = float(moved_x((3,), time))
@@ -69,7 +69,7 @@ def test_what_moves_is_picked_where_it_is_shown(tmp_path: Path) -> None:
         np.testing.assert_allclose(found, [x, 0, 0], atol=0.02)
 
 
-def test_coordinates_far_from_the_origin_are_told_to_a_thousandth_of_the_box(
+def test_coordinates_far_from_the_origin_have_a_thousandth_of_the_box_as_precision(
     tmp_path: Path,
 ) -> None:
     opened = open_run(write_moving_run(tmp_path, moves=False, offset=(500_000.0, 4_600_000.0, 0.0)))
@@ -113,9 +113,9 @@ def test_deletions_in_the_coordinates_of_the_frame_and_back(tmp_path: Path) -> N
         work.delete(inside=True)
 
 
-def test_what_is_saved(tmp_path: Path) -> None:
-    """Of a run in its frame, at the time that is shown; of a file all that its header says; both
-    stay as they are."""
+def test_saved_edits_keep_frame_time_and_header(tmp_path: Path) -> None:
+    """An edited run is saved in its own frame at the displayed time, and an edited file with its
+    whole header. Neither original changes."""
     run = write_moving_run(tmp_path)
     work = editing(open_run(run), (1.0, 0.0, 0.0), 0.4)
     work.delete(inside=True)

@@ -64,7 +64,10 @@ def test_colours_are_those_of_dyngs_render() -> None:
 @pytest.mark.parametrize("layer", LAYERS)
 def test_a_gpu_draws_every_layer_alike(run: OpenedScene, layer: str) -> None:
     view = 0 if layer in ("colour", "error") else None
-    shots = [ViewRequest(camera(), 0.5, layer, part, view, 0.5) for part in PARTS]  # type: ignore[arg-type]
+    shots = [
+        ViewRequest(camera(), 0.5, layer, part, view, 0.5)  # type: ignore[arg-type]
+        for part in PARTS
+    ]
     expected = [draw(run, request) for request in shots]
     with pretend_gpu():
         there = run.to(GPU)

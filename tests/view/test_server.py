@@ -104,7 +104,7 @@ def settle(page: Page, connection: BrowserConnection) -> None:
 
 
 def rendered(run: Path, connection: BrowserConnection, folder: Path) -> np.ndarray:
-    """What ``dyngs render`` draws along the path that the page would save."""
+    """Return the image that ``dyngs render`` draws along the path that the page would save."""
     session = connection.session
     assert session.browser_camera is not None
     recording = Recording((Keyframe(session.browser_camera.camera(), session.time),))
@@ -323,7 +323,11 @@ def test_the_server_asks_the_gate() -> None:
         socket_at = page.replace("http", "ws")
         with pytest.raises(InvalidStatus):
             connect(socket_at, subprotocols=[version])  # type: ignore[list-item]
-        with connect(socket_at, additional_headers=cookie, subprotocols=[version]) as opened_socket:  # type: ignore[list-item]
+        with connect(
+            socket_at,
+            additional_headers=cookie,
+            subprotocols=[version],  # type: ignore[list-item]
+        ) as opened_socket:
             assert opened_socket.recv(timeout=5)
     finally:
         with silence_viser():

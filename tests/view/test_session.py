@@ -1,4 +1,4 @@
-"""What a browser sees when: sizes, times, recorded paths, turns of several browsers."""
+"""Images sent to a browser: sizes, times, recorded paths, and turns between several browsers."""
 
 from __future__ import annotations
 
@@ -53,14 +53,14 @@ def browser_camera(x: float = 0.0, size: tuple[int, int] = (400, 300)) -> Browse
 
 
 class Looked:
-    """A session on a clock that stands still, and what it sent."""
+    """A session on a stopped clock, with the images that it sent."""
 
     def __init__(self, scene: GaussianScene | None = None) -> None:
         self.clock, self.sent = Clock(), list[SentImage]()
         self.session = Session(opened(scene), self.sent.append, clock=self.clock)
 
     def after(self, seconds: float) -> None:
-        """Let time pass, and draw whatever is due then."""
+        """Advance the clock, and draw all images that are due."""
         self.clock.now += seconds
         while self.session.due() == 0.0:
             self.session.draw_next()
@@ -269,7 +269,7 @@ def test_each_gets_a_turn_and_the_thread_ends() -> None:
     assert threading.active_count() == before
 
 
-def test_a_fault_of_one_is_told_once_and_the_others_go_on() -> None:
+def test_an_error_of_one_session_is_shown_once_and_others_continue() -> None:
     told: list[tuple[Session, str]] = []
     drawer = RenderScheduler()
     (bad, _), (worse, _), (good, sent) = (looking_at_balls() for _ in range(3))

@@ -1,4 +1,4 @@
-"""What can be looked at: folders of runs, motion files, and training."""
+"""Sources of the viewer: folders of runs, motion files, and training."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_a_folder_of_runs_is_a_picker(tmp_path: Path) -> None:
     assert open_source(tmp_path / "b" / "run").names == ("run",)
 
 
-def test_where_nothing_is_to_be_seen_one_line_says_so(tmp_path: Path) -> None:
+def test_a_folder_without_scenes_is_reported_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="no runs found"):
         open_source(tmp_path)
     with pytest.raises(DyngsError, match="no such file"):
@@ -90,7 +90,7 @@ class Onlooker:
 
 
 @pytest.mark.parametrize("preset", ["static", "dynamic"])
-def test_training_gives_the_same_bytes_whoever_looks(
+def test_training_gives_the_same_bytes_with_and_without_viewers(
     preset: str, tmp_path: Path, still: Path, moving: Path
 ) -> None:
     onlooker = Onlooker()

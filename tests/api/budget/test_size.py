@@ -1,4 +1,5 @@
-"""A file is never larger than allowed, drawn as it says, and made again where it is missing."""
+"""File size budgets: a file stays within its limit, renders as recorded, and is rebuilt when it is
+missing."""
 
 from __future__ import annotations
 
@@ -65,7 +66,9 @@ def trainer(still: Path, tmp_path_factory: pytest.TempPathFactory) -> Trainer:
     return trainer
 
 
-def test_a_file_is_never_larger_and_shows_what_is_said(trainer: Trainer, tmp_path: Path) -> None:
+def test_a_file_fits_its_budget_and_has_the_reported_quality(
+    trainer: Trainer, tmp_path: Path
+) -> None:
     before = trainer.checkpoint().tensors
     usual = write_limited_file(trainer, tmp_path / "usual", 5.0)
     assert (usual.coarser, usual.num_kept) == (1, 500)
@@ -87,13 +90,13 @@ def test_a_file_is_never_larger_and_shows_what_is_said(trainer: Trainer, tmp_pat
     assert all(torch.equal(x, before[name]) for name, x in after.items())
 
 
-def test_what_cannot_fit_is_said(trainer: Trainer, tmp_path: Path) -> None:
+def test_an_unreachable_size_is_reported(trainer: Trainer, tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match=r"budget.max_mb=0.0001: too small for this scene"):
         write_limited_file(trainer, tmp_path, 0.0001)
     assert not (tmp_path / EXPORT_FOLDER).exists()
 
 
-def test_a_run_writes_it_and_a_finished_one_makes_it_again(still: Path, tmp_path: Path) -> None:
+def test_a_run_writes_the_file_and_a_finished_run_rebuilds_it(still: Path, tmp_path: Path) -> None:
     folder = train(config_of(still, tmp_path / "run", BudgetConfig(max_mb=0.02)))
     file = folder / EXPORT_FOLDER / SCENE_FILE
     end = checkpoint_paths(folder)[-1].read_bytes()

@@ -27,7 +27,7 @@ def config_of(root: Path, run: Path, minutes: float, *keys: str) -> Config:
 
 
 def slow(monkeypatch: pytest.MonkeyPatch, seconds: float, after: int = 0) -> None:
-    """Let each step take so many seconds more ``after`` so many."""
+    """Delay every training step by ``seconds``, from step ``after`` on."""
     real = Trainer.step
 
     def step(trainer: Trainer[Any]) -> Any:

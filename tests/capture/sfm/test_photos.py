@@ -37,7 +37,7 @@ def _save_heic(path: Path, orientation: int = 1) -> Path:
 
 
 def _gather(tmp_path: Path) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Source and stored name of each photo, and lines on what is left out."""
+    """Return {source: stored name} of all photos, and the notes on skipped files."""
     photos, notes = gather_photos(tmp_path / "photos", tmp_path / "images", tmp_path / "out")
     return {photo.source: photo.name for photo in photos}, notes
 
@@ -60,8 +60,7 @@ def test_every_suffix_is_taken_or_said_to_be_left_out(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("orientation", [1, 3, 6])
 def test_heic_becomes_png_with_its_tags(tmp_path: Path, orientation: int) -> None:
-    """libheif rotates by what the file itself says; the EXIF tag repeats it and must not be applied
-    again."""
+    """Apply the rotation of a HEIC file once: libheif applies it, and the EXIF tag repeats it."""
     _save_heic(tmp_path / "photos" / "a.HEIC", orientation)
     names, notes = _gather(tmp_path)
     assert (names, notes) == ({"a.HEIC": "a.png"}, [])

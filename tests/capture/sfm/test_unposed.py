@@ -23,7 +23,7 @@ from dyngs.io.write import cache_folder, write_image
 
 @pytest.fixture(autouse=True)
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """Structure from motion is not done; what it was asked for is listed."""
+    """Replace structure from motion by a stub; return the list of its sources."""
     sources: list[Path] = []
 
     def estimate(source: Path, out: Path, options: SfmOptions, report: object) -> SfmResult:

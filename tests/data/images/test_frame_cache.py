@@ -1,5 +1,4 @@
-"""Frames of videos in the user's cache: those asked for, once, within the limit; nothing else is
-ever removed."""
+"""Cache of video frames: only requested frames are decoded, once and within the size limit."""
 
 from __future__ import annotations
 
@@ -105,7 +104,7 @@ def test_the_limit_is_refused_at_once(root: Path, monkeypatch: pytest.MonkeyPatc
     assert len(cached()) <= 2, "the estimate is made from the first frame"
 
 
-def test_what_was_not_used_for_longest_makes_room(
+def test_least_recently_used_frames_are_evicted(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Frames that were used in the last days stay, and so do folders without our mark."""

@@ -212,7 +212,7 @@ def test_target_size(
     assert target_size(*size, downscale, longest) == wanted
 
 
-# ---------------------------------------------------------------------------------------------------- damaged and huge
+# -------------------------------------------------------------------------------- damaged and huge
 
 
 def write_empty_png(path: Path, side: int) -> None:
@@ -279,7 +279,7 @@ def test_each_orientation_is_turned_as_pillow_turns_it(tmp_path: Path, orientati
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_photos_are_upright_for_colmap_and_for_us(tmp_path: Path, orientation: int) -> None:
-    """What COLMAP sees is what the loader gets for a camera of the size that COLMAP saw."""
+    """The loader and COLMAP read the same upright image."""
     path = _photo(tmp_path / "photos" / "a b.png", orientation, UPRIGHT)
     shown = read_image(path, upright=True).numpy()
     photos, _ = gather_photos(tmp_path / "photos", tmp_path / "images", tmp_path / "out")

@@ -91,7 +91,7 @@ def test_undistorted_points_go_back(lens: Lens) -> None:
     torch.testing.assert_close(distort(lens, straight) * focal + center, points, rtol=0, atol=0.05)
 
 
-def test_where_a_lens_folds_back_nothing_is_valid() -> None:
+def test_pixels_where_a_lens_folds_back_are_invalid() -> None:
     """r (1 - r^6 / 2) falls from r = 3.5^(-1/6) = 0.81 on: beyond, the image would appear a second
     time."""
     intrinsics = np.array([[100.0, 0.0, 100.0], [0.0, 100.0, 100.0], [0.0, 0.0, 1.0]])

@@ -1,4 +1,4 @@
-"""Depth, flow and silhouettes: read as they are written, taken at pixels, refused in one line."""
+"""Depth, flow and silhouette maps: values, sampling at pixels, and one-line errors."""
 
 from __future__ import annotations
 

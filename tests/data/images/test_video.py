@@ -1,4 +1,4 @@
-"""Decoding of videos: the frames asked for, and where a damaged file breaks."""
+"""Decoding of videos: requested frames, orientation, colours and damaged files."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def _display_matrix(a: int, b: int, c: int, d: int) -> bytes:
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_display_matrices_rotate_and_mirror(tmp_path: Path, orientation: int) -> None:
-    """As each pixel (x, y) is shown at (a x + c y, b x + d y), moved into the image."""
+    """The matrix shows pixel (x, y) at (a x + c y, b x + d y), shifted into the image."""
     path = tmp_path / "a.mp4"
     stored = np.kron(np.array([[20, 80], [140, 220]], np.uint8), np.ones((16, 24), np.uint8))
     with av.open(str(path), "w") as container:

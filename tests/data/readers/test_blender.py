@@ -267,7 +267,8 @@ def test_masks_and_windows_separators(nerfstudio_root: Path) -> None:
 )
 @pytest.mark.parametrize("form", ["nerfstudio", "blender"])
 def test_masks_that_no_frame_names(nerfstudio_root: Path, name: str, form: str) -> None:
-    """As nerfstudio, COLMAP and Brush name the masks of ``images/03.jpg``."""
+    """Find masks under the names that nerfstudio, COLMAP and Brush give them for
+    ``images/03.jpg``."""
     write_image(nerfstudio_root / "masks" / name, random_pixels(8, 12, 1))
     if form == "blender":
         (nerfstudio_root / "transforms.json").rename(nerfstudio_root / "transforms_train.json")
@@ -295,7 +296,7 @@ def test_masks_beside_named_ones_are_not_read(nerfstudio_root: Path) -> None:
 
 @pytest.mark.parametrize("width", [24, 6])
 def test_resized_images_rescale_the_intrinsics(nerfstudio_root: Path, width: int) -> None:
-    """The JSON speaks of images of another size but the same shape."""
+    """The JSON file gives another image size with the same aspect ratio."""
     scale = 12 / width
     edit_json(nerfstudio_root / "transforms.json", lambda c: c.update(w=width, h=width * 8 / 12))
     capture = read_nerfstudio(nerfstudio_root)

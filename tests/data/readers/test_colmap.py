@@ -102,7 +102,7 @@ def test_masks_are_found_by_any_usual_name(colmap_root: Path, name: str) -> None
 
 
 def numbered_models(root: Path, *counts: int) -> None:
-    """Give a capture sub-models 0, 1, ... with so many of its images each, as text."""
+    """Write the text sub-models 0, 1, ... with the given numbers of images each."""
     folder = root / "sparse/0"
     lines = [line for line in (folder / "images.txt").read_text().splitlines() if line[:1] != "#"]
     for number, count in enumerate(counts):

@@ -58,7 +58,7 @@ def test_truncated_binary_file_is_one_line_that_names_it(colmap_root: Path, name
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 def test_truncated_text_file_is_one_line_that_names_it(tmp_path: Path, name: str) -> None:
-    """Cut after each line: COLMAP's own header says how many entries there should be."""
+    """Cut the file after each line; its header gives the expected number of entries."""
     root = write_colmap(tmp_path, "txt")
     path = root / "sparse/0" / f"{name}.txt"
     lines = path.read_text().splitlines(keepends=True)

@@ -51,7 +51,7 @@ def test_views_times_and_splits(root: Path) -> None:
 
 @pytest.mark.parametrize("factor", [1, 2, 4])
 def test_known_points_at_known_pixels(tmp_path: Path, factor: int) -> None:
-    """In the scaled frame of scene.json, with intrinsics for the images that are there."""
+    """Project points in the scaled frame of scene.json, with intrinsics of the available images."""
     capture = read(write_nerfies(tmp_path, factor=factor))
     view = capture.splits["train"][0]
     assert (view.width, view.height, capture.warnings) == (16, 12, ())

@@ -38,7 +38,7 @@ def alignment(index: int) -> tuple[float, Rotation, np.ndarray]:
 
 
 def matrices() -> dict[str, np.ndarray]:
-    """As ``alignments.npy`` has them: row vectors are multiplied from the left."""
+    """Return the matrices of ``alignments.npy``, which multiply row vectors from the right."""
     found = {}
     for index, name in enumerate(NAMES):
         scale, turn, trans = alignment(index)

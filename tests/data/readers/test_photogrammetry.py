@@ -45,7 +45,7 @@ def read(root: Path) -> Capture:
 
 
 def pixel(view: View, point: np.ndarray) -> np.ndarray:
-    """Where the view, with its lens, shows a point of the world."""
+    """Return the pixel of a world point in a view, with lens distortion."""
     x, y, z = view.cam_from_world[:3, :3] @ point + view.cam_from_world[:3, 3]
     distorted = distort(view.lens, torch.tensor([[x / z, y / z]], dtype=torch.float64))[0].numpy()
     return view.intrinsics[:2, :2] @ distorted + view.intrinsics[:2, 2]

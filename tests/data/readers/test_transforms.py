@@ -312,7 +312,10 @@ def test_bad_point_files_are_named(tmp_path: Path, content: bytes | None) -> Non
     "content",
     [
         b"",
-        b"ply\nformat binary_little_endian 1.0\nelement vertex 1099511627776\nproperty float x\nend_header\n",
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 1099511627776\n"
+            b"property float x\nend_header\n"
+        ),
         b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float q\nend_header\n0\n",
         b"PK\x03\x04 an archive",
         b"# an .obj\nmtllib ../../own.mtl\nv 0 0 0\n",

@@ -211,7 +211,7 @@ def test_older_parameters_and_masks_elsewhere(tmp_path: Path) -> None:
 
 
 def test_names_with_dates(tmp_path: Path) -> None:
-    """As two of the sequences have them: the number of the frame is not the last one."""
+    """Read frame numbers from names with a date at the end, as in two sequences of the dataset."""
     annots = write_annots(tmp_path, cameras=1, frames=(1, 2))
     for frame, own in enumerate(annots["ims"], start=1):
         name = f"Camera (1)/Camera (1)_{frame:04d}_2019-08-23_16-08-50.592.jpg"
@@ -374,7 +374,7 @@ def test_the_last_frame_is_held_out_as_a_new_pose(tmp_path: Path, cameras: int, 
 
 
 def test_one_camera_is_trained_on_and_all_others_tested(tmp_path: Path) -> None:
-    """As published for one training camera, with new poses held out."""
+    """Split as published for one training camera, with new poses held out."""
     write_annots(tmp_path)
     capture = read_capture(DataConfig(root=tmp_path, train_cameras=(0,), pose_frames="2::"))
     found = {

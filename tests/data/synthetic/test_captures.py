@@ -45,8 +45,8 @@ def test_one_seed_gives_the_same_bytes_and_another_one_other_cameras(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_inspection_finds_nothing_suspicious(name: SceneName, tmp_path: Path) -> None:
-    """But that so few images, each of a time of its own, show what moves from one side only; the
-    room has cameras."""
+    """The only warning is that few images show motion from one side; the room, with several
+    cameras, has none."""
     problems = inspect_capture(
         write_dynamic_capture(name, tmp_path / "out", TINY), deep=True
     ).problems

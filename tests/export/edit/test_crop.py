@@ -1,4 +1,4 @@
-"""What lies in boxes and spheres, and regions that are none."""
+"""Selection of Gaussians by boxes and spheres, and refusal of invalid regions."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_regions_that_are_none(words: list[str], said: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_what_moves_is_held_if_it_ever_is() -> None:
+def test_moving_gaussians_are_selected_if_ever_inside() -> None:
     """Balls 1 and 3 slide along x."""
     for scene in (still_scene(), moving_scene(sliding_nodes())):
         at = [scene.at(t).means for t in (0.0, 0.25, 0.5, 0.75, 1.0)]

@@ -1,5 +1,4 @@
-"""What words mean as frames, and control points; each word that means nothing is told in one
-line."""
+"""Parsing of coordinate frames and control points; each invalid word is refused in one line."""
 
 from __future__ import annotations
 

@@ -46,7 +46,12 @@ def trained(capture: Path, folder: Path, **model: object) -> Path:
     return train(
         Config(
             data=DataConfig(root=capture),
-            model=HumanModel(resolution=16, sh_degree=0, fit=False, **model),  # type: ignore[arg-type]
+            model=HumanModel(
+                resolution=16,
+                sh_degree=0,
+                fit=False,
+                **model,  # type: ignore[arg-type]
+            ),
             strategy=DefaultStrategy(grow=False),
             train=TrainConfig(steps=4),
             run=RunConfig(dir=folder, threads=1),

@@ -1,5 +1,5 @@
-"""Colours near the outlines of found masks: what is behind the person is found, and decides instead
-of the mask."""
+"""Colours near the outlines of estimated masks: the background is estimated and replaces the mask
+there."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ GENERATOR = torch.Generator()
 
 
 def behind() -> np.ndarray:
-    """What stands behind the person (H, W, 3), grey levels."""
+    """Return the background behind the person (H, W, 3) in grey levels."""
     return np.random.default_rng(3).integers(40, 160, (SIDE, SIDE, 3)).astype(np.float64)
 
 

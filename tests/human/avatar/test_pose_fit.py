@@ -62,7 +62,7 @@ def test_disturbed_poses_are_found_again(
     assert fit.learned is start.learned
 
 
-def test_what_fits_already_stays(
+def test_fitting_keeps_correct_poses(
     truth: tuple[HumanScene, list[Cameras]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pose_fit, "MAX_WINDOWS", 1)

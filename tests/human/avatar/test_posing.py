@@ -200,8 +200,8 @@ def rigid_body() -> BodyTemplate:
 
 
 def test_blend_shapes_of_the_template_move_texels_as_its_surface() -> None:
-    """Where a triangle follows one joint alone, texels in any pose are the barycentric points of
-    the posed mesh."""
+    """In triangles that follow a single joint, posed texels are the barycentric points of the posed
+    mesh."""
     body = rigid_body()
     generator = torch.Generator().manual_seed(0)
     poses = 0.5 * torch.randn(24, 3, generator=generator)

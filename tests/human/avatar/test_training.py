@@ -112,9 +112,7 @@ def test_training_learns_and_evaluates_on_both_splits(capture: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("own_body", [False, True])
-def test_what_is_played_back_is_what_was_trained(
-    capture: Path, tmp_path: Path, own_body: bool
-) -> None:
+def test_playback_equals_the_trained_avatar(capture: Path, tmp_path: Path, own_body: bool) -> None:
     body = write_npz(tmp_path / "model.npz", model("smplx")) if own_body else None
     trainer = build_trainer(tiny(capture, body=body))
     assert (human(trainer).shapes is not None) == own_body
@@ -131,7 +129,7 @@ def test_what_is_played_back_is_what_was_trained(
     assert len(scene.rows) == len(scene)
 
 
-def test_what_all_frames_share_is_learned_before_poses_of_single_ones(capture: Path) -> None:
+def test_shared_corrections_are_trained_before_poses_per_frame(capture: Path) -> None:
     trainer = build_trainer(tiny(capture, steps=20))
     early = tensors_after(trainer, 5)
     names = [f"model.learned.{name}" for name in ("turns", "joints", "poses", "trans")]
@@ -188,7 +186,7 @@ def test_a_fit_far_from_the_origin_is_played_exactly(capture: Path, tmp_path: Pa
     torch.testing.assert_close(there, here, rtol=0, atol=1e-6)
 
 
-def test_what_is_hardly_seen_is_filled_after_the_last_step_and_nothing_else_changes(
+def test_only_unseen_texels_are_filled_after_the_last_step(
     capture: Path,
 ) -> None:
     def after(step: int, fill: bool) -> tuple[dict[str, Tensor], str]:

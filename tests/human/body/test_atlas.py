@@ -168,7 +168,7 @@ def test_mirrored_texture_has_right_handed_frames_all_the_same() -> None:
     torch.testing.assert_close(texels.points[:, 0], 1 - centres(texels)[:, 0])
 
 
-def test_what_cannot_be_done() -> None:
+def test_invalid_atlas_arguments_are_refused() -> None:
     body = square()
     with pytest.raises(DyngsError, match="'test' has no UV map"):
         atlas_texels(replace(body, uv=None, uv_faces=None), 8)
@@ -198,8 +198,8 @@ def test_texels_of_the_template(resolution: int, count: int) -> None:
 
 
 # --- shells
-# -----------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 # --- neighbours
-# -------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------

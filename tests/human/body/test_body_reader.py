@@ -47,7 +47,8 @@ TEMPLATE = Path(inspect.getfile(BodyTemplate)).parent / "files" / "anny_smplx55.
 
 
 def assert_same(body: BodyTemplate, arrays: Arrays) -> None:
-    """The loaded body poses as the raw arrays say, in float32 and float64, to a micrometre."""
+    """Assert that the loaded body is posed like the raw arrays, in float32 and float64, to a
+    micrometre."""
     generator = np.random.default_rng(1)
     count = arrays["shapedirs"].shape[2]
     poses = 0.5 * generator.standard_normal((2, len(body.joints), 3))
@@ -91,11 +92,11 @@ def refusal(path: Path, uv: Path | None = None) -> str:
 
 
 # --- right files
-# ------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", NUM_JOINTS)
-def test_an_npz_poses_as_the_paper_says(kind: str, tmp_path: Path) -> None:
+def test_an_npz_body_is_posed_as_in_the_paper(kind: str, tmp_path: Path) -> None:
     arrays = model(kind)
     body = read_body(write_npz(tmp_path / "model.npz", arrays))
     assert body.name == kind
@@ -137,7 +138,7 @@ def assert_equal(one: BodyTemplate, other: BodyTemplate) -> None:
 def test_pickles_of_python_2_with_chumpy(
     chumpy: Callable[[object], object], protocol: int, tmp_path: Path
 ) -> None:
-    """As the original SMPL files are; chumpy is not installed when they are read."""
+    """Read pickles like the original SMPL files without chumpy being installed."""
     arrays = model("smpl")
     whole = read_body(write_npz(tmp_path / "model.npz", arrays))
     old = arrays | {
@@ -167,13 +168,16 @@ def test_expressions_after_the_shapes_are_left_out(
     np.testing.assert_array_equal(body.shape_dirs, expected)
 
 
-def test_the_template_is_what_its_file_says() -> None:
+def test_the_template_equals_its_file() -> None:
     body = default_template()
     with np.load(TEMPLATE, allow_pickle=False) as raw:
         np.testing.assert_array_equal(body.vertices, raw["v_template"])
         np.testing.assert_array_equal(body.joints, raw["J"])
         np.testing.assert_array_equal(body.faces, raw["f"])
-        np.testing.assert_array_equal(body.uv_faces, raw["ft"])  # pyright: ignore[reportArgumentType]
+        np.testing.assert_array_equal(
+            body.uv_faces,  # pyright: ignore[reportArgumentType]
+            raw["ft"],
+        )
         assert body.parents == tuple(raw["kintree_table"][0].tolist())
         for row in range(0, len(body.weights), 997):
             expected = np.zeros(55)
@@ -208,7 +212,7 @@ def test_uvs_of_the_file_belong_to_corners(tmp_path: Path) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6))
-def test_uvs_of_an_obj_belong_to_corners_in_whatever_order(seed: int) -> None:
+def test_uvs_of_an_obj_belong_to_corners_in_any_order(seed: int) -> None:
     """Triangles in another order that begin at another corner or run the other way: each corner
     keeps its own."""
     arrays, uv, uv_faces = textured()
@@ -251,7 +255,7 @@ def test_wrong_objs(old: str, new: str, words: str, tmp_path: Path) -> None:
 
 
 # --- wrong files
-# ------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 def changed(key: str, change: Callable[[np.ndarray], object], kind: str = "smpl") -> Arrays:

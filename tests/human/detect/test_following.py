@@ -1,4 +1,4 @@
-"""Left and right of a person told apart over a clip."""
+"""Left and right of a person are kept apart over a clip."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_sides_swapped_in_a_few_images_are_put_right(
         np.testing.assert_array_equal(x.keypoints, y.keypoints)
 
 
-def test_who_turns_around_keeps_their_sides() -> None:
+def test_a_turning_person_keeps_left_and_right() -> None:
     turning = [
         person(100, width=float(np.cos(np.pi * min(max(t - 10, 0), 10) / 10))) for t in range(30)
     ]

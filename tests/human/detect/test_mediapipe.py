@@ -47,7 +47,7 @@ def images(tmp_path: Path) -> list[Path]:
 @pytest.mark.skipif(
     os.name != "posix", reason="the interpreter is replaced by a script with a #! line"
 )
-def test_what_the_process_finds_comes_back(tmp_path: Path, images: list[Path]) -> None:
+def test_detections_of_the_process_are_returned(tmp_path: Path, images: list[Path]) -> None:
     first, second, third = MediaPipe(interpreter(tmp_path, FINDS)).detect(images)
     assert second is None
     assert first is not None
@@ -67,7 +67,8 @@ def test_what_the_process_finds_comes_back(tmp_path: Path, images: list[Path]) -
         ("sys.exit('out of memory')", "MediaPipe failed with exit status 1: out of memory"),
         ("sys.exit(7)", "MediaPipe failed with exit status 7: no error output"),
         (
-            "for x in Path(images).iterdir(): (Path(out) / f'{x.stem}.npz').write_bytes(b'rubbish')",
+            "for x in Path(images).iterdir(): "
+            "(Path(out) / f'{x.stem}.npz').write_bytes(b'rubbish')",
             "damaged",
         ),
     ],

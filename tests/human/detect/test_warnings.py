@@ -1,4 +1,4 @@
-"""What is said to be bad about a clip of a person."""
+"""Warnings about a clip of a person."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_a_good_clip_has_no_warning() -> None:
         (turning(12, 380), "feet are cut off or hidden in 12 of 12 images"),
     ],
 )
-def test_what_is_bad_is_said(people: list[Detection | None], said: str) -> None:
+def test_each_problem_of_a_clip_has_one_warning(people: list[Detection | None], said: str) -> None:
     found = capture_warnings(clip(people), people)
     assert len(found) == 1
     assert said in found[0]

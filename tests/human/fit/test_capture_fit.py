@@ -219,7 +219,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 def as_given(capture: Capture) -> CaptureFit:
-    """A fit that took the poses as they are."""
+    """Return a fit that keeps the poses of the capture."""
     body = default_template()
     assert capture.body is not None
     motion = captured_motion(

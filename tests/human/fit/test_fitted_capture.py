@@ -34,7 +34,7 @@ from dyngs.io.write import write_image
 
 @pytest.fixture(scope="module")
 def person_of_zeros(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small capture whose poses are said to be for the mean shape of another template."""
+    """A small capture whose poses are labelled as those of the mean shape of another template."""
     options = HumanOptions(
         size=32, num_frames=2, num_pose_frames=2, num_cameras=3, num_test=1, samples=1, body_seed=3
     )
@@ -101,7 +101,10 @@ def test_the_fit_begins_with_a_given_shape_of_the_template(
     betas[:10] = np.linspace(-1, 1, 10)
     for name in ("train", "pose"):
         path = data.root / f"body_{name}.npz"
-        np.savez(path, **(dict(np.load(path)) | {"betas": betas}))  # pyright: ignore[reportArgumentType]
+        np.savez(
+            path,
+            **(dict(np.load(path)) | {"betas": betas}),  # pyright: ignore[reportArgumentType]
+        )
     found = write_fitted_capture(
         data, tmp_path / "fitted", lambda *_: None, FitInputs(template=smpl)
     )

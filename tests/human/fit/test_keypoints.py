@@ -86,7 +86,7 @@ def test_points_are_undistorted(tmp_path: Path) -> None:
         ("[1]", "must be a JSON object"),
     ],
 )
-def test_what_is_no_openpose_file_is_refused(tmp_path: Path, text: str, wanted: str) -> None:
+def test_invalid_openpose_files_are_refused(tmp_path: Path, text: str, wanted: str) -> None:
     (tmp_path / "a_keypoints.json").write_text(text)
     with pytest.raises(DyngsError, match=wanted):
         read_keypoints(tmp_path, [view("a")])
@@ -155,7 +155,9 @@ def test_sam_3d_body_is_in_the_axes_of_the_camera(tmp_path: Path) -> None:
         ({"other": np.zeros(3)}, "'joints'"),
     ],
 )
-def test_what_is_refused(tmp_path: Path, fields: dict[str, np.ndarray], said: str) -> None:
+def test_invalid_joint_files_are_refused(
+    tmp_path: Path, fields: dict[str, np.ndarray], said: str
+) -> None:
     np.savez(tmp_path / "a.npz", **fields)  # pyright: ignore[reportArgumentType]
     with pytest.raises(DyngsError, match=said):
         read_joints(tmp_path / "a.npz", capture())

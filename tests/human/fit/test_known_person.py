@@ -1,5 +1,5 @@
-"""The shape of a known person: where it is found, what it does to the template, and what is
-refused."""
+"""The shape of a known person: which file it is read from, how it changes the template, and which
+files are refused."""
 
 from __future__ import annotations
 
@@ -155,11 +155,10 @@ def test_disturbed_poses_are_found_again(
     assert torch.equal(after.times, start.times)
 
 
-def test_worse_poses_are_not_taken(
+def test_worse_poses_are_rejected(
     avatar: HumanScene, views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Left-out views that show somebody else (a person who stands still) decide against what the
-    others ask for."""
+    """Held-out views that show another person, who does not move, outvote the training views."""
     monkeypatch.setattr(pose_fit, "MAX_WINDOWS", 2)
     start = replace(avatar.clip, trans=avatar.clip.trans + AWAY)
     first = {view.frame: view for view in reversed(views)}

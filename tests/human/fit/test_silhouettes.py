@@ -49,7 +49,7 @@ def test_a_point_of_the_world_falls_on_the_same_part_of_the_person() -> None:
     assert float(frame.alpha.sum()) * (25 / 10) ** 2 == pytest.approx(160, rel=0.01)
 
 
-def test_what_lies_outside_of_the_image_is_not_known() -> None:
+def test_pixels_outside_the_image_are_unknown() -> None:
     frame = crop_frame([image(slice(0, 20), slice(0, 5))], 20, 25)
     assert frame is not None
     assert frame.known[0, :, 12:].mean() > 0.8

@@ -35,7 +35,7 @@ from dyngs.human.motion.motion import MotionClip
 
 
 def cost(errors: np.ndarray, path: tuple[int, ...], weight: float) -> float:
-    """What a path costs, by its definition."""
+    """Return the cost of a path by its definition."""
     count = errors.shape[1]
     total = sum(errors[i, x] for i, x in enumerate(path))
     for a, b in itertools.pairwise(path):
@@ -119,7 +119,7 @@ def test_the_heading_is_found(body: BodyDiscs, monkeypatch: pytest.MonkeyPatch) 
     assert facing @ np.array([math.sin(heading), 0.0, math.cos(heading)]) > 0.8
 
 
-def test_who_turns_before_one_camera_is_followed(
+def test_a_person_turning_before_one_camera_is_tracked(
     body: BodyDiscs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From frame to frame a body would rather twist than turn: outlines of front and back are
@@ -138,7 +138,7 @@ def test_who_turns_before_one_camera_is_followed(
 
 
 def with_joints(body: BodyDiscs, clip: MotionClip, cameras: Cameras) -> ObservedFrame:
-    """What is seen, and the joints as key points."""
+    """Return the observed frame with its joints as key points."""
     seen = seen_by(body, clip, cameras)
     joints = posed_joints(body.skeleton, frame_pose(clip, 0))
     local = joints @ cameras.cam_from_world[0, :3, :3].T + cameras.cam_from_world[0, :3, 3]

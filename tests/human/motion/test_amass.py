@@ -24,7 +24,7 @@ FRAMES = 4
 
 
 def numbers(count: int = 55, **changes: Any) -> dict[str, object]:
-    """The arrays of a file for a body of so many joints."""
+    """Return the arrays of a file for a body of ``count`` joints."""
     motion = random_motion(FRAMES)
     return {
         "poses": motion.for_joints(count).poses.reshape(FRAMES, -1).numpy().astype(np.float64),
@@ -46,7 +46,7 @@ def read(
 
 
 def as_written(arrays: dict[str, object], count: int, scale: float = 1.0) -> Motion:
-    """What the file says, in its own world."""
+    """Return the motion that a file stores, in the world frame of the file."""
     poses = torch.zeros(FRAMES, 55, 3)
     rows = {24: range(22), 52: [*range(22), *range(25, 55)], 55: range(55)}[count]
     flat = torch.tensor(np.asarray(arrays["poses"])).float().reshape(FRAMES, -1, 3)
@@ -56,7 +56,7 @@ def as_written(arrays: dict[str, object], count: int, scale: float = 1.0) -> Mot
 
 
 # --- up axis
-# ----------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("count", [24, 52, 55])
@@ -98,7 +98,7 @@ def test_which_files_are_turned(
 
 
 # --- layouts
-# ----------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("count", [24, 52, 55])
@@ -271,7 +271,7 @@ def test_files_of_romp_and_hmr(tmp_path: Path, as_matrices: bool) -> None:
 
 
 # --- broken files
-# -----------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 NAN = np.full((FRAMES, 3), np.nan)
 
@@ -332,12 +332,12 @@ def test_broken_files_say_what_is_wrong(
 
 
 # --- writing
-# ----------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("fps", [30.0, 29.97, 1 / 3])
 def test_saved_motions_are_read_exactly(tmp_path: Path, fps: float) -> None:
-    """On whatever body, and the same motion is the same file."""
+    """Motions are read exactly on any body, and the same motion is written to the same bytes."""
     motion = replace(random_motion(), fps=fps, betas=torch.randn(7), scale=torch.rand(4) + 0.1)
     write_amass(motion, tmp_path / "new" / "x.npz")
     for body in (BODY, tiny_body(24)):

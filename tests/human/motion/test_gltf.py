@@ -39,7 +39,11 @@ OWN = skeleton()
 
 def clip(**changes: object) -> Clip:
     """The motion on our own skeleton."""
-    return Clip(as_local(MOTION, OWN), pelvis_path(BODY, MOTION), **changes)  # pyright: ignore[reportArgumentType]
+    return Clip(
+        as_local(MOTION, OWN),
+        pelvis_path(BODY, MOTION),
+        **changes,  # pyright: ignore[reportArgumentType]
+    )
 
 
 def two_joints(**changes: object) -> Glb:
@@ -48,7 +52,15 @@ def two_joints(**changes: object) -> Glb:
     local = np.stack(
         [[Rotation.from_euler("z", a, degrees=True).as_matrix(), np.eye(3)] for a in (0, 90)]
     )
-    return glb_of(own, Clip(local, np.zeros((2, 3)), fps=1.0, **changes))  # pyright: ignore[reportArgumentType]
+    return glb_of(
+        own,
+        Clip(
+            local,
+            np.zeros((2, 3)),
+            fps=1.0,
+            **changes,  # pyright: ignore[reportArgumentType]
+        ),
+    )
 
 
 def same(found: Motion, expected: Motion, atol: float = 1e-5) -> None:
@@ -62,7 +74,7 @@ def same(found: Motion, expected: Motion, atol: float = 1e-5) -> None:
 
 
 # --- round trips
-# ------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("interpolation", ["LINEAR", "STEP", "CUBICSPLINE"])
@@ -108,20 +120,25 @@ def test_the_text_form_with_its_buffer_inside_or_beside_it(tmp_path: Path) -> No
 
 
 # --- VRM animations
-# ---------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 BONES = skeleton(tuple(VRM))
 
 
 def vrma(**changes: object) -> Glb:
     """The motion as a VRM animation."""
-    moved = Clip(as_local(MOTION, BONES), pelvis_path(BODY, MOTION), bind_matrices=False, **changes)  # pyright: ignore[reportArgumentType]
+    moved = Clip(
+        as_local(MOTION, BONES),
+        pelvis_path(BODY, MOTION),
+        bind_matrices=False,
+        **changes,  # pyright: ignore[reportArgumentType]
+    )
     return vrma_of(BONES, moved)
 
 
 def test_a_vrm_animation_moves_the_bones_that_it_names(tmp_path: Path) -> None:
-    """All but jaw and eyes, which VRM does not animate; also with axes of its own at rest, and
-    facing -z."""
+    """All bones move except jaw and eyes, which VRM does not animate, also with other axes in the
+    rest pose and facing -z."""
     own = as_local(MOTION, BONES)
     own_poses = np.zeros((5, 55, 3))
     rows = [JOINT_NAMES.index(name) for name in BONES.names]
@@ -140,7 +157,7 @@ def test_a_vrm_animation_moves_the_bones_that_it_names(tmp_path: Path) -> None:
 
 
 # --- sampling
-# ---------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 def angles_of(path: Path, fps: float) -> np.ndarray:
@@ -200,7 +217,7 @@ def test_one_of_several_animations(tmp_path: Path) -> None:
 
 
 # --- broken files
-# -----------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 def _sampler(glb: Glb, **changes: object) -> None:

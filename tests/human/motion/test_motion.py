@@ -31,7 +31,7 @@ def matrices(motion: Motion) -> np.ndarray:
 
 
 # --- files
-# ------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 # --- joints and times
@@ -86,7 +86,7 @@ def test_between_frames() -> None:
 
 
 # --- limits
-# -----------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 def test_motions_that_fill_the_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,8 +154,8 @@ def test_a_captured_motion_has_the_frames_that_views_show_in_order_of_time() -> 
     np.testing.assert_allclose(filmed.clip.poses.numpy(), given.poses[[0, 2, 3]], rtol=1e-6)
 
 
-def test_who_never_moves_has_one_pose_for_all_frames() -> None:
-    """And who goes on, or moves one joint, has one for each."""
+def test_a_static_person_has_one_pose_for_all_frames() -> None:
+    """A person who moves, or turns one joint, has one pose per frame."""
     given = bodies([3, 4, 7])
     given.poses[:], given.trans[:] = given.poses[0], given.trans[0]
     views = [view(3, 0.0), view(4, 0.5), view(7, 1.0)]

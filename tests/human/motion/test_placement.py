@@ -35,8 +35,7 @@ def joint_places(clip: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> 
 
 @pytest.mark.parametrize("up", [1, 2])
 def test_a_motion_is_put_where_the_person_was(up: int) -> None:
-    """As large, on the same floor, over the same place, the same way up; the motion itself is the
-    same."""
+    """A placed motion keeps its size, floor, position and up axis, and its poses do not change."""
     body = tiny_body()
     clip = motion_clip(random_motion(5, angle=0.3, seed=4))
     turn = torch.eye(3) if up == 1 else axis_angle_to_matrix(torch.tensor([math.pi / 2, 0.0, 0.0]))

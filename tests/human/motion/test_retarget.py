@@ -38,9 +38,10 @@ from dyngs.human.motion.retarget import RIGS, match_joints, read_motion, retarge
 
 FILE = Path("walk.bvh")
 
-CMU_NAMES = """Hips LHipJoint LeftUpLeg LeftLeg LeftFoot LeftToeBase RHipJoint RightUpLeg RightLeg RightFoot
-RightToeBase LowerBack Spine Spine1 Neck Neck1 Head LeftShoulder LeftArm LeftForeArm LeftHand LeftFingerBase
-LeftHandIndex1 LThumb RightShoulder RightArm RightForeArm RightHand RightFingerBase RightHandIndex1 RThumb"""
+CMU_NAMES = """Hips LHipJoint LeftUpLeg LeftLeg LeftFoot LeftToeBase
+RHipJoint RightUpLeg RightLeg RightFoot RightToeBase LowerBack Spine Spine1 Neck Neck1 Head
+LeftShoulder LeftArm LeftForeArm LeftHand LeftFingerBase LeftHandIndex1 LThumb
+RightShoulder RightArm RightForeArm RightHand RightFingerBase RightHandIndex1 RThumb"""
 CMU = CMU_NAMES.split()
 
 
@@ -51,8 +52,8 @@ def names_of(rig: str) -> dict[str, str]:
 
 @pytest.mark.parametrize("rig", RIGS)
 @pytest.mark.parametrize("prefix", ["", "mixamorig:", "Bip01 ", "m_avg_"])
-def test_each_kind_is_known(rig: str, prefix: str) -> None:
-    """Whatever precedes the names, and in any case."""
+def test_joint_names_of_each_rig_are_matched(rig: str, prefix: str) -> None:
+    """Joint names are matched with any prefix and in upper or lower case."""
     names = names_of(rig)
     assert set(names) <= set(JOINT_NAMES)
     found = match_joints(FILE, [prefix + name.upper() for name in names.values()])
@@ -72,7 +73,7 @@ def test_names_of_cmu_files() -> None:
     assert not any("index" in name or "thumb" in name for name in found)
 
 
-def test_what_is_missing_is_named() -> None:
+def test_missing_joints_are_named() -> None:
     names = [name for name in CMU if name not in ("LeftForeArm", "RightLeg")]
     with pytest.raises(
         DyngsError, match=r"walk\.bvh: unknown joint names; .* lacks rightleg, leftforearm; "
@@ -120,7 +121,7 @@ def close(found: Motion, expected: Motion, atol: float = 1e-5) -> None:
 
 
 # --- known answers
-# ----------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 def test_a_t_pose_is_the_zero_pose_on_the_floor() -> None:
@@ -195,9 +196,7 @@ def test_the_path_shrinks_with_the_legs() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 99), st.sampled_from(TURNS), st.floats(1e-3, 1e3))
-def test_rotations_are_kept_whatever_the_axes_and_the_unit(
-    seed: int, turn: np.ndarray, unit: float
-) -> None:
+def test_rotations_are_kept_for_any_axes_and_unit(seed: int, turn: np.ndarray, unit: float) -> None:
     """On a skeleton of our proportions; its world and its rest pose have the same axes."""
     body = tiny_body()
     original = random_motion(seed=seed)
@@ -230,11 +229,11 @@ def test_a_crooked_rest_pose_does_not_turn_the_world() -> None:
 
 
 # --- errors
-# -----------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------
 
 
 def test_a_rest_pose_that_lies_in_a_line_is_refused() -> None:
-    """As in files whose bones all point along x while no joint is turned."""
+    """A file whose bones all point along x in the rest pose is refused."""
     own = skeleton()
     depth = np.zeros(55)
     for i, parent in enumerate(own.parents):
@@ -251,7 +250,7 @@ def matrices(motion: Motion) -> np.ndarray:
     return Rotation.from_rotvec(motion.poses.double().numpy().reshape(-1, 3)).as_matrix()
 
 
-def test_the_suffix_says_what_a_file_is(tmp_path: Path) -> None:
+def test_the_suffix_selects_the_file_format(tmp_path: Path) -> None:
     """The same motion from BVH, GLB and VRM animation, in upper case too."""
     motion = random_motion()
     own = skeleton()
@@ -293,7 +292,7 @@ def test_the_suffix_says_what_a_file_is(tmp_path: Path) -> None:
         ("x.npz", {}, "No such file"),
     ],
 )
-def test_what_cannot_be_read(
+def test_unreadable_motion_files_are_refused(
     tmp_path: Path, name: str, options: dict[str, str], problem: str
 ) -> None:
     with pytest.raises(DyngsError, match=problem) as caught:

@@ -71,7 +71,7 @@ def test_depth_and_silhouettes_agree_between_views(root: Path) -> None:
                 assert (wide[row, column] > 0).float().mean() > 0.99
 
 
-def test_what_does_not_fit_is_refused(root: Path, tmp_path: Path) -> None:
+def test_mismatched_options_are_refused(root: Path, tmp_path: Path) -> None:
     with pytest.raises(DyngsError, match="people with other options"):
         write_people(root, PeopleOptions(people=2, size=32, cameras=3))
     (tmp_path / "file").touch()

@@ -253,8 +253,7 @@ def test_a_ply_of_another_program() -> None:
 
 @pytest.mark.parametrize("name", ["three.spz", "three_v4.spz"])
 def test_an_spz_of_another_program(name: str) -> None:
-    """Its bytes stand for just these values; those of the harmonics are multiples of an eighth, and
-    exact."""
+    """The bytes encode exactly these values; SH coefficients are multiples of 1/8."""
     if name == "three_v4.spz":
         pytest.importorskip("zstandard")
     found = read_splats(KNOWN / name).gaussians
@@ -335,8 +334,8 @@ def test_bytes_of_a_splat_are_the_nearest(tmp_path: Path) -> None:
 
 
 def test_a_glb_of_another_program() -> None:
-    """It stands on its side: half a turn about z. Colours are those of the harmonics, whatever
-    ``COLOR_0`` says."""
+    """The scene is rotated by half a turn about z; colours come from the SH coefficients, not
+    ``COLOR_0``."""
     found = read_splats(KNOWN / "three.glb").gaussians
     wanted = three()
     exactly(found.means, wanted.means * torch.tensor([-1.0, -1.0, 1.0]))

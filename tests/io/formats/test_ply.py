@@ -47,7 +47,7 @@ def assert_same(a: Gaussians, b: Gaussians) -> None:
 
 
 def write_vertices(path: Path, columns: dict[str, np.ndarray]) -> Path:
-    """A .ply written by hand from named columns, each of its own dtype."""
+    """Write a .ply file from named columns with separate dtypes."""
     kinds = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
     count = len(next(iter(columns.values())))
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]

@@ -44,7 +44,14 @@ def trained_on(gains: tuple[float, ...]) -> ViewExposures:
     optimizer = torch.optim.Adam([scene], 0.01)
     for step in range(1, STEPS + 1):
         index = step % len(gains)
-        image = Image(f"{index}", None, (gains[index] * given).clamp_max(1), None, None, None)  # type: ignore[arg-type]
+        image = Image(
+            f"{index}",
+            None,  # type: ignore[arg-type]
+            (gains[index] * given).clamp_max(1),
+            None,
+            None,
+            None,
+        )
         rendered = corrected(exposures, index, step, image, scene)
         loss = (rendered - image.rgb_premultiplied).abs().mean()
         sum(exposures.penalties(index).values(), loss).backward()

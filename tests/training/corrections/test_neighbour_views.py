@@ -1,4 +1,4 @@
-"""Other views are asked about the right places."""
+"""Neighbour views are sampled at the right pixels."""
 
 from __future__ import annotations
 
@@ -91,7 +91,10 @@ def test_places_are_found_by_cameras_as_they_are_by_now() -> None:
     drawn = adaptive_avg_pool2d(torch.cat([rgb, more], -1).permute(2, 0, 1), grid)
     which = torch.ones(grid, dtype=torch.bool)
     images = seen_from(right)
-    given = NeighbourViews(images, right).difference(1, which, drawn, BLACK)  # type: ignore[arg-type]
+    given = NeighbourViews(
+        images,  # type: ignore[arg-type]
+        right,
+    ).difference(1, which, drawn, BLACK)
     found = NeighbourViews(images, wrong, lambda i, _: cell_camera(right[i])).difference(
         1, which, drawn, BLACK
     )  # type: ignore[arg-type]
@@ -117,7 +120,11 @@ def images_with(gains: Tensor) -> Any:
 
 
 def found(images: list[Image], which: list[int] | None = None) -> Tensor:
-    return estimate_log_gains(images, list(range(COUNT)) if which is None else which, drawn)  # type: ignore[arg-type]
+    return estimate_log_gains(
+        images,  # type: ignore[arg-type]
+        list(range(COUNT)) if which is None else which,
+        drawn,
+    )
 
 
 def test_gains_of_images_that_only_neighbours_share_places_with() -> None:

@@ -1,5 +1,5 @@
-"""Masks found in training: what one image shows and the others do not is left out, and nothing else
-is."""
+"""Masks estimated in training exclude exactly the content that one image shows and the others do
+not."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def busy_wall(which: tuple[int, ...] = (1, 4)) -> list[Image]:
     return [with_block(x, ROWS, COLUMNS) if i in which else x for i, x in enumerate(images)]
 
 
-def test_what_stands_in_front_of_some_views_is_left_out() -> None:
+def test_occluders_of_some_views_are_masked() -> None:
     images = busy_wall()
     found = masked_images(images, [learned(image.cameras) for image in images])
     for i, image in enumerate(found):
@@ -84,7 +84,7 @@ def test_nothing_is_left_out_where_views_agree() -> None:
     assert all(image.mask is None for image in found)
 
 
-def test_what_is_not_learned_yet_counts() -> None:
+def test_regions_not_yet_learned_stay_in_the_loss() -> None:
     """A hole in the model errs as much as a passer-by, but there the other views look like the
     image."""
     images = busy_wall(())

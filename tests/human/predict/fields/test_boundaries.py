@@ -49,8 +49,8 @@ def camera() -> Cameras:
 
 
 def true_depths(radius: float, sign: float) -> torch.Tensor:
-    """Where rays through pixel centres meet a sphere at the origin first (-1) or last (1), z in
-    m."""
+    """Return the depth in m at which rays through pixel centres enter (-1) or leave (1) a sphere at
+    the origin."""
     y, x = torch.meshgrid(torch.arange(24) + 0.5, torch.arange(32) + 0.5, indexing="ij")
     local = torch.stack([(x - 16) / 100, (y - 12) / 100, torch.ones_like(x)], -1).double()
     a = local.square().sum(-1)

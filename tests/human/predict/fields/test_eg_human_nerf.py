@@ -1,4 +1,4 @@
-"""Where guided samples lie, opacities from signed ray distances, and pictures of EG-HumanNeRF."""
+"""Positions of guided samples, opacities from signed ray distances, and images of EG-HumanNeRF."""
 
 from __future__ import annotations
 
@@ -112,8 +112,8 @@ def test_all_weights_are_learned_alike(person: Person) -> None:
     )
 
 
-def test_distances_are_compared_with_depth_maps(person: Person) -> None:
-    """None is off where samples say the truth, of rays that meet somebody and of those that
+def test_penalty_compares_distances_with_depth_maps(person: Person) -> None:
+    """The penalty is zero for true distances, both of rays that hit a person and of those that
     miss."""
     network = network_with()
     image = crop_window(person.images[1], 12, 4, 16)

@@ -1,4 +1,4 @@
-"""What images show at points, and the small networks."""
+"""Image features sampled at points, and the small networks."""
 
 from __future__ import annotations
 

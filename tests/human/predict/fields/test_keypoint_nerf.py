@@ -67,10 +67,8 @@ def test_the_code_is_that_of_the_paper(person: Person) -> None:
                 torch.testing.assert_close(found[view, m, j::22], expected, atol=2e-5, rtol=0)
 
 
-def test_the_cells_hold_the_body_and_nothing_far_away(
-    network: KeypointNerf, person: Person
-) -> None:
-    """What two opposite images leave open is closed by the bones."""
+def test_occupied_cells_cover_only_the_body(network: KeypointNerf, person: Person) -> None:
+    """The bones close the cells that two opposite images leave open."""
     for views in ((0, 2, 4), (0, 4)):
         own = known(network, person, views)
         space, occupied = own.extra

@@ -92,7 +92,7 @@ def test_a_prediction_is_a_run(
     )
 
 
-def test_what_cannot_be_predicted_from_is_refused(run: Path, folder: Path, tmp_path: Path) -> None:
+def test_unsuitable_prediction_inputs_are_refused(run: Path, folder: Path, tmp_path: Path) -> None:
     person = read_captured_person(folder)
     out = tmp_path / "out"
     with pytest.raises(DyngsError, match="p000001: needs at least two views of one time step"):

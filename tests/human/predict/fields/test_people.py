@@ -44,7 +44,7 @@ def test_metres_look_the_same(person: Person) -> None:
 
 
 def test_sources_are_the_images_around_the_person(person: Person) -> None:
-    """Padded to one size; what a point shows is what it shows in the whole image."""
+    """Crops are padded to one size, and features at a point equal those of the whole image."""
     images = [person.images[i] for i in (0, 2, 5)]
     body, scale = person.body_in(person.views[0])
     sources = crop_source_images(images, scale)

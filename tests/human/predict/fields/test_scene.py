@@ -1,4 +1,4 @@
-"""What was predicted: drawn, stored, restored; not trained; broken files are refused."""
+"""A predicted field is drawn, stored, restored and not trained; broken files are refused."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_nothing_is_drawn_where_nobody_is(scene: PredictedField, person: Person)
     "name",
     ["numbers", "body.vertices", "body.faces", "sources.rgba", "network.encoder.fine.weight"],
 )
-def test_what_does_not_fit_is_refused(scene: PredictedField, name: str) -> None:
+def test_mismatched_tensors_are_refused(scene: PredictedField, name: str) -> None:
     whole = checkpoint_of(scene)
     own = whole.tensors[f"field.{name}"]
     broken = own + 10**9 if name == "body.faces" else own[..., :-1]

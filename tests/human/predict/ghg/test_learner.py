@@ -67,7 +67,7 @@ def test_mean_colours_are_those_of_the_people(folder: Path, tmp_path: Path) -> N
     assert (both > 0.02).any(0).all()
 
 
-def test_what_cannot_be_trained_on_is_refused(folder: Path, tmp_path: Path) -> None:
+def test_unsuitable_training_data_is_refused(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "junk").mkdir()
     with pytest.raises(DyngsError, match="junk: no capture found"):
         assembled(config(tmp_path, tmp_path / "run"))

@@ -40,7 +40,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
 
 
 def constant_network(bias: dict[str, float] | None = None) -> AtlasNetwork:
-    """One that says the same everywhere: 0, or ``bias`` in every number of some heads."""
+    """Return a network with constant output: 0, or ``bias`` in every channel of some heads."""
     made = AtlasNetwork(num_input_channels(2), 2, torch.Generator().manual_seed(0))
     names = [name for _ in range(2) for name, count in HEADS.items() for _ in range(count)]
     with torch.no_grad():

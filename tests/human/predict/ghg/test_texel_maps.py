@@ -160,7 +160,7 @@ def test_distances_from_the_edge_are_those_of_the_outline() -> None:
     assert maps.count == 1
 
 
-def test_what_is_behind_an_arm_does_not_get_its_colour() -> None:
+def test_texels_behind_an_arm_do_not_get_its_colour() -> None:
     """Arms red, the rest blue: of the texels seen, nearly all have their own colour, and parts of
     the chest are hidden that are seen when the arms are aside. Mixed colours remain where a pixel
     covers both."""

@@ -49,8 +49,7 @@ def read_captured_person(folder: Path) -> Path:
 
 
 def test_a_resumed_run_ends_with_the_same_bytes(folder: Path, run: Path, tmp_path: Path) -> None:
-    """Resumed between the two stages: of what is learned in the second alone there are no views_by_time
-    yet."""
+    """Resume between the two stages, when the optimiser has no moments of the second stage yet."""
     middle, last = checkpoint_paths(run)
     config = stereo_config(folder, tmp_path / "parts")
     resumed = train(config, resume_from=stopped(config, 2))
@@ -187,7 +186,7 @@ def without_depth(frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
         (without_depth, "p: no depth maps, which training needs"),
     ],
 )
-def test_what_cannot_be_trained_on_is_refused(
+def test_unsuitable_training_data_is_refused(
     folder: Path, tmp_path: Path, change: Any, message: str
 ) -> None:
     changed(read_captured_person(folder), tmp_path / "set" / "p", change)

@@ -59,7 +59,7 @@ def test_order_around_the_vertical_starts_anywhere() -> None:
         (view_at(0, 0.5), view_at(1, 2.5)),
     ],
 )
-def test_what_does_not_suit_is_refused(one: View, other: View) -> None:
+def test_unsuitable_pairs_are_refused(one: View, other: View) -> None:
     assert order_as_pair([one, other], 0, 1) is None
     for chosen in ([0, 1], [0]):
         with pytest.raises(DyngsError, match=rf"^ann: {one.name} has no neighbouring view"):

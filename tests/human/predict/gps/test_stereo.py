@@ -44,7 +44,7 @@ def test_colours_agree_at_the_true_offset_in_both_views(index: int) -> None:
     assert colours.amin(1)[inner].max() < 1e-6
 
 
-def test_what_the_other_view_shows_beside_the_person_is_known() -> None:
+def test_costs_mark_background_of_the_other_view() -> None:
     """At the left edge of the left view a nearer surface would be seen beside the person in the
     right one."""
     offsets = candidate_offsets(SHIFT)

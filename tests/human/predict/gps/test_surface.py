@@ -34,7 +34,7 @@ def test_true_offsets_put_gaussians_on_the_surface(pair: RectifiedPair) -> None:
     torch.testing.assert_close(found.base_rgb, colour, atol=1e-6, rtol=1e-5)
 
 
-def test_what_the_other_view_does_not_show_is_transparent(pair: RectifiedPair) -> None:
+def test_surfaces_unseen_by_the_other_view_are_transparent(pair: RectifiedPair) -> None:
     """A surface beside that of the ball; where the true one is hidden from the other view nothing
     is wrong with it."""
     offsets = pair.focal * pair.baseline / exact_depth(pair) - pair.shift
@@ -50,7 +50,7 @@ def test_what_the_other_view_does_not_show_is_transparent(pair: RectifiedPair) -
 
 
 def test_gradients_reach_every_weight(pair: RectifiedPair) -> None:
-    """Of the depth from its error, and of everything from what the Gaussians are."""
+    """Depth errors reach the weights of the depth, and Gaussian parameters reach all weights."""
     network = GpsNetwork(torch.Generator().manual_seed(0))
     torch.nn.init.normal_(network.heads.weight, generator=torch.Generator().manual_seed(1))
     torch.nn.init.normal_(
