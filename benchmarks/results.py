@@ -296,6 +296,11 @@ def size_page(results: dict[str, Result]) -> str:
     )
 
 
+def model_overrides(measurement: Measurement) -> list[str]:
+    """Return the overrides that change the model, which a reader needs beside the preset."""
+    return [word for word in measurement.overrides if word.startswith("model.")]
+
+
 def readme_table(results: dict[str, Result]) -> str:
     """The table of README.md."""
     rows = [["capture", "preset", "test PSNR, dB", "Gaussians", "file, MB", "CPU minutes"]]
@@ -310,7 +315,7 @@ def readme_table(results: dict[str, Result]) -> str:
         rows.append(
             [
                 measurement.title,
-                f"`{measurement.preset}`",
+                f"`{' '.join([measurement.preset, *model_overrides(measurement)])}`",
                 psnr,
                 number(result.num_gaussians, 0),
                 number(result.stored_mb),
