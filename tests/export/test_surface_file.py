@@ -79,7 +79,7 @@ def test_a_moving_scene_has_a_mesh_for_each_time(
     out = tmp_path / "meshes"
     command = f"export {run} --format mesh --cells 24 --times 0:1:2 --out {out}".split()
     assert main(command) == 0
-    assert len(re.findall(r"triangles with colours of .* vertices", capsys.readouterr().out)) == 2
+    assert len(re.findall(r"triangles, .* vertices", capsys.readouterr().out)) == 2
     first, last = (mesh_of(path) for path in sorted(out.iterdir()))
     assert not np.array_equal(first.vertices[:50], last.vertices[:50])
     assert main(command) == 0
@@ -96,8 +96,8 @@ def test_a_moving_scene_has_a_mesh_for_each_time(
             "--out x.stl",
             r"x\.stl: a mesh file must end in \.ply, \.glb, \.obj",
         ),
-        ("--times 0:1:2 --out x.ply", r"x\.ply: a sequence is a folder of files; give --out x"),
-        ("--static", "--static does not go with --format mesh"),
+        ("--times 0:1:2 --out x.ply", r"x\.ply: --times writes a folder; use --out x"),
+        ("--static", "--static is not supported with --format mesh"),
     ],
 )
 def test_refusals_are_one_line(
@@ -127,6 +127,6 @@ def test_a_file_of_gaussians_has_no_views(
     capsys.readouterr()
     assert main(["export", str(file), "--format", "mesh", "--out", str(tmp_path / "mesh.glb")]) == 2
     assert re.fullmatch(
-        r"dyngs: error: .*balls\.ply: a file has no training views, .*\n", capsys.readouterr().err
+        r"dyngs: error: .*balls\.ply: a mesh needs the depth of training views; .*\n", capsys.readouterr().err
     )
     assert not (tmp_path / "mesh.glb").exists()

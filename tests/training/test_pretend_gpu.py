@@ -148,7 +148,7 @@ def test_views_are_drawn_and_scored_there_alike(
     folder, (split, refined, others) = tmp_path / "run", SCORED[name]
     for few in (
         "human.avatar.pose_fit.UPDATES_PER_WINDOW",
-        "human.avatar.pose_fit.MOST_WINDOWS",
+        "human.avatar.pose_fit.MAX_WINDOWS",
         "training.corrections.camera_refinement.FIT_UPDATES",
     ):
         monkeypatch.setattr(f"dyngs.{few}", 2)

@@ -224,7 +224,7 @@ def test_a_checkpoint_of_another_model_is_refused(capture: Path) -> None:
         ),
         ("exp_avg_sq.sh", lambda x: x[:, :1], "'exp_avg_sq.sh' is float32"),
         ("exp_avg.quats", lambda x: x.double(), "'exp_avg.quats' is float64"),
-        ("exp_avg_sq.means", lambda x: x / 0, "'exp_avg_sq.means' holds NaN"),
+        ("exp_avg_sq.means", lambda x: x / 0, "'exp_avg_sq.means' has NaN"),
         ("gaussians.quats", lambda x: x[:, :3], "quats must be"),
         ("sampler.order", lambda x: torch.tensor([7]), "'order' has indices outside"),
         ("sampler.position", lambda x: x + 99, "'position' has indices outside"),

@@ -216,7 +216,7 @@ class HumanScene(GaussianScene, Posable):
 
     def part(self, which: str) -> HumanScene:
         """Return all Gaussians or none: a person moves as a whole."""
-        count = len(self) if (which == "still") == self.is_static else 0
+        count = len(self) if (which == "static") == self.is_static else 0
         return self.select(torch.arange(count, device=self.gaussians.means.device))
 
     def with_motion(self, clip: MotionClip) -> HumanScene:

@@ -101,10 +101,10 @@ def test_invalid_arguments_are_refused(
 @pytest.mark.parametrize(
     ("keys", "said"),
     [
-        (["train.robust=always"], "has no effect with model.kind=ngp"),
-        (["train.exposure=always"], "has no effect with model.kind=ngp"),
-        (["camera.refine=always"], "has no effect with model.kind=ngp"),
-        (["budget.max_gaussians=10"], "has no effect with model.kind=ngp"),
+        (["train.robust=always"], "not supported by model.kind=ngp"),
+        (["train.exposure=always"], "not supported by model.kind=ngp"),
+        (["camera.refine=always"], "not supported by model.kind=ngp"),
+        (["budget.max_gaussians=10"], "not supported by model.kind=ngp"),
         (["model.time=true"], "model.time=true needs images at several times"),
         (["model.sizes=huge"], "one of tiny, cpu, published"),
     ],
