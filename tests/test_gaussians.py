@@ -78,5 +78,7 @@ def test_stored_sizes_beyond_float32_are_refused() -> None:
     tensors["log_scales"][2, 1] = 87.9
     Gaussians.stored(tensors)
     tensors["log_scales"][2, 1] = 88.5
-    with pytest.raises(ValueError, match=r"'log_scales' has values above 88, which overflow float32"):
+    with pytest.raises(
+        ValueError, match=r"'log_scales' has values above 88, which overflow float32"
+    ):
         Gaussians.stored(tensors)

@@ -127,6 +127,7 @@ def test_a_file_of_gaussians_has_no_views(
     capsys.readouterr()
     assert main(["export", str(file), "--format", "mesh", "--out", str(tmp_path / "mesh.glb")]) == 2
     assert re.fullmatch(
-        r"dyngs: error: .*balls\.ply: a mesh needs the depth of training views; .*\n", capsys.readouterr().err
+        r"dyngs: error: .*balls\.ply: a mesh needs the depth of training views; .*\n",
+        capsys.readouterr().err,
     )
     assert not (tmp_path / "mesh.glb").exists()
