@@ -325,8 +325,7 @@ def _part(config: Config, run_dir: Path, rows: Tensor) -> Checkpoint:
 
 
 def _up(found: EditSource, frame: Frame) -> tuple[float, ...] | None:
-    """Return the direction (3,) of the source that is up: as told, else as known; None: nothing
-    says."""
+    """Return the up direction (3,) of the source: the given one, else the detected one, else None."""
     if isinstance(frame.up, tuple):
         return frame.up
     if frame.up is None:
@@ -343,8 +342,8 @@ def _up(found: EditSource, frame: Frame) -> tuple[float, ...] | None:
 def _frame(
     found: EditSource, edits: Edits, wanted: str, tell: Tell
 ) -> tuple[Similarity, str | None]:
-    """Return the similarity to the frame that is asked for, and what is up there; ``wanted``: up
-    for viewers."""
+    """Return the similarity to the requested frame, and its up axis; ``wanted``: the axis for
+    viewers."""
     offset = found.opened.world_offset
     if edits.geo is not None:
         for line in edits.geo.lines:

@@ -61,5 +61,5 @@ def write_scene_file(
 
 
 def num_bytes_exact(scene: Renderable) -> int:
-    """Return the bytes of what drawing needs, as it is in memory."""
+    """Return the size in bytes of the tensors that rendering needs, in memory."""
     return sum(x.numel() * x.itemsize for x in tensors_to_store(scene).values())

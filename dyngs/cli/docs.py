@@ -97,7 +97,7 @@ def page_text(path: Path) -> str:
 
 
 def show(text: str) -> None:
-    """Show Markdown in the pager of the terminal; print it as it is without a terminal."""
+    """Show Markdown in the pager of the terminal, or print its source without a terminal."""
     if not sys.stdout.isatty():
         print(text, end="")
         return

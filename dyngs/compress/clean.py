@@ -96,8 +96,7 @@ Tell = Callable[[str], None]
 
 
 def classify_shapes(gaussians: Gaussians, opacities: Tensor) -> dict[str, Tensor]:
-    """Return (N,) bool by kind: what scales, opacities (N,) and distances alone say of
-    Gaussians."""
+    """Return masks (N,) of suspicious Gaussians by kind, from scales, opacities and distances."""
     ordered = gaussians.scales.sort(dim=1, descending=True).values
     longest = ordered[:, 0]
     second = ordered[:, 1]
@@ -144,7 +143,7 @@ def clean_file(gaussians: Gaussians, tell: Tell) -> Tensor:
 def clean_run(
     run_dir: Path, max_loss: float, threads: int, data_root: Path | None, tell: Tell
 ) -> Tensor:
-    """Return (N,) bool which Gaussians of a run stay; what goes, and what it costs, is told.
+    """Return the mask (N,) of the Gaussians of a run to keep; logs removals and their cost.
 
     One kind after another goes, of each as much as the mean PSNR of views held out may lose: by no
     more than ``max_loss`` in all, dB, and that of 16 training views by no more. Views held out are

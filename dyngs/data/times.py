@@ -269,7 +269,7 @@ def split_by_camera(root: Path, splits: Splits, cameras: Sequence[int]) -> Split
 
 
 def assign_camera_ids(splits: Splits) -> Splits:
-    """Give each fixed camera an id of its own if all views share one.
+    """Assign one id per fixed camera if all views share one id.
 
     Fixed cameras are detected if each pose repeats at other times, up to rounding, and some times
     are seen from several poses. The views of a camera get exactly one pose.

@@ -110,11 +110,11 @@ class Regions:
 
     @property
     def moving_from(self) -> str | None:
-        """Source of the moving regions so far, or None."""
+        """Source of the moving regions of the scored images, or None."""
         return " and ".join(sorted(self._moving_from)) or None
 
     def reason(self, metric: str) -> str:
-        """Return why no image so far has a score for this region."""
+        """Return the reason why no scored image has a value for this region."""
         if metric == "psnr_foreground":
             return TOO_SMALL if self._has_alpha else NO_ALPHA
         if self._moving_from:

@@ -35,7 +35,7 @@ _CAPTURE = (
 
 
 def suggest_command(path: Path, *, captures: bool = True) -> str | None:
-    """Return what a path is and the command for it, None for anything else.
+    """Return a description of a path with the command that reads it; None: unknown.
 
     Only file names are checked, those directly in a folder and in ``images`` below it.
     """

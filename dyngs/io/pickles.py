@@ -118,7 +118,7 @@ class _Name(str):
 
 
 class _Dtype:
-    """Stands for ``numpy.dtype``: plain numbers, text and objects only."""
+    """Replacement for ``numpy.dtype``: plain numbers, text and objects only."""
 
     def __init__(self, text: object) -> None:
         if not isinstance(text, str) or not re.fullmatch(r"[<>|=]?[biufcSUO]\d{0,9}", text):
@@ -207,7 +207,7 @@ class _Unpickler(_PythonUnpickler):
         self._build(self.stack[-1], state)
 
     def _called(self, name: object, arguments: object) -> object:
-        """Return the object that a call stands for."""
+        """Return the object that a call in the pickle constructs."""
         if not isinstance(name, _Name) or not isinstance(arguments, tuple):
             raise ValueError("call of an object that is not a function")
         if name in _LAYOUTS:

@@ -43,7 +43,7 @@ class RenderOutput:
 
 @dataclass(frozen=True)
 class UpdateResult:
-    """What an update has done."""
+    """Result of an update."""
 
     bad: Count = 0  # number of rows left out because their gradient was not finite
     finding: str | None = None  # lines about what was found out, or None
@@ -64,7 +64,7 @@ class Model(ABC, Generic[S_co]):
     @property
     @abstractmethod
     def scene(self) -> S_co:
-        """What is trained, as it is now."""
+        """The scene in its current state."""
 
     @abstractmethod
     def draw(
@@ -74,7 +74,7 @@ class Model(ABC, Generic[S_co]):
 
     @abstractmethod
     def update(self, step: int) -> UpdateResult:
-        """Change what is learned by the gradients that are there, and drop them."""
+        """Update the parameters by their gradients, then clear the gradients."""
 
     @property
     @abstractmethod
@@ -83,7 +83,7 @@ class Model(ABC, Generic[S_co]):
 
     @abstractmethod
     def state(self) -> State:
-        """Return everything that training needs to go on, by name, with its role."""
+        """Return all tensors that resuming needs, by name, with their roles."""
 
     @abstractmethod
     def restore(self, checkpoint: Checkpoint) -> None:
@@ -91,7 +91,7 @@ class Model(ABC, Generic[S_co]):
 
     @abstractmethod
     def place(self, device: torch.device) -> None:
-        """Go on on ``device``."""
+        """Move the model to ``device``."""
 
     @property
     def colour_loss(self) -> Loss | None:

@@ -153,7 +153,7 @@ class Predictor(ABC, Generic[N]):
 
 @dataclass(frozen=True)
 class Example:
-    """What a network in training has predicted, next to the truth."""
+    """Prediction of a network in training and its ground truth."""
 
     loss: Tensor  # (), differentiable
     image: Image  # that the prediction was compared with last
@@ -195,8 +195,7 @@ class Learner(ABC, Generic[N]):
 
     @abstractmethod
     def example(self, person: int, step: int, generator: torch.Generator) -> Example:
-        """Return a prediction of a person; what is random is drawn from ``generator``, on the
-        CPU."""
+        """Return a prediction of a person; random numbers come from ``generator``, on the CPU."""
 
     def kept(self) -> dict[str, Tensor]:
         """Return what is stored next to the weights."""

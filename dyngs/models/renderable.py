@@ -147,7 +147,7 @@ class TimeStep:
 
 
 class Renderable(ABC):
-    """What evaluation, rendering, viewer and videos need of a scene.
+    """Interface of scenes for evaluation, rendering, viewer and videos.
 
     Attributes:
         options: ``DrawOptions``, or more than that: how it is drawn unless ``render`` is told
@@ -222,12 +222,12 @@ class Renderable(ABC):
         return None
 
     def page_data(self) -> tuple[dict[str, Any], dict[str, tuple[Tensor, Literal[8, 16]]]] | None:
-        """Return what a page draws of a scene that is not made of Gaussians: its header, and rows
-        (R, D) by name with the bits of each number; None: there is no page of it."""
+        """Return the page data of a scene without Gaussians: its header, and rows (R, D) by name
+        with the bits of each number; None: it has no page."""
         return None
 
     def on_background(self: R, colour: Tensor) -> R:
-        """Return it before a background (3,), with caches of its own."""
+        """Return the scene on a background (3,), with separate caches."""
         other = copy(self)
         object.__setattr__(other, "background", colour)  # scenes may be frozen
         return other
@@ -251,7 +251,7 @@ def single_views(
 
 
 def check_views(cameras: Cameras, background: Tensor | None) -> None:
-    """Check what any scene is rendered from, and before which colour.
+    """Validate the cameras and the background of a render call.
 
     Raises DyngsError: no cameras, poses that are not rigid, focal lengths that are not positive,
     NaN or infinity, or a background of another shape than (3,) or (V, 3).

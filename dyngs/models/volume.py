@@ -57,8 +57,8 @@ def reached_samples(densities: Tensor, samples: Samples) -> tuple[Samples, Tenso
 
 @torch.no_grad()
 def thin_samples(densities: Tensor, samples: Samples, shifts: Tensor) -> tuple[Samples, Tensor]:
-    """As ``reached_samples``; of light ones each fourth is taken, four times as long around the
-    same middle.
+    """Return the samples of ``reached_samples``, with faint ones thinned to every fourth, four
+    times as long around the same midpoint.
 
     What rays see, and the gradients by densities, are on average those of all samples. ``shifts``
     (R,) in [0, 1): which of four it is, at random for each ray.

@@ -48,7 +48,7 @@ class Cache:
     _kept: dict[str, Any]
 
     def once(self, name: str, compute: Callable[[], T]) -> T:
-        """Return what ``compute`` returned when first asked for ``name`` of this object."""
+        """Return the cached result of ``compute`` for ``name``."""
         if name not in self._kept:
             self._kept[name] = compute()
         return self._kept[name]
@@ -109,7 +109,7 @@ class OpenedScene(LoadedRun, Cache):
 
     @property
     def capture(self) -> Capture:
-        """What it was trained on. Raises DyngsError where there is none, or it cannot be read."""
+        """The training capture. Raises DyngsError: none, or it cannot be read."""
         if self.captured is None or self.missing is not None:
             raise self.missing or DyngsError(
                 f"{self.config.data.root}: a file, without the capture that it was trained on"
@@ -125,7 +125,7 @@ class OpenedScene(LoadedRun, Cache):
 
     @property
     def cameras(self) -> Cameras | None:
-        """As of ``SourceCapture``; None where no capture can be read."""
+        """Training cameras of the capture; None: no capture can be read."""
         return None if self.captured is None else self.captured.cameras
 
     @property
@@ -149,8 +149,8 @@ class OpenedScene(LoadedRun, Cache):
 
     @property
     def frame(self) -> Similarity:
-        """From the scene, as it is drawn, to the frame it was given, else to the capture's files
-        less their offset."""
+        """Similarity from scene coordinates to the edited frame, else to the coordinates of the
+        capture's files less their offset."""
         if self.edited is not None:
             return self.edited.similarity
         return Similarity(Similarity(self.turned).inverse().turn, self.info.world_scale)
@@ -175,8 +175,8 @@ class OpenedScene(LoadedRun, Cache):
 
     @property
     def up(self) -> tuple[np.ndarray, str] | None:
-        """Direction (3,) that is up, and what says so: the file, a body at rest, or the cameras;
-        None: nothing does."""
+        """Up direction (3,) and its source: the file, a body in rest pose, or the cameras; None:
+        unknown."""
         if self.stated_up is not None:
             return self.direction_of(
                 self.stated_up
@@ -188,8 +188,8 @@ class OpenedScene(LoadedRun, Cache):
 
     @property
     def seconds(self) -> float:
-        """Seconds that pass from time 0 to 1: as the capture or the motion says, else 30 frames a
-        second."""
+        """Duration in seconds of time 0 to 1: from the capture or the motion, else at 30 frames
+        per second."""
         frames = max(len(self.renderable.times), 1)
         if self.fps is not None:
             return max(frames / self.fps, SHORTEST)

@@ -121,7 +121,7 @@ class TimeForecast:
 
     @property
     def mean_step(self) -> float:
-        """Mean seconds per step so far."""
+        """Mean seconds per finished step."""
         first = self._marks[0]
         now = self._marks[-1]
         return (now.seconds - first.seconds) / max(now.step - first.step, 1)

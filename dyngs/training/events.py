@@ -76,7 +76,7 @@ class StepDone:
 
     @property
     def bad_gradients(self) -> int:
-        """Number of parameter rows skipped so far because their gradient was not finite."""
+        """Number of parameter rows that were skipped because their gradient was not finite."""
         return int(self.loop.trainer.bad_gradients)
 
     @property

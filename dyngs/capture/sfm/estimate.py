@@ -440,7 +440,7 @@ def pairs_to_match(task: SfmTask) -> list[tuple[int, int]]:
 
 
 def _alike_pairs(task: SfmTask) -> list[tuple[int, int]]:
-    """Return pairs of each image with the others that look most alike by their features.
+    """Return the pairs of each image with its most similar images, by their features.
 
     An image is described by its SIFT descriptors, counted by which of 64 typical ones is nearest
     (found by k-means among these images), as sums of differences from it (VLAD: Jegou et al. 2010,

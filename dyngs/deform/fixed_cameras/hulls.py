@@ -130,7 +130,7 @@ def _drop_specks(differs: np.ndarray, certainty: np.ndarray) -> np.ndarray:
 
 
 def detect_shadows(image: np.ndarray, static: np.ndarray) -> np.ndarray:
-    """Return a mask (..., H, W) of shadows: darker than ``static`` in all channels alike.
+    """Return a mask (..., H, W) of shadows: pixels darker than ``static`` by one factor.
 
     After Horprasert et al. 1999.
     """

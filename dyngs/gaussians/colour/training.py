@@ -285,7 +285,7 @@ class NetworkTraining(ColourTraining):
 
 
 class AutoTraining(ColourTraining):
-    """SH for all Gaussians at first, later only for those where they improve held-out views."""
+    """SH for all Gaussians, later reduced to those where they improve held-out views."""
 
     def __init__(self, options: AutoColour, steps: int, num_views: int) -> None:
         super().__init__(options)

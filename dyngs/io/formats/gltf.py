@@ -41,7 +41,7 @@ _MOST_NODES, _MOST_DEPTH = 4096, 32
 
 
 def read_gltf(path: Path) -> SplatFile:
-    """Read all Gaussians of a .glb, placed as its nodes say.
+    """Read all Gaussians of a .glb, transformed by its nodes.
 
     Raises DyngsError: no primitive of Gaussians, a kernel or colour space other than those of 3DGS,
     or damaged contents.

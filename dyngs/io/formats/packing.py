@@ -113,8 +113,7 @@ def nearest_entries(table: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return P representative rows (P, D), and the index (N,) of the one that stands for each of
-    ``rows`` (N, D).
+    """Return a palette of P rows (P, D), and the palette index (N,) of each of ``rows`` (N, D).
 
     All rows where there are at most 1,024 of them; else about N / 2 to N rows, at most 65,536. The
     set is halved again and again at the median of the column that varies most in it; a

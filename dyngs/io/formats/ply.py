@@ -61,8 +61,8 @@ _MOST_LOG = 20.0
 
 
 def read_ply(path: Path) -> SplatFile:
-    """Read a binary little-endian .ply, plain or compressed, whatever its values are; properties
-    may have any order.
+    """Read a binary little-endian .ply, plain or compressed, with properties in any order and
+    without a check of their values.
 
     Means of a plain .ply are float64. Scalar types other than float32 are converted; other
     properties, and elements other than ``vertex``, are skipped.

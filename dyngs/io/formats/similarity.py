@@ -120,8 +120,8 @@ IDENTITY = Similarity()
 
 
 def similarity_from_numbers(numbers: Sequence[float]) -> Similarity:
-    """Return what ``numbers`` (8,) of a file say, as of ``Similarity.numbers``. Raises ValueError:
-    no such numbers."""
+    """Return the similarity stored as ``numbers`` (8,), see ``Similarity.numbers``. Raises
+    ValueError: invalid numbers."""
     a, b, c, d, scale, x, y, z = (float(value) for value in numbers)
     if not (
         np.isfinite(numbers).all() and scale > 0 and abs(a * a + b * b + c * c + d * d - 1) < 1e-3

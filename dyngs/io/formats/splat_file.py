@@ -1,5 +1,4 @@
-"""What a file of Gaussians holds, whatever its format: which values can be drawn, and what header
-comments say."""
+"""Contents of a file of Gaussians in any format: renderable values and header comments."""
 
 from __future__ import annotations
 
@@ -157,8 +156,7 @@ def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
 def from_linear(
     means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.ndarray, sh: np.ndarray
 ) -> Gaussians:
-    """Return the Gaussians of a file that holds scales and opacities themselves, not as they are
-    optimised.
+    """Return the Gaussians of a file that stores post-activation scales and opacities.
 
     Logarithms and logits are infinite, or NaN, where there are none. ``means``: (N, 3). ``quats``:
     (N, 4) wxyz of any length. ``scales``: (N, 3). ``opacities``: (N,). ``sh``: (N, K, 3).
@@ -227,7 +225,7 @@ def comments_from_json(value: object) -> tuple[str, ...]:
 
 
 def parse_comments(splat: SplatFile) -> SplatFile:
-    """Return the contents of a file with what its comments say about them.
+    """Return the contents of a file with the metadata of its comments.
 
     Raises ValueError: a comment of ours holds no such values, or names a render mode that does not
     exist.

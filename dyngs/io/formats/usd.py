@@ -33,8 +33,7 @@ _UP = {"Y": "y", "Z": "z"}
 
 
 def read_usd(path: Path) -> SplatFile:
-    """Read all Gaussians of a .usd, .usda or .usdc, placed as their prims say, at the stage's
-    default time.
+    """Read all Gaussians of a .usd, .usda or .usdc in stage coordinates, at its default time.
 
     Raises DyngsError: usd-core is missing, the file refers to others, holds no Gaussians, or is
     damaged.

@@ -1,5 +1,4 @@
-"""The part of reading USD that runs in a process of its own: ``python -m dyngs.io.formats.usd_child IN
-OUT.npz``.
+"""USD reader for a separate process: ``python -m dyngs.io.formats.usd_child IN OUT.npz``.
 
 The USD library takes unbounded memory for damaged binary files, or ends the process. Here that
 harms nothing else. Prints one line and exits with 2 where the file is refused.
