@@ -28,11 +28,11 @@ class _OnTemplate(SceneModel):
 
 class HumanModel(_OnTemplate):
     """Avatar: one Gaussian per texel of a body template, posed by linear blend skinning
-    (docs/human.md)."""
+    (`dyngs docs people`)."""
 
     kind: Literal["human"] = Field(
         default="human",
-        description="avatar of one person: Gaussians on a body template, posed by its skeleton (docs/human.md)",
+        description="avatar of one person: Gaussians on a body template, posed by its skeleton (`dyngs docs people`)",
     )
     fit: bool = Field(
         default=True,
@@ -66,11 +66,11 @@ class HumanModel(_OnTemplate):
 
 class HumanPredictorModel(_OnTemplate):
     """Network that predicts avatars from a few images, trained on other people
-    (docs/people_network.md)."""
+    (`dyngs docs people`)."""
 
     kind: Literal["human_predictor"] = Field(
         default="human_predictor",
-        description="network that predicts avatars from a few images, after GHG (docs/people_network.md)",
+        description="network that predicts avatars from a few images, after GHG (`dyngs docs people`)",
     )
     scaffold_heights: tuple[float, ...] = Field(
         default=(0.0, 0.02, 0.04),

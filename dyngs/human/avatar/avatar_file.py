@@ -39,7 +39,7 @@ _LONGEST_NAME = 200
 def write_avatar(person: Renderable, model: ModelSection, info: CheckpointInfo, path: Path) -> Path:
     """Write an avatar in its rest pose, upright at its position in the capture; return ``path``.
 
-    The format is described in docs/formats.md. Raises DyngsError: the scene is not an avatar, its
+    The format is described in docs/reference/formats.md. Raises DyngsError: the scene is not an avatar, its
     template is missing, or the file cannot be written.
     """
     # imported here because it needs scipy, which reading an avatar does not

@@ -223,7 +223,7 @@ def detect_person(
         raise DyngsError(
             f"{capture.root}: {detector.name} detects nobody in "
             f"{format_count(sum(map(len, cameras)), 'image')}; check the images, or pass masks of "
-            "another program to `dyngs data fit` (docs/person.md)"
+            "another program to `dyngs data fit` (`dyngs docs people`)"
         )
     _write_keypoints(folder / "keypoints.json", points)
     return FitInputs(keypoints=folder / "keypoints.json", masks=folder / "masks")

@@ -81,7 +81,7 @@ INSTALL_HINT = (
     f"`python -m venv ENV && ENV/bin/pip install {MEDIAPIPE_PACKAGE}` (Python 3.9 to 3.12), "
     f"then pass --mediapipe ENV/bin/python or set {MEDIAPIPE_VARIABLE} to it"
 )
-MASKS_HINT = "or pass masks of another program to `dyngs data fit` (docs/person.md)"
+MASKS_HINT = "or pass masks of another program to `dyngs data fit` (`dyngs docs people`)"
 LANDMARKS = (0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)
 """MediaPipe landmarks that correspond to the COCO key points, in COCO order."""
 _SECONDS_PER_IMAGE, _SECONDS_TO_START = 10.0, 120.0

@@ -1073,12 +1073,12 @@ def crop_views(
     if float(np.mean([_border_covered(images[i]) for i in indices])) > 0.6:
         raise DyngsError(
             f"{capture.root}: the masks cover the image borders and seem to be inverted; the person must "
-            "be white (docs/human.md)"
+            "be white (`dyngs docs people`)"
         )
     side = longest_box_side(images[i] for i in indices)
     if side < 8:
         raise DyngsError(
-            f"{capture.root}: the silhouettes are empty; check the masks (docs/human.md)"
+            f"{capture.root}: the silhouettes are empty; check the masks (`dyngs docs people`)"
         )
     size = min(effort.side, 2 * (side // 2))
     relative_keypoints = {

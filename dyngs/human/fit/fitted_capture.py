@@ -555,7 +555,7 @@ def ensure_fitted_body(
         if body_frames is None:
             raise DyngsError(
                 f"{data.root}: has neither silhouettes nor body parameters; add masks of the person "
-                "(docs/person.md)"
+                "(`dyngs docs people`)"
             )
         log(f"{data.root}: no silhouettes; using the body parameters of the capture")
         return data

@@ -33,7 +33,7 @@ class KeypointNerfModel(FieldPredictorModel):
     kind: Literal["keypoint_nerf"] = Field(
         default="keypoint_nerf",
         description="network that predicts a radiance field of a person from images and key points (KeypointNeRF; "
-        "docs/people_network.md)",
+        "`dyngs docs people`)",
     )
 
 
@@ -43,7 +43,7 @@ class EgHumanNerfModel(FieldPredictorModel):
     kind: Literal["eg_human_nerf"] = Field(
         default="eg_human_nerf",
         description="network that predicts a radiance field of a person with few samples around a body "
-        "(EG-HumanNeRF; docs/people_network.md)",
+        "(EG-HumanNeRF; `dyngs docs people`)",
     )
 
 
@@ -60,12 +60,12 @@ class PredictedFieldModel(ModelSection):
 
 
 class GpsModel(SceneModel):
-    """Network that predicts people from pairs of neighbouring views (docs/people_network.md)."""
+    """Network that predicts people from pairs of neighbouring views (`dyngs docs people`)."""
 
     kind: Literal["gps"] = Field(
         default="gps",
         description="network that predicts people from two neighbouring views, after GPS-Gaussian "
-        "(docs/people_network.md)",
+        "(`dyngs docs people`)",
     )
     person_px: int = Field(
         default=256,

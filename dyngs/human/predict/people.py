@@ -113,7 +113,9 @@ def captured_person(capture: Capture, template: BodyTemplate, images: ImageLoade
     """
     if capture.body is None or not capture.has_alpha:
         missing = "silhouettes" if capture.body is not None else "body parameters"
-        raise DyngsError(f"{capture.root}: no {missing}, which predictions need; see docs/human.md")
+        raise DyngsError(
+            f"{capture.root}: no {missing}, which predictions need; see `dyngs docs people`"
+        )
     body_frames = capture.body["train"]
     vertices, joints = rest_shape(template, body_frames)
     body = replace(

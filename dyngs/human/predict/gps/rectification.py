@@ -253,7 +253,7 @@ def _at_size(image: Image, person_px: int) -> Image:
     """Downscale the image by an integer if the person is at least twice ``person_px`` high."""
     if image.alpha is None or int((image.alpha > MIN_ALPHA).sum()) < _MIN_PIXELS:
         raise DyngsError(
-            f"{image.name}: no silhouette of a person; add alpha or a mask of the person, see docs/human.md"
+            f"{image.name}: no silhouette of a person; add alpha or a mask of the person, see `dyngs docs people`"
         )
     rows = (image.alpha > MIN_ALPHA).any(1).nonzero()
     return image.downscaled(max(1, int(rows.max() - rows.min() + 1) // person_px))

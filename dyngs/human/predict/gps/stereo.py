@@ -431,7 +431,9 @@ def _open_person(data: DataConfig) -> tuple[ImageLoader, list[tuple[tuple[int, i
 def _with_silhouettes(data: DataConfig) -> Capture:
     capture = read_capture(data)
     if not capture.has_alpha:
-        raise DyngsError(f"{data.root}: no silhouettes; add alpha or masks, see docs/human.md")
+        raise DyngsError(
+            f"{data.root}: no silhouettes; add alpha or masks, see `dyngs docs people`"
+        )
     return capture
 
 
