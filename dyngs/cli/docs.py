@@ -8,7 +8,7 @@ import re
 import sys
 from difflib import get_close_matches
 from pathlib import Path
-from pydoc import plaintext, render_doc
+from pydoc import plain, render_doc
 
 from dyngs.cli.arguments import Commands, add_command
 from dyngs.core.errors import DyngsError
@@ -90,7 +90,7 @@ def page_text(path: Path) -> str:
     text = path.read_text(encoding="utf-8")
     return re.sub(
         r"^::: (dyngs[.\w]*)\n(?:[ \t]+.*\n)*",
-        lambda match: f"```text\n{render_doc(match[1], renderer=plaintext)}```\n",
+        lambda match: f"```text\n{plain(render_doc(match[1]))}```\n",
         text,
         flags=re.MULTILINE,
     )
