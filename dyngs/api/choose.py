@@ -81,9 +81,9 @@ FEWEST_VIEWS, FEW_VIEWS, HELD_OUT = 8, 24, 24
 without a fourth of the views; otherwise about so many are held out."""
 LEAST_GAIN = 0.05  # Mean gain, dB, up to which two settings tie
 ERRORS, ERRORS_OF_MOTION = 2.0, 3.0
-"""Standard errors that a gain must exceed. The preset ``static`` learns faster than the static model
-of a pilot run, so motion needs more: on photos of a cup that stands still it gained 1.13 dB (0.56),
-and ended 1.3 dB below ``static``. On captures that move the gain was 3.5 errors or more."""
+"""Standard errors that a gain must exceed. The preset ``static`` learns faster than the static
+model of a pilot run, so motion needs more: on photos of a static cup it gained 1.13 dB (0.56), and
+ended 1.3 dB below ``static``. On captures that move the gain was 3.5 errors or more."""
 FILTERED_VIEWS, FREE_VIEWS = 3.0, 6.0
 """Views of each time by fixed cameras, in the mean, from which Gaussians are filtered in space (a
 room gains 2.1 dB on other cameras), and from which free primitives move (before eight cameras it
@@ -258,11 +258,10 @@ def _motion(config: Config, capture: Capture) -> Choice | None:
 def _with_settings(
     config: Config, capture: Capture, *, moving: bool = False
 ) -> tuple[Config, list[Choice], Capture]:
-    """Return ``config`` with the settings that win pilot runs, each tried on top of those before it,
-    all results, and the prepared capture.
+    """Resolve ``auto`` settings by pilot runs; return config, results and the prepared capture.
 
-    Open are settings that are ``auto``, the most valuable first; where motion was found to pay, also
-    colours.
+    The settings are tried in order of their expected gain, each on top of those accepted before it.
+    If motion improved the held-out views, colours are tried, too.
     """
     kind = find_kind(config.model)
     is_static = capability(config.model, HasMotion) is None
@@ -500,8 +499,7 @@ def psnr_after_pose_fit(pair: Pair, index: int) -> list[float]:
 
 
 def psnr_after_colour_fit(pair: Pair, index: int) -> list[float]:
-    """Return the mean PSNR of the view as it is, and with each half recoloured by a fit on the
-    other half.
+    """Return the mean PSNR of a view without and with colours fitted on its other half.
 
     Held-out views have no exposures of their own. Where exposure goes with the viewpoint, as in a
     slow walk, colours that depend on the viewpoint explain it: then the scene in one exposure is

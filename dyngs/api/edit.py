@@ -325,7 +325,7 @@ def _part(config: Config, run_dir: Path, rows: Tensor) -> Checkpoint:
 
 
 def _up(found: EditSource, frame: Frame) -> tuple[float, ...] | None:
-    """Return the up direction (3,) of the source: the given one, else the detected one, else None."""
+    """Return the up direction (3,) of the source: given or detected; None if there is neither."""
     if isinstance(frame.up, tuple):
         return frame.up
     if frame.up is None:

@@ -162,8 +162,7 @@ def set_limits(plan: RunPlan) -> tuple[RunPlan, None]:
 
 
 def extend_run(folder: Path, resumed: Checkpoint | None) -> Stage:
-    """Return the stage that changes a resumed run, in its folder, too, where another number of steps
-    is requested."""
+    """Return the stage that sets a new number of steps in a resumed run and in its folder."""
 
     def stage(plan: RunPlan) -> tuple[RunPlan, str | None]:
         config = plan.resolved

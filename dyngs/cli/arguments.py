@@ -43,7 +43,7 @@ def add_command(
     return parser
 
 
-# ---------------------------------------------------------------------------------------------------- types
+# -------------------------------------------------------------------------------------------- types
 
 
 def input_path(text: str) -> Path:
@@ -100,7 +100,7 @@ def image_size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-# ---------------------------------------------------------------------------------------------------- arguments
+# ---------------------------------------------------------------------------------------- arguments
 
 
 def add_threads(parser: argparse.ArgumentParser) -> None:
@@ -228,7 +228,7 @@ def data_section(overrides: list[str], capture_format: str = "auto") -> DataConf
     return load_config(None, ["data.root=.", f"data.format={capture_format}", *overrides]).data
 
 
-# ---------------------------------------------------------------------------------------------------- inputs, outputs
+# ---------------------------------------------------------------------------------- inputs, outputs
 
 
 def require_outputs_apart(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:

@@ -1,4 +1,4 @@
-"""``dyngs data``: inspect captures, estimate poses, fit bodies, convert motions, synthesise captures."""
+"""``dyngs data``: inspect and synthesise captures, estimate poses, fit bodies, convert motions."""
 
 from __future__ import annotations
 

@@ -39,9 +39,9 @@ def add_parser(commands: args.Commands) -> None:
         "edit",
         run,
         "transform, crop, clean and merge scenes",
-        "Edit a run or a file of Gaussians, and write the result as another file or run. Points are "
-        "in the coordinates of the file, or of the capture of a run. Changes of the coordinate frame "
-        "are stored and can be undone.",
+        "Edit a run or a file of Gaussians, and write the result as another file or run. Points "
+        "are in the coordinates of the file, or of the capture of a run. Changes of the "
+        "coordinate frame are stored and can be undone.",
         _EPILOG,
     )
     parser._negative_number_matcher = _NEGATIVE  # otherwise "-1,0,2" is parsed as an option

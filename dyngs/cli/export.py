@@ -73,7 +73,8 @@ def add_parser(commands: args.Commands) -> None:
         commands,
         "export",
         run,
-        "export a run as .ply, .spz, .glb ..., mesh, web page, tracks, avatar, cameras or .dyngs file",
+        "export a run as .ply, .spz, .glb ..., mesh, web page, tracks, avatar, cameras or .dyngs "
+        "file",
         "Export a run: Gaussians in the formats of other viewers and editors, tracks of their "
         "centres, a mesh, a web page, a compressed .dyngs file, an avatar, or the cameras.",
         _EPILOG,
@@ -304,7 +305,8 @@ def _export_splats(
         is_file and is_sequence and not arguments.static
     ):
         raise DyngsError(
-            f"{out}: --times and --folder write a folder; use --out FOLDER, or --time T for one file"
+            f"{out}: --times and --folder write a folder; use --out FOLDER, or --time T for one "
+            "file"
         )
     print_notes((line,))
     if arguments.folder:
@@ -395,7 +397,8 @@ def _export_dyngs(arguments: argparse.Namespace) -> None:
     max_change: float | None = arguments.max_change
     if max_change is not None and not SMALLEST_CHANGE <= max_change <= 64:
         raise DyngsError(
-            f"--max-change {max_change:g}: must be from {SMALLEST_CHANGE:g} to 64 (grey levels of 255)"
+            f"--max-change {max_change:g}: must be from {SMALLEST_CHANGE:g} to 64 (grey levels of "
+            "255)"
         )
     out: Path = arguments.out or arguments.run_dir
     if out.suffix == ".dyngs":
@@ -417,7 +420,8 @@ def _export_dyngs(arguments: argparse.Namespace) -> None:
         print_notes((f"RMS change of training views: {change:.2f} grey levels of 255",))
     ratio = written.num_bytes_exact / written.num_bytes
     print(
-        f"written: {written.path} ({written.num_bytes / 1e6:.2f} MB, {ratio:.1f} times smaller than uncompressed)"
+        f"written: {written.path} ({written.num_bytes / 1e6:.2f} MB, {ratio:.1f} times smaller "
+        "than uncompressed)"
     )
 
 
@@ -505,7 +509,8 @@ def _export_surface(arguments: argparse.Namespace) -> None:
     out: Path = arguments.out or arguments.run_dir / ("mesh" if arguments.times else "mesh.ply")
     if arguments.times and out.suffix:
         raise DyngsError(
-            f"{out}: --times writes a folder; use --out {out.with_suffix('')}, or --time for one file"
+            f"{out}: --times writes a folder; use --out {out.with_suffix('')}, or --time for one "
+            "file"
         )
     opened = _open(arguments)
     options = SurfaceOptions(arguments.level, arguments.cells, arguments.segments)

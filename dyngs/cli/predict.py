@@ -31,8 +31,8 @@ def add_parser(commands: Commands) -> None:
         "predict a person from a few images, without training",
         "Predict a person from one or a few training views of a capture with silhouettes. Networks "
         "of model.kind=human_predictor predict an avatar (a missing body is fitted first, as by "
-        "`dyngs data fit`), gps the Gaussians of neighbouring views, others a radiance field. Writes "
-        "a run folder.",
+        "`dyngs data fit`), gps the Gaussians of neighbouring views, others a radiance field. "
+        "Writes a run folder.",
         _EPILOG,
     )
     about = "run folder or weights file of a network, or gps or human_predictor if installed"

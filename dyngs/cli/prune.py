@@ -37,8 +37,8 @@ def add_parser(commands: args.Commands) -> None:
         run,
         "prune a run within a loss of 0.2 dB: a smaller, faster run and its file",
         "Remove Gaussians, faint contributions, SH coefficients and precision until the PSNR of "
-        "held-out views drops by --max-loss. Every trial is fine-tuned. Writes a new run folder with "
-        "its compressed file; prints quality, speed and size before and after.",
+        "held-out views drops by --max-loss. Every trial is fine-tuned. Writes a new run folder "
+        "with its compressed file; prints quality, speed and size before and after.",
         _EPILOG,
     )
     parser.add_argument(
@@ -101,8 +101,8 @@ def run(arguments: argparse.Namespace) -> int:
         print("note: --masks was ignored, because the scene is static")
     print(
         f"written: {folder}, and the file in {export_folder(folder)}\n"
-        f"next:    dyngs eval {quote_path(folder)}\n         dyngs render {quote_path(export_folder(folder))} "
-        f"--out {quote_path(folder / 'images')}"
+        f"next:    dyngs eval {quote_path(folder)}\n         dyngs render "
+        f"{quote_path(export_folder(folder))} --out {quote_path(folder / 'images')}"
     )
     return 0
 

@@ -114,7 +114,8 @@ def _check(arguments: argparse.Namespace) -> None:
         raise DyngsError("--times and --frames both set the number of frames; use one of them")
     if arguments.out is None and (arguments.video is None or not _is_path(arguments)):
         raise DyngsError(
-            "no output given; add --out DIR, or --video FILE.mp4 with --path, --time, --times or --view"
+            "no output given; add --out DIR, or --video FILE.mp4 with --path, --time, --times or "
+            "--view"
         )
     if not arguments.source.exists():
         raise DyngsError(

@@ -9,8 +9,7 @@ from dyngs.cli.arguments import AXES
 from dyngs.cli.output import print_notes
 
 SPLAT_FORMATS = ("ply", "compressed-ply", "spz", "splat", "sog", "glb", "usd")
-"""Names of ``dyngs.io.formats.formats.FORMATS``; those and ``MOVING`` are so that ``--help`` need not
-import them."""
+"""Names of ``dyngs.io.formats.formats.FORMATS``, repeated so that ``--help`` need not import it."""
 MOVING = "4dgs"
 """Name and suffix of the format of moving Gaussians."""
 
@@ -29,7 +28,7 @@ def add_axes(parser: argparse.ArgumentParser) -> None:
 
 
 def print_image_difference(notes: tuple[str, ...], found: Sequence[float]) -> None:
-    """Print notes about the format, and the lowest PSNR, dB, between renderings of file and scene."""
+    """Print notes about the format and the lowest PSNR, dB, of renderings of file and scene."""
     worst = min(found)
     figure = "the same images" if worst >= 99.9 else f"{worst:.1f} dB (PSNR)"
     print_notes((*notes, f"drawn again: {figure} compared with the scene"))

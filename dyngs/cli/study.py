@@ -78,8 +78,8 @@ def add_tradeoff_parser(commands: args.Commands) -> None:
         run_tradeoff,
         "measure quality, speed and size of a run with other settings, and pick the best one",
         "Vary the settings of a run one at a time, then several together. Writes tradeoff.csv, "
-        ".json, .md, .html and, with the extra plots, .svg, and selects the best run that meets the "
-        "requirements.",
+        ".json, .md, .html and, with the extra plots, .svg, and selects the best run that meets "
+        "the requirements.",
         _TRADEOFF,
     )
     parser.add_argument("run_dir", type=args.input_path, metavar="RUN", help="run folder")

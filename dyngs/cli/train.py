@@ -105,7 +105,8 @@ def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> i
         print(f"next:    dyngs predict {word} CAPTURE --out RUN")
     else:
         print(
-            f"next:    dyngs eval {word}\n         dyngs render {word} --out {quote_path(folder / 'images')}"
+            f"next:    dyngs eval {word}\n         dyngs render {word} --out "
+            f"{quote_path(folder / 'images')}"
         )
     return 0
 
@@ -135,7 +136,8 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
     if scene.is_static:
         return ["motion:  none, the scene is static"]
     return [
-        f"motion:  {len(scene.rows):,} of {format_count(len(scene), 'Gaussian')} move ({scene.moving_fraction:.1%})"
+        f"motion:  {len(scene.rows):,} of {format_count(len(scene), 'Gaussian')} move "
+        f"({scene.moving_fraction:.1%})"
     ]
 
 

@@ -102,8 +102,8 @@ def measure_precision(
     """Return the largest steps found that change the images by at most ``max_change``, grey levels
     of 255.
 
-    ``exact``: from ``tensors_to_store``, with the coarseness of the Gaussians if they have any; ``draw``
-    draws its like anew. Raises DyngsError: a value is not finite.
+    ``exact``: from ``tensors_to_store``, with the coarseness of the Gaussians if they have any;
+    ``draw`` renders such tensors. Raises DyngsError: a value is not finite.
     """
 
     def change(steps: Mapping[str, float], names: Iterable[str] = exact) -> float:
@@ -143,8 +143,8 @@ def quantize_tensors(
 ) -> dict[str, Tensor]:
     """Return the tensors with those of ``names`` (None: all) as a file with these steps holds them.
 
-    ``exact``: from ``tensors_to_store``, and the coarseness of the Gaussians if they have any. ``names``:
-    of the tensors that are rounded.
+    ``exact``: from ``tensors_to_store``, and the coarseness of the Gaussians if they have any.
+    ``names``: of the tensors that are rounded.
     """
     coarseness = exact[COARSENESS].numpy() if COARSENESS in exact else None
     found = dict(exact)

@@ -184,8 +184,10 @@ def _let_through(edit: TrainingEdit) -> str:
 
 @torch.no_grad()
 def build_removal_edit(trainer: GaussianTrainer, scores: Tensor | None) -> TrainingEdit:
-    """Return the edit that leaves all but the fraction ``prune.fraction`` with the lowest ``scores``
-    (N,), and masks them if requested; from then on their number stays."""
+    """Return the edit that removes the fraction ``prune.fraction`` with the lowest ``scores`` (N,).
+
+    It also masks the Gaussians over time if requested. Their number is constant from then on.
+    """
     options = trainer.config.prune
     whole = trainer.model.scene.without_masks()
     kept = None if scores is None else select_highest(scores, options.fraction)

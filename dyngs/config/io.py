@@ -458,7 +458,7 @@ def _not_allowed(keys: tuple[str, ...], allowed: str, value: object, choices: li
 
 
 def _describe_unknown(section: type[BaseModel], keys: tuple[str, ...], layers: _Layers) -> str:
-    """Return the error about an unknown key: its new name, the kind that has it, or a similar key."""
+    """Return the error for an unknown key: its new name, the kind that has it, or a similar key."""
     *above, key = keys
     name = ".".join(keys)
     where = layers.origin_of(keys)

@@ -81,8 +81,10 @@ class Gaussians:
     def isotropic(
         means: Tensor, log_scales: Tensor | float, logit: float, base: Tensor, num_terms: int
     ) -> Gaussians:
-        """Create isotropic Gaussians at ``means`` (N, 3) with the given log scale(s), opacity logit,
-        and degree-0 SH coefficients ``base`` (N, 3); the other of the ``num_terms`` are zero."""
+        """Create isotropic Gaussians at ``means`` (N, 3) with the given log scale(s) and opacity.
+
+        ``base`` (N, 3): SH coefficients of degree 0; the others of the ``num_terms`` are zero.
+        """
         count = len(means)
         sh = means.new_zeros(count, num_terms, 3)
         sh[:, 0] = base
@@ -138,7 +140,7 @@ class Gaussians:
     def to(
         self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> Gaussians:
-        """Return the Gaussians on another device or in another precision, without needless copies."""
+        """Return the Gaussians on another device or in another precision; copy only if needed."""
         return Gaussians(
             **{name: x.to(device=device, dtype=dtype) for name, x in self.tensors().items()}
         )

@@ -53,7 +53,7 @@ class Nodes:
     followed: Tensor  # (M, B) node indices, nearest first
 
     def weights(self, means: Tensor) -> Tensor:
-        """Return skinning weights (M, B): normalised Gaussians of the distance, without gradient."""
+        """Return skinning weights (M, B): normalised Gaussians of distance, without gradient."""
         apart = (means.detach()[:, None] - self.positions[self.followed]).square().sum(-1)
         return torch.softmax(-0.5 * apart / self.radii[self.followed].square(), dim=1)
 
@@ -119,7 +119,7 @@ def blend_node_motion(
 
 
 def rotate_by_offsets(offsets: Tensor, vectors: Tensor) -> Tensor:
-    """Rotate ``vectors`` (..., 3) by the quaternions identity + ``offsets`` (..., 4), of any norm."""
+    """Rotate ``vectors`` (..., 3) by quaternions identity + ``offsets`` (..., 4), any norm."""
     return rotate(offsets + identity_quat(offsets), vectors)
 
 

@@ -159,7 +159,7 @@ class OuterField(DeformationField):
         self.inner_field = inner_field
 
     def modify(self, offsets: Offsets, means: Tensor, time: float, rows: Tensor | None) -> Offsets:
-        """Return the modified ``offsets`` of the inner field; other arguments as for ``offsets``."""
+        """Return the modified ``offsets`` of the inner field; arguments as for ``offsets``."""
         raise NotImplementedError
 
     def offsets(self, means: Tensor, time: float, rows: Tensor | None = None) -> Offsets:
@@ -285,7 +285,7 @@ class Decoder:
         self.skip = skip
 
     def start_values(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """Return Glorot weights (Glorot and Bengio 2010) and zero biases; the last layer is zero."""
+        """Return Glorot weights (Glorot and Bengio 2010), zero biases and a zero last layer."""
         values: dict[str, Tensor] = {}
         last = len(self.widths) - 2
         for i in range(last + 1):

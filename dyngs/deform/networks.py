@@ -1,4 +1,4 @@
-"""Network fields: HexPlane (4DGS, Wu et al. 2024) and an MLP (Deformable-3DGS, Yang et al. 2024)."""
+"""Network fields: HexPlane (4DGS, Wu et al. 2024), an MLP (Deformable-3DGS, Yang et al. 2024)."""
 
 from __future__ import annotations
 

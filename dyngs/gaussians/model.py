@@ -87,7 +87,7 @@ class SceneTraining(Generic[S]):
         return scene
 
     def edit_scene(self, scene: S, step: int) -> tuple[S, EditResult] | None:
-        """Return the scene and the edit of its Gaussians after ``step``; None if nothing changes."""
+        """Return the scene and the edit of its Gaussians after ``step``; None if unchanged."""
         return None
 
     def apply_edit(self, edit: TopologyEdit) -> None:
@@ -271,7 +271,7 @@ class GaussianModel(Model[GaussianScene]):
             means.detach()[frozen_mask.rows] = kept
 
     def replace_scene(self, scene: GaussianScene) -> None:
-        """Continue with ``scene``: the same Gaussians with other motion, masks or render options."""
+        """Continue with ``scene``: same Gaussians with other motion, masks or render options."""
         self._scene = scene.with_gaussians(self._optimizer.parameters)
         self._scene.clear_caches()
 
@@ -367,7 +367,7 @@ class GaussianModel(Model[GaussianScene]):
         return replace(result, edit=edit.in_order(order), changes=changes)
 
     def _measure_harmonics(self, step: int) -> str | None:
-        """Drop SH that do not improve held-out views, if it is the step for it; return a message."""
+        """Drop SH that do not improve held-out views if due at this step; return a message."""
         if not self._scene.gaussians.sh_degree:
             return None
         result = self.colours.measure_harmonics(step, lambda: self._measurement_views(step))

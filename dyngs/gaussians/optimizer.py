@@ -273,7 +273,7 @@ class FrozenMask:
     shapes: bool = False
 
     def exclude_from_edit(self, result: EditResult, parameters: Gaussians) -> EditResult:
-        """Remove frozen Gaussians from an edit; they are appended unchanged after the other rows."""
+        """Remove frozen Gaussians from an edit; they are appended unchanged after other rows."""
         if self.rows is None:
             return result
         old = parameters.tensors()

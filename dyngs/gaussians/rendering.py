@@ -58,8 +58,8 @@ class RenderOptions(DrawOptions):
         sh_degree: highest degree used; None = that of the Gaussians.
         alpha_min, alpha_max, transmittance_min: see ``BlendOptions``.
         absgrad: fill the absolute part of the probe's gradient.
-        nonfinite: NaN or infinite input raises (``error``), its Gaussians are skipped (``skip``), or
-            the check is omitted (``trust``, for inputs known to be finite, as in training).
+        nonfinite: NaN or infinite input raises (``error``), its Gaussians are skipped (``skip``),
+            or the check is omitted (``trust``, for inputs known to be finite, as in training).
 
     Raises:
         DyngsError: a number out of range or NaN, or an unknown choice.
@@ -273,7 +273,7 @@ def _project(
 def _validate_inputs(
     gaussians: Gaussians, cameras: Cameras, background: Tensor | None, options: RenderOptions
 ) -> tuple[Gaussians, Cameras]:
-    """Validate the inputs and convert them to one dtype; handle non-finite values per ``options``."""
+    """Validate inputs and convert them to one dtype; handle non-finite values per ``options``."""
     check_background(background, len(cameras))
     if cameras.cam_from_world.device != gaussians.means.device:
         devices = f"the cameras are on {cameras.cam_from_world.device}, the Gaussians on {gaussians.means.device}"
@@ -310,7 +310,7 @@ def _handle_nonfinite(gaussians: Gaussians, policy: str) -> Gaussians:
 
 
 def splat_options(splat: SplatFile) -> RenderOptions:
-    """Return the render options stored in a splat file: its mode, and its low-pass filter if any."""
+    """Return the render options stored in a splat file: mode, and low-pass filter if any."""
     options = RenderOptions(mode=splat.mode)
     return options if splat.eps2d is None else replace(options, eps2d=splat.eps2d)
 

@@ -57,7 +57,7 @@ class GaussianScene(Renderable):
         gaussians = scene.at(0.5)
 
     Attributes:
-        gaussians: canonical Gaussians, or in the rest pose. In training the optimiser's leaf tensors.
+        gaussians: canonical or rest-pose Gaussians; in training, leaf tensors of the optimiser.
         colour: colour network; None: SH coefficients give the colours.
         masks: visibility over time, only with a deformation field; None: all are always visible.
     """
@@ -109,7 +109,7 @@ class GaussianScene(Renderable):
 
     @property
     def num_colour_values(self) -> int:
-        """Number of stored colour values: base colours, non-zero SH coefficients and the network."""
+        """Number of stored colour values: base colours, non-zero SH coefficients, the network."""
         sh = self.gaussians.sh
         with_rest = int((sh[:, 1:] != 0).flatten(1).any(1).sum())
         network = 0 if self.colour is None else self.colour.num_values

@@ -249,7 +249,7 @@ def opaque_box(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
 
 
 def keep_largest_components(mesh: Mesh) -> Mesh:
-    """Drop components with fewer than a fiftieth of the faces of the largest, and unused vertices."""
+    """Drop components with under a fiftieth of the faces of the largest, and unused vertices."""
     from trimesh.graph import connected_component_labels
 
     faces = mesh.faces

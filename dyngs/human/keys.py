@@ -32,12 +32,13 @@ class HumanModel(_OnTemplate):
 
     kind: Literal["human"] = Field(
         default="human",
-        description="avatar of one person: Gaussians on a body template, posed by its skeleton (`dyngs docs people`)",
+        description="avatar of one person: Gaussians on a body template, posed by its skeleton "
+        "(`dyngs docs people`)",
     )
     fit: bool = Field(
         default=True,
-        description="fit the template to the silhouettes before training, as `dyngs data fit` does; always done for a "
-        "capture without body parameters",
+        description="fit the template to the silhouettes before training, as `dyngs data fit` "
+        "does; always done for a capture without body parameters",
     )
     refine: bool = Field(
         default=True,
@@ -45,13 +46,13 @@ class HumanModel(_OnTemplate):
     )
     light: bool = Field(
         default=True,
-        description="learn light that is fixed in the world, so that colours depend on the surface normal (needs "
-        "colour.kind=sh and model.refine=true)",
+        description="learn light that is fixed in the world, so that colours depend on the "
+        "surface normal (needs colour.kind=sh and model.refine=true)",
     )
     fill_unseen: bool = Field(
         default=True,
-        description="after the last step, fill regions that few images show from the mirrored side of the body and "
-        "from neighbouring texels",
+        description="after the last step, fill regions that few images show from the mirrored "
+        "side of the body and from neighbouring texels",
     )
 
     @property
@@ -70,18 +71,20 @@ class HumanPredictorModel(_OnTemplate):
 
     kind: Literal["human_predictor"] = Field(
         default="human_predictor",
-        description="network that predicts avatars from a few images, after GHG (`dyngs docs people`)",
+        description="network that predicts avatars from a few images, after GHG ("
+        "`dyngs docs people`)",
     )
     scaffold_heights: tuple[float, ...] = Field(
         default=(0.0, 0.02, 0.04),
         min_length=1,
-        description="heights of the scaffolds above the skin, m; each has one Gaussian per texel (multi-scaffold of "
-        "GHG)",
+        description="heights of the scaffolds above the skin, m; each has one Gaussian per texel "
+        "(multi-scaffold of GHG)",
     )
     source_views: int = Field(
         default=3,
         ge=1,
-        description="largest number of input images per person; every other training example has fewer",
+        description="largest number of input images per person; every other training example has "
+        "fewer",
     )
     lr: Positive = Field(
         default=2e-3, description="peak learning rate of AdamW (one-cycle schedule)"

@@ -1,8 +1,8 @@
 """Loading of the compiled kernels for the CPU and CUDA, thread counts, and passing of tensors.
 
 There is one module per x86-64 level; the newest that the processor supports is imported.
-``DYNGS_ISA=v2|v3|v4`` selects an older one for tests. The CUDA module (docs/guides/gpu.md) is imported
-for the first tensor on a GPU.
+``DYNGS_ISA=v2|v3|v4`` selects an older one for tests. The CUDA module (docs/guides/gpu.md) is
+imported for the first tensor on a GPU.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def _gpu(index: int) -> torch.device:
 
 
 def active_isa() -> str:
-    """Return the instruction set of the loaded kernels: ``v2``, ``v3`` (AVX2) or ``v4`` (AVX-512)."""
+    """Return the instruction set of the kernels: ``v2``, ``v3`` (AVX2) or ``v4`` (AVX-512)."""
     return _ISA
 
 

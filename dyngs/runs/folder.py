@@ -1,5 +1,7 @@
-"""Contents of a run folder: configuration with a copy of the fitted body, checks before a new run,
-clean-up after killed processes, list of input files, and the coordinate frame set by ``dyngs edit``.
+"""Contents of a run folder.
+
+They are the configuration with a copy of the fitted body, the checks before a new run, the clean-up
+after killed processes, the list of input files, and the coordinate frame set by ``dyngs edit``.
 """
 
 from __future__ import annotations

@@ -127,10 +127,10 @@ class RadianceField(ABC):
 
     @abstractmethod
     def colours(self, points: Tensor, directions: Tensor, time: float) -> Tensor:
-        """Return colours (M, 3) at world ``points`` (M, 3) along unit view ``directions`` (M, 3)."""
+        """Return colours (M, 3) at world ``points`` (M, 3) along unit ``directions`` (M, 3)."""
 
     def may_be_occupied(self, points: Tensor) -> Tensor:
-        """Return a mask (M,) of world ``points`` (M, 3) whose density may not be 0; conservative."""
+        """Return a conservative mask (M,) of world ``points`` (M, 3) that may have density."""
         return torch.ones(len(points), dtype=torch.bool, device=points.device)
 
     def state(self) -> State:

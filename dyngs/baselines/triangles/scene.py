@@ -102,7 +102,7 @@ class Patches:
 
     @staticmethod
     def from_state(stored: Mapping[str, Tensor]) -> Patches:
-        """Return the triangles in a state. Raises KeyError or ValueError for inconsistent tensors."""
+        """Load triangles from a state. Raises KeyError or ValueError for inconsistent tensors."""
         texture = int(require_indices("texture", stored["texture"], (1,), MAX_TEXTURE + 1))
         points = require_tensor("points", stored["points"], (None, NUM_POINTS, 3))
         count = len(points)

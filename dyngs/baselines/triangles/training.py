@@ -213,7 +213,7 @@ class TriangleStatistics:
 
     @staticmethod
     def from_state(stored: Mapping[str, Tensor], count: int) -> TriangleStatistics:
-        """Return the statistics of ``count`` triangles in a state. Raises KeyError or ValueError."""
+        """Load statistics of ``count`` triangles from a state. Raises KeyError or ValueError."""
         found = TriangleStatistics(count)
         for name, x in found.tensors().items():
             x.copy_(require_tensor(name, stored[name], tuple(x.shape)))

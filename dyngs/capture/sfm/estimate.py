@@ -130,8 +130,8 @@ def _sampson(matrix: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.nd
 
 _NUM_FRAMES = 100
 _SMALL_ANGLE_DEG = 1.0
-# fraction of the pairs that a homography explains, above which the camera only rotated: 1 for images
-# of a camera that did, 0.72 for the fox, up to 0.2 for other captures
+# fraction of the pairs that a homography explains, above which the camera only rotated: 1 for
+# images of a rotating camera, 0.72 for the fox, up to 0.2 for other captures
 _FLAT = 0.95
 
 

@@ -1,5 +1,6 @@
-"""Captures of synthetic scenes in the layout of NeRF-synthetic and D-NeRF, with true tracks: a small
-ray tracer in NumPy, the scenes, and the captures.
+"""Synthetic captures in the layout of NeRF-synthetic and D-NeRF, with true tracks.
+
+This module holds a small ray tracer in NumPy, the scenes, and the captures.
 
 The ray tracer shares no formula with the rasterizer, so that its images are an independent ground
 truth. A scene is a tuple of primitives; a scene that moves is a function from time to such a tuple.
@@ -149,8 +150,8 @@ class Scene:
     """Primitives, z up, lit by a sky and one square lamp, whose size softens the shadows.
 
     Attributes:
-        occlusion_threshold: a neighbour that hides no more than this fraction of a point's sky hides nothing,
-            which leaves what is far from a moving thing exactly as it is.
+        occlusion_threshold: fraction of the sky of a point up to which a neighbour occludes
+            nothing, so that the shading of surfaces far from a moving object is constant.
         num_static: the first so many primitives stand still; None: all do.
     """
 
@@ -309,8 +310,8 @@ SceneName = Literal["spin", "room", "roll"]
 Rgb = tuple[float, float, float]
 
 _OCCLUSION_THRESHOLD = 0.05
-"""``Scene.occlusion_threshold`` of the moving scenes: a ball occludes the sky for what is nearer than about four
-radii."""
+"""``Scene.occlusion_threshold`` of the moving scenes: a ball occludes the sky for
+surfaces nearer than about four radii."""
 
 _PLATE_TOP = -0.34
 _ROOM_FLOOR = -0.50
@@ -560,7 +561,7 @@ def _tiles(count: int, light: Rgb, dark: Rgb) -> Paint:
 
 
 def _wallpaper(across: int, ground: Rgb, spot: Rgb) -> Paint:
-    """Rows of soft spots, every other row shifted, over the axis ``across`` and the vertical of a box."""
+    """Staggered rows of soft spots over the axis ``across`` and the vertical of a box."""
 
     def paint(local: np.ndarray) -> np.ndarray:
         row = (local[:, 2] + 1.0) * 9

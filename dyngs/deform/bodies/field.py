@@ -109,7 +109,7 @@ class BodyField(OuterField):
         return super().num_values + sum(x.numel() for x in vars(self.rest).values())
 
     def poses(self, time: float) -> tuple[Tensor, Tensor]:
-        """Return positions (B, 3) and quaternions (B, 4), of any norm, of the bodies at ``time``."""
+        """Return positions (B, 3) and unnormalised quaternions (B, 4) of bodies at ``time``."""
         motion, quats = spline_motion(
             [self.parameters["places"], self.parameters["quats"], None, None, None], time
         )

@@ -67,7 +67,7 @@ class FrameStack:
         return self.intrinsics[:, 0, 0]
 
     def project(self, which: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project ``points`` (n, 3) into the images ``which`` (n,): pixels (n, 2) and depths (n,)."""
+        """Project ``points`` (n, 3) into images ``which`` (n,): pixels (n, 2) and depths (n,)."""
         seen = np.einsum("nij,nj->ni", self.poses[which, :3, :3], points) + self.poses[which, :3, 3]
         depths = np.maximum(seen[:, 2], 1e-6)
         scale = self.intrinsics[which][:, [0, 1], [0, 1]]
@@ -126,7 +126,7 @@ class FrameStack:
 
 
 def _shifted_differences(images: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the smallest mean differences (T, H, W) over shifts of ``others`` by up to one pixel."""
+    """Return the least mean differences (T, H, W) over shifts of ``others`` by up to one pixel."""
     height, width = images.shape[1:3]
     around = np.pad(others, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge")
     smallest = np.full(images.shape[:3], np.inf, np.float32)
@@ -138,7 +138,7 @@ def _shifted_differences(images: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def order_moving_camera(views: Sequence[View]) -> list[int] | None:
-    """Return the temporal order of views of one moving camera; None if cameras or times coincide."""
+    """Return the temporal order of a moving camera's views; None if cameras or times coincide."""
     times = [view.time for view in views]
     if None in times or len(set(times)) < len(times) or static_cameras(views):
         return None
@@ -323,7 +323,7 @@ def clear_path_(maps: np.ndarray, frame_stack: FrameStack, path: Path) -> None:
 def _colors(
     frame_stack: FrameStack, which: np.ndarray, centers: np.ndarray, radius: np.ndarray
 ) -> np.ndarray:
-    """Return mean colours (n, 3) at the middle of balls with ``centers`` (n, 3) in ``which`` (n,)."""
+    """Return mean colours (n, 3) at the middle of balls at ``centers`` (n, 3) in ``which`` (n,)."""
     height, width = frame_stack.size
     pixels, depths = frame_stack.project(which, centers)
     grid = np.array([-0.5, 0.0, 0.5])
@@ -334,7 +334,7 @@ def _colors(
 
 
 def _colour_variation(frame_stack: FrameStack, discs: DiscContrast, path: Path) -> float:
-    """Return the standard deviation of colours along a path; large if it switches between objects."""
+    """Return the standard deviation of colours along a path; large if it switches objects."""
     which = np.nonzero(_contrast(frame_stack, discs, path.centers, path.radius) > MIN_PEAK)[0]
     if len(which) < 2:
         return 0.0
@@ -484,7 +484,7 @@ def _interpolate_chain(chain: list[tuple[PathSegments, int]], count: int) -> Pat
 
 
 def _transition_costs(first: PathSegments, later: PathSegments) -> np.ndarray:
-    """Return the costs (n, m) of transitions from each segment of ``first`` to each of ``later``."""
+    """Return the costs (n, m) of transitions from segments of ``first`` to those of ``later``."""
     apart = np.full((len(first.scores), len(later.scores)), np.inf)
     for t in range(first.middle, later.middle + 1):
         one = first.centers + (t - first.middle) * first.steps

@@ -460,7 +460,7 @@ class Bodies:
         return float(marked.sum()) < UNEXPLAINED_FRACTION * whole
 
     def build_field(self, inner_field: DeformationField) -> BodyField:
-        """Build the body field around ``inner_field``; the last moving Gaussians are the bodies'."""
+        """Build the body field around ``inner_field``; the bodies own the last moving Gaussians."""
         num_pieces = min(max(round(PIECES_PER_TIME * len(self.frame_stack)), 1), MAX_KEY_TIMES)
         basis = spline_basis(torch.from_numpy(self.frame_stack.times), num_pieces).numpy()
         splines = {

@@ -315,7 +315,7 @@ def _agreement(views: Sequence[ChangedRegion], points: np.ndarray) -> tuple[np.n
 
 
 def _largest_px(views: Sequence[ChangedRegion], centers: np.ndarray, side: float) -> float:
-    """Return the size of ``side`` in pixels at the median of ``centers``, median over the cameras."""
+    """Return the size of ``side`` in pixels at the median of ``centers``, median over cameras."""
     middle = np.median(centers, axis=0)
     depths = [max(float(view.pixels(middle[None])[1][0]), NEAR) for view in views]
     return float(

@@ -112,7 +112,7 @@ def improves_images(gaussians: Gaussians, time: float, clips: Sequence[FixedCame
 
 
 def hull_surface(track: Track) -> tuple[np.ndarray, float]:
-    """Return surface points (S, 3) of a tracked object, relative to its centre, and their spacing."""
+    """Return surface points (S, 3) of a tracked object, relative to its centre, and the spacing."""
     whole = [blob for blob in track.blobs if blob.radius >= COMPLETE_FRACTION * track.radius]
     side = float(np.median([blob.side for blob in whole]))
     cells: dict[tuple[int, ...], int] = {}
@@ -291,7 +291,7 @@ def find_tracks(clips: Sequence[FixedCameraClip], low: np.ndarray, high: np.ndar
 def _box(
     clips: Sequence[FixedCameraClip], static: Gaussians, extent: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners (3,) of a box around the static Gaussians and the cameras, with a margin."""
+    """Return the corners (3,) of a box around static Gaussians and cameras, with a margin."""
     center, half_size = (x.double().cpu().numpy() for x in box_of(static, extent))
     centers = np.concatenate([one.camera.centers.double().cpu().numpy() for one in clips])
     low = np.minimum(center - half_size, centers.min(0))

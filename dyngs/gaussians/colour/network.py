@@ -196,7 +196,7 @@ class ColourNetwork:
         time: float | None,
         rest_pose: RestPose | None,
     ) -> Tensor:
-        """Return colours (N, 3) seen from ``center``; rows where ``drawn`` (N,) is false are zero."""
+        """Return colours (N, 3) seen from ``center``; zero in rows not in ``drawn`` (N,)."""
         rows = torch.nonzero(drawn)[:, 0]
         dtype = gaussians.means.dtype
         moment = min(max(0.0 if time is None else time, 0.0), 1.0)

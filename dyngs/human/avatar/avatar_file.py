@@ -39,8 +39,8 @@ _LONGEST_NAME = 200
 def write_avatar(person: Renderable, model: ModelSection, info: CheckpointInfo, path: Path) -> Path:
     """Write an avatar in its rest pose, upright at its position in the capture; return ``path``.
 
-    The format is described in docs/reference/formats.md. Raises DyngsError: the scene is not an avatar, its
-    template is missing, or the file cannot be written.
+    The format is described in docs/reference/formats.md. Raises DyngsError: the scene is not an
+    avatar, its template is missing, or the file cannot be written.
     """
     # imported here because it needs scipy, which reading an avatar does not
     from dyngs.human.motion.placement import rest_clip
@@ -48,7 +48,8 @@ def write_avatar(person: Renderable, model: ModelSection, info: CheckpointInfo, 
     scene = as_human_scene(person)
     if scene is None or not isinstance(model, HumanModel):
         raise DyngsError(
-            f"--format avatar needs a run with model.kind=human, this one has model.kind={model.kind}"
+            "--format avatar needs a run with model.kind=human, this one has "
+            f"model.kind={model.kind}"
         )
     if path.suffix.lower() != SUFFIX:
         raise DyngsError(f"{path}: the name of an avatar file must end in {SUFFIX}")
@@ -95,8 +96,8 @@ def read_avatar(path: Path) -> tuple[HumanModel, HumanScene, CheckpointInfo]:
     """Read an avatar file; return its config section, the scene in rest pose, and the metadata.
 
     A template other than the free one must lie next to the file; it is read when a motion needs it.
-    Raises DyngsError: the file is missing, damaged, changed or no avatar, or the template next to it
-    is a different one.
+    Raises DyngsError: the file is missing, damaged, changed or no avatar, or the template next to
+    it is a different one.
     """
     header, tensors = read_tensors(path, _KIND, _ADVICE)
     try:

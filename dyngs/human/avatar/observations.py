@@ -217,8 +217,8 @@ def smooth_over_neighbours(
 ) -> Tensor:
     """Smooth ``values`` (N, C) over neighbours, keeping those with high ``confidence`` (N,).
 
-    Minimises sum_i c_i / (1 - c_i) (x_i - v_i)^2 + sum_ij w_ij (x_i - x_j)^2 by conjugate gradients,
-    over neighbours of the same body part; w falls with their distance.
+    Minimises sum_i c_i / (1 - c_i) (x_i - v_i)^2 + sum_ij w_ij (x_i - x_j)^2 by conjugate
+    gradients, over neighbours of the same body part; w falls with their distance.
     """
     from scipy.sparse import csr_array, diags_array
     from scipy.sparse.linalg import cg
@@ -302,7 +302,7 @@ def observed_colours(
 
 
 def project_points(world: Tensor, camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
-    """Project points (N, 3); return column and row (N, 2), px, depth (N,) and in-frame mask (N,)."""
+    """Project points (N, 3); return pixels (N, 2), x and y, depth (N,) and in-frame mask (N,)."""
     pose = camera.cam_from_world[0].to(world)
     intrinsics = camera.intrinsics[0].to(world)
     in_camera = world @ pose[:3, :3].T + pose[:3, 3]

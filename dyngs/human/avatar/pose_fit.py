@@ -103,8 +103,9 @@ LAST_RATES = (2.5e-3, 1.2e-3, 5e-4)
 TRANSLATION_RATE = 0.5  # learning rate of the translation, m, relative to that of rotations, rad
 BETAS = (0.9, 0.99)
 UPDATES_PER_WINDOW, MIN_LOSS_DECREASE, MAX_WINDOWS = 8, 0.02, 12
-"""After each window of updates (at least one per image), the learning rate is halved unless the mean
-loss decreased by this fraction. A level ends below its last rate or after this many windows."""
+"""After each window of updates (at least one per image), the learning rate is halved unless the
+mean loss decreased by this fraction. A level ends below its last rate or after this many
+windows."""
 
 
 def fit_poses_to_images(

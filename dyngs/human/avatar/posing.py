@@ -67,7 +67,7 @@ class Skeleton:
 
 @dataclass(frozen=True)
 class PoseBlendShapes:
-    """SMPL's pose blend shapes: pose-dependent offsets of rest-pose vertices (Loper et al. 2015)."""
+    """SMPL pose blend shapes: pose-dependent offsets of rest-pose vertices (Loper et al. 2015)."""
 
     # (9 (J - 1), 3 M) metres per unit of the rotation matrices minus the identity, without the root
     directions: Tensor

@@ -340,7 +340,8 @@ def require_avatar(gaussians: Gaussians, state: Mapping[str, Tensor]) -> None:
         )
     if parents.is_floating_point() or tuple(parents.shape) != (j,):
         raise ValueError(
-            f"'parents' must be integers of shape ({j},), got {parents.dtype} {tuple(parents.shape)}"
+            f"'parents' must be integers of shape ({j},), got {parents.dtype} "
+            f"{tuple(parents.shape)}"
         )
     check_tree(tuple(parents.tolist()))
     require_times("clip.times", state["clip.times"])

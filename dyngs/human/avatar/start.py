@@ -85,7 +85,8 @@ def initialize_human_scene(
         raise DyngsError(f"{capture.root}: {NO_BODY}")
     if sh_degree > 1:
         raise DyngsError(
-            f"model.sh_degree={sh_degree}: avatars support spherical harmonics of degree 0 and 1 only"
+            f"model.sh_degree={sh_degree}: avatars support spherical harmonics of degree 0 and 1 "
+            "only"
         )
     body_frames = capture.body["train"]
     body = load_template(model)

@@ -118,8 +118,8 @@ def posed_vertices(
 
 
 BONE_UNIT = 0.015
-"""Change of a bone vector per unit of a shape parameter, m; about one standard deviation among adults
-of the same height."""
+"""Change of a bone vector per unit of a shape parameter, m; about one standard deviation among
+adults of the same height."""
 PAIRED_JOINTS = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")
 MIDLINE_JOINTS = ("spine1", "spine2", "spine3", "neck", "head")
 NUM_BONE_SHAPES = 3 * len(PAIRED_JOINTS) + 2 * len(MIDLINE_JOINTS)

@@ -118,7 +118,7 @@ class _BodyFile:
     arrays: dict[str, np.ndarray]
 
     def numbers(self, key: str, *shape: int | None) -> np.ndarray:
-        """Return the finite float64 array at ``key``; None in ``shape`` matches any positive size."""
+        """Return the finite float64 array at ``key``; None in ``shape`` is any positive size."""
         value = self.arrays[key]
         if value.dtype.kind not in "biuf":
             raise DyngsError(f"{self.path}: '{key}' must hold numbers, not {value.dtype}")
@@ -148,7 +148,8 @@ class _BodyFile:
         count = table.shape[1]
         if count not in _NAMES:
             raise DyngsError(
-                f"{self.path}: 'kintree_table' has {count} joints; SMPL has 24, SMPL-H 52, SMPL-X 55"
+                f"{self.path}: 'kintree_table' has {count} joints; SMPL has 24, SMPL-H 52, SMPL-X "
+                "55"
             )
         above = table[0, 1:]
         rows = np.arange(count)
@@ -165,7 +166,7 @@ def _float(values: np.ndarray) -> Tensor:
 
 
 def _normalized(path: Path, weights: np.ndarray) -> np.ndarray:
-    """Return skinning weights with rows that sum to 1; half-precision errors of files are removed."""
+    """Return skinning weights with rows that sum to 1, despite half-precision errors of files."""
     sums = weights.sum(1)
     if (np.abs(sums - 1) > 1e-3).any() or weights.min() < -1e-6:
         raise DyngsError(f"{path}: skinning weights must be non-negative and sum to 1")

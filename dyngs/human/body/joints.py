@@ -1,4 +1,4 @@
-"""Names, parents and mirror images of the 55 SMPL-X joints, and their subsets in SMPL and SMPL-H."""
+"""Names, parents and mirror images of the 55 SMPL-X joints; their subsets in SMPL and SMPL-H."""
 
 from __future__ import annotations
 

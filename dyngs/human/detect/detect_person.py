@@ -32,8 +32,8 @@ from dyngs.io.outputs import make_once, record_source, require_new_folder
 from dyngs.io.write import cache_folder, temporary_folder_beside, write_image, write_text
 
 SWAP_COST = 0.04
-"""Cost of starting or ending a left-right swap, as key point motion in heights of the person. A limb
-mistaken for the other one in a few images moves more than this."""
+"""Cost of starting or ending a left-right swap, as key point motion in heights of the person. A
+limb mistaken for the other one in a few images moves more than this."""
 _PAIRS = {
     "all": ((1, 2), (3, 4), (5, 6), (7, 8), (9, 10), (11, 12), (13, 14), (15, 16)),
     "arms": ((7, 8), (9, 10)),
@@ -109,12 +109,13 @@ def capture_warnings(
     if count < len(images):
         num_missing = len(images) - count
         messages.append(
-            f"no person detected in {num_missing} of {format_count(len(images), 'image')}; skipping them"
+            f"no person detected in {num_missing} of {format_count(len(images), 'image')}; "
+            "skipping them"
         )
     if num_cut_off > 0.1 * count:
         messages.append(
-            f"feet are cut off or hidden in {num_cut_off} of {format_count(count, 'image')}; legs are "
-            "not reliable there"
+            f"feet are cut off or hidden in {num_cut_off} of {format_count(count, 'image')}; legs "
+            "are not reliable there"
         )
     if height < 120:
         messages.append(
@@ -198,8 +199,8 @@ def detect_person(
         else:
             log(
                 f"{prefix}{detector.name} detected the person in {len(heights)} of "
-                f"{format_count(len(person), 'image')}, {np.median(heights):.0f} px high; swapped left and "
-                f"right in {format_count(num_swapped, 'image')}"
+                f"{format_count(len(person), 'image')}, {np.median(heights):.0f} px high; swapped "
+                f"left and right in {format_count(num_swapped, 'image')}"
             )
             for warning in capture_warnings(images, person, is_single_camera=len(cameras) == 1):
                 log(f"warning: {prefix}{warning}")

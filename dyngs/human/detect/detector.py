@@ -38,7 +38,7 @@ class Detection:
 
     @cached_property
     def box(self) -> np.ndarray:
-        """Bounding box (left, top, right, bottom), px; zeros if nothing was detected confidently."""
+        """Bounding box (left, top, right, bottom), px; zeros without a confident detection."""
         person = self.mask > 127
         if person.any():
             rows, columns = (person.any(side).nonzero()[0] for side in (1, 0))
@@ -144,7 +144,8 @@ class MediaPipe:
             )
         if process.returncode:
             raise DyngsError(
-                f"{self._python}: MediaPipe failed with exit status {process.returncode}: {_last_line(process.stderr)}"
+                f"{self._python}: MediaPipe failed with exit status {process.returncode}: "
+                f"{_last_line(process.stderr)}"
             )
 
 

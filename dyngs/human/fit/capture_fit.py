@@ -90,7 +90,7 @@ class BodyDiscs:
 
 
 def body_discs(body: BodyTemplate, resolution: int) -> BodyDiscs:
-    """Create discs on the texels of a template in its mean shape, ``resolution`` texels per side."""
+    """Create discs on the texels of a mean-shape template, ``resolution`` texels per side."""
     texels = atlas_texels(body, resolution, body.vertices)
     discs, anchors = texel_gaussians(texels, [0.0], 0)
     # Standard deviations and depth below the skin (0.2), in texel sides, at which silhouettes have
@@ -266,8 +266,8 @@ shoulder   16 -13 -49   37 20 28
 elbow      -7 -40  16    5 29 13
 wrist      -4  -2  10    3 11  6
 """
-"""Pose statistics of CMU motion capture: mean axis-angle vectors and standard deviations, degrees, for
-joints of the left side and the middle; the right side is mirrored."""
+"""Pose statistics of CMU motion capture: mean axis-angle vectors and standard deviations, degrees,
+for joints of the left side and the middle; the right side is mirrored."""
 
 
 def usual_pose_statistics(joints: int) -> tuple[Tensor, Tensor]:
@@ -896,7 +896,8 @@ def fit_capture(
     """
     if not capture.has_alpha:
         raise DyngsError(
-            f"{capture.root}: the images have no silhouettes; add masks of the person (`dyngs docs people`)"
+            f"{capture.root}: the images have no silhouettes; add masks of the person ("
+            "`dyngs docs people`)"
         )
     capture = capture.replace(splits=assign_frame_numbers(capture.splits))
     views = capture.splits["train"]
@@ -1072,8 +1073,8 @@ def crop_views(
     # Even a person cut off on three sides covers less of the image border.
     if float(np.mean([_border_covered(images[i]) for i in indices])) > 0.6:
         raise DyngsError(
-            f"{capture.root}: the masks cover the image borders and seem to be inverted; the person must "
-            "be white (`dyngs docs people`)"
+            f"{capture.root}: the masks cover the image borders and seem to be inverted; the "
+            "person must be white (`dyngs docs people`)"
         )
     side = longest_box_side(images[i] for i in indices)
     if side < 8:

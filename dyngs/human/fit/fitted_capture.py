@@ -79,7 +79,7 @@ class FitInputs:
 
 @dataclass(frozen=True)
 class FittedCapture:
-    """Result of ``write_fitted_capture``: folder of the new capture, the fit, and a text summary."""
+    """Result of ``write_fitted_capture``: folder of the new capture, the fit, a text summary."""
 
     root: Path
     fit: CaptureFit
@@ -205,8 +205,8 @@ def _require_texels(model: HumanModel, body: BodyTemplate) -> None:
     """Raise DyngsError if the template has no UV map."""
     if body.uv is None:
         raise DyngsError(
-            f"{model.body}: has no UV map, which the fit needs; pass the .obj that has it (--uv FILE, "
-            "or model.uv=FILE in training)"
+            f"{model.body}: has no UV map, which the fit needs; pass the .obj that has it (--uv "
+            "FILE, or model.uv=FILE in training)"
         )
 
 
@@ -325,8 +325,8 @@ def read_person_capture(
 
 
 SILHOUETTE_SIDE_PX = 320
-"""Longest side of the compared silhouettes; an avatar trained on smaller images is compared at their
-size."""
+"""Longest side of the compared silhouettes; an avatar trained on smaller images is compared at
+their size."""
 
 
 @dataclass(frozen=True)
@@ -538,7 +538,8 @@ def ensure_fitted_body(
         path = data.body / _BODY
         if path.is_file() and not has_same_shape_space(load_template(model), read_body_file(path)):
             log(
-                f"body:    {data.body} was fitted with another template; using its poses, not its shape"
+                f"body:    {data.body} was fitted with another template; using its poses, not its "
+                "shape"
             )
         return data
     capture = read_capture(data)
@@ -554,8 +555,8 @@ def ensure_fitted_body(
     if not capture.has_alpha:
         if body_frames is None:
             raise DyngsError(
-                f"{data.root}: has neither silhouettes nor body parameters; add masks of the person "
-                "(`dyngs docs people`)"
+                f"{data.root}: has neither silhouettes nor body parameters; add masks of the "
+                "person (`dyngs docs people`)"
             )
         log(f"{data.root}: no silhouettes; using the body parameters of the capture")
         return data
@@ -566,8 +567,8 @@ def ensure_fitted_body(
 
     def run_fit() -> None:
         log(
-            f"body:    fitting {_template_label(model, body)} to the silhouettes (see `dyngs data fit`), "
-            f"result in {folder}"
+            f"body:    fitting {_template_label(model, body)} to the silhouettes (see "
+            f"`dyngs data fit`), result in {folder}"
         )
         keypoints = data.root / "keypoints"  # as OpenPose writes them
         inputs = FitInputs(keypoints if keypoints.is_dir() else None, template=model)

@@ -166,8 +166,8 @@ def read_joints(path: Path, capture: Capture) -> Joints3D:
                     joints[number] = _placed_joints(path, row)
     if not joints:
         raise DyngsError(
-            f"{path}: no joints for any frame of the capture; give frame numbers, or name SAM 3D Body "
-            "files like the images"
+            f"{path}: no joints for any frame of the capture; give frame numbers, or name SAM 3D "
+            "Body files like the images"
         )
     return joints
 
@@ -180,7 +180,8 @@ def _placed_joints(file: Path, values: object) -> Tensor:
     rows = as_float_array(values)
     if rows is None or rows.ndim != 2 or rows.shape[1] not in (3, 4) or len(rows) not in _IN_SPACE:
         raise DyngsError(
-            f"{file}: 'joints' must be (frames, joints, 3 or 4) numbers of {sorted(_IN_SPACE)} joints; export it again"
+            f"{file}: 'joints' must be (frames, joints, 3 or 4) numbers of {sorted(_IN_SPACE)} "
+            "joints; export it again"
         )
     placed = torch.zeros(len(JOINT_NAMES), 4, device="cpu")
     for name, row in zip(_IN_SPACE[len(rows)], rows, strict=False):

@@ -24,7 +24,7 @@ from dyngs.io.write import atomic_file
 _MODELS = {24: "smpl", 52: "smplh", 55: "smplx", 22: "the body of all three"}
 """Model names by number of joints."""
 _PARTS = {"root_orient": 1, "pose_body": 21, "pose_jaw": 1, "pose_eye": 2, "pose_hand": 30}
-"""AMASS keys and joint counts of the parts of 55 joints, in order; only the first two are required."""
+"""AMASS keys and joint counts of the parts of 55 joints, in order; the first two are required."""
 _NAMED = {"global_orient": 1, "body_pose": 21, "jaw_pose": 1, "leye_pose": 1, "reye_pose": 1} | {
     "left_hand_pose": 15,
     "right_hand_pose": 15,
@@ -155,7 +155,8 @@ def _poses(path: Path, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, str]:
     largest = np.linalg.norm(poses, axis=-1).max()
     if largest > 4 * np.pi:
         raise DyngsError(
-            f"{path}: a joint rotates by {largest:.0f} rad, more than two turns; convert degrees to radians"
+            f"{path}: a joint rotates by {largest:.0f} rad, more than two turns; convert degrees "
+            "to radians"
         )
     return poses, model
 
@@ -177,8 +178,8 @@ def _axis_angles(
         raise DyngsError(
             f"{path}: '{key}' must hold axis-angles or rotation matrices of "
             f"{' or '.join(map(str, sorted(counts)))} joints per frame, got shape "
-            f"{' x '.join(map(str, value.shape))}; convert quaternions and 6D rotations, save hands with "
-            "use_pca=False"
+            f"{' x '.join(map(str, value.shape))}; convert quaternions and 6D rotations, save "
+            "hands with use_pca=False"
         )
     return rotvecs
 

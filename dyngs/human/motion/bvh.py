@@ -65,8 +65,8 @@ def read_bvh(path: Path) -> SkeletonMotion:
                 channels[blocks[-1]] = [x.lower() for x in rest[1:]]
                 if rest[0] != str(len(rest) - 1) or not set(channels[blocks[-1]]) <= _CHANNELS:
                     raise DyngsError(
-                        f"{path}: CHANNELS of '{names[blocks[-1]]}' must be a count followed by that many "
-                        "names, Xposition ... Zrotation"
+                        f"{path}: CHANNELS of '{names[blocks[-1]]}' must be a count followed by "
+                        "that many names, Xposition ... Zrotation"
                     )
         if blocks != [-1] or not names:
             raise DyngsError(f"{path}: HIERARCHY is truncated or has no ROOT; export it again")
@@ -77,8 +77,8 @@ def read_bvh(path: Path) -> SkeletonMotion:
         values = np.loadtxt(io.StringIO(text[header.end() :]), comments=None, ndmin=2)
         if not values.size or values.size != frames * width:
             raise DyngsError(
-                f"{path}: expected {frames} frames of {width} numbers, got {values.size} numbers; the "
-                "file may be truncated"
+                f"{path}: expected {frames} frames of {width} numbers, got {values.size} numbers; "
+                "the file may be truncated"
             )
         values = values.reshape(frames, width)
         offset_array = np.array(offsets, dtype=np.float64)

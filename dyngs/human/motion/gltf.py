@@ -26,8 +26,8 @@ _VRM_THUMBS = {
 }
 """Names of the first two thumb bones in VRM 1, and their names in VRM 0 and for other fingers."""
 _Curve = tuple[np.ndarray, np.ndarray, str]
-"""Animation curve of a node property: K ascending times, s; K values (3 K for cubic splines); and the
-interpolation."""
+"""Animation curve of a node property: K ascending times, s; K values (3 K for cubic splines); and
+the interpolation."""
 _Curves = dict[tuple[int, str], _Curve]
 
 

@@ -72,8 +72,8 @@ def require_frame_count(path: Path, frames: float, joints: int) -> None:
     most = scaled_limit(MAX_JOINT_POSES)
     if not frames * count <= most:
         raise DyngsError(
-            f"{path}: {frames:.0f} frames of {count} joints exceed the limit of {most:,} joint poses; "
-            f"split the motion, or set {LIMITS_VARIABLE}=N to allow N times as many"
+            f"{path}: {frames:.0f} frames of {count} joints exceed the limit of {most:,} joint "
+            f"poses; split the motion, or set {LIMITS_VARIABLE}=N to allow N times as many"
         )
 
 
@@ -81,8 +81,8 @@ def require_frame_rate(path: Path, fps: float) -> float:
     """Return ``fps`` if it is a plausible frame rate; raise DyngsError otherwise."""
     if not 1e-3 <= fps <= 1e5:
         raise DyngsError(
-            f"{path}: frame rate {fps:g} is outside 0.001 to 100,000 frames per second; correct the frame "
-            "rate or frame time"
+            f"{path}: frame rate {fps:g} is outside 0.001 to 100,000 frames per second; correct "
+            "the frame rate or frame time"
         )
     return fps
 

@@ -1,4 +1,4 @@
-"""Placement of motions at the size, position and floor of a person, and reduction of foot sliding."""
+"""Placement of motions at the size, position and floor of a person; foot sliding reduction."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def place_like(
 def transform_clip(
     clip: MotionClip, rotation: Tensor, unit: float | Tensor, shift: Tensor, pelvis: Tensor
 ) -> MotionClip:
-    """Apply the similarity x -> unit * rotation x + shift; ``pelvis`` (3,) is in the rest pose, m."""
+    """Apply the similarity x -> unit * rotation x + shift; ``pelvis`` (3,): in rest pose, m."""
     roots = (rotation @ axis_angle_to_matrix(clip.poses[:, 0])).double().cpu().numpy()
     poses = clip.poses.clone()
     poses[:, 0] = torch.from_numpy(Rotation.from_matrix(roots).as_rotvec()).to(poses)
@@ -90,7 +90,7 @@ def rest_clip(like: MotionClip, joints: Tensor, parents: tuple[int, ...]) -> Mot
 
 
 def up_direction(clip: MotionClip) -> Tensor:
-    """Return the mean up direction (3,) of the pelvis, or the world axis within 30 degrees of it."""
+    """Return the mean up direction (3,) of the pelvis, or a world axis within 30 degrees of it."""
     mean = torch.nn.functional.normalize(
         axis_angle_to_matrix(clip.poses[:, 0])[:, :, 1].mean(0), dim=0
     )
@@ -204,8 +204,8 @@ def reduce_foot_sliding(
     )
     return (
         replace(clip, trans=clip.trans + shift - shift.mean(0)),
-        f"feet: floor contact in {int(touching.any(1).sum())} of {len(soles)} frames; sliding reduced "
-        f"from {before:.1f} to {after:.1f} mm per frame",
+        f"feet: floor contact in {int(touching.any(1).sum())} of {len(soles)} frames; sliding "
+        f"reduced from {before:.1f} to {after:.1f} mm per frame",
     )
 
 

@@ -30,8 +30,8 @@ from dyngs.human.motion.motion import (
 from dyngs.human.motion.placement import place_on_floor, shortest_arc_rotation
 
 _OURS = (
-    "pelvis spine1 spine2 spine3 neck head *_collar *_shoulder *_elbow *_wrist *_hip *_knee *_ankle *_foot "
-    "*_index# *_middle# *_pinky# *_ring# *_thumb# jaw *_eye"
+    "pelvis spine1 spine2 spine3 neck head *_collar *_shoulder *_elbow *_wrist *_hip *_knee "
+    "*_ankle *_foot *_index# *_middle# *_pinky# *_ring# *_thumb# jaw *_eye"
 )
 """SMPL-X joint names; ``*`` stands for left and right, ``#`` for 1, 2 and 3."""
 
@@ -75,8 +75,8 @@ Anny | l r | 1 2 3
 """Joint names of known rigs, in lower case and without punctuation.
 
 First line: name of the rig, values of ``*`` (left, right), values of ``#`` (``_``: empty). Then one
-name per word of ``_OURS``: ``a|b`` is a or b, ``-`` none; names at the end may be missing. Rocketbox
-avatars use Biped, VALID avatars Mixamo, cgspeed conversions of CMU either CMU or DAZ.
+name per word of ``_OURS``: ``a|b`` is a or b, ``-`` none; names at the end may be missing.
+Rocketbox avatars use Biped, VALID avatars Mixamo, cgspeed conversions of CMU either CMU or DAZ.
 """
 
 
@@ -141,8 +141,8 @@ def match_joints(path: Path, names: Sequence[str]) -> dict[str, int]:
     missing = [" or ".join(wanted[name]) for name in _NEEDED if name not in best]
     if missing:
         raise DyngsError(
-            f"{path}: unknown joint names; compared with the most similar rig, {best_rig}, it lacks "
-            f"{', '.join(missing)}; rename its joints (known rigs: {', '.join(RIGS)})"
+            f"{path}: unknown joint names; compared with the most similar rig, {best_rig}, it "
+            f"lacks {', '.join(missing)}; rename its joints (known rigs: {', '.join(RIGS)})"
         )
     return best
 
@@ -240,7 +240,8 @@ def _target_from_rest(source: SkeletonMotion, matched: dict[str, int]) -> np.nda
     length = float(np.linalg.norm(left))
     if length < 0.1:
         raise DyngsError(
-            f"{source.path}: left and right coincide in the rest pose; export it with a T-pose as rest pose"
+            f"{source.path}: left and right coincide in the rest pose; export it with a T-pose as "
+            "rest pose"
         )
     left = left / length
     if left @ _nearest_axis(left) > np.cos(np.radians(15)):

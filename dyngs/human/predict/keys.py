@@ -32,8 +32,8 @@ class KeypointNerfModel(FieldPredictorModel):
 
     kind: Literal["keypoint_nerf"] = Field(
         default="keypoint_nerf",
-        description="network that predicts a radiance field of a person from images and key points (KeypointNeRF; "
-        "`dyngs docs people`)",
+        description="network that predicts a radiance field of a person from images and key "
+        "points (KeypointNeRF; `dyngs docs people`)",
     )
 
 
@@ -42,8 +42,8 @@ class EgHumanNerfModel(FieldPredictorModel):
 
     kind: Literal["eg_human_nerf"] = Field(
         default="eg_human_nerf",
-        description="network that predicts a radiance field of a person with few samples around a body "
-        "(EG-HumanNeRF; `dyngs docs people`)",
+        description="network that predicts a radiance field of a person with few samples around a "
+        "body (EG-HumanNeRF; `dyngs docs people`)",
     )
 
 

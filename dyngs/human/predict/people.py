@@ -214,8 +214,8 @@ class BodyBoundaries:
         inner = self._body - EROSION * self._normals
         entry = depths(outer, self._faces, camera)
         exit_depth = depths(outer, self._faces, camera, last=True)
-        # Parts thinner than the erosion turn inside out, so that faces of the eroded mesh may lie in
-        # front of the body; depths before the body are therefore raised.
+        # Parts thinner than the erosion turn inside out, so that faces of the eroded mesh may lie
+        # in front of the body; depths before the body are therefore raised.
         eroded = depths(inner, self._faces, camera, front_faces=True)
         body_depth = self.depth(camera)
         last = torch.minimum(torch.maximum(eroded, body_depth + EROSION / 2), exit_depth)

@@ -741,7 +741,8 @@ def write_people(
     least = min(options.people, options.size, options.cameras, options.frames, options.seed + 1)
     if least < 1 or options.people > _MAX_PEOPLE:
         raise DyngsError(
-            f"synthetic people need size, cameras and frames >= 1, seed >= 0, and 1 to {_MAX_PEOPLE:,} people"
+            "synthetic people need size, cameras and frames >= 1, seed >= 0, and 1 to "
+            f"{_MAX_PEOPLE:,} people"
         )
     mark = out / PEOPLE_FILE
     made_with = {name: value for name, value in asdict(options).items() if name != "people"}
@@ -751,7 +752,8 @@ def write_people(
         write_text(mark, text)
     elif mark.read_text(encoding="utf-8", errors="replace") != text:
         raise DyngsError(
-            f"{out}: holds people with other options ({PEOPLE_FILE}); use a new folder or the same options"
+            f"{out}: holds people with other options ({PEOPLE_FILE}); use a new folder or the "
+            "same options"
         )
     for number in range(options.people):
         person = out / f"s{number // PEOPLE_PER_FOLDER:04d}" / f"p{number:06d}"

@@ -141,9 +141,9 @@ def write_splats(
     """Write a file of Gaussians, into which any 3D filter is fused, atomically; its suffix names
     the format.
 
-    ``sh_degree``: of the harmonics in the file: higher ones are left out, missing ones zero; None:
-    up to what the format holds. Raises DyngsError: an unknown suffix, no Gaussians, non-finite values, or a degree
-    that the format does not hold.
+    ``sh_degree``: SH degree of the file; higher coefficients are omitted, missing ones are zero;
+    None: up to the limit of the format. Raises DyngsError: an unknown suffix, no Gaussians,
+    non-finite values, or a degree that the format does not support.
     """
     path = Path(path)
     own = format_for_path(path)

@@ -190,8 +190,8 @@ def rotate_harmonics(sh: Tensor, matrix: Tensor) -> Tensor:
     """Return harmonics (N, K, 3) whose colour towards ``matrix @ d`` is that of ``sh`` towards d.
 
     A rotation mixes the harmonics of one degree only among themselves; how, is solved for from
-    their values in many directions. ``sh``: (N, K, 3), degree 0 to 4. ``matrix``: (3, 3) rotation or
-    reflection, float64.
+    their values in many directions. ``sh``: (N, K, 3), degree 0 to 4. ``matrix``: (3, 3) rotation
+    or reflection, float64.
     """
     degree = round(sh.shape[1] ** 0.5) - 1
     if degree == 0:

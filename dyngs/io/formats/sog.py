@@ -46,7 +46,7 @@ _HALF_ROOT = float(np.sqrt(0.5))
 
 
 def read_sog(path: Path) -> SplatFile:
-    """Read a .sog of version 2. Raises ValueError: damaged; DyngsError: it needs too much memory."""
+    """Read a .sog of version 2. Raises ValueError: damaged; DyngsError: too much memory needed."""
     with zipfile.ZipFile(path) as archive:
         return _read(path, archive)
 

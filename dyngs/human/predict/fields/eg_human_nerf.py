@@ -153,9 +153,12 @@ class EgHumanNerf(FieldNetwork):
             return points, features.sample(points), height.clamp(-PARAMS.limit, PARAMS.limit)
 
         def hints(pixel_features: PointFeatures, prior: Tensor, at: Tensor) -> Tensor:
-            """Return input features (R K, HINTS): distances to the body (signed, absolute, along the
-            ray), position in the interval, closest approach of the ray to the body, and alpha of
-            the ray and of the sample."""
+            """Return input features (R K, HINTS) of ray samples.
+
+            They are the distances to the body (signed, absolute, along the ray), the position in
+            the interval, the closest approach of the ray to the body, and alpha of the ray and of
+            the sample.
+            """
             along = (body - at).clamp(-DILATION, DILATION) / DILATION
             place = (at - first) / (last - first)
             limit = PARAMS.limit
@@ -210,7 +213,7 @@ class EgHumanNerf(FieldNetwork):
         return colour, through[:, -1:], distance, [(at, signed), (near, closer)]
 
     def penalty(self, picture: FieldPicture, image: Image, scale: float) -> Tensor:
-        """Return the mean signed ray distance error; rays hit the person where alpha is above 0.5."""
+        """Return the mean signed ray distance error; rays hit the person if alpha exceeds 0.5."""
         total = picture.colour.new_zeros(())
         assert image.depth is not None
         assert image.alpha is not None

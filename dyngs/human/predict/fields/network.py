@@ -206,5 +206,5 @@ class FieldNetwork(nn.Module, ABC):
         """
 
     def penalty(self, picture: FieldPicture, image: Image, scale: float) -> Tensor:
-        """Return loss terms besides the image error; ``scale`` is the depth map's units per metre."""
+        """Return loss terms besides the image error; ``scale``: depth map units per metre."""
         return picture.colour.new_zeros(())

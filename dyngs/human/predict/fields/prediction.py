@@ -180,8 +180,8 @@ class PredictedModel(Model[PredictedField]):
 
     def _untrained(self) -> DyngsError:
         return DyngsError(
-            f"{self._run_dir}: predicted fields cannot be trained; predict from other views, or train "
-            "`ngp` or `human` on the capture"
+            f"{self._run_dir}: predicted fields cannot be trained; predict from other views, or "
+            "train `ngp` or `human` on the capture"
         )
 
     def draw(
@@ -230,8 +230,8 @@ class FieldPredictor(Predictor[FieldNetwork]):
             angle_between_views(first, view) < MIN_ANGLE for view in chosen
         ):
             raise DyngsError(
-                f"{self.name}: needs at least two views of one time step from different directions; "
-                "pass --views A,B"
+                f"{self.name}: needs at least two views of one time step from different "
+                "directions; pass --views A,B"
             )
         body, scale = self._person.body_in(first)
         sources = crop_source_images([self._person.images[i] for i in views], scale)
@@ -305,8 +305,8 @@ class FieldLearner(Learner[FieldNetwork]):
             raise DyngsError(f"{data.root}: training needs a time step with three or more views")
         if self.network.needs_depth and any(view.depth_path is None for view in captured.views):
             raise DyngsError(
-                f"{data.root}: no depth maps, which {self.config.model.kind} is trained on; `dyngs data "
-                "synth people` writes them"
+                f"{data.root}: no depth maps, which {self.config.model.kind} is trained on; "
+                "`dyngs data synth people` writes them"
             )
         return captured
 

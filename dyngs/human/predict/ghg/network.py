@@ -464,12 +464,12 @@ SQUARED_WEIGHT = 1.0  # of the mean squared error in the loss, which emphasises 
 MEAN_COLOUR_VIEWS = 8  # images per person for the mean colours
 ADAPTATION_STEPS = 10  # training steps on the input images before a prediction
 ADAPTATION_RATE = 1e-4
-"""Initial learning rate of Adam per input image; it falls linearly. More images allow a higher rate."""
+"""Initial learning rate of Adam per input image, falling linearly; more images allow more."""
 _MIN_OPACITY = 0.02  # of predicted Gaussians, as in the preset ``human``
 
 
 class PersonPredictor(Predictor[AtlasNetwork]):
-    """Predicts an avatar of one person, optionally after training on the input images (``adapt``)."""
+    """Predictor of avatars, optionally trained on the input images of a person (``adapt``)."""
 
     def __init__(
         self,

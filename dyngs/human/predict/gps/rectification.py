@@ -47,8 +47,9 @@ def neighbour_pairs(
     alone = set(chosen) - {i for pair in pairs for i in pair}
     if alone:
         raise DyngsError(
-            f"{name}: {views[min(alone)].name} has no neighbouring view for stereo; give two or more views "
-            f"of one time step, side by side, {MIN_ANGLE:g} to {MAX_ANGLE:g} degrees apart"
+            f"{name}: {views[min(alone)].name} has no neighbouring view for stereo; give two or "
+            f"more views of one time step, side by side, {MIN_ANGLE:g} to {MAX_ANGLE:g} degrees "
+            "apart"
         )
     return pairs
 
@@ -253,7 +254,8 @@ def _at_size(image: Image, person_px: int) -> Image:
     """Downscale the image by an integer if the person is at least twice ``person_px`` high."""
     if image.alpha is None or int((image.alpha > MIN_ALPHA).sum()) < _MIN_PIXELS:
         raise DyngsError(
-            f"{image.name}: no silhouette of a person; add alpha or a mask of the person, see `dyngs docs people`"
+            f"{image.name}: no silhouette of a person; add alpha or a mask of the person, see "
+            "`dyngs docs people`"
         )
     rows = (image.alpha > MIN_ALPHA).any(1).nonzero()
     return image.downscaled(max(1, int(rows.max() - rows.min() + 1) // person_px))

@@ -75,13 +75,13 @@ QUARTER = 4
 NUM_OFFSETS = 48
 """Candidate offsets, evenly spaced in ``RANGE``."""
 RANGE = (-0.22, 0.28)
-"""Range of offsets, relative to the disparity of the person's middle: 0.56 m behind to 0.44 m in front
-of it at a distance of 2 m."""
+"""Range of offsets, relative to the disparity of the person's middle: 0.56 m behind to 0.44 m in
+front of it at a distance of 2 m."""
 _COLOUR, _BESIDE = 300.0, 5.0  # factors of colour difference and background in the offset logits
 _SHARPNESS = 2.0  # of upsampling weights, which fall with the squared distance
 _NEVER = -1e4  # logit of excluded values
 SIDES = (1.0, -1.0)
-"""Direction in which a match moves with its offset: left in the right view, right in the left one."""
+"""Direction of a match's motion with its offset: left in the right view, right in the left."""
 
 
 class StereoNetwork(nn.Module):
@@ -134,7 +134,7 @@ def _block(before: int, width: int, stride: int = 1) -> nn.Module:
 
 
 def candidate_offsets(shift: Tensor) -> list[int]:
-    """Return the D candidate offsets, even px, for the disparity ``shift`` of the person's middle."""
+    """Return D candidate offsets, even px, for the disparity ``shift`` of the person's middle."""
     return [
         2 * round(float(x))
         for x in (shift / 2) * torch.linspace(*RANGE, NUM_OFFSETS, device=shift.device)
@@ -341,7 +341,8 @@ class GpsPredictor(Predictor[GpsNetwork]):
         gaussians = Gaussians.joined(surfaces)
         if not len(gaussians):
             raise DyngsError(
-                f"{self.name}: no surface inside the silhouettes; check the masks and the calibration"
+                f"{self.name}: no surface inside the silhouettes; check the masks and the "
+                "calibration"
             )
         return StaticScene(
             gaussians=gaussians,
@@ -418,12 +419,13 @@ def _open_person(data: DataConfig) -> tuple[ImageLoader, list[tuple[tuple[int, i
     pairs = training_pairs(views)
     if not pairs:
         raise DyngsError(
-            f"{data.root}: no view lies between two others at most {MAX_ANGLE:g} degrees apart, as training "
-            "needs; use a ring of 16 or more cameras"
+            f"{data.root}: no view lies between two others at most {MAX_ANGLE:g} degrees apart, "
+            "as training needs; use a ring of 16 or more cameras"
         )
     if any(view.depth_path is None for view in views):
         raise DyngsError(
-            f"{data.root}: no depth maps, which training needs; `dyngs data synth people` writes them"
+            f"{data.root}: no depth maps, which training needs; `dyngs data synth people` writes "
+            "them"
         )
     return ImageLoader(views, data, with_maps=True), pairs
 
