@@ -1,5 +1,5 @@
-"""Storage precision of a trained scene, measured on images of its capture, and the coarsest file
-that will do."""
+"""Search for the coarsest quantisation of a trained scene whose error on images of its capture
+stays below a limit."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ CLOSE = 0.8  # fraction of the allowed error from which the search ends
 FIRST_STEP = 2.0**-6  # first step as a fraction of the mean magnitude of the values
 WIDEST_JUMP = 32.0
 OUTLYING, USUAL_FRACTION = 64.0, 0.95
-"""Values so many times as large as this fraction of those that are not 0 are outliers: steps are
-chosen without them."""
+"""Outliers, which are ignored when steps are chosen: values above this multiple of this quantile of
+the nonzero values."""
 MOST_VISIBLE = 0.9  # quantile of visibility above which Gaussians are stored most finely
 ASSUMED_STEPS = {
     "quats": 2**-8,

@@ -427,7 +427,7 @@ class RigidBody:
 
 @dataclass(frozen=True)
 class Bodies:
-    """Rigid bodies and the images that they were found in."""
+    """Rigid bodies and the images in which they were detected."""
 
     frame_stack: FrameStack
     bodies: tuple[RigidBody, ...]
@@ -441,9 +441,7 @@ class Bodies:
         turns = [Rotation.from_matrix(body.rotation.rotations) for body in self.bodies]
         turns = [np.degrees((turn[1:] * turn[:-1].inv()).magnitude()).sum() for turn in turns]
         things = "1 rigid body" if len(turns) == 1 else f"{len(turns)} rigid bodies"
-        clip = (
-            "followed at all times at once" if self.explains_all_motion else "other parts move, too"
-        )
+        clip = "nothing else moves" if self.explains_all_motion else "other parts move, too"
         angles = ", ".join(f"{turn:.0f}" for turn in turns)
         return f"found {things} rotating by {angles} degrees; {clip}"
 
