@@ -123,15 +123,20 @@ def read_same_capture(folder: Path, resumed: Checkpoint) -> Stage:
     return stage
 
 
-def run_pilots(plan: RunPlan) -> tuple[RunPlan, None]:
-    """Read the capture, find initial points, and resolve ``auto`` settings by pilot runs."""
-    config = plan.resolved
-    if capability(config.model, PredictsScenes) is not None:
-        return plan, None
-    config, choices, capture = resolve_auto_settings(
-        config, require_images(read_capture(config.data))
-    )
-    return replace(plan, resolved=config, capture=capture, choices=tuple(choices)), None
+def run_pilots(report: ProgressCallback) -> Stage:
+    """Return the stage that reads the capture, finds initial points, and resolves ``auto`` settings
+    by pilot runs."""
+
+    def stage(plan: RunPlan) -> tuple[RunPlan, None]:
+        config = plan.resolved
+        if capability(config.model, PredictsScenes) is not None:
+            return plan, None
+        config, choices, capture = resolve_auto_settings(
+            config, require_images(read_capture(config.data)), report
+        )
+        return replace(plan, resolved=config, capture=capture, choices=tuple(choices)), None
+
+    return stage
 
 
 def find_first_gaussians(plan: RunPlan) -> tuple[RunPlan, str | None]:

@@ -36,7 +36,14 @@ human, human_predictor. `dyngs config static` lists all keys.
 """
 _LOGGING = tuple(
     f"train.{name}"
-    for name in ("save_minutes", "save_every", "eval_every", "log_every", "tensorboard")
+    for name in (
+        "save_minutes",
+        "save_every",
+        "eval_every",
+        "eval_psnr",
+        "log_every",
+        "tensorboard",
+    )
 )
 _FOR_THIS_CALL = ("run.threads", "run.device", "run.deterministic", "data.cache_mb", *_LOGGING)
 """Keys that do not change the result of a run."""
@@ -99,15 +106,15 @@ def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> i
         print(line)
     word = quote_path(folder)
     print(f"trained: {folder}")
-    from dyngs.models.kind import PredictsScenes, capability
+    from dyngs.models.kind import HasGaussians, PredictsScenes, capability
 
     if capability(config.model, PredictsScenes) is not None:
         print(f"next:    dyngs predict {word} CAPTURE --out RUN")
     else:
-        print(
-            f"next:    dyngs eval {word}\n         dyngs render {word} --out "
-            f"{quote_path(folder / 'images')}"
-        )
+        print(f"next:    dyngs view {word}")
+        if capability(config.model, HasGaussians) is not None:
+            print(f"         dyngs export {word} --format html")
+        print(f"         dyngs eval {word}")
     return 0
 
 

@@ -31,12 +31,13 @@ from dyngs.config.io import (
 from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.deform.scene import DynamicScene
+from dyngs.evaluate.report import evaluate_run
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.training import losses
 from dyngs.training.clock import SaveTimer
-from dyngs.training.events import Event, StepDone
+from dyngs.training.events import Evaluated, Event, StepDone
 from dyngs.training.trainer import StepReport, Trainer
 
 # Everything happens within a few steps: changes each third step, a reset at step 5, new SH degrees.
@@ -294,6 +295,20 @@ def test_checkpoints_and_scores_come_when_asked(capture: Path, tmp_path: Path) -
         (9, False),
     ]
     assert json.loads((folder / "metrics.json").read_text())["num_views"] == 1
+
+
+def test_held_out_psnr_leaves_the_result_as_it_is(capture: Path, tmp_path: Path) -> None:
+    events = list[Event]()
+    folders = []
+    for scored in (True, False):
+        options = TrainConfig(steps=9, eval_psnr=scored)
+        config = _config(capture, tmp_path / str(scored), train=options)
+        folders.append(train(config, listeners=[events.append]))
+    (scores,) = (event for event in events if isinstance(event, Evaluated))
+    assert (scores.step, scores.num_views, scores.ssim) == (9, 1, None)
+    assert scores.psnr == pytest.approx(evaluate_run(folders[0]).psnr, abs=1e-6)
+    first, second = (checkpoint_paths(folder)[-1].read_bytes() for folder in folders)
+    assert first == second
 
 
 @pytest.fixture

@@ -85,6 +85,11 @@ class TrainConfig(Section):
     eval_every: int = Field(
         default=0, ge=0, description="steps between evaluations on the test split; 0: none"
     )
+    eval_psnr: bool = Field(
+        default=True,
+        description="whether to measure the PSNR of test views at the end of training and, unless "
+        "train.minutes is set, every train.save_minutes; takes at most 2 % of the training time",
+    )
     tensorboard: bool = Field(
         default=False,
         description="whether to log to RUN/tensorboard (pip install 'dyngs[tensorboard]')",
