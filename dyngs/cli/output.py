@@ -109,11 +109,13 @@ class Bars:
         if self._progress is None:
             self._progress = _rich_bars(self._stream)
             self._progress.start()
-        if what not in self._tasks:
-            self._tasks[what] = self._progress.add_task(what, total=1.0, count="", left="")
         shown = "" if left is None else f"{format_duration(left)} left"
         self._progress.text = text
-        self._progress.update(self._tasks[what], completed=fraction, count=count, left=shown)
+        fields: dict[str, Any] = {"completed": fraction, "count": count, "left": shown}
+        if what in self._tasks:
+            self._progress.update(self._tasks[what], **fields)
+        else:
+            self._tasks[what] = self._progress.add_task(what, total=1.0, **fields)
 
     def log(self, line: str) -> None:
         """Print ``line`` above the bars."""
