@@ -42,15 +42,14 @@ class UserLoop:
 
     def render(self, packed: bool) -> tuple[Tensor, dict[str, Any]]:
         p = self.params
-        poses, intrinsics = self.scene.cam_from_world.float(), self.scene.intrinsics.float()
         image, _, info = gsplat.rasterization(
             p["means"],
             p["quats"],
             p["scales"].exp(),
             p["opacities"].sigmoid(),
             p["sh0"],
-            poses,
-            intrinsics,
+            self.scene.cam_from_world.float(),
+            self.scene.intrinsics.float(),
             self.scene.width,
             self.scene.height,
             sh_degree=0,
