@@ -39,7 +39,7 @@ with times, and `human` for a capture of a person. `dyngs config static` lists a
 """
 _LOGGING = tuple(
     f"train.{name}"
-    for name in ("save_minutes", "save_every", "eval_every", "log_every", "tensorboard")
+    for name in ("save_minutes", "save_every", "eval_every", "log_every", "image_every", "loggers")
 )
 _FOR_THIS_CALL = ("run.threads", "run.device", "run.deterministic", "data.cache_mb", *_LOGGING)
 """Keys that do not change the result of a run."""
