@@ -130,6 +130,13 @@ class ProgressImage:
 
 
 @dataclass(frozen=True)
+class Paused:
+    """Training was paused for ``seconds``, which do not count as training."""
+
+    seconds: float
+
+
+@dataclass(frozen=True)
 class Message:
     """A line of text for the user."""
 
@@ -144,6 +151,7 @@ Event = (
     | Saved
     | Evaluated
     | ProgressImage
+    | Paused
     | Message
 )
 Listener = Callable[[Event], None]
