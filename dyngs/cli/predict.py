@@ -35,7 +35,9 @@ def add_parser(commands: Commands) -> None:
         "Writes a run folder.",
         _EPILOG,
     )
-    about = "run folder or weights file of a network, or gps or human_predictor, which come with dyngs"
+    about = (
+        "run folder or weights file of a network, or gps or human_predictor, which come with dyngs"
+    )
     parser.add_argument("network", type=input_path, metavar="NET", help=about)
     parser.add_argument("capture", type=input_path, metavar="CAPTURE", help="capture of a person")
     parser.add_argument(
