@@ -9,9 +9,9 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from dyngs.api.compat import rasterization
     from dyngs.api.load import load, read_capture
     from dyngs.api.train import train
+    from dyngs.compat.rendering import rasterization
     from dyngs.config.io import load_config
     from dyngs.core.camera import Cameras
     from dyngs.core.errors import DyngsError
@@ -47,7 +47,7 @@ _MODULES = {
     "contributions": "dyngs.gaussians.rendering",
     "load": "dyngs.api.load",
     "load_config": "dyngs.config.io",
-    "rasterization": "dyngs.api.compat",
+    "rasterization": "dyngs.compat.rendering",
     "read_capture": "dyngs.api.load",
     "render": "dyngs.gaussians.rendering",
     "train": "dyngs.api.train",

@@ -11,7 +11,15 @@ from dyngs.cli.output import Bars, format_duration, is_terminal
 from dyngs.core.errors import escape_control_characters, format_count
 from dyngs.models.schedule import image_divisor
 from dyngs.training.clock import TimeForecast
-from dyngs.training.events import Evaluated, Event, Message, Started, StepDone, TotalChanged
+from dyngs.training.events import (
+    Evaluated,
+    Event,
+    Message,
+    Paused,
+    Started,
+    StepDone,
+    TotalChanged,
+)
 
 PLAIN_LINES = 10
 """Number of lines that a run prints without a terminal, if it takes less than ``MOST_SECONDS``."""
@@ -27,6 +35,9 @@ class TrainingProgress:
 
     Args:
         stream: output stream; None: standard error.
+
+    Attributes:
+        figures: the latest displayed numbers by name.
     """
 
     def __init__(self, stream: IO[str] | None = None) -> None:
@@ -37,6 +48,7 @@ class TrainingProgress:
         self._start = self._total = self._next_line = 0
         self._since = self._last_line = 0.0
         self._fraction = 0.0
+        self.figures: dict[str, str] = {}
 
     def __call__(self, event: Event) -> None:
         match event:
@@ -48,12 +60,13 @@ class TrainingProgress:
                 self._show(event)
             case TotalChanged():
                 self._total = event.total
-            case Evaluated():
+            case Evaluated() | Paused():
                 self._since += event.seconds
                 if self._forecast is not None:
                     self._forecast.exclude(event.seconds)
-                views = format_count(event.num_views, f"{event.split} view")
-                self.log(f"step {event.step}: PSNR {event.psnr:.2f} dB on {views}")
+                if isinstance(event, Evaluated):
+                    views = format_count(event.num_views, f"{event.split} view")
+                    self.log(f"step {event.step}: PSNR {event.psnr:.2f} dB on {views}")
             case Message():
                 self.log(event.text)
 
@@ -74,9 +87,6 @@ class TrainingProgress:
             left = self._forecast.seconds(config, self._total)
         if event.is_last:
             left = None
-        is_due = step >= self._next_line or now - self._last_line >= MOST_SECONDS
-        if not (self._is_terminal or is_due or event.is_last):
-            return
         rate = (step - self._start) / max(now - self._since, 1e-9)
         psnr = "-" if event.mean_psnr is None else f"{event.mean_psnr:.2f}"
         gaussians = f"{count:,} Gaussians " if count else ""
@@ -85,14 +95,22 @@ class TrainingProgress:
         is_estimated = config.train.minutes is not None and not event.is_last
         steps = f"{step}" if is_estimated else f"{step}/{self._total}"
         self._fraction = max(self._fraction, step / self._total)
+        self.figures = {
+            "step": f"{steps} ({self._fraction:.0%})",
+            "PSNR": f"{psnr} dB",
+            "Gaussians": f"{count:,}",
+            "steps/s": f"{rate:.1f}",
+            "time left": "-" if left is None else format_duration(left),
+        }
+        is_due = step >= self._next_line or now - self._last_line >= MOST_SECONDS
         if self._is_terminal:
             with suppress(OSError):
                 self._bars.update("training", self._fraction, steps, left, text)
-            return
-        estimate = "" if left is None else f" {format_duration(left)} left"
-        self.log(f"step {steps} ({self._fraction:.0%}) {text}{estimate}")
-        self._next_line = step + max(1, self._total // PLAIN_LINES)
-        self._last_line = now
+        elif is_due or event.is_last:
+            estimate = "" if left is None else f" {format_duration(left)} left"
+            self.log(f"step {self.figures['step']} {text}{estimate}")
+            self._next_line = step + max(1, self._total // PLAIN_LINES)
+            self._last_line = now
 
     def log(self, line: str) -> None:
         """Show ``line`` above the progress bar."""

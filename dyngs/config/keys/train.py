@@ -90,9 +90,16 @@ class TrainConfig(Section):
         description="whether to measure the PSNR of test views at the end of training and, unless "
         "train.minutes is set, every train.save_minutes; takes at most 2 % of the training time",
     )
-    tensorboard: bool = Field(
-        default=False,
-        description="whether to log to RUN/tensorboard (pip install 'dyngs[tensorboard]')",
+    image_every: int = Field(
+        default=0,
+        ge=0,
+        description="steps between images of the first test view beside its photo, written to "
+        "RUN/progress; 0: none",
+    )
+    loggers: tuple[Literal["tensorboard", "wandb", "rerun"], ...] = Field(
+        default=(),
+        description="programs that show scalars and images of the training; each needs its extra, "
+        "such as pip install 'dyngs[wandb]'",
     )
 
     @field_validator("alpha_weight", mode="before")
