@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from dyngs.api.budget.count import CountLimit
 from dyngs.api.budget.size import has_file, write_limited_file
 from dyngs.api.budget.time import TimeLimit, fit_minutes
@@ -35,7 +37,9 @@ from dyngs.core.errors import DyngsError, format_count, log_info, log_warning, q
 from dyngs.data.loader import ImageLoader
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.outputs import lock_folder
+from dyngs.io.write import to_uint8
 from dyngs.models.kind import PredictsScenes, capability
+from dyngs.models.views import background_colour
 from dyngs.ops.device import deterministic, keep_freed_memory, select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import write_record
@@ -67,11 +71,13 @@ from dyngs.training.events import (
     Event,
     Listener,
     Message,
+    ProgressImage,
     Saved,
     StepDone,
     TotalChanged,
 )
 from dyngs.training.limits import validate_limits
+from dyngs.training.loggers import open_loggers, require_loggers
 from dyngs.training.loop import Editor, Interrupts, Loop, Trainable
 from dyngs.training.memory import memory_forecasts
 from dyngs.training.new_trainer import build_trainer
@@ -126,6 +132,7 @@ def train(
     processes = processes or Processes()
     plan = run_stages(RunPlan(config, config), [share_views(processes)])
     validate_limits(plan.resolved)
+    require_loggers(plan.resolved)
     device = select_device(config.run.device)
     if resume_from is None:
         if not (folder / RESOLVED_NAME).is_file():
@@ -280,7 +287,7 @@ class _Run:
                 self.folder / LOG_NAME,
                 done,
                 every=options.log_every,
-                tensorboard=options.tensorboard,
+                loggers=open_loggers(self.config, self.folder, done),
             ) as log,
             Interrupts() as interrupts,
         ):
@@ -310,6 +317,8 @@ class _Run:
             case StepDone():
                 options = self.config.train
                 step = event.step
+                if options.image_every > 0 and step % options.image_every == 0:
+                    self._emit_image(step)
                 evaluates = options.eval_every > 0 and step % options.eval_every == 0
                 is_last = step == options.steps or event.is_last
                 is_due = options.save_every > 0 and step % options.save_every == 0
@@ -341,6 +350,22 @@ class _Run:
         seconds = time.perf_counter() - start
         self.loop.stopwatch.exclude(seconds)
         self.loop.emit(Evaluated(step, "test", report.psnr, report.ssim, seconds))
+
+    def _emit_image(self, step: int) -> None:
+        """Render the first test view, or training view without test views; emit it and its
+        photo."""
+        start = time.perf_counter()
+        trainer: Any = self.loop.trainer
+        split = "test" if trainer.has_test_views else "train"
+        views = trainer.capture.splits[split]
+        image = ImageLoader(views[:1], self.config.data)[0].to(trainer.device)
+        background = background_colour(trainer.background)
+        with torch.no_grad():
+            scene = trainer.model.scene.on_background(background)
+            rendered = scene.render(image.cameras, image.time).rgb[0]
+        pair = torch.cat([rendered, image.composite(background)], dim=1)
+        self.loop.stopwatch.exclude(time.perf_counter() - start)
+        self.loop.emit(ProgressImage(step, split, to_uint8(pair.cpu().numpy())))
 
     def _reached(self) -> Iterator[str]:
         """Yield a line for each limit; a file that is pending is written before its line."""

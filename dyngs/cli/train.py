@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from difflib import get_close_matches
@@ -13,10 +14,11 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.output import ProgressBar, print_lines
-from dyngs.cli.view import add_serving_arguments
+from dyngs.cli.view import add_serving_arguments, wait_for_interrupt
 from dyngs.core.errors import DyngsError, format_count, log_info, quote_path
 
 if TYPE_CHECKING:
+    from dyngs.cli.training_progress import TrainingProgress
     from dyngs.config import Config
     from dyngs.training.events import Listener
     from dyngs.training.processes import Processes
@@ -59,6 +61,8 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument(
         "--view", action="store_true", help="view the scene in a browser during training"
     )
+    about = "with --view: end with the training (default: serve until Ctrl-C, on a terminal)"
+    parser.add_argument("--close-viewer", action="store_true", help=about)
     add_serving_arguments(parser)
     args.add_run_device(parser)
     parser.set_defaults(takes_root=True)
@@ -78,21 +82,47 @@ def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> i
     words = [*arguments.overrides, *args.run_device(arguments)]
     config = parse_config(words, arguments.resume, arguments.begun)
     args.computing_device(config.run.device)  # fails early without a GPU
-    if arguments.port is not None and not arguments.view:
-        raise DyngsError("--port requires --view")
+    for option, is_given in (
+        ("--port", arguments.port),
+        ("--close-viewer", arguments.close_viewer),
+    ):
+        if is_given and not arguments.view:
+            raise DyngsError(f"{option} requires --view")
     from dyngs.api.train import train
     from dyngs.cli.training_progress import TrainingProgress
 
+    progress = TrainingProgress()
+    listeners: list[Listener] = [progress]
     with ExitStack() as stack:
-        listeners: list[Listener] = [stack.enter_context(TrainingProgress())]
-        listeners += [stack.enter_context(_view(arguments, config))] if arguments.view else []
-        folder = train(
-            config,
-            resume_from=arguments.resume,
-            listeners=listeners,
-            processes=processes,
-            progress=ProgressBar,
-        )
+        view = None
+        if arguments.view:
+            view = stack.enter_context(_view(arguments, config, progress))
+            listeners.append(view)
+        with progress:
+            folder = train(
+                config,
+                resume_from=arguments.resume,
+                listeners=listeners,
+                processes=processes,
+                progress=ProgressBar,
+            )
+        _print_result(folder, config)
+        if view is not None and sys.stdin.isatty() and not arguments.close_viewer:
+            _keep_open(view)
+    return 0
+
+
+def _keep_open(view: TrainingView) -> None:
+    """Serve the page of a finished training until Ctrl-C."""
+    if view.link is None:
+        return  # the run was finished before
+    print(f"training finished; viewer open at {view.link}; Ctrl-C closes", flush=True)
+    view.serve()
+    wait_for_interrupt()
+
+
+def _print_result(folder: Path, config: Config) -> None:
+    """Print the run folder and the next commands."""
     for line in _about_motion(folder, config):
         print(line)
     word = quote_path(folder)
@@ -106,10 +136,11 @@ def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> i
             f"next:    dyngs eval {word}\n         dyngs render {word} --out "
             f"{quote_path(folder / 'images')}"
         )
-    return 0
 
 
-def _view(arguments: argparse.Namespace, config: Config) -> TrainingView:
+def _view(
+    arguments: argparse.Namespace, config: Config, progress: TrainingProgress
+) -> TrainingView:
     """Return the listener that serves the page."""
     from dyngs.view.server import require_viser
 
@@ -117,7 +148,8 @@ def _view(arguments: argparse.Namespace, config: Config) -> TrainingView:
     from dyngs.view.server import ServerOptions
     from dyngs.view.training import TrainingView
 
-    return TrainingView(config, ServerOptions(arguments.host, arguments.port), print_lines)
+    serving = ServerOptions(arguments.host, arguments.port)
+    return TrainingView(config, serving, print_lines, lambda: progress.figures)
 
 
 def _about_motion(folder: Path, config: Config) -> list[str]:
