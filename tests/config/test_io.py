@@ -387,3 +387,16 @@ def test_runs_of_earlier_versions_with_keys_of_one_kind_are_read(kind: str, tmp_
     (tmp_path / RESOLVED_NAME).write_text(text)
     with pytest.raises(DyngsError, match=f"unknown key 'model.{changed}'"):
         load_resolved(tmp_path)
+
+
+def test_image_size_limit_and_downscale() -> None:
+    """A requested ``downscale`` replaces the default limit; a limit of 0 is none."""
+    for overrides, limit in (
+        ([], 1600),
+        (["data.longest_side=0"], None),
+        (["data.downscale=2"], None),
+        (["data.downscale=2", "data.longest_side=900"], 900),
+    ):
+        assert load_config("static", ["data.root=a", *overrides]).data.longest_side == limit, (
+            overrides
+        )
