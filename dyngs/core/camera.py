@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from dyngs.core.errors import DyngsError
 
 
 @dataclass(frozen=True)
 class Cameras:
     """V pinhole cameras of one image size.
 
+    The matrices may be tensors, NumPy arrays or lists. For camera-to-world matrices and OpenGL
+    axes see ``from_matrices``.
+
     Example:
 
-        import torch
+        import numpy as np
 
         import dyngs
 
-        pose = torch.eye(4)[None]  # at the origin, looking along z
-        intrinsics = torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]])
+        pose = np.eye(4)[None]  # at the origin, looking along z
+        intrinsics = [[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]]
         cameras = dyngs.Cameras(pose, intrinsics, width=64, height=48)
 
     Attributes:
@@ -34,6 +41,9 @@ class Cameras:
     height: int
 
     def __post_init__(self) -> None:
+        for name in ("cam_from_world", "intrinsics"):
+            if not isinstance(getattr(self, name), Tensor):
+                object.__setattr__(self, name, _as_tensor(getattr(self, name)))
         if self.cam_from_world.ndim != 3 or self.cam_from_world.shape[1:] != (4, 4):
             raise ValueError(
                 f"cam_from_world must be (V, 4, 4), got {tuple(self.cam_from_world.shape)}"
@@ -44,6 +54,60 @@ class Cameras:
             raise ValueError(
                 f"image size must be positive, in whole pixels, got {self.width}x{self.height}"
             )
+
+    @staticmethod
+    def from_matrices(
+        world_from_cam: Any,
+        intrinsics: Any,
+        width: int,
+        height: int,
+        *,
+        convention: Literal["opencv", "opengl"] = "opencv",
+    ) -> Cameras:
+        """Return cameras from camera-to-world matrices.
+
+        Example:
+
+            import numpy as np
+
+            import dyngs
+
+            poses = np.stack([np.eye(4)] * 8)
+            intrinsics = [[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]
+            cameras = dyngs.Cameras.from_matrices(
+                poses, intrinsics, width=64, height=48, convention="opengl"
+            )
+
+        Args:
+            world_from_cam: (V, 4, 4) or (V, 3, 4) tensor, array or list.
+            intrinsics: (3, 3) for all cameras, or (V, 3, 3), in pixels.
+            width, height: image size in pixels.
+            convention: camera axes, "opencv" (x right, y down, z forward) or "opengl" (x right,
+                y up, z backward; also of Blender, NeRF and nerfstudio).
+
+        Raises:
+            DyngsError: other shapes, or a matrix without an inverse.
+        """
+        if convention not in ("opencv", "opengl"):
+            raise DyngsError(f"convention={convention!r}: must be 'opencv' or 'opengl'")
+        given = _as_tensor(world_from_cam).double()
+        if given.ndim != 3 or given.shape[1:] not in ((4, 4), (3, 4)):
+            raise DyngsError(
+                f"world_from_cam must be (V, 4, 4) or (V, 3, 4), got {tuple(given.shape)}"
+            )
+        poses = torch.eye(4, dtype=torch.float64, device=given.device).repeat(len(given), 1, 1)
+        poses[:, :3] = given[:, :3]
+        if convention == "opengl":
+            poses[:, :, 1:3] *= -1
+        inverse, info = torch.linalg.inv_ex(poses)
+        if bool(info.any()) or not bool(inverse.isfinite().all()):
+            raise DyngsError("world_from_cam has a matrix without an inverse; check the poses")
+        matrices = _as_tensor(intrinsics)
+        matrices = matrices.expand(len(poses), 3, 3) if matrices.ndim == 2 else matrices
+        return Cameras(inverse, matrices, width, height)
+
+    def __repr__(self) -> str:
+        return f"Cameras({len(self)} of {self.width}x{self.height} px)"
 
     def __len__(self) -> int:
         return len(self.cam_from_world)
@@ -84,3 +148,9 @@ class Cameras:
             for x in (self.cam_from_world, self.intrinsics)
         )
         return Cameras(pose, intrinsics, self.width, self.height)
+
+
+def _as_tensor(values: Any) -> Tensor:
+    """Return a tensor of floating-point numbers."""
+    found = values if isinstance(values, Tensor) else torch.as_tensor(np.asarray(values))
+    return found if found.is_floating_point() else found.float()

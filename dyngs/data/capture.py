@@ -220,6 +220,11 @@ class Capture:
     tracks_path: Path | None = None
     warnings: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        views = ", ".join(f"{len(x)} {name}" for name, x in self.splits.items() if x)
+        points = 0 if self.points is None else len(self.points.xyz)
+        return f"Capture({self.root}: {self.format}, views: {views}; {points:,} points)"
+
     def replace(self, **changes: object) -> Capture:
         """Return a copy with some attributes replaced."""
         return replace(self, **changes)  # type: ignore[arg-type]
