@@ -71,8 +71,8 @@ def find_poses(report: ProgressCallback) -> Stage:
         data = config.data
         model = config.model
         kind = find_kind(model)
-        if isinstance(kind, PredictsScenes):
-            return plan, None  # its folder holds a capture per person
+        if isinstance(kind, PredictsScenes) or plan.capture is not None:
+            return plan, None  # a folder with a capture per person, or one that was read
         root = data.root
         folder = capture_folder(root)
         data = data.model_copy(update={"root": folder})
@@ -116,7 +116,7 @@ def read_same_capture(folder: Path, resumed: Checkpoint) -> Stage:
         data = plan.resolved.data
         if capability(plan.resolved.model, PredictsScenes) is not None:
             return plan, None
-        capture = read_run_capture(data, resumed.info)
+        capture = read_run_capture(data, resumed.info, plan.capture)
         require_same_capture(folder, data, capture)
         return replace(plan, capture=capture), None
 
@@ -128,9 +128,8 @@ def run_pilots(plan: RunPlan) -> tuple[RunPlan, None]:
     config = plan.resolved
     if capability(config.model, PredictsScenes) is not None:
         return plan, None
-    config, choices, capture = resolve_auto_settings(
-        config, require_images(read_capture(config.data))
-    )
+    given = plan.capture or read_capture(config.data)
+    config, choices, capture = resolve_auto_settings(config, require_images(given))
     return replace(plan, resolved=config, capture=capture, choices=tuple(choices)), None
 
 

@@ -31,7 +31,9 @@ from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info, log_warning, quote_path
+from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader
+from dyngs.data.scene_space import normalise_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.outputs import lock_folder
 from dyngs.models.kind import PredictsScenes, capability
@@ -71,6 +73,7 @@ from dyngs.training.events import (
     TotalChanged,
 )
 from dyngs.training.limits import validate_limits
+from dyngs.training.losses import AddedLoss, require_losses
 from dyngs.training.loop import Editor, Interrupts, Loop, Trainable
 from dyngs.training.memory import memory_forecasts
 from dyngs.training.new_trainer import build_trainer
@@ -90,18 +93,21 @@ def train(
     listeners: Sequence[Listener] = (),
     processes: Processes | None = None,
     progress: Callable[[], AbstractContextManager[ProgressCallback]] | None = None,
+    capture: Capture | None = None,
+    losses: Sequence[AddedLoss] = (),
 ) -> Path:
-    """Train and return the run folder.
+    """Train and return the run folder. ``dyngs.train`` is the same for users.
 
     Poses of photos and videos are found first, and a body is fitted to a person where that is
     needed.
 
     Example:
 
-        import dyngs
+        from dyngs.api.train import train
+        from dyngs.config.io import load_config
 
         overrides = ["data.root=lego", "run.dir=runs/short", "train.steps=2", "init.num_random=50"]
-        run = dyngs.train(dyngs.load_config("static", overrides))
+        run = train(load_config("static", overrides))
 
     Args:
         config: everything that decides the run; on resuming, that of the run folder, whose
@@ -113,6 +119,8 @@ def train(
         listeners: are told everything that happens, see ``dyngs.training.events``.
         processes: that this one, the first of them, leads; None: it is alone.
         progress: shows how far what comes before training is; None: nothing does.
+        capture: trained on instead of what ``config.data`` reads.
+        losses: added to those of dyngs, named in ``config.train.losses``.
 
     Raises:
         DyngsError: bad input, a run folder that already holds a run or that another process writes
@@ -123,7 +131,10 @@ def train(
     """
     folder = resume_from or config.run.dir or default_run_dir(config.run.name)
     processes = processes or Processes()
-    plan = run_stages(RunPlan(config, config), [share_views(processes)])
+    require_losses(config, losses)
+    found = None if capture is None else normalise_capture(capture)
+    plan = RunPlan(config, config, capture=found, losses=tuple(losses))
+    plan = run_stages(plan, [share_views(processes)])
     validate_limits(plan.resolved)
     device = select_device(config.run.device)
     if resume_from is None:
@@ -188,6 +199,7 @@ def _built(
             first=plan.first,
             uncapped=plan.uncapped,
             images=images,
+            added_losses=plan.losses,
         )
     if resumed is not None:
         trainer.restore(resumed)

@@ -236,7 +236,7 @@ def evaluate_run(
         refine_poses: also score with poses fitted to the evaluated images: body poses of a person,
             else camera poses. Always done for a run that refined its cameras.
         data_root: current folder of the capture, if it was moved.
-        capture: capture of the run, if already read.
+        capture: capture of the run, in any coordinates. None reads it.
     """
     render_device = select_device(device)
     collect_inputs(run_dir).require_output(report_path(run_dir, split))
@@ -246,7 +246,7 @@ def evaluate_run(
             "pose"
         )
     run = load_run(run_dir, data_root)
-    capture = capture or read_run_capture(run.config.data, run.info)
+    capture = read_run_capture(run.config.data, run.info, capture)
     views = split_views(capture, split)
     background, colour = evaluation_background(run.config.data.background, capture.has_alpha)
     scene = scene_of_split(run, capture, split).to(render_device)

@@ -38,9 +38,9 @@ _RING = 24  # Cameras around a scene, one of which faces a person
 class PathOptions:
     """Cameras and times to render."""
 
-    # "orbit", "spiral", "along" (the training cameras), a JSON file, or
-    # None for one fixed camera
-    path: str | None = "orbit"
+    # "orbit", "spiral", "along" (the training cameras), a JSON file, cameras in
+    # the coordinates of the capture's files, or None for one fixed camera
+    path: str | Cameras | None = "orbit"
     # frames of an automatic path; None uses the frames of a motion, else 120
     num_frames: int | None = None
     # width and height in pixels; None uses that of the images or of the JSON, else 960x720
@@ -75,12 +75,7 @@ def choose_path(opened: OpenedScene, options: PathOptions) -> CameraPath:
     if options.path is None:
         path = _fixed_camera(opened, options)
     else:
-        file = camera_path_file(options.path)
-        if file is None:
-            path = _automatic_path(opened, options.path, options)
-        else:
-            path = read_path(file, opened.world_offset, options.size)
-            path = replace(path, cameras=opened.frame.inverse().cameras(path.cameras))
+        path = _moving_camera(opened, options.path, options)
         if times is not None:
             path = with_times(path, times * len(path) if len(times) == 1 else times)
     notes = path.notes
@@ -172,6 +167,19 @@ def _fixed_camera(opened: OpenedScene, options: PathOptions) -> CameraPath:
         times = (view.time or 0.0,) if opened.fps is None else times
     times = times if options.times is None else options.times
     return with_times(CameraPath(pick_cameras(camera, [0] * len(times))), times)
+
+
+def _moving_camera(
+    opened: OpenedScene, given: str | Cameras, options: PathOptions
+) -> CameraPath:
+    """Return the given cameras, those of a file, or an automatic path."""
+    if isinstance(given, Cameras):
+        return CameraPath(opened.file_unit.inverse().cameras(given))
+    file = camera_path_file(given)
+    if file is None:
+        return _automatic_path(opened, given, options)
+    path = read_path(file, opened.world_offset, options.size)
+    return replace(path, cameras=opened.frame.inverse().cameras(path.cameras))
 
 
 def _automatic_path(opened: OpenedScene, name: str, options: PathOptions) -> CameraPath:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
+from dyngs.config import Config
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image
 from dyngs.models.model import Loss, LossInput
@@ -62,6 +63,40 @@ class RegularizerLoss(Loss):
 
     def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
         return look.model.regularizers()
+
+
+LossFunction = Callable[[LossInput], Tensor]
+"""A loss of the user: a differentiable scalar, weighted, of a training image and its rendering."""
+
+
+class AddedLoss(Loss):
+    """A loss of the user, which is added to those of dyngs.
+
+    Attributes:
+        name: of the function, in the config of the run and in messages.
+    """
+
+    def __init__(self, function: LossFunction) -> None:
+        self._function = function
+        self.name = str(getattr(function, "__name__", type(function).__name__))
+
+    def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
+        value = self._function(look)
+        if not isinstance(value, Tensor) or value.numel() != 1:
+            got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+            raise DyngsError(f"loss {self.name}: must return a scalar tensor, got {got}")
+        return {f"loss {self.name}": value.reshape(())}
+
+
+def require_losses(config: Config, losses: Sequence[AddedLoss]) -> None:
+    """Raise DyngsError unless ``losses`` are those that the run was started with."""
+    given = [loss.name for loss in losses]
+    if given != list(config.train.losses):
+        own = ", ".join(config.train.losses) or "no losses of its own"
+        raise DyngsError(
+            f"train.losses: the run has {own}, given were {', '.join(given) or 'none'}; a run with "
+            "its own losses continues from Python: dyngs.train(resume=RUN, losses=[...])"
+        )
 
 
 class StepCheck:
