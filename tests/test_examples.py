@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import dyngs
+from dyngs.api.train import train
 from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 
 
@@ -24,7 +25,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "train.steps=2",
         "init.num_random=50",
     ]
-    dyngs.train(dyngs.load_config("static", overrides))
+    train(dyngs.load_config("static", overrides))
     return here
 
 

@@ -122,7 +122,9 @@ def train(
         fixed = {*keys, *changes} - {"train.steps", "data.root", "run.threads", "run.device"}
         if config is not None or fixed:
             first = min(fixed, default="config")
-            raise DyngsError(f"{first}: the configuration of a run is fixed; leave it out to resume")
+            raise DyngsError(
+                f"{first}: the configuration of a run is fixed; leave it out to resume"
+            )
         resume = Path(resume)
         chosen = load_resolved(resume).replace({**changes, "run.dir": resume})
     else:

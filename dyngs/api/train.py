@@ -73,8 +73,8 @@ from dyngs.training.events import (
     TotalChanged,
 )
 from dyngs.training.limits import validate_limits
-from dyngs.training.losses import AddedLoss, require_losses
 from dyngs.training.loop import Editor, Interrupts, Loop, Trainable
+from dyngs.training.losses import AddedLoss, require_losses
 from dyngs.training.memory import memory_forecasts
 from dyngs.training.new_trainer import build_trainer
 from dyngs.training.plan import RunPlan

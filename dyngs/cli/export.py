@@ -7,7 +7,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
@@ -16,6 +16,7 @@ from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_image_differ
 from dyngs.core.errors import DyngsError, format_count, quote_path
 
 if TYPE_CHECKING:
+    from dyngs.api.calls import Source
     from dyngs.data.capture import Split, View
     from dyngs.export.splat_files import Part
     from dyngs.runs.opened import OpenedScene
@@ -140,6 +141,70 @@ def add_parser(commands: args.Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the files and print their paths and sizes."""
+    print_written(*_write(arguments))
+    return 0
+
+
+def export(
+    run: Source,
+    out: Path | str | None = None,
+    *,
+    format: str | None = None,
+    time: float | None = None,
+    times: Sequence[float] | str | None = None,
+    motion: Path | str | None = None,
+    data: Path | str | None = None,
+    **options: Any,
+) -> list[Path]:
+    """Export a run, an avatar or a scene that was loaded from a run. Returns the written paths.
+
+    Does what ``dyngs export`` does, and prints nothing: notes go to the logger ``dyngs``.
+    ``dyngs.save`` writes scenes in memory.
+
+    Example:
+
+        import dyngs
+
+        dyngs.export("runs/lego", "lego.spz", sh_degree=0)
+        dyngs.export("runs/lego", "lego.html")
+
+    Args:
+        run: run folder, file, or scene with a ``run``.
+        out: file or folder; None: a name in the run folder.
+        format: as ``--format``; None: from the suffix of ``out``, else ply.
+        time: in [0, 1], of a moving scene.
+        times: of a sequence, or text such as "0:1:30".
+        motion: motion file for a person.
+        data: current folder of the capture, if it was moved.
+        options: all other options of ``dyngs export``, with underscores, such as ``folder=True``.
+
+    Raises:
+        DyngsError: an unknown option, one that the format does not have, or a file that cannot be
+            written.
+    """
+    from dyngs.api.calls import run_folder
+    from dyngs.cli import make_parser
+
+    named = {"out": out, "format": format, "time": time, "motion": motion, **options}
+    words = ["export"]
+    for name, value in named.items():
+        flag = f"--{name.replace('_', '-')}"
+        if value is True:
+            words.append(flag)
+        elif value is not None and value is not False:
+            words.append(f"{flag}={value}")
+    words += ["--", str(run_folder(run)), *([] if data is None else [f"data.root={data}"])]
+    arguments = make_parser("export").parse_args(words)
+    unknown = options.keys() - vars(arguments).keys()  # argparse accepts abbreviations
+    if unknown:
+        raise DyngsError(f"{min(unknown)}: no option of dyngs.export; see `dyngs export --help`")
+    arguments.times = times
+    args.require_outputs_apart(arguments.parser, arguments)
+    return _write(arguments)
+
+
+def _write(arguments: argparse.Namespace) -> list[Path]:
+    """Write the files and return their paths."""
     with heavy_imports():
         import dyngs.runs.opened  # noqa: F401
 
@@ -171,21 +236,17 @@ def run(arguments: argparse.Namespace) -> int:
         "mesh of a person": _export_rigged,
     }
     if kind in writers:
-        writers[kind](arguments)
-        return 0
+        return writers[kind](arguments)
     times = _times(arguments)
     opened = _moved(arguments, _open(arguments))
     times = opened.scene.times if arguments.motion is not None and times is None else times
     if opened.scene.is_static and times is not None:
         print_notes(("the scene is static: all times are the same",))
     if kind == "tracks":
-        files = _export_tracks(arguments, opened, times)
-    elif kind == MOVING:
-        files = _export_moving(arguments, opened, times or opened.scene.times or (0.0,))
-    else:
-        files = _export_splats(arguments, opened, times, kind)
-    print_written(*files)
-    return 0
+        return _export_tracks(arguments, opened, times)
+    if kind == MOVING:
+        return _export_moving(arguments, opened, times or opened.scene.times or (0.0,))
+    return _export_splats(arguments, opened, times, kind)
 
 
 def _kind(arguments: argparse.Namespace) -> str:
@@ -262,9 +323,12 @@ def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
 
     if arguments.times is None and arguments.time is None:
         return None
-    inside, warnings = clamp_times(
-        (arguments.time,) if arguments.times is None else parse_times(arguments.times)
-    )
+    times = arguments.times
+    if times is None:
+        times = (arguments.time,)
+    elif isinstance(times, str):
+        times = parse_times(times)
+    inside, warnings = clamp_times(tuple(times))
     print_notes((), warnings)
     return inside
 
@@ -389,7 +453,7 @@ def _export_tracks(
     return [write_tracks(_target(arguments, "tracks.npz"), tracks)]
 
 
-def _export_dyngs(arguments: argparse.Namespace) -> None:
+def _export_dyngs(arguments: argparse.Namespace) -> list[Path]:
     """Write the run as a .dyngs file and print the change of its images."""
     from dyngs.api.scene_file import write_scene_file
     from dyngs.compress.measure import SMALLEST_CHANGE
@@ -419,13 +483,12 @@ def _export_dyngs(arguments: argparse.Namespace) -> None:
     else:
         print_notes((f"RMS change of training views: {change:.2f} grey levels of 255",))
     ratio = written.num_bytes_exact / written.num_bytes
-    print(
-        f"written: {written.path} ({written.num_bytes / 1e6:.2f} MB, {ratio:.1f} times smaller "
-        "than uncompressed)"
-    )
+    size = f"{written.num_bytes / 1e6:.2f} MB"
+    print_notes((f"{size}, {ratio:.1f} times smaller than uncompressed",))
+    return [written.path]
 
 
-def _export_avatar(arguments: argparse.Namespace) -> None:
+def _export_avatar(arguments: argparse.Namespace) -> list[Path]:
     from dyngs.human.avatar.avatar_file import write_avatar
     from dyngs.runs.folder import collect_inputs
     from dyngs.runs.opened import open_run
@@ -433,20 +496,20 @@ def _export_avatar(arguments: argparse.Namespace) -> None:
     path = _target(arguments, "avatar.safetensors")
     run = open_run(arguments.run_dir).in_edit_frame()
     collect_inputs(run).require_output(path)
-    print_written(write_avatar(run.renderable, run.config.model, run.info, path))
+    return [write_avatar(run.renderable, run.config.model, run.info, path)]
 
 
-def _export_network(arguments: argparse.Namespace) -> None:
+def _export_network(arguments: argparse.Namespace) -> list[Path]:
     from dyngs.api.predict import network_config
     from dyngs.runs.checkpoint import latest_checkpoint
     from dyngs.runs.network_file import SUFFIX, write_network
 
     run: Path = arguments.run_dir
     out = _target(arguments, f"network{SUFFIX}")
-    print_written(write_network(run, network_config(run), latest_checkpoint(run), out))
+    return [write_network(run, network_config(run), latest_checkpoint(run), out)]
 
 
-def _export_bodies(arguments: argparse.Namespace) -> None:
+def _export_bodies(arguments: argparse.Namespace) -> list[Path]:
     """Write a moving scene with its rigid bodies as animated nodes."""
     from dyngs.export.images import compare_file_with_run
     from dyngs.export.splat_files import choose_write_options, write_rigid_bodies
@@ -464,10 +527,10 @@ def _export_bodies(arguments: argparse.Namespace) -> None:
         opened, opened.scene, time, written.splat, read_splats(written.path)
     )
     print_image_difference(written.notes, [found])
-    print_written(written.path)
+    return [written.path]
 
 
-def _export_rigged(arguments: argparse.Namespace) -> None:
+def _export_rigged(arguments: argparse.Namespace) -> list[Path]:
     """Write a person as a skinned mesh, or as Gaussians with joints."""
     from dyngs.export.rigged.people import AnimationInfo, write_mesh, write_rigged_splats
     from dyngs.runs.opened import FRAME_RATE
@@ -483,7 +546,7 @@ def _export_rigged(arguments: argparse.Namespace) -> None:
     opened = _moved(arguments, _open(arguments)).in_edit_frame()
     played = None if motion is None else AnimationInfo(motion.stem, opened.fps or FRAME_RATE)
     print_notes((write_rigged_splats if arguments.joints else write_mesh)(opened, out, played))
-    print_written(out)
+    return [out]
 
 
 def _has_surface(arguments: argparse.Namespace) -> bool:
@@ -500,7 +563,7 @@ def _has_surface(arguments: argparse.Namespace) -> bool:
     return source.is_dir() and capability(load_resolved(source).model, HasBody) is None
 
 
-def _export_surface(arguments: argparse.Namespace) -> None:
+def _export_surface(arguments: argparse.Namespace) -> list[Path]:
     """Write the mesh of a scene, one file per time."""
     from dyngs.export.surface_file import surface_write_options, write_surface
     from dyngs.gaussians.surface import count_holes
@@ -518,6 +581,7 @@ def _export_surface(arguments: argparse.Namespace) -> None:
         opened, ".ply" if arguments.times else out.suffix, arguments.up, arguments.from_up
     )
     print_notes((line,))
+    written: list[Path] = []
     for i, time in enumerate(_times(arguments) or (0.0,)):
         path = out / f"mesh_{i:04d}.ply" if arguments.times else out
         surface = write_surface(opened, path, time=time, options=options, how=how)
@@ -525,10 +589,11 @@ def _export_surface(arguments: argparse.Namespace) -> None:
         closed = "closed" if holes == 0 else f"{format_count(holes, 'hole')}"
         faces = format_count(len(surface.faces), "triangle")
         print_notes((f"{faces}, {len(surface.vertices):,} vertices, {closed}",))
-        print_written(path)
+        written.append(path)
+    return written
 
 
-def _export_page(arguments: argparse.Namespace) -> None:
+def _export_page(arguments: argparse.Namespace) -> list[Path]:
     """Write a self-contained web page, or a folder whose page streams the scene."""
     from dyngs.export.html.page import write_page, write_page_folder
 
@@ -550,11 +615,11 @@ def _export_page(arguments: argparse.Namespace) -> None:
         written = write_page_folder(opened, out, most=most, time=time)
     else:
         written = write_page(opened, out, time=time)
-    print_notes(written.notes)
-    print(f"written: {written.path} ({written.num_bytes / 1e6:.1f} MB); {where}")
+    print_notes((*written.notes, where))
+    return [written.path]
 
 
-def _export_cameras(arguments: argparse.Namespace) -> None:
+def _export_cameras(arguments: argparse.Namespace) -> list[Path]:
     """Write the cameras of a run as a transforms.json, refined if training refined them."""
     from dyngs.data.capture import all_views
     from dyngs.evaluate.report import load_camera_corrections
@@ -585,6 +650,5 @@ def _export_cameras(arguments: argparse.Namespace) -> None:
     written = write_cameras(path, capture, splits, run.world)
     count = format_count(len(all_views(capture.splits)), "camera")
     root = quote_path(path.parent)
-    print(
-        f"written: {written} ({count}); `data.root={root} data.follow_links=true` trains with them"
-    )
+    print_notes((f"{count}; `data.root={root} data.follow_links=true` trains with them",))
+    return [written]

@@ -169,9 +169,7 @@ def _fixed_camera(opened: OpenedScene, options: PathOptions) -> CameraPath:
     return with_times(CameraPath(pick_cameras(camera, [0] * len(times))), times)
 
 
-def _moving_camera(
-    opened: OpenedScene, given: str | Cameras, options: PathOptions
-) -> CameraPath:
+def _moving_camera(opened: OpenedScene, given: str | Cameras, options: PathOptions) -> CameraPath:
     """Return the given cameras, those of a file, or an automatic path."""
     if isinstance(given, Cameras):
         return CameraPath(opened.file_unit.inverse().cameras(given))

@@ -6,6 +6,7 @@ An interrupted comparison continues when called again.
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import time
 from collections.abc import Sequence
@@ -21,19 +22,31 @@ from pydantic import TypeAdapter
 from dyngs.api.budget.size import has_file
 from dyngs.config import Config
 from dyngs.config.io import find_preset, load_config, load_resolved
+from dyngs.config.schema import format_yaml_value
+from dyngs.config.yaml_reader import read_mapping
 from dyngs.core.errors import DyngsError, format_one_line, log_info
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.view_scores import SceneRenderer
+from dyngs.io.outputs import lock_folder
 from dyngs.models.kind import PredictsScenes, capability, find_kind
 from dyngs.models.views import evaluation_background
 from dyngs.runs.checkpoint import LoadedRun
-from dyngs.runs.folder import EXPORT_FOLDER
+from dyngs.runs.folder import EXPORT_FOLDER, collect_inputs
 from dyngs.runs.opened import scene_of_split, split_views
 from dyngs.study.measure import Measurement, SceneMeasurer, StudyScene
+from dyngs.study.report import (
+    Report,
+    build_table,
+    can_plot,
+    page_views,
+    plot_curves,
+    write_report,
+)
 from dyngs.study.runs import read_stored, require_same_study, run_tasks, train_to_end, write_stored
+from dyngs.study.tradeoff import Row, build_rows
 from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import validate_limits
 from dyngs.training.trainer import Trainer
@@ -48,6 +61,103 @@ MARKS = tuple((i / 12) ** 2 for i in range(1, 12))
 # Points of a curve: step, seconds of training, mean PSNR in dB of some held-out views
 Curve = list[tuple[int, float, float]]
 _CURVE = TypeAdapter(Curve)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Result of ``compare``.
+
+    Attributes:
+        report: tables, and the reasons why models were skipped (``left_out``).
+        files: comparison.csv, .json, .md, the page .html, and with the extra plots .svg.
+    """
+
+    report: Report
+    files: list[Path]
+
+    @property
+    def rows(self) -> Sequence[Row]:
+        """A row per model by the names of its columns, highest PSNR first."""
+        return self.report.rows
+
+
+def compare(
+    capture: Path | str,
+    models: Sequence[Path | str],
+    *,
+    minutes: float | None = None,
+    steps: int | None = None,
+    max_mb: float | None = None,
+    out: Path | str | None = None,
+    split: str = "test",
+    views: int = 4,
+    threads: int = 0,
+    device: str = "auto",
+    ray_cores: int | None = None,
+    overrides: Sequence[str] = (),
+    **keys: Any,
+) -> Comparison:
+    """Train several models on one capture with the same budget, and compare them.
+
+    The same call continues an interrupted comparison.
+
+    Example:
+
+        import dyngs
+
+        result = dyngs.compare(
+            "lego", ["static", "mip"], steps=2, out="both", threads=1, init={"num_random": 50}
+        )
+        for row in result.rows:
+            row["name"], row["psnr"], row["mb"]
+
+    Args:
+        capture: folder, in any format.
+        models: presets or YAML files.
+        minutes, steps, max_mb: the budget, exactly one of them.
+        out: output folder; None: compare/CAPTURE.
+        split: held-out views to compare on.
+        views: number of views on the page.
+        threads, device: of each training.
+        ray_cores: cores per model with Ray; None trains one model after the other.
+        overrides: ``section.key=value`` for all models.
+        keys: configuration keys for all models, by dotted name or as nested mappings.
+
+    Raises:
+        DyngsError: no budget, an unknown model or key, another comparison in ``out``, or no model
+            that can be trained.
+    """
+    capture = Path(os.path.abspath(capture))  # so that it has a name, also as . or ..
+    out = Path(out or Path("compare", capture.name)).absolute()
+    if (minutes, steps, max_mb).count(None) != 2:
+        raise DyngsError("give one common limit: minutes, steps or max_mb")
+    more = [f"{'.'.join(x.keys)}={format_yaml_value(x.value)}" for x in read_mapping(keys)]
+    words = (*overrides, *more)
+    comparison = ModelComparison(
+        capture, out, minutes, steps, max_mb, split, words, threads, device, views
+    )
+    configs, unfit = comparison.configs([str(model) for model in models])
+    for config in configs.values():
+        collect_inputs(config).require_output(out)
+    with lock_folder(out):
+        comparison.require_same(configs, unfit)
+        results, left_out, curves = comparison.run(configs, ray_cores)
+    rows = sorted(build_rows(results), key=lambda row: -row["psnr"])
+    held_out = f"{results[0].num_views} held-out views (split {split})"
+    about = (
+        f"{capture.name}: {comparison.limit} each, {held_out}; PSNR in dB, seconds of training; "
+        "* Pareto front of PSNR, speed and size"
+    )
+    report = Report(
+        "Comparison",
+        about,
+        rows,
+        [build_table(about, rows)],
+        left_out=unfit | left_out,
+        views=page_views(out, results),
+        figure=plot_curves(curves) if can_plot() and any(curves.values()) else None,
+    )
+    return Comparison(report, write_report(out / "comparison", report))
 
 
 @dataclass(frozen=True)
