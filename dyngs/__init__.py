@@ -11,7 +11,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from dyngs.api.calls import evaluate, render_path, save, train
+    from dyngs.api.calls import train
     from dyngs.api.compat import rasterization
     from dyngs.api.load import load, read_capture
     from dyngs.cli.export import export
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from dyngs.core.camera import Cameras
     from dyngs.core.errors import DyngsError
     from dyngs.data.capture import Capture
+    from dyngs.evaluate.report import evaluate
+    from dyngs.export.choose_path import render_path
+    from dyngs.export.splat_files import save
     from dyngs.gaussians import Gaussians
     from dyngs.gaussians.rendering import RenderOptions, contributions, render
     from dyngs.gaussians.scene import GaussianScene
@@ -64,15 +67,15 @@ _MODULES = {
     "Rendering": "dyngs.gaussians.rendering",
     "compare": "dyngs.study.compare",
     "contributions": "dyngs.gaussians.rendering",
-    "evaluate": "dyngs.api.calls",
+    "evaluate": "dyngs.evaluate.report",
     "export": "dyngs.cli.export",
     "load": "dyngs.api.load",
     "load_config": "dyngs.config.io",
     "rasterization": "dyngs.api.compat",
     "read_capture": "dyngs.api.load",
     "render": "dyngs.gaussians.rendering",
-    "render_path": "dyngs.api.calls",
-    "save": "dyngs.api.calls",
+    "render_path": "dyngs.export.choose_path",
+    "save": "dyngs.export.splat_files",
     "train": "dyngs.api.calls",
 }
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-import torch
 from torch import Tensor
 
 from dyngs.config import DataConfig
@@ -19,16 +17,15 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.rendering import GaussianRendering, RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.io.formats.similarity import Similarity
-from dyngs.models.renderable import Renderable, Rendering, RunInfo, TimeStep
+from dyngs.models.renderable import RunInfo, TimeStep
 from dyngs.runs.opened import open_scene
 
 
 def load(path: Path | str) -> GaussianScene:
     """Load a scene for rendering.
 
-    Coordinates are those of the capture's files, as in ``read_capture``. ``run`` of a scene from a
-    run folder has the folder, the config, the step and the seconds of training. A run of another
-    kind of model than Gaussians gives a ``Renderable``, which has ``render`` and no Gaussians.
+    Coordinates are those of the capture's files, as in ``read_capture``. The attribute ``run`` of
+    the scene has the folder, the config and the step of its run.
 
     Example:
 
@@ -51,18 +48,16 @@ def load(path: Path | str) -> GaussianScene:
         DyngsError: nothing is there, it is damaged, or it is something else.
     """
     opened = open_scene(Path(path), with_capture=False)
-    scene: Any = opened.renderable
+    scene = opened.scene
     scale = opened.info.world_scale
     if scale != 1:
         options = replace(scene.options, near=scale * scene.options.near)
-        how = {"options": options, "background": scene.background, "scene": scene, "scale": scale}
-        if isinstance(scene, GaussianScene):
-            scene = ScaledScene(gaussians=_scaled(scene.gaussians, scale), **how)
-        else:
-            scene = ScaledRenderable(**how)
-    if not Path(path).is_dir():
-        return scene
-    return scene.from_run(RunInfo(Path(path), opened.config, opened.step, opened.seconds_train))
+        gaussians = _scaled(scene.gaussians, scale)
+        behind = scene.background
+        scene = ScaledScene(
+            gaussians=gaussians, options=options, background=behind, scene=scene, scale=scale
+        )
+    return scene.from_run(RunInfo(Path(path), opened.config, opened.step))
 
 
 def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) -> Capture:
@@ -130,9 +125,16 @@ class ScaledScene(GaussianScene):
         probe: Tensor | None = None,
     ) -> GaussianRendering:
         options = self.options if options is None else options
-        options = replace(options, far=options.far / self.scale)
-        inner = time.inner if isinstance(time, _ScaledTimeStep) else time
-        return _render(self, cameras, inner, options, background, probe=probe)
+        poses = cameras.cam_from_world.clone()
+        poses[:, :3, 3] = poses[:, :3, 3] / self.scale
+        drawn = self.scene.render(
+            replace(cameras, cam_from_world=poses),
+            time.inner if isinstance(time, _ScaledTimeStep) else time,
+            options=replace(options, near=options.near / self.scale, far=options.far / self.scale),
+            background=self.background if background is None else background,
+            probe=probe,
+        )
+        return drawn if drawn.depth is None else replace(drawn, depth=self.scale * drawn.depth)
 
     def apply_edit(self, edit: TopologyEdit) -> ScaledScene:
         return replace(
@@ -144,64 +146,6 @@ class ScaledScene(GaussianScene):
 
     def _model_state(self) -> State:
         return self.scene._model_state()
-
-
-@dataclass(frozen=True, kw_only=True, repr=False)
-class ScaledRenderable(Renderable):
-    """As ``ScaledScene``, of a scene that is not made of Gaussians."""
-
-    options: Any
-    background: Tensor | None
-    scene: Renderable
-    scale: float
-
-    @property
-    def times(self) -> tuple[float, ...]:
-        return self.scene.times
-
-    @property
-    def bounds(self) -> Tensor:
-        return self.scale * self.scene.bounds
-
-    @property
-    def device(self) -> torch.device:
-        return self.scene.device
-
-    def render(
-        self,
-        cameras: Cameras,
-        time: float | TimeStep | None = None,
-        *,
-        options: Any = None,
-        background: Tensor | None = None,
-    ) -> Rendering:
-        options = self.options if options is None else options
-        return _render(self, cameras, time, options, background)
-
-    def state(self) -> State:
-        return self.scene.state()
-
-
-def _render(
-    scaled: ScaledScene | ScaledRenderable,
-    cameras: Cameras,
-    time: float | TimeStep | None,
-    options: Any,
-    background: Tensor | None,
-    **more: Any,
-) -> Any:
-    """Render the inner scene from the same cameras in its unit."""
-    scale = scaled.scale
-    poses = cameras.cam_from_world.clone()
-    poses[:, :3, 3] = poses[:, :3, 3] / scale
-    drawn = scaled.scene.render(
-        replace(cameras, cam_from_world=poses),
-        time,
-        options=replace(options, near=options.near / scale),
-        background=scaled.background if background is None else background,
-        **more,
-    )
-    return drawn if drawn.depth is None else replace(drawn, depth=scale * drawn.depth)
 
 
 def _scaled(gaussians: Gaussians, scale: float) -> Gaussians:

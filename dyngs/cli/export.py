@@ -16,9 +16,9 @@ from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_image_differ
 from dyngs.core.errors import DyngsError, format_count, quote_path
 
 if TYPE_CHECKING:
-    from dyngs.api.calls import Source
     from dyngs.data.capture import Split, View
     from dyngs.export.splat_files import Part
+    from dyngs.models.renderable import Renderable
     from dyngs.runs.opened import OpenedScene
 
 _OTHER_SUFFIXES = {
@@ -146,59 +146,41 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def export(
-    run: Source,
-    out: Path | str | None = None,
-    *,
-    format: str | None = None,
-    time: float | None = None,
-    times: Sequence[float] | str | None = None,
-    motion: Path | str | None = None,
-    data: Path | str | None = None,
-    **options: Any,
+    run: Path | str | Renderable, out: Path | str | None = None, **options: Any
 ) -> list[Path]:
     """Export a run, an avatar or a scene that was loaded from a run. Returns the written paths.
 
-    Does what ``dyngs export`` does, and prints nothing: notes go to the logger ``dyngs``.
-    ``dyngs.save`` writes scenes in memory.
+    Does what ``dyngs export`` does, but prints nothing. ``dyngs.save`` writes scenes in memory.
 
     Example:
 
         import dyngs
 
         dyngs.export("runs/lego", "lego.spz", sh_degree=0)
-        dyngs.export("runs/lego", "lego.html")
+        dyngs.export("runs/lego", "lego.glb", format="mesh", cells=32)
 
     Args:
-        run: run folder, file, or scene with a ``run``.
+        run: run folder, file, or scene.
         out: file or folder; None: a name in the run folder.
-        format: as ``--format``; None: from the suffix of ``out``, else ply.
-        time: in [0, 1], of a moving scene.
-        times: of a sequence, or text such as "0:1:30".
-        motion: motion file for a person.
-        data: current folder of the capture, if it was moved.
-        options: all other options of ``dyngs export``, with underscores, such as ``folder=True``.
+        options: those of ``dyngs export``, with underscores, such as ``format="mesh"``,
+            ``time=0.5``, ``times="0:1:30"``, ``motion="walk.npz"`` or ``folder=True``.
 
     Raises:
         DyngsError: an unknown option, one that the format does not have, or a file that cannot be
             written.
     """
-    from dyngs.api.calls import run_folder
     from dyngs.cli import make_parser
+    from dyngs.models.renderable import run_path
 
-    named = {"out": out, "format": format, "time": time, "motion": motion, **options}
-    words = ["export"]
-    for name, value in named.items():
+    words = ["export", "--out", str(out)] if out else ["export"]
+    for name, value in options.items():
         flag = f"--{name.replace('_', '-')}"
-        if value is True:
-            words.append(flag)
-        elif value is not None and value is not False:
-            words.append(f"{flag}={value}")
-    words += ["--", str(run_folder(run)), *([] if data is None else [f"data.root={data}"])]
-    arguments = make_parser("export").parse_args(words)
+        if value is not None and value is not False:
+            words.append(flag if value is True else f"{flag}={value}")
+    arguments = make_parser("export").parse_args([*words, "--", str(run_path(run))])
     unknown = options.keys() - vars(arguments).keys()  # argparse accepts abbreviations
     if unknown:
         raise DyngsError(f"{min(unknown)}: no option of dyngs.export; see `dyngs export --help`")
-    arguments.times = times
     args.require_outputs_apart(arguments.parser, arguments)
     return _write(arguments)
 
@@ -323,12 +305,9 @@ def _times(arguments: argparse.Namespace) -> tuple[float, ...] | None:
 
     if arguments.times is None and arguments.time is None:
         return None
-    times = arguments.times
-    if times is None:
-        times = (arguments.time,)
-    elif isinstance(times, str):
-        times = parse_times(times)
-    inside, warnings = clamp_times(tuple(times))
+    inside, warnings = clamp_times(
+        (arguments.time,) if arguments.times is None else parse_times(arguments.times)
+    )
     print_notes((), warnings)
     return inside
 

@@ -4,6 +4,7 @@ the settings of a run."""
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -149,14 +150,15 @@ def run_compare(arguments: argparse.Namespace) -> int:
             )
         except KeyboardInterrupt:
             raise KeyboardInterrupt(_CONTINUES) from None
-    _print_report(result.report, result.files, is_json=arguments.json)
+    _print_report(result, is_json=arguments.json)
     return 0
 
 
-def _print_report(report: Report, paths: list[Path], *, is_json: bool) -> None:
+def _print_report(report: Report, *, is_json: bool) -> None:
     """Print the tables of a study, or only its .json."""
     from dyngs.study.report import MATPLOTLIB_MISSING, can_plot
 
+    paths = report.files
     if is_json:
         print(paths[1].read_text(encoding="utf-8"), end="")
         return
@@ -219,8 +221,8 @@ def _tradeoff(arguments: argparse.Namespace, out: Path) -> int:
         {"exchange_rates": rates, "changes": [variant.changes for variant in variants]},
         figure=plot_variants(rows, settings) if can_plot() else None,
     )
-    paths = write_report(out / "tradeoff", report)
-    _print_report(report, paths, is_json=arguments.json)
+    report = replace(report, files=write_report(out / "tradeoff", report))
+    _print_report(report, is_json=arguments.json)
     if arguments.require or metric:
         number = tradeoff.choose_variant(rows, requirements, goal)
         best = rows[number]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, cast
@@ -153,10 +153,11 @@ def load_config(preset: Path | str | None, overrides: Overrides = ()) -> Config:
 def replace_config(config: Config, changes: Mapping[str, Any]) -> Config:
     """Return a config with some values changed, see ``Config.replace``."""
     layers = _Layers()
-    for leaf in read_mapping(config.model_dump(mode="json")):
-        layers.add([replace(leaf, origin="")])
+    layers.add(read_mapping(config.model_dump(mode="json")))
+    layers.origins.clear()
     given = layers.add_overrides(changes)
-    return _completed(layers, given | set(_requested_keys(config, ())))
+    requested = {leaf.keys for leaf in read_mapping(config.model_dump(exclude_unset=True))}
+    return _completed(layers, given | requested)
 
 
 def _completed(layers: _Layers, requested: set[tuple[str, ...]]) -> Config:
@@ -503,16 +504,6 @@ def _describe_unknown(section: type[BaseModel], keys: tuple[str, ...], layers: _
     found = [x for x in close if get_close_matches(last, [x.rpartition(".")[2]])] or same
     hint = f"; did you mean {' or '.join(map(repr, found))}?" if found else ""
     return f"{where}unknown key {format_one_line(repr(name), 60)}{hint}"
-
-
-def _requested_keys(section: BaseModel, above: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    """Yield the keys in ``model_fields_set``, recursively."""
-    for name in type(section).model_fields:
-        inner = getattr(section, name)
-        if isinstance(inner, BaseModel):
-            yield from _requested_keys(inner, (*above, name))
-        elif name in section.model_fields_set:
-            yield (*above, name)
 
 
 def _note_requested(

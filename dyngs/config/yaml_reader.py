@@ -1,6 +1,6 @@
 """Read YAML presets and overrides as values with their origin (file and line).
 
-Values of YAML stay text (``007``, ``2024-02-30``) because the schema decides their types. Invalid YAML
+YAML values stay text (``007``, ``2024-02-30``) because the schema decides their types. Invalid YAML
 raises a one-line DyngsError.
 """
 
@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import BaseModel
 
 from dyngs.core.errors import DyngsError, describe_error, format_one_line, wrap_read_errors
 from dyngs.io.fields import read_limited
@@ -81,11 +80,9 @@ def read_override(text: str) -> list[Leaf]:
 
 
 def read_mapping(values: Mapping[str, Any], above: str = "") -> Iterator[Leaf]:
-    """Yield the values that keyword arguments set: dotted keys, nested mappings or sections."""
+    """Yield the values that keyword arguments set: dotted keys or nested mappings."""
     for key, value in values.items():
         name = f"{above}{key}"
-        if isinstance(value, BaseModel):
-            value = value.model_dump(mode="json")
         if isinstance(value, Mapping) and value:
             yield from read_mapping(value, f"{name}.")
         else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -41,9 +42,8 @@ class Cameras:
     height: int
 
     def __post_init__(self) -> None:
-        for name in ("cam_from_world", "intrinsics"):
-            if not isinstance(getattr(self, name), Tensor):
-                object.__setattr__(self, name, _as_tensor(getattr(self, name)))
+        object.__setattr__(self, "cam_from_world", _as_tensor(self.cam_from_world))
+        object.__setattr__(self, "intrinsics", _as_tensor(self.intrinsics))
         if self.cam_from_world.ndim != 3 or self.cam_from_world.shape[1:] != (4, 4):
             raise ValueError(
                 f"cam_from_world must be (V, 4, 4), got {tuple(self.cam_from_world.shape)}"
@@ -79,32 +79,27 @@ class Cameras:
             )
 
         Args:
-            world_from_cam: (V, 4, 4) or (V, 3, 4) tensor, array or list.
+            world_from_cam: (V, 4, 4) tensor, array or list.
             intrinsics: (3, 3) for all cameras, or (V, 3, 3), in pixels.
             width, height: image size in pixels.
             convention: camera axes, "opencv" (x right, y down, z forward) or "opengl" (x right,
                 y up, z backward; also of Blender, NeRF and nerfstudio).
 
         Raises:
-            DyngsError: other shapes, or a matrix without an inverse.
+            DyngsError: other shapes.
         """
         if convention not in ("opencv", "opengl"):
             raise DyngsError(f"convention={convention!r}: must be 'opencv' or 'opengl'")
-        given = _as_tensor(world_from_cam).double()
-        if given.ndim != 3 or given.shape[1:] not in ((4, 4), (3, 4)):
-            raise DyngsError(
-                f"world_from_cam must be (V, 4, 4) or (V, 3, 4), got {tuple(given.shape)}"
-            )
-        poses = torch.eye(4, dtype=torch.float64, device=given.device).repeat(len(given), 1, 1)
-        poses[:, :3] = given[:, :3]
+        poses = _as_tensor(world_from_cam).double()
+        if poses.shape[1:] != (4, 4):
+            raise DyngsError(f"world_from_cam must be (V, 4, 4), got {tuple(poses.shape)}")
         if convention == "opengl":
-            poses[:, :, 1:3] *= -1
-        inverse, info = torch.linalg.inv_ex(poses)
-        if bool(info.any()) or not bool(inverse.isfinite().all()):
-            raise DyngsError("world_from_cam has a matrix without an inverse; check the poses")
-        matrices = _as_tensor(intrinsics)
-        matrices = matrices.expand(len(poses), 3, 3) if matrices.ndim == 2 else matrices
-        return Cameras(inverse, matrices, width, height)
+            poses = poses * poses.new_tensor([1, -1, -1, 1])
+        matrices = _as_tensor(intrinsics).expand(len(poses), 3, 3)
+        return Cameras(torch.linalg.inv_ex(poses).inverse, matrices, width, height)
+
+    def __iter__(self) -> Iterator[Cameras]:
+        return (self.select(i) for i in range(len(self)))
 
     def __repr__(self) -> str:
         return f"Cameras({len(self)} of {self.width}x{self.height} px)"
@@ -151,6 +146,4 @@ class Cameras:
 
 
 def _as_tensor(values: Any) -> Tensor:
-    """Return a tensor of floating-point numbers."""
-    found = values if isinstance(values, Tensor) else torch.as_tensor(np.asarray(values))
-    return found if found.is_floating_point() else found.float()
+    return values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values, float))

@@ -236,13 +236,12 @@ class Capture:
         cameras: Cameras | Sequence[Cameras],
         times: Sequence[float] | None = None,
         masks: Sequence[Any] | None = None,
-        *,
-        test_every: int = 8,
     ) -> Capture:
         """Return a capture of images in memory, for ``dyngs.train`` and ``dyngs.evaluate``.
 
         The images are stored once, as PNG in the user's cache (``DYNGS_CACHE_DIR``). Runs that are
-        trained on them can therefore be resumed, evaluated and viewed from there.
+        trained on them can therefore be resumed, evaluated and viewed from there. Every eighth
+        image is held out, as of files.
 
         Example:
 
@@ -263,14 +262,13 @@ class Capture:
             cameras: one per image; a list of ``Cameras`` where sizes differ.
             times: one per image in any unit, for a moving scene.
             masks: (H, W) bool, uint8 or float; True, 255 or 1: used, 0: ignored.
-            test_every: hold out every n-th image; 0: none.
 
         Raises:
             DyngsError: other lengths, shapes, types or values, or an invalid pose.
         """
         from dyngs.data.arrays import capture_from_images
 
-        return capture_from_images(images, cameras, times, masks, test_every)
+        return capture_from_images(images, cameras, times, masks)
 
     def __repr__(self) -> str:
         views = ", ".join(f"{len(x)} {name}" for name, x in self.splits.items() if x)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,15 +21,21 @@ from dyngs.export.camera_paths import (
     resize_cameras,
     with_times,
 )
-from dyngs.export.images import file_stems
+from dyngs.export.images import OutputOptions, file_stems, write_path_images
 from dyngs.export.orbits import frame_orbit_for_points, orbit_path, path_along, spiral_path
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.scene import as_human_scene
 from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.io.formats.similarity import AXES
-from dyngs.models.renderable import Renderable
+from dyngs.models.renderable import Renderable, run_path
 from dyngs.models.views import training_cameras
-from dyngs.runs.opened import OpenedScene, cameras_for_paths, split_views
+from dyngs.runs.opened import (
+    OpenedScene,
+    cameras_for_paths,
+    open_scene,
+    split_views,
+    wrap_scene,
+)
 
 DEFAULT_FRAMES = 120
 DEFAULT_SIZE = (960, 720)  # Image size in pixels for scenes without a capture
@@ -90,6 +98,48 @@ def choose_path(opened: OpenedScene, options: PathOptions) -> CameraPath:
     if options.size is not None:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
     return replace(path, notes=notes, fps=path.fps if opened.fps is None else opened.fps)
+
+
+def render_path(
+    scene: Path | str | Renderable,
+    path: Cameras | str = "orbit",
+    *,
+    out: Path | str,
+    frames: int | None = None,
+    size: tuple[int, int] | None = None,
+    times: Sequence[float] | None = None,
+    fps: float | None = None,
+) -> list[Path]:
+    """Render a camera path to images or a video. Returns the written files.
+
+    Example:
+
+        import dyngs
+
+        dyngs.render_path("runs/lego", "orbit", out="orbit", frames=4)
+
+    Args:
+        scene: a scene, a run folder or a file.
+        path: "orbit", "spiral", "along" (the training cameras), a .json file of cameras, or
+            ``Cameras`` in the coordinates of ``dyngs.load``.
+        out: a folder of images, or a video by its suffix, such as .mp4.
+        frames: number of frames of an automatic path; None: 120.
+        size: width and height in px; None: that of the capture or of the cameras.
+        times: scene time of each frame, or one for all; None: 0 to 1 along the path.
+        fps: frames per second of a video; None: 30, or that of the .json file.
+
+    Raises:
+        DyngsError: a path that needs the capture of a run, or a file that cannot be written.
+    """
+    if isinstance(scene, Renderable) and scene.run is None:
+        opened = wrap_scene(scene)
+    else:
+        opened = open_scene(run_path(scene), nonfinite="skip")
+    chosen = choose_path(opened, PathOptions(path, frames, size, times and tuple(times)))
+    out = Path(out)
+    folder, video = (None, out) if out.suffix else (out, None)
+    output = OutputOptions(video=video, fps=fps or chosen.fps)
+    return write_path_images(opened, chosen, folder, output)
 
 
 def select_view(capture: Capture, name: str | None = None, split: str | None = None) -> View:

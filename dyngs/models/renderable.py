@@ -160,22 +160,28 @@ def concatenate_renderings(found: Sequence[Images]) -> Images:
 
 @dataclass(frozen=True)
 class RunInfo:
-    """The run that a scene was loaded from.
+    """The run folder or file that a scene was loaded from.
 
     Attributes:
-        path: the run folder.
+        path: the folder or file.
         config: as saved with the run.
         step: of the checkpoint.
-        seconds: of training until then.
     """
 
     path: Path
     config: Config
     step: int
-    seconds: float
 
-    def __str__(self) -> str:
-        return f"{self.path} after {format_count(self.step, 'step')}"
+
+def run_path(run: Path | str | Renderable) -> Path:
+    """Return the folder or file of a scene. Raises DyngsError: it was changed since it was read."""
+    if not isinstance(run, Renderable):
+        return Path(run)
+    if run.run is None:
+        raise DyngsError(
+            "this scene was changed or made in memory; give a run folder, or use dyngs.save"
+        )
+    return run.run.path
 
 
 class TimeStep:
@@ -194,7 +200,7 @@ class Renderable(ABC):
         background: (3,) colour behind it unless ``render`` is told otherwise; None is black.
         surface_options: which ``SurfaceOptions`` have an effect.
         has_levels: it can be drawn in levels of detail.
-        run: where ``dyngs.load`` found it; None: a file, or a scene changed since.
+        run: where ``dyngs.load`` found it; None: nowhere, or it was changed since.
     """
 
     surface_options: ClassVar[frozenset[str]] = frozenset({"cells"})
@@ -206,8 +212,8 @@ class Renderable(ABC):
     def __repr__(self) -> str:
         count = f"{len(self):,} Gaussians, " if isinstance(self, Sized) else ""
         moves = "static" if self.is_static else "moving"
-        run = "" if self.run is None else f", {self.run}"
-        return f"{type(self).__name__}({count}{moves}, {self.device}{run})"
+        path = "" if self.run is None else f", {self.run.path}"
+        return f"{type(self).__name__}({count}{moves}, {self.device}{path})"
 
     @property
     @abstractmethod

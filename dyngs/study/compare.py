@@ -11,7 +11,7 @@ import re
 import time
 from collections.abc import Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -22,8 +22,6 @@ from pydantic import TypeAdapter
 from dyngs.api.budget.size import has_file
 from dyngs.config import Config
 from dyngs.config.io import find_preset, load_config, load_resolved
-from dyngs.config.schema import format_yaml_value
-from dyngs.config.yaml_reader import read_mapping
 from dyngs.core.errors import DyngsError, format_one_line, log_info
 from dyngs.core.metrics import psnr
 from dyngs.data.loader import Image, ImageLoader
@@ -46,7 +44,7 @@ from dyngs.study.report import (
     write_report,
 )
 from dyngs.study.runs import read_stored, require_same_study, run_tasks, train_to_end, write_stored
-from dyngs.study.tradeoff import Row, build_rows
+from dyngs.study.tradeoff import build_rows
 from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import validate_limits
 from dyngs.training.trainer import Trainer
@@ -63,24 +61,6 @@ Curve = list[tuple[int, float, float]]
 _CURVE = TypeAdapter(Curve)
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Result of ``compare``.
-
-    Attributes:
-        report: tables, and the reasons why models were skipped (``left_out``).
-        files: comparison.csv, .json, .md, the page .html, and with the extra plots .svg.
-    """
-
-    report: Report
-    files: list[Path]
-
-    @property
-    def rows(self) -> Sequence[Row]:
-        """A row per model by the names of its columns, highest PSNR first."""
-        return self.report.rows
-
-
 def compare(
     capture: Path | str,
     models: Sequence[Path | str],
@@ -95,8 +75,7 @@ def compare(
     device: str = "auto",
     ray_cores: int | None = None,
     overrides: Sequence[str] = (),
-    **keys: Any,
-) -> Comparison:
+) -> Report:
     """Train several models on one capture with the same budget, and compare them.
 
     The same call continues an interrupted comparison.
@@ -106,10 +85,9 @@ def compare(
         import dyngs
 
         result = dyngs.compare(
-            "lego", ["static", "mip"], steps=2, out="both", threads=1, init={"num_random": 50}
+            "lego", ["static", "mip"], steps=2, out="both", overrides=["init.num_random=50"]
         )
-        for row in result.rows:
-            row["name"], row["psnr"], row["mb"]
+        [(row["name"], row["psnr"], row["mb"]) for row in result.rows]
 
     Args:
         capture: folder, in any format.
@@ -121,7 +99,9 @@ def compare(
         threads, device: of each training.
         ray_cores: cores per model with Ray; None trains one model after the other.
         overrides: ``section.key=value`` for all models.
-        keys: configuration keys for all models, by dotted name or as nested mappings.
+
+    Returns:
+        the report: ``rows`` per model, ``left_out`` with reasons, and the written ``files``.
 
     Raises:
         DyngsError: no budget, an unknown model or key, another comparison in ``out``, or no model
@@ -131,8 +111,7 @@ def compare(
     out = Path(out or Path("compare", capture.name)).absolute()
     if (minutes, steps, max_mb).count(None) != 2:
         raise DyngsError("give one common limit: minutes, steps or max_mb")
-    more = [f"{'.'.join(x.keys)}={format_yaml_value(x.value)}" for x in read_mapping(keys)]
-    words = (*overrides, *more)
+    words = tuple(overrides)
     comparison = ModelComparison(
         capture, out, minutes, steps, max_mb, split, words, threads, device, views
     )
@@ -157,7 +136,7 @@ def compare(
         views=page_views(out, results),
         figure=plot_curves(curves) if can_plot() and any(curves.values()) else None,
     )
-    return Comparison(report, write_report(out / "comparison", report))
+    return replace(report, files=write_report(out / "comparison", report))
 
 
 @dataclass(frozen=True)

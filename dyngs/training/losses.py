@@ -73,29 +73,28 @@ class AddedLoss(Loss):
     """A loss of the user, which is added to those of dyngs.
 
     Attributes:
-        name: of the function, in the config of the run and in messages.
+        name: in the config of the run and in messages: its number and the name of the function.
     """
 
-    def __init__(self, function: LossFunction) -> None:
+    def __init__(self, number: int, function: LossFunction) -> None:
         self._function = function
-        self.name = str(getattr(function, "__name__", type(function).__name__))
+        self.name = f"{number} {getattr(function, '__name__', type(function).__name__)}"
 
     def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
         value = self._function(look)
-        if not isinstance(value, Tensor) or value.numel() != 1:
-            got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-            raise DyngsError(f"loss {self.name}: must return a scalar tensor, got {got}")
-        return {f"loss {self.name}": value.reshape(())}
+        if not isinstance(value, Tensor) or value.ndim:
+            shape = getattr(value, "shape", type(value).__name__)
+            raise DyngsError(f"loss {self.name}: must return a scalar tensor, got {shape}")
+        return {f"loss {self.name}": value}
 
 
 def require_losses(config: Config, losses: Sequence[AddedLoss]) -> None:
     """Raise DyngsError unless ``losses`` are those that the run was started with."""
-    given = [loss.name for loss in losses]
-    if given != list(config.train.losses):
-        own = ", ".join(config.train.losses) or "no losses of its own"
+    given = tuple(loss.name for loss in losses)
+    if given != config.train.losses:
         raise DyngsError(
-            f"train.losses: the run has {own}, given were {', '.join(given) or 'none'}; a run with "
-            "its own losses continues from Python: dyngs.train(resume=RUN, losses=[...])"
+            f"train.losses: the run has {list(config.train.losses)}, given were {list(given)}; "
+            "pass the same again from Python: dyngs.train(resume=RUN, losses=[...])"
         )
 
 

@@ -108,7 +108,15 @@ class RunConfig(Section):
 
 
 class Config(Section):
-    """Complete configuration of a run."""
+    """Complete configuration of a run, see ``dyngs config`` for its keys.
+
+    Example:
+
+        import dyngs
+
+        config = dyngs.load_config("static", {"data.root": "lego"})
+        config.train.steps, config.replace({"train.steps": 60_000}).train.steps
+    """
 
     data: DataConfig
     camera: CameraConfig = CameraConfig()
@@ -147,7 +155,7 @@ class Config(Section):
             same = config.replace(train={"steps": 60_000}, strategy={"kind": "mcmc"})
 
         Args:
-            changes, keys: values by dotted key, or nested mappings or sections. A changed ``kind``
+            changes, keys: values by dotted key, or nested mappings. A changed ``kind``
                 resets its section to the defaults of that kind.
 
         Raises:
