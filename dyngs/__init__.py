@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from typing import Any
 
     from dyngs.api.calls import train
-    from dyngs.api.compat import rasterization
     from dyngs.api.load import load, read_capture
     from dyngs.cli.export import export
+    from dyngs.compat.rendering import rasterization
     from dyngs.config import Config
     from dyngs.config.io import load_config
     from dyngs.core.camera import Cameras
@@ -71,7 +71,7 @@ _MODULES = {
     "export": "dyngs.cli.export",
     "load": "dyngs.api.load",
     "load_config": "dyngs.config.io",
-    "rasterization": "dyngs.api.compat",
+    "rasterization": "dyngs.compat.rendering",
     "read_capture": "dyngs.api.load",
     "render": "dyngs.gaussians.rendering",
     "render_path": "dyngs.export.choose_path",

@@ -26,7 +26,7 @@ from moving_scene import write_moving_run
 import dyngs
 from dyngs.cli import main, make_parser
 from dyngs.cli.train import parse_config
-from dyngs.config.io import load_config
+from dyngs.config.io import load_config, packaged_presets
 from dyngs.config.schema import config_keys
 from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
@@ -175,6 +175,15 @@ def require_overrides(*overrides: str) -> None:
     raise errors[0]
 
 
+def with_root(words: list[str]) -> list[str]:
+    """Replace the path of a capture, which does not exist here, by ``data.root``."""
+    names = [word for word in words if "=" not in word]
+    presets = [name for name in names if name in packaged_presets() or name.endswith(".yaml")]
+    roots = [f"data.root={name}" for name in names if name not in presets]
+    assert len(roots) <= 1
+    return [*(presets or ["static"]), *roots, *(word for word in words if "=" in word)]
+
+
 def require_valid(command: Command, arguments: argparse.Namespace) -> None:
     """Check what a command names besides options: keys, variations, times, presets, files."""
     from dyngs.export.camera_paths import camera_path_file, parse_times
@@ -186,7 +195,7 @@ def require_valid(command: Command, arguments: argparse.Namespace) -> None:
         assert not Path(word.partition("=")[2] or word).is_absolute(), f"{command}: absolute path"
     overrides = [word for word in getattr(arguments, "overrides", []) if "=" in word]
     if command.verb == "train" and arguments.resume is None:
-        parse_config(arguments.overrides, None, arguments.begun)
+        parse_config(with_root(arguments.overrides), None, arguments.begun)
     elif command.verb == "tradeoff":
         parse_variations(arguments.vary)
         parse_requirements(arguments.require or "psnr>=1")

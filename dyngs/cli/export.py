@@ -7,6 +7,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 from dyngs.cli import arguments as args
@@ -14,6 +15,7 @@ from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import print_notes, print_written
 from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_image_difference
 from dyngs.core.errors import DyngsError, format_count, quote_path
+from dyngs.core.plugins import EXPORTERS, load_plugin, plugin_entries
 
 if TYPE_CHECKING:
     from dyngs.data.capture import Split, View
@@ -197,7 +199,7 @@ def _write(arguments: argparse.Namespace) -> list[Path]:
         kind = "mesh of a person"
     elif (arguments.bodies and kind == "glb") or (arguments.joints and kind in ("ply", "glb")):
         kind = "bodies" if arguments.bodies else "joints"
-    taken = {*_TAKES[kind].split(), kind}
+    taken = {*_TAKES.get(kind, "time motion").split(), kind}
     for name in (*dict.fromkeys(" ".join(_TAKES.values()).split()), "bodies", "joints"):
         given = getattr(arguments, name)
         if name not in taken and given is not None and given is not False:
@@ -217,6 +219,8 @@ def _write(arguments: argparse.Namespace) -> list[Path]:
         "joints": _export_rigged,
         "mesh of a person": _export_rigged,
     }
+    if kind not in _TAKES:
+        return _export_by_plugin(arguments, kind)
     if kind in writers:
         return writers[kind](arguments)
     times = _times(arguments)
@@ -244,7 +248,10 @@ def _kind(arguments: argparse.Namespace) -> str:
     if out is None or out.is_dir():
         return usual
     found = find_format(out)
-    named = _OTHER_SUFFIXES.get(out.suffix.lower()) if found is None else found.name
+    suffix = out.suffix.lower()
+    named = _OTHER_SUFFIXES.get(suffix) if found is None else found.name
+    if named is None and suffix[1:] in plugin_entries(EXPORTERS):
+        named = suffix[1:]
     if stated is None and (named or (_is_sequence(arguments) and not out.suffix)):
         return named or "ply"
     fits = named in (None, stated) and not (
@@ -260,6 +267,19 @@ def _kind(arguments: argparse.Namespace) -> str:
             else f"{out}: wrong suffix for --format {stated}"
         )
     return usual
+
+
+def _export_by_plugin(arguments: argparse.Namespace, suffix: str) -> list[Path]:
+    """Write a file by the exporter of another package: a function of scene, path and time."""
+    from dyngs.io.write import atomic_file
+    from dyngs.runs.folder import collect_inputs
+
+    write = load_plugin(EXPORTERS, suffix, FunctionType)
+    opened = _moved(arguments, _open(arguments))
+    collect_inputs(opened).require_output(arguments.out)
+    with atomic_file(arguments.out) as temporary:
+        write(opened, temporary, (_times(arguments) or (0.0,))[0])
+    return [arguments.out]
 
 
 def _target(arguments: argparse.Namespace, name: str) -> Path:

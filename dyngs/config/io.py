@@ -19,6 +19,7 @@ from pydantic.fields import FieldInfo
 
 from dyngs.config import Config
 from dyngs.config.kinds import is_kind, package_of
+from dyngs.config.other_programs import key_of_option
 from dyngs.config.schema import (
     allowed_values,
     allows_kind,
@@ -495,6 +496,9 @@ def _describe_unknown(section: type[BaseModel], keys: tuple[str, ...], layers: _
         return (
             f"{where}{name} belongs to {'.'.join(above)}.kind={' or '.join(owners)}, not to {kind}"
         )
+    other = key_of_option(key)
+    if other is not None:
+        return f"{where}unknown key {format_one_line(repr(name), 60)}; use {other}"
     written = ".".join(next((k for k in layers.origins if k[: len(keys)] == keys), keys))
     known = list(layers.names(Config, ()))
     last = written.rpartition(".")[2]

@@ -120,11 +120,18 @@ class Evaluated:
 
 
 @dataclass(frozen=True)
+class Paused:
+    """Training was paused for ``seconds``, which do not count as training."""
+
+    seconds: float
+
+
+@dataclass(frozen=True)
 class Message:
     """A line of text for the user."""
 
     text: str
 
 
-Event = Started | StepDone | TopologyChanged | TotalChanged | Saved | Evaluated | Message
+Event = Started | StepDone | TopologyChanged | TotalChanged | Saved | Evaluated | Paused | Message
 Listener = Callable[[Event], None]

@@ -81,6 +81,10 @@ def test_a_hole_in_a_white_object_shows_on_black_alone(background: float) -> Non
     scores = background_scores(truth, nothing, torch.full((3,), background))
     assert scores["psnr_white"] == pytest.approx(100.0)
     assert scores["psnr_black"] == pytest.approx(-10 * math.log10(0.5), abs=1e-4)
+    assert scores["see_through"] == 1.0
+    blurred = replace(nothing, transmittance=(torch.arange(20) >= 8).expand(1, 14, 20).float())
+    edge = background_scores(truth, blurred, torch.full((3,), background))
+    assert edge["see_through"] == 0  # an edge that is off by two pixels is no hole
     masked = background_scores(
         replace(truth, mask=1 - alpha), nothing, torch.full((3,), background)
     )

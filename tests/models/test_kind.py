@@ -79,7 +79,7 @@ def test_a_run_needs_the_package_of_its_kind(capture: Path, tmp_path: Path) -> N
     without = dyngs_command("eval", str(run), plugin=False)
     assert without.returncode == 2
     assert without.stderr.strip().count("\n") == 0
-    assert "model.kind=toy needs the package toy-splats, which is not installed" in without.stderr
+    assert "model.kind=toy needs the package dyngs-toy, which is not installed" in without.stderr
 
 
 def test_its_keys_are_listed_and_validated(capture: Path, tmp_path: Path) -> None:
