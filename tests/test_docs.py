@@ -421,7 +421,8 @@ def test_commands_of_these_pages_run(page: str, capsys: pytest.CaptureFixture[st
 def test_python_examples_run(page: str, code: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in set(re.findall(r"\bdyngs\.(\w+)\(", code)):
         assert hasattr(dyngs, name), f"{page}: there is no dyngs.{name}"
-    train, compare = dyngs.train, dyngs.compare
+    train = dyngs.train
+    compare = dyngs.compare
 
     def train_shortly(*arguments: Any, **keys: Any) -> dyngs.GaussianScene:
         few = {"run.threads": 1, "init.kind": "random", "init.num_random": 80}

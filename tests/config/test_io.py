@@ -400,8 +400,8 @@ def test_replace_is_as_an_override_and_keeps_what_was_requested() -> None:
     ):
         assert found == wanted
         for section in ("optim", "strategy", "train"):
-            one, other = getattr(found, section), getattr(wanted, section)
-            assert one.model_fields_set == other.model_fields_set, section
+            requested = getattr(found, section).model_fields_set
+            assert requested == getattr(wanted, section).model_fields_set, section
     for changes, message in (
         ({"train.stpes": 1}, "unknown key 'train.stpes'; did you mean 'train.steps'"),
         ({"train": {"steps": "x"}}, "train.steps='x': train.steps must be an integer >= 1, not x"),
