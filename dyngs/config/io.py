@@ -66,6 +66,7 @@ REMOVED_KEYS: dict[str, object] = {
     "strategy.scale_reg": 0.01,
     "optim.sparse": False,
     "model.deform.time_resolution": 0,
+    "train.tensorboard": False,
 }
 """Removed keys that stored configurations may still contain. Maps each key to the value at which it
 had no effect; only that value is accepted."""

@@ -8,6 +8,9 @@ from pydantic import BeforeValidator, Field, field_validator
 
 from dyngs.core.section import Fraction, Section, parse_digits
 
+LOGGING_KEYS = ("save_minutes", "save_every", "eval_every", "log_every", "image_every", "loggers")
+"""Keys of ``TrainConfig`` that do not change the result of a run."""
+
 
 class TrainConfig(Section):
     """Length, losses, checkpoints and logging of a run."""
@@ -90,9 +93,16 @@ class TrainConfig(Section):
     eval_every: int = Field(
         default=0, ge=0, description="steps between evaluations on the test split; 0: none"
     )
-    tensorboard: bool = Field(
-        default=False,
-        description="whether to log to RUN/tensorboard (pip install 'dyngs[tensorboard]')",
+    image_every: int = Field(
+        default=0,
+        ge=0,
+        description="steps between images of the first test view beside its photo, written to "
+        "RUN/progress; 0: none",
+    )
+    loggers: tuple[Literal["tensorboard", "wandb", "rerun"], ...] = Field(
+        default=(),
+        description="programs that show scalars and images of the training; each needs its extra, "
+        "such as pip install 'dyngs[wandb]'",
     )
 
     @field_validator("alpha_weight", mode="before")
