@@ -380,7 +380,7 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_moving_run(tmp_path / "moving").rename(tmp_path / "runs" / "dance")
     for name in ("plush", "dog"):
         shutil.copytree(tmp_path / "runs" / "dance", tmp_path / "runs" / name)
-    for name in ("scene", "object"):
+    for name in ("scene", "object", "photos"):
         shutil.copytree(tmp_path / "PATH", tmp_path / name)
     monkeypatch.chdir(tmp_path)
     return tmp_path

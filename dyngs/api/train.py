@@ -16,6 +16,7 @@ from dyngs.api.budget.size import has_file, write_limited_file
 from dyngs.api.budget.time import TimeLimit, fit_minutes
 from dyngs.api.choose import write_choices
 from dyngs.api.following import Leader
+from dyngs.api.run_choice import choose_run
 from dyngs.api.stages import (
     continue_scene,
     extend_run,
@@ -127,7 +128,7 @@ def train(
         KeyboardInterrupt: after Ctrl-C or SIGTERM, once a checkpoint is saved; the message says how
             to go on.
     """
-    folder = resume_from or config.run.dir or default_run_dir(config.run.name)
+    folder = resume_from or config.run.dir or default_run_dir(config)
     processes = processes or Processes()
     plan = run_stages(RunPlan(config, config), [share_views(processes)])
     validate_limits(plan.resolved)
@@ -138,6 +139,11 @@ def train(
             collect_inputs(config).require_output(folder)
         with progress() if progress else nullcontext(ignore_progress) as report:
             plan = run_stages(plan, [find_poses(report), continue_scene])
+        if config.run.dir is None:
+            folder, continued = choose_run(folder, plan.resolved)
+            if continued is not None:
+                resume_from = folder
+                plan = RunPlan(continued, continued)
     elif not folder.is_dir():
         latest_checkpoint(folder)  # raises, and says what is there
     keep_freed_memory()
@@ -152,7 +158,7 @@ def train(
                 return folder
             require_startable(folder, plan.resolved)
         else:
-            update_data_root(folder, config.data)
+            update_data_root(folder, plan.resolved.data)
             resumed = _newest(folder)
             plan = replace(plan, requested=load_requested_config(folder))
             plan = run_stages(plan, [extend_run(folder, resumed)])
@@ -237,8 +243,9 @@ class _Run:
             editors = [remove_floaters]
             limits = plan.limits
             if limits.seconds is not None:
-                steps = plan.uncapped.train.steps if plan.uncapped else config.train.steps
-                self._time = TimeLimit(limits.seconds, steps, corrects=resumed is None)
+                corrects = resumed is None or plan.is_extended
+                steps = plan.requested.train.steps
+                self._time = TimeLimit(limits.seconds, steps, corrects=corrects)
                 editors.append(self._time)
             if limits.gaussians is not None:
                 self._count = CountLimit(limits.gaussians, limits.seconds)

@@ -41,6 +41,7 @@ class RunPlan:
         capture: None for a network, which has several.
         first: Gaussians of another scene to start from.
         choices: results of pilot runs.
+        is_extended: whether a finished or interrupted run is extended.
     """
 
     requested: Config
@@ -50,6 +51,7 @@ class RunPlan:
     first: InitialGaussians | None = None
     limits: Limits = Limits()
     choices: tuple[Any, ...] = ()
+    is_extended: bool = False
 
 
 Stage = Callable[[RunPlan], tuple[RunPlan, str | None]]
@@ -57,7 +59,13 @@ Stage = Callable[[RunPlan], tuple[RunPlan, str | None]]
 
 def with_steps(config: Config, steps: int) -> Config:
     """Return ``config`` with another ``train.steps``. All schedules scale with it."""
-    return config.model_copy(update={"train": config.train.model_copy(update={"steps": steps})})
+    return with_length(config, steps, config.train.minutes)
+
+
+def with_length(config: Config, steps: int, minutes: float | None) -> Config:
+    """Return ``config`` with other ``train.steps`` and ``train.minutes``."""
+    train = config.train.model_copy(update={"steps": steps, "minutes": minutes})
+    return config.model_copy(update={"train": train})
 
 
 def extend_config(config: Config, done: int, steps: int) -> Config:
@@ -101,7 +109,8 @@ def _require_exposures_stay(config: Config, length: LengthChange) -> None:
 def describe_extension(before: Config, after: Config, done: int) -> str:
     """Return a log message about a run that continues after ``done`` steps."""
     steps = after.train.steps
-    no_limit = "" if before.train.minutes is None else "; train.minutes is ignored"
+    is_free = before.train.minutes is not None and after.train.minutes is None
+    no_limit = "; train.minutes is ignored" if is_free else ""
     return (
         f"resuming at step {done:,}, extended from {before.train.steps:,} to "
         f"{format_count(steps, 'step')}; "

@@ -89,8 +89,15 @@ class BudgetConfig(Section):
 class RunConfig(Section):
     """Output folder and execution of a run."""
 
-    name: str = Field(default="static", description="name of the run, used for its default folder")
-    dir: Path | None = Field(default=None, description="run folder; null: runs/NAME")
+    name: str = Field(
+        default="static",
+        description="name of the run; if you set it, the default folder is runs/NAME",
+    )
+    dir: Path | None = Field(
+        default=None,
+        description="run folder; null: runs/CAPTURE-NAME, which continues a run of the same keys, or "
+        "else runs/CAPTURE-NAME-2, ...",
+    )
     seed: int = Field(default=42, ge=0, lt=2**63, description="seed of all random numbers")
     threads: int = Field(
         default=0, ge=0, le=1024, description="number of CPU threads; 0: one per core"

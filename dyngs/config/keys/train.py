@@ -8,6 +8,9 @@ from pydantic import BeforeValidator, Field, field_validator
 
 from dyngs.core.section import Fraction, Section, parse_digits
 
+LOGGING_KEYS = ("save_minutes", "save_every", "eval_every", "log_every", "image_every", "loggers")
+"""Keys of ``TrainConfig`` that do not change the result of a run."""
+
 
 class TrainConfig(Section):
     """Length, losses, checkpoints and logging of a run."""
