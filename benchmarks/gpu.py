@@ -29,7 +29,7 @@ import torch
 from rasterize import Workload, garden_workload, random_workload
 from torch import Tensor
 
-from dyngs.api.compat import rasterization
+from dyngs.compat.rendering import rasterization
 from dyngs.core.camera import Cameras
 from dyngs.export.orbits import frame_orbit_for_points
 from dyngs.io.formats.formats import read_splats

@@ -58,7 +58,7 @@ CONFIG_INTRODUCTION = """\
 A run is configured by a preset or a YAML file, and by overrides on the command line:
 
 ```bash
-dyngs train static data.root=PATH train.steps=2000 run.dir=runs/first
+dyngs train static PATH train.steps=2000
 dyngs config static > mine.yaml
 ```
 

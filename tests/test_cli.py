@@ -40,6 +40,7 @@ VERBS = (
     "tradeoff",
     "compare",
     "config",
+    "presets",
     "docs",
 )
 ENVIRONMENT = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"} | {
@@ -182,8 +183,10 @@ def test_names_that_are_no_text_can_be_printed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
-        ("trian", "invalid choice: 'trian'"),
-        ("train", "a config is required"),
+        ("trian", "unknown command 'trian'; did you mean `dyngs train`? (see `dyngs --help`)"),
+        ("people", "did you mean `dyngs data people`?"),
+        ("data synt", "did you mean `dyngs data synth`?"),
+        ("train", "a capture is required"),
         ("train nowhere.yaml data.root=x", "nowhere.yaml: no such preset"),
         ("train static", "data.root is required"),
         ("train static data.rot=x", "did you mean 'data.root'"),

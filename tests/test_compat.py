@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scenes import Scene, random_scene, weights
 from torch import Tensor
 
-from dyngs.api.compat import rasterization
+from dyngs.compat.rendering import rasterization
 from dyngs.core.errors import DyngsError
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.ops.projection import Projection, ProjectionOptions, project

@@ -1,1 +1,1 @@
-"""Whole jobs for Python users: load, train, prune, predict; gsplat-compatible `rasterization`."""
+"""Whole jobs for Python users: load, train, prune, predict."""

@@ -480,8 +480,8 @@ def video_report(path: Path) -> str:
         lines += [f"video {video.path}", *_aligned(facts)]
     where = quote_path(videos[0].path if len(videos) == 1 else path)
     if len(videos) == 1 and moving:
-        lines.append(f"next: dyngs train static data.root={where}     # only the camera moves")
-        lines.append(f"      dyngs train dynamic data.root={where}    # objects move as well")
+        lines.append(f"next: dyngs train static {where}     # only the camera moves")
+        lines.append(f"      dyngs train dynamic {where}    # objects move as well")
     elif len(videos) == 1:
         lines.append(
             "next: one fixed camera gives no depth; put synchronous videos of two or more into a "
@@ -494,7 +494,7 @@ def video_report(path: Path) -> str:
         is_given = read_video_settings(path, [video.name for video in videos])[0] is not None
         known = f"from {VIDEOS_FILE}" if is_given else "estimated from sound"
         lines.append(f"{len(videos)} fixed cameras; offsets between them: {known}")
-        lines.append(f"next: dyngs train dynamic data.root={where}")
+        lines.append(f"next: dyngs train dynamic {where}")
     return "\n".join(lines)
 
 

@@ -20,6 +20,7 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from difflib import get_close_matches
 from typing import Any, NoReturn, TextIO
 
 from dyngs import __version__
@@ -75,6 +76,7 @@ _COMMANDS: dict[str, Callable[[Any], None]] = {
     "compare": study.add_parser,
     "data": data.add_parser,
     "config": config.add_parser,
+    "presets": config.add_presets_parser,
     "docs": docs.add_parser,
     "doctor": doctor.add_parser,
 }
@@ -86,9 +88,9 @@ _NEXT = f"""\
 dyngs {__version__}: Gaussian splatting for static scenes, moving scenes and people, on the CPU.
 
   dyngs demo                             train and render a small moving scene in minutes
-  dyngs train static data.root=PHOTOS    train a scene from a folder of photos or a video
-  dyngs train dynamic data.root=CAPTURE  train a moving scene
-  dyngs train human data.root=VIDEO      train an avatar of a person
+  dyngs train PHOTOS                     train a scene from a folder of photos
+  dyngs train VIDEO                      train a moving scene from a video
+  dyngs train human VIDEO                train an avatar of a person
   dyngs view runs/NAME                   view a run in a browser
   dyngs render runs/NAME --out images    render images and videos
   dyngs export runs/NAME                 write .ply and other formats
@@ -200,6 +202,8 @@ def _parsed(parser: argparse.ArgumentParser, arguments: list[str]) -> argparse.N
     parsed, rest = parser.parse_known_args(arguments)
     overrides = getattr(parsed, "overrides", None)
     unknown = [word for word in rest if overrides is None or not _OVERRIDE.fullmatch(word)]
+    if unknown and arguments[0] == "train":
+        parsed.parser.error(train.describe_option(unknown[0]))
     if unknown:
         parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     if overrides is not None:
@@ -217,6 +221,20 @@ class _Parser(argparse.ArgumentParser):
         if "parser" not in parsed:
             parsed.parser = self
         return parsed, rest
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Refuse an unknown command with the commands, also those of ``data``, of similar names."""
+        choices = action.choices or ()
+        if isinstance(action, argparse._SubParsersAction) and value not in choices:
+            known = {name: f"{self.prog} {name}" for name in choices}
+            if "data" in choices:
+                known |= {name: f"dyngs data {name}" for name in data.VERBS}
+            close = [f"`{known[name]}`" for name in get_close_matches(value, known, cutoff=0.7)]
+            if os.path.exists(value):
+                close = [f"`dyngs train {quote_word(value)}`"]
+            hint = f"; did you mean {' or '.join(close)}?" if close else ""
+            raise DyngsError(f"unknown command {value!r}{hint} (see `{self.prog} --help`)")
+        super()._check_value(action, value)
 
     def error(self, message: str) -> NoReturn:
         raise DyngsError(f"{format_one_line(message, 400)} (see `{self.prog} --help`)")

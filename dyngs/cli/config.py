@@ -1,4 +1,5 @@
-"""``dyngs config``: print all configuration keys of a preset or a run."""
+"""``dyngs config``: print all configuration keys of a preset or a run. ``dyngs presets``: list the
+presets."""
 
 from __future__ import annotations
 
@@ -21,8 +22,23 @@ def add_parser(commands: Commands) -> None:
     add_overrides(parser, "key=value", "overrides, as for `dyngs train`")
 
 
+def add_presets_parser(commands: Commands) -> None:
+    add_command(commands, "presets", run_presets, "list the presets of `dyngs train`")
+
+
 def run(arguments: argparse.Namespace) -> int:
     from dyngs.config.listing import format_config
 
     print(format_config(arguments.source, arguments.overrides), end="")
+    return 0
+
+
+def run_presets(_: argparse.Namespace) -> int:
+    from dyngs.config.listing import preset_summaries
+
+    summaries = preset_summaries()
+    width = max(map(len, summaries))
+    for name, summary in summaries.items():
+        print(f"{name:<{width}}  {summary}")
+    print("next: dyngs train PRESET PATH, or dyngs config PRESET for all keys")
     return 0

@@ -40,6 +40,7 @@ _OF_A_TEMPLATE = {
     ),
     "uv": ("FILE", ".obj with the texture coordinates of --template if it has none"),
 }
+VERBS = ("inspect", "sfm", "fit", "people", "motion", "synth")
 
 
 def add_parser(commands: args.Commands) -> None:
@@ -272,7 +273,7 @@ def run_sfm(arguments: argparse.Namespace) -> int:
         else:
             said = estimate_poses(images, out, options, report).summary()
     print_lines(f"{said}\nnext: dyngs data inspect {quote_path(out)} --image cameras.png")
-    print(f"      dyngs train {'dynamic' if several else 'static'} data.root={quote_path(out)}")
+    print(f"      dyngs train {'dynamic' if several else 'static'} {quote_path(out)}")
     return 0
 
 
@@ -293,9 +294,7 @@ def run_fit(arguments: argparse.Namespace) -> int:
         result = write_fitted_capture(options, arguments.out, report, inputs)
     files = {"model.body": result.model.body, "model.uv": result.model.uv}
     keys = "".join(f" {key}={quote_path(path)}" for key, path in files.items() if path is not None)
-    print_lines(
-        f"{result.summary}\nnext: dyngs train human data.root={quote_path(result.root)}{keys}"
-    )
+    print_lines(f"{result.summary}\nnext: dyngs train human {quote_path(result.root)}{keys}")
     return 0
 
 
@@ -308,7 +307,7 @@ def run_people(arguments: argparse.Namespace) -> int:
     detector = MediaPipe(arguments.mediapipe)
     with ProgressBar() as report:
         result = write_detected_person(options, arguments.out, detector, report)
-    print_lines(f"{result.summary}\nnext: dyngs train human data.root={quote_path(result.root)}")
+    print_lines(f"{result.summary}\nnext: dyngs train human {quote_path(result.root)}")
     return 0
 
 
@@ -391,5 +390,5 @@ def run_synth(arguments: argparse.Namespace) -> int:
         else:
             usual = "fixed" if "num_cameras" in given else None
             synthetic.write_dynamic_capture(scene, out, options(**{"style": usual} | given))
-    print(f"written: {out}\nnext:    dyngs train {preset} data.root={quote_path(out)}")
+    print(f"written: {out}\nnext:    dyngs train {preset} {quote_path(out)}")
     return 0

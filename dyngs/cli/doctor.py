@@ -16,6 +16,22 @@ from typing import Literal
 from dyngs.cli.arguments import Commands, add_command, add_json
 from dyngs.core.errors import DyngsError
 
+_OPTIONAL = {
+    "viser": "view",
+    "lpips": "metrics",
+    "matplotlib": "plots",
+    "tensorboard": "tensorboard",
+    "wandb": "wandb",
+    "rerun-sdk": "rerun",
+    "zstandard": "zstd",
+    "usd-core": "usd",
+    "fourdgs": "4dgs",
+    "h5py": "people",
+    "pillow-heif": "heic",
+    "ray": "ray",
+}
+"""Optional packages and the extras of dyngs that install them."""
+
 
 @dataclass(frozen=True)
 class Check:
@@ -66,15 +82,15 @@ def _examine_packages() -> Iterator[Check]:
     """Yield the versions of required and optional packages."""
     requirements = metadata.requires("dyngs") or [] if _version("dyngs") else []
     for line in requirements:
-        name = re.split(r"[^\w.-]", line, maxsplit=1)[0]
-        extra = re.search(r"extra == ['\"](\w+)", line)
+        if "extra ==" not in line:
+            name = re.split(r"[^\w.-]", line, maxsplit=1)[0]
+            version = _version(name)
+            needed = "absent" if ";" in line else "broken"  # a marker: not for all platforms
+            yield Check(name, version or "missing", needed if version is None else "ok")
+    for name, extra in _OPTIONAL.items():
         version = _version(name)
-        if version is not None:
-            yield Check(name, version)
-        elif extra is None:
-            yield Check(name, "missing", "broken")
-        elif extra[1] not in ("test", "dev"):
-            yield Check(name, f"pip install 'dyngs[{extra[1]}]'", "absent")
+        advice = f"pip install 'dyngs[{extra}]'"
+        yield Check(name, version or advice, "absent" if version is None else "ok")
 
 
 def _examine_core() -> Iterator[Check]:
@@ -105,7 +121,7 @@ def _examine_gpu() -> Iterator[Check]:
         return
     reason = gpu_unavailable_reason()
     for name, value in gpu_status().items():
-        yield Check(name, value)
+        yield Check(name, value, "absent" if value in ("none", "not built") else "ok")
     if reason is None:
         yield Check("device", "cuda")
     else:

@@ -10,13 +10,13 @@ from dyngs.core.errors import format_count, quote_path
 
 _EPILOG = """\
 examples:
-  dyngs train human_predictor data.root=PEOPLE run.dir=runs/net     PEOPLE holds a capture in each folder
+  dyngs train human_predictor PEOPLE run.dir=runs/net     PEOPLE holds a capture in each folder
   dyngs predict runs/net captures/ann --out runs/ann
   dyngs predict runs/net captures/ann --out runs/ann --views f000_c00.png,f000_c03.png,f000_c06.png
-  dyngs train gps data.root=PEOPLE run.dir=runs/stereo              from two neighbouring views, without a body
+  dyngs train gps PEOPLE run.dir=runs/stereo              from two neighbouring views, without a body
   dyngs export runs/stereo --format network --out stereo.safetensors   the weights as one file
   dyngs predict stereo.safetensors captures/ann --out runs/two --views f000_c00.png,f000_c01.png
-  dyngs predict gps captures/ann --out runs/two                     with the published weights
+  dyngs predict gps captures/ann --out runs/two                     with the weights of dyngs
   dyngs predict runs/keypoint_nerf captures/ann --out runs/field --views 4
   dyngs eval runs/ann
   dyngs train --resume runs/ann                                     continues from the prediction
@@ -35,7 +35,9 @@ def add_parser(commands: Commands) -> None:
         "Writes a run folder.",
         _EPILOG,
     )
-    about = "run folder or weights file of a network, or gps or human_predictor if installed"
+    about = (
+        "run folder or weights file of a network, or gps or human_predictor, which come with dyngs"
+    )
     parser.add_argument("network", type=input_path, metavar="NET", help=about)
     parser.add_argument("capture", type=input_path, metavar="CAPTURE", help="capture of a person")
     parser.add_argument(

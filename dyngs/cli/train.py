@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.output import ProgressBar, print_lines
-from dyngs.cli.view import add_serving_arguments
-from dyngs.core.errors import DyngsError, format_count, quote_path
+from dyngs.cli.view import add_serving_arguments, wait_for_interrupt
+from dyngs.core.errors import DyngsError, format_count, log_info, quote_path
 
 if TYPE_CHECKING:
+    from dyngs.cli.training_progress import TrainingProgress
     from dyngs.config import Config
     from dyngs.training.events import Listener
     from dyngs.training.processes import Processes
@@ -23,33 +26,30 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 examples:
-  dyngs train configs/static.yaml data.root=scans/bench
-  dyngs train configs/static.yaml data.root=scans/bench train.steps=30000 run.dir=runs/bench run.threads=8
+  dyngs train scans/bench
+  dyngs train clip.mp4 data.longest_side=480
+  dyngs train mip scans/bench train.steps=30000 run.dir=runs/bench run.threads=8
   dyngs train --resume runs/bench
   dyngs train --resume runs/bench train.steps=60000
-  dyngs train configs/static.yaml data.root=scans/bench --view
-  dyngs train configs/static.yaml data.root=scans/bench --from runs/bench init.trainable=colour run.dir=runs/recoloured
-  torchrun --nproc-per-node 4 -m dyngs train configs/static.yaml data.root=scans/bench
+  dyngs train static scans/bench --view
+  dyngs train static scans/bench --from runs/bench init.trainable=colour run.dir=runs/recoloured
+  torchrun --nproc-per-node 4 -m dyngs train static scans/bench
 
-CONFIG is a YAML file or the name of a packaged preset: static, blender, colmap, static_mcmc, mip, dynamic,
-human, human_predictor. `dyngs config static` lists all keys.
+PATH is a capture, a folder of photos or a video. PRESET is a YAML file or a name; `dyngs presets`
+lists the names. Without PRESET, `static` is used for photos, `dynamic` for a video or a capture
+with times, and `human` for a capture of a person. `dyngs config static` lists all keys.
 """
-_LOGGING = tuple(
-    f"train.{name}"
-    for name in ("save_minutes", "save_every", "eval_every", "log_every", "tensorboard")
-)
-_FOR_THIS_CALL = ("run.threads", "run.device", "run.deterministic", "data.cache_mb", *_LOGGING)
-"""Keys that do not change the result of a run."""
-WITH_RESUME = ("train.steps", "data.root", "data.follow_links", *_FOR_THIS_CALL)
-"""Keys that may be given with ``--resume``."""
+_RUN_KEYS = ("run.threads", "run.device", "run.deterministic", "data.cache_mb")
+"""Keys that do not change the result of a run, besides those of logging."""
 
 
 def add_parser(commands: args.Commands) -> None:
-    about = "Train a model from a capture. Writes a run folder (default runs/NAME)."
+    about = "Train a model from a capture. Writes a run folder (default runs/CAPTURE-PRESET)."
     parser = args.add_command(
         commands, "train", run, "train a model from a capture", about, _EPILOG
     )
-    args.add_overrides(parser, "CONFIG key=value", "preset or YAML file, and overrides")
+    about = "preset or YAML file, capture, and overrides"
+    args.add_overrides(parser, "PRESET PATH key=value", about)
     resume = "continue an interrupted run, or with train.steps=N extend a run to N steps"
     parser.add_argument("--resume", type=args.input_path, metavar="RUN", help=resume)
     about = (
@@ -61,6 +61,8 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument(
         "--view", action="store_true", help="view the scene in a browser during training"
     )
+    about = "with --view: end with the training (default: serve until Ctrl-C, on a terminal)"
+    parser.add_argument("--close-viewer", action="store_true", help=about)
     add_serving_arguments(parser)
     args.add_run_device(parser)
     parser.set_defaults(takes_root=True)
@@ -80,21 +82,47 @@ def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> i
     words = [*arguments.overrides, *args.run_device(arguments)]
     config = parse_config(words, arguments.resume, arguments.begun)
     args.computing_device(config.run.device)  # fails early without a GPU
-    if arguments.port is not None and not arguments.view:
-        raise DyngsError("--port requires --view")
+    for option, is_given in (
+        ("--port", arguments.port),
+        ("--close-viewer", arguments.close_viewer),
+    ):
+        if is_given and not arguments.view:
+            raise DyngsError(f"{option} requires --view")
     from dyngs.api.train import train
     from dyngs.cli.training_progress import TrainingProgress
 
+    progress = TrainingProgress()
+    listeners: list[Listener] = [progress]
     with ExitStack() as stack:
-        listeners: list[Listener] = [stack.enter_context(TrainingProgress())]
-        listeners += [stack.enter_context(_view(arguments, config))] if arguments.view else []
-        folder = train(
-            config,
-            resume_from=arguments.resume,
-            listeners=listeners,
-            processes=processes,
-            progress=ProgressBar,
-        )
+        view = None
+        if arguments.view:
+            view = stack.enter_context(_view(arguments, config, progress))
+            listeners.append(view)
+        with progress:
+            folder = train(
+                config,
+                resume_from=arguments.resume,
+                listeners=listeners,
+                processes=processes,
+                progress=ProgressBar,
+            )
+        _print_result(folder, config)
+        if view is not None and sys.stdin.isatty() and not arguments.close_viewer:
+            _keep_open(view)
+    return 0
+
+
+def _keep_open(view: TrainingView) -> None:
+    """Serve the page of a finished training until Ctrl-C."""
+    if view.link is None:
+        return  # the run was finished before
+    print(f"training finished; viewer open at {view.link}; Ctrl-C closes", flush=True)
+    view.serve()
+    wait_for_interrupt()
+
+
+def _print_result(folder: Path, config: Config) -> None:
+    """Print the run folder and the next commands."""
     for line in _about_motion(folder, config):
         print(line)
     word = quote_path(folder)
@@ -108,10 +136,11 @@ def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> i
             f"next:    dyngs eval {word}\n         dyngs render {word} --out "
             f"{quote_path(folder / 'images')}"
         )
-    return 0
 
 
-def _view(arguments: argparse.Namespace, config: Config) -> TrainingView:
+def _view(
+    arguments: argparse.Namespace, config: Config, progress: TrainingProgress
+) -> TrainingView:
     """Return the listener that serves the page."""
     from dyngs.view.server import require_viser
 
@@ -119,7 +148,8 @@ def _view(arguments: argparse.Namespace, config: Config) -> TrainingView:
     from dyngs.view.server import ServerOptions
     from dyngs.view.training import TrainingView
 
-    return TrainingView(config, ServerOptions(arguments.host, arguments.port), print_lines)
+    serving = ServerOptions(arguments.host, arguments.port)
+    return TrainingView(config, serving, print_lines, lambda: progress.figures)
 
 
 def _about_motion(folder: Path, config: Config) -> list[str]:
@@ -144,29 +174,102 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
 def parse_config(words: Sequence[str], resume: Path | None, begun: Path | None = None) -> Config:
     """Return the configuration for the words after ``dyngs train`` and the path of ``--from``."""
     from dyngs.config.io import load_config, load_resolved
+    from dyngs.config.keys.train import LOGGING_KEYS
 
     if begun is not None and resume is not None:
         raise DyngsError("--from starts a new run, --resume continues a run: use one of them")
+    preset, root, overrides = _split_words(words)
     if begun is not None:
-        words = [*words, "init.kind=scene", f"init.scene={begun}"]
-    has_preset = bool(words) and "=" not in words[0]
-    preset, overrides = (Path(words[0]), words[1:]) if has_preset else (None, words)
-    paths = [word for word in overrides if "=" not in word and Path(word).exists()]
-    if paths:
-        raise DyngsError(
-            f"{paths[0]!r}: unexpected path; for a capture use data.root={quote_path(paths[0])}"
-        )
+        overrides = [*overrides, "init.kind=scene", f"init.scene={begun}"]
     if resume is None:
         if not words:
-            raise DyngsError(
-                "a config is required, for instance `dyngs train static data.root=FOLDER`"
-            )
+            raise DyngsError("a capture is required, for instance `dyngs train FOLDER`")
+        if preset is None and root is not None:
+            preset = "static" if begun is not None else _choose_preset(root, overrides)
         return load_config(preset, overrides)
-    other = [word for word in words if word.partition("=")[0].strip() not in WITH_RESUME]
+    harmless = [*_RUN_KEYS, *(f"train.{key}" for key in LOGGING_KEYS)]
+    allowed = ("train.steps", "data.root", "data.follow_links", *harmless)
+    words = [*([preset] if preset else []), *overrides]
+    other = [word for word in words if word.partition("=")[0].strip() not in allowed]
     if other:
         raise DyngsError(
             f"{other[0]!r}: the configuration of a run is fixed; --resume accepts train.steps=N, "
-            f"data.root=FOLDER (a moved capture) and {', '.join(_FOR_THIS_CALL)}"
+            f"data.root=FOLDER (a moved capture) and {', '.join(harmless)}"
         )
     config = load_resolved(resume, overrides)
     return config.model_copy(update={"run": config.run.model_copy(update={"dir": resume})})
+
+
+def describe_option(option: str) -> str:
+    """Return the message about an unknown option, with the key of the same meaning."""
+    from dyngs.config.other_programs import key_of_option
+    from dyngs.config.schema import config_keys
+
+    name = option.lstrip("-").partition("=")[0].replace("-", "_")
+    keys = dict.fromkeys(
+        f"{key.name}=..." for key in config_keys() if f".{key.name}".endswith(f".{name}")
+    )
+    similar = key_of_option(option) or " or ".join(keys)
+    hint = f"; use {similar}" if similar else "; settings are written as section.key=value"
+    return f"unrecognized arguments: {option}{hint}"
+
+
+def _split_words(words: Sequence[str]) -> tuple[str | None, Path | None, list[str]]:
+    """Return the preset, the capture and the overrides, with ``data.root`` set to the capture.
+
+    Raises DyngsError: a word that is none of these, or two of a kind.
+    """
+    names = [word for word in words if "=" not in word or Path(word).exists()]
+    overrides = [word for word in words if word not in names]
+    presets = [name for name in names if _is_preset(name)]
+    paths = [_existing_capture(name) for name in names if name not in presets]
+    given = [word for word in overrides if word.partition("=")[0].strip() == "data.root"]
+    for what, found in (("preset", presets), ("capture", [*paths, *given])):
+        if len(found) > 1:
+            raise DyngsError(f"{str(found[1])!r}: a second {what}; give one preset and one capture")
+    preset = presets[0] if presets else None
+    if not paths:
+        return preset, None, overrides
+    return preset, paths[0], [f"data.root={paths[0].absolute()}", *overrides]
+
+
+def _is_preset(name: str) -> bool:
+    """Return whether a word is a YAML file, a file without suffix, or the name of a preset."""
+    from dyngs.config.io import packaged_presets
+
+    suffix = Path(name).suffix.lower()
+    is_file = suffix in (".yaml", ".yml") or (not suffix and Path(name).is_file())
+    return is_file or name.removeprefix("configs/") in packaged_presets()
+
+
+def _existing_capture(name: str) -> Path:
+    """Return the path of a capture. Raises DyngsError: no such path, a run, or another file."""
+    from dyngs.config.io import RESOLVED_NAME, packaged_presets
+    from dyngs.io.archive import is_archive
+    from dyngs.io.outputs import VIDEO_SUFFIXES, suggest_command
+
+    path = Path(name)
+    if not path.exists():
+        beside = path.parent.glob("*") if path.parent.is_dir() else ()
+        close = get_close_matches(name, [*packaged_presets(), *map(str, beside)], n=2)
+        hint = f"; did you mean {' or '.join(map(quote_path, close))}?" if close else ""
+        raise DyngsError(f"{name}: no such preset (see `dyngs presets`) and no such path{hint}")
+    if (path / RESOLVED_NAME).is_file():
+        raise DyngsError(f"{name}: not a capture; {suggest_command(path)}")
+    if path.is_file() and not is_archive(path) and path.suffix.lower() not in VIDEO_SUFFIXES:
+        raise DyngsError(f"{name}: not a capture; give a folder, a video or a .zip")
+    return path
+
+
+def _choose_preset(root: Path, overrides: Sequence[str]) -> str:
+    """Return the preset that fits the capture, and log it."""
+    from dyngs.capture.preset import choose_preset
+    from dyngs.config.io import load_config
+
+    data = load_config(None, [word for word in overrides if word.startswith("data.")]).data
+    preset, reason = choose_preset(data)
+    log_info(
+        f"preset {preset} ({reason}); for another one: `dyngs train PRESET {quote_path(root)}`, "
+        "`dyngs presets` lists them"
+    )
+    return preset

@@ -8,13 +8,12 @@ points are searched only for names that are not built in.
 from __future__ import annotations
 
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from typing import Protocol, cast
 
-from dyngs.core.errors import DyngsError
+from dyngs.core.plugins import MODELS as GROUP
+from dyngs.core.plugins import load_plugin, load_plugins, package_name, plugin_entries
 from dyngs.core.section import ModelSection
-
-GROUP = "dyngs.models"
 
 BUILT_IN = {
     "static": "dyngs.static.kind:STATIC",
@@ -36,17 +35,21 @@ class InstalledKind(Protocol):
     """The part of a kind that the configuration needs."""
 
     @property
+    def name(self) -> str: ...
+
+    @property
     def section(self) -> type[ModelSection]: ...
 
 
 def kind_names() -> list[str]:
-    """Return the names of all installed kinds, built-in ones first."""
-    return [*BUILT_IN, *(name for name in sorted(plugin_kinds()) if name not in BUILT_IN)]
+    """Return the names of all kinds that can be imported, built-in ones first."""
+    plugins = load_plugins(GROUP, object, tuple(BUILT_IN))
+    return [*BUILT_IN, *(cast("InstalledKind", kind).name for kind in plugins)]
 
 
 def is_kind(name: object) -> bool:
     """Return whether a kind with this name is installed."""
-    return name in BUILT_IN or name in plugin_kinds()
+    return name in BUILT_IN or name in plugin_entries(GROUP)
 
 
 @cache
@@ -57,13 +60,7 @@ def installed_kind(name: str) -> InstalledKind:
     """
     if name in BUILT_IN:
         return cast("InstalledKind", EntryPoint(name, BUILT_IN[name], GROUP).load())
-    entry = plugin_kinds()[name]
-    try:
-        return cast("InstalledKind", entry.load())
-    except Exception as error:
-        raise DyngsError(
-            f"model.kind={name}: the package {package_of(name)} cannot be imported ({error})"
-        ) from error
+    return cast("InstalledKind", load_plugin(GROUP, name, object))
 
 
 def section_of_kind(name: str) -> type[ModelSection]:
@@ -73,10 +70,5 @@ def section_of_kind(name: str) -> type[ModelSection]:
 
 def package_of(name: str) -> str | None:
     """Return the name of the plugin package of a kind; None if it is built in or not installed."""
-    entry = None if name in BUILT_IN else plugin_kinds().get(name)
-    return entry.dist.name if entry is not None and entry.dist is not None else None
-
-
-@cache
-def plugin_kinds() -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in entry_points(group=GROUP)}
+    entry = None if name in BUILT_IN else plugin_entries(GROUP).get(name)
+    return None if entry is None else package_name(entry)

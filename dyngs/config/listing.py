@@ -12,7 +12,7 @@ import yaml
 from pydantic import BaseModel
 
 from dyngs.config import Config
-from dyngs.config.io import find_preset, load_config, load_resolved
+from dyngs.config.io import find_preset, load_config, load_resolved, packaged_presets
 from dyngs.config.schema import allowed_values, default_text, list_kinds, section_classes
 from dyngs.config.yaml_reader import read_file, read_override
 
@@ -39,10 +39,14 @@ def format_config(source: Path, overrides: list[str]) -> str:
     return _text(config, has_root, str(source))
 
 
+def preset_summaries() -> dict[str, str]:
+    """Return the first line, a comment, of each packaged preset by name."""
+    files = packaged_presets().items()
+    return {name: file.read_text("utf-8").partition("\n")[0].lstrip("# ") for name, file in files}
+
+
 def _text(config: Config, has_root: bool, source: str) -> str:
-    head = (
-        f"# {source!r} with every key; train with it: dyngs train THIS_FILE.yaml data.root=FOLDER"
-    )
+    head = f"# {source!r} with every key; train with it: dyngs train THIS_FILE.yaml FOLDER"
     lines = [
         head.encode("unicode_escape").decode("ascii"),
         *_section(config, config.model_dump(mode="json"), 0),

@@ -11,6 +11,7 @@ import numpy as np
 
 from dyngs.config import DataConfig
 from dyngs.core.errors import DyngsError, NoCaptureError, wrap_read_errors
+from dyngs.core.plugins import READERS, load_plugin, load_plugins
 from dyngs.data import times
 from dyngs.data.body_frames import attach_fitted_body
 from dyngs.data.capture import (
@@ -157,6 +158,7 @@ FORMATS: tuple[CaptureFormat, ...] = (
     camera_folders.LLFF_FORMAT,
 )
 """All formats in order of priority: the first one that is recognised is read."""
+_BUILT_IN = {format.name: format for format in FORMATS}
 
 
 def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) -> Capture:
@@ -190,8 +192,7 @@ def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) ->
     require_folder(options.root)
     root = capture_folder(options.root)
     options = options.model_copy(update={"root": root})
-    with wrap_read_errors(root, "choose another folder or change its permissions"):
-        found = [format for format in FORMATS if format.recognise(root)]
+    found = _recognised_formats(root, options.format)
     chosen = _chosen_format(options, found)
     with (
         restrict_paths_to(root, options.follow_links),
@@ -220,7 +221,7 @@ def require_folder(root: Path) -> None:
 def is_capture(root: Path) -> bool:
     """Whether a folder or archive is recognised as a capture of any format."""
     folder = capture_folder(root)
-    return folder.is_dir() and _is_recognised(folder)
+    return folder.is_dir() and bool(_recognised_formats(folder))
 
 
 def capture_folder(root: Path) -> Path:
@@ -231,7 +232,7 @@ def capture_folder(root: Path) -> Path:
     if not is_archive(root):
         return root
     folder: Path = unpack_archive(root)
-    while not _is_recognised(folder):
+    while not _recognised_formats(folder):
         inner = list(folder.iterdir())
         if len(inner) != 1 or not inner[0].is_dir():
             break
@@ -239,9 +240,17 @@ def capture_folder(root: Path) -> Path:
     return folder
 
 
-def _is_recognised(folder: Path) -> bool:
+def _recognised_formats(folder: Path, wanted: str = "auto") -> list[CaptureFormat]:
+    """Return the formats of a folder; those of plug-ins if ``wanted`` or no other is found."""
     with wrap_read_errors(folder, "choose another folder or change its permissions"):
-        return any(format.recognise(folder) for format in FORMATS)
+        found = [format for format in FORMATS if format.recognise(folder)]
+        if not found or wanted not in ("auto", *_BUILT_IN):
+            found += [format for format in _plugin_formats() if format.recognise(folder)]
+    return found
+
+
+def _plugin_formats() -> tuple[CaptureFormat, ...]:
+    return load_plugins(READERS, CaptureFormat, tuple(_BUILT_IN))
 
 
 def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFormat:
@@ -251,10 +260,11 @@ def _chosen_format(options: DataConfig, found: list[CaptureFormat]) -> CaptureFo
             known = suggest_command(options.root, captures=False)
             if known is not None:
                 raise DyngsError(f"{options.root}: no capture found; {known}")
-            looked_for = "; ".join(f"{format.name}: {format.files}" for format in FORMATS)
+            formats = (*FORMATS, *_plugin_formats())
+            looked_for = "; ".join(f"{format.name}: {format.files}" for format in formats)
             raise DyngsError(f"{options.root}: no capture found; looked for {looked_for}")
         return found[0]
-    chosen = next(format for format in FORMATS if format.name == options.format)
+    chosen = _BUILT_IN.get(options.format) or load_plugin(READERS, options.format, CaptureFormat)
     if chosen not in found:
         also = f"; it contains a {found[0].name} capture" if found else ""
         raise DyngsError(

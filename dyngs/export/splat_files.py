@@ -24,6 +24,7 @@ from dyngs.gaussians.colour.network import bake_harmonics
 from dyngs.gaussians.levels import MERGED, build_levels
 from dyngs.gaussians.rendering import splat_options
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import (
     SOG_INDEX,
     Format,
@@ -60,7 +61,7 @@ from dyngs.io.outputs import atomic_folder, require_new_folder
 from dyngs.io.write import atomic_file
 from dyngs.ops.quaternions import align_quat_signs, rotation_matrices, unit_quats
 from dyngs.runs.folder import collect_inputs
-from dyngs.runs.opened import OpenedScene
+from dyngs.runs.opened import OpenedScene, wrap_scene
 
 PER_LEAF = MERGED**7  # Gaussians of a leaf at level 0
 PER_FILE = MERGED**9  # Most Gaussians of a file
@@ -255,6 +256,42 @@ def _for_viewers(
     near = opened.scene.options.near * frame.scale
     fitted, note = fit_classic(splat, frame.cameras(opened.cameras), near, degree)
     return fitted, (note,)
+
+
+def save(
+    scene: GaussianScene | Gaussians,
+    path: Path | str,
+    *,
+    time: float | None = None,
+    sh_degree: int | None = None,
+) -> Path:
+    """Write a scene in memory as a file of Gaussians, in its own axes. Returns the path.
+
+    ``dyngs.export`` writes runs, in more formats and with the axes that viewers expect.
+
+    Example:
+
+        import dyngs
+
+        scene = dyngs.load("runs/lego")
+        opaque = scene.gaussians.opacities > 0.1
+        dyngs.save(scene.select(opaque), "opaque.ply")
+
+    Args:
+        scene: a scene, or Gaussians.
+        path: the suffix selects the format.
+        time: in [0, 1], of a moving scene.
+        sh_degree: highest degree in the file; None: that of the scene.
+
+    Raises:
+        DyngsError: an unknown suffix, no time of a moving scene, or a file that cannot be written.
+    """
+    if isinstance(scene, Gaussians):
+        scene = StaticScene(gaussians=scene)
+    if time is None and not scene.is_static:
+        raise DyngsError(f"{path}: the scene moves; give time=T, or use dyngs.export for all times")
+    how = WriteOptions(sh_degree=sh_degree)
+    return write_run_splats(wrap_scene(scene), Path(path), time or 0.0, how=how).path
 
 
 def write_run_sequence(

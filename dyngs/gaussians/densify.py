@@ -145,7 +145,7 @@ class DefaultDensifier(Densifier):
             result = EditResult(None)
         else:
             return None
-        return _with_opacity_reset(result, parameters.logit_opacities) if resets else result
+        return with_opacity_reset(result, parameters.logit_opacities) if resets else result
 
     def move_to(self, device: torch.device) -> None:
         self.sums = self.sums.to(device)
@@ -184,22 +184,8 @@ class DefaultDensifier(Densifier):
             PRUNE_SCALE * reference_length if step > self.schedule.prune_scale_after else math.inf
         )
         score = self.sums[0] / self.sums[1].clamp_min(1)
-        masks = plan_edit(parameters, score, self.options, reference_length, max_scale)
-        kept, cloned, split = (torch.nonzero(mask)[:, 0] for mask in masks)
-        source = torch.cat([kept, cloned, split, split])
-        is_new = torch.ones(len(source), dtype=torch.bool, device=source.device)
-        is_new[: len(kept)] = False
-        means = parameters.means[source]
-        log_scales = parameters.log_scales[source]
-        children = slice(len(kept) + len(cloned), None)
-        sizes = log_scales[children].clamp_max(MAX_LOG_VARIANCE / 2).exp()
-        noise = (
-            torch.randn((2 * len(split), 3), generator=generator, device="cpu").to(sizes.device)
-            * sizes
-        )
-        means[children] += rotate(parameters.quats[source[children]], noise)
-        log_scales[children] -= math.log(SPLIT_SHRINK)
-        return EditResult(TopologyEdit(source, is_new), {"means": means, "log_scales": log_scales})
+        plan = plan_edit(parameters, score, self.options, reference_length, max_scale)
+        return apply_plan(parameters, plan, generator)
 
 
 class EditPlan(NamedTuple):
@@ -248,6 +234,24 @@ def plan_edit(
     return EditPlan(kept, cloned, split)
 
 
+def apply_plan(parameters: Gaussians, plan: EditPlan, generator: torch.Generator) -> EditResult:
+    """Clone and split as planned; the halves of a split Gaussian are sampled from it."""
+    kept, cloned, split = (torch.nonzero(mask)[:, 0] for mask in plan)
+    source = torch.cat([kept, cloned, split, split])
+    is_new = torch.ones(len(source), dtype=torch.bool, device=source.device)
+    is_new[: len(kept)] = False
+    means = parameters.means[source]
+    log_scales = parameters.log_scales[source]
+    children = slice(len(kept) + len(cloned), None)
+    sizes = log_scales[children].clamp_max(MAX_LOG_VARIANCE / 2).exp()
+    noise = (
+        torch.randn((2 * len(split), 3), generator=generator, device="cpu").to(sizes.device) * sizes
+    )
+    means[children] += rotate(parameters.quats[source[children]], noise)
+    log_scales[children] -= math.log(SPLIT_SHRINK)
+    return EditResult(TopologyEdit(source, is_new), {"means": means, "log_scales": log_scales})
+
+
 def _select_within_budget(candidates: Tensor, score: Tensor, cost: Tensor, room: int) -> Tensor:
     """Select the candidates of highest score whose total cost is at most ``room``; ties by index.
 
@@ -262,10 +266,12 @@ def _select_within_budget(candidates: Tensor, score: Tensor, cost: Tensor, room:
     return chosen
 
 
-def _with_opacity_reset(result: EditResult, logit_opacities: Tensor) -> EditResult:
-    """Add an opacity reset to an edit: opacities of at most 0.01 and zero moments."""
+def with_opacity_reset(
+    result: EditResult, logit_opacities: Tensor, most: float = RESET_OPACITY
+) -> EditResult:
+    """Add an opacity reset to an edit: opacities of at most ``most`` and zero moments."""
     moved = logit_opacities if result.edit is None else result.edit.apply(logit_opacities)
-    lowered = moved.clamp_max(math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+    lowered = moved.clamp_max(math.log(most / (1 - most)))
     changes = {**result.changes, "logit_opacities": lowered}
     return EditResult(result.edit, changes, result.zero_moments | {"logit_opacities"})
 

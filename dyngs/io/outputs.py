@@ -40,17 +40,15 @@ def suggest_command(path: Path, *, captures: bool = True) -> str | None:
     Only file names are checked, those directly in a folder and in ``images`` below it.
     """
     where = quote_path(path)
-    static = f"`dyngs train static data.root={where}`"
-    dynamic = f"`dyngs train dynamic data.root={where}`"
-    either = f"train it with {static}, or {dynamic} if the scene moves"
+    train = f"train it with `dyngs train {where}`"
     if path.is_file():
-        return f"it is a video, {either}" if path.suffix.lower() in VIDEO_SUFFIXES else None
+        return f"it is a video, {train}" if path.suffix.lower() in VIDEO_SUFFIXES else None
     if not path.is_dir():
         return None
     if (path / "config.yaml").is_file():
         return f"it is a run, for `dyngs eval {where}`, `dyngs render {where}` or `dyngs train --resume {where}`"
     if captures and any((path / name).exists() for name in _CAPTURE):
-        return f"it is a capture, {either}"
+        return f"it is a capture, {train}"
     try:
         found = [*path.glob("[!.]*.*"), *path.glob("images/[!.]*.*")]
     except OSError:
@@ -58,9 +56,9 @@ def suggest_command(path: Path, *, captures: bool = True) -> str | None:
     suffixes = [one.suffix.lower() for one in found]
     videos = sum(x in VIDEO_SUFFIXES for x in suffixes)
     if sum(x in PHOTO_SUFFIXES for x in suffixes) >= 3:
-        return f"it is a folder of photos, train it with {static}"
+        return f"it is a folder of photos, {train}"
     if videos > 1:
-        return f"it is a folder of {videos} videos, train it with {dynamic}"
+        return f"it is a folder of {videos} videos, {train}"
     return "it is a folder with one video; give the video itself" if videos else None
 
 

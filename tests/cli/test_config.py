@@ -50,3 +50,10 @@ def test_a_run_and_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
         assert load_resolved(tmp_path / "all.yaml") == config
     assert main(["config", "statik"]) == 2
     assert "did you mean 'static'" in capsys.readouterr().err
+
+
+def test_presets_are_listed_in_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["presets"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[:-1]] == list(packaged_presets())
+    assert all(50 < len(line) <= 110 and line.endswith(".") for line in lines[:-1])

@@ -133,7 +133,7 @@ def test_a_person_is_synthesised_and_inspected(tmp_path: Path, capsys: PrintedOu
     out = tmp_path / "new"
     words = ["--size", "12", "--views", "2", "--cameras", "3", "--seed", "4"]
     assert main(["data", "synth", "human", str(out), *words]) == 0
-    assert f"dyngs train human data.root={out}" in capsys.readouterr().out
+    assert f"dyngs train human {out}" in capsys.readouterr().out
     capture = read_capture(DataConfig(root=out))  # type: ignore[call-arg]
     assert {(view.frame, view.camera_id) for view in capture.splits["train"]} == {
         (f, c) for f in (0, 1) for c in range(3)
@@ -150,7 +150,7 @@ def test_people_are_synthesised(tmp_path: Path, capsys: PrintedOutput) -> None:
     words = ["data", "synth", "people", str(out), "--size", "12", "--cameras", "3", "--people"]
     for count in (1, 2):
         assert main([*words, str(count)]) == 0
-        assert f"dyngs train gps data.root={out}" in capsys.readouterr().out
+        assert f"dyngs train gps {out}" in capsys.readouterr().out
         people = list_captures(DataConfig(root=out))
         captures = [read_capture(person) for person in people]
         assert [sum(map(len, capture.splits.values())) for capture in captures] == [3] * count
@@ -195,7 +195,7 @@ def test_a_fitted_capture_says_how_good_it_is(tmp_path: Path, capsys: PrintedOut
     printed = capsys.readouterr().out
     assert "2 frames; silhouette IoU on 2 held-out views" in printed
     assert "chosen: given poses" in printed, "they are exact"
-    assert f"next: dyngs train human data.root={tmp_path / 'out'}" in printed
+    assert f"next: dyngs train human {tmp_path / 'out'}" in printed
     report = json.loads((tmp_path / "out" / "fit_report.json").read_text())
     assert report["taken"] == "given poses"
     assert set(report["iou_per_frame"]) == {"0", "1"}
@@ -265,9 +265,7 @@ def test_a_body_file_of_ones_own_is_fitted_trained_and_known_again(
     printed = capsys.readouterr().out
     assert printed.startswith("smpl (smpl.npz), 1 frame; silhouette IoU")
     keys = [f"model.body={body}", f"model.uv={uv}"]
-    assert (
-        printed.splitlines()[-1] == f"next: dyngs train human data.root={fitted} {' '.join(keys)}"
-    )
+    assert printed.splitlines()[-1] == f"next: dyngs train human {fitted} {' '.join(keys)}"
     small = ["model.resolution=24", "train.steps=1", "run.threads=1"]
     assert main(["train", "human", f"data.root={fitted}", f"run.dir={run}", *keys, *small]) == 0
     assert "fitted to the silhouettes" not in capsys.readouterr().out, "that was done"

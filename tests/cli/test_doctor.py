@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 
 import dyngs
-from dyngs.cli import main
+from dyngs.cli import doctor, main
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(dyngs.__file__).resolve().parents[1])}
 Capture = pytest.CaptureFixture[str]
@@ -23,6 +23,12 @@ def test_doctor(capsys: Capture) -> None:
     text = capsys.readouterr().out
     assert re.search(r"instruction set v\d \(\S+\), compiled: v\d", text)
     assert "broken" not in text
+
+
+def test_doctor_names_the_extras_of_optional_packages() -> None:
+    project = (Path(dyngs.__file__).resolve().parents[1] / "pyproject.toml").read_text()
+    for name, extra in doctor._OPTIONAL.items():
+        assert re.search(rf'^{extra} = \[.*"{name}>', project, re.MULTILINE), name
 
 
 def test_doctor_reports_kernels_that_this_processor_cannot_run() -> None:

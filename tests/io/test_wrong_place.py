@@ -37,11 +37,11 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(
     ("path", "command"),
     [
-        ("photos", "`dyngs train static data.root=photos`"),
-        ("clip.mp4", "`dyngs train dynamic data.root=clip.mp4`"),
-        ("rig", "2 videos, train it with `dyngs train dynamic data.root=rig`"),
+        ("photos", "`dyngs train photos`"),
+        ("clip.mp4", "`dyngs train clip.mp4`"),
+        ("rig", "2 videos, train it with `dyngs train rig`"),
         ("run", "`dyngs eval run`"),
-        ("capture", "`dyngs train static data.root=capture`"),
+        ("capture", "`dyngs train capture`"),
         ("single", "one video"),
         ("empty", None),
         ("empty/notes.txt", None),

@@ -13,6 +13,7 @@ import pytest
 from toy_plugin import FOLDER, installed
 
 import dyngs
+from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config.io import load_config
 from dyngs.config.kinds import BUILT_IN, GROUP
@@ -50,7 +51,7 @@ def options(capture: Path, run: Path, steps: int = 40) -> list[str]:
 
 @pytest.fixture(scope="module")
 def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return dyngs.train(load_config(None, options(capture, tmp_path_factory.mktemp("runs") / "toy")))
+    return train(load_config(None, options(capture, tmp_path_factory.mktemp("runs") / "toy")))
 
 
 def test_our_own_kinds_are_entry_points_of_the_package() -> None:
@@ -78,7 +79,7 @@ def test_a_run_needs_the_package_of_its_kind(capture: Path, tmp_path: Path) -> N
     without = dyngs_command("eval", str(run), plugin=False)
     assert without.returncode == 2
     assert without.stderr.strip().count("\n") == 0
-    assert "model.kind=toy needs the package toy-splats, which is not installed" in without.stderr
+    assert "model.kind=toy needs the package dyngs-toy, which is not installed" in without.stderr
 
 
 def test_its_keys_are_listed_and_validated(capture: Path, tmp_path: Path) -> None:
@@ -97,7 +98,7 @@ def test_it_learns_and_resumes_with_the_same_bytes(
     run: Path, capture: Path, tmp_path: Path
 ) -> None:
     middle, last = checkpoint_paths(run)
-    again = dyngs.train(load_config(None, options(capture, tmp_path / "again")))
+    again = train(load_config(None, options(capture, tmp_path / "again")))
     checkpoint_paths(again)[-1].unlink()
     assert [path.name for path in checkpoint_paths(again)] == [middle.name]
     assert main(["train", "--resume", str(again)]) == 0

@@ -46,7 +46,7 @@ def ensure_poses(
     if videos and not needs_times:
         raise DyngsError(
             f"{source}: holds {len(videos)} videos; a static scene needs one video of a moving "
-            f"camera, several need `dyngs train dynamic data.root={quote_path(source)}`"
+            f"camera, several need `dyngs train dynamic {quote_path(source)}`"
         )
     if source.is_dir() and not videos and needs_times and data.times == "files":
         raise DyngsError(

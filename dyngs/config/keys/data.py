@@ -5,35 +5,56 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import (
+    Field,
+    PlainSerializer,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+)
 
+from dyngs.core.plugins import READERS, plugin_entries
 from dyngs.core.section import Section
+
+
+def _or_plugin(value: object, check: ValidatorFunctionWrapHandler) -> object:
+    """Allow the names of installed readers beside the built-in ones."""
+    try:
+        return check(value)
+    except ValidationError:
+        if value in plugin_entries(READERS):
+            return value
+        raise
 
 
 class DataConfig(Section):
     """Location and reading of the capture."""
 
     root: Path = Field(description="folder or .zip of the capture")
-    format: Literal[
-        "auto",
-        "body_json",
-        "zju_mocap",
-        "people_snapshot",
-        "neuman",
-        "blender",
-        "nerfstudio",
-        "colmap",
-        "nerfies",
-        "polycam",
-        "record3d",
-        "metashape",
-        "realitycapture",
-        "odm",
-        "llff",
-        "camera_folders",
+    format: Annotated[
+        Literal[
+            "auto",
+            "body_json",
+            "zju_mocap",
+            "people_snapshot",
+            "neuman",
+            "blender",
+            "nerfstudio",
+            "colmap",
+            "nerfies",
+            "polycam",
+            "record3d",
+            "metashape",
+            "realitycapture",
+            "odm",
+            "llff",
+            "camera_folders",
+        ],
+        WrapValidator(_or_plugin),
+        PlainSerializer(str),
     ] = Field(
         default="auto",
-        description="format of the capture; auto: detected from its files",
+        description="format of the capture, also that of a plug-in; auto: detected from its files",
     )
     frames: str | None = Field(
         default=None,

@@ -1,5 +1,5 @@
-"""A kind of model of another package, not made of Gaussians: a grid of colours and densities,
-ray-marched in plain torch. The folder is what pip would install."""
+"""A kind of model that is not made of Gaussians: a grid of colours and densities, ray-marched in plain
+torch."""
 
 from __future__ import annotations
 
