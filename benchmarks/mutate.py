@@ -87,7 +87,7 @@ MUTATIONS = (
     ("gaussians/schedule.py", "range(period, stop - period + 1, period)", "range(period, stop, period)", "gaussians/test_schedule.py"),
     ("gaussians/schedule.py", "(1 - progress) * math.log(options.lr_means)", "progress * math.log(options.lr_means)", "gaussians/test_schedule.py"),
     ("training/corrections/exposure.py", "composite(view.background) >= SATURATED", "composite(view.background) >= 9", "training/corrections/test_exposure.py"),
-    ("evaluate/view_scores.py", "kept = 1 - grown", "kept = (shown)[None, None].float()", "evaluate/test_regions.py"),
+    ("evaluate/view_scores.py", "kept = _erode(shown, radius=1)[None, None].float()", "kept = shown[None, None].float()", "evaluate/test_regions.py"),
     ("evaluate/view_scores.py", "else x & foreground", "else x", "evaluate/test_regions.py"),
     ("evaluate/view_scores.py", "(after - now) / (after - before)", "(now - before) / (after - before)", "evaluate/test_temporal.py"),
     ("evaluate/view_scores.py", "psnr(rendering.rgb[0][:, middle:], truth[:, middle:], mask)", "psnr(rendering.rgb[0][:, :middle], truth[:, :middle], mask)", "evaluate/test_view_scores.py"),

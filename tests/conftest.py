@@ -14,6 +14,12 @@ from __future__ import annotations
 
 import gc
 import os
+import sys
+from pathlib import Path
+
+# `python -m pytest` searches the working directory first; its core may not be compiled
+if os.getcwd() in sys.path and not [*Path("dyngs/ops").glob("_core_*")]:
+    sys.path.remove(os.getcwd())
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     # `pytest -n 2`: processes share the cores, their threads would fight for them
@@ -26,7 +32,6 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from importlib import import_module
 from itertools import count as numbers
-from pathlib import Path
 
 import pytest
 import torch

@@ -18,10 +18,11 @@ from dyngs.core.errors import DyngsError
 
 _OPTIONAL = {
     "viser": "view",
-    "flip-evaluator": "metrics",
     "lpips": "metrics",
     "matplotlib": "plots",
     "tensorboard": "tensorboard",
+    "wandb": "wandb",
+    "rerun-sdk": "rerun",
     "zstandard": "zstd",
     "usd-core": "usd",
     "fourdgs": "4dgs",
@@ -84,7 +85,8 @@ def _examine_packages() -> Iterator[Check]:
         if "extra ==" not in line:
             name = re.split(r"[^\w.-]", line, maxsplit=1)[0]
             version = _version(name)
-            yield Check(name, version or "missing", "broken" if version is None else "ok")
+            needed = "absent" if ";" in line else "broken"  # a marker: not for all platforms
+            yield Check(name, version or "missing", needed if version is None else "ok")
     for name, extra in _OPTIONAL.items():
         version = _version(name)
         advice = f"pip install 'dyngs[{extra}]'"

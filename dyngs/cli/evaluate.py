@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import numbers_table, print_notes, print_tables
-from dyngs.core.errors import format_count
+from dyngs.core.errors import DyngsError, format_count, quote_path
 
 if TYPE_CHECKING:
     from dyngs.evaluate.report import EvalReport
@@ -40,6 +40,8 @@ def add_parser(commands: args.Commands) -> None:
         "images; always on for runs with camera.refine"
     )
     parser.add_argument("--refine", action="store_true", help=about)
+    about = "more rows: worst views, right halves, per time, flicker, and why metrics are missing"
+    parser.add_argument("--verbose", action="store_true", help=about)
     args.add_json(parser)
 
 
@@ -49,6 +51,13 @@ def run(arguments: argparse.Namespace) -> int:
         from dyngs.config.io import load_resolved
         from dyngs.evaluate.report import evaluate_run, report_path
 
+    arguments.run_dir = args.run_of_scene_file(arguments.run_dir)
+    if arguments.run_dir.is_file():
+        word = quote_path(arguments.run_dir)
+        raise DyngsError(
+            f"{arguments.run_dir}: a file holds no images to compare with; give the run folder "
+            f"written by `dyngs train`, or see the file with `dyngs view {word}`"
+        )
     if arguments.refine and arguments.split != "train":
         load_resolved(arguments.run_dir)  # fails for anything but a run before the message
         print(
@@ -68,62 +77,84 @@ def run(arguments: argparse.Namespace) -> int:
         print(report.to_json(), end="")
         return 0
     title = f"{format_count(report.num_views, 'view')} of the {report.split} split"
-    print_tables(numbers_table(title, ("metric", "value"), report_rows(report)))
-    print_notes(report.notes, report.warnings)
+    rows = report_rows(report, verbose=arguments.verbose)
+    print_tables(numbers_table(title, ("metric", "value"), rows))
+    print_notes([*report.notes, *missing_metrics(report)], report.warnings)
     print(f"written: {report_path(arguments.run_dir, report.split)}")
     return 0
 
 
-def report_rows(report: EvalReport) -> list[tuple[str, str]]:
-    """Return labels and values of the mean metrics, or the reason why one is missing."""
-
-    def known(name: str, shown: str = "{:.4f}") -> str:
-        value = getattr(report, name)
-        return report.reasons.get(name, "not measured") if value is None else shown.format(value)
-
+def report_rows(report: EvalReport, *, verbose: bool = False) -> list[tuple[str, str]]:
+    """Return labels and values of the mean metrics that were measured, with ``verbose`` all."""
     rows = [("PSNR", f"{report.psnr:.2f} dB")]
+    if report.psnr_own_poses is not None:
+        rows.append((f"PSNR{_REFINED}", f"{report.psnr_own_poses:.2f} dB"))
+    rows.append(("SSIM", f"{report.ssim:.4f}"))
+    if report.flip is not None:
+        part = "" if report.flip_views == report.num_views else f" of {report.flip_views} views"
+        rows.append((f"FLIP{part}", f"{report.flip:.4f}"))
+    if report.lpips is not None:
+        rows.append((f"LPIPS ({report.lpips_net})", f"{report.lpips:.4f}"))
+    rows += _rows_of_person(report)
+    rows += _rows_of_regions(report)
+    if report.num_gaussians:
+        rows.append(("Gaussians", f"{report.num_gaussians:,}"))
+    if report.num_moving:
+        rows.append(("moving", f"{report.num_moving:,} ({report.moving_fraction:.1%})"))
+    stored = "" if report.stored_mb is None else f"{report.stored_mb:.2f} MB on disk, as float32 "
+    rows.append(("model", f"{stored}{report.model_mb:.1f} MB"))
+    rows.append(("rendering", f"{report.fps:.1f} frames/s at {report.width}x{report.height}"))
+    duration = f" in {report.seconds_train:.0f} s" if report.seconds_train else ""
+    rows.append(("training", f"{format_count(report.step, 'step')}{duration}"))
+    if verbose:
+        rows += _further_rows(report)
+    return rows
+
+
+def missing_metrics(report: EvalReport) -> list[str]:
+    """Return a line about FLIP and LPIPS if they were not measured, else nothing."""
+    missing = {"FLIP": report.reasons.get("flip"), "LPIPS": report.reasons.get("lpips")}
+    reasons = [f"no {name}: {reason}" for name, reason in missing.items() if reason]
+    return ["; ".join(reasons)] if reasons else []
+
+
+def _further_rows(report: EvalReport) -> list[tuple[str, str]]:
+    """Return labels and values for ``--verbose``, and the reasons for metrics without a value."""
+    rows: list[tuple[str, str]] = []
+    worst = sorted(report.per_view, key=lambda view: view.psnr)[:MOST_THINGS]
+    rows += [(f"PSNR of {view.name}", f"{view.psnr:.2f} dB") for view in worst]
     if report.psnr_white is not None and report.psnr_black is not None:
         both = f"{report.psnr_white:.2f} dB, {report.psnr_black:.2f} dB"
         rows.append(("PSNR on white, on black", both))
     if report.psnr_right is not None and report.psnr_right_fitted is not None:
-        right = f"{report.psnr_right:.2f} dB; {report.psnr_right_fitted:.2f} dB with colours fitted on left halves"
-        rows.append(("PSNR of right halves", right))
-    if report.psnr_own_poses is not None:
-        rows.append((f"PSNR{_REFINED}", f"{report.psnr_own_poses:.2f} dB"))
-    rows.append(("SSIM", f"{report.ssim:.4f}"))
-    rows += _rows_of_person(report)
-    rows += _rows_of_regions(report)
-    rows += [("FLIP", known("flip")), (f"LPIPS ({report.lpips_net})", known("lpips"))]
+        rows.append(("PSNR of right halves", f"{report.psnr_right:.2f} dB"))
+        rows.append(("with colours of left halves", f"{report.psnr_right_fitted:.2f} dB"))
     if report.psnr_per_time:
         values = [at.psnr for at in report.psnr_per_time]
-        worst = min(report.psnr_per_time, key=lambda at: at.psnr)
-        mean = sum(values) / len(values)
-        spread = f"min {worst.psnr:.2f}, mean {mean:.2f}, max {max(values):.2f} dB; worst at time {worst.time:g}"
+        lowest = min(report.psnr_per_time, key=lambda at: at.psnr)
+        spread = f"{lowest.psnr:.2f} (time {lowest.time:g}) to {max(values):.2f} dB"
         rows.append((f"PSNR at {format_count(len(values), 'time')}", spread))
-        moves = report.num_moving or report.flicker is None
-        flicker = known("flicker", "{:.3f} of 255") if moves else "0 (nothing moves)"
-        rows.append(("flicker", flicker))
-        rows.append(("flicker error", known("flicker_error", "{:.3f} of 255")))
+        for label, value in (
+            ("flicker", report.flicker),
+            ("flicker error", report.flicker_error),
+        ):
+            if value is not None:
+                rows.append((label, f"{value:.3f} of 255"))
         if report.track_error_px is not None:
             close = f"{report.track_within_5px or 0:.0%} within 5 px"
             still = f"{report.track_motion_px or 0:.2f} px if nothing moved"
             rows.append(("tracks", f"{report.track_error_px:.2f} px off, {close}; {still}"))
-    rows.append(("image size", f"{report.width}x{report.height} on {report.background}"))
-    if report.num_gaussians:
-        rows.append(("Gaussians", f"{report.num_gaussians:,}"))
-    field = deforming = ""
     if report.num_moving:
-        rows.append(("moving", f"{report.num_moving:,} ({report.moving_fraction:.1%})"))
-        field = f", {report.field_mb:.1f} of them the field"
-        deforming = f", {report.deform_fraction:.0%} of the time deforming"
-    stored = "" if report.stored_mb is None else f"{report.stored_mb:.2f} MB on disk, as float32 "
-    rows.append(("model", f"{stored}{report.model_mb:.1f} MB{field}"))
+        rows.append(("deformation field", f"{report.field_mb:.1f} MB"))
+        rows.append(("time for deforming", f"{report.deform_fraction:.0%} of rendering"))
     if report.num_gaussians:
         rows.append(("colour", f"{report.colour_floats:.1f} numbers per Gaussian"))
-    rows.append(("rendering", f"{report.fps:.1f} frames/s{deforming}"))
-    rows.append(
-        ("training", f"{format_count(report.step, 'step')} in {report.seconds_train:.0f} s")
-    )
+    rows.append(("background", report.background))
+    names: dict[str, list[str]] = {}
+    for name, reason in report.reasons.items():
+        if name not in ("flip", "lpips"):
+            names.setdefault(reason, []).append(name)
+    rows += [(f"no {', '.join(group)}", reason) for reason, group in names.items()]
     return rows
 
 
@@ -153,12 +184,12 @@ def _rows_of_regions(report: EvalReport) -> list[tuple[str, str]]:
     rows = []
     if report.psnr_foreground is not None:
         rows.append(("on the foreground", f"{report.psnr_foreground:.2f} dB"))
-    for label, name in (("on what moves", "psnr_moving"), ("on what does not", "psnr_static")):
-        value = getattr(report, name)
+    for label, value in (
+        ("on what moves", report.psnr_moving),
+        ("on what does not", report.psnr_static),
+    ):
         if value is not None:
             rows.append((label, f"{value:.2f} dB (by {report.moving_from})"))
-        elif report.psnr_per_time:
-            rows.append((label, report.reasons.get(name, "not measured")))
     if len(report.psnr_things) > 1:
         worst = sorted(report.psnr_things.items(), key=lambda item: item[1])[:MOST_THINGS]
         things = ", ".join(f"{label}: {value:.2f} dB" for label, value in worst)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from difflib import get_close_matches
@@ -13,10 +14,11 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.output import ProgressBar, print_lines
-from dyngs.cli.view import add_serving_arguments
+from dyngs.cli.view import add_serving_arguments, wait_for_interrupt
 from dyngs.core.errors import DyngsError, format_count, log_info, quote_path
 
 if TYPE_CHECKING:
+    from dyngs.cli.training_progress import TrainingProgress
     from dyngs.config import Config
     from dyngs.training.events import Listener
     from dyngs.training.processes import Processes
@@ -37,18 +39,12 @@ PATH is a capture, a folder of photos or a video. PRESET is a YAML file or a nam
 lists the names. Without PRESET, `static` is used for photos, `dynamic` for a video or a capture
 with times, and `human` for a capture of a person. `dyngs config static` lists all keys.
 """
-_LOGGING = tuple(
-    f"train.{name}"
-    for name in ("save_minutes", "save_every", "eval_every", "log_every", "tensorboard")
-)
-_FOR_THIS_CALL = ("run.threads", "run.device", "run.deterministic", "data.cache_mb", *_LOGGING)
-"""Keys that do not change the result of a run."""
-WITH_RESUME = ("train.steps", "data.root", "data.follow_links", *_FOR_THIS_CALL)
-"""Keys that may be given with ``--resume``."""
+_RUN_KEYS = ("run.threads", "run.device", "run.deterministic", "data.cache_mb")
+"""Keys that do not change the result of a run, besides those of logging."""
 
 
 def add_parser(commands: args.Commands) -> None:
-    about = "Train a model from a capture. Writes a run folder (default runs/NAME)."
+    about = "Train a model from a capture. Writes a run folder (default runs/CAPTURE-PRESET)."
     parser = args.add_command(
         commands, "train", run, "train a model from a capture", about, _EPILOG
     )
@@ -65,6 +61,8 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument(
         "--view", action="store_true", help="view the scene in a browser during training"
     )
+    about = "with --view: end with the training (default: serve until Ctrl-C, on a terminal)"
+    parser.add_argument("--close-viewer", action="store_true", help=about)
     add_serving_arguments(parser)
     args.add_run_device(parser)
     parser.set_defaults(takes_root=True)
@@ -84,21 +82,47 @@ def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> i
     words = [*arguments.overrides, *args.run_device(arguments)]
     config = parse_config(words, arguments.resume, arguments.begun)
     args.computing_device(config.run.device)  # fails early without a GPU
-    if arguments.port is not None and not arguments.view:
-        raise DyngsError("--port requires --view")
+    for option, is_given in (
+        ("--port", arguments.port),
+        ("--close-viewer", arguments.close_viewer),
+    ):
+        if is_given and not arguments.view:
+            raise DyngsError(f"{option} requires --view")
     from dyngs.api.train import train
     from dyngs.cli.training_progress import TrainingProgress
 
+    progress = TrainingProgress()
+    listeners: list[Listener] = [progress]
     with ExitStack() as stack:
-        listeners: list[Listener] = [stack.enter_context(TrainingProgress())]
-        listeners += [stack.enter_context(_view(arguments, config))] if arguments.view else []
-        folder = train(
-            config,
-            resume_from=arguments.resume,
-            listeners=listeners,
-            processes=processes,
-            progress=ProgressBar,
-        )
+        view = None
+        if arguments.view:
+            view = stack.enter_context(_view(arguments, config, progress))
+            listeners.append(view)
+        with progress:
+            folder = train(
+                config,
+                resume_from=arguments.resume,
+                listeners=listeners,
+                processes=processes,
+                progress=ProgressBar,
+            )
+        _print_result(folder, config)
+        if view is not None and sys.stdin.isatty() and not arguments.close_viewer:
+            _keep_open(view)
+    return 0
+
+
+def _keep_open(view: TrainingView) -> None:
+    """Serve the page of a finished training until Ctrl-C."""
+    if view.link is None:
+        return  # the run was finished before
+    print(f"training finished; viewer open at {view.link}; Ctrl-C closes", flush=True)
+    view.serve()
+    wait_for_interrupt()
+
+
+def _print_result(folder: Path, config: Config) -> None:
+    """Print the run folder and the next commands."""
     for line in _about_motion(folder, config):
         print(line)
     word = quote_path(folder)
@@ -112,10 +136,11 @@ def _run(arguments: argparse.Namespace, processes: Processes | None = None) -> i
             f"next:    dyngs eval {word}\n         dyngs render {word} --out "
             f"{quote_path(folder / 'images')}"
         )
-    return 0
 
 
-def _view(arguments: argparse.Namespace, config: Config) -> TrainingView:
+def _view(
+    arguments: argparse.Namespace, config: Config, progress: TrainingProgress
+) -> TrainingView:
     """Return the listener that serves the page."""
     from dyngs.view.server import require_viser
 
@@ -123,7 +148,8 @@ def _view(arguments: argparse.Namespace, config: Config) -> TrainingView:
     from dyngs.view.server import ServerOptions
     from dyngs.view.training import TrainingView
 
-    return TrainingView(config, ServerOptions(arguments.host, arguments.port), print_lines)
+    serving = ServerOptions(arguments.host, arguments.port)
+    return TrainingView(config, serving, print_lines, lambda: progress.figures)
 
 
 def _about_motion(folder: Path, config: Config) -> list[str]:
@@ -148,6 +174,7 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
 def parse_config(words: Sequence[str], resume: Path | None, begun: Path | None = None) -> Config:
     """Return the configuration for the words after ``dyngs train`` and the path of ``--from``."""
     from dyngs.config.io import load_config, load_resolved
+    from dyngs.config.keys.train import LOGGING_KEYS
 
     if begun is not None and resume is not None:
         raise DyngsError("--from starts a new run, --resume continues a run: use one of them")
@@ -160,12 +187,14 @@ def parse_config(words: Sequence[str], resume: Path | None, begun: Path | None =
         if preset is None and root is not None:
             preset = "static" if begun is not None else _choose_preset(root, overrides)
         return load_config(preset, overrides)
+    harmless = [*_RUN_KEYS, *(f"train.{key}" for key in LOGGING_KEYS)]
+    allowed = ("train.steps", "data.root", "data.follow_links", *harmless)
     words = [*([preset] if preset else []), *overrides]
-    other = [word for word in words if word.partition("=")[0].strip() not in WITH_RESUME]
+    other = [word for word in words if word.partition("=")[0].strip() not in allowed]
     if other:
         raise DyngsError(
             f"{other[0]!r}: the configuration of a run is fixed; --resume accepts train.steps=N, "
-            f"data.root=FOLDER (a moved capture) and {', '.join(_FOR_THIS_CALL)}"
+            f"data.root=FOLDER (a moved capture) and {', '.join(harmless)}"
         )
     config = load_resolved(resume, overrides)
     return config.model_copy(update={"run": config.run.model_copy(update={"dir": resume})})

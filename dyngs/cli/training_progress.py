@@ -11,7 +11,15 @@ from typing import IO, Any
 from dyngs.core.errors import escape_control_characters
 from dyngs.models.schedule import image_divisor
 from dyngs.training.clock import TimeForecast
-from dyngs.training.events import Evaluated, Event, Message, Started, StepDone, TotalChanged
+from dyngs.training.events import (
+    Evaluated,
+    Event,
+    Message,
+    Paused,
+    Started,
+    StepDone,
+    TotalChanged,
+)
 from dyngs.training.run_log import log_record
 
 PLAIN_LINES = 10
@@ -26,6 +34,9 @@ class TrainingProgress:
 
     Args:
         stream: output stream; None: standard error.
+
+    Attributes:
+        figures: the latest displayed numbers by name.
     """
 
     def __init__(self, stream: IO[str] | None = None) -> None:
@@ -36,6 +47,7 @@ class TrainingProgress:
         self._since = 0.0
         self._bar: Any = None
         self._task: Any = None
+        self.figures: dict[str, str] = {}
 
     def __call__(self, event: Event) -> None:
         match event:
@@ -47,7 +59,7 @@ class TrainingProgress:
                 self._total = event.total
                 if self._bar is not None:
                     self._bar.update(self._task, total=event.total)
-            case Evaluated():
+            case Evaluated() | Paused():
                 self._since += event.seconds
                 if self._forecast is not None:
                     self._forecast.exclude(event.seconds)
@@ -78,16 +90,21 @@ class TrainingProgress:
         if record.psnr is not None:  # smoothed, because single views differ by several dB
             before = record.psnr if self._psnr is None else self._psnr
             self._psnr = 0.95 * before + 0.05 * record.psnr
-        if self._bar is None and step < self._next_line and not event.is_last:
-            return  # no line is due
         rate = (step - self._start) / max(now - self._since, 1e-9)
         left = _clock(self._forecast.seconds(config, self._total))
         psnr = "-" if self._psnr is None else f"{self._psnr:.2f}"
         gaussians = f"{count:,} Gaussians " if count else ""
         text = f"loss {record.loss:.4f} psnr {psnr} {gaussians}{rate:.1f} steps/s"
+        self.figures = {
+            "step": f"{step:,} of {self._total:,}",
+            "PSNR": f"{psnr} dB",
+            "Gaussians": f"{count:,}",
+            "steps/s": f"{rate:.1f}",
+            "time left": left,
+        }
         if self._bar is not None:
             self._bar.update(self._task, completed=step, text=text, left=left)
-        else:
+        elif step >= self._next_line or event.is_last:
             self.log(f"step {step}/{self._total} {text} {left} left")
             self._next_line = step + max(1, self._total // PLAIN_LINES)
 

@@ -93,11 +93,11 @@ def flip(rendered: Tensor, truth: Tensor, mask: Tensor | None = None) -> MetricV
     """Return the mean LDR-FLIP error in [0, 1], 0 = equal, at 67.02 pixels per degree (Andersson et
     al. 2020).
 
-    Needs the package ``flip-evaluator`` (the extra ``metrics``).
+    Needs the package ``flip-evaluator``.
     """
     if find_spec("flip_evaluator") is None:
         return MetricValue(
-            None, "the package flip-evaluator is not installed (pip install 'dyngs[metrics]')"
+            None, "the package flip-evaluator is not installed (it has wheels up to Python 3.13)"
         )
     from flip_evaluator import evaluate  # pyright: ignore[reportMissingImports]
 
@@ -155,7 +155,7 @@ def load_lpips(net: LpipsNet = "alex", device: torch.device | str = "cpu") -> Lp
     The check prevents the package from downloading missing weights.
     """
     if find_spec("lpips") is None or find_spec("torchvision") is None:
-        return Lpips(net, "the packages lpips and torchvision are not installed (dyngs[metrics])")
+        return Lpips(net, "not installed (pip install 'dyngs[metrics]')")
     try:
         weights = _backbone_file(net)
         if not weights.is_file():

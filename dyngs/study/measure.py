@@ -126,6 +126,7 @@ class SceneMeasurer:
             background,
             load_lpips("alex", background.device),
             Regions(loader.views, loader, background),
+            flip_every=0,
         )
         means: dict[str, Any] = {}
         for key in SCORES:

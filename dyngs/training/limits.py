@@ -59,6 +59,8 @@ def _kind_specific_options(config: Config) -> dict[str, object]:
         given |= {f"{name}.{key}": value for key, value in changed.items()}
     if config.train.minutes is not None:
         given["train.minutes"] = config.train.minutes
+    if config.train.image_every > 0:
+        given["train.image_every"] = config.train.image_every
     if config.train.batch_size > 1:
         given["train.batch_size"] = config.train.batch_size
     return given

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import Any, Protocol
@@ -16,6 +17,7 @@ from dyngs.training.events import (
     Event,
     Listener,
     Message,
+    Paused,
     Started,
     StepDone,
     StepReport,
@@ -99,6 +101,7 @@ class Loop:
         self._limits = limits
         self._before_step = before_step
         self._listeners: list[Listener] = []
+        self._is_stopped: Callable[[], bool] = lambda: False
 
     def subscribe(self, *listeners: Listener) -> None:
         self._listeners += listeners
@@ -109,6 +112,7 @@ class Loop:
 
     def run(self, is_stopped: Callable[[], bool] = lambda: False) -> None:
         """Train until the last step, or until ``is_stopped`` returns true between two steps."""
+        self._is_stopped = is_stopped
         self.emit(Started(self.trainer.done, self.total))
         while self.trainer.done < self.total and not is_stopped():
             self._edit(self._stages)
@@ -117,6 +121,18 @@ class Loop:
                 self.emit(Message(f"step {report.step}: {line}"))
             self._edit(self._limits)
             self.emit(StepDone(report, self))
+
+    def pause(self, is_paused: Callable[[], bool]) -> None:
+        """Wait while ``is_paused`` returns true, until the run is stopped. Listeners may call this.
+
+        The waiting time does not count as training.
+        """
+        start = time.perf_counter()
+        while is_paused() and not self._is_stopped():
+            time.sleep(0.01)
+        seconds = time.perf_counter() - start
+        self.stopwatch.exclude(seconds)
+        self.emit(Paused(seconds))
 
     def _edit(self, editors: Sequence[Editor]) -> None:
         for editor in editors:

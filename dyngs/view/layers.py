@@ -1,4 +1,4 @@
-"""Images of a scene for the viewer: colour, depth, opacity, and error against the true image."""
+"""Images of a scene for the viewer: colour, depth, normals, opacity, error to the true image."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dyngs.models.renderable import Rendering, TimeStep
 from dyngs.runs.opened import OpenedScene
 from dyngs.view.views import views_of
 
-Layer = Literal["colour", "depth", "alpha", "error"]
+Layer = Literal["colour", "depth", "normal", "alpha", "error"]
 Part = Literal["all", "moving", "static"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 PARTS: tuple[Part, ...] = get_args(Part)
@@ -91,11 +91,27 @@ def _layer(opened: OpenedScene, request: ViewRequest) -> np.ndarray:
     match request.layer:
         case "depth":
             return depth_to_rgb(*depth_of(opened, request))
+        case "normal":
+            return normals_to_rgb(*depth_of(opened, request), request.camera)
         case "alpha":
             pixels = _rendering(opened, request).alpha[0, ..., None].expand(-1, -1, 3)
         case _:
             pixels = _rendering(opened, request).rgb[0]
     return to_uint8(pixels.clamp(0, 1).cpu().numpy())
+
+
+def normals_to_rgb(depth: np.ndarray, alpha: np.ndarray, camera: Cameras) -> np.ndarray:
+    """Return the surface normals (H, W, 3) uint8 of a depth image (H, W), in world axes.
+
+    Components -1 to 1 become 0 to 255. Transparent pixels are black.
+    """
+    y, x = np.indices(depth.shape) + 0.5
+    inverse = torch.linalg.inv(camera.intrinsics[0].double()).cpu().numpy()
+    points = depth[..., None] * (np.stack([x, y, np.ones_like(x)], axis=-1) @ inverse.T)
+    normals = np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1))
+    normals = normals @ camera.cam_from_world[0, :3, :3].double().cpu().numpy()
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
+    return to_uint8((0.5 + 0.5 * normals) * alpha[..., None])
 
 
 def with_levels(opened: OpenedScene, most: int) -> OpenedScene:

@@ -292,6 +292,12 @@ class Viewer:
         with silence_viser():
             self.server.stop()
 
+    def show(self, opened: OpenedScene) -> None:
+        """Show a newer state of the scene in all browsers, also in those that connect later."""
+        self.first = opened
+        for session in self.drawer.sessions:
+            session.update_scene(opened, refreshes=True)
+
     def _prepare(self) -> None:
         """Set the theme, the initial camera and the up direction of all browsers."""
         from viser import _messages

@@ -9,7 +9,7 @@ import pytest
 from steps import step_done
 
 from dyngs.cli.training_progress import TrainingProgress
-from dyngs.training.events import Evaluated, Message, Started, TotalChanged
+from dyngs.training.events import Evaluated, Message, Paused, Started, TotalChanged
 
 
 class Terminal(io.StringIO):
@@ -37,9 +37,11 @@ def test_messages_and_another_number_of_steps_are_shown() -> None:
         progress(step_done(1, 12))
         progress(Message("something was found\x1b[2J"))
         progress(Evaluated(1, "test", 20.0, 0.5, 3.0))
+        progress(Paused(3.0))
         progress(TotalChanged(8))
         progress(step_done(8, 8))
     lines = [line.split(" loss")[0] for line in stream.getvalue().splitlines()]
+    assert progress.figures["step"] == "8 of 8"
     assert lines == ["step 1/12", "something was found\\x1b[2J", "step 8/8"]
 
 

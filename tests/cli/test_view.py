@@ -25,6 +25,40 @@ def test_a_page_is_served_until_it_is_ended(
 
 
 @pytest.mark.parametrize(
+    ("is_terminal", "words", "stays"),
+    [
+        (True, ["--view"], True),
+        (False, ["--view"], False),
+        (True, ["--view", "--close-viewer"], False),
+    ],
+)
+def test_after_training_the_page_stays_open_on_a_terminal(
+    is_terminal: bool,
+    words: list[str],
+    stays: bool,
+    still: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pytest.importorskip("viser", reason="viser is not installed (pip install 'dyngs[view]')")
+    seen: list[bytes] = []
+
+    def look() -> None:
+        line = capsys.readouterr().out.splitlines()[-1]
+        assert line.startswith("training finished; viewer open at http://localhost:")
+        seen.append(urllib.request.urlopen(line.split()[5].rstrip(";"), timeout=10).read())
+
+    monkeypatch.setattr("dyngs.cli.train.wait_for_interrupt", look)
+    monkeypatch.setattr("sys.stdin.isatty", lambda: is_terminal, raising=False)
+    options = ["train.steps=2", "init.num_random=40", f"run.dir={tmp_path / 'run'}"]
+    assert main(["train", "static", f"data.root={still}", *options, *words]) == 0
+    assert [b"<html" in page for page in seen] == [True] * stays
+    assert main(["train", "static", f"data.root={still}", "--close-viewer"]) == 2
+    assert "--close-viewer requires --view" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("words", "line"),
     [
         (["nothing"], "no such file"),

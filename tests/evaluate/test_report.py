@@ -12,10 +12,13 @@ import torch
 from moving_scene import TEST_TIMES, row_of_balls, sliding_nodes, write_moving_run
 
 import dyngs
+from dyngs.api.train import train
 from dyngs.cli import main
+from dyngs.cli.evaluate import report_rows
 from dyngs.config import Config, DataConfig, TrainConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.core.errors import DyngsError
+from dyngs.core.metrics import MetricValue
 from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader
 from dyngs.data.read import read_capture
@@ -87,7 +90,7 @@ def test_report_of_a_run(tmp_path) -> None:
         "track_error_px track_within_5px"
     )
     parts += " psnr_things track_motion_px psnr_right psnr_right_fitted psnr_own_poses own_poses"
-    parts += " silhouette_poses psnr_white psnr_black ssim_black lpips_black"
+    parts += " silhouette_poses psnr_white psnr_black ssim_black lpips_black see_through flip_views"
     rest = {
         *parts.split(),
         "seconds_train",
@@ -139,14 +142,40 @@ def test_psnr_is_that_on_the_background_of_the_run(tmp_path) -> None:
     assert reports["white"].psnr_white != pytest.approx(reports["white"].psnr_black, abs=0.1)
 
 
-def test_scenes_that_are_worse_on_one_background_are_warned_of(tmp_path) -> None:
+def test_see_through_objects_are_warned_of(tmp_path) -> None:
     report = evaluate_run(write_run(tmp_path, some_gaussians()))
-    assert replace(report, psnr_white=30.0, psnr_black=29.1).warnings == ()
-    (line,) = replace(report, psnr_white=30.0, psnr_black=28.5).warnings
-    assert "PSNR on black is 1.5 dB lower" in line
-    (line,) = replace(report, psnr_white=30.0, psnr_black=33.0).warnings
-    assert "PSNR on white is 3.0 dB lower" in line
-    assert replace(report, psnr_white=None, psnr_black=None).warnings == ()
+    assert report.background == "white"
+    (line,) = replace(report, see_through=0.05).warnings
+    assert "5% of the object is see-through" in line
+    assert "--background black" in line
+    assert replace(report, see_through=0.001, psnr_white=30.0, psnr_black=34.0).warnings == ()
+    assert replace(report, see_through=None).warnings == ()
+
+
+def test_flip_of_large_images_is_computed_on_evenly_spaced_views(tmp_path, monkeypatch) -> None:
+    run_dir = write_run(tmp_path, some_gaussians())
+    monkeypatch.setattr("dyngs.evaluate.report.FLIP_PIXELS", 16 * 16 * 2)
+    monkeypatch.setattr(
+        "dyngs.evaluate.view_scores.flip", lambda rendered, truth, mask: MetricValue(0.25)
+    )
+    report = evaluate_run(run_dir)
+    assert [view.flip for view in report.per_view] == [0.25, None, 0.25]
+    assert (report.flip, report.flip_views) == (0.25, 2)
+    assert ("FLIP of 2 views", "0.2500") in report_rows(report)
+
+
+def test_the_table_lists_what_was_measured_and_more_with_verbose(tmp_path) -> None:
+    report = evaluate_run(write_run(tmp_path, some_gaussians()))
+    short = dict(report_rows(replace(report, flip=0.1, lpips=None, flip_views=3)))
+    assert {"PSNR", "SSIM", "FLIP", "rendering", "training"} <= set(short)
+    assert not {"LPIPS (alex)", "PSNR of right halves"} & set(short)
+    assert short["training"] == "7 steps in 12 s"
+    assert dict(report_rows(replace(report, seconds_train=0.0)))["training"] == "7 steps"
+    more = dict(report_rows(report, verbose=True))
+    assert "PSNR of right halves" in more
+    worst = min(report.per_view, key=lambda view: view.psnr)
+    assert more[f"PSNR of {worst.name}"] == f"{worst.psnr:.2f} dB"
+    assert "the images have no times" in more.values()
 
 
 def test_an_unfinished_run_is_reported_as_unfinished(tmp_path) -> None:
@@ -235,7 +264,7 @@ def test_parts_of_a_moving_scene_are_measured(tmp_path, capsys) -> None:
     assert not {"track_error_px", "psnr_foreground"} & set(report.reasons)
     known = [view.psnr_foreground for view in report.per_view if view.psnr_foreground is not None]
     assert report.psnr_foreground == pytest.approx(sum(known) / len(known))
-    assert main(["eval", str(run_dir)]) == 0
+    assert main(["eval", str(run_dir), "--verbose"]) == 0
     shown = capsys.readouterr().out
     assert "on the foreground" in shown
     assert "on what moves" in shown
@@ -266,7 +295,7 @@ def run(
         "init.num_random=60",
         "run.threads=1",
     ]
-    return dyngs.train(
+    return train(
         dyngs.load_config("static", [*keys, f"camera.refine={request.param}"])
     ), request.param
 
@@ -298,3 +327,10 @@ def test_training_images_have_the_refined_cameras(run: tuple[Path, str]) -> None
     assert (moved > 0) == (refine == "always")
     if refine == "always":
         assert bool(latest_checkpoint(folder).part("cameras")["poses"].any())
+
+
+def test_files_are_refused_in_one_line(tmp_path, capsys) -> None:
+    file = tmp_path / "middle.ply"
+    file.write_bytes(b"ply\n")
+    assert main(["eval", str(file)]) == 2
+    assert "holds no images to compare with" in capsys.readouterr().err

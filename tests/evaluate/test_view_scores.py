@@ -14,6 +14,7 @@ from flat_wall import BLACK, cameras_before_wall, seen_from
 from moving_scene import Sliding, moving_scene, still_scene
 
 import dyngs
+from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
@@ -80,6 +81,10 @@ def test_a_hole_in_a_white_object_shows_on_black_alone(background: float) -> Non
     scores = background_scores(truth, nothing, torch.full((3,), background))
     assert scores["psnr_white"] == pytest.approx(100.0)
     assert scores["psnr_black"] == pytest.approx(-10 * math.log10(0.5), abs=1e-4)
+    assert scores["see_through"] == 1.0
+    blurred = replace(nothing, transmittance=(torch.arange(20) >= 8).expand(1, 14, 20).float())
+    edge = background_scores(truth, blurred, torch.full((3,), background))
+    assert edge["see_through"] == 0  # an edge that is off by two pixels is no hole
     masked = background_scores(
         replace(truth, mask=1 - alpha), nothing, torch.full((3,), background)
     )
@@ -236,9 +241,7 @@ def run(person: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "train.steps=6",
         "run.threads=1",
     ]
-    return dyngs.train(
-        dyngs.load_config("human", [*keys, "model.resolution=24", "model.fit=false"])
-    )
+    return train(dyngs.load_config("human", [*keys, "model.resolution=24", "model.fit=false"]))
 
 
 def test_held_out_frames_are_scored_in_the_poses_of_the_file(run: Path) -> None:

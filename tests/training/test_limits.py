@@ -124,6 +124,10 @@ def test_contradicting_limits_are_refused(tmp_path: Path) -> None:
         (limited(network, max_mb=5.0), "budget.max_mb"),
         (timed(network, 5.0), "train.minutes"),
         (timed(both, 5.0), "train.minutes: .*dyngs prune"),
+        (
+            network.model_copy(update={"train": TrainConfig(image_every=5)}),
+            "train.image_every=5: not supported",
+        ),
     ):
         with pytest.raises(DyngsError, match=said):
             train(config)

@@ -11,7 +11,7 @@ from steps import Counting
 
 from dyngs.core.errors import DyngsError
 from dyngs.training.clock import Stopwatch
-from dyngs.training.events import Event, Message, Started, StepDone
+from dyngs.training.events import Event, Message, Paused, Started, StepDone
 from dyngs.training.loop import Interrupts, Loop
 
 SIGNALS = [
@@ -54,6 +54,29 @@ def test_it_stops_between_two_steps() -> None:
     assert trainer.done == 4
     loop.run()
     assert trainer.done == 9
+
+
+def test_a_pause_is_no_training_time_and_ends_with_a_signal() -> None:
+    pauses: list[float] = []
+    answers = iter([True, True, True, False])
+    is_stopped = False
+
+    def listen(event: Event) -> None:
+        nonlocal is_stopped
+        if isinstance(event, Paused):
+            pauses.append(event.seconds)
+        if isinstance(event, StepDone) and event.step == 1:
+            before = event.loop.stopwatch.seconds
+            event.loop.pause(lambda: next(answers))
+            assert event.loop.stopwatch.seconds - before < pauses[0]
+        if isinstance(event, StepDone) and event.step == 2:
+            is_stopped = True
+            event.loop.pause(lambda: True)
+
+    trainer = Counting()
+    looped(trainer, 9, listen).run(lambda: is_stopped)
+    assert trainer.done == 2
+    assert 0.03 <= pauses[0] < 5
 
 
 def test_advice_is_added_to_a_failing_step() -> None:

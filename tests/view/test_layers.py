@@ -34,6 +34,7 @@ from dyngs.view.layers import (
     PARTS,
     ViewRequest,
     draw,
+    normals_to_rgb,
     with_levels,
 )
 from dyngs.view.views import (
@@ -95,6 +96,24 @@ def test_many_gaussians_are_drawn_in_levels_while_anything_moves(
     assert np.array_equal(draw(edited, moving), draw(edited, request))
     with pytest.raises(DyngsError, match="need a static scene"):
         with_levels(balls(), 300)
+
+
+@pytest.mark.parametrize("facing", [(0.0, 0.0, -1.0), (0.6, 0.0, -0.8), (0.0, -0.6, -0.8)])
+def test_normals_of_a_plane_are_in_world_axes(facing: tuple[float, float, float]) -> None:
+    """The plane is two units in front of a camera that looks along x of the world."""
+    normal = np.array(facing)
+    turn = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])  # from world to camera
+    pose = np.eye(4)
+    pose[:3, :3] = turn
+    one = Cameras(torch.from_numpy(pose).float()[None], camera().intrinsics, 20, 14)
+    y, x = np.indices((14, 20)) + 0.5
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(one.intrinsics[0].numpy()).T
+    depth = 2 * normal[2] / (rays @ normal)
+    shown = normals_to_rgb(depth, np.ones_like(depth), one)
+    np.testing.assert_allclose(
+        shown / 255 * 2 - 1, np.broadcast_to(normal @ turn, shown.shape), atol=0.02
+    )
+    assert not normals_to_rgb(depth, np.zeros_like(depth), one).any()
 
 
 def test_the_moment_of_a_time_is_computed_once() -> None:

@@ -18,9 +18,11 @@ from browser import Browser, Page, missing
 from moving_scene import write_moving_run
 from PIL import Image
 
+import dyngs
 from dyngs.cli import main
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import ssim
+from dyngs.training.events import Event, StepDone
 from dyngs.view.server import (
     COOKIE,
     AccessPolicy,
@@ -37,6 +39,7 @@ from dyngs.view.server import (
 )
 from dyngs.view.session import Keyframe, Recording
 from dyngs.view.source import open_source
+from dyngs.view.training import TrainingView
 
 pytest.importorskip("viser", reason="viser is not installed (pip install 'dyngs[view]')")
 
@@ -172,6 +175,42 @@ def test_two_browsers_have_cameras_of_their_own_and_one_may_go(
     until(lambda: not viewer.connections)
     assert viewer.drawer.sessions == ()
     assert threading.active_count() <= threads + 2  # viser's pool may have grown
+
+
+def test_a_training_is_paused_and_resumed_on_its_page(
+    browser: Browser, still: Path, tmp_path: Path
+) -> None:
+    links: list[str] = []
+    steps: list[int] = []
+    resumed = threading.Event()
+
+    def watch(event: Event) -> None:
+        if isinstance(event, StepDone):
+            steps.append(event.step)
+            resumed.wait(0.05)  # leaves time for clicks
+
+    settings = [f"data.root={still}", f"run.dir={tmp_path / 'run'}", "train.steps=600"]
+    config = dyngs.load_config("static", [*settings, "init.num_random=40"])
+    with TrainingView(
+        config, ServerOptions(), links.append, lambda: {"step": f"{steps[-1]}"}
+    ) as view:
+        work = {"listeners": [watch, view]}
+        thread = threading.Thread(target=dyngs.train, args=(config,), kwargs=work, daemon=True)
+        thread.start()
+        until(lambda: bool(links))
+        page = browser.open(links[0].removeprefix("viewer: "), *SIZE)
+        page.click("text=Pause training")
+        page.driven.wait_for_selector("text=Resume training")
+        page.driven.wait_for_timeout(300)
+        paused = steps[-1]
+        page.driven.wait_for_timeout(500)
+        assert steps[-1] == paused
+        page.click("text=Resume training")
+        resumed.set()
+        until(lambda: not thread.is_alive(), page)
+        page.driven.wait_for_selector("text=step: 600")
+        assert not page.driven.get_by_text("Pause training").is_visible()
+        page.close()
 
 
 SCRIPT = "<img src=x onerror=window.ran=1>"
