@@ -34,7 +34,9 @@ from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info, log_warning, quote_path
+from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader
+from dyngs.data.scene_space import normalise_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.outputs import lock_folder
 from dyngs.io.write import to_uint8
@@ -79,6 +81,7 @@ from dyngs.training.events import (
 from dyngs.training.limits import validate_limits
 from dyngs.training.loggers import open_loggers, require_loggers
 from dyngs.training.loop import Editor, Interrupts, Loop, Trainable
+from dyngs.training.losses import AddedLoss, require_losses
 from dyngs.training.memory import memory_forecasts
 from dyngs.training.new_trainer import build_trainer
 from dyngs.training.plan import RunPlan
@@ -97,18 +100,21 @@ def train(
     listeners: Sequence[Listener] = (),
     processes: Processes | None = None,
     progress: Callable[[], AbstractContextManager[ProgressCallback]] | None = None,
+    capture: Capture | None = None,
+    losses: Sequence[AddedLoss] = (),
 ) -> Path:
-    """Train and return the run folder.
+    """Train and return the run folder. ``dyngs.train`` is the same for users.
 
     Poses of photos and videos are found first, and a body is fitted to a person where that is
     needed.
 
     Example:
 
-        import dyngs
+        from dyngs.api.train import train
+        from dyngs.config.io import load_config
 
         overrides = ["data.root=lego", "run.dir=runs/short", "train.steps=2", "init.num_random=50"]
-        run = dyngs.train(dyngs.load_config("static", overrides))
+        run = train(load_config("static", overrides))
 
     Args:
         config: everything that decides the run; on resuming, that of the run folder, whose
@@ -120,6 +126,8 @@ def train(
         listeners: are told everything that happens, see ``dyngs.training.events``.
         processes: that this one, the first of them, leads; None: it is alone.
         progress: shows how far what comes before training is; None: nothing does.
+        capture: trained on instead of what ``config.data`` reads.
+        losses: added to those of dyngs, named in ``config.train.losses``.
 
     Raises:
         DyngsError: bad input, a run folder that already holds a run or that another process writes
@@ -130,7 +138,10 @@ def train(
     """
     folder = resume_from or config.run.dir or default_run_dir(config)
     processes = processes or Processes()
-    plan = run_stages(RunPlan(config, config), [share_views(processes)])
+    require_losses(config, losses)
+    found = None if capture is None else normalise_capture(capture)
+    plan = RunPlan(config, config, capture=found, losses=tuple(losses))
+    plan = run_stages(plan, [share_views(processes)])
     validate_limits(plan.resolved)
     require_loggers(plan.resolved)
     device = select_device(config.run.device)
@@ -143,7 +154,7 @@ def train(
             folder, continued = choose_run(folder, plan.resolved)
             if continued is not None:
                 resume_from = folder
-                plan = RunPlan(continued, continued)
+                plan = replace(plan, requested=continued, resolved=continued)
     elif not folder.is_dir():
         latest_checkpoint(folder)  # raises, and says what is there
     keep_freed_memory()
@@ -201,6 +212,7 @@ def _built(
             first=plan.first,
             uncapped=plan.uncapped,
             images=images,
+            added_losses=plan.losses,
         )
     if resumed is not None:
         trainer.restore(resumed)

@@ -13,6 +13,7 @@ from dyngs.gaussians.initialization import InitialGaussians
 from dyngs.models.kind import HasSchedules, capability
 from dyngs.models.schedule import PUBLISHED_STEPS, LengthChange, scale_step
 from dyngs.training.corrections.exposure import WARM_UP
+from dyngs.training.losses import AddedLoss
 
 
 @dataclass(frozen=True)
@@ -38,9 +39,10 @@ class RunPlan:
         requested: config as given by the user.
         resolved: config that is trained and saved.
         uncapped: resolved config without the limit on Gaussians, used for initialisation.
-        capture: None for a network, which has several.
+        capture: None for a network, which has several, and until it is read.
         first: Gaussians of another scene to start from.
         choices: results of pilot runs.
+        losses: of the user, in addition to those of the config.
         is_extended: whether a finished or interrupted run is extended.
     """
 
@@ -51,6 +53,7 @@ class RunPlan:
     first: InitialGaussians | None = None
     limits: Limits = Limits()
     choices: tuple[Any, ...] = ()
+    losses: tuple[AddedLoss, ...] = ()
     is_extended: bool = False
 
 

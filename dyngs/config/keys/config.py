@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
@@ -114,7 +115,15 @@ class RunConfig(Section):
 
 
 class Config(Section):
-    """Complete configuration of a run."""
+    """Complete configuration of a run, see ``dyngs config`` for its keys.
+
+    Example:
+
+        import dyngs
+
+        config = dyngs.load_config("static", {"data.root": "lego"})
+        config.train.steps, config.replace({"train.steps": 60_000}).train.steps
+    """
 
     data: DataConfig
     camera: CameraConfig = CameraConfig()
@@ -140,6 +149,29 @@ class Config(Section):
     prune: PruneConfig = PruneConfig()
     budget: BudgetConfig = BudgetConfig()
     run: RunConfig = RunConfig()
+
+    def replace(self, changes: Mapping[str, Any] | None = None, /, **keys: Any) -> Config:
+        """Return a validated copy with some values changed.
+
+        Example:
+
+            import dyngs
+
+            config = dyngs.load_config("static", {"data.root": "lego"})
+            longer = config.replace(**{"train.steps": 60_000, "strategy.kind": "mcmc"})
+            same = config.replace(train={"steps": 60_000}, strategy={"kind": "mcmc"})
+
+        Args:
+            changes, keys: values by dotted key, or nested mappings. A changed ``kind``
+                resets its section to the defaults of that kind.
+
+        Raises:
+            DyngsError: an unknown key or invalid value; the message has similar keys or the
+                allowed values.
+        """
+        from dyngs.config.io import replace_config
+
+        return replace_config(self, {**(changes or {}), **keys})
 
     @property
     def total_steps(self) -> int:

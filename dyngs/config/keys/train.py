@@ -65,6 +65,11 @@ class TrainConfig(Section):
         description="whether to learn exposure and white balance of each training image as an "
         "affine colour transform; auto: decided by pilot runs",
     )
+    losses: tuple[str, ...] = Field(
+        default=(),
+        description="names of the additional losses of a run from Python, see "
+        "`dyngs docs python`; they are passed again to resume it",
+    )
     remove_floaters: bool = Field(
         default=True,
         description="whether to remove floaters close to single cameras at the end of training; "
