@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,8 +13,8 @@ import numpy as np
 from dyngs.config import Config
 from dyngs.core.errors import DyngsError
 
-Scalars = dict[str, float]
-Images = dict[str, np.ndarray]
+Scalars = Mapping[str, float]
+Images = Mapping[str, np.ndarray]
 
 
 class Logger(Protocol):
@@ -51,7 +52,7 @@ class _Wandb:
         self.close = self._run.finish
 
     def log_scalars(self, step: int, scalars: Scalars) -> None:
-        self._run.log(scalars, step=step)
+        self._run.log(dict(scalars), step=step)
 
     def log_images(self, step: int, images: Images) -> None:
         self._run.log({name: self._wandb.Image(x) for name, x in images.items()}, step=step)

@@ -8,6 +8,17 @@ from pydantic import BeforeValidator, Field, field_validator
 
 from dyngs.core.section import Fraction, Section, parse_digits
 
+LOGGING_KEYS = (
+    "save_minutes",
+    "save_every",
+    "eval_every",
+    "eval_psnr",
+    "log_every",
+    "image_every",
+    "loggers",
+)
+"""Keys of ``TrainConfig`` that do not change the result of a run."""
+
 
 class TrainConfig(Section):
     """Length, losses, checkpoints and logging of a run."""
@@ -61,6 +72,11 @@ class TrainConfig(Section):
         default="never",
         description="whether to learn exposure and white balance of each training image as an "
         "affine colour transform; auto: decided by pilot runs",
+    )
+    losses: tuple[str, ...] = Field(
+        default=(),
+        description="names of the additional losses of a run from Python, see "
+        "`dyngs docs python`; they are passed again to resume it",
     )
     remove_floaters: bool = Field(
         default=True,
