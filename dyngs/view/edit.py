@@ -365,7 +365,8 @@ class EditControls:
         self._select(Sphere((x, y, z), float(self._radius.value) * self._extent), event)
 
     def _select_rectangle(self, event: Any) -> None:
-        (left, top), (right, bottom) = event.screen_min, event.screen_max
+        left, top = event.screen_min
+        right, bottom = event.screen_max
         corners = np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
         self._select(ScreenPolygon(self._camera(), corners), event)
 
