@@ -62,8 +62,8 @@ def train(
         data: folder, .zip or video (``data.root``), a ``Capture``, or keys of the section.
         steps, minutes: ``train.steps`` and ``train.minutes``.
         run_dir, device: ``run.dir`` and ``run.device``.
-        resume: a run folder to continue, up to ``steps`` or ``minutes`` if given. Its config is fixed; pass
-            ``losses`` again, and the ``Capture`` if it was not read from files.
+        resume: a run folder to continue, up to ``steps`` or ``minutes`` if given. Its config is
+            fixed; pass ``losses`` again, and a ``Capture`` that you changed.
         losses: functions of a ``dyngs.LossInput`` that return a differentiable scalar tensor,
             which is added to the loss of every step. Pilot runs are without them.
         listeners: functions of one event, see ``dyngs.training.events``.
@@ -100,8 +100,7 @@ def train(
             own = {name: value for name, value in changes.items() if name.startswith("data")}
             config, reason = choose_preset(load_config(None, own).data)
             log_info(f"preset {config} ({reason})")
-    known = config if isinstance(config, Config) else None
-    config = known.replace(changes) if known else load_config(config, changes)
+    config = config.replace(changes) if isinstance(config, Config) else load_config(config, changes)
     if capability(config.model, HasGaussians) is None:
         raise DyngsError(
             f"model.kind={config.model.kind}: only scenes of Gaussians are trained by dyngs.train; "
