@@ -32,8 +32,8 @@ _OTHER_SUFFIXES = {
     ".json": "cameras",
 }
 _SPLATS = "time times motion static dynamic up from_up"
-_TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree") | {
-    "sog": f"{_SPLATS} sh_degree folder",
+_TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree classic") | {
+    "sog": f"{_SPLATS} sh_degree classic folder",
     MOVING: _SPLATS,
     "tracks": "time times motion dynamic",
     "dyngs": "max_change",
@@ -43,7 +43,7 @@ _TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree") | {
     "html": "time motion from_up folder max_gaussians_drawn",
     "mesh of a person": "motion",
     "mesh": "time times up from_up level segments cells",
-    "bodies": "time up from_up",
+    "bodies": "time up from_up classic",
     "joints": "motion",
 }
 """Options that each format accepts."""
@@ -135,6 +135,11 @@ def add_parser(commands: args.Commands) -> None:
     about = "rigidly moving bodies as animated nodes of a .glb; all else is static, as at --time"
     parser.add_argument("--bodies", action="store_true", help=about)
     add_axes(parser)
+    about = (
+        "fit opacities, scales and (without SH) colours to viewers without antialiasing (default: "
+        "only for .splat, .glb and USD, which cannot store that a scene is antialiased)"
+    )
+    parser.add_argument("--classic", action=argparse.BooleanOptionalAction, help=about)
     part = parser.add_mutually_exclusive_group()
     part.add_argument("--static", action="store_true", help="only the Gaussians that never move")
     part.add_argument("--dynamic", action="store_true", help="only the Gaussians that move")
@@ -360,6 +365,7 @@ def _export_splats(
     how, line = choose_write_options(
         opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree
     )
+    how = replace(how, classic=arguments.classic)
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
     out: Path | None = arguments.out
     is_sequence = _is_sequence(arguments)
@@ -520,6 +526,7 @@ def _export_bodies(arguments: argparse.Namespace) -> list[Path]:
     how, line = choose_write_options(
         opened, format_by_name("glb").up, arguments.up, arguments.from_up
     )
+    how = replace(how, classic=arguments.classic)
     written = write_rigid_bodies(opened, out, time, how)
     print_notes((line,))
     found = compare_file_with_run(
