@@ -16,6 +16,7 @@ from types import FrameType
 from typing import Any
 
 import dyngs
+from dyngs.api.train import train
 
 ROOT = Path(dyngs.__file__).parent
 
@@ -88,7 +89,7 @@ def main() -> None:
         ]
         config = dyngs.load_config(given.preset, overrides)
         sys.setprofile(profile)
-        dyngs.train(config)
+        train(config)
         sys.setprofile(None)
     for title, recorder in (("before the first step", before), ("in the second step", within)):
         print(

@@ -16,6 +16,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 from scaled_captures import scaled_capture
 
 import dyngs
+from dyngs.api.train import train
 from dyngs.evaluate.report import evaluate_run
 
 PLACES = ("1:0", "1e-4:0", "0.05:0", "1e3:0", "1:1e6")
@@ -44,7 +45,7 @@ def main() -> None:
             config = dyngs.load_config(
                 preset, [f"data.root={capture}", f"run.dir={run}", *overrides]
             )
-            dyngs.train(config)
+            train(config)
             cells.append(f"{evaluate_run(run).psnr:.2f}")
         print(f"| {preset} | {' | '.join(cells)} |", flush=True)
 

@@ -58,7 +58,7 @@ CONFIG_INTRODUCTION = """\
 A run is configured by a preset or a YAML file, and by overrides on the command line:
 
 ```bash
-dyngs train static PATH train.steps=2000 run.dir=runs/first
+dyngs train static PATH train.steps=2000
 dyngs config static > mine.yaml
 ```
 
@@ -192,6 +192,8 @@ def argument_name(action: argparse.Action) -> str:
     if not action.option_strings:
         return f"`{cell(value)}`"
     takes_value = action.nargs != 0
+    if isinstance(action, argparse.BooleanOptionalAction):
+        return f"`{', '.join(action.option_strings)}`"
     text = action.option_strings[-1] + (f" {value}" if takes_value else "")
     return f"`{cell(text)}`"
 

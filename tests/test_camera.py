@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from scenes import look_around
 
 from dyngs.core.camera import Cameras
+from dyngs.core.errors import DyngsError
 
 
 def three_cameras() -> Cameras:
@@ -53,3 +55,17 @@ def test_wrong_shapes_are_named(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         Cameras(torch.zeros(poses), torch.zeros(intrinsics), *size)
+
+
+def test_matrices_of_both_conventions_give_the_same_cameras() -> None:
+    opencv = np.stack([np.linalg.inv(pose) for pose in look_around(3).numpy()])
+    opengl = opencv @ np.diag([1, -1, -1, 1])
+    wanted = three_cameras()
+    for poses, convention in ((opencv, "opencv"), (opengl.tolist(), "opengl")):
+        found = Cameras.from_matrices(poses, np.eye(3), 20, 10, convention=convention)
+        torch.testing.assert_close(found.cam_from_world, wanted.cam_from_world)
+        assert [one.width for one in found] == [20, 20, 20]
+    array = Cameras(wanted.cam_from_world.numpy(), [[[1, 0, 0], [0, 1, 0], [0, 0, 1]]] * 3, 20, 10)
+    assert torch.equal(array.intrinsics, wanted.intrinsics)
+    with pytest.raises(DyngsError, match=r"\(V, 4, 4\), got \(3, 4\)"):
+        Cameras.from_matrices(np.eye(4)[:3], np.eye(3), 20, 10)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import inspect
 import re
+import runpy
 import textwrap
 from pathlib import Path
 
 import pytest
 
 import dyngs
+from dyngs.api.train import train
 from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 
 
@@ -24,7 +26,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "train.steps=2",
         "init.num_random=50",
     ]
-    dyngs.train(dyngs.load_config("static", overrides))
+    train(dyngs.load_config("static", overrides))
     return here
 
 
@@ -41,3 +43,28 @@ def test_every_public_name_has_an_example_that_runs(
             compile(textwrap.dedent(example), f"example of dyngs.{name}", "exec"),
             {"__name__": name},
         )
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize(
+    ("script", "arguments", "printed"),
+    [
+        ("load_and_render", ["runs/lego"], "12 images in orbit"),
+        ("train_in_memory", ["3"], "dB"),
+        ("own_loss", ["lego", "2"], " 4\n"),
+        ("evaluate_and_compare", ["runs/lego", "2"], "static_mcmc"),
+        ("export", ["runs/lego"], "visible.ply StaticScene("),
+    ],
+)
+def test_scripts_run(
+    script: str,
+    arguments: list[str],
+    printed: str,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr("sys.argv", [script, *arguments])
+    runpy.run_path(str(Path(__file__).parents[1] / "examples" / f"{script}.py"))
+    assert printed in capsys.readouterr().out

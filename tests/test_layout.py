@@ -27,6 +27,8 @@ HEAVY = (
     "av",
     "rich",
     "tensorboard",
+    "wandb",
+    "rerun",
     "lpips",
     "matplotlib",
 )

@@ -17,6 +17,7 @@ from tiny_people import NET
 from tiny_stereo import STEREO
 
 import dyngs
+from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.data.loader import ImageLoader
 from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
@@ -68,7 +69,7 @@ def capture_for(preset: str, captures: Path) -> Path:
 
 def trained(preset: str, capture: Path, out: Path, *more: str) -> Path:
     overrides = [f"data.root={capture}", f"run.dir={out}", *SCENES[preset], *more]
-    return dyngs.train(dyngs.load_config(preset, overrides))
+    return train(dyngs.load_config(preset, overrides))
 
 
 def assert_same_up_to_scale(one: Path, other: Path, scale: float) -> None:

@@ -17,14 +17,15 @@ from dyngs.gaussians import Gaussians, TopologyEdit
 from dyngs.gaussians.rendering import GaussianRendering, RenderOptions
 from dyngs.gaussians.scene import GaussianScene, GaussianTimeStep
 from dyngs.io.formats.similarity import Similarity
-from dyngs.models.renderable import TimeStep
+from dyngs.models.renderable import RunInfo, TimeStep
 from dyngs.runs.opened import open_scene
 
 
 def load(path: Path | str) -> GaussianScene:
     """Load a scene for rendering.
 
-    Coordinates are those of the capture's files, as in ``read_capture``.
+    Coordinates are those of the capture's files, as in ``read_capture``. The attribute ``run`` of
+    the scene has the folder, the config and the step of its run.
 
     Example:
 
@@ -49,13 +50,14 @@ def load(path: Path | str) -> GaussianScene:
     opened = open_scene(Path(path), with_capture=False)
     scene = opened.scene
     scale = opened.info.world_scale
-    if scale == 1:
-        return scene
-    options = replace(scene.options, near=scale * scene.options.near)
-    gaussians = _scaled(scene.gaussians, scale)
-    return ScaledScene(
-        gaussians=gaussians, options=options, background=scene.background, scene=scene, scale=scale
-    )
+    if scale != 1:
+        options = replace(scene.options, near=scale * scene.options.near)
+        gaussians = _scaled(scene.gaussians, scale)
+        behind = scene.background
+        scene = ScaledScene(
+            gaussians=gaussians, options=options, background=behind, scene=scene, scale=scale
+        )
+    return scene.from_run(RunInfo(Path(path), opened.config, opened.step))
 
 
 def read_capture(source: DataConfig | Path | str, decode_videos: bool = True) -> Capture:
@@ -83,7 +85,7 @@ class _ScaledTimeStep(GaussianTimeStep):
     inner: GaussianTimeStep | None = None  # of the scene that is scaled
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class ScaledScene(GaussianScene):
     """A scene in another unit of length.
 

@@ -84,7 +84,7 @@ def predict(
 
 
 def read_trained_network(network: Path) -> tuple[Config, Checkpoint]:
-    """Return configuration and weights of a network: its run, a file, or a published name. Raises
+    """Return configuration and weights of a network: its run, a file, or a name in ``WEIGHTS``. Raises
     DyngsError."""
     if not network.exists() and network.name == str(network):
         network = published_network(network.name)

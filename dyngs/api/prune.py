@@ -30,6 +30,7 @@ from dyngs.runs.checkpoint import (
 )
 from dyngs.runs.folder import EXPORT_FOLDER, FRAME_NAME, LOG_NAME, require_empty, write_config
 from dyngs.runs.stored_file import write_scene
+from dyngs.training.losses import require_losses
 from dyngs.training.new_trainer import build_trainer
 
 SEARCH_STEPS = 1000  # Steps of fine-tuning of each candidate, unless ``prune.steps`` says otherwise
@@ -130,6 +131,7 @@ def _config_from(run_dir: Path, start: Checkpoint, out: Path, overrides: Sequenc
     config = load_resolved(run_dir, [*done, *defaults, *overrides])
     if capability(config.model, HasGaussians) is None:
         raise DyngsError(f"{run_dir}: model.kind={config.model.kind} has no Gaussians to prune")
+    require_losses(config, ())
     return config
 
 

@@ -13,20 +13,27 @@ from dyngs.config import AutoColour, FixedStrategy, SceneInit, ShColour
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.core.conventions import ProgressCallback
 from dyngs.core.errors import DyngsError, format_count, log_info
-from dyngs.data.read import capture_folder, read_capture, require_folder, require_images
+from dyngs.data.read import (
+    capture_folder,
+    describe_shrinking,
+    read_capture,
+    require_folder,
+    require_images,
+)
 from dyngs.models.checkpoint import Checkpoint, read_run_capture
 from dyngs.models.kind import HasBody, HasMotion, PredictsScenes, capability, find_kind
 from dyngs.models.views import training_times
 from dyngs.runs.capture_record import require_same_capture
-from dyngs.runs.checkpoint import SCENE_FILE
-from dyngs.runs.folder import EXPORT_FOLDER, REQUESTED_NAME
-from dyngs.training.limits import apply_gaussian_cap, gaussian_limit
+from dyngs.runs.checkpoint import SCENE_FILE, seconds_at
+from dyngs.runs.folder import EXPORT_FOLDER, write_requested_config
+from dyngs.training.limits import apply_gaussian_cap, apply_pixel_cap, gaussian_limit
 from dyngs.training.plan import (
     Limits,
     RunPlan,
     Stage,
     describe_extension,
     extend_config,
+    with_length,
     with_steps,
 )
 from dyngs.training.processes import Processes
@@ -71,8 +78,8 @@ def find_poses(report: ProgressCallback) -> Stage:
         data = config.data
         model = config.model
         kind = find_kind(model)
-        if isinstance(kind, PredictsScenes):
-            return plan, None  # its folder holds a capture per person
+        if isinstance(kind, PredictsScenes) or plan.capture is not None:
+            return plan, None  # a folder with a capture per person, or one that was read
         root = data.root
         folder = capture_folder(root)
         data = data.model_copy(update={"root": folder})
@@ -116,7 +123,7 @@ def read_same_capture(folder: Path, resumed: Checkpoint) -> Stage:
         data = plan.resolved.data
         if capability(plan.resolved.model, PredictsScenes) is not None:
             return plan, None
-        capture = read_run_capture(data, resumed.info)
+        capture = read_run_capture(data, resumed.info, plan.capture)
         require_same_capture(folder, data, capture)
         return replace(plan, capture=capture), None
 
@@ -128,9 +135,12 @@ def run_pilots(plan: RunPlan) -> tuple[RunPlan, None]:
     config = plan.resolved
     if capability(config.model, PredictsScenes) is not None:
         return plan, None
-    config, choices, capture = resolve_auto_settings(
-        config, require_images(read_capture(config.data))
-    )
+    capture = require_images(plan.capture or read_capture(config.data))
+    message = describe_shrinking(capture.splits, config.data)
+    if message and "longest_side" not in config.data.model_fields_set:
+        log_info(message)
+    config, choices, capture = resolve_auto_settings(config, capture)
+    config = apply_pixel_cap(config, capture)
     return replace(plan, resolved=config, capture=capture, choices=tuple(choices)), None
 
 
@@ -168,8 +178,11 @@ def extend_run(folder: Path, resumed: Checkpoint | None) -> Stage:
         config = plan.resolved
         stored = load_resolved(folder)
         steps = config.train.steps
-        if steps == stored.train.steps:
-            return plan, None
+        minutes = config.train.minutes
+        if minutes == stored.train.minutes:
+            if steps == stored.train.steps:
+                return plan, None
+            minutes = None
         if resumed is None:
             raise DyngsError(
                 f"train.steps={steps}: {folder} has no checkpoint to go on from; remove it, or give another run.dir, "
@@ -177,15 +190,19 @@ def extend_run(folder: Path, resumed: Checkpoint | None) -> Stage:
             )
         require_folder(stored.data.root)
         done = resumed.info.step
-        longer = extend_config(stored, done, steps)
+        requested = with_length(plan.requested, steps, minutes)
+        if minutes is not None:  # as many as fit at the same speed; ``TimeLimit`` corrects it
+            speed = done / max(seconds_at(folder, done), 1e-3)
+            steps = min(steps, max(done + 1, int(60 * minutes * speed)))
+        longer = with_length(extend_config(stored, done, steps), steps, minutes)
         if stored.budget.max_mb is not None:
             # otherwise a run that is stopped now would take it for its own
             (folder / EXPORT_FOLDER / SCENE_FILE).unlink(missing_ok=True)
         save_config(longer, folder / RESOLVED_NAME)
-        (folder / REQUESTED_NAME).unlink(missing_ok=True)  # what was requested now is what is there
+        write_requested_config(folder, requested)
         config = extend_config(with_steps(config, stored.train.steps), done, steps)
-        return replace(plan, requested=longer, resolved=config), describe_extension(
-            stored, longer, done
-        )
+        config = with_length(config, steps, minutes)
+        plan = replace(plan, requested=requested, resolved=config, is_extended=True)
+        return plan, describe_extension(stored, longer, done)
 
     return stage

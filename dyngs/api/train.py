@@ -9,11 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from dyngs.api.budget.count import CountLimit
 from dyngs.api.budget.size import has_file, write_limited_file
 from dyngs.api.budget.time import TimeLimit, fit_minutes
 from dyngs.api.choose import write_choices
 from dyngs.api.following import Leader
+from dyngs.api.run_choice import choose_run
 from dyngs.api.stages import (
     continue_scene,
     extend_run,
@@ -31,10 +34,14 @@ from dyngs.config import Config
 from dyngs.config.io import RESOLVED_NAME
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info, log_warning, quote_path
+from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader
+from dyngs.data.scene_space import normalise_capture
 from dyngs.evaluate.report import evaluate_run
 from dyngs.io.outputs import lock_folder
+from dyngs.io.write import to_uint8
 from dyngs.models.kind import PredictsScenes, capability
+from dyngs.models.views import background_colour
 from dyngs.ops.device import deterministic, keep_freed_memory, select_device
 from dyngs.ops.native import kernel_threads, num_cores
 from dyngs.runs.capture_record import write_record
@@ -66,12 +73,15 @@ from dyngs.training.events import (
     Event,
     Listener,
     Message,
+    ProgressImage,
     Saved,
     StepDone,
     TotalChanged,
 )
 from dyngs.training.limits import validate_limits
+from dyngs.training.loggers import open_loggers, require_loggers
 from dyngs.training.loop import Editor, Interrupts, Loop, Trainable
+from dyngs.training.losses import AddedLoss, require_losses
 from dyngs.training.memory import memory_forecasts
 from dyngs.training.new_trainer import build_trainer
 from dyngs.training.plan import RunPlan
@@ -90,18 +100,21 @@ def train(
     listeners: Sequence[Listener] = (),
     processes: Processes | None = None,
     progress: Callable[[], AbstractContextManager[ProgressCallback]] | None = None,
+    capture: Capture | None = None,
+    losses: Sequence[AddedLoss] = (),
 ) -> Path:
-    """Train and return the run folder.
+    """Train and return the run folder. ``dyngs.train`` is the same for users.
 
     Poses of photos and videos are found first, and a body is fitted to a person where that is
     needed.
 
     Example:
 
-        import dyngs
+        from dyngs.api.train import train
+        from dyngs.config.io import load_config
 
         overrides = ["data.root=lego", "run.dir=runs/short", "train.steps=2", "init.num_random=50"]
-        run = dyngs.train(dyngs.load_config("static", overrides))
+        run = train(load_config("static", overrides))
 
     Args:
         config: everything that decides the run; on resuming, that of the run folder, whose
@@ -113,6 +126,8 @@ def train(
         listeners: are told everything that happens, see ``dyngs.training.events``.
         processes: that this one, the first of them, leads; None: it is alone.
         progress: shows how far what comes before training is; None: nothing does.
+        capture: trained on instead of what ``config.data`` reads.
+        losses: added to those of dyngs, named in ``config.train.losses``.
 
     Raises:
         DyngsError: bad input, a run folder that already holds a run or that another process writes
@@ -121,16 +136,25 @@ def train(
         KeyboardInterrupt: after Ctrl-C or SIGTERM, once a checkpoint is saved; the message says how
             to go on.
     """
-    folder = resume_from or config.run.dir or default_run_dir(config.run.name)
+    folder = resume_from or config.run.dir or default_run_dir(config)
     processes = processes or Processes()
-    plan = run_stages(RunPlan(config, config), [share_views(processes)])
+    require_losses(config, losses)
+    found = None if capture is None else normalise_capture(capture)
+    plan = RunPlan(config, config, capture=found, losses=tuple(losses))
+    plan = run_stages(plan, [share_views(processes)])
     validate_limits(plan.resolved)
+    require_loggers(plan.resolved)
     device = select_device(config.run.device)
     if resume_from is None:
         if not (folder / RESOLVED_NAME).is_file():
             collect_inputs(config).require_output(folder)
         with progress() if progress else nullcontext(ignore_progress) as report:
             plan = run_stages(plan, [find_poses(report), continue_scene])
+        if config.run.dir is None:
+            folder, continued = choose_run(folder, plan.resolved)
+            if continued is not None:
+                resume_from = folder
+                plan = replace(plan, requested=continued, resolved=continued)
     elif not folder.is_dir():
         latest_checkpoint(folder)  # raises, and says what is there
     keep_freed_memory()
@@ -145,7 +169,7 @@ def train(
                 return folder
             require_startable(folder, plan.resolved)
         else:
-            update_data_root(folder, config.data)
+            update_data_root(folder, plan.resolved.data)
             resumed = _newest(folder)
             plan = replace(plan, requested=load_requested_config(folder))
             plan = run_stages(plan, [extend_run(folder, resumed)])
@@ -188,6 +212,7 @@ def _built(
             first=plan.first,
             uncapped=plan.uncapped,
             images=images,
+            added_losses=plan.losses,
         )
     if resumed is not None:
         trainer.restore(resumed)
@@ -230,8 +255,9 @@ class _Run:
             editors = [remove_floaters]
             limits = plan.limits
             if limits.seconds is not None:
-                steps = plan.uncapped.train.steps if plan.uncapped else config.train.steps
-                self._time = TimeLimit(limits.seconds, steps, corrects=resumed is None)
+                corrects = resumed is None or plan.is_extended
+                steps = plan.requested.train.steps
+                self._time = TimeLimit(limits.seconds, steps, corrects=corrects)
                 editors.append(self._time)
             if limits.gaussians is not None:
                 self._count = CountLimit(limits.gaussians, limits.seconds)
@@ -273,7 +299,7 @@ class _Run:
                 self.folder / LOG_NAME,
                 done,
                 every=options.log_every,
-                tensorboard=options.tensorboard,
+                loggers=open_loggers(self.config, self.folder, done),
             ) as log,
             Interrupts() as interrupts,
         ):
@@ -303,6 +329,8 @@ class _Run:
             case StepDone():
                 options = self.config.train
                 step = event.step
+                if options.image_every > 0 and step % options.image_every == 0:
+                    self._emit_image(step)
                 evaluates = options.eval_every > 0 and step % options.eval_every == 0
                 is_last = step == options.steps or event.is_last
                 is_due = options.save_every > 0 and step % options.save_every == 0
@@ -334,6 +362,22 @@ class _Run:
         seconds = time.perf_counter() - start
         self.loop.stopwatch.exclude(seconds)
         self.loop.emit(Evaluated(step, "test", report.psnr, report.ssim, seconds))
+
+    def _emit_image(self, step: int) -> None:
+        """Render the first test view, or training view without test views; emit it and its
+        photo."""
+        start = time.perf_counter()
+        trainer: Any = self.loop.trainer
+        split = "test" if trainer.has_test_views else "train"
+        views = trainer.capture.splits[split]
+        image = ImageLoader(views[:1], self.config.data)[0].to(trainer.device)
+        background = background_colour(trainer.background)
+        with torch.no_grad():
+            scene = trainer.model.scene.on_background(background)
+            rendered = scene.render(image.cameras, image.time).rgb[0]
+        pair = torch.cat([rendered, image.composite(background)], dim=1)
+        self.loop.stopwatch.exclude(time.perf_counter() - start)
+        self.loop.emit(ProgressImage(step, split, to_uint8(pair.cpu().numpy())))
 
     def _reached(self) -> Iterator[str]:
         """Yield a line for each limit; a file that is pending is written before its line."""

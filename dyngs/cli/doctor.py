@@ -21,6 +21,8 @@ _OPTIONAL = {
     "lpips": "metrics",
     "matplotlib": "plots",
     "tensorboard": "tensorboard",
+    "wandb": "wandb",
+    "rerun-sdk": "rerun",
     "zstandard": "zstd",
     "usd-core": "usd",
     "fourdgs": "4dgs",

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import FunctionType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
@@ -20,6 +20,7 @@ from dyngs.core.plugins import EXPORTERS, load_plugin, plugin_entries
 if TYPE_CHECKING:
     from dyngs.data.capture import Split, View
     from dyngs.export.splat_files import Part
+    from dyngs.models.renderable import Renderable
     from dyngs.runs.opened import OpenedScene
 
 _OTHER_SUFFIXES = {
@@ -31,8 +32,8 @@ _OTHER_SUFFIXES = {
     ".json": "cameras",
 }
 _SPLATS = "time times motion static dynamic up from_up"
-_TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree") | {
-    "sog": f"{_SPLATS} sh_degree folder",
+_TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree classic") | {
+    "sog": f"{_SPLATS} sh_degree classic folder",
     MOVING: _SPLATS,
     "tracks": "time times motion dynamic",
     "dyngs": "max_change",
@@ -42,7 +43,7 @@ _TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree") | {
     "html": "time motion from_up folder max_gaussians_drawn",
     "mesh of a person": "motion",
     "mesh": "time times up from_up level segments cells",
-    "bodies": "time up from_up",
+    "bodies": "time up from_up classic",
     "joints": "motion",
 }
 """Options that each format accepts."""
@@ -134,6 +135,11 @@ def add_parser(commands: args.Commands) -> None:
     about = "rigidly moving bodies as animated nodes of a .glb; all else is static, as at --time"
     parser.add_argument("--bodies", action="store_true", help=about)
     add_axes(parser)
+    about = (
+        "fit opacities, scales and (without SH) colours to viewers without antialiasing (default: "
+        "only for .splat, .glb and USD, which cannot store that a scene is antialiased)"
+    )
+    parser.add_argument("--classic", action=argparse.BooleanOptionalAction, help=about)
     part = parser.add_mutually_exclusive_group()
     part.add_argument("--static", action="store_true", help="only the Gaussians that never move")
     part.add_argument("--dynamic", action="store_true", help="only the Gaussians that move")
@@ -142,6 +148,52 @@ def add_parser(commands: args.Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the files and print their paths and sizes."""
+    print_written(*_write(arguments))
+    return 0
+
+
+def export(
+    run: Path | str | Renderable, out: Path | str | None = None, **options: Any
+) -> list[Path]:
+    """Export a run, an avatar or a scene that was loaded from a run. Returns the written paths.
+
+    Does what ``dyngs export`` does, but prints nothing. ``dyngs.save`` writes scenes in memory.
+
+    Example:
+
+        import dyngs
+
+        dyngs.export("runs/lego", "lego.spz", sh_degree=0)
+        dyngs.export("runs/lego", "lego.glb", format="mesh", cells=32)
+
+    Args:
+        run: run folder, file, or scene.
+        out: file or folder; None: a name in the run folder.
+        options: those of ``dyngs export``, with underscores, such as ``format="mesh"``,
+            ``time=0.5``, ``times="0:1:30"``, ``motion="walk.npz"`` or ``folder=True``.
+
+    Raises:
+        DyngsError: an unknown option, one that the format does not have, or a file that cannot be
+            written.
+    """
+    from dyngs.cli import make_parser
+    from dyngs.models.renderable import run_path
+
+    words = ["export", "--out", str(out)] if out else ["export"]
+    for name, value in options.items():
+        flag = f"--{name.replace('_', '-')}"
+        if value is not None and value is not False:
+            words.append(flag if value is True else f"{flag}={value}")
+    arguments = make_parser("export").parse_args([*words, "--", str(run_path(run))])
+    unknown = options.keys() - vars(arguments).keys()  # argparse accepts abbreviations
+    if unknown:
+        raise DyngsError(f"{min(unknown)}: no option of dyngs.export; see `dyngs export --help`")
+    args.require_outputs_apart(arguments.parser, arguments)
+    return _write(arguments)
+
+
+def _write(arguments: argparse.Namespace) -> list[Path]:
+    """Write the files and return their paths."""
     with heavy_imports():
         import dyngs.runs.opened  # noqa: F401
 
@@ -173,24 +225,19 @@ def run(arguments: argparse.Namespace) -> int:
         "mesh of a person": _export_rigged,
     }
     if kind not in _TAKES:
-        _export_by_plugin(arguments, kind)
-        return 0
+        return _export_by_plugin(arguments, kind)
     if kind in writers:
-        writers[kind](arguments)
-        return 0
+        return writers[kind](arguments)
     times = _times(arguments)
     opened = _moved(arguments, _open(arguments))
     times = opened.scene.times if arguments.motion is not None and times is None else times
     if opened.scene.is_static and times is not None:
         print_notes(("the scene is static: all times are the same",))
     if kind == "tracks":
-        files = _export_tracks(arguments, opened, times)
-    elif kind == MOVING:
-        files = _export_moving(arguments, opened, times or opened.scene.times or (0.0,))
-    else:
-        files = _export_splats(arguments, opened, times, kind)
-    print_written(*files)
-    return 0
+        return _export_tracks(arguments, opened, times)
+    if kind == MOVING:
+        return _export_moving(arguments, opened, times or opened.scene.times or (0.0,))
+    return _export_splats(arguments, opened, times, kind)
 
 
 def _kind(arguments: argparse.Namespace) -> str:
@@ -227,7 +274,7 @@ def _kind(arguments: argparse.Namespace) -> str:
     return usual
 
 
-def _export_by_plugin(arguments: argparse.Namespace, suffix: str) -> None:
+def _export_by_plugin(arguments: argparse.Namespace, suffix: str) -> list[Path]:
     """Write a file by the exporter of another package: a function of scene, path and time."""
     from dyngs.io.write import atomic_file
     from dyngs.runs.folder import collect_inputs
@@ -237,7 +284,7 @@ def _export_by_plugin(arguments: argparse.Namespace, suffix: str) -> None:
     collect_inputs(opened).require_output(arguments.out)
     with atomic_file(arguments.out) as temporary:
         write(opened, temporary, (_times(arguments) or (0.0,))[0])
-    print_written(arguments.out)
+    return [arguments.out]
 
 
 def _target(arguments: argparse.Namespace, name: str) -> Path:
@@ -318,6 +365,7 @@ def _export_splats(
     how, line = choose_write_options(
         opened, own.up, arguments.up, arguments.from_up, arguments.sh_degree
     )
+    how = replace(how, classic=arguments.classic)
     stem = "splats" + ("_static" if arguments.static else "_dynamic" if arguments.dynamic else "")
     out: Path | None = arguments.out
     is_sequence = _is_sequence(arguments)
@@ -410,7 +458,7 @@ def _export_tracks(
     return [write_tracks(_target(arguments, "tracks.npz"), tracks)]
 
 
-def _export_dyngs(arguments: argparse.Namespace) -> None:
+def _export_dyngs(arguments: argparse.Namespace) -> list[Path]:
     """Write the run as a .dyngs file and print the change of its images."""
     from dyngs.api.scene_file import write_scene_file
     from dyngs.compress.measure import SMALLEST_CHANGE
@@ -440,13 +488,12 @@ def _export_dyngs(arguments: argparse.Namespace) -> None:
     else:
         print_notes((f"RMS change of training views: {change:.2f} grey levels of 255",))
     ratio = written.num_bytes_exact / written.num_bytes
-    print(
-        f"written: {written.path} ({written.num_bytes / 1e6:.2f} MB, {ratio:.1f} times smaller "
-        "than uncompressed)"
-    )
+    size = f"{written.num_bytes / 1e6:.2f} MB"
+    print_notes((f"{size}, {ratio:.1f} times smaller than uncompressed",))
+    return [written.path]
 
 
-def _export_avatar(arguments: argparse.Namespace) -> None:
+def _export_avatar(arguments: argparse.Namespace) -> list[Path]:
     from dyngs.human.avatar.avatar_file import write_avatar
     from dyngs.runs.folder import collect_inputs
     from dyngs.runs.opened import open_run
@@ -454,20 +501,20 @@ def _export_avatar(arguments: argparse.Namespace) -> None:
     path = _target(arguments, "avatar.safetensors")
     run = open_run(arguments.run_dir).in_edit_frame()
     collect_inputs(run).require_output(path)
-    print_written(write_avatar(run.renderable, run.config.model, run.info, path))
+    return [write_avatar(run.renderable, run.config.model, run.info, path)]
 
 
-def _export_network(arguments: argparse.Namespace) -> None:
+def _export_network(arguments: argparse.Namespace) -> list[Path]:
     from dyngs.api.predict import network_config
     from dyngs.runs.checkpoint import latest_checkpoint
     from dyngs.runs.network_file import SUFFIX, write_network
 
     run: Path = arguments.run_dir
     out = _target(arguments, f"network{SUFFIX}")
-    print_written(write_network(run, network_config(run), latest_checkpoint(run), out))
+    return [write_network(run, network_config(run), latest_checkpoint(run), out)]
 
 
-def _export_bodies(arguments: argparse.Namespace) -> None:
+def _export_bodies(arguments: argparse.Namespace) -> list[Path]:
     """Write a moving scene with its rigid bodies as animated nodes."""
     from dyngs.export.images import compare_file_with_run
     from dyngs.export.splat_files import choose_write_options, write_rigid_bodies
@@ -479,16 +526,17 @@ def _export_bodies(arguments: argparse.Namespace) -> None:
     how, line = choose_write_options(
         opened, format_by_name("glb").up, arguments.up, arguments.from_up
     )
+    how = replace(how, classic=arguments.classic)
     written = write_rigid_bodies(opened, out, time, how)
     print_notes((line,))
     found = compare_file_with_run(
         opened, opened.scene, time, written.splat, read_splats(written.path)
     )
     print_image_difference(written.notes, [found])
-    print_written(written.path)
+    return [written.path]
 
 
-def _export_rigged(arguments: argparse.Namespace) -> None:
+def _export_rigged(arguments: argparse.Namespace) -> list[Path]:
     """Write a person as a skinned mesh, or as Gaussians with joints."""
     from dyngs.export.rigged.people import AnimationInfo, write_mesh, write_rigged_splats
     from dyngs.runs.opened import FRAME_RATE
@@ -504,7 +552,7 @@ def _export_rigged(arguments: argparse.Namespace) -> None:
     opened = _moved(arguments, _open(arguments)).in_edit_frame()
     played = None if motion is None else AnimationInfo(motion.stem, opened.fps or FRAME_RATE)
     print_notes((write_rigged_splats if arguments.joints else write_mesh)(opened, out, played))
-    print_written(out)
+    return [out]
 
 
 def _has_surface(arguments: argparse.Namespace) -> bool:
@@ -521,7 +569,7 @@ def _has_surface(arguments: argparse.Namespace) -> bool:
     return source.is_dir() and capability(load_resolved(source).model, HasBody) is None
 
 
-def _export_surface(arguments: argparse.Namespace) -> None:
+def _export_surface(arguments: argparse.Namespace) -> list[Path]:
     """Write the mesh of a scene, one file per time."""
     from dyngs.export.surface_file import surface_write_options, write_surface
     from dyngs.gaussians.surface import count_holes
@@ -539,6 +587,7 @@ def _export_surface(arguments: argparse.Namespace) -> None:
         opened, ".ply" if arguments.times else out.suffix, arguments.up, arguments.from_up
     )
     print_notes((line,))
+    written: list[Path] = []
     for i, time in enumerate(_times(arguments) or (0.0,)):
         path = out / f"mesh_{i:04d}.ply" if arguments.times else out
         surface = write_surface(opened, path, time=time, options=options, how=how)
@@ -546,10 +595,11 @@ def _export_surface(arguments: argparse.Namespace) -> None:
         closed = "closed" if holes == 0 else f"{format_count(holes, 'hole')}"
         faces = format_count(len(surface.faces), "triangle")
         print_notes((f"{faces}, {len(surface.vertices):,} vertices, {closed}",))
-        print_written(path)
+        written.append(path)
+    return written
 
 
-def _export_page(arguments: argparse.Namespace) -> None:
+def _export_page(arguments: argparse.Namespace) -> list[Path]:
     """Write a self-contained web page, or a folder whose page streams the scene."""
     from dyngs.export.html.page import write_page, write_page_folder
 
@@ -571,11 +621,11 @@ def _export_page(arguments: argparse.Namespace) -> None:
         written = write_page_folder(opened, out, most=most, time=time)
     else:
         written = write_page(opened, out, time=time)
-    print_notes(written.notes)
-    print(f"written: {written.path} ({written.num_bytes / 1e6:.1f} MB); {where}")
+    print_notes((*written.notes, where))
+    return [written.path]
 
 
-def _export_cameras(arguments: argparse.Namespace) -> None:
+def _export_cameras(arguments: argparse.Namespace) -> list[Path]:
     """Write the cameras of a run as a transforms.json, refined if training refined them."""
     from dyngs.data.capture import all_views
     from dyngs.evaluate.report import load_camera_corrections
@@ -606,6 +656,5 @@ def _export_cameras(arguments: argparse.Namespace) -> None:
     written = write_cameras(path, capture, splits, run.world)
     count = format_count(len(all_views(capture.splits)), "camera")
     root = quote_path(path.parent)
-    print(
-        f"written: {written} ({count}); `data.root={root} data.follow_links=true` trains with them"
-    )
+    print_notes((f"{count}; `data.root={root} data.follow_links=true` trains with them",))
+    return [written]

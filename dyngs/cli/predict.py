@@ -16,7 +16,7 @@ examples:
   dyngs train gps PEOPLE run.dir=runs/stereo              from two neighbouring views, without a body
   dyngs export runs/stereo --format network --out stereo.safetensors   the weights as one file
   dyngs predict stereo.safetensors captures/ann --out runs/two --views f000_c00.png,f000_c01.png
-  dyngs predict gps captures/ann --out runs/two                     with the published weights
+  dyngs predict gps captures/ann --out runs/two                     with the weights of dyngs
   dyngs predict runs/keypoint_nerf captures/ann --out runs/field --views 4
   dyngs eval runs/ann
   dyngs train --resume runs/ann                                     continues from the prediction
@@ -35,7 +35,9 @@ def add_parser(commands: Commands) -> None:
         "Writes a run folder.",
         _EPILOG,
     )
-    about = "run folder or weights file of a network, or gps or human_predictor if installed"
+    about = (
+        "run folder or weights file of a network, or gps or human_predictor, which come with dyngs"
+    )
     parser.add_argument("network", type=input_path, metavar="NET", help=about)
     parser.add_argument("capture", type=input_path, metavar="CAPTURE", help="capture of a person")
     parser.add_argument(

@@ -4,7 +4,7 @@ the settings of a run."""
 from __future__ import annotations
 
 import argparse
-import os
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -126,62 +126,41 @@ def amount(text: str) -> float:
 
 
 def run_compare(arguments: argparse.Namespace) -> int:
-    """Train and compare the models, print the table and write the report; locks the folder."""
-    from dyngs.io.outputs import lock_folder
-    from dyngs.runs.folder import collect_inputs
-    from dyngs.study.compare import ModelComparison
-    from dyngs.study.report import Report, build_table, can_plot, page_views, plot_curves
-    from dyngs.study.tradeoff import build_rows
+    """Train and compare the models, and print the table."""
+    from dyngs.study.compare import compare
 
-    capture = Path(os.path.abspath(arguments.capture))  # so that it has a name, also as . or ..
-    out = (arguments.out or Path("compare", capture.name)).absolute()
     if arguments.minutes is None and arguments.steps is None and arguments.max_mb is None:
         raise DyngsError("a common limit is required: --minutes M, --steps N or --max-mb MB")
     args.computing_device(arguments.device)
-    comparison = ModelComparison(
-        capture,
-        out,
-        arguments.minutes,
-        arguments.steps,
-        arguments.max_mb,
-        arguments.split,
-        tuple(arguments.overrides),
-        arguments.threads,
-        arguments.device,
-        arguments.views,
-    )
-    configs, unfit = comparison.configs(arguments.models.split(","))
-    for config in configs.values():
-        collect_inputs(config).require_output(out)
-    with lock_folder(out), redirect_messages(arguments.json):
-        comparison.require_same(configs, unfit)
+    with redirect_messages(arguments.json):
         try:
-            results, left_out, curves = comparison.run(configs, arguments.ray)
+            result = compare(
+                arguments.capture,
+                arguments.models.split(","),
+                minutes=arguments.minutes,
+                steps=arguments.steps,
+                max_mb=arguments.max_mb,
+                out=arguments.out,
+                split=arguments.split,
+                views=arguments.views,
+                threads=arguments.threads,
+                device=arguments.device,
+                ray_cores=arguments.ray,
+                overrides=arguments.overrides,
+            )
         except KeyboardInterrupt:
             raise KeyboardInterrupt(_CONTINUES) from None
-    rows = sorted(build_rows(results), key=lambda row: -row["psnr"])
-    views = f"{results[0].num_views} held-out views (split {comparison.split})"
-    about = f"{capture.name}: {comparison.limit} each, {views}; PSNR in dB, seconds of training; {_FRONT}"
-    report = Report(
-        "Comparison",
-        about,
-        rows,
-        [build_table(about, rows)],
-        left_out=unfit | left_out,
-        views=page_views(out, results),
-        figure=plot_curves(curves) if can_plot() and any(curves.values()) else None,
-    )
-    _print_report(report, out / "comparison", is_json=arguments.json)
+    _print_report(result, is_json=arguments.json)
     return 0
 
 
-def _print_report(report: Report, stem: Path, *, is_json: bool) -> None:
-    """Write the files of a study, and print its tables or only its .json."""
-    from dyngs.study.report import MATPLOTLIB_MISSING, can_plot, write_report
+def _print_report(report: Report, *, is_json: bool) -> None:
+    """Print the tables of a study, or only its .json."""
+    from dyngs.study.report import MATPLOTLIB_MISSING, can_plot
 
-    paths = write_report(stem, report)
+    paths = report.files
     if is_json:
-        print(stem.with_suffix(".json").read_text(encoding="utf-8"), end="")
+        print(paths[1].read_text(encoding="utf-8"), end="")
         return
     print_tables(*(numbers_table(table.title, table.head, table.cells) for table in report.tables))
     for name, problem in report.left_out.items():
@@ -206,7 +185,7 @@ def run_tradeoff(arguments: argparse.Namespace) -> int:
 
 def _tradeoff(arguments: argparse.Namespace, out: Path) -> int:
     from dyngs.study import tradeoff
-    from dyngs.study.report import RATES, Report, build_table, can_plot, plot_variants
+    from dyngs.study.report import RATES, Report, build_table, can_plot, plot_variants, write_report
 
     requirements = tradeoff.parse_requirements(arguments.require) if arguments.require else []
     metric = arguments.minimize or arguments.maximize
@@ -242,7 +221,8 @@ def _tradeoff(arguments: argparse.Namespace, out: Path) -> int:
         {"exchange_rates": rates, "changes": [variant.changes for variant in variants]},
         figure=plot_variants(rows, settings) if can_plot() else None,
     )
-    _print_report(report, out / "tradeoff", is_json=arguments.json)
+    report = replace(report, files=write_report(out / "tradeoff", report))
+    _print_report(report, is_json=arguments.json)
     if arguments.require or metric:
         number = tradeoff.choose_variant(rows, requirements, goal)
         best = rows[number]

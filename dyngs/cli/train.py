@@ -39,18 +39,12 @@ PATH is a capture, a folder of photos or a video. PRESET is a YAML file or a nam
 lists the names. Without PRESET, `static` is used for photos, `dynamic` for a video or a capture
 with times, and `human` for a capture of a person. `dyngs config static` lists all keys.
 """
-_LOGGING = tuple(
-    f"train.{name}"
-    for name in ("save_minutes", "save_every", "eval_every", "log_every", "tensorboard")
-)
-_FOR_THIS_CALL = ("run.threads", "run.device", "run.deterministic", "data.cache_mb", *_LOGGING)
-"""Keys that do not change the result of a run."""
-WITH_RESUME = ("train.steps", "data.root", "data.follow_links", *_FOR_THIS_CALL)
-"""Keys that may be given with ``--resume``."""
+_RUN_KEYS = ("run.threads", "run.device", "run.deterministic", "data.cache_mb")
+"""Keys that do not change the result of a run, besides those of logging."""
 
 
 def add_parser(commands: args.Commands) -> None:
-    about = "Train a model from a capture. Writes a run folder (default runs/NAME)."
+    about = "Train a model from a capture. Writes a run folder (default runs/CAPTURE-PRESET)."
     parser = args.add_command(
         commands, "train", run, "train a model from a capture", about, _EPILOG
     )
@@ -180,6 +174,7 @@ def _about_motion(folder: Path, config: Config) -> list[str]:
 def parse_config(words: Sequence[str], resume: Path | None, begun: Path | None = None) -> Config:
     """Return the configuration for the words after ``dyngs train`` and the path of ``--from``."""
     from dyngs.config.io import load_config, load_resolved
+    from dyngs.config.keys.train import LOGGING_KEYS
 
     if begun is not None and resume is not None:
         raise DyngsError("--from starts a new run, --resume continues a run: use one of them")
@@ -192,12 +187,14 @@ def parse_config(words: Sequence[str], resume: Path | None, begun: Path | None =
         if preset is None and root is not None:
             preset = "static" if begun is not None else _choose_preset(root, overrides)
         return load_config(preset, overrides)
+    harmless = [*_RUN_KEYS, *(f"train.{key}" for key in LOGGING_KEYS)]
+    allowed = ("train.steps", "data.root", "data.follow_links", *harmless)
     words = [*([preset] if preset else []), *overrides]
-    other = [word for word in words if word.partition("=")[0].strip() not in WITH_RESUME]
+    other = [word for word in words if word.partition("=")[0].strip() not in allowed]
     if other:
         raise DyngsError(
             f"{other[0]!r}: the configuration of a run is fixed; --resume accepts train.steps=N, "
-            f"data.root=FOLDER (a moved capture) and {', '.join(_FOR_THIS_CALL)}"
+            f"data.root=FOLDER (a moved capture) and {', '.join(harmless)}"
         )
     config = load_resolved(resume, overrides)
     return config.model_copy(update={"run": config.run.model_copy(update={"dir": resume})})

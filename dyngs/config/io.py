@@ -32,7 +32,7 @@ from dyngs.config.schema import (
     section_class,
     section_classes,
 )
-from dyngs.config.yaml_reader import Leaf, read_file, read_override
+from dyngs.config.yaml_reader import Leaf, read_file, read_mapping, read_override
 from dyngs.core.errors import DyngsError, format_one_line, validate_file_name, wrap_read_errors
 from dyngs.io.containment import run_links_allowed
 from dyngs.io.outputs import suggest_command
@@ -66,6 +66,7 @@ REMOVED_KEYS: dict[str, object] = {
     "strategy.scale_reg": 0.01,
     "optim.sparse": False,
     "model.deform.time_resolution": 0,
+    "train.tensorboard": False,
 }
 """Removed keys that stored configurations may still contain. Maps each key to the value at which it
 had no effect; only that value is accepted."""
@@ -105,7 +106,11 @@ _FOLLOW_LINKS = ("data", "follow_links")
 _ODD_LINE_BREAKS = frozenset("\x85\u2028\u2029")
 
 
-def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Config:
+Overrides = Iterable[str] | Mapping[str, Any]
+"""``section.key=value`` texts, or values by dotted key or in nested mappings."""
+
+
+def load_config(preset: Path | str | None, overrides: Overrides = ()) -> Config:
     """Return the configuration of a preset with overrides applied.
 
     Example:
@@ -117,8 +122,9 @@ def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Con
     Args:
         preset: a YAML file, or the name of a packaged preset (``static``, ``configs/static.yaml``)
             where no such file exists; None starts from the defaults.
-        overrides: ``section.key=value`` with the value in YAML. A changed ``kind`` resets its
-            section to the defaults of that kind, in any order of the overrides.
+        overrides: ``section.key=value`` with the value in YAML, or a mapping such as
+            ``{"train.steps": 3000}`` or ``{"train": {"steps": 3000}}``. A changed ``kind`` resets
+            its section to the defaults of that kind, in any order of the overrides.
 
     Returns:
         the validated configuration, with absolute ``data.root`` and ``data.body``. In each section
@@ -137,14 +143,29 @@ def load_config(preset: Path | str | None, overrides: Iterable[str] = ()) -> Con
         if file.resolve() not in [packaged.resolve() for packaged in packaged_presets().values()]:
             own |= _own_keys(layers)
     given = layers.add_overrides(overrides)
-    own |= given
-    config = _validated(layers)
+    config = _completed(layers, own | given)
     if config.data.follow_links and _FOLLOW_LINKS not in given:
         raise DyngsError(
             f"{layers.origin_of(_FOLLOW_LINKS)}data.follow_links is allowed on the command line "
             "only; remove it here and, if you trust the capture, add data.follow_links=true there"
         )
-    _note_requested(config, (), own)
+    return config
+
+
+def replace_config(config: Config, changes: Mapping[str, Any]) -> Config:
+    """Return a config with some values changed, see ``Config.replace``."""
+    layers = _Layers()
+    layers.add(read_mapping(config.model_dump(mode="json")))
+    layers.origins.clear()
+    given = layers.add_overrides(changes)
+    requested = {leaf.keys for leaf in read_mapping(config.model_dump(exclude_unset=True))}
+    return _completed(layers, given | requested)
+
+
+def _completed(layers: _Layers, requested: set[tuple[str, ...]]) -> Config:
+    """Return the validated config with absolute paths; ``requested`` are the keys of the user."""
+    config = _validated(layers)
+    _note_requested(config, (), requested)
     body = config.data.body
     paths = {"root": config.data.root.absolute(), "body": None if body is None else body.absolute()}
     data = config.data.model_copy(update=paths)
@@ -180,6 +201,8 @@ def load_resolved(
     if isinstance(data, dict):
         stored_root = data.get("root")
         data["follow_links"] = run_links_allowed()
+        # Runs of versions without this key were trained on full images.
+        data.setdefault("longest_side", None)
         if isinstance(data.get("body"), str):
             data["body"] = str(file.parent.absolute() / data["body"])
     layers.add_overrides(overrides)
@@ -275,9 +298,12 @@ class _Layers:
         for leaf in leaves:
             self._set(leaf)
 
-    def add_overrides(self, overrides: Iterable[str]) -> set[tuple[str, ...]]:
+    def add_overrides(self, overrides: Overrides) -> set[tuple[str, ...]]:
         """Apply overrides, and return the keys that they set."""
-        leaves = [leaf for text in overrides for leaf in read_override(text)]
+        if isinstance(overrides, Mapping):
+            leaves = list(read_mapping(overrides))
+        else:
+            leaves = [leaf for text in overrides for leaf in read_override(text)]
         # a ``kind`` or {} clears its section, so these come first, outer sections before inner ones
         for leaf in sorted(
             leaves, key=lambda o: (o.keys[-1] != "kind" and o.value != {}, len(o.keys))

@@ -1,13 +1,14 @@
-"""Read YAML presets and overrides as text values with their origin (file and line).
+"""Read YAML presets and overrides as values with their origin (file and line).
 
-Values stay text (``007``, ``2024-02-30``) because the schema decides their types. Invalid YAML
+YAML values stay text (``007``, ``2024-02-30``) because the schema decides their types. Invalid YAML
 raises a one-line DyngsError.
 """
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,8 @@ _NULL = ("", "~", "null", "Null", "NULL")
 @dataclass(frozen=True)
 class Leaf:
     """One value of a file or an override: text, a list, None, or {} for an empty section.
+
+    From Python it may also be a number or a bool.
 
     ``origin`` is the file and line, for messages.
     """
@@ -74,6 +77,18 @@ def read_override(text: str) -> list[Leaf]:
     # a block mapping such as "10:" is taken as text
     value = _value(node) if node is not None and (is_flow or is_quoted) else written
     return [Leaf(keys, None if is_null else value, origin)]
+
+
+def read_mapping(values: Mapping[str, Any], above: str = "") -> Iterator[Leaf]:
+    """Yield the values that keyword arguments set: dotted keys or nested mappings."""
+    for key, value in values.items():
+        name = f"{above}{key}"
+        if isinstance(value, Mapping) and value:
+            yield from read_mapping(value, f"{name}.")
+        else:
+            value = os.fspath(value) if isinstance(value, os.PathLike) else value
+            origin = format_one_line(f"{name}={value!r}", _SHOWN)
+            yield Leaf(tuple(name.split(".")), value, origin)
 
 
 def _root(text: str, origin: str) -> yaml.Node | None:

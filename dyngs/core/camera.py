@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from dyngs.core.errors import DyngsError
 
 
 @dataclass(frozen=True)
 class Cameras:
     """V pinhole cameras of one image size.
 
+    The matrices may be tensors, NumPy arrays or lists. For camera-to-world matrices and OpenGL
+    axes see ``from_matrices``.
+
     Example:
 
-        import torch
+        import numpy as np
 
         import dyngs
 
-        pose = torch.eye(4)[None]  # at the origin, looking along z
-        intrinsics = torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]])
+        pose = np.eye(4)[None]  # at the origin, looking along z
+        intrinsics = [[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]]
         cameras = dyngs.Cameras(pose, intrinsics, width=64, height=48)
 
     Attributes:
@@ -34,6 +42,8 @@ class Cameras:
     height: int
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "cam_from_world", _as_tensor(self.cam_from_world))
+        object.__setattr__(self, "intrinsics", _as_tensor(self.intrinsics))
         if self.cam_from_world.ndim != 3 or self.cam_from_world.shape[1:] != (4, 4):
             raise ValueError(
                 f"cam_from_world must be (V, 4, 4), got {tuple(self.cam_from_world.shape)}"
@@ -44,6 +54,55 @@ class Cameras:
             raise ValueError(
                 f"image size must be positive, in whole pixels, got {self.width}x{self.height}"
             )
+
+    @staticmethod
+    def from_matrices(
+        world_from_cam: Any,
+        intrinsics: Any,
+        width: int,
+        height: int,
+        *,
+        convention: Literal["opencv", "opengl"] = "opencv",
+    ) -> Cameras:
+        """Return cameras from camera-to-world matrices, without gradients.
+
+        Example:
+
+            import numpy as np
+
+            import dyngs
+
+            poses = np.stack([np.eye(4)] * 8)
+            intrinsics = [[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]
+            cameras = dyngs.Cameras.from_matrices(
+                poses, intrinsics, width=64, height=48, convention="opengl"
+            )
+
+        Args:
+            world_from_cam: (V, 4, 4) tensor, array or list.
+            intrinsics: (3, 3) for all cameras, or (V, 3, 3), in pixels.
+            width, height: image size in pixels.
+            convention: camera axes, "opencv" (x right, y down, z forward) or "opengl" (x right,
+                y up, z backward; also of Blender, NeRF and nerfstudio).
+
+        Raises:
+            DyngsError: other shapes.
+        """
+        if convention not in ("opencv", "opengl"):
+            raise DyngsError(f"convention={convention!r}: must be 'opencv' or 'opengl'")
+        poses = _as_tensor(world_from_cam).detach().double().cpu().numpy()
+        if poses.shape[1:] != (4, 4):
+            raise DyngsError(f"world_from_cam must be (V, 4, 4), got {poses.shape}")
+        if convention == "opengl":
+            poses = poses * [1.0, -1.0, -1.0, 1.0]
+        matrices = _as_tensor(intrinsics).expand(len(poses), 3, 3)
+        return Cameras(torch.as_tensor(np.linalg.pinv(poses)), matrices, width, height)
+
+    def __iter__(self) -> Iterator[Cameras]:
+        return (self.select(i) for i in range(len(self)))
+
+    def __repr__(self) -> str:
+        return f"Cameras({len(self)} of {self.width}x{self.height} px)"
 
     def __len__(self) -> int:
         return len(self.cam_from_world)
@@ -84,3 +143,7 @@ class Cameras:
             for x in (self.cam_from_world, self.intrinsics)
         )
         return Cameras(pose, intrinsics, self.width, self.height)
+
+
+def _as_tensor(values: Any) -> Tensor:
+    return values if isinstance(values, Tensor) else torch.as_tensor(np.asarray(values, float))

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from dyngs.core.conventions import MAX_SH_DEGREE, SH_C0, num_sh_terms
+from dyngs.core.errors import format_count
 from dyngs.core.tensor_checks import require_tensor
 
 LARGEST_LOG_SCALE = 88  # Natural logarithm of the largest size that float32 can hold, rounded down
@@ -100,6 +101,10 @@ class Gaussians:
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def __repr__(self) -> str:
+        count = format_count(len(self), "Gaussian")
+        return f"Gaussians({count}, SH degree {self.sh_degree}, {self.means.device})"
 
     @property
     def scales(self) -> Tensor:

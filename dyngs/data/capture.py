@@ -3,12 +3,15 @@ disk."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from dyngs.core.camera import Cameras
 
 Split = Literal["train", "val", "test", "pose"]
 """Splits of a capture; "pose" is a separate clip of a person, with its own times and frame
@@ -182,6 +185,13 @@ class BodyFrames:
 class Capture:
     """A capture on disk: its views, points, body parameters and coordinate frame.
 
+    Example:
+
+        import dyngs
+
+        capture = dyngs.read_capture("lego")
+        capture.splits["train"][0].name, len(capture.splits["test"])
+
     Attributes:
         root: the folder.
         format: name of its format, as in ``data.format``.
@@ -219,6 +229,51 @@ class Capture:
     seconds: float | None = None
     tracks_path: Path | None = None
     warnings: tuple[str, ...] = ()
+
+    @staticmethod
+    def from_images(
+        images: Sequence[Any],
+        cameras: Cameras | Sequence[Cameras],
+        times: Sequence[float] | None = None,
+        masks: Sequence[Any] | None = None,
+    ) -> Capture:
+        """Return a capture of images in memory, for ``dyngs.train`` and ``dyngs.evaluate``.
+
+        The images are stored once, as PNG in the user's cache (``DYNGS_CACHE_DIR``). Runs that are
+        trained on them can therefore be resumed, evaluated and viewed from there. Every eighth
+        image is held out, as of files.
+
+        Example:
+
+            import numpy as np
+
+            import dyngs
+
+            images = [np.zeros((48, 64, 3), np.uint8)] * 4
+            poses = np.stack([np.eye(4)] * 4)
+            poses[:, 0, 3] = np.arange(4)
+            intrinsics = [[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]
+            cameras = dyngs.Cameras.from_matrices(poses, intrinsics, width=64, height=48)
+            capture = dyngs.Capture.from_images(images, cameras)
+
+        Args:
+            images: (H, W), (H, W, 3) or (H, W, 4) arrays or tensors with straight alpha; uint8, or
+                floats in [0, 1], which are rounded to 8 bits.
+            cameras: one per image; a list of ``Cameras`` where sizes differ.
+            times: one per image in any unit, for a moving scene.
+            masks: (H, W) bool, uint8 or float; True, 255 or 1: used, 0: ignored.
+
+        Raises:
+            DyngsError: other lengths, shapes, types or values, or an invalid pose.
+        """
+        from dyngs.data.arrays import capture_from_images
+
+        return capture_from_images(images, cameras, times, masks)
+
+    def __repr__(self) -> str:
+        views = ", ".join(f"{len(x)} {name}" for name, x in self.splits.items() if x)
+        points = 0 if self.points is None else len(self.points.xyz)
+        return f"Capture({self.root}: {self.format}, views: {views}; {points:,} points)"
 
     def replace(self, **changes: object) -> Capture:
         """Return a copy with some attributes replaced."""

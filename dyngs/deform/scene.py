@@ -22,7 +22,7 @@ from dyngs.models.renderable import Renderable, clamp_time
 _NONE = torch.zeros(0, dtype=torch.long, device="cpu")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class DynamicScene(GaussianScene):
     """N canonical Gaussians, of which a field moves M."""
 

@@ -1,1 +1,7 @@
 """Metrics of runs over held-out views, regions, point tracks and time."""
+
+import sys
+
+from dyngs.core.callable_package import CallablePackage
+
+sys.modules[__name__].__class__ = CallablePackage

@@ -42,7 +42,7 @@ from dyngs.human.avatar.scene import as_human_scene
 from dyngs.io.write import write_text
 from dyngs.models.checkpoint import CONFIG_ADVICE, read_run_capture
 from dyngs.models.kind import HasMotion, capability
-from dyngs.models.renderable import Renderable
+from dyngs.models.renderable import Renderable, run_path
 from dyngs.models.views import evaluation_background, training_cameras
 from dyngs.ops.device import CPU, select_device
 from dyngs.ops.native import kernel_threads
@@ -221,7 +221,7 @@ class EvalReport:
 
 
 def evaluate_run(
-    run_dir: Path,
+    run_dir: Path | str | Renderable,
     split: str = "test",
     *,
     lpips_net: LpipsNet = "alex",
@@ -235,13 +235,23 @@ def evaluate_run(
 
     The file is ``metrics.json`` for the split "test", else ``metrics_SPLIT.json``.
 
+    Example:
+
+        import dyngs
+
+        report = dyngs.evaluate("runs/lego")
+        report.psnr, report.ssim, report.num_gaussians
+
     Args:
+        run_dir: run folder, or the scene of one as it was trained or loaded.
+        split: "test", "val", "train" or "pose".
         threads: number of torch threads from now on. 0 keeps it.
         refine_poses: also score with poses fitted to the evaluated images: body poses of a person,
             else camera poses. Always done for a run that refined its cameras.
         data_root: current folder of the capture, if it was moved.
-        capture: capture of the run, if already read.
+        capture: capture of the run, in any coordinates. None reads it.
     """
+    run_dir = run_path(run_dir)
     render_device = select_device(device)
     collect_inputs(run_dir).require_output(report_path(run_dir, split))
     if refine_poses and split == "train":
@@ -250,7 +260,7 @@ def evaluate_run(
             "pose"
         )
     run = load_run(run_dir, data_root)
-    capture = capture or read_run_capture(run.config.data, run.info)
+    capture = read_run_capture(run.config.data, run.info, capture)
     views = split_views(capture, split)
     background, colour = evaluation_background(run.config.data.background, capture.has_alpha)
     scene = scene_of_split(run, capture, split).to(render_device)
@@ -317,6 +327,8 @@ def evaluate_run(
     return report
 
 
+evaluate = evaluate_run
+"""Its public name, ``dyngs.evaluate``."""
 MEAN_METRICS = (
     *POSE_METRICS,
     "flip",

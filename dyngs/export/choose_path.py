@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,15 +21,21 @@ from dyngs.export.camera_paths import (
     resize_cameras,
     with_times,
 )
-from dyngs.export.images import file_stems
+from dyngs.export.images import OutputOptions, file_stems, write_path_images
 from dyngs.export.orbits import frame_orbit_for_points, orbit_path, path_along, spiral_path
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.human.avatar.scene import as_human_scene
 from dyngs.human.body.skinning import axis_angle_to_matrix
 from dyngs.io.formats.similarity import AXES
-from dyngs.models.renderable import Renderable
+from dyngs.models.renderable import Renderable, run_path
 from dyngs.models.views import training_cameras
-from dyngs.runs.opened import OpenedScene, cameras_for_paths, split_views
+from dyngs.runs.opened import (
+    OpenedScene,
+    cameras_for_paths,
+    open_scene,
+    split_views,
+    wrap_scene,
+)
 
 DEFAULT_FRAMES = 120
 DEFAULT_SIZE = (960, 720)  # Image size in pixels for scenes without a capture
@@ -38,9 +46,9 @@ _RING = 24  # Cameras around a scene, one of which faces a person
 class PathOptions:
     """Cameras and times to render."""
 
-    # "orbit", "spiral", "along" (the training cameras), a JSON file, or
-    # None for one fixed camera
-    path: str | None = "orbit"
+    # "orbit", "spiral", "along" (the training cameras), a JSON file, cameras in
+    # the coordinates of the capture's files, or None for one fixed camera
+    path: str | Cameras | None = "orbit"
     # frames of an automatic path; None uses the frames of a motion, else 120
     num_frames: int | None = None
     # width and height in pixels; None uses that of the images or of the JSON, else 960x720
@@ -75,12 +83,7 @@ def choose_path(opened: OpenedScene, options: PathOptions) -> CameraPath:
     if options.path is None:
         path = _fixed_camera(opened, options)
     else:
-        file = camera_path_file(options.path)
-        if file is None:
-            path = _automatic_path(opened, options.path, options)
-        else:
-            path = read_path(file, opened.world_offset, options.size)
-            path = replace(path, cameras=opened.frame.inverse().cameras(path.cameras))
+        path = _moving_camera(opened, options.path, options)
         if times is not None:
             path = with_times(path, times * len(path) if len(times) == 1 else times)
     notes = path.notes
@@ -95,6 +98,48 @@ def choose_path(opened: OpenedScene, options: PathOptions) -> CameraPath:
     if options.size is not None:
         path = replace(path, cameras=resize_cameras(path.cameras, *options.size))
     return replace(path, notes=notes, fps=path.fps if opened.fps is None else opened.fps)
+
+
+def render_path(
+    scene: Path | str | Renderable,
+    path: Cameras | str = "orbit",
+    *,
+    out: Path | str,
+    frames: int | None = None,
+    size: tuple[int, int] | None = None,
+    times: Sequence[float] | None = None,
+    fps: float | None = None,
+) -> list[Path]:
+    """Render a camera path to images or a video. Returns the written files.
+
+    Example:
+
+        import dyngs
+
+        dyngs.render_path("runs/lego", "orbit", out="orbit", frames=4)
+
+    Args:
+        scene: a scene, a run folder or a file.
+        path: "orbit", "spiral", "along" (the training cameras), a .json file of cameras, or
+            ``Cameras`` in the coordinates of ``dyngs.load``.
+        out: a folder of images, or a video by its suffix, such as .mp4.
+        frames: number of frames of an automatic path; None: 120.
+        size: width and height in px; None: that of the capture or of the cameras.
+        times: scene time of each frame, or one for all; None: 0 to 1 along the path.
+        fps: frames per second of a video; None: 30, or that of the .json file.
+
+    Raises:
+        DyngsError: a path that needs the capture of a run, or a file that cannot be written.
+    """
+    if isinstance(scene, Renderable) and scene.run is None:
+        opened = wrap_scene(scene)
+    else:
+        opened = open_scene(run_path(scene), nonfinite="skip")
+    chosen = choose_path(opened, PathOptions(path, frames, size, tuple(times) if times else None))
+    out = Path(out)
+    folder, video = (None, out) if out.suffix else (out, None)
+    output = OutputOptions(video=video, fps=fps or chosen.fps)
+    return write_path_images(opened, chosen, folder, output)
 
 
 def select_view(capture: Capture, name: str | None = None, split: str | None = None) -> View:
@@ -172,6 +217,17 @@ def _fixed_camera(opened: OpenedScene, options: PathOptions) -> CameraPath:
         times = (view.time or 0.0,) if opened.fps is None else times
     times = times if options.times is None else options.times
     return with_times(CameraPath(pick_cameras(camera, [0] * len(times))), times)
+
+
+def _moving_camera(opened: OpenedScene, given: str | Cameras, options: PathOptions) -> CameraPath:
+    """Return the given cameras, those of a file, or an automatic path."""
+    if isinstance(given, Cameras):
+        return CameraPath(opened.file_unit.inverse().cameras(given))
+    file = camera_path_file(given)
+    if file is None:
+        return _automatic_path(opened, given, options)
+    path = read_path(file, opened.world_offset, options.size)
+    return replace(path, cameras=opened.frame.inverse().cameras(path.cameras))
 
 
 def _automatic_path(opened: OpenedScene, name: str, options: PathOptions) -> CameraPath:

@@ -351,8 +351,7 @@ def compare_file_with_run(
         cameras = frame.inverse().cameras(_orbit_of_file(meant))
     else:
         rows = np.unique(np.linspace(0, len(cameras) - 1, 4).round().astype(int))
-        fraction = min(1.0, 240 / max(cameras.width, cameras.height))
-        cameras = pick_cameras(cameras, rows).scaled(fraction)
+        cameras = pick_cameras(cameras, rows)
     black = torch.zeros(3, device=scene.device)
     with torch.no_grad():
         wanted = scene.render(cameras, time, background=black).rgb

@@ -19,13 +19,18 @@ from dyngs.core.errors import DyngsError, format_count
 from dyngs.core.gaussians import Gaussians
 from dyngs.deform.bodies.field import BodyField, find_body_field
 from dyngs.deform.scene import field_scene_of
+from dyngs.export.classic import CLASSIC, fit_classic
 from dyngs.gaussians.colour.network import bake_harmonics
 from dyngs.gaussians.levels import MERGED, build_levels
+from dyngs.gaussians.rendering import splat_options
 from dyngs.gaussians.scene import GaussianScene
+from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import (
     SOG_INDEX,
+    Format,
     WrittenFile,
     format_by_name,
+    format_for_path,
     limit_to_format,
     rotate_file,
     transform_file,
@@ -56,7 +61,7 @@ from dyngs.io.outputs import atomic_folder, require_new_folder
 from dyngs.io.write import atomic_file
 from dyngs.ops.quaternions import align_quat_signs, rotation_matrices, unit_quats
 from dyngs.runs.folder import collect_inputs
-from dyngs.runs.opened import OpenedScene
+from dyngs.runs.opened import OpenedScene, wrap_scene
 
 PER_LEAF = MERGED**7  # Gaussians of a leaf at level 0
 PER_FILE = MERGED**9  # Most Gaussians of a file
@@ -146,6 +151,8 @@ class WriteOptions:
     # SH degree in the file; None keeps it, up to the limit of the format
     sh_degree: int | None = None
     edit: Similarity = IDENTITY  # applied after ``turn``, and stored to be undone
+    # fit for viewers without antialiasing; None: formats that cannot store the render mode
+    classic: bool | None = None
 
 
 DEFAULT_WRITE_OPTIONS = WriteOptions()
@@ -221,7 +228,70 @@ def write_run_splats(
     """
     collect_inputs(opened).require_output(path)
     splat = splats_at(opened, scene_part(opened.scene, part), time, how)
-    return write_splats(path, splat, sh_degree=how.sh_degree)
+    splat, notes = _for_viewers(opened, splat, format_for_path(path), how)
+    written = write_splats(path, splat, sh_degree=how.sh_degree)
+    return replace(written, notes=(*notes, *written.notes))
+
+
+def _for_viewers(
+    opened: OpenedScene, splat: SplatFile, own: Format, how: WriteOptions
+) -> tuple[SplatFile, tuple[str, ...]]:
+    """Return the version of a scene for the viewers of a format, and a note if it was fitted.
+
+    Raises DyngsError: ``how.classic``, but no capture can be read.
+    """
+    wanted = not own.stores_render_mode if how.classic is None else how.classic
+    degree = own.max_degree if how.sh_degree is None else how.sh_degree
+    loses_colours = degree == 0 and splat.gaussians.sh_degree > 0
+    if not wanted or not (loses_colours or splat_options(splat) != CLASSIC):
+        return splat, ()
+    if opened.cameras is None:
+        if how.classic:
+            raise DyngsError(
+                "--classic fits to training cameras, which were not found; give a run, and "
+                "data.root=FOLDER if its capture was moved"
+            )
+        return splat, ()
+    frame = splat.frame.after(opened.file_unit)
+    near = opened.scene.options.near * frame.scale
+    fitted, note = fit_classic(splat, frame.cameras(opened.cameras), near, degree)
+    return fitted, (note,)
+
+
+def save(
+    scene: GaussianScene | Gaussians,
+    path: Path | str,
+    *,
+    time: float | None = None,
+    sh_degree: int | None = None,
+) -> Path:
+    """Write a scene in memory as a file of Gaussians, in its own axes. Returns the path.
+
+    ``dyngs.export`` writes runs, in more formats and with the axes that viewers expect.
+
+    Example:
+
+        import dyngs
+
+        scene = dyngs.load("runs/lego")
+        opaque = scene.gaussians.opacities > 0.1
+        dyngs.save(scene.select(opaque), "opaque.ply")
+
+    Args:
+        scene: a scene, or Gaussians.
+        path: the suffix selects the format.
+        time: in [0, 1], of a moving scene.
+        sh_degree: highest degree in the file; None: that of the scene.
+
+    Raises:
+        DyngsError: an unknown suffix, no time of a moving scene, or a file that cannot be written.
+    """
+    if isinstance(scene, Gaussians):
+        scene = StaticScene(gaussians=scene)
+    if time is None and not scene.is_static:
+        raise DyngsError(f"{path}: the scene moves; give time=T, or use dyngs.export for all times")
+    how = WriteOptions(sh_degree=sh_degree)
+    return write_run_splats(wrap_scene(scene), Path(path), time or 0.0, how=how).path
 
 
 def write_run_sequence(
@@ -269,9 +339,11 @@ def write_run_levels(
         DyngsError: an empty part, or a folder that is not empty.
     """
     collect_inputs(opened).require_output(folder)
+    own = format_by_name("sog")
     splat = splats_at(opened, scene_part(opened.scene, part), time, how)
-    whole, notes = limit_to_format(folder, format_by_name("sog"), splat, how.sh_degree)
-    return write_sog_levels(folder, whole), notes
+    splat, fitted = _for_viewers(opened, splat, own, how)
+    whole, notes = limit_to_format(folder, own, splat, how.sh_degree)
+    return write_sog_levels(folder, whole), (*fitted, *notes)
 
 
 def scene_part(scene: GaussianScene, part: Part) -> GaussianScene:
@@ -295,7 +367,6 @@ def splats_at(
 
     An edited run is in its own frame, which the file stores to be undone.
     """
-    model = opened.config.model
     with torch.no_grad():
         moment = scene.time_step(time)
     gaussians = moment.gaussians
@@ -309,7 +380,8 @@ def splats_at(
         comments.append(f"colours: harmonics fitted to a network, rms error {baked.error:.4f}")
     x, y, z = opened.info.world_offset
     gaussians = opened.file_unit.gaussians(gaussians.detach())
-    splat = SplatFile(gaussians, model.rasterize_mode, model.eps2d, (x, y, z), tuple(comments))
+    options = scene.options
+    splat = SplatFile(gaussians, options.mode, options.eps2d, (x, y, z), tuple(comments))
     if opened.edited is not None:
         splat = transform_file(
             splat, opened.frame.after(opened.file_unit.inverse()), opened.edited.up
@@ -470,6 +542,7 @@ def write_rigid_bodies(
         raise DyngsError("--bodies: no rotating body in this run; remove it, or use --times A:B:N")
     scene = scene.without_masks()  # labels refer to all rows
     splat = splats_at(opened, scene, time, how)
+    splat, fitted = _for_viewers(opened, splat, format_by_name("glb"), how)
     require_writable(path, splat.gaussians)
     gaussians = splat.gaussians.replace(quats=unit_rotations(splat.gaussians.quats))
     gaussians = with_sh_degree(gaussians, min(gaussians.sh_degree, 3))
@@ -509,6 +582,7 @@ def write_rigid_bodies(
     with atomic_file(path) as temporary:
         document.write(temporary)
     notes = (
+        *fitted,
         f"bodies: {len(channels) // 2}, animated for {opened.seconds:.1f} s, with the colours of "
         f"time {time:g}",
         f"other motion and shadows are frozen at time {time:g}; export a sequence to keep them",

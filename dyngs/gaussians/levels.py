@@ -266,7 +266,7 @@ def _tree_order(points: np.ndarray) -> np.ndarray:
     return order
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class LevelScene(Renderable):
     """A scene of Gaussians in levels of detail.
 

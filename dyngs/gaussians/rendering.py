@@ -95,7 +95,7 @@ class RenderOptions(DrawOptions):
         return BlendOptions(self.alpha_min, self.alpha_max, self.transmittance_min, self.absgrad)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class GaussianRendering(Rendering):
     """Rendering of V images of N Gaussians."""
 

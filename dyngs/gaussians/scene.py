@@ -45,7 +45,7 @@ class GaussianTimeStep(TimeStep):
     penalties: dict[str, Tensor] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class GaussianScene(Renderable):
     """N Gaussians at any time.
 

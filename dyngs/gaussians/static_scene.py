@@ -72,7 +72,7 @@ class ViewSides:
         return ViewSides(side_ids, directions, center)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class StaticScene(GaussianScene):
     """N static Gaussians; with ``sides`` each camera renders the Gaussians of its viewing
     direction."""

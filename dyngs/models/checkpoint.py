@@ -88,12 +88,16 @@ def parse_info(header: Mapping[str, Any]) -> CheckpointInfo:
     return CheckpointInfo(step, extent, (x, y, z), background, mode, scale)
 
 
-def read_run_capture(data: DataConfig, info: CheckpointInfo) -> Capture:
+def read_run_capture(
+    data: DataConfig, info: CheckpointInfo, capture: Capture | None = None
+) -> Capture:
     """Read the capture of a run in the scene coordinates that the run was trained in.
 
     ``read_capture`` may give other coordinates if the capture or the version of dyngs has changed.
+    A given ``capture`` is not read again.
     """
-    return change_coordinates(read_capture(data), info.world_scale, info.world_offset)
+    found = capture or read_capture(data)
+    return change_coordinates(found, info.world_scale, info.world_offset)
 
 
 @dataclass(frozen=True)

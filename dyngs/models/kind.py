@@ -69,7 +69,9 @@ class ModelKind(ABC):
             unused one is refused.
     """
 
-    uses: ClassVar[frozenset[str]] = frozenset({"train.minutes", "train.batch_size"})
+    uses: ClassVar[frozenset[str]] = frozenset(
+        {"train.minutes", "train.batch_size", "train.image_every"}
+    )
 
     def __init__(self, section: type[ModelSection]) -> None:
         self.section = section

@@ -139,13 +139,30 @@ class Model(ABC, Generic[S_co]):
 
 @dataclass(frozen=True)
 class LossInput:
-    """A training image next to its rendering, for terms of the loss."""
+    """A training image next to its rendering, for terms of the loss.
 
-    index: int  # of the view
+    Example:
+
+        import dyngs
+
+        def dark(look: dyngs.LossInput):
+            return 0.01 * look.rendered.mean()
+
+    Attributes:
+        index: of the training view.
+        step: from 1.
+        image: what was trained on: ``dyngs.data.loader.Image`` with camera, alpha, and a mask of
+            the pixels that count.
+        drawn: the rendering with alpha and depth, and its regularizers.
+        rendered, truth: (H, W, 3) that are compared, on the same background.
+        model: the model in training; ``model.scene`` is its scene.
+        generator: random numbers of the run.
+    """
+
+    index: int
     step: int
-    image: Image  # what was trained on, with a mask of the pixels that count
+    image: Image
     drawn: RenderOutput
-    # rendered, truth: (H, W, 3) that are compared, on the same background
     rendered: Tensor
     truth: Tensor
     model: Model[Any]

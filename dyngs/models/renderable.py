@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from copy import copy
 from dataclasses import dataclass, fields, replace
+from io import BytesIO
+from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
@@ -14,10 +16,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dyngs.config import Config
 from dyngs.core.camera import Cameras
-from dyngs.core.errors import DyngsError
+from dyngs.core.errors import DyngsError, format_count
 from dyngs.core.state import Role, State, move_fields_to
 from dyngs.data.capture import Capture, Split
+from dyngs.io.write import to_uint8
 from dyngs.ops.registration import check_choice, check_finite, check_number
 
 
@@ -116,6 +120,21 @@ class Rendering:
     transmittance: Tensor
     depth: Tensor | None
 
+    def __repr__(self) -> str:
+        count, height, width = self.transmittance.shape
+        depth = "" if self.depth is None else ", with depth"
+        size = f"{format_count(count, 'image')} of {width}x{height} px"
+        return f"{type(self).__name__}({size}{depth}, {self.rgb.device})"
+
+    def _repr_png_(self) -> bytes:
+        """Return the first four images side by side as PNG, for notebooks."""
+        from PIL import Image
+
+        strip = torch.cat(list(self.rgb[:4].detach()), 1).float().cpu().numpy()
+        stream = BytesIO()
+        Image.fromarray(to_uint8(strip)).save(stream, "PNG")
+        return stream.getvalue()
+
     @property
     def alpha(self) -> Tensor:
         """Return (V, H, W) opacities of the images, in [0, 1]."""
@@ -139,6 +158,32 @@ def concatenate_renderings(found: Sequence[Images]) -> Images:
     )
 
 
+@dataclass(frozen=True)
+class RunInfo:
+    """The run folder or file that a scene was loaded from.
+
+    Attributes:
+        path: the folder or file.
+        config: as saved with the run.
+        step: of the checkpoint.
+    """
+
+    path: Path
+    config: Config
+    step: int
+
+
+def run_path(run: Path | str | Renderable) -> Path:
+    """Return the folder or file of a scene. Raises DyngsError: it was changed since it was read."""
+    if not isinstance(run, Renderable):
+        return Path(run)
+    if run.run is None:
+        raise DyngsError(
+            "this scene was changed or made in memory; give a run folder, or use dyngs.save"
+        )
+    return run.run.path
+
+
 class TimeStep:
     """A scene at one time, computed once for several images."""
 
@@ -155,12 +200,20 @@ class Renderable(ABC):
         background: (3,) colour behind it unless ``render`` is told otherwise; None is black.
         surface_options: which ``SurfaceOptions`` have an effect.
         has_levels: it can be drawn in levels of detail.
+        run: where ``dyngs.load`` found it; None: nowhere, or it was changed since.
     """
 
     surface_options: ClassVar[frozenset[str]] = frozenset({"cells"})
     has_levels: ClassVar[bool] = False
     options: Any
     background: Tensor | None
+    run: ClassVar[RunInfo | None] = None
+
+    def __repr__(self) -> str:
+        count = f"{len(self):,} Gaussians, " if isinstance(self, Sized) else ""
+        moves = "static" if self.is_static else "moving"
+        path = "" if self.run is None else f", {self.run.path}"
+        return f"{type(self).__name__}({count}{moves}, {self.device}{path})"
 
     @property
     @abstractmethod
@@ -230,6 +283,12 @@ class Renderable(ABC):
         """Return the scene on a background (3,), with separate caches."""
         other = copy(self)
         object.__setattr__(other, "background", colour)  # scenes may be frozen
+        return other
+
+    def from_run(self: R, run: RunInfo) -> R:
+        """Return the scene with the run that it was loaded from."""
+        other = copy(self)
+        object.__setattr__(other, "run", run)  # ``replace`` drops it, as a changed scene must
         return other
 
     def to(self: R, device: torch.device | str) -> R:

@@ -17,8 +17,9 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from dyngs.config import Config, DataConfig, RunConfig
+from dyngs.config import Config, DataConfig, RunConfig, TrainConfig
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
+from dyngs.config.keys.train import LOGGING_KEYS
 from dyngs.core.errors import DyngsError, quote_path
 from dyngs.data.capture import Capture
 from dyngs.data.read import read_capture
@@ -120,8 +121,13 @@ _BEGUN = (
 """Files of a run that was stopped before its first checkpoint."""
 
 
-def default_run_dir(name: str) -> Path:
-    """Return the default run folder, ``runs/NAME``."""
+def default_run_dir(config: Config) -> Path:
+    """Return the default run folder: ``runs/CAPTURE-NAME``, or ``runs/NAME`` if ``run.name`` was
+    set by the user."""
+    name = config.run.name
+    root = Path(os.path.abspath(config.data.root))
+    if "name" not in config.run.model_fields_set:
+        name = f"{root.stem if root.is_file() else root.name}-{name}".lstrip("-")
     parts = Path(name).parts
     if not parts or ".." in parts or Path(name).is_absolute():
         raise DyngsError(
@@ -291,14 +297,28 @@ def _config_of_begun(folder: Path) -> Config | None:
 
 
 def _is_same_run(one: Config, other: Config) -> bool:
-    """Return whether two configurations give the same result; names, folders and threads are
-    ignored."""
-    return _relevant_config(one) == _relevant_config(share_body_path(other, one))
+    """Return whether two configurations give the same result; names, folders, threads and logging
+    are ignored."""
+    return not differing_keys(one, other)
+
+
+def differing_keys(one: Config, other: Config) -> list[str]:
+    """Return the keys by which the results of two configurations differ."""
+    pairs = zip(_relevant_config(one), _relevant_config(share_body_path(other, one)), strict=True)
+    return [
+        f"{section}.{key}"
+        for (section, mine), (_, theirs) in pairs
+        for key in type(theirs).model_fields
+        if getattr(mine, key, None) != getattr(theirs, key)
+    ]
 
 
 def _relevant_config(config: Config) -> Config:
-    data = config.data.model_copy(update={"follow_links": False})
-    return config.model_copy(update={"run": RunConfig(seed=config.run.seed), "data": data})
+    data = config.data.model_copy(update={"follow_links": False, "cache_mb": 0})
+    usual = TrainConfig()
+    train = config.train.model_copy(update={key: getattr(usual, key) for key in LOGGING_KEYS})
+    run = RunConfig(seed=config.run.seed)
+    return config.model_copy(update={"run": run, "data": data, "train": train})
 
 
 Read = Path | BaseModel | LoadedRun | Capture | None

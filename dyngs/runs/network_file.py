@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -19,8 +18,8 @@ from dyngs.runs.checkpoint import parse_info
 from dyngs.runs.folder import collect_inputs
 
 SUFFIX = ".safetensors"
-PUBLISHED = "dyngs_people_weights"
-"""Package of published weights, built by packaging/weights."""
+WEIGHTS = Path(__file__).parents[1] / "human" / "predict" / "weights"
+"""Weights that come with dyngs, trained on synthetic people."""
 
 _KIND = FileKind("dyngs network", "the weights of a network", 1)
 _ADVICE = "; write it again with `dyngs export NET_RUN --format network`"
@@ -78,20 +77,12 @@ def read_network(path: Path) -> tuple[Config, Checkpoint]:
 
 
 def published_network(name: str) -> Path:
-    """Return the file of the published weights ``name``. Raises DyngsError if not installed."""
-    package = find_spec(PUBLISHED)
-    if package is None:
-        advice = "install the package dyngs-people-weights, see `dyngs docs people`, to use published weights"
+    """Return the file of weights that come with dyngs. Raises DyngsError: an unknown name."""
+    path = WEIGHTS / f"{name}{SUFFIX}"
+    if not path.is_file():
+        names = " and ".join(sorted(file.stem for file in WEIGHTS.glob(f"*{SUFFIX}"))) or "none"
         raise DyngsError(
-            f"{name}: no run and no file of weights; give the run of a network, or {advice}"
+            f"{name}: no run and no file of weights; networks that come with dyngs: {names}; "
+            "train others with `dyngs train`"
         )
-    files = {
-        x.stem: x
-        for folder in package.submodule_search_locations or ()
-        for x in Path(folder).glob(f"*{SUFFIX}")
-    }
-    if name not in files:
-        raise DyngsError(
-            f"{name}: no run and no file of weights; published are {' and '.join(sorted(files)) or 'none'}"
-        )
-    return files[name]
+    return path

@@ -339,10 +339,14 @@ def scene_from_file(splat: SplatFile, path: Path) -> OpenedScene:
     return replace(opened, stated_up=splat.up, notes=splat.notes, path=path, scaled=scaled)
 
 
-def wrap_scene(scene: GaussianScene, file: Path = Path("scene")) -> OpenedScene:
+def wrap_scene(scene: Renderable, file: Path = Path("scene")) -> OpenedScene:
     """Return a scene of which nothing else is known, as if it had been read from ``file``."""
-    config = Config(data=DataConfig(root=file), model=StaticModel())
-    info = CheckpointInfo(0, 0.0, (0.0, 0.0, 0.0), "black", scene.options.mode.value)
+    model = StaticModel()
+    if isinstance(scene, GaussianScene):
+        options = scene.options
+        model = StaticModel(rasterize_mode=options.mode, eps2d=options.eps2d)
+    config = Config(data=DataConfig(root=file), model=model)
+    info = CheckpointInfo(0, 0.0, (0.0, 0.0, 0.0), "black", model.rasterize_mode.value)
     return OpenedScene(config, scene, 0, 0.0, info, name=file.name)
 
 

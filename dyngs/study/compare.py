@@ -6,11 +6,12 @@ An interrupted comparison continues when called again.
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import time
 from collections.abc import Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -27,13 +28,23 @@ from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.read import read_capture
 from dyngs.data.times import evenly_spaced
 from dyngs.evaluate.view_scores import SceneRenderer
+from dyngs.io.outputs import lock_folder
 from dyngs.models.kind import PredictsScenes, capability, find_kind
 from dyngs.models.views import evaluation_background
 from dyngs.runs.checkpoint import LoadedRun
-from dyngs.runs.folder import EXPORT_FOLDER
+from dyngs.runs.folder import EXPORT_FOLDER, collect_inputs
 from dyngs.runs.opened import scene_of_split, split_views
 from dyngs.study.measure import Measurement, SceneMeasurer, StudyScene
+from dyngs.study.report import (
+    Report,
+    build_table,
+    can_plot,
+    page_views,
+    plot_curves,
+    write_report,
+)
 from dyngs.study.runs import read_stored, require_same_study, run_tasks, train_to_end, write_stored
+from dyngs.study.tradeoff import build_rows
 from dyngs.training.events import Event, StepDone
 from dyngs.training.limits import validate_limits
 from dyngs.training.trainer import Trainer
@@ -48,6 +59,84 @@ MARKS = tuple((i / 12) ** 2 for i in range(1, 12))
 # Points of a curve: step, seconds of training, mean PSNR in dB of some held-out views
 Curve = list[tuple[int, float, float]]
 _CURVE = TypeAdapter(Curve)
+
+
+def compare(
+    capture: Path | str,
+    models: Sequence[Path | str],
+    *,
+    minutes: float | None = None,
+    steps: int | None = None,
+    max_mb: float | None = None,
+    out: Path | str | None = None,
+    split: str = "test",
+    views: int = 4,
+    threads: int = 0,
+    device: str = "auto",
+    ray_cores: int | None = None,
+    overrides: Sequence[str] = (),
+) -> Report:
+    """Train several models on one capture with the same budget, and compare them.
+
+    The same call continues an interrupted comparison.
+
+    Example:
+
+        import dyngs
+
+        result = dyngs.compare(
+            "lego", ["static", "mip"], steps=2, out="both", overrides=["init.num_random=50"]
+        )
+        [(row["name"], row["psnr"], row["mb"]) for row in result.rows]
+
+    Args:
+        capture: folder, in any format.
+        models: presets or YAML files.
+        minutes, steps, max_mb: the budget, exactly one of them.
+        out: output folder; None: compare/CAPTURE.
+        split: held-out views to compare on.
+        views: number of views on the page.
+        threads, device: of each training.
+        ray_cores: cores per model with Ray; None trains one model after the other.
+        overrides: ``section.key=value`` for all models.
+
+    Returns:
+        the report: ``rows`` per model, ``left_out`` with reasons, and the written ``files``.
+
+    Raises:
+        DyngsError: no budget, an unknown model or key, another comparison in ``out``, or no model
+            that can be trained.
+    """
+    capture = Path(os.path.abspath(capture))  # so that it has a name, also as . or ..
+    out = Path(out or Path("compare", capture.name)).absolute()
+    if (minutes, steps, max_mb).count(None) != 2:
+        raise DyngsError("give one common limit: minutes, steps or max_mb")
+    words = tuple(overrides)
+    comparison = ModelComparison(
+        capture, out, minutes, steps, max_mb, split, words, threads, device, views
+    )
+    configs, unfit = comparison.configs([str(model) for model in models])
+    for config in configs.values():
+        collect_inputs(config).require_output(out)
+    with lock_folder(out):
+        comparison.require_same(configs, unfit)
+        results, left_out, curves = comparison.run(configs, ray_cores)
+    rows = sorted(build_rows(results), key=lambda row: -row["psnr"])
+    held_out = f"{results[0].num_views} held-out views (split {split})"
+    about = (
+        f"{capture.name}: {comparison.limit} each, {held_out}; PSNR in dB, seconds of training; "
+        "* Pareto front of PSNR, speed and size"
+    )
+    report = Report(
+        "Comparison",
+        about,
+        rows,
+        [build_table(about, rows)],
+        left_out=unfit | left_out,
+        views=page_views(out, results),
+        figure=plot_curves(curves) if can_plot() and any(curves.values()) else None,
+    )
+    return replace(report, files=write_report(out / "comparison", report))
 
 
 @dataclass(frozen=True)

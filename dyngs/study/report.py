@@ -69,6 +69,7 @@ class Report:
         values: further values of the .json file.
         left_out: reasons why models were skipped, by name.
         views: name, true image and images of the models, as returned by ``page_views``.
+        files: paths of the written report.
     """
 
     title: str
@@ -79,6 +80,7 @@ class Report:
     left_out: Mapping[str, str] = field(default_factory=dict)
     views: Sequence[Mapping[str, Any]] = ()
     figure: Figure | None = None
+    files: Sequence[Path] = ()
 
 
 def can_plot() -> bool:

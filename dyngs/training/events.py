@@ -12,6 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from torch import Tensor
 
 from dyngs.core.metrics import psnr
@@ -120,6 +121,15 @@ class Evaluated:
 
 
 @dataclass(frozen=True)
+class ProgressImage:
+    """The first view of a split after ``step``, rendered and as photo: (H, 2 W, 3) uint8."""
+
+    step: int
+    split: str
+    pixels: np.ndarray
+
+
+@dataclass(frozen=True)
 class Paused:
     """Training was paused for ``seconds``, which do not count as training."""
 
@@ -133,5 +143,15 @@ class Message:
     text: str
 
 
-Event = Started | StepDone | TopologyChanged | TotalChanged | Saved | Evaluated | Paused | Message
+Event = (
+    Started
+    | StepDone
+    | TopologyChanged
+    | TotalChanged
+    | Saved
+    | Evaluated
+    | ProgressImage
+    | Paused
+    | Message
+)
 Listener = Callable[[Event], None]

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
+from dyngs.config import Config
 from dyngs.core.errors import DyngsError
 from dyngs.data.loader import Image
 from dyngs.models.model import Loss, LossInput
@@ -62,6 +63,39 @@ class RegularizerLoss(Loss):
 
     def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
         return look.model.regularizers()
+
+
+LossFunction = Callable[[LossInput], Tensor]
+"""A loss of the user: a differentiable scalar, weighted, of a training image and its rendering."""
+
+
+class AddedLoss(Loss):
+    """A loss of the user, which is added to those of dyngs.
+
+    Attributes:
+        name: in the config of the run and in messages: its number and the name of the function.
+    """
+
+    def __init__(self, number: int, function: LossFunction) -> None:
+        self._function = function
+        self.name = f"{number} {getattr(function, '__name__', type(function).__name__)}"
+
+    def __call__(self, look: LossInput) -> Mapping[str, Tensor]:
+        value = self._function(look)
+        if not isinstance(value, Tensor) or value.ndim:
+            shape = getattr(value, "shape", type(value).__name__)
+            raise DyngsError(f"loss {self.name}: must return a scalar tensor, got {shape}")
+        return {f"loss {self.name}": value}
+
+
+def require_losses(config: Config, losses: Sequence[AddedLoss]) -> None:
+    """Raise DyngsError unless ``losses`` are those that the run was started with."""
+    given = tuple(loss.name for loss in losses)
+    if given != config.train.losses:
+        raise DyngsError(
+            f"train.losses: the run has {list(config.train.losses)}, given were {list(given)}; "
+            "pass the same again from Python: dyngs.train(resume=RUN, losses=[...])"
+        )
 
 
 class StepCheck:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -18,6 +19,7 @@ from dyngs.data.times import evenly_spaced
 from dyngs.gaussians.initialization import InitialGaussians, scene_geometry
 from dyngs.gaussians.model import GaussianModel
 from dyngs.models.kind import HasMotion, StartContext, find_kind
+from dyngs.models.model import Loss
 from dyngs.models.views import (
     background_colour,
     background_coloured_fraction,
@@ -54,6 +56,7 @@ def build_trainer(
     held_out: frozenset[int] = frozenset(),
     first: InitialGaussians | None = None,
     uncapped: Config | None = None,
+    added_losses: Sequence[Loss] = (),
 ) -> Trainer[Any]:
     """Return the trainer of a scene with an initialised, untrained model.
 
@@ -65,6 +68,7 @@ def build_trainer(
         first: Gaussians to start from. None initialises them as in ``config.init``.
         uncapped: config without the limit on Gaussians, used for initialisation. None uses
             ``config``.
+        added_losses: losses of the user.
     """
     if capture is None:
         capture = read_capture(config.data) if restored else prepare_capture(config)
@@ -122,6 +126,7 @@ def build_trainer(
             *([] if exposures is None else [exposures]),
             priors,
             RegularizerLoss(),
+            *added_losses,
         ]
         found = (robust, exposures, refinement)
         return TrainerParts(model, losses, [x for x in found if x is not None])

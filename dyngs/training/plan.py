@@ -13,6 +13,7 @@ from dyngs.gaussians.initialization import InitialGaussians
 from dyngs.models.kind import HasSchedules, capability
 from dyngs.models.schedule import PUBLISHED_STEPS, LengthChange, scale_step
 from dyngs.training.corrections.exposure import WARM_UP
+from dyngs.training.losses import AddedLoss
 
 
 @dataclass(frozen=True)
@@ -38,9 +39,11 @@ class RunPlan:
         requested: config as given by the user.
         resolved: config that is trained and saved.
         uncapped: resolved config without the limit on Gaussians, used for initialisation.
-        capture: None for a network, which has several.
+        capture: None for a network, which has several, and until it is read.
         first: Gaussians of another scene to start from.
         choices: results of pilot runs.
+        losses: of the user, in addition to those of the config.
+        is_extended: whether a finished or interrupted run is extended.
     """
 
     requested: Config
@@ -50,6 +53,8 @@ class RunPlan:
     first: InitialGaussians | None = None
     limits: Limits = Limits()
     choices: tuple[Any, ...] = ()
+    losses: tuple[AddedLoss, ...] = ()
+    is_extended: bool = False
 
 
 Stage = Callable[[RunPlan], tuple[RunPlan, str | None]]
@@ -57,7 +62,13 @@ Stage = Callable[[RunPlan], tuple[RunPlan, str | None]]
 
 def with_steps(config: Config, steps: int) -> Config:
     """Return ``config`` with another ``train.steps``. All schedules scale with it."""
-    return config.model_copy(update={"train": config.train.model_copy(update={"steps": steps})})
+    return with_length(config, steps, config.train.minutes)
+
+
+def with_length(config: Config, steps: int, minutes: float | None) -> Config:
+    """Return ``config`` with other ``train.steps`` and ``train.minutes``."""
+    train = config.train.model_copy(update={"steps": steps, "minutes": minutes})
+    return config.model_copy(update={"train": train})
 
 
 def extend_config(config: Config, done: int, steps: int) -> Config:
@@ -101,7 +112,8 @@ def _require_exposures_stay(config: Config, length: LengthChange) -> None:
 def describe_extension(before: Config, after: Config, done: int) -> str:
     """Return a log message about a run that continues after ``done`` steps."""
     steps = after.train.steps
-    no_limit = "" if before.train.minutes is None else "; train.minutes is ignored"
+    is_free = before.train.minutes is not None and after.train.minutes is None
+    no_limit = "; without a time limit" if is_free else ""
     return (
         f"resuming at step {done:,}, extended from {before.train.steps:,} to "
         f"{format_count(steps, 'step')}; "

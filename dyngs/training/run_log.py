@@ -1,4 +1,4 @@
-"""Run log: one JSON line per step, and TensorBoard events if requested."""
+"""Run log: one JSON line per step, progress images, and what loggers show."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from dyngs.core.errors import DyngsError
 from dyngs.io.fields import read_limited
-from dyngs.io.write import write_text
-from dyngs.training.events import Evaluated, Event, StepDone
+from dyngs.io.write import write_image, write_text
+from dyngs.training.events import Evaluated, Event, ProgressImage, StepDone
+from dyngs.training.loggers import Logger
 
 MAX_LOG_BYTES = 1 << 28  # a line has about 150 bytes
 
@@ -44,43 +44,47 @@ class RunLog:
     Args:
         after_step: lines beyond this step, left by an interrupted run, are removed. 0 removes all.
         every: steps between lines. The last step is always logged.
-        tensorboard: also write TensorBoard events to ``tensorboard/`` next to the log.
+        loggers: programs that get scalars and images, too; closed at the end.
     """
 
     def __init__(
-        self, path: Path, after_step: int, *, every: int = 1, tensorboard: bool = False
+        self, path: Path, after_step: int, *, every: int = 1, loggers: Sequence[Logger] = ()
     ) -> None:
         self.path = path
         self._every = every
-        self._board = _open_tensorboard(path.parent, after_step) if tensorboard else None
+        self._loggers = loggers
         write_text(self.path, "".join(_lines_up_to(self.path, after_step)))
         self._file: IO[str] = self.path.open("a", encoding="utf-8")
 
     def __call__(self, event: Event) -> None:
-        """Write ``StepDone`` and ``Evaluated`` events to the log."""
+        """Log scores of ``StepDone`` and ``Evaluated``; write progress images to ``progress/``."""
         match event:
             case StepDone() if event.step % self._every == 0 or event.is_last:
-                plotted = ("loss", "psnr", "num_gaussians")
-                self._append(asdict(log_record(event)), "train", plotted)
+                self._append("train", asdict(log_record(event)))
             case Evaluated(step, split, psnr, ssim):
                 scores = {"step": step, "split": split, "psnr": psnr, "ssim": ssim}
-                self._append(scores, split, ("psnr", "ssim"))
+                self._append(split, scores)
+            case ProgressImage(step, split, pixels):
+                write_image(self.path.parent / "progress" / f"step_{step:07d}.png", pixels)
+                for logger in self._loggers:
+                    logger.log_images(step, {f"{split}/image": pixels})
 
-    def _append(self, values: dict[str, Any], group: str, plotted: Sequence[str]) -> None:
+    def _append(self, group: str, values: dict[str, Any]) -> None:
         """Append a line and flush, so that a crash loses nothing."""
         self._file.write(json.dumps(values) + "\n")
         self._file.flush()
-        for name in plotted:
-            if self._board is not None and values[name] is not None:
-                self._board.add_scalar(f"{group}/{name}", values[name], values["step"])
+        step = values.pop("step")
+        scalars = {f"{group}/{k}": x for k, x in values.items() if isinstance(x, int | float)}
+        for logger in self._loggers:
+            logger.log_scalars(step, scalars)
 
     def __enter__(self) -> RunLog:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._file.close()
-        if self._board is not None:
-            self._board.close()
+        for logger in self._loggers:
+            logger.close()
 
 
 def log_record(event: StepDone) -> LogRecord:
@@ -108,13 +112,3 @@ def _lines_up_to(path: Path, step: int) -> list[str]:
         except (ValueError, KeyError, TypeError, RecursionError):
             continue  # incomplete last line of a killed run
     return kept
-
-
-def _open_tensorboard(run_dir: Path, after_step: int) -> Any:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        raise DyngsError(
-            "train.tensorboard=true needs the package tensorboard; run pip install tensorboard"
-        ) from None
-    return SummaryWriter(str(run_dir / "tensorboard"), purge_step=after_step + 1)

@@ -10,6 +10,7 @@ import torch
 import dyngs
 from dyngs.api.load import load
 from dyngs.api.scene_file import write_scene_file
+from dyngs.api.train import train
 from dyngs.export.splat_files import write_run_splats
 from dyngs.human.avatar.avatar_file import write_avatar
 from dyngs.runs.checkpoint import load_run
@@ -27,7 +28,7 @@ def trained(capture: Path, out: Path, *more: str) -> Path:
         "init.num_random=60",
         *more,
     ]
-    return dyngs.train(dyngs.load_config(None, words))
+    return train(dyngs.load_config(None, words))
 
 
 def camera(size: int = 24) -> dyngs.Cameras:
@@ -72,7 +73,7 @@ def test_an_avatar_is_a_scene(person: Path, tmp_path: Path) -> None:
         "model.fit=false",
         "run.threads=1",
     ]
-    run = dyngs.train(dyngs.load_config("human", [*words, f"run.dir={tmp_path / 'run'}"]))
+    run = train(dyngs.load_config("human", [*words, f"run.dir={tmp_path / 'run'}"]))
     loaded = load_run(run)
     file = tmp_path / "a.safetensors"
     scene = load(write_avatar(loaded.renderable, loaded.config.model, loaded.info, file))

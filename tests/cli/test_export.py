@@ -17,6 +17,7 @@ from moving_scene import moved_x, write_moving_run
 from refused import error_line
 
 import dyngs
+from dyngs.api.train import train
 from dyngs.cli import export, main
 from dyngs.config import DataConfig
 from dyngs.data.geometry import camera_center
@@ -35,7 +36,7 @@ def run_of(still: Path, folder: Path, refine: str) -> Path:
         "init.num_random=60",
         "run.threads=1",
     ]
-    return dyngs.train(dyngs.load_config("static", [*keys, f"camera.refine={refine}"]))
+    return train(dyngs.load_config("static", [*keys, f"camera.refine={refine}"]))
 
 
 @pytest.fixture(scope="module")

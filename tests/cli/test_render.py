@@ -10,6 +10,7 @@ from moving_scene import write_moving_run
 from refused import error_line
 
 import dyngs
+from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.data.images.images import read_image
 
@@ -24,7 +25,7 @@ def run_dir(still: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "train.steps=20",
         "run.threads=1",
     ]
-    return dyngs.train(dyngs.load_config("static", [*keys, "init.num_random=200"]))
+    return train(dyngs.load_config("static", [*keys, "init.num_random=200"]))
 
 
 @pytest.fixture(scope="module")

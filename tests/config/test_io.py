@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import suppress
 from pathlib import Path
 
@@ -387,3 +388,37 @@ def test_runs_of_earlier_versions_with_keys_of_one_kind_are_read(kind: str, tmp_
     (tmp_path / RESOLVED_NAME).write_text(text)
     with pytest.raises(DyngsError, match=f"unknown key 'model.{changed}'"):
         load_resolved(tmp_path)
+
+
+def test_image_size_limit_and_downscale() -> None:
+    """A requested ``downscale`` replaces the default limit; a limit of 0 is none."""
+    for overrides, limit in (
+        ([], 1600),
+        (["data.longest_side=0"], None),
+        (["data.downscale=2"], None),
+        (["data.downscale=2", "data.longest_side=900"], 900),
+    ):
+        assert load_config("static", ["data.root=a", *overrides]).data.longest_side == limit, (
+            overrides
+        )
+
+
+def test_replace_is_as_an_override_and_keeps_what_was_requested() -> None:
+    config = load_config(Path("static"), ["data.root=x", "optim.lr_sh_dc=0.1"])
+    words = ["data.root=x", "optim.lr_sh_dc=0.1", "strategy.kind=mcmc", "train.steps=10"]
+    wanted = load_config(Path("static"), words)
+    for found in (
+        config.replace({"strategy.kind": "mcmc", "train.steps": 10}),
+        config.replace(strategy={"kind": "mcmc"}, train={"steps": 10}),
+    ):
+        assert found == wanted
+        for section in ("optim", "strategy", "train"):
+            requested = getattr(found, section).model_fields_set
+            assert requested == getattr(wanted, section).model_fields_set, section
+    for changes, message in (
+        ({"train.stpes": 1}, "unknown key 'train.stpes'; did you mean 'train.steps'"),
+        ({"train": {"steps": "x"}}, "train.steps='x': train.steps must be an integer >= 1, not x"),
+        ({"train": 3}, "train is a section, not a value"),
+    ):
+        with pytest.raises(DyngsError, match=re.escape(message)):
+            config.replace(changes)

@@ -12,6 +12,7 @@ import torch
 from moving_scene import TEST_TIMES, row_of_balls, sliding_nodes, write_moving_run
 
 import dyngs
+from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.cli.evaluate import report_rows
 from dyngs.config import Config, DataConfig, TrainConfig
@@ -294,7 +295,7 @@ def run(
         "init.num_random=60",
         "run.threads=1",
     ]
-    return dyngs.train(
+    return train(
         dyngs.load_config("static", [*keys, f"camera.refine={request.param}"])
     ), request.param
 

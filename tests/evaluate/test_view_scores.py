@@ -14,6 +14,7 @@ from flat_wall import BLACK, cameras_before_wall, seen_from
 from moving_scene import Sliding, moving_scene, still_scene
 
 import dyngs
+from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
@@ -240,9 +241,7 @@ def run(person: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "train.steps=6",
         "run.threads=1",
     ]
-    return dyngs.train(
-        dyngs.load_config("human", [*keys, "model.resolution=24", "model.fit=false"])
-    )
+    return train(dyngs.load_config("human", [*keys, "model.resolution=24", "model.fit=false"]))
 
 
 def test_held_out_frames_are_scored_in_the_poses_of_the_file(run: Path) -> None:

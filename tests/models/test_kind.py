@@ -13,6 +13,7 @@ import pytest
 from toy_plugin import FOLDER, installed
 
 import dyngs
+from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config.io import load_config
 from dyngs.config.kinds import BUILT_IN, GROUP
@@ -50,7 +51,7 @@ def options(capture: Path, run: Path, steps: int = 40) -> list[str]:
 
 @pytest.fixture(scope="module")
 def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return dyngs.train(load_config(None, options(capture, tmp_path_factory.mktemp("runs") / "toy")))
+    return train(load_config(None, options(capture, tmp_path_factory.mktemp("runs") / "toy")))
 
 
 def test_our_own_kinds_are_entry_points_of_the_package() -> None:
@@ -97,7 +98,7 @@ def test_it_learns_and_resumes_with_the_same_bytes(
     run: Path, capture: Path, tmp_path: Path
 ) -> None:
     middle, last = checkpoint_paths(run)
-    again = dyngs.train(load_config(None, options(capture, tmp_path / "again")))
+    again = train(load_config(None, options(capture, tmp_path / "again")))
     checkpoint_paths(again)[-1].unlink()
     assert [path.name for path in checkpoint_paths(again)] == [middle.name]
     assert main(["train", "--resume", str(again)]) == 0

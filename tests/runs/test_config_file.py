@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import dyngs
+from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.config import Config
 from dyngs.config.io import load_resolved
@@ -51,14 +52,14 @@ def test_a_moved_run_needs_no_cache(
 ) -> None:
     fit = fit_of(person, tmp_path / "cache" / "bodies" / "person.1")
     config = config_of(person, fit, tmp_path / "run")
-    run = dyngs.train(config)
+    run = train(config)
     assert sorted(path.name for path in (run / "body").iterdir()) == [
         *("body_pose.npz", "body_train.npz", "fit_report.json")
     ]
     assert not (run / "asked.yaml").exists(), "the same body, elsewhere"
     before = evaluate_run(run, "pose")
     capsys.readouterr()
-    dyngs.train(config)
+    train(config)
     assert "run already finished" in capsys.readouterr().out
     shutil.rmtree(tmp_path / "cache")
     moved = tmp_path / "elsewhere" / "moved"
@@ -89,8 +90,6 @@ def test_bodies_are_the_same_by_their_contents(person: Path, tmp_path: Path) -> 
 
 
 def test_another_fit_is_another_run(person: Path, tmp_path: Path) -> None:
-    dyngs.train(config_of(person, fit_of(person, tmp_path / "one"), tmp_path / "run"))
+    train(config_of(person, fit_of(person, tmp_path / "one"), tmp_path / "run"))
     with pytest.raises(DyngsError, match="already contains a run"):
-        dyngs.train(
-            config_of(person, fit_of(person, tmp_path / "two", raised=0.02), tmp_path / "run")
-        )
+        train(config_of(person, fit_of(person, tmp_path / "two", raised=0.02), tmp_path / "run"))

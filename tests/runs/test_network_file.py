@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,6 @@ from dyngs.human.predict.gps.stereo import GpsNetwork
 from dyngs.io.tensor_file import FileKind, write_tensors
 from dyngs.models.checkpoint import Checkpoint, CheckpointInfo
 from dyngs.models.prediction import load_weights
-from dyngs.runs import network_file
 from dyngs.runs.network_file import published_network, read_network, write_network
 
 INFO = CheckpointInfo(7, 1.0, (0.0, 0.0, 0.0), "white", "classic")
@@ -91,18 +89,10 @@ def _refusal(path: Path) -> str:
     return str(error.value)
 
 
-def test_published_weights_are_known_by_their_name(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.setattr(network_file, "PUBLISHED", "no_weights_here")
-    with pytest.raises(
-        DyngsError, match=r"gps: no run and no file of weights; .* install the package"
-    ):
-        published_network("gps")
-    (tmp_path / "no_weights_here").mkdir()
-    (tmp_path / "no_weights_here" / "gps.safetensors").touch()
-    sys.path.append(str(tmp_path))
-    assert published_network("gps") == tmp_path / "no_weights_here" / "gps.safetensors"
-    with pytest.raises(DyngsError, match="bps: no run and no file of weights; published are gps"):
-        published_network("bps")
+def test_weights_come_with_the_package() -> None:
+    for name, kind in (("gps", "gps"), ("human_predictor", "human_predictor")):
+        config, checkpoint = read_network(published_network(name))
+        assert config.model.kind == kind
+        assert checkpoint.tensors
+    with pytest.raises(DyngsError, match="come with dyngs: gps and human_predictor; train others"):
+        published_network("keypoint_nerf")

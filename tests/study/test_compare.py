@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import dyngs
+from dyngs.api.train import train
 from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.runs.checkpoint import checkpoint_paths
@@ -62,7 +63,7 @@ def test_the_curve_changes_nothing_of_the_training(capture: Path, tmp_path: Path
     for name, listeners in (("plain", []), ("watched", [curve])):
         words = ["train.steps=20", "init.num_random=50", "run.threads=1"]
         words += [f"data.root={capture}", f"run.dir={tmp_path / name}"]
-        runs.append(dyngs.train(dyngs.load_config("static", words), listeners=listeners))
+        runs.append(train(dyngs.load_config("static", words), listeners=listeners))
     plain, watched = (checkpoint_paths(run)[-1].read_bytes() for run in runs)
     assert plain == watched
     steps = [step for step, _, _ in curve.points()]

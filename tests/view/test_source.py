@@ -11,6 +11,7 @@ from moving_scene import write_moving_run
 from view_sessions import looking_at_balls
 
 import dyngs
+from dyngs.api.train import train
 from dyngs.core.errors import DyngsError
 from dyngs.runs.checkpoint import checkpoint_paths
 from dyngs.training.events import Event, StepDone
@@ -102,7 +103,7 @@ def test_training_gives_the_same_bytes_with_and_without_viewers(
         ]
         overrides += ["train.steps=12", "init.num_random=40", "run.threads=1"]
         overrides += ["model.pilot_runs=false"] if preset == "dynamic" else []
-        folder = dyngs.train(dyngs.load_config(preset, overrides), listeners=listeners)
+        folder = train(dyngs.load_config(preset, overrides), listeners=listeners)
         found.append(checkpoint_paths(folder)[-1].read_bytes())
     assert found[0] == found[1]
     assert len(set(onlooker.seen)) > 2

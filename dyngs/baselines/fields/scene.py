@@ -187,7 +187,7 @@ def mlp(x: Tensor, weights: Sequence[Tensor]) -> Tensor:
     return perceptron(x, [Layer(weight, weight.new_zeros(len(weight))) for weight in weights])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FieldScene(Renderable):
     """Scene of a radiance field.
 

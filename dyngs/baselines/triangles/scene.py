@@ -162,7 +162,7 @@ class TriangleOptions(DrawOptions):
     supersampling: int = 1  # a pixel is the mean of this squared number of samples
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class TriangleScene(Renderable):
     """Scene of triangles; ``unit``: half side of the scene, world units."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
@@ -89,8 +90,15 @@ class BudgetConfig(Section):
 class RunConfig(Section):
     """Output folder and execution of a run."""
 
-    name: str = Field(default="static", description="name of the run, used for its default folder")
-    dir: Path | None = Field(default=None, description="run folder; null: runs/NAME")
+    name: str = Field(
+        default="static",
+        description="name of the run; if you set it, the default folder is runs/NAME",
+    )
+    dir: Path | None = Field(
+        default=None,
+        description="run folder; null: runs/CAPTURE-NAME, which continues a run of the same keys, or "
+        "else runs/CAPTURE-NAME-2, ...",
+    )
     seed: int = Field(default=42, ge=0, lt=2**63, description="seed of all random numbers")
     threads: int = Field(
         default=0, ge=0, le=1024, description="number of CPU threads; 0: one per core"
@@ -107,7 +115,15 @@ class RunConfig(Section):
 
 
 class Config(Section):
-    """Complete configuration of a run."""
+    """Complete configuration of a run, see ``dyngs config`` for its keys.
+
+    Example:
+
+        import dyngs
+
+        config = dyngs.load_config("static", {"data.root": "lego"})
+        config.train.steps, config.replace({"train.steps": 60_000}).train.steps
+    """
 
     data: DataConfig
     camera: CameraConfig = CameraConfig()
@@ -133,6 +149,29 @@ class Config(Section):
     prune: PruneConfig = PruneConfig()
     budget: BudgetConfig = BudgetConfig()
     run: RunConfig = RunConfig()
+
+    def replace(self, changes: Mapping[str, Any] | None = None, /, **keys: Any) -> Config:
+        """Return a validated copy with some values changed.
+
+        Example:
+
+            import dyngs
+
+            config = dyngs.load_config("static", {"data.root": "lego"})
+            longer = config.replace(**{"train.steps": 60_000, "strategy.kind": "mcmc"})
+            same = config.replace(train={"steps": 60_000}, strategy={"kind": "mcmc"})
+
+        Args:
+            changes, keys: values by dotted key, or nested mappings. A changed ``kind``
+                resets its section to the defaults of that kind.
+
+        Raises:
+            DyngsError: an unknown key or invalid value; the message has similar keys or the
+                allowed values.
+        """
+        from dyngs.config.io import replace_config
+
+        return replace_config(self, {**(changes or {}), **keys})
 
     @property
     def total_steps(self) -> int:

@@ -8,6 +8,9 @@ from pydantic import BeforeValidator, Field, field_validator
 
 from dyngs.core.section import Fraction, Section, parse_digits
 
+LOGGING_KEYS = ("save_minutes", "save_every", "eval_every", "log_every", "image_every", "loggers")
+"""Keys of ``TrainConfig`` that do not change the result of a run."""
+
 
 class TrainConfig(Section):
     """Length, losses, checkpoints and logging of a run."""
@@ -62,6 +65,11 @@ class TrainConfig(Section):
         description="whether to learn exposure and white balance of each training image as an "
         "affine colour transform; auto: decided by pilot runs",
     )
+    losses: tuple[str, ...] = Field(
+        default=(),
+        description="names of the additional losses of a run from Python, see "
+        "`dyngs docs python`; they are passed again to resume it",
+    )
     remove_floaters: bool = Field(
         default=True,
         description="whether to remove floaters close to single cameras at the end of training; "
@@ -85,9 +93,16 @@ class TrainConfig(Section):
     eval_every: int = Field(
         default=0, ge=0, description="steps between evaluations on the test split; 0: none"
     )
-    tensorboard: bool = Field(
-        default=False,
-        description="whether to log to RUN/tensorboard (pip install 'dyngs[tensorboard]')",
+    image_every: int = Field(
+        default=0,
+        ge=0,
+        description="steps between images of the first test view beside its photo, written to "
+        "RUN/progress; 0: none",
+    )
+    loggers: tuple[Literal["tensorboard", "wandb", "rerun"], ...] = Field(
+        default=(),
+        description="programs that show scalars and images of the training; each needs its extra, "
+        "such as pip install 'dyngs[wandb]'",
     )
 
     @field_validator("alpha_weight", mode="before")

@@ -45,7 +45,7 @@ from dyngs.human.motion.motion import MotionClip, captured_motion, has_same_para
 from dyngs.models.renderable import Posable, Renderable, clamp_time
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class HumanScene(GaussianScene, Posable):
     """Avatar of one person: N Gaussians in the rest pose, m, and the motion clip that it plays."""
 

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from small_fields import NERF, NGP, config_of
 
-import dyngs
+from dyngs.api.train import train
 from dyngs.cli import main
 from dyngs.evaluate.report import evaluate_run
 from dyngs.runs.checkpoint import checkpoint_paths
@@ -25,12 +25,12 @@ STEPS = ["train.steps=30", "train.save_every=15"]
 @pytest.fixture(scope="module")
 def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "ngp"
-    return dyngs.train(config_of(capture, *NGP, *STEPS, f"run.dir={folder}"))
+    return train(config_of(capture, *NGP, *STEPS, f"run.dir={folder}"))
 
 
 @pytest.mark.parametrize("keys", [NGP, NERF], ids=["ngp", "nerf"])
 def test_resume_equals_uninterrupted_run(capture: Path, tmp_path: Path, keys: list[str]) -> None:
-    run = dyngs.train(config_of(capture, *keys, *STEPS, f"run.dir={tmp_path / 'run'}"))
+    run = train(config_of(capture, *keys, *STEPS, f"run.dir={tmp_path / 'run'}"))
     last = checkpoint_paths(run)[-1]
     whole = last.read_bytes()
     last.unlink()

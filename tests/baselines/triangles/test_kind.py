@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from small_triangles import config_of
 
-import dyngs
+from dyngs.api.train import train
 from dyngs.baselines.triangles.scene import TriangleScene
 from dyngs.baselines.triangles.training import max_pixels
 from dyngs.cli import main
@@ -29,7 +29,7 @@ STEPS = ["train.steps=120", "train.save_every=60"]
 @pytest.fixture(scope="module")
 def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "triangles"
-    return dyngs.train(config_of(capture, *STEPS, "model.gaussian_steps=300", f"run.dir={folder}"))
+    return train(config_of(capture, *STEPS, "model.gaussian_steps=300", f"run.dir={folder}"))
 
 
 def test_training_improves_and_respects_max_triangles(run: Path) -> None:
@@ -45,7 +45,7 @@ def test_training_improves_and_respects_max_triangles(run: Path) -> None:
 def test_resume_equals_uninterrupted_run(capture: Path, tmp_path: Path) -> None:
     # cut right after a change and the first texture
     steps = ["train.steps=112", "train.save_every=56"]
-    run = dyngs.train(config_of(capture, *steps, f"run.dir={tmp_path / 'run'}"))
+    run = train(config_of(capture, *steps, f"run.dir={tmp_path / 'run'}"))
     path = checkpoint_paths(run)[-1]
     whole = path.read_bytes()
     path.unlink()
@@ -57,7 +57,7 @@ def test_file_fits_requested_size(capture: Path, tmp_path: Path) -> None:
     """The limit is half the size of 72 values per triangle, so the run starts with fewer."""
     run = tmp_path / "run"
     keys = ["train.steps=60", "model.gaussian_steps=100", "model.max_triangles=1000"]
-    dyngs.train(config_of(capture, *keys, "budget.max_mb=0.0125", f"run.dir={run}"))
+    train(config_of(capture, *keys, "budget.max_mb=0.0125", f"run.dir={run}"))
     file = run / "export" / "scene.dyngs"
     assert file.stat().st_size <= 12500
     whole, stored = (open_run(folder).renderable for folder in (run, file.parent))
@@ -72,7 +72,7 @@ def test_a_file_that_is_too_small_is_refused(capture: Path, tmp_path: Path) -> N
     with pytest.raises(
         DyngsError, match=r"budget.max_mb=0.005 is too small for 100 triangles; 0.0098 would do"
     ):
-        dyngs.train(config_of(capture, "budget.max_mb=0.005", f"run.dir={tmp_path / 'run'}"))
+        train(config_of(capture, "budget.max_mb=0.005", f"run.dir={tmp_path / 'run'}"))
     assert not (tmp_path / "run" / "config.yaml").exists()
 
 
@@ -131,7 +131,7 @@ def test_coincident_points_are_refused(capture: Path, tmp_path: Path) -> None:
     trimesh.PointCloud(np.zeros((20, 3))).export(same / "points3d.ply")
     more = ("model.gaussian_steps=0", f"run.dir={tmp_path / 'run'}")
     with pytest.raises(DyngsError, match="initial points coincide"):
-        dyngs.train(config_of(same, *more))
+        train(config_of(same, *more))
 
 
 def test_a_capture_that_shows_no_surface_is_refused(

@@ -75,7 +75,7 @@ NETWORKS: dict[str, Callable[[torch.Generator], FieldNetwork]] = {
 """Untrained networks, by ``model.kind``."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PredictedField(Renderable):
     """Radiance field of a person, predicted from ``sources``; static."""
 
