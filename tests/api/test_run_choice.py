@@ -96,6 +96,7 @@ def test_previews_are_continued(capture: Path) -> None:
     continued = choose_run(BASE, config_of(capture, "train.minutes=2"))[1]
     assert continued is not None
     assert continued.train.minutes == 2
+    assert choose_run(BASE, config_of(capture, "train.steps=300"))[0] == BASE, "finished"
     assert choose_run(BASE, config_of(capture, "train.minutes=0.5"))[0] != BASE
     assert choose_run(BASE, config_of(capture, "train.steps=200"))[0] != BASE
 
