@@ -14,18 +14,19 @@ from dyngs.runs.folder import differing_keys, load_requested_config, require_sta
 from dyngs.training.plan import extend_config, with_length
 
 
-def choose_run(base: Path, config: Config) -> tuple[Path, Config | None]:
+def choose_run(base: Path, config: Config, *, continues: bool = True) -> tuple[Path, Config | None]:
     """Return the run folder for ``config``, and the config of the run in it if that is continued.
 
     It is the first of ``base``, ``base-2``, ... that has no run, or one with the same keys that is
-    not longer. The folder and the reason are logged if it is not a new ``base``.
+    not longer. The folder and the reason are logged if it is not a new ``base``. ``continues`` is
+    false for captures in memory, whose images may differ.
     """
     problem = ""
     for number in count(1):
         folder = base if number == 1 else base.with_name(f"{base.name}-{number}")
         continued = None
         try:
-            if checkpoint_paths(folder):
+            if continues and checkpoint_paths(folder):
                 continued = _continue_run(folder, config)
             else:
                 require_startable(folder, config)
