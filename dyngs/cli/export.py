@@ -40,7 +40,7 @@ _TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree classic") | {
     "avatar": "",
     "network": "",
     "cameras": "",
-    "html": "time motion from_up folder max_gaussians_drawn",
+    "html": "time motion from_up folder max_gaussians_drawn title view",
     "mesh of a person": "motion",
     "mesh": "time times up from_up level segments cells",
     "bodies": "time up from_up classic",
@@ -130,6 +130,12 @@ def add_parser(commands: args.Commands) -> None:
     args.add_max_gaussians_drawn(
         parser, "--folder: maximum number of Gaussians drawn per image, for example for phones"
     )
+    about = "--format html: title of the page (default: name of the run)"
+    parser.add_argument("--title", metavar="TEXT", help=about)
+    about = (
+        "--format html: view of the capture that the page starts with, by name or index (default 0)"
+    )
+    parser.add_argument("--view", metavar="NAME|N", help=about)
     about = "Gaussians of a person in rest pose, with joints and skinning weights: .ply, .glb"
     parser.add_argument("--joints", action="store_true", help=about)
     about = "rigidly moving bodies as animated nodes of a .glb; all else is static, as at --time"
@@ -617,10 +623,12 @@ def _export_page(arguments: argparse.Namespace) -> list[Path]:
     opened = _moved(arguments, _open(arguments))
     opened = opened if arguments.from_up is None else replace(opened, stated_up=arguments.from_up)
     time = arguments.time or 0.0
+    title = arguments.title
+    view = arguments.view
     if arguments.folder:
-        written = write_page_folder(opened, out, most=most, time=time)
+        written = write_page_folder(opened, out, most=most, title=title, time=time, view=view)
     else:
-        written = write_page(opened, out, time=time)
+        written = write_page(opened, out, title=title, time=time, view=view)
     print_notes((*written.notes, where))
     return [written.path]
 
