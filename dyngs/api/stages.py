@@ -13,14 +13,20 @@ from dyngs.config import AutoColour, FixedStrategy, SceneInit, ShColour
 from dyngs.config.io import RESOLVED_NAME, load_resolved, save_config
 from dyngs.core.conventions import ProgressCallback
 from dyngs.core.errors import DyngsError, format_count, log_info
-from dyngs.data.read import capture_folder, read_capture, require_folder, require_images
+from dyngs.data.read import (
+    capture_folder,
+    describe_shrinking,
+    read_capture,
+    require_folder,
+    require_images,
+)
 from dyngs.models.checkpoint import Checkpoint, read_run_capture
 from dyngs.models.kind import HasBody, HasMotion, PredictsScenes, capability, find_kind
 from dyngs.models.views import training_times
 from dyngs.runs.capture_record import require_same_capture
 from dyngs.runs.checkpoint import SCENE_FILE, seconds_at
 from dyngs.runs.folder import EXPORT_FOLDER, write_requested_config
-from dyngs.training.limits import apply_gaussian_cap, gaussian_limit
+from dyngs.training.limits import apply_gaussian_cap, apply_pixel_cap, gaussian_limit
 from dyngs.training.plan import (
     Limits,
     RunPlan,
@@ -124,14 +130,23 @@ def read_same_capture(folder: Path, resumed: Checkpoint) -> Stage:
     return stage
 
 
-def run_pilots(plan: RunPlan) -> tuple[RunPlan, None]:
-    """Read the capture, find initial points, and resolve ``auto`` settings by pilot runs."""
-    config = plan.resolved
-    if capability(config.model, PredictsScenes) is not None:
-        return plan, None
-    given = plan.capture or read_capture(config.data)
-    config, choices, capture = resolve_auto_settings(config, require_images(given))
-    return replace(plan, resolved=config, capture=capture, choices=tuple(choices)), None
+def run_pilots(report: ProgressCallback) -> Stage:
+    """Return the stage that reads the capture, finds initial points, and resolves ``auto`` settings
+    by pilot runs."""
+
+    def stage(plan: RunPlan) -> tuple[RunPlan, None]:
+        config = plan.resolved
+        if capability(config.model, PredictsScenes) is not None:
+            return plan, None
+        capture = require_images(plan.capture or read_capture(config.data))
+        message = describe_shrinking(capture.splits, config.data)
+        if message and "longest_side" not in config.data.model_fields_set:
+            log_info(message)
+        config, choices, capture = resolve_auto_settings(config, capture, report)
+        config = apply_pixel_cap(config, capture)
+        return replace(plan, resolved=config, capture=capture, choices=tuple(choices)), None
+
+    return stage
 
 
 def find_first_gaussians(plan: RunPlan) -> tuple[RunPlan, str | None]:

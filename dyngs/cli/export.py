@@ -231,7 +231,7 @@ def _write(arguments: argparse.Namespace) -> list[Path]:
         "mesh of a person": _export_rigged,
     }
     if kind not in _TAKES:
-        return _export_by_plugin(arguments, kind)
+        return _export_by_plugin(arguments, kind[1:])
     if kind in writers:
         return writers[kind](arguments)
     times = _times(arguments)
@@ -262,7 +262,7 @@ def _kind(arguments: argparse.Namespace) -> str:
     suffix = out.suffix.lower()
     named = _OTHER_SUFFIXES.get(suffix) if found is None else found.name
     if named is None and suffix[1:] in plugin_entries(EXPORTERS):
-        named = suffix[1:]
+        named = suffix
     if stated is None and (named or (_is_sequence(arguments) and not out.suffix)):
         return named or "ply"
     fits = named in (None, stated) and not (

@@ -201,6 +201,8 @@ def load_resolved(
     if isinstance(data, dict):
         stored_root = data.get("root")
         data["follow_links"] = run_links_allowed()
+        # Runs of versions without this key were trained on full images.
+        data.setdefault("longest_side", None)
         if isinstance(data.get("body"), str):
             data["body"] = str(file.parent.absolute() / data["body"])
     layers.add_overrides(overrides)

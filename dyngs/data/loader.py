@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import os
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -167,6 +168,7 @@ class ImageLoader:
         times: times of the views in [0, 1] or None.
         camera_correction: returns the corrected camera of an image, given its index and the camera
             of the capture; None: no correction.
+        waited_seconds: time in which requested images were decoded.
     """
 
     def __init__(
@@ -200,6 +202,8 @@ class ImageLoader:
         self._pending: dict[int, Future[Decoded]] = {}
         self._last_map: tuple[object, LensMap] | None = None
         self._lock = Lock()
+        self.waited_seconds = 0.0
+        self._num_waited = 0
         check_files(self.views)
 
     def __len__(self) -> int:
@@ -313,6 +317,17 @@ class ImageLoader:
         return 0 if is_whole else 2 * self._threads
 
     @property
+    def is_cacheable(self) -> bool:
+        """Whether the cache can hold all images, so that each one is decoded once."""
+        return self._bytes_of_all() <= self._cache.room
+
+    @property
+    def decoding_seconds_left(self) -> float:
+        """Expected time to decode the images that are not cached yet."""
+        pending = sum((i, 1) not in self._cache.images for i in range(len(self)))
+        return pending * self.waited_seconds / max(self._num_waited, 1)
+
+    @property
     def sizes(self) -> list[tuple[int, int]]:
         """Width and height of the images in px; no image is decoded."""
         return [view_size(view, self._options) for view in self.views]
@@ -341,7 +356,10 @@ class ImageLoader:
             pending = self._pending.pop(index, None)
         if found is not None:
             return found
+        begun = time.perf_counter()
         image = self._on_demand(index) if pending is None else pending.result()
+        self.waited_seconds += time.perf_counter() - begun
+        self._num_waited += 1
         found = {name: copy_async(x, self._device) for name, x in image.items()}
         size = _num_bytes(found)
         left = sum((i, 1) not in self._cache.images for i in range(len(self))) - 1

@@ -78,6 +78,20 @@ def view_size(view: View, options: DataConfig) -> tuple[int, int]:
     )
 
 
+def describe_shrinking(splits: Splits, options: DataConfig) -> str | None:
+    """Return a message if ``longest_side`` shrinks images, and None otherwise."""
+    if options.longest_side is None:
+        return None
+    view = max(all_views(splits), key=lambda view: view.width * view.height * view.copy_factor**2)
+    width, height = (side * view.copy_factor for side in (view.width, view.height))
+    if max(width, height) <= options.longest_side:
+        return None
+    small = "x".join(map(str, view_size(view, options)))
+    return (
+        f"images of {width}x{height} px are shrunk to {small}; data.longest_side=0 keeps their size"
+    )
+
+
 def with_smaller_images(
     root: Path, splits: Splits, options: DataConfig
 ) -> tuple[Splits, list[str]]:

@@ -113,7 +113,7 @@ def describe_extension(before: Config, after: Config, done: int) -> str:
     """Return a log message about a run that continues after ``done`` steps."""
     steps = after.train.steps
     is_free = before.train.minutes is not None and after.train.minutes is None
-    no_limit = "; train.minutes is ignored" if is_free else ""
+    no_limit = "; without a time limit" if is_free else ""
     return (
         f"resuming at step {done:,}, extended from {before.train.steps:,} to "
         f"{format_count(steps, 'step')}; "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -114,7 +115,8 @@ def test_a_longer_time_limit_plans_steps_at_the_same_speed(capture: Path) -> Non
     continued = choose_run(BASE, requested)[1]
     assert continued is not None
     plan = RunPlan(with_steps(requested, 300), continued)
-    plan, _ = extend_run(BASE, SimpleNamespace(info=SimpleNamespace(step=300)))(plan)
+    checkpoint: Any = SimpleNamespace(info=SimpleNamespace(step=300))
+    plan, _ = extend_run(BASE, checkpoint)(plan)
     assert (plan.resolved.train.steps, plan.resolved.train.minutes) == (900, 3)
     assert (plan.requested.train.steps, plan.requested.train.minutes) == (7000, 3)
     assert choose_run(BASE, requested)[1] is not None, "interrupted, and the same command again"

@@ -390,6 +390,19 @@ def test_runs_of_earlier_versions_with_keys_of_one_kind_are_read(kind: str, tmp_
         load_resolved(tmp_path)
 
 
+def test_image_size_limit_and_downscale() -> None:
+    """A requested ``downscale`` replaces the default limit; a limit of 0 is none."""
+    for overrides, limit in (
+        ([], 1600),
+        (["data.longest_side=0"], None),
+        (["data.downscale=2"], None),
+        (["data.downscale=2", "data.longest_side=900"], 900),
+    ):
+        assert load_config("static", ["data.root=a", *overrides]).data.longest_side == limit, (
+            overrides
+        )
+
+
 def test_replace_is_as_an_override_and_keeps_what_was_requested() -> None:
     config = load_config(Path("static"), ["data.root=x", "optim.lr_sh_dc=0.1"])
     words = ["data.root=x", "optim.lr_sh_dc=0.1", "strategy.kind=mcmc", "train.steps=10"]

@@ -13,7 +13,7 @@ def test_known_rows() -> None:
         ("train.steps",): ("an integer >= 1", "7000"),
         ("strategy.kind",): ("one of default, mcmc, fixed", "default"),
         ("train.ssim_weight",): ("a number >= 0 and <= 1", "0.2"),
-        ("data.longest_side",): ("an integer >= 1 or null", "null"),
+        ("data.longest_side",): ("an integer >= 0 or null", "1600"),
         ("strategy.max_gaussians", "mcmc"): ("an integer >= 1", "300000"),
         ("model.deform.kind", "dynamic"): ("one of hexplane, mlp, control_nodes, free", "hexplane"),
     }

@@ -13,6 +13,7 @@ from dyngs.api.load import read_capture
 from dyngs.config import DataConfig
 from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader
+from dyngs.data.read import describe_shrinking
 
 WIDTH, HEIGHT, COUNT = 64, 48, 4
 GREY = {1: 50, 2: 100, 4: 150, 8: 200}
@@ -72,6 +73,16 @@ def test_smallest_copy_that_is_large_enough(
     assert names == [f"images/{i}" for i in range(COUNT)]
     lines = [f"images_{factor} is read instead of images"] if factor > 1 else []
     assert [line.partition(",")[0] for line in capture.warnings] == lines
+
+
+def test_message_on_shrinking_names_the_full_size(root: Path) -> None:
+    """Views of a smaller copy count with the size of their originals."""
+    capture, config = read(root, longest_side=20)
+    message = describe_shrinking(capture.splits, config)
+    assert message is not None
+    assert message.startswith("images of 64x48 px are shrunk to 20x15")
+    capture, config = read(root)
+    assert describe_shrinking(capture.splits, config) is None
 
 
 @pytest.mark.parametrize("is_absent", [False, True])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dyngs.api.train import train
@@ -20,11 +21,18 @@ from dyngs.config import (
 )
 from dyngs.config.io import load_config, packaged_preset
 from dyngs.core.errors import DyngsError
+from dyngs.data.capture import PointCloud
+from dyngs.data.read import read_capture
 from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.deform.keys import DynamicModel
 from dyngs.human.keys import HumanPredictorModel
 from dyngs.models.static_section import StaticModel
-from dyngs.training.limits import apply_gaussian_cap, gaussian_limit, validate_limits
+from dyngs.training.limits import (
+    apply_gaussian_cap,
+    apply_pixel_cap,
+    gaussian_limit,
+    validate_limits,
+)
 from dyngs.training.new_trainer import build_trainer
 from dyngs.training.trainer import Trainer
 
@@ -79,6 +87,18 @@ def test_none_are_added_beyond_a_cap(
     config = still_config(still, tmp_path, strategy)
     assert largest_count(build_trainer(config)) > 90
     assert largest_count(build_trainer(apply_gaussian_cap(config, cap), uncapped=config)) == most
+
+
+def test_cap_from_training_pixels(still: Path, tmp_path: Path) -> None:
+    """Only a limit that was not requested is lowered, and not below twice the initial points."""
+    capture = read_capture(still)
+    config = still_config(still, tmp_path, DefaultStrategy())
+    assert apply_pixel_cap(config, capture).strategy.growth_limit == 100_000
+    many = PointCloud(np.zeros((70_000, 3)), np.zeros((70_000, 3), np.uint8))
+    capture = capture.replace(points=many)
+    assert apply_pixel_cap(config, capture).strategy.growth_limit == 140_000
+    requested = still_config(still, tmp_path, DefaultStrategy(max_gaussians=200_000))
+    assert apply_pixel_cap(requested, capture).strategy.growth_limit == 200_000
 
 
 @pytest.mark.parametrize("model", [StaticModel(), DynamicModel()])

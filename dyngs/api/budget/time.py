@@ -44,7 +44,7 @@ def fit_minutes(
     while True:
         trainer = build(plan)
         forecast = _measured(trainer, 0.05 * seconds)
-        left = AIM * seconds - stopwatch.seconds
+        left = AIM * seconds - stopwatch.seconds - _decoding_seconds_left(trainer.images)
         steps = fitting_steps(forecast, plan.resolved, 0, left, asked)
         side = max(map(max, trainer.images.sizes))
         if steps >= min(FEWEST, asked) or side < 2 * SMALLEST_SIDE:
@@ -68,7 +68,9 @@ def _measured(trainer: Trainer[Any], seconds: float) -> TimeForecast:
     last = min(WARM_UP + 20, trainer.config.train.steps)
     forecast = _forecast(trainer, begun)
     while trainer.done < last:
+        waited = _decoding_seconds(trainer.images)
         trainer.step()
+        forecast.exclude(_decoding_seconds(trainer.images) - waited)
         now = time.perf_counter()
         if trainer.done == WARM_UP < last:
             forecast = _forecast(trainer, now)
@@ -77,6 +79,15 @@ def _measured(trainer: Trainer[Any], seconds: float) -> TimeForecast:
         if now - begun > seconds and trainer.done != WARM_UP:
             break
     return forecast
+
+
+def _decoding_seconds(images: ImageLoader) -> float:
+    """Return the time spent on decoding so far; 0 if images are decoded again in each epoch."""
+    return images.waited_seconds if images.is_cacheable else 0.0
+
+
+def _decoding_seconds_left(images: ImageLoader) -> float:
+    return images.decoding_seconds_left if images.is_cacheable else 0.0
 
 
 def _forecast(trainer: Trainer[Any], now: float) -> TimeForecast:
@@ -113,6 +124,7 @@ class TimeLimit:
         self.most_steps = most_steps
         self._corrects = corrects
         self._forecast: TimeForecast | None = None
+        self._waited = 0.0
 
     def __call__(self, loop: Loop) -> TrainingEdit | None:
         trainer = loop.trainer
@@ -124,14 +136,18 @@ class TimeLimit:
             return None
         if self._forecast is None:  # the first step includes loading and compilation
             self._forecast = _forecast(trainer, now)
+            self._waited = _decoding_seconds(trainer.images)
             return None
+        waited = _decoding_seconds(trainer.images)
+        self._forecast.exclude(waited - self._waited)
+        self._waited = waited
         self._forecast.observe(config, done, now, trainer.num_gaussians)
         if now + 2 * self._forecast.mean_step > self.seconds:
             return TrainingEdit(steps=done)
         if not self._corrects or 4 * done < loop.total:
             return None
         self._corrects = False
-        left = AIM * self.seconds - now
+        left = AIM * self.seconds - now - _decoding_seconds_left(trainer.images)
         found = fitting_steps(self._forecast, config, done, left, self.most_steps)
         is_small = abs(found - loop.total) <= 0.04 * loop.total
         new = with_steps(config, found)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     Field,
@@ -11,6 +11,8 @@ from pydantic import (
     ValidationError,
     ValidatorFunctionWrapHandler,
     WrapValidator,
+    field_validator,
+    model_validator,
 )
 
 from dyngs.core.plugins import READERS, plugin_entries
@@ -89,10 +91,10 @@ class DataConfig(Section):
         default=1.0, ge=1.0, description="factor by which image width and height are divided"
     )
     longest_side: int | None = Field(
-        default=None,
-        ge=1,
+        default=1600,
+        ge=0,
         description="maximum length of the longer image side, px; larger images are downscaled; "
-        "null: no limit",
+        "0 or null: no limit, which is also the default if data.downscale is given",
     )
     test_every: int = Field(
         default=8,
@@ -115,3 +117,16 @@ class DataConfig(Section):
         default=False,
         description="whether to follow links to files outside the folder of the capture",
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _keep_requested_downscale(cls, given: Any) -> Any:
+        """Remove the default limit on the image size if ``downscale`` determines the size."""
+        if isinstance(given, dict) and "downscale" in given:
+            return {"longest_side": None, **given}
+        return given
+
+    @field_validator("longest_side")
+    @classmethod
+    def _read_no_limit(cls, value: int | None) -> int | None:
+        return value or None

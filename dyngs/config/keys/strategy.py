@@ -53,7 +53,10 @@ class DefaultStrategy(Section):
         default=True, description="whether to clone and split Gaussians; false: only prune"
     )
     max_gaussians: int = Field(
-        default=3_000_000, ge=1, description="number of Gaussians at which densification stops"
+        default=3_000_000,
+        ge=1,
+        description="number of Gaussians at which densification stops; unless it is given, at most "
+        "400 times the square root of the number of training pixels, and at least 100,000",
     )
 
     @property
