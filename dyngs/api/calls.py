@@ -8,9 +8,10 @@ from typing import Any
 
 from dyngs.api import train as training
 from dyngs.api.load import load
+from dyngs.capture.preset import choose_preset
 from dyngs.config import Config, DataConfig
 from dyngs.config.io import load_config, load_resolved
-from dyngs.core.errors import DyngsError
+from dyngs.core.errors import DyngsError, log_info
 from dyngs.data.capture import Capture
 from dyngs.gaussians.scene import GaussianScene
 from dyngs.models.kind import HasGaussians, capability
@@ -57,12 +58,12 @@ def train(
         scene.run.path, scene.run.step
 
     Args:
-        config: a ``Config``, a preset name or a YAML file; None: ``static``.
+        config: a ``Config``, a preset name or a YAML file; None: the preset that fits the data.
         data: folder, .zip or video (``data.root``), a ``Capture``, or keys of the section.
         steps, minutes: ``train.steps`` and ``train.minutes``.
         run_dir, device: ``run.dir`` and ``run.device``.
-        resume: a run folder to continue, up to ``steps`` if given. Its config is fixed; pass
-            ``losses`` again, and the ``Capture`` if it was not read from files.
+        resume: a run folder to continue, up to ``steps`` or ``minutes`` if given. Its config is
+            fixed; pass ``losses`` again, and a ``Capture`` that you changed.
         losses: functions of a ``dyngs.LossInput`` that return a differentiable scalar tensor,
             which is added to the loss of every step. Pilot runs are without them.
         listeners: functions of one event, see ``dyngs.training.events``.
@@ -86,24 +87,27 @@ def train(
     changes = {name: value for name, value in changes.items() if value is not None}
     folder = None
     if resume is not None:
-        if config is not None or minutes is not None or run_dir is not None or keys:
+        if config is not None or run_dir is not None or keys:
             raise DyngsError(
-                "resume: the configuration of a run is fixed; give only steps, data, device, "
-                "losses and listeners"
+                "resume: the configuration of a run is fixed; give only steps, minutes, data, "
+                "device, losses and listeners"
             )
         folder = Path(resume)
         config = load_resolved(folder)
     else:
         changes |= {"train.losses": [loss.name for loss in added], **keys}
-    known = config if isinstance(config, Config) else None
-    config = known.replace(changes) if known else load_config(config or "static", changes)
+        if config is None:
+            own = {name: value for name, value in changes.items() if name.startswith("data")}
+            config, reason = choose_preset(load_config(None, own).data)
+            log_info(f"preset {config} ({reason})")
+    config = config.replace(changes) if isinstance(config, Config) else load_config(config, changes)
     if capability(config.model, HasGaussians) is None:
         raise DyngsError(
             f"model.kind={config.model.kind}: only scenes of Gaussians are trained by dyngs.train; "
             "use `dyngs train`"
         )
-    own = config.data.model_dump(exclude=_AFTER_READING)
-    if capture and own != DataConfig(root=capture.root).model_dump(exclude=_AFTER_READING):
+    reading = config.data.model_dump(exclude=_AFTER_READING)
+    if capture and reading != DataConfig(root=capture.root).model_dump(exclude=_AFTER_READING):
         raise DyngsError(
             "data: keys such as frames have no effect on a capture that was read already; give "
             "them to dyngs.read_capture in a DataConfig"

@@ -64,7 +64,7 @@ class Cameras:
         *,
         convention: Literal["opencv", "opengl"] = "opencv",
     ) -> Cameras:
-        """Return cameras from camera-to-world matrices.
+        """Return cameras from camera-to-world matrices, without gradients.
 
         Example:
 
@@ -90,13 +90,13 @@ class Cameras:
         """
         if convention not in ("opencv", "opengl"):
             raise DyngsError(f"convention={convention!r}: must be 'opencv' or 'opengl'")
-        poses = _as_tensor(world_from_cam).double()
+        poses = _as_tensor(world_from_cam).detach().double().cpu().numpy()
         if poses.shape[1:] != (4, 4):
-            raise DyngsError(f"world_from_cam must be (V, 4, 4), got {tuple(poses.shape)}")
+            raise DyngsError(f"world_from_cam must be (V, 4, 4), got {poses.shape}")
         if convention == "opengl":
-            poses = poses * poses.new_tensor([1, -1, -1, 1])
+            poses = poses * [1.0, -1.0, -1.0, 1.0]
         matrices = _as_tensor(intrinsics).expand(len(poses), 3, 3)
-        return Cameras(torch.linalg.inv_ex(poses).inverse, matrices, width, height)
+        return Cameras(torch.as_tensor(np.linalg.pinv(poses)), matrices, width, height)
 
     def __iter__(self) -> Iterator[Cameras]:
         return (self.select(i) for i in range(len(self)))
@@ -146,4 +146,4 @@ class Cameras:
 
 
 def _as_tensor(values: Any) -> Tensor:
-    return values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values, float))
+    return values if isinstance(values, Tensor) else torch.as_tensor(np.asarray(values, float))

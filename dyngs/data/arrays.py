@@ -23,9 +23,6 @@ from dyngs.data.scene_space import change_coordinates
 from dyngs.io.outputs import atomic_folder
 from dyngs.io.write import cache_folder, to_uint8, write_image
 
-_COLOURS = ((3,), (4,))
-"""Shapes of a pixel of an image."""
-
 
 def capture_from_images(
     images: Sequence[Any],
@@ -42,10 +39,10 @@ def capture_from_images(
     for i, camera in enumerate(cameras):
         name = f"{i:06d}.png"
         frame = _frame(camera) | {"file_path": f"images/{name}"}
-        files[f"images/{name}"] = _pixels(images[i], f"images[{i}]", camera, _COLOURS)
+        files[f"images/{name}"] = _pixels(images[i], f"images[{i}]", camera)
         if masks is not None:
             frame["mask_path"] = f"masks/{name}"
-            files[f"masks/{name}"] = _pixels(masks[i], f"masks[{i}]", camera, ((),))
+            files[f"masks/{name}"] = _pixels(masks[i], f"masks[{i}]", camera)
         if times is not None:
             frame["time"] = float(times[i])
         frames.append(frame)
@@ -63,17 +60,15 @@ def capture_from_images(
     return change_coordinates(capture, 1.0, capture.world_offset)
 
 
-def _pixels(
-    values: Any, name: str, camera: Cameras, channels: tuple[tuple[int, ...], ...]
-) -> np.ndarray:
+def _pixels(values: Any, name: str, camera: Cameras) -> np.ndarray:
     """Return pixels as uint8. Raises DyngsError: another type, range or shape."""
     given = values.detach().cpu() if isinstance(values, torch.Tensor) else values
     pixels = np.asarray(given)
     size = (camera.height, camera.width)
-    wanted = [(*size, *channel) for channel in channels]
-    if pixels.shape not in wanted:
-        allowed = " or ".join(map(str, wanted))
-        raise DyngsError(f"{name}: must be {allowed} for its camera, got {pixels.shape}")
+    if pixels.shape[:2] != size or pixels.ndim > 3:
+        raise DyngsError(
+            f"{name}: its shape must begin with {size} of its camera, got {pixels.shape}"
+        )
     if pixels.dtype == bool or (
         pixels.dtype.kind == "f" and 0 <= pixels.min() <= pixels.max() <= 1
     ):

@@ -257,8 +257,8 @@ class Capture:
             capture = dyngs.Capture.from_images(images, cameras)
 
         Args:
-            images: (H, W, 3) or (H, W, 4) arrays or tensors with straight alpha; uint8, or floats
-                in [0, 1], which are rounded to 8 bits.
+            images: (H, W), (H, W, 3) or (H, W, 4) arrays or tensors with straight alpha; uint8, or
+                floats in [0, 1], which are rounded to 8 bits.
             cameras: one per image; a list of ``Cameras`` where sizes differ.
             times: one per image in any unit, for a moving scene.
             masks: (H, W) bool, uint8 or float; True, 255 or 1: used, 0: ignored.

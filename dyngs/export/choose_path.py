@@ -135,7 +135,7 @@ def render_path(
         opened = wrap_scene(scene)
     else:
         opened = open_scene(run_path(scene), nonfinite="skip")
-    chosen = choose_path(opened, PathOptions(path, frames, size, times and tuple(times)))
+    chosen = choose_path(opened, PathOptions(path, frames, size, tuple(times) if times else None))
     out = Path(out)
     folder, video = (None, out) if out.suffix else (out, None)
     output = OutputOptions(video=video, fps=fps or chosen.fps)
