@@ -84,6 +84,8 @@ class Page:
     def add_vector3(self, label: str, value: tuple[float, ...], **_: Any) -> Control:
         return self._added(label, value)
 
+    add_rgb = add_vector3
+
     def add_button(self, label: str, **_: Any) -> Control:
         return self._added(label, False)
 

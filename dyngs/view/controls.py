@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from dyngs.view.server import BrowserConnection
 
 NEAREST = "nearest"
+BACKGROUNDS = "of the scene", "black", "white", "custom"
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 AS_CAPTURED, AT_REST, BY_SLIDERS = "as captured", "rest pose", "pose sliders"
 BODY_JOINTS = JOINT_NAMES[:22]  # Joints with sliders, common to all bodies
@@ -135,6 +136,17 @@ class Controls:
             part.on_update(lambda _: session.change(part=part.value))
         else:
             session.change(part="all")
+        background = gui.add_dropdown("Background", BACKGROUNDS)
+        custom = gui.add_rgb("Custom", (128, 128, 128), visible=False)
+
+        def choose(_: Any) -> None:
+            custom.visible = background.value == "custom"
+            colours = {"black": (0, 0, 0), "white": (255, 255, 255), "custom": custom.value}
+            session.change(background=colours.get(background.value))
+
+        background.on_update(choose)
+        custom.on_update(choose)
+        session.change(background=None)
         screenshot = gui.add_button("Screenshot", hint="save as .png in window size")
         screenshot.on_click(lambda _: session.submit_job(self._screenshot))
         gui.add_button("Reset view").on_click(lambda _: self._connection.go_to(None))

@@ -7,11 +7,14 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from dyngs.core.camera import Cameras
+from dyngs.core.conventions import SH_C0
 from dyngs.export.camera_paths import resize_cameras
 from dyngs.export.images import color_map, depth_to_rgb
 from dyngs.gaussians.levels import LevelScene
+from dyngs.gaussians.scene import GaussianScene
 from dyngs.io.write import to_uint8
 from dyngs.models.renderable import Rendering, TimeStep
 from dyngs.runs.opened import OpenedScene
@@ -33,6 +36,7 @@ class ViewRequest:
         view: view of the capture whose camera, time and true image are used. None shows no true
             image.
         divide: fraction of the width that shows the rendering, with the true image on its right.
+        background: colour (R, G, B) from 0 to 255. None uses that of the scene.
         is_moving: part of an animation, so levels of detail are used if available.
     """
 
@@ -42,18 +46,24 @@ class ViewRequest:
     part: Part = "all"
     view: int | None = None
     divide: float = 1.0
+    background: tuple[int, int, int] | None = None
     is_moving: bool = False
+
+    def behind(self, opened: OpenedScene) -> Tensor:
+        """Return the background colour (3,) in [0, 1]."""
+        if self.background is None:
+            return opened.background
+        return torch.tensor(self.background, device="cpu") / 255
 
 
 def draw(opened: OpenedScene, request: ViewRequest) -> np.ndarray:
     """Return the image (H, W, 3) uint8 of a request."""
+    request = with_camera_of_view(opened, request)
+    rgb = highlight_selection(opened, request, _layer(opened, request))
     if request.view is None:
-        return _layer(opened, request)
-    views = views_of(opened)
+        return rgb
     size = request.camera.width, request.camera.height
-    camera = resize_cameras(views.cameras[request.view], *size)
-    rgb = _layer(opened, replace(request, camera=camera, time=views.views[request.view].time))
-    truth = truth_in_window(opened, request.view, size)
+    truth = truth_in_window(opened, request.view, size, request.behind(opened))
     if truth is None:
         return rgb
     outside = truth[..., 3:] == 0
@@ -70,7 +80,41 @@ def draw(opened: OpenedScene, request: ViewRequest) -> np.ndarray:
     return composed
 
 
-def truth_in_window(opened: OpenedScene, view: int, size: tuple[int, int]) -> np.ndarray | None:
+def with_camera_of_view(opened: OpenedScene, request: ViewRequest) -> ViewRequest:
+    """Return the request with camera and time of its view of the capture, if it has one."""
+    if request.view is None:
+        return request
+    views = views_of(opened)
+    size = request.camera.width, request.camera.height
+    camera = resize_cameras(views.cameras[request.view], *size)
+    return replace(request, camera=camera, time=views.views[request.view].time)
+
+
+def mark_selection(opened: OpenedScene, selected: Tensor) -> None:
+    """Highlight Gaussians in all images of a scene that was not drawn before.
+
+    Args:
+        selected: (N,) bool.
+    """
+    scene: GaussianScene = opened.scene
+    sh = torch.zeros_like(scene.gaussians.sh)
+    sh[:, 0] = torch.where(selected.to(sh.device), 0.5, -0.5)[:, None] / SH_C0
+    mask = replace(scene, gaussians=scene.gaussians.replace(sh=sh), colour=None)
+    opened.once("selection", lambda: opened.with_scene(mask))
+
+
+def highlight_selection(opened: OpenedScene, request: ViewRequest, rgb: np.ndarray) -> np.ndarray:
+    """Return ``rgb`` (H, W, 3) uint8 with the visible selected Gaussians of a scene in yellow."""
+    mask: OpenedScene | None = opened.once("selection", lambda: None)
+    if mask is None:
+        return rgb
+    weights = 0.6 * _layer(mask, replace(request, layer="colour", background=(0, 0, 0))) / 255
+    return (rgb + weights * ((255, 200, 0) - rgb.astype(np.float32))).astype(np.uint8)
+
+
+def truth_in_window(
+    opened: OpenedScene, view: int, size: tuple[int, int], background: Tensor
+) -> np.ndarray | None:
     """Return the true image of a view, fitted into a window of ``size`` px: (H, W, 4) uint8.
 
     Pixels outside the image are transparent.
@@ -80,7 +124,7 @@ def truth_in_window(opened: OpenedScene, view: int, size: tuple[int, int]) -> np
     images = views_of(opened).images
     if images is None:
         return None
-    pixels = to_uint8(images[view].composite(opened.background.cpu()).numpy())
+    pixels = to_uint8(images[view].composite(background.cpu()).numpy())
     image = Image.fromarray(pixels).convert("RGBA")
     return np.asarray(ImageOps.pad(image, size, color=(0, 0, 0, 0)))
 
@@ -128,14 +172,16 @@ def _rendering(opened: OpenedScene, request: ViewRequest, **options: Any) -> Ren
     scene = opened.renderable
     levels: LevelScene | None = opened.once("levels", lambda: None)
     if levels is not None and request.is_moving and part == "all" and not options:
-        return levels.render(request.camera).to(device="cpu")
+        return levels.render(request.camera, background=request.behind(opened)).to(device="cpu")
     if part != "all":
         scene = opened.once(part, lambda: opened.scene.part(part))
     kept: dict[str, tuple[float | None, TimeStep]] = opened.once("time steps", dict)
     if part not in kept or kept[part][0] != request.time:
         kept[part] = request.time, scene.time_step(request.time)
     how = replace(scene.options, **options)
-    return scene.render(request.camera, kept[part][1], options=how).to(device="cpu")
+    behind = request.behind(opened)
+    rendering = scene.render(request.camera, kept[part][1], options=how, background=behind)
+    return rendering.to(device="cpu")
 
 
 @torch.no_grad()

@@ -86,7 +86,7 @@ class Display:
     """Display settings.
 
     Attributes:
-        layer, part, divide: as in ``ViewRequest``.
+        layer, part, divide, background: as in ``ViewRequest``.
         comparing: show the true image beside the rendering.
         view: index of the compared view. None uses the nearest one.
     """
@@ -96,6 +96,7 @@ class Display:
     comparing: bool = False
     view: int | None = None
     divide: float = 0.5
+    background: tuple[int, int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -321,9 +322,8 @@ class Session:
             view = None
         layer = "colour" if display.layer == "error" and view is None else display.layer
         shown = None if self.opened.renderable.is_static else time
-        return ViewRequest(
-            camera, shown, layer, display.part, view, display.divide if display.comparing else 1.0
-        )
+        divide = display.divide if display.comparing else 1.0
+        return ViewRequest(camera, shown, layer, display.part, view, divide, display.background)
 
     @property
     def _is_moving(self) -> bool:

@@ -82,6 +82,22 @@ def test_a_screenshot_is_what_is_shown() -> None:
     assert np.array_equal(np.asarray(Image.open(io.BytesIO(data))), shown)
 
 
+def test_the_background_is_chosen() -> None:
+    page = page_of()
+    session = page.session
+    for choice, corner in (
+        ("black", 0),
+        ("white", 255),
+        ("of the scene", 255),
+        ("custom", (9, 8, 7)),
+    ):
+        page.set("Custom", (9, 8, 7))
+        page.set("Background", choice)
+        assert (draw(session.opened, session.view_request())[0, 0] == corner).all(), choice
+    page.set("Custom", (1, 2, 3))
+    assert (draw(session.opened, session.view_request())[0, 0] == (1, 2, 3)).all()
+
+
 def test_an_image_is_chosen_by_name(tmp_path: Path) -> None:
     page = page_of(open_run(write_moving_run(tmp_path)))
     assert page.session.view_request().view is None

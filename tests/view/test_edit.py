@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import torch
 from moving_scene import camera, moved_x, row_of_balls, write_moving_run
+from view_sessions import balls
 
 from dyngs.api.edit import Edits, edit_scene
 from dyngs.core.errors import DyngsError
+from dyngs.export.edit.crop import ScreenPolygon, Sphere, screen_positions
 from dyngs.export.edit.frame import Frame
 from dyngs.export.splat_files import write_run_splats
 from dyngs.gaussians import Gaussians
@@ -19,7 +21,7 @@ from dyngs.gaussians.static_scene import StaticScene
 from dyngs.io.formats.formats import read_splats
 from dyngs.runs.opened import OpenedScene, open_run, open_scene, wrap_scene
 from dyngs.view.edit import EditState, can_be_edited, pick_point
-from dyngs.view.layers import ViewRequest
+from dyngs.view.layers import ViewRequest, draw, mark_selection
 
 SHOT = ViewRequest(camera())
 
@@ -99,18 +101,69 @@ def test_deletions_in_the_coordinates_of_the_frame_and_back(tmp_path: Path) -> N
     # x from -0.05 to 1.05 in the scene
     work = editing(open_run(tmp_path / "scaled"), (1.0, 0.0, 0.0), 2.2)
     assert "box: `--crop -0.1,-1.1,-1.1 2.1,1.1,1.1`" in work.description
-    assert work.delete(inside=True) == 3
+    work.select_box()
+    assert work.delete(selected=True) == 3
     assert work.left.scene.gaussians.means[:, 0].tolist() == [-1.0, -0.5]
     assert "2 of 5 Gaussians remaining" in work.description
-    assert work.delete(inside=True) == 0
-    with pytest.raises(DyngsError, match="the box contains no"):
-        work.delete(inside=False)
-    work.steps.pop()
-    assert work.left is work.whole
-    assert work.delete(inside=False) == 2
+    work.select_box()
+    with pytest.raises(DyngsError, match="nothing is selected"):
+        work.delete(selected=False)
+    work.undo()
+    work.undo()
+    assert work.delete(selected=False) == 2
     work.size = np.full(3, 99.0)
-    with pytest.raises(DyngsError, match="the box contains the whole"):
-        work.delete(inside=True)
+    work.select_box()
+    with pytest.raises(DyngsError, match="the whole scene"):
+        work.delete(selected=True)
+
+
+def test_steps_are_undone_and_redone(tmp_path: Path) -> None:
+    work = editing(open_run(write_moving_run(tmp_path, moves=False)))
+
+    def rows() -> tuple[list[int], list[int]]:
+        return work.rows.tolist(), work.state[1].nonzero()[:, 0].tolist()
+
+    work.select_region(Sphere((-1.0, 0.0, 0.0), 0.6), None, removes=False)
+    assert rows() == ([0, 1, 2, 3, 4], [0, 1])
+    work.select_region(Sphere((-1.0, 0.0, 0.0), 0.1), None, removes=True)
+    assert rows() == ([0, 1, 2, 3, 4], [1])
+    work.invert()
+    work.delete(selected=True)
+    assert rows() == ([1], [])
+    for _ in range(9):
+        work.undo()
+    assert work.left is work.whole
+    for _ in range(9):
+        work.redo()
+    assert rows() == ([1], [])
+    work.undo()
+    work.invert()
+    work.redo()  # a new step discards what was undone
+    assert rows() == ([0, 1, 2, 3, 4], [1])
+
+
+def test_a_polygon_on_the_screen_selects_what_is_in_front() -> None:
+    """The camera is 4 before the origin, with a field of view of 2 x 28/20 units there."""
+    one = camera()
+    width = 4 * one.width / float(one.intrinsics[0, 0, 0])
+    points = np.array([[0.0, 0, 0], [width / 4, 0, 0], [-width / 4, 0, 0], [0.0, 0, -8]])
+    places = screen_positions(points, one)
+    np.testing.assert_allclose(places[:3], [[0.5, 0.5], [0.75, 0.5], [0.25, 0.5]], atol=1e-6)
+    triangle = np.array([[0.4, 0.4], [0.9, 0.5], [0.4, 0.6]])
+    assert ScreenPolygon(one, triangle).contains(points).tolist() == [True, True, False, False]
+
+
+def test_visible_selected_gaussians_are_highlighted() -> None:
+    plain = draw(balls(), SHOT)
+    opened = balls()
+    selected = torch.zeros(5, dtype=torch.bool)
+    selected[4] = True
+    mark_selection(opened, selected)
+    changed = np.abs(draw(opened, SHOT).astype(int) - plain).max(2) > 20
+    x = screen_positions(opened.scene.at(None).means.numpy(), camera())[:, 0] * 20
+    columns = np.flatnonzero(changed.any(0))
+    assert len(columns)
+    assert np.abs(columns + 0.5 - x[4]).max() < np.abs(columns + 0.5 - x[3]).min() + 1
 
 
 def test_saved_edits_keep_frame_time_and_header(tmp_path: Path) -> None:
@@ -118,7 +171,8 @@ def test_saved_edits_keep_frame_time_and_header(tmp_path: Path) -> None:
     whole header. Neither original changes."""
     run = write_moving_run(tmp_path)
     work = editing(open_run(run), (1.0, 0.0, 0.0), 0.4)
-    work.delete(inside=True)
+    work.select_box()
+    work.delete(selected=True)
     (tmp_path / "a.ply").write_bytes(work.file(0.75))
     saved = read_splats(tmp_path / "a.ply").gaussians.means
     # the fourth goes through it
@@ -129,7 +183,8 @@ def test_saved_edits_keep_frame_time_and_header(tmp_path: Path) -> None:
     file = write_run_splats(open_run(tmp_path / "up"), tmp_path / "b.ply").path
     work = editing(open_scene(file), (2.0, 0.0, 0.0), 0.4)
     assert work.whole.scaled
-    work.delete(inside=True)
+    work.select_box()
+    work.delete(selected=True)
     (tmp_path / "c.ply").write_bytes(work.file(None))
     back = read_splats(tmp_path / "c.ply")
     assert back.edited == read_splats(file).edited

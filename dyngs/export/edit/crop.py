@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError, format_one_line
 from dyngs.data.times import evenly_spaced
 from dyngs.export.edit.frame import Point, parse_number, parse_point
@@ -40,10 +41,7 @@ class Sphere:
         return np.linalg.norm(points - np.array(self.centre), axis=1) <= self.radius
 
 
-Region = Box | Sphere
-
-
-def parse_region(words: Sequence[str]) -> Region:
+def parse_region(words: Sequence[str]) -> Box | Sphere:
     """Parse ``--crop``: "x,y,z x,y,z" for a box, or "x,y,z RADIUS" for a sphere.
 
     Raises:
@@ -66,6 +64,39 @@ def parse_region(words: Sequence[str]) -> Region:
     if not radius > 0:
         raise DyngsError(f"--crop: the radius must be positive, not {radius:g}")
     return Sphere(first, radius)
+
+
+def screen_positions(points: np.ndarray, camera: Cameras) -> np.ndarray:
+    """Project points (N, 3) to positions (N, 2) in the image, whose corners are (0, 0) and (1, 1).
+
+    Points behind the camera have infinite positions.
+    """
+    pose = camera.cam_from_world[0].double().cpu().numpy()
+    matrix = camera.intrinsics[0].double().cpu().numpy()
+    x, y, depth = matrix @ (pose[:3, :3] @ points.T + pose[:3, 3:])
+    in_front = depth > 0
+    pixels = np.stack([x, y], axis=1) / np.where(in_front, depth, 1)[:, None]
+    return np.where(in_front[:, None], pixels / (camera.width, camera.height), np.inf)
+
+
+@dataclass(frozen=True)
+class ScreenPolygon:
+    """Everything in front of a camera whose image lies in a polygon.
+
+    Attributes:
+        corners: (C, 2), as ``screen_positions``.
+    """
+
+    camera: Cameras
+    corners: np.ndarray
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        from skimage.measure import points_in_poly
+
+        return points_in_poly(screen_positions(points, self.camera), self.corners)
+
+
+Region = Box | Sphere | ScreenPolygon
 
 
 def gaussians_in_region(region: Region, scene: GaussianScene, world: Similarity) -> Tensor:
