@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -329,6 +330,42 @@ def evaluate_run(
 
 evaluate = evaluate_run
 """Its public name, ``dyngs.evaluate``."""
+
+
+def held_out_psnr(
+    run_dir: Path, capture: Capture, seconds: float, split: str = "test"
+) -> tuple[float, int]:
+    """Return the mean PSNR over views of a split in dB, and their number.
+
+    Args:
+        seconds: limit on the time. If too short for all views, as many as fit are rendered, evenly
+            spaced.
+    """
+    begun = time.perf_counter()
+    run = load_run(run_dir)
+    device = select_device(run.config.run.device)
+    views = split_views(capture, split)
+    _, background = evaluation_background(run.config.data.background, capture.has_alpha)
+    scene = scene_of_split(run, capture, split).to(device)
+    drawing = SceneRenderer(scene, scene.options, background.to(device))
+    images = load_split_images(capture, views, run_dir, run)
+    images.device = device
+
+    def score(index: int) -> float:
+        image = images[index]
+        rendered = drawing.image(image.cameras, image.time)
+        return psnr(rendered, image.composite(drawing.background), image.mask)
+
+    score(0)  # includes loading and compilation
+    start = time.perf_counter()
+    score(0)
+    each = time.perf_counter() - start
+    fitting = int((seconds - (start - begun)) / each)
+    scores = [score(i) for i in evenly_spaced(len(views), max(fitting, 1))]
+    known = [value for value in scores if math.isfinite(value)]
+    return (fmean(known) if known else math.nan), len(known)
+
+
 MEAN_METRICS = (
     *POSE_METRICS,
     "flip",
