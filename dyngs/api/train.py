@@ -154,7 +154,7 @@ def train(
         with progress() if progress else nullcontext(ignore_progress) as report:
             plan = run_stages(plan, [find_poses(report), continue_scene])
         if config.run.dir is None:
-            folder, continued = choose_run(folder, plan.resolved)
+            folder, continued = choose_run(folder, plan.resolved, continues=capture is None)
             if continued is not None:
                 resume_from = folder
                 plan = replace(plan, requested=continued, resolved=continued)

@@ -40,7 +40,7 @@ _TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree classic") | {
     "avatar": "",
     "network": "",
     "cameras": "",
-    "html": "time motion from_up folder max_gaussians_drawn",
+    "html": "time motion from_up folder max_gaussians_drawn title view",
     "mesh of a person": "motion",
     "mesh": "time times up from_up level segments cells",
     "bodies": "time up from_up classic",
@@ -130,6 +130,12 @@ def add_parser(commands: args.Commands) -> None:
     args.add_max_gaussians_drawn(
         parser, "--folder: maximum number of Gaussians drawn per image, for example for phones"
     )
+    about = "--format html: title of the page (default: name of the run)"
+    parser.add_argument("--title", metavar="TEXT", help=about)
+    about = (
+        "--format html: view of the capture that the page starts with, by name or index (default 0)"
+    )
+    parser.add_argument("--view", metavar="NAME|N", help=about)
     about = "Gaussians of a person in rest pose, with joints and skinning weights: .ply, .glb"
     parser.add_argument("--joints", action="store_true", help=about)
     about = "rigidly moving bodies as animated nodes of a .glb; all else is static, as at --time"
@@ -225,7 +231,7 @@ def _write(arguments: argparse.Namespace) -> list[Path]:
         "mesh of a person": _export_rigged,
     }
     if kind not in _TAKES:
-        return _export_by_plugin(arguments, kind)
+        return _export_by_plugin(arguments, kind[1:])
     if kind in writers:
         return writers[kind](arguments)
     times = _times(arguments)
@@ -256,7 +262,7 @@ def _kind(arguments: argparse.Namespace) -> str:
     suffix = out.suffix.lower()
     named = _OTHER_SUFFIXES.get(suffix) if found is None else found.name
     if named is None and suffix[1:] in plugin_entries(EXPORTERS):
-        named = suffix[1:]
+        named = suffix
     if stated is None and (named or (_is_sequence(arguments) and not out.suffix)):
         return named or "ply"
     fits = named in (None, stated) and not (
@@ -617,10 +623,12 @@ def _export_page(arguments: argparse.Namespace) -> list[Path]:
     opened = _moved(arguments, _open(arguments))
     opened = opened if arguments.from_up is None else replace(opened, stated_up=arguments.from_up)
     time = arguments.time or 0.0
+    title = arguments.title
+    view = arguments.view
     if arguments.folder:
-        written = write_page_folder(opened, out, most=most, time=time)
+        written = write_page_folder(opened, out, most=most, title=title, time=time, view=view)
     else:
-        written = write_page(opened, out, time=time)
+        written = write_page(opened, out, title=title, time=time, view=view)
     print_notes((*written.notes, where))
     return [written.path]
 
