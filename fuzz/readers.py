@@ -301,11 +301,10 @@ def read_option_values(root: Path) -> object:
     """Parse values of options of the command line."""
     from dyngs.data.times import parse_frames
     from dyngs.export.camera_paths import parse_times
-    from dyngs.study.tradeoff import parse_requirements, parse_variations
+    from dyngs.study.tradeoff import parse_variations
 
     parsers: tuple[Callable[[str], object], ...]
     parsers = (
-        parse_requirements,
         lambda word: parse_variations([word]),
         parse_frames,
         parse_times,
