@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
-from dyngs.cli.output import print_notes, print_written
+from dyngs.cli.output import ProgressBar, print_notes, print_written
 from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_image_difference
 from dyngs.core.errors import DyngsError, format_count, quote_path
 from dyngs.core.plugins import EXPORTERS, load_plugin, plugin_entries
@@ -481,9 +481,9 @@ def _export_dyngs(arguments: argparse.Namespace) -> list[Path]:
             f"{out}: --format dyngs writes a folder with config.yaml and scene.dyngs; "
             f"use --out {out.with_suffix('')}"
         )
-    written = write_scene_file(
-        arguments.run_dir, out, max_change, data_root=args.data_root(arguments)
-    )
+    root = args.data_root(arguments)
+    with ProgressBar() as report:
+        written = write_scene_file(arguments.run_dir, out, max_change, root, report)
     change = written.precision.change
     if change is None:
         warning = (
