@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
-from dyngs.cli.output import print_notes, print_written
+from dyngs.cli.output import ProgressBar, print_notes, print_written
 from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_image_difference
 from dyngs.core.errors import DyngsError, format_count, quote_path
 from dyngs.core.plugins import EXPORTERS, load_plugin, plugin_entries
@@ -30,6 +30,7 @@ _OTHER_SUFFIXES = {
     ".dyngs": "dyngs",
     ".html": "html",
     ".json": "cameras",
+    ".obj": "mesh",
 }
 _SPLATS = "time times motion static dynamic up from_up"
 _TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree classic") | {
@@ -251,9 +252,13 @@ def _kind(arguments: argparse.Namespace) -> str:
 
     Raises DyngsError: an unknown suffix, or a suffix that contradicts --format.
     """
+    from dyngs.export.video import WRITTEN_SUFFIXES
     from dyngs.io.formats.formats import all_suffixes, find_format
 
     out = arguments.out
+    if out is not None and out.suffix.lower() in WRITTEN_SUFFIXES:
+        run = quote_path(arguments.run_dir)
+        raise DyngsError(f"{out}: a video; use `dyngs render {run} --out {quote_path(out)}`")
     stated = arguments.format
     usual = stated or ("glb" if arguments.bodies else "ply")
     if out is None or out.is_dir():
@@ -481,9 +486,9 @@ def _export_dyngs(arguments: argparse.Namespace) -> list[Path]:
             f"{out}: --format dyngs writes a folder with config.yaml and scene.dyngs; "
             f"use --out {out.with_suffix('')}"
         )
-    written = write_scene_file(
-        arguments.run_dir, out, max_change, data_root=args.data_root(arguments)
-    )
+    root = args.data_root(arguments)
+    with ProgressBar() as report:
+        written = write_scene_file(arguments.run_dir, out, max_change, root, report)
     change = written.precision.change
     if change is None:
         warning = (

@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import fmean, median
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.core.metrics import Lpips, LpipsNet, load_lpips, psnr
 from dyngs.data.capture import Capture, View, all_views
@@ -231,6 +232,7 @@ def evaluate_run(
     device: str = "cpu",
     data_root: Path | None = None,
     capture: Capture | None = None,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> EvalReport:
     """Evaluate a run on one split and write the report to its folder.
 
@@ -251,6 +253,7 @@ def evaluate_run(
             else camera poses. Always done for a run that refined its cameras.
         data_root: current folder of the capture, if it was moved.
         capture: capture of the run, in any coordinates. None reads it.
+        on_progress: receives the number of scored views.
     """
     run_dir = run_path(run_dir)
     render_device = select_device(device)
@@ -271,12 +274,18 @@ def evaluate_run(
     loader = load_split_images(capture, views, run_dir, run)
     loader.device = render_device
     regions = Regions(views, loader, drawing.background)
-    images = (loader[i] for i in range(len(loader)))
+
+    def images() -> Iterator[Image]:
+        for index in range(len(loader)):
+            on_progress("views", index, len(loader))
+            yield loader[index]
+        on_progress("views", len(loader), len(loader))
+
     lpips = load_lpips(lpips_net, render_device)
     num_pixels = len(loader) * loader[0].cameras.width * loader[0].cameras.height
     scores, reasons = score_views(
         scene,
-        images,
+        images(),
         drawing.options,
         drawing.background,
         lpips,
