@@ -59,6 +59,11 @@ def report_of(step: int, difference: float = 0.1, message: str | None = None) ->
     return StepReport(step, 0.5, IMAGE, truth + difference, truth, message)
 
 
-def step_done(step: int, total: int, difference: float = 0.1) -> StepDone:
+def step_done(
+    step: int, total: int, difference: float = 0.1, minutes: float | None = None
+) -> StepDone:
     """The event of ``step`` of ``total``."""
-    return StepDone(report_of(step, difference), Loop(Counting(step), total, Stopwatch()))
+    train = CONFIG.train.model_copy(update={"minutes": minutes})
+    trainer = Counting(step, config=CONFIG.model_copy(update={"train": train}))
+    loop = Loop(trainer, total, Stopwatch())
+    return StepDone(report_of(step, difference), loop)

@@ -67,5 +67,5 @@ def test_matrices_of_both_conventions_give_the_same_cameras() -> None:
         assert [one.width for one in found] == [20, 20, 20]
     array = Cameras(wanted.cam_from_world.numpy(), [[[1, 0, 0], [0, 1, 0], [0, 0, 1]]] * 3, 20, 10)
     assert torch.equal(array.intrinsics, wanted.intrinsics)
-    with pytest.raises(DyngsError, match=r"\(V, 4, 4\), got \(3, 4\)"):
+    with pytest.raises(DyngsError, match=r"\(V, 4, 4\) and finite, got \(3, 4\)"):
         Cameras.from_matrices(np.eye(4)[:3], np.eye(3), 20, 10)

@@ -64,9 +64,11 @@ def test_the_template_reads_trains_and_exports(
     assert main(["export", str(run), "--out", str(tmp_path / "points.xyz")]) == 0
     points = np.loadtxt(tmp_path / "points.xyz")
     np.testing.assert_allclose(points[:, :3], dyngs.load(run).at(0).means, rtol=1e-4)
+    dyngs.export(run, tmp_path / "again.xyz")
+    assert (tmp_path / "again.xyz").read_bytes() == (tmp_path / "points.xyz").read_bytes()
     capsys.readouterr()
     assert main(["export", str(run), "--out", str(tmp_path / "b.xyz"), "--sh-degree", "1"]) == 2
-    assert "--sh-degree is not supported with --format xyz" in capsys.readouterr().err
+    assert "--sh-degree is not supported with --format .xyz" in capsys.readouterr().err
     assert not (tmp_path / "b.xyz").exists()
 
 

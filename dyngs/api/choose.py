@@ -24,6 +24,7 @@ from torch import Tensor
 from dyngs.api.first_scene import load_initial_gaussians
 from dyngs.config import BudgetConfig, Config, NetworkColour, PruneConfig, ShColour
 from dyngs.config.io import load_config, packaged_preset
+from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, format_count, log_info
 from dyngs.core.metrics import psnr
 from dyngs.core.section import ModelSection, Section
@@ -129,7 +130,9 @@ class Choice:
         )
 
 
-def resolve_auto_settings(config: Config, capture: Capture) -> tuple[Config, list[Choice], Capture]:
+def resolve_auto_settings(
+    config: Config, capture: Capture, on_progress: ProgressCallback = ignore_progress
+) -> tuple[Config, list[Choice], Capture]:
     """Resolve every setting that is left open by pilot runs.
 
     Returns the resolved config, the results, and the capture with the points that the scene begins
@@ -145,22 +148,22 @@ def resolve_auto_settings(config: Config, capture: Capture) -> tuple[Config, lis
         raise DyngsError(f"{config.data.root}: {problem}")
     model: Any = config.model
     if capability(model, HasMotion) is None or not model.pilot_runs:
-        return _with_settings(config, capture)
+        return _with_settings(config, capture, on_progress)
     moves = _motion_of_fixed_cameras(capture, config)
     if moves is False:
-        return _with_settings(as_static(config), capture)
+        return _with_settings(as_static(config), capture, on_progress)
     moving = _with(config, "model", pilot_runs=False)
     views = capture.splits["train"]
     at_once = len(views) / len({view.time for view in views})
     if moves and at_once >= FILTERED_VIEWS:
         moving = _before_fixed_cameras(moving, at_once)
-    choice = _motion(moving, capture)
+    choice = _motion(moving, capture, on_progress)
     if choice is None:
         log_info(f"model.kind=dynamic {_TOO_SHORT}; model.pilot_runs=false trains a moving scene")
-        return _with_settings(as_static(config), capture)
+        return _with_settings(as_static(config), capture, on_progress)
     log_info(f"  {choice}")
     found = moving if choice.taken else as_static(config)
-    best, choices, capture = _with_settings(found, capture, moving=choice.taken)
+    best, choices, capture = _with_settings(found, capture, on_progress, moving=choice.taken)
     return best, [choice, *choices], capture
 
 
@@ -213,7 +216,7 @@ def _before_fixed_cameras(config: Config, views: float) -> Config:
     return config
 
 
-def _motion(config: Config, capture: Capture) -> Choice | None:
+def _motion(config: Config, capture: Capture, on_progress: ProgressCallback) -> Choice | None:
     """Compare ``config`` with the same model at rest; None where the run is too short, or has too
     few views.
 
@@ -236,7 +239,7 @@ def _motion(config: Config, capture: Capture) -> Choice | None:
         return None
     given = 60 * (config.train.minutes or math.inf)
     begun = time.monotonic()
-    capture = add_initial_points(capture, config, log_messages=False)
+    capture = add_initial_points(capture, config, log_messages=False, on_progress=on_progress)
     log_info(
         f"pilot runs of {format_count(MOTION.steps, 'step')}, compared on held-out training views:"
     )
@@ -246,6 +249,7 @@ def _motion(config: Config, capture: Capture) -> Choice | None:
         capture,
         folds,
         plain_psnr,
+        on_progress,
         errors=ERRORS_OF_MOTION,
         deadline=begun + MOTION.spent * given,
     )
@@ -256,7 +260,7 @@ def _motion(config: Config, capture: Capture) -> Choice | None:
 
 
 def _with_settings(
-    config: Config, capture: Capture, *, moving: bool = False
+    config: Config, capture: Capture, on_progress: ProgressCallback, *, moving: bool = False
 ) -> tuple[Config, list[Choice], Capture]:
     """Resolve ``auto`` settings by pilot runs; return config, results and the prepared capture.
 
@@ -278,7 +282,7 @@ def _with_settings(
                 found.append((f"{section}.{key}=always", section, always, score))
     if moving and config.colour == ShColour() and not config.colour.model_fields_set:
         found.append(("colour.kind=network", "colour", lambda _: NetworkColour(), plain_psnr))
-    capture = add_initial_points(capture, config)
+    capture = add_initial_points(capture, config, on_progress=on_progress)
     views = capture.splits["train"]
     folds = _held_out(views)
     steps, first_side = _affordable(config, views[0], len(found), len(folds))
@@ -293,7 +297,7 @@ def _with_settings(
     for text, section, change, score in found:
         changed = config.model_copy(update={section: change(getattr(config, section))})
         both = [_small(x, SETTINGS, steps, first_side) for x in (config, changed)]
-        choice = _compared(text, both, capture, folds, score)
+        choice = _compared(text, both, capture, folds, score, on_progress)
         if choice is not None:
             log_info(f"  {choice}")
             choices.append(choice)
@@ -307,6 +311,7 @@ def _compared(
     capture: Capture,
     folds: Sequence[frozenset[int]],
     score: Score,
+    on_progress: ProgressCallback,
     *,
     errors: float = ERRORS,
     deadline: float = math.inf,
@@ -315,8 +320,16 @@ def _compared(
     where that takes until ``deadline``."""
     begun = time.monotonic()
     pairs = list[list[float]]()
+    steps = both[0].train.steps - 1
+    done = 0
+
+    def on_step() -> None:
+        nonlocal done
+        done += 1
+        on_progress(f"pilot runs of {text}, steps", done, 2 * len(folds) * steps)
+
     for held_out in folds:
-        one, other = (_trained(config, capture, held_out, deadline) for config in both)
+        one, other = (_trained(config, capture, held_out, deadline, on_step) for config in both)
         if one is None or other is None:
             return None
         pairs += [score((one, other), index) for index in sorted(held_out)]
@@ -336,7 +349,11 @@ def _compared(
 
 
 def _trained(
-    config: Config, capture: Capture, held_out: frozenset[int], deadline: float
+    config: Config,
+    capture: Capture,
+    held_out: frozenset[int],
+    deadline: float,
+    on_step: Callable[[], None],
 ) -> GaussianTrainer | None:
     """Return the trainer of a pilot run; None where that takes until ``deadline``.
 
@@ -353,6 +370,7 @@ def _trained(
                     "stopped before training began: nothing is written, give the command again"
                 )
             trainer.step()
+            on_step()
     trainer.images.stop_prefetching()
     return trainer if trainer.done >= last else None
 

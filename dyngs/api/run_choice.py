@@ -13,22 +13,20 @@ from dyngs.runs.checkpoint import checkpoint_paths, checkpoint_step
 from dyngs.runs.folder import differing_keys, load_requested_config, require_startable
 from dyngs.training.plan import extend_config, with_length
 
-_AUTO = {("camera", "refine"), ("train", "exposure"), ("train", "robust")}
-"""Settings that pilot runs resolve, besides those of ``model.pilot_runs``."""
 
-
-def choose_run(base: Path, config: Config) -> tuple[Path, Config | None]:
+def choose_run(base: Path, config: Config, *, continues: bool = True) -> tuple[Path, Config | None]:
     """Return the run folder for ``config``, and the config of the run in it if that is continued.
 
     It is the first of ``base``, ``base-2``, ... that has no run, or one with the same keys that is
-    not longer. The folder and the reason are logged if it is not a new ``base``.
+    not longer. The folder and the reason are logged if it is not a new ``base``. ``continues`` is
+    false for captures in memory, whose images may differ.
     """
     problem = ""
     for number in count(1):
         folder = base if number == 1 else base.with_name(f"{base.name}-{number}")
         continued = None
         try:
-            if checkpoint_paths(folder):
+            if continues and checkpoint_paths(folder):
                 continued = _continue_run(folder, config)
             else:
                 require_startable(folder, config)
@@ -50,7 +48,8 @@ def _continue_run(folder: Path, config: Config) -> Config:
     stored = load_resolved(folder)
     requested = load_requested_config(folder)
     done = checkpoint_step(checkpoint_paths(folder)[-1])
-    steps, minutes = (config.train.steps, config.train.minutes)
+    steps = config.train.steps
+    minutes = config.train.minutes
     was = requested.train
     different = differing_keys(with_length(requested, steps, minutes), config)
     if different:
@@ -58,19 +57,20 @@ def _continue_run(folder: Path, config: Config) -> Config:
     logging = {key: getattr(config.train, key) for key in LOGGING_KEYS}
     train = stored.train.model_copy(update=logging)
     continued = stored.model_copy(update={"train": train, "run": config.run})
-    is_later = minutes is None or (was.minutes is not None and minutes > was.minutes)
-    if (steps, minutes) == (was.steps, was.minutes) or (is_later and steps == done):
+    if (steps, minutes) == (was.steps, was.minutes):
         return continued
+    is_later = minutes is None or (was.minutes is not None and minutes > was.minutes)
     if not is_later or steps < (was.steps if was.minutes is None else done):
         raise DyngsError(f"{folder} has a run of {format_count(was.steps, 'step')}")
     by_hand = f"(`dyngs train --resume {quote_path(folder)} train.steps={steps}` continues it)"
-    if getattr(config.model, "pilot_runs", False) or any(
-        getattr(getattr(config, section), key) == "auto" for section, key in _AUTO
-    ):
+    settings = (config.camera.refine, config.train.exposure, config.train.robust)
+    if "auto" in settings or getattr(config.model, "pilot_runs", False):
         raise DyngsError(
             f"{folder} has a shorter run, for which its pilot runs were made {by_hand}"
         )
     if was.minutes is not None and stored.data.longest_side != requested.data.longest_side:
         raise DyngsError(f"{folder} has a preview with smaller images {by_hand}")
-    extend_config(stored, done, steps)
+    if steps == done:
+        return continued
+    extend_config(stored, done, steps)  # raises if the run cannot be extended
     return with_length(continued, steps, minutes)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from dyngs.compress.measure import Precision, plan_storage
 from dyngs.config.io import load_resolved
+from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.models.checkpoint import restore_model
 from dyngs.models.renderable import Renderable
 from dyngs.runs.checkpoint import SCENE_FILE, latest_checkpoint
@@ -35,6 +36,7 @@ def write_scene_file(
     out: Path,
     max_change: float | None = None,
     data_root: Path | None = None,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> SceneFile:
     """Write the file into the folder ``out``, with the run's ``config.yaml``: together a run that
     can be drawn.
@@ -49,7 +51,7 @@ def write_scene_file(
     with open_export_folder(out, run_dir, config) as folder:
         checkpoint = latest_checkpoint(run_dir)
         scene = restore_model(checkpoint, config.model)
-        precision, coarseness = plan_storage(config, checkpoint, scene, max_change)
+        precision, coarseness = plan_storage(config, checkpoint, scene, max_change, on_progress)
         data = encode_scene(checkpoint.info, scene, precision.steps, coarseness)
         write_scene(folder / SCENE_FILE, data)
         if out.resolve() != run_dir.resolve():

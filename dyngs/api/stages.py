@@ -130,18 +130,23 @@ def read_same_capture(folder: Path, resumed: Checkpoint) -> Stage:
     return stage
 
 
-def run_pilots(plan: RunPlan) -> tuple[RunPlan, None]:
-    """Read the capture, find initial points, and resolve ``auto`` settings by pilot runs."""
-    config = plan.resolved
-    if capability(config.model, PredictsScenes) is not None:
-        return plan, None
-    capture = require_images(plan.capture or read_capture(config.data))
-    message = describe_shrinking(capture.splits, config.data)
-    if message and "longest_side" not in config.data.model_fields_set:
-        log_info(message)
-    config, choices, capture = resolve_auto_settings(config, capture)
-    config = apply_pixel_cap(config, capture)
-    return replace(plan, resolved=config, capture=capture, choices=tuple(choices)), None
+def run_pilots(report: ProgressCallback) -> Stage:
+    """Return the stage that reads the capture, finds initial points, and resolves ``auto`` settings
+    by pilot runs."""
+
+    def stage(plan: RunPlan) -> tuple[RunPlan, None]:
+        config = plan.resolved
+        if capability(config.model, PredictsScenes) is not None:
+            return plan, None
+        capture = require_images(plan.capture or read_capture(config.data))
+        message = describe_shrinking(capture.splits, config.data)
+        if message and "longest_side" not in config.data.model_fields_set:
+            log_info(message)
+        config, choices, capture = resolve_auto_settings(config, capture, report)
+        config = apply_pixel_cap(config, capture)
+        return replace(plan, resolved=config, capture=capture, choices=tuple(choices)), None
+
+    return stage
 
 
 def find_first_gaussians(plan: RunPlan) -> tuple[RunPlan, str | None]:

@@ -37,7 +37,7 @@ from dyngs.core.errors import DyngsError, format_count, log_info, log_warning, q
 from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader
 from dyngs.data.scene_space import normalise_capture
-from dyngs.evaluate.report import evaluate_run
+from dyngs.evaluate.report import evaluate_run, held_out_psnr
 from dyngs.io.outputs import lock_folder
 from dyngs.io.write import to_uint8
 from dyngs.models.kind import PredictsScenes, capability
@@ -87,10 +87,13 @@ from dyngs.training.new_trainer import build_trainer
 from dyngs.training.plan import RunPlan
 from dyngs.training.prediction import network_trainer
 from dyngs.training.processes import Processes
-from dyngs.training.run_log import RunLog
+from dyngs.training.run_log import RunLog, read_recent_psnr
 from dyngs.training.trainer import Trainer
 
 _COUNT = "budget.count"  # Name of the limit's state in a checkpoint
+# Largest part of the training time, and seconds, that the PSNR of test views may take
+_EVAL_FRACTION = 0.02
+_EVAL_SECONDS = 10.0
 
 
 def train(
@@ -151,7 +154,7 @@ def train(
         with progress() if progress else nullcontext(ignore_progress) as report:
             plan = run_stages(plan, [find_poses(report), continue_scene])
         if config.run.dir is None:
-            folder, continued = choose_run(folder, plan.resolved)
+            folder, continued = choose_run(folder, plan.resolved, continues=capture is None)
             if continued is not None:
                 resume_from = folder
                 plan = replace(plan, requested=continued, resolved=continued)
@@ -181,7 +184,9 @@ def train(
         stopwatch = Stopwatch()
         images = None
         if resumed is None:
-            plan = run_stages(plan, [run_pilots, find_first_gaussians, set_limits])
+            with progress() if progress else nullcontext(ignore_progress) as report:
+                plan = run_stages(plan, [run_pilots(report)])
+            plan = run_stages(plan, [find_first_gaussians, set_limits])
             if plan.limits.seconds is not None:
                 plan, message, images = fit_minutes(plan, stopwatch, _built)
                 if message:
@@ -275,6 +280,7 @@ class _Run:
             stages=[prune_stage] if isinstance(trainer, Trainer) else [],
             limits=editors,
             before_step=self._leader.before_step,
+            recent_psnr=read_recent_psnr(self.folder / LOG_NAME, trainer.done),
         )
         self._saved = trainer.done
         self._save_timer = SaveTimer(config.train.save_minutes, stopwatch.seconds)
@@ -334,10 +340,17 @@ class _Run:
                 evaluates = options.eval_every > 0 and step % options.eval_every == 0
                 is_last = step == options.steps or event.is_last
                 is_due = options.save_every > 0 and step % options.save_every == 0
-                if evaluates or is_last or is_due or self._save_timer.is_due(event.seconds):
+                is_regular = self._save_timer.is_due(event.seconds)
+                if evaluates or is_last or is_due or is_regular:
                     self._save()
-                if evaluates and event.loop.trainer.has_test_views:
+                if not event.loop.trainer.has_test_views:
+                    return
+                if evaluates:
                     self._evaluate(step)
+                elif options.eval_psnr and (
+                    is_last or (is_regular and self._plan.limits.seconds is None)
+                ):
+                    self._measure_psnr(step)
 
     def _save(self) -> None:
         start = self.loop.stopwatch.seconds
@@ -359,9 +372,27 @@ class _Run:
     def _evaluate(self, step: int) -> None:
         start = time.perf_counter()
         report = evaluate_run(self.folder, "test", capture=self._plan.capture)
+        self._emit_scores(step, start, report.psnr, report.ssim, report.num_views)
+
+    def _measure_psnr(self, step: int) -> None:
+        start = time.perf_counter()
+        limit = min(_EVAL_FRACTION * self.loop.stopwatch.seconds, _EVAL_SECONDS)
+        capture = self._plan.capture
+        assert capture is not None
+        try:
+            mean, num_views = held_out_psnr(self.folder, capture, limit)
+        except DyngsError as error:  # the run itself is complete
+            self.loop.emit(Message(f"step {step}: test views were not scored: {error}"))
+            return
+        if num_views:
+            self._emit_scores(step, start, mean, None, num_views)
+
+    def _emit_scores(
+        self, step: int, start: float, mean: float, ssim: float | None, num_views: int
+    ) -> None:
         seconds = time.perf_counter() - start
         self.loop.stopwatch.exclude(seconds)
-        self.loop.emit(Evaluated(step, "test", report.psnr, report.ssim, seconds))
+        self.loop.emit(Evaluated(step, "test", mean, ssim, seconds, num_views))
 
     def _emit_image(self, step: int) -> None:
         """Render the first test view, or training view without test views; emit it and its

@@ -27,6 +27,7 @@ from dyngs.capture.sfm.colmap import (
     quiet_colmap,
 )
 from dyngs.config import DataConfig, PointsInit
+from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.data.capture import Capture, PointCloud, View
 from dyngs.data.geometry import project_points
 from dyngs.data.loader import Image, ImageLoader
@@ -72,16 +73,20 @@ def views_at_one_time(views: Sequence[View], limit: int) -> list[View]:
     return [of_step[i] for i in evenly_spaced(len(of_step), limit)]
 
 
-def triangulate_from_views(views: Sequence[View], options: DataConfig) -> PointCloud | None:
+def triangulate_from_views(
+    views: Sequence[View], options: DataConfig, on_progress: ProgressCallback = ignore_progress
+) -> PointCloud | None:
     """Triangulate points from views of one time step, sorted by coordinates; None for too few.
 
     SIFT features in images of at most ``LONGEST_SIDE`` px are matched between all pairs and
     triangulated with the given poses, in one thread for reproducible results.
     """
-    return _points_of(views, options, None)
+    return _points_of(views, options, None, on_progress)
 
 
-def triangulate_clip(views: Sequence[View], options: DataConfig) -> PointCloud | None:
+def triangulate_clip(
+    views: Sequence[View], options: DataConfig, on_progress: ProgressCallback = ignore_progress
+) -> PointCloud | None:
     """Triangulate static points from one moving camera; None for too few.
 
     As ``triangulate_from_views``, with at most ``CLIP_IMAGES`` images and the pairs of
@@ -90,7 +95,7 @@ def triangulate_clip(views: Sequence[View], options: DataConfig) -> PointCloud |
     """
     in_order = sorted(views, key=lambda view: (view.time or 0.0, view.name))
     chosen = [in_order[i] for i in evenly_spaced(len(in_order), CLIP_IMAGES)]
-    return _points_of(chosen, options, clip_pairs(chosen))
+    return _points_of(chosen, options, clip_pairs(chosen), on_progress)
 
 
 def clip_pairs(views: Sequence[View]) -> list[tuple[int, int]]:
@@ -114,7 +119,10 @@ def clip_pairs(views: Sequence[View]) -> list[tuple[int, int]]:
 
 
 def _points_of(
-    views: Sequence[View], options: DataConfig, pairs: Sequence[tuple[int, int]] | None
+    views: Sequence[View],
+    options: DataConfig,
+    pairs: Sequence[tuple[int, int]] | None,
+    on_progress: ProgressCallback,
 ) -> PointCloud | None:
     if len({view.cam_from_world.tobytes() for view in views}) < MIN_IMAGES:
         return None
@@ -124,13 +132,17 @@ def _points_of(
     images = ImageLoader(views, full_size)
     try:
         with tempfile.TemporaryDirectory(prefix="dyngs_points.") as folder, quiet_colmap():
-            return _triangulated(Path(folder), [images[i] for i in range(len(images))], pairs)
+            shown = [images[i] for i in range(len(images))]
+            return _triangulated(Path(folder), shown, pairs, on_progress)
     except (ColmapError, OSError):
         return None
 
 
 def _triangulated(
-    folder: Path, images: Sequence[Image], pairs: Sequence[tuple[int, int]] | None
+    folder: Path,
+    images: Sequence[Image],
+    pairs: Sequence[tuple[int, int]] | None,
+    on_progress: ProgressCallback,
 ) -> PointCloud | None:
     """Return the points of tracks over enough images, matched between all or the given pairs."""
     import pycolmap
@@ -149,15 +161,21 @@ def _triangulated(
     reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE")
     device = pycolmap.Device.cpu
     mode = pycolmap.CameraMode.PER_IMAGE
-    pycolmap.extract_features(
-        database,
-        files,
-        names,
-        camera_mode=mode,
-        reader_options=reader,
-        extraction_options=extraction,
-        device=device,
-    )
+    stage = "initial points, images"
+    for done, name in enumerate(names):
+        on_progress(stage, done, len(names))
+        pycolmap.extract_features(
+            database,
+            files,
+            [name],
+            camera_mode=mode,
+            reader_options=reader,
+            extraction_options=extraction,
+            device=device,
+        )
+    on_progress(stage, len(names), len(names))
+    stage = "initial points, matching"
+    on_progress(stage, 0, 2)
     if pairs is None:
         matching, verification = matching_options(1)
         pycolmap.match_exhaustive(
@@ -165,8 +183,10 @@ def _triangulated(
         )
     else:
         match_listed(database, names, pairs, 1)
+    on_progress(stage, 1, 2)
     posed = _posed(database, dict(zip(names, images, strict=True)))
     found = pycolmap.triangulate_points(posed, database, files, model, clear_points=True)
+    on_progress(stage, 2, 2)
     side = max(max(image.cameras.width, image.cameras.height) for image in images)
     largest = math.inf if pairs is None else max(MAX_ERROR * side, PRECISION)
     tracks = (point for point in found.points3D.values() if point.track.length() >= MIN_IMAGES)
@@ -207,7 +227,10 @@ AROUND_ORIGIN = ("blender", "body_json")
 
 
 def create_initial_points(
-    capture: Capture, options: DataConfig, init: PointsInit
+    capture: Capture,
+    options: DataConfig,
+    init: PointsInit,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> tuple[Capture, list[str]]:
     """Return the capture with initial points (None for random ones), and messages on their source.
 
@@ -223,7 +246,7 @@ def create_initial_points(
         if capture.points_file is not None:
             count = f"{len(capture.points.xyz):,} points"
             lines.append(f"{capture.points_file.name}: {count} used as initial points")
-        return _with_dense_points(capture, options, init.dense, lines)
+        return _with_dense_points(capture, options, init.dense, lines, on_progress)
     views = capture.splits["train"]
     is_by_custom = capture.format in AROUND_ORIGIN
     half_side = cube_half_side(init.half_extent, views, capture.world_scale)
@@ -252,16 +275,21 @@ def create_initial_points(
         views[0].time is None
         or len({view.cam_from_world.tobytes() for view in moment}) >= MIN_IMAGES
     ):
-        points = triangulate_from_views(moment, options)
+        points = triangulate_from_views(moment, options, on_progress)
     elif not is_in_cube:
-        points = triangulate_clip(views, options)
+        points = triangulate_clip(views, options, on_progress)
         if points is not None:
             lines.append(f"{len(points.xyz):,} initial points triangulated from the whole clip")
-    return _with_dense_points(capture.replace(points=points), options, init.dense, lines)
+    capture = capture.replace(points=points)
+    return _with_dense_points(capture, options, init.dense, lines, on_progress)
 
 
 def _with_dense_points(
-    capture: Capture, options: DataConfig, count: int, lines: list[str]
+    capture: Capture,
+    options: DataConfig,
+    count: int,
+    lines: list[str],
+    on_progress: ProgressCallback,
 ) -> tuple[Capture, list[str]]:
     points = capture.points
     views = capture.splits["train"]
@@ -272,14 +300,16 @@ def _with_dense_points(
         candidates, _ = sample_points_in_frusta(
             views, np.random.default_rng(0).random((_PROBES, 4))
         )
-        points = sweep_dense_points(views, options, candidates, count, fill=True)
+        points = sweep_dense_points(
+            views, options, candidates, count, fill=True, on_progress=on_progress
+        )
         if points is not None:
             lines = [
                 *lines,
                 f"{len(points.xyz):,} initial points from plane-sweep depth maps (init.dense)",
             ]
         return capture.replace(points=points), lines
-    dense = sweep_dense_points(views, options, points.xyz, count)
+    dense = sweep_dense_points(views, options, points.xyz, count, on_progress=on_progress)
     if dense is None:
         return capture, lines
     both = PointCloud(

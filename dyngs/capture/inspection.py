@@ -43,7 +43,7 @@ from dyngs.data.geometry import (
     perpendicular,
     unit,
 )
-from dyngs.data.images.images import read_header, read_image, read_mask
+from dyngs.data.images.images import read_header, read_image, read_mask, try_read_header
 from dyngs.data.images.video import list_videos, open_video_container, read_frames
 from dyngs.data.times import distinct_times, evenly_spaced
 from dyngs.io.containment import check_inside, find_escaping_links
@@ -286,6 +286,27 @@ def inspect_capture(source: Path | DataConfig, deep: bool = False) -> InspectRep
     except DyngsError as error:
         return InspectReport(options.root, None, (), (str(error), *links))
     return replace(report, problems=(*links, *report.problems))
+
+
+def inspect_photos(options: DataConfig) -> InspectReport:
+    """Return a report on a folder of photos without poses."""
+    from dyngs.capture.sfm.photos import list_photos
+
+    root = options.root
+    headers = [
+        header
+        for path in list_photos(root / "images" if (root / "images").is_dir() else root)
+        if (header := try_read_header(path)) is not None
+    ]
+    focals = [header.focal_px for header in headers if header.focal_px is not None]
+    focal = f"{_range(focals)} px, in {len(focals)} photos" if focals else "unknown"
+    facts = {
+        "photos": f"{len(headers)} without poses",
+        "sizes": _tallied("{}x{}".format(*header.upright_size) for header in headers),
+        "focal length": f"{focal} (EXIF)",
+        "next": f"`dyngs train {quote_path(root)}` estimates the poses, then trains",
+    }
+    return InspectReport(root, None, tuple(facts.items()), ())
 
 
 def build_report(capture: Capture, deep: bool = False) -> InspectReport:

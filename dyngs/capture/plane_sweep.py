@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
 from dyngs.config import DataConfig
+from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.data.capture import PointCloud, View
 from dyngs.data.geometry import camera_center, invert_rigid, project_points
 from dyngs.data.loader import ImageLoader
@@ -79,7 +80,13 @@ class _Shot:
 
 
 def sweep_dense_points(
-    views: Sequence[View], options: DataConfig, sparse: np.ndarray, count: int, fill: bool = False
+    views: Sequence[View],
+    options: DataConfig,
+    sparse: np.ndarray,
+    count: int,
+    *,
+    fill: bool = False,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> PointCloud | None:
     """Return at most ``count`` random surface points seen by several views; None if too few are
     found.
@@ -91,15 +98,13 @@ def sweep_dense_points(
     needed = sorted({i for group in groups for i in group})
     loader = ImageLoader([views[i] for i in needed], _small(options))
     shots = {i: _shot(loader, k) for k, i in enumerate(needed)}
-    maps = [
-        (
-            shots[first],
-            _depth_map(
-                shots[first], [shots[i] for i in others], _depth_range(views[first], sparse)
-            ),
-        )
-        for first, *others in groups
-    ]
+    maps: list[tuple[_Shot, np.ndarray]] = []
+    for first, *others in groups:
+        on_progress("depth maps", len(maps), len(groups))
+        shot = shots[first]
+        seen_from = [shots[i] for i in others]
+        maps.append((shot, _depth_map(shot, seen_from, _depth_range(views[first], sparse))))
+    on_progress("depth maps", len(maps), len(groups))
     return _agreed_points(maps, count, MIN_POINTS, fill)
 
 

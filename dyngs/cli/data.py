@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -63,11 +64,11 @@ def _add_inspect(verbs: args.Commands) -> None:
         verbs,
         "inspect",
         run_inspect,
-        "print the contents and problems of a capture or a video",
+        "print the contents and problems of a capture, photos or a video",
         "Print views, sizes, intrinsics, times, points, masks and detected problems. For videos "
         "without poses: size, frame rate, length, sound, sharpness, motion and the next command.",
     )
-    path = "capture (folder or .zip), video, or folder of videos"
+    path = "capture (folder or .zip), video, or folder of photos or videos"
     parser.add_argument("path", type=args.input_path, metavar="PATH", help=path)
     args.add_overrides(parser, "data.key=value", "keys of data, such as data.follow_links=true")
     parser.add_argument(
@@ -82,6 +83,7 @@ def _add_inspect(verbs: args.Commands) -> None:
         help="write an image of cameras and points",
     )
     parser.add_argument("--deep", action="store_true", help="decode all images in full (slow)")
+    args.add_json(parser)
 
 
 def _add_sfm(verbs: args.Commands) -> None:
@@ -211,27 +213,38 @@ def _add_synth(verbs: args.Commands) -> None:
 
 def run_inspect(arguments: argparse.Namespace) -> int:
     """Print a report on a capture or on videos without poses."""
-    from dyngs.capture.inspection import format_report, inspect_capture
-    from dyngs.capture.sfm.unposed import is_videos
+    from dyngs.capture.inspection import format_report, inspect_capture, inspect_photos
+    from dyngs.capture.sfm.unposed import is_unposed, is_videos
     from dyngs.data.read import capture_folder
 
     arguments.path = capture_folder(arguments.path)
     if is_videos(arguments.path):
         return _inspect_videos(arguments)
-    options = args.data_section(arguments.overrides, arguments.format).model_copy(
-        update={"root": arguments.path}
-    )
-    report = inspect_capture(options, arguments.deep)
-    if report.capture is None:
+    # The full size is reported, instead of that in training.
+    options = args.data_section(
+        ["data.longest_side=0", *arguments.overrides], arguments.format
+    ).model_copy(update={"root": arguments.path})
+    is_photos = is_unposed(options)
+    report = inspect_photos(options) if is_photos else inspect_capture(options, arguments.deep)
+    if report.capture is None and not is_photos:
         for problem in report.problems[1:]:
             print_lines(f"also: {problem}")
         raise DyngsError(report.problems[0])
-    print_lines(format_report(report))
-    if arguments.image is not None:
+    if report.capture is None and arguments.image is not None:
+        raise DyngsError(
+            f"{arguments.path}: photos have no poses to draw; run `dyngs data sfm` first"
+        )
+    if arguments.json:
+        found = {"facts": dict(report.facts), "problems": report.problems}
+        print(json.dumps({"path": str(report.root), **found}, indent=2))
+    else:
+        print_lines(format_report(report))
+    if report.capture is not None and arguments.image is not None:
         from dyngs.capture.inspection import draw_cameras
 
         draw_cameras(report.capture, arguments.image)
-        print(f"written: {arguments.image}")
+        if not arguments.json:
+            print(f"written: {arguments.image}")
     return 0
 
 
@@ -242,6 +255,8 @@ def _inspect_videos(arguments: argparse.Namespace) -> int:
         raise DyngsError(
             f"{arguments.path}: videos have no poses to draw; run `dyngs data sfm` first"
         )
+    if arguments.json:
+        raise DyngsError(f"{arguments.path}: --json is not supported for videos; remove it")
     print_lines(video_report(arguments.path))
     return 0
 

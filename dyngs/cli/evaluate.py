@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
-from dyngs.cli.output import numbers_table, print_notes, print_tables
+from dyngs.cli.output import ProgressBar, numbers_table, print_notes, print_tables
 from dyngs.core.errors import DyngsError, format_count, quote_path
 
 if TYPE_CHECKING:
@@ -64,15 +64,17 @@ def run(arguments: argparse.Namespace) -> int:
             "refining the poses of the evaluated images, this takes a while",
             file=sys.stderr,
         )
-    report = evaluate_run(
-        arguments.run_dir,
-        arguments.split,
-        lpips_net=arguments.lpips_net,
-        threads=arguments.threads,
-        refine_poses=arguments.refine,
-        device=args.computing_device(arguments.device).type,
-        data_root=args.data_root(arguments),
-    )
+    with ProgressBar() as progress:
+        report = evaluate_run(
+            arguments.run_dir,
+            arguments.split,
+            lpips_net=arguments.lpips_net,
+            threads=arguments.threads,
+            refine_poses=arguments.refine,
+            device=args.computing_device(arguments.device).type,
+            data_root=args.data_root(arguments),
+            on_progress=progress,
+        )
     if arguments.json:
         print(report.to_json(), end="")
         return 0

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
-from dyngs.cli.output import print_notes, print_written
+from dyngs.cli.output import ProgressBar, print_notes, print_written
 from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_image_difference
 from dyngs.core.errors import DyngsError, format_count, quote_path
 from dyngs.core.plugins import EXPORTERS, load_plugin, plugin_entries
@@ -30,6 +30,7 @@ _OTHER_SUFFIXES = {
     ".dyngs": "dyngs",
     ".html": "html",
     ".json": "cameras",
+    ".obj": "mesh",
 }
 _SPLATS = "time times motion static dynamic up from_up"
 _TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree classic") | {
@@ -40,7 +41,7 @@ _TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree classic") | {
     "avatar": "",
     "network": "",
     "cameras": "",
-    "html": "time motion from_up folder max_gaussians_drawn",
+    "html": "time motion from_up folder max_gaussians_drawn title view",
     "mesh of a person": "motion",
     "mesh": "time times up from_up level segments cells",
     "bodies": "time up from_up classic",
@@ -130,6 +131,12 @@ def add_parser(commands: args.Commands) -> None:
     args.add_max_gaussians_drawn(
         parser, "--folder: maximum number of Gaussians drawn per image, for example for phones"
     )
+    about = "--format html: title of the page (default: name of the run)"
+    parser.add_argument("--title", metavar="TEXT", help=about)
+    about = (
+        "--format html: view of the capture that the page starts with, by name or index (default 0)"
+    )
+    parser.add_argument("--view", metavar="NAME|N", help=about)
     about = "Gaussians of a person in rest pose, with joints and skinning weights: .ply, .glb"
     parser.add_argument("--joints", action="store_true", help=about)
     about = "rigidly moving bodies as animated nodes of a .glb; all else is static, as at --time"
@@ -225,7 +232,7 @@ def _write(arguments: argparse.Namespace) -> list[Path]:
         "mesh of a person": _export_rigged,
     }
     if kind not in _TAKES:
-        return _export_by_plugin(arguments, kind)
+        return _export_by_plugin(arguments, kind[1:])
     if kind in writers:
         return writers[kind](arguments)
     times = _times(arguments)
@@ -245,9 +252,13 @@ def _kind(arguments: argparse.Namespace) -> str:
 
     Raises DyngsError: an unknown suffix, or a suffix that contradicts --format.
     """
+    from dyngs.export.video import WRITTEN_SUFFIXES
     from dyngs.io.formats.formats import all_suffixes, find_format
 
     out = arguments.out
+    if out is not None and out.suffix.lower() in WRITTEN_SUFFIXES:
+        run = quote_path(arguments.run_dir)
+        raise DyngsError(f"{out}: a video; use `dyngs render {run} --out {quote_path(out)}`")
     stated = arguments.format
     usual = stated or ("glb" if arguments.bodies else "ply")
     if out is None or out.is_dir():
@@ -256,7 +267,7 @@ def _kind(arguments: argparse.Namespace) -> str:
     suffix = out.suffix.lower()
     named = _OTHER_SUFFIXES.get(suffix) if found is None else found.name
     if named is None and suffix[1:] in plugin_entries(EXPORTERS):
-        named = suffix[1:]
+        named = suffix
     if stated is None and (named or (_is_sequence(arguments) and not out.suffix)):
         return named or "ply"
     fits = named in (None, stated) and not (
@@ -475,9 +486,9 @@ def _export_dyngs(arguments: argparse.Namespace) -> list[Path]:
             f"{out}: --format dyngs writes a folder with config.yaml and scene.dyngs; "
             f"use --out {out.with_suffix('')}"
         )
-    written = write_scene_file(
-        arguments.run_dir, out, max_change, data_root=args.data_root(arguments)
-    )
+    root = args.data_root(arguments)
+    with ProgressBar() as report:
+        written = write_scene_file(arguments.run_dir, out, max_change, root, report)
     change = written.precision.change
     if change is None:
         warning = (
@@ -617,10 +628,12 @@ def _export_page(arguments: argparse.Namespace) -> list[Path]:
     opened = _moved(arguments, _open(arguments))
     opened = opened if arguments.from_up is None else replace(opened, stated_up=arguments.from_up)
     time = arguments.time or 0.0
+    title = arguments.title
+    view = arguments.view
     if arguments.folder:
-        written = write_page_folder(opened, out, most=most, time=time)
+        written = write_page_folder(opened, out, most=most, title=title, time=time, view=view)
     else:
-        written = write_page(opened, out, time=time)
+        written = write_page(opened, out, title=title, time=time, view=view)
     print_notes((*written.notes, where))
     return [written.path]
 

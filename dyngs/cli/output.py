@@ -6,7 +6,7 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext, redirect_stdout
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -20,6 +20,8 @@ _WIDTH = 100
 """Width of tables without a terminal, columns."""
 SECONDS_BETWEEN_LINES = 10.0
 """Interval of progress lines without a terminal."""
+SECONDS_BEFORE_ESTIMATE = 2.0
+"""Time after which the remaining time of work is estimated."""
 
 
 class _Messages(logging.Handler):
@@ -88,36 +90,77 @@ def numbers_table(title: str, head: Sequence[str], cells: Sequence[Sequence[str]
     return table
 
 
+class Bars:
+    """Progress bars as wide as the terminal, with counts, percentage, remaining time and a line of
+    text below.
+
+    Not shown before the first ``update``, so that work without progress leaves no line.
+    """
+
+    def __init__(self, stream: IO[str]) -> None:
+        self._stream = stream
+        self._tasks: dict[str, Any] = {}
+        self._progress: Any = None
+
+    def update(
+        self, what: str, fraction: float, count: str, left: float | None, text: str = ""
+    ) -> None:
+        """Show ``fraction`` in [0, 1] of ``what``, and the seconds ``left``. None: unknown."""
+        if self._progress is None:
+            self._progress = _rich_bars(self._stream)
+            self._progress.start()
+        shown = "" if left is None else f"{format_duration(left)} left"
+        self._progress.text = text
+        fields: dict[str, Any] = {"completed": fraction, "count": count, "left": shown}
+        if what in self._tasks:
+            self._progress.update(self._tasks[what], **fields)
+        else:
+            self._tasks[what] = self._progress.add_task(what, total=1.0, **fields)
+
+    def log(self, line: str) -> None:
+        """Print ``line`` above the bars."""
+        if self._progress is None:
+            print(line, file=self._stream, flush=True)
+        else:
+            self._progress.console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    def stop(self) -> None:
+        if self._progress is not None:
+            self._progress.stop()
+
+
 class ProgressBar:
-    """Context manager that shows how far work has come, to be called as a ``ReportProgress``.
+    """Context manager that shows how far work has come, to be called as a ``ProgressCallback``.
 
     Shows one bar per kind of work on a terminal, else a line every ``SECONDS_BETWEEN_LINES``.
     """
 
     def __init__(self, stream: IO[str] | None = None) -> None:
         self._stream = sys.stderr if stream is None else stream
-        self._is_terminal = self._stream.isatty() and os.environ.get("TERM") != "dumb"
-        self._bars: Any = None
-        self._tasks: dict[str, Any] = {}
+        self._bars = Bars(self._stream) if is_terminal(self._stream) else None
         self._what = ""
+        self._begun = self._done = 0  # completed steps at ``_since``, and now
         self._since = self._last_line = time.monotonic()
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        if self._is_terminal:
-            if self._bars is None:  # created late, so that work without progress leaves no line
-                self._bars = _rich_bars(self._stream)
-                self._bars.start()
-            if what not in self._tasks:
-                self._tasks[what] = self._bars.add_task(what, total=total)
-            self._bars.update(self._tasks[what], completed=done, total=total)
-            return
         now = time.monotonic()
-        if what != self._what:
-            self._what, self._since = what, now
-        if now - self._last_line >= SECONDS_BETWEEN_LINES and 0 < done < total:
-            left = (now - self._since) / done * (total - done)
+        if what != self._what or done < self._done:
+            self._what = what
+            self._since = now
+            self._begun = done
+        self._done = done
+        seconds = now - self._since
+        left = None
+        if self._begun < done < total and seconds >= SECONDS_BEFORE_ESTIMATE:
+            left = seconds / (done - self._begun) * (total - done)
+        if self._bars is not None:
+            self._bars.update(what, done / max(total, 1), f"{done}/{total}", left)
+        elif now - self._last_line >= SECONDS_BETWEEN_LINES and done < total:
+            estimate = "" if left is None else f", {format_duration(left)} left"
             print(
-                f"{what}: {done} of {total}, about {left:.0f} s left", file=self._stream, flush=True
+                f"{what}: {done}/{total} ({done / total:.0%}){estimate}",
+                file=self._stream,
+                flush=True,
             )
             self._last_line = now
 
@@ -130,21 +173,38 @@ class ProgressBar:
             self._bars.stop()
 
 
+def is_terminal(stream: IO[str]) -> bool:
+    """Return whether ``stream`` can show bars."""
+    return stream.isatty() and os.environ.get("TERM") != "dumb"
+
+
+def format_duration(seconds: float) -> str:
+    """Return "h:mm:ss", or "m:ss" below an hour."""
+    minutes, rest = divmod(int(seconds + 0.5), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
 def _rich_bars(stream: IO[str]) -> Any:
     """Return rich progress bars, not yet shown."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
+    from rich.console import Console, RenderableType
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+    from rich.text import Text
+
+    class ProgressWithText(Progress):
+        text = ""
+
+        def get_renderables(self) -> Iterable[RenderableType]:
+            yield from super().get_renderables()
+            if self.text:
+                yield Text(self.text, overflow="ellipsis", no_wrap=True)
 
     columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=None),
+        TextColumn("{task.fields[count]}"),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[left]}"),
     )
-    return Progress(*columns, console=Console(file=stream), refresh_per_second=4)
+    console = Console(file=stream)
+    return ProgressWithText(*columns, console=console, refresh_per_second=4, expand=True)

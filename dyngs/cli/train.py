@@ -127,15 +127,15 @@ def _print_result(folder: Path, config: Config) -> None:
         print(line)
     word = quote_path(folder)
     print(f"trained: {folder}")
-    from dyngs.models.kind import PredictsScenes, capability
+    from dyngs.models.kind import HasGaussians, PredictsScenes, capability
 
     if capability(config.model, PredictsScenes) is not None:
         print(f"next:    dyngs predict {word} CAPTURE --out RUN")
     else:
-        print(
-            f"next:    dyngs eval {word}\n         dyngs render {word} --out "
-            f"{quote_path(folder / 'images')}"
-        )
+        print(f"next:    dyngs view {word}")
+        if capability(config.model, HasGaussians) is not None:
+            print(f"         dyngs export {word} --format html")
+        print(f"         dyngs eval {word}")
 
 
 def _view(

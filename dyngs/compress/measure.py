@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dyngs.config import Config
 from dyngs.core.camera import Cameras
+from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError
 from dyngs.data.capture import Capture, View
 from dyngs.data.loader import ImageLoader
@@ -97,7 +98,11 @@ def default_precision(gaussians: Gaussians) -> Precision:
 
 
 def measure_precision(
-    exact: Mapping[str, Tensor], wanted: Sequence[Tensor], draw: Draw, max_change: float
+    exact: Mapping[str, Tensor],
+    wanted: Sequence[Tensor],
+    draw: Draw,
+    max_change: float,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> Precision:
     """Return the largest steps found that change the images by at most ``max_change``, grey levels
     of 255.
@@ -122,12 +127,14 @@ def measure_precision(
     steps: dict[str, float] = {}
     enough: dict[str, float] = {}
     for name, group in groups.items():
+        on_progress("measuring precision, parameters", len(steps), len(groups) + 1)
         steps[name], is_enough = _largest_step(
             lambda step, name=name, group=group: change({name: step}, group),
             list(group.values()),
             allowed * sizes[name] / sum(sizes.values()),
         )
         enough[name] = steps[name] if is_enough else 0.0
+    on_progress("measuring precision, parameters", len(groups), len(groups) + 1)
     for tried in (steps, enough):
         kept, found = _scaled(tried, change, allowed)
         if found <= allowed:
@@ -135,6 +142,7 @@ def measure_precision(
     else:
         kept = dict.fromkeys((*groups, *exact), 0.0)
         found = change(kept)
+    on_progress("measuring precision, parameters", len(groups) + 1, len(groups) + 1)
     return Precision(kept, math.sqrt(found) * GREY_LEVELS, max_change)
 
 
@@ -249,7 +257,11 @@ Shot = tuple[Cameras, float | None]
 
 
 def plan_storage(
-    config: Config, checkpoint: Checkpoint, scene: Renderable, max_change: float | None
+    config: Config,
+    checkpoint: Checkpoint,
+    scene: Renderable,
+    max_change: float | None,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> tuple[Precision, Tensor | None]:
     """Return how exactly ``scene`` must be stored, and the coarseness (N,) uint8 of its Gaussians,
     measured where the run's capture can be read.
@@ -295,7 +307,7 @@ def plan_storage(
         max_change = GREY_LEVELS * math.sqrt((10 ** (LOSS_DB / 10) - 1) * fmean(errors))
     exact = tensors_to_store(scene) | ({} if coarseness is None else {COARSENESS: coarseness})
     most = max(max_change, SMALLEST_CHANGE)
-    return measure_precision(exact, wanted, redrawn, most), coarseness
+    return measure_precision(exact, wanted, redrawn, most, on_progress), coarseness
 
 
 def find_coarsest_file(

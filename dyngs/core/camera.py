@@ -86,13 +86,13 @@ class Cameras:
                 y up, z backward; also of Blender, NeRF and nerfstudio).
 
         Raises:
-            DyngsError: other shapes.
+            DyngsError: other shapes, NaN or infinity.
         """
         if convention not in ("opencv", "opengl"):
             raise DyngsError(f"convention={convention!r}: must be 'opencv' or 'opengl'")
         poses = _as_tensor(world_from_cam).detach().double().cpu().numpy()
-        if poses.shape[1:] != (4, 4):
-            raise DyngsError(f"world_from_cam must be (V, 4, 4), got {poses.shape}")
+        if poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
+            raise DyngsError(f"world_from_cam must be (V, 4, 4) and finite, got {poses.shape}")
         if convention == "opengl":
             poses = poses * [1.0, -1.0, -1.0, 1.0]
         matrices = _as_tensor(intrinsics).expand(len(poses), 3, 3)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import fmean, median
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.core.metrics import Lpips, LpipsNet, load_lpips, psnr
 from dyngs.data.capture import Capture, View, all_views
@@ -230,6 +232,7 @@ def evaluate_run(
     device: str = "cpu",
     data_root: Path | None = None,
     capture: Capture | None = None,
+    on_progress: ProgressCallback = ignore_progress,
 ) -> EvalReport:
     """Evaluate a run on one split and write the report to its folder.
 
@@ -250,6 +253,7 @@ def evaluate_run(
             else camera poses. Always done for a run that refined its cameras.
         data_root: current folder of the capture, if it was moved.
         capture: capture of the run, in any coordinates. None reads it.
+        on_progress: receives the number of scored views.
     """
     run_dir = run_path(run_dir)
     render_device = select_device(device)
@@ -270,12 +274,18 @@ def evaluate_run(
     loader = load_split_images(capture, views, run_dir, run)
     loader.device = render_device
     regions = Regions(views, loader, drawing.background)
-    images = (loader[i] for i in range(len(loader)))
+
+    def images() -> Iterator[Image]:
+        for index in range(len(loader)):
+            on_progress("views", index, len(loader))
+            yield loader[index]
+        on_progress("views", len(loader), len(loader))
+
     lpips = load_lpips(lpips_net, render_device)
     num_pixels = len(loader) * loader[0].cameras.width * loader[0].cameras.height
     scores, reasons = score_views(
         scene,
-        images,
+        images(),
         drawing.options,
         drawing.background,
         lpips,
@@ -329,6 +339,42 @@ def evaluate_run(
 
 evaluate = evaluate_run
 """Its public name, ``dyngs.evaluate``."""
+
+
+def held_out_psnr(
+    run_dir: Path, capture: Capture, seconds: float, split: str = "test"
+) -> tuple[float, int]:
+    """Return the mean PSNR over views of a split in dB, and their number.
+
+    Args:
+        seconds: limit on the time. If too short for all views, as many as fit are rendered, evenly
+            spaced.
+    """
+    begun = time.perf_counter()
+    run = load_run(run_dir)
+    device = select_device(run.config.run.device)
+    views = split_views(capture, split)
+    _, background = evaluation_background(run.config.data.background, capture.has_alpha)
+    scene = scene_of_split(run, capture, split).to(device)
+    drawing = SceneRenderer(scene, scene.options, background.to(device))
+    images = load_split_images(capture, views, run_dir, run)
+    images.device = device
+
+    def score(index: int) -> float:
+        image = images[index]
+        rendered = drawing.image(image.cameras, image.time)
+        return psnr(rendered, image.composite(drawing.background), image.mask)
+
+    score(0)  # includes loading and compilation
+    start = time.perf_counter()
+    score(0)
+    each = time.perf_counter() - start
+    fitting = int((seconds - (start - begun)) / each)
+    scores = [score(i) for i in evenly_spaced(len(views), max(fitting, 1))]
+    known = [value for value in scores if math.isfinite(value)]
+    return (fmean(known) if known else math.nan), len(known)
+
+
 MEAN_METRICS = (
     *POSE_METRICS,
     "flip",

@@ -18,6 +18,7 @@ from dyngs.training.events import (
     Listener,
     Message,
     Paused,
+    RecentMean,
     Started,
     StepDone,
     StepReport,
@@ -80,6 +81,7 @@ class Loop:
         stages: editors called before each step.
         limits: editors called after each step, before its ``StepDone`` event.
         before_step: called with the trainer before each step.
+        recent_psnr: mean PSNR of the last steps before the run was resumed.
     """
 
     def __init__(
@@ -92,6 +94,7 @@ class Loop:
         stages: Sequence[Editor] = (),
         limits: Sequence[Editor] = (),
         before_step: Callable[[Trainable], None] = lambda _: None,
+        recent_psnr: RecentMean | None = None,
     ) -> None:
         self.trainer = trainer
         self.total = total
@@ -100,6 +103,7 @@ class Loop:
         self._stages = stages
         self._limits = limits
         self._before_step = before_step
+        self.recent_psnr = recent_psnr or RecentMean()
         self._listeners: list[Listener] = []
         self._is_stopped: Callable[[], bool] = lambda: False
 
@@ -117,6 +121,7 @@ class Loop:
         while self.trainer.done < self.total and not is_stopped():
             self._edit(self._stages)
             report = self._step()
+            self.recent_psnr.add(report.sampled_psnr)
             for line in (report.message or "").splitlines():
                 self.emit(Message(f"step {report.step}: {line}"))
             self._edit(self._limits)

@@ -10,7 +10,8 @@ import torch
 from dyngs.capture.initial_points import create_initial_points
 from dyngs.capture.inspection import check_before_training
 from dyngs.config import Config, PointsInit, RandomInit
-from dyngs.core.errors import log_warning
+from dyngs.core.conventions import ProgressCallback, ignore_progress
+from dyngs.core.errors import log_info, log_warning
 from dyngs.data.capture import Capture
 from dyngs.data.loader import ImageLoader, default_decoding_threads
 from dyngs.data.read import read_capture, require_images
@@ -150,24 +151,34 @@ def prepare_capture(config: Config) -> Capture:
     return add_initial_points(require_images(read_capture(config.data)), config)
 
 
-def add_initial_points(capture: Capture, config: Config, *, log_messages: bool = True) -> Capture:
+def add_initial_points(
+    capture: Capture,
+    config: Config,
+    *,
+    log_messages: bool = True,
+    on_progress: ProgressCallback = ignore_progress,
+) -> Capture:
     """Return ``capture`` with initial points, if the model kind needs them."""
     messages: list[str] = []
+    warnings: list[str] = []
     if "init" in find_kind(config.model).uses:
         init = config.init
         if isinstance(init, PointsInit):
-            capture, messages = create_initial_points(capture, config.data, init)
+            capture, messages = create_initial_points(capture, config.data, init, on_progress)
         elif isinstance(init, RandomInit):
             views = capture.splits["train"]
             why = cube_mismatch_reason(
                 views, cube_half_side(init.half_extent, views, capture.world_scale)
             )
             if why is not None:
-                messages.append(
+                warnings.append(
                     f"init.kind=random: points are drawn around the origin, but {why}; use auto"
                 )
-    for message in [*messages, *check_before_training(capture)] if log_messages else []:
-        log_warning(message)
+    if log_messages:
+        for message in messages:
+            log_info(message)
+        for warning in [*warnings, *check_before_training(capture)]:
+            log_warning(warning)
     return capture
 
 

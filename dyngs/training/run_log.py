@@ -11,7 +11,7 @@ from typing import IO, Any
 
 from dyngs.io.fields import read_limited
 from dyngs.io.write import write_image, write_text
-from dyngs.training.events import Evaluated, Event, ProgressImage, StepDone
+from dyngs.training.events import Evaluated, Event, ProgressImage, RecentMean, StepDone
 from dyngs.training.loggers import Logger
 
 MAX_LOG_BYTES = 1 << 28  # a line has about 150 bytes
@@ -23,6 +23,7 @@ class LogRecord:
 
     Attributes:
         loss, psnr: of this step and its image, in dB. None if the mask excludes all pixels.
+        mean_psnr: mean over the images of the last steps, in dB.
         num_gaussians: after the step.
         num_moving: Gaussians that depend on time, after the step.
         bad_gradients: parameter rows skipped so far because their gradient was not finite.
@@ -32,6 +33,7 @@ class LogRecord:
     step: int
     loss: float
     psnr: float | None
+    mean_psnr: float | None
     num_gaussians: int
     num_moving: int
     bad_gradients: int
@@ -61,9 +63,10 @@ class RunLog:
         match event:
             case StepDone() if event.step % self._every == 0 or event.is_last:
                 self._append("train", asdict(log_record(event)))
-            case Evaluated(step, split, psnr, ssim):
-                scores = {"step": step, "split": split, "psnr": psnr, "ssim": ssim}
-                self._append(split, scores)
+            case Evaluated():
+                scores = asdict(event)
+                del scores["seconds"]
+                self._append(event.split, scores)
             case ProgressImage(step, split, pixels):
                 write_image(self.path.parent / "progress" / f"step_{step:07d}.png", pixels)
                 for logger in self._loggers:
@@ -93,11 +96,21 @@ def log_record(event: StepDone) -> LogRecord:
         step=event.step,
         loss=event.report.loss,
         psnr=quality if math.isfinite(quality) else None,
+        mean_psnr=event.mean_psnr,
         num_gaussians=event.num_gaussians,
         num_moving=event.num_moving,
         bad_gradients=event.bad_gradients,
         seconds=round(event.seconds, 3),
     )
+
+
+def read_recent_psnr(path: Path, step: int) -> RecentMean:
+    """Return the mean PSNR that a log holds for ``step`` or the last step before it."""
+    for line in reversed(_lines_up_to(path, step)):
+        mean = json.loads(line).get("mean_psnr")
+        if isinstance(mean, float):
+            return RecentMean(mean, step)
+    return RecentMean()
 
 
 def _lines_up_to(path: Path, step: int) -> list[str]:

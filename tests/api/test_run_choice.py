@@ -75,6 +75,7 @@ def test_other_runs_get_new_folders(capture: Path, tmp_path: Path) -> None:
     config = config_of(capture, "train.steps=7")
     write_run(BASE, config, 7)
     assert choose_run(BASE, config)[0] == BASE
+    assert choose_run(BASE, config, continues=False)[0] != BASE, "a capture in memory"
     second = Path("runs/plush-static-2")
     for other in (
         config_of(capture, "train.steps=7", "model.sh_degree=1"),
@@ -96,6 +97,7 @@ def test_previews_are_continued(capture: Path) -> None:
     continued = choose_run(BASE, config_of(capture, "train.minutes=2"))[1]
     assert continued is not None
     assert continued.train.minutes == 2
+    assert choose_run(BASE, config_of(capture, "train.steps=300"))[0] == BASE, "finished"
     assert choose_run(BASE, config_of(capture, "train.minutes=0.5"))[0] != BASE
     assert choose_run(BASE, config_of(capture, "train.steps=200"))[0] != BASE
 

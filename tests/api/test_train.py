@@ -31,12 +31,13 @@ from dyngs.config.io import (
 from dyngs.core.errors import DyngsError
 from dyngs.data.synthetic.captures import StaticOptions, write_static_capture
 from dyngs.deform.scene import DynamicScene
+from dyngs.evaluate.report import evaluate_run
 from dyngs.models.checkpoint import Checkpoint
 from dyngs.models.static_section import StaticModel
 from dyngs.runs.checkpoint import checkpoint_paths, load_run
 from dyngs.training import losses
 from dyngs.training.clock import SaveTimer
-from dyngs.training.events import Event, StepDone
+from dyngs.training.events import Evaluated, Event, StepDone
 from dyngs.training.trainer import StepReport, Trainer
 
 # Everything happens within a few steps: changes each third step, a reset at step 5, new SH degrees.
@@ -86,7 +87,9 @@ def _final_bytes(run_dir: Path) -> bytes:
 
 
 def _log(run_dir: Path) -> list[dict[str, float]]:
-    return [json.loads(line) for line in (run_dir / "log.jsonl").read_text().splitlines()]
+    """The lines of training steps."""
+    records = [json.loads(line) for line in (run_dir / "log.jsonl").read_text().splitlines()]
+    return [record for record in records if "loss" in record]
 
 
 def _stopped_and_resumed(config: Config, stop_at: int, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -289,11 +292,23 @@ def test_checkpoints_and_scores_come_when_asked(capture: Path, tmp_path: Path) -
     options = TrainConfig(steps=9, save_every=3, eval_every=6, log_every=100)
     folder = train(_config(capture, tmp_path / "run", train=options))
     assert [path.stem for path in checkpoint_paths(folder)] == ["step_0000006", "step_0000009"]
-    assert [(record["step"], "split" in record) for record in _log(folder)] == [
-        (6, True),
-        (9, False),
-    ]
+    lines = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    assert [(line["step"], "ssim" in line) for line in lines] == [(6, True), (9, False), (9, True)]
     assert json.loads((folder / "metrics.json").read_text())["num_views"] == 1
+
+
+def test_held_out_psnr_leaves_the_result_as_it_is(capture: Path, tmp_path: Path) -> None:
+    events = list[Event]()
+    folders = []
+    for scored in (True, False):
+        options = TrainConfig(steps=9, eval_psnr=scored)
+        config = _config(capture, tmp_path / str(scored), train=options)
+        folders.append(train(config, listeners=[events.append]))
+    (scores,) = (event for event in events if isinstance(event, Evaluated))
+    assert (scores.step, scores.num_views, scores.ssim) == (9, 1, None)
+    assert scores.psnr == pytest.approx(evaluate_run(folders[0]).psnr, abs=1e-6)
+    first, second = (checkpoint_paths(folder)[-1].read_bytes() for folder in folders)
+    assert first == second
 
 
 @pytest.fixture

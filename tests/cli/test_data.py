@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from refused import error_line
-from tiny_captures import write_colmap
+from tiny_captures import write_colmap, write_image
 
 from dyngs.cli import main
 from dyngs.config import DataConfig
@@ -325,3 +325,13 @@ def test_a_body_file_that_cannot_be_fitted_is_refused_in_one_line(
                 "damaged.npz",
                 "wrong.obj",
             ]
+
+
+def test_photos_without_poses_are_inspected(tmp_path: Path, capsys: PrintedOutput) -> None:
+    for i in range(3):
+        write_image(tmp_path / f"{i}.png", np.zeros((6, 8, 3), np.uint8))
+    assert main(["data", "inspect", str(tmp_path), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["facts"]["photos"] == "3 without poses"
+    assert found["facts"]["sizes"] == "8x6"
+    assert f"dyngs train {tmp_path}" in found["facts"]["next"]

@@ -26,6 +26,7 @@ def test_a_terminal_shows_a_bar_for_each_kind_of_work(monkeypatch: pytest.Monkey
     assert "features" in shown
     assert "3/3" in shown
     assert "2/8" in shown
+    assert "25%" in shown
 
 
 def test_no_work_leaves_no_line_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -52,4 +53,4 @@ def test_long_work_prints_lines_with_the_time_left(monkeypatch: pytest.MonkeyPat
         for i in range(5):
             report("frames", i + 1, 5)
     lines = stream.getvalue().splitlines()
-    assert lines == ["frames: 2 of 5, about 9 s left", "frames: 4 of 5, about 4 s left"]
+    assert lines == ["frames: 2/5 (40%), 0:18 left", "frames: 4/5 (80%), 0:06 left"]

@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,10 +33,12 @@ from small_triangles import bent
 from small_triangles import camera as before_triangles
 
 from dyngs.baselines.triangles.scene import TriangleOptions, TriangleScene
+from dyngs.cli import main
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import RasterizeMode
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import psnr, ssim
+from dyngs.export.choose_path import select_view
 from dyngs.export.html import scene_data
 from dyngs.export.html.page import (
     ELEMENT,
@@ -236,6 +239,57 @@ def test_a_page_begins_at_a_camera_of_the_capture(moving_run: OpenedScene, tmp_p
     assert "<title>run</title>" in text
     written = write_page(replace(moving_run, stated_up="-y"), tmp_path / "a.html")
     assert written.header["up"] == [0.0, -1.0, 0.0]
+
+
+def test_title_and_first_view_are_chosen(moving_run: OpenedScene, tmp_path: Path) -> None:
+    run = moving_run.path
+    path = tmp_path / "a.html"
+    assert main(["export", str(run), "--out", str(path), "--view", "2", "--title", "A <b>"]) == 0
+    text = path.read_text(encoding="utf-8")
+    assert "<title>A &lt;b&gt;</title>" in text
+    wanted = select_view(moving_run.capture, "2").cam_from_world
+    header = write_page(moving_run, path, view="2").header
+    found = np.array(header["views"][0]["camFromWorld"]).reshape(4, 4)
+    np.testing.assert_allclose(found, wanted, atol=1e-5)
+    assert main(["export", str(run), "--out", str(path), "--view", "none"]) == 2
+
+
+@needs_browser
+def test_fingers_and_the_button_move_the_camera(browser: Browser, tmp_path: Path) -> None:
+    write_page(wrap_scene(still_scene()), tmp_path / "a.html")
+    page = browser.open((tmp_path / "a.html").as_uri(), 320, 240, touch=True)
+    page.wait_for("window.dyngs?.renderer")
+    screen = page.driven.context.new_cdp_session(page.driven)
+
+    def swipe(*fingers: tuple[int, int, int, int]) -> None:
+        before = [{"x": a, "y": b, "id": i} for i, (a, b, _, _) in enumerate(fingers)]
+        after = [{"x": c, "y": d, "id": i} for i, (_, _, c, d) in enumerate(fingers)]
+        for kind, points in (("Start", before), ("Move", after), ("End", [])):
+            screen.send("Input.dispatchTouchEvent", {"type": f"touch{kind}", "touchPoints": points})
+
+    def camera() -> dict[str, Any]:
+        names = "({ yaw, target, distance, index }) => ({ yaw, target, distance, index })"
+        return page.evaluate(f"({names})(dyngs.camera)")
+
+    start = camera()
+    swipe((100, 120, 160, 120))
+    turned = camera()
+    assert turned["yaw"] != start["yaw"]
+    assert (turned["target"], turned["distance"]) == (start["target"], start["distance"])
+    swipe((100, 120, 120, 150), (200, 120, 220, 150))
+    moved = camera()
+    assert moved["target"] != turned["target"]
+    assert moved["distance"] == pytest.approx(turned["distance"], rel=0.2)
+    swipe((140, 120, 100, 120), (180, 120, 220, 120))
+    assert camera()["distance"] == pytest.approx(moved["distance"] / 3)
+    page.driven.tap("#next")
+    assert camera()["index"] == 1
+    page.driven.tap("#help")
+    keys = page.driven.inner_text("#keys")
+    assert "next, previous camera" in keys
+    assert "play" not in keys  # nothing moves
+    assert page.errors == []
+    page.close()
 
 
 @pytest.mark.parametrize("factor", [1e-7, *FACTORS])

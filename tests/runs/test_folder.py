@@ -132,7 +132,7 @@ def test_a_run_stopped_before_its_first_checkpoint_is_taken_up(
         train(config_of(still, out), resume_from=out if resumes else None)
         assert checkpoint_paths(out)[-1].read_bytes() == end
         assert (out / "config.yaml").read_bytes() == (run_dir / "config.yaml").read_bytes()
-        assert (out / "log.jsonl").read_text().count("\n") == 4
+        assert (out / "log.jsonl").read_text().count("\n") == 5  # four steps, and the test views
 
 
 def test_a_finished_run_is_not_begun_again(still: Path, run_dir: Path) -> None:

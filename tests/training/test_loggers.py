@@ -72,10 +72,9 @@ def options(capture: Path, run: Path, *more: str) -> list[str]:
 
 def train(capture: Path, run: Path, *more: str, listeners: tuple[Any, ...] = ()) -> bytes:
     """Return the bytes of the last checkpoint."""
-    found = dyngs.train(
-        load_config("static", options(capture, run, *more)), listeners=list(listeners)
-    )
-    return sorted(found.glob("checkpoints/*"))[-1].read_bytes()
+    config = load_config("static", options(capture, run, *more))
+    dyngs.train(config, listeners=list(listeners))
+    return sorted(run.glob("checkpoints/*"))[-1].read_bytes()
 
 
 @pytest.mark.usefixtures("programs")

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
-from steps import step_done
+import pytest
+from steps import Counting, step_done
 
-from dyngs.training.events import Evaluated, Message
-from dyngs.training.run_log import RunLog
+from dyngs.training.clock import Stopwatch
+from dyngs.training.events import Evaluated, Message, RecentMean
+from dyngs.training.loop import Loop
+from dyngs.training.run_log import RunLog, read_recent_psnr
 
 
 def _steps(path: Path) -> list[int]:
@@ -37,10 +41,35 @@ def test_it_listens_to_steps_and_scores(tmp_path: Path) -> None:
         for step in range(1, 13):
             log(step_done(step, 12))
             log(Message("nothing for the log"))
-        log(Evaluated(12, "test", 21.0, 0.9, 3.0))
+        log(Evaluated(12, "test", 21.0, 0.9, 3.0, 4))
     lines = [json.loads(line) for line in log.path.read_text().splitlines()]
     assert [line["step"] for line in lines] == [5, 10, 12, 12]
     assert {"loss", "psnr", "num_gaussians", "num_moving", "bad_gradients", "seconds"} < set(
         lines[0]
     )
-    assert lines[-1] == {"step": 12, "split": "test", "psnr": 21.0, "ssim": 0.9}
+    scores = {"step": 12, "split": "test", "psnr": 21.0, "ssim": 0.9, "num_views": 4}
+    assert lines[-1] == scores
+
+
+def test_the_recent_mean_is_unbiased_and_continues_after_a_resume(tmp_path: Path) -> None:
+    constant = RecentMean()
+    assert constant.value is None
+    for _ in range(3):
+        constant.add(28.0)
+        constant.add(math.nan)  # a view without visible pixels
+    assert constant.value == 28.0
+    ramp = RecentMean()
+    for value in range(200):
+        ramp.add(float(value))
+    assert ramp.value == 174.5  # mean of 150 to 199
+
+    trainer = Counting()
+    with RunLog(tmp_path / "log.jsonl", 0) as log:
+        loop = Loop(trainer, 4, Stopwatch())
+        loop.subscribe(log)
+        loop.run()
+    resumed = read_recent_psnr(log.path, 4)
+    assert resumed.value == pytest.approx(20.0)  # images are off by 0.1
+    resumed.add(30.0)
+    assert resumed.value == pytest.approx(22.0)
+    assert read_recent_psnr(tmp_path / "none.jsonl", 4).value is None

@@ -82,7 +82,7 @@ def _measured(trainer: Trainer[Any], seconds: float) -> TimeForecast:
 
 
 def _decoding_seconds(images: ImageLoader) -> float:
-    """Return the time spent on decoding so far; 0 if images are decoded again in each epoch."""
+    """Return the seconds of decoding until now, or 0 if the cache is too small for all images."""
     return images.waited_seconds if images.is_cacheable else 0.0
 
 

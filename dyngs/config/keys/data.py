@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 from pydantic import (
     Field,
@@ -120,11 +120,12 @@ class DataConfig(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _keep_requested_downscale(cls, given: Any) -> Any:
+    def _keep_requested_downscale(cls, given: object) -> object:
         """Remove the default limit on the image size if ``downscale`` determines the size."""
-        if isinstance(given, dict) and "downscale" in given:
-            return {"longest_side": None, **given}
-        return given
+        if not isinstance(given, dict):
+            return given
+        values = cast("dict[str, Any]", given)
+        return {"longest_side": None, **values} if "downscale" in values else values
 
     @field_validator("longest_side")
     @classmethod

@@ -8,7 +8,15 @@ from pydantic import BeforeValidator, Field, field_validator
 
 from dyngs.core.section import Fraction, Section, parse_digits
 
-LOGGING_KEYS = ("save_minutes", "save_every", "eval_every", "log_every", "image_every", "loggers")
+LOGGING_KEYS = (
+    "save_minutes",
+    "save_every",
+    "eval_every",
+    "eval_psnr",
+    "log_every",
+    "image_every",
+    "loggers",
+)
 """Keys of ``TrainConfig`` that do not change the result of a run."""
 
 
@@ -92,6 +100,11 @@ class TrainConfig(Section):
     )
     eval_every: int = Field(
         default=0, ge=0, description="steps between evaluations on the test split; 0: none"
+    )
+    eval_psnr: bool = Field(
+        default=True,
+        description="whether to measure the PSNR of test views at the end of training and, unless "
+        "train.minutes is set, every train.save_minutes; takes at most 2 % of the training time",
     )
     image_every: int = Field(
         default=0,

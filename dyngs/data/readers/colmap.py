@@ -15,7 +15,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
-from dyngs.core.errors import DyngsError, wrap_read_errors
+from dyngs.core.errors import DyngsError, format_count, wrap_read_errors
 from dyngs.data.capture import Capture, CaptureFormat, Lens, PointCloud, Splits, View
 from dyngs.data.geometry import (
     ROTATION_TOLERANCE,
@@ -40,6 +40,9 @@ NUM_PARAMS = {
 }  # fmt: skip
 """Number of parameters of each camera model, in the order of COLMAP's model ids."""
 Entry = TypeVar("Entry")
+# A 2D point in images.bin, with the id of its 3D point, -1 without one
+_POINT_2D = np.dtype([("position", "<f8", 2), ("id", "<i8")])
+_USUALLY_OBSERVED = 5  # points per image in a model that stores observations
 # A line of 2D points: x, y and the id of a 3D point, repeated. A line of a pose ends in a name.
 _POINTS_2D = re.compile(r"(?:[-+.\deEnaif]+\s+[-+.\deEnaif]+\s+-?\d+(?:\s+|$))+")
 
@@ -55,12 +58,13 @@ class ModelCamera:
 
 @dataclass(frozen=True)
 class ModelImage:
-    """A registered image: name as written, camera id, and ``cam_from_world`` as wxyz and
-    translation."""
+    """A registered image: name as written, camera id, ``cam_from_world`` as wxyz and translation,
+    and the number of points that it observes, None if unknown."""
 
     name: str
     camera: int
     pose: tuple[float, ...]
+    num_observed: int | None = None
 
 
 def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], PointCloud]:
@@ -190,9 +194,10 @@ def _next_image(file: _Binary) -> ModelImage:
     end = file.data.index(b"\0", file.at)
     name = file.data[file.at : end].decode()
     file.at = end + 1
-    (num_seen,) = file.unpack("<Q")
-    file.at += 24 * num_seen
-    return ModelImage(name, camera, tuple(pose))
+    (count,) = file.unpack("<Q")
+    ids = np.frombuffer(file.data, _POINT_2D, count, file.at)["id"]
+    file.at += 24 * count
+    return ModelImage(name, camera, tuple(pose), int((ids >= 0).sum()))
 
 
 def _next_point(file: _Binary) -> array[float]:
@@ -312,13 +317,26 @@ def read_colmap(root: Path) -> Capture:
     warnings += [
         *repair_warning(repaired),
         *rescale_warning(rescaled),
-        *missing_mask_warning(views, bool(masks)),
+        *_unobserving_warning(listed),
     ]
     splits, notes = _splits(folder, [image.name for image in listed], views)
+    warnings += missing_mask_warning(splits["train"], bool(masks))
     cloud = points if len(points.xyz) else None
     return Capture(
         root, "colmap", splits, cloud, times_in_seconds=bool(seconds), warnings=(*warnings, *notes)
     )
+
+
+def _unobserving_warning(images: list[ModelImage]) -> list[str]:
+    """Return a warning on images that observe no points, if most images observe some."""
+    known = [image.num_observed for image in images if image.num_observed is not None]
+    without = [image.name for image in images if image.num_observed == 0]
+    if not without or np.median(known) < _USUALLY_OBSERVED:
+        return []
+    return [
+        f"{format_count(len(without), 'image')} of the model, first {without[0]}, observe no "
+        "points: their poses are probably wrong; remove them"
+    ]
 
 
 def _images_of(root: Path, model: Path) -> Path:

@@ -444,8 +444,8 @@ def find_mask(image_name: str, masks: Mapping[str, Path]) -> Path | None:
     return next((masks[key] for name in names if (key := normalize_name(name)) in masks), None)
 
 
-def missing_mask_warning(views: list[View], has_masks: bool) -> list[str]:
-    """Return a warning on images without a mask, if other images have one."""
+def missing_mask_warning(views: Sequence[View], has_masks: bool) -> list[str]:
+    """Return a warning on training images without a mask, if other images have one."""
     without = [view.name for view in views if view.mask_path is None]
     return (
         [f"{len(without)} images have no mask, first {without[0]}"] if has_masks and without else []
@@ -493,7 +493,7 @@ def _with_masks(root: Path, splits: Splits) -> tuple[Splits, list[str]]:
         return replace(view, mask_path=next(filter(None, found), None))
 
     splits = map_views(splits, with_mask)
-    return splits, missing_mask_warning(all_views(splits), bool(masks))
+    return splits, missing_mask_warning(splits["train"], bool(masks))
 
 
 def _capture_of(

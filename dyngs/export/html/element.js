@@ -105,7 +105,7 @@ class DyngsScene extends HTMLElement {
   async begin(scene, source) {
     if ((scene.levels || scene.curves?.chunk) && location.protocol === "file:")
       throw new Error("its parts are fetched, so open it by a web server, such as `python -m http.server`");
-    const { canvas, help } = this.parts, changed = () => this.changed();
+    const { canvas, help, keys, next } = this.parts, changed = () => this.changed();
     const renderer = rendererOf(canvas, scene, source, changed);
     await renderer.begun?.(); // its first picture, however coarse
     if (source.signal.aborted) return;
@@ -116,6 +116,9 @@ class DyngsScene extends HTMLElement {
     // In the middle of an article, the wheel is for the article until the scene is clicked.
     steer(canvas, this.camera, changed, () => !this.embedded || this.root.activeElement !== null);
     help.addEventListener("click", () => this.help());
+    keys.firstChild.replaceChildren(...keysOf(scene));
+    next.hidden = scene.views.length < 2;
+    next.addEventListener("click", () => this.go(1));
     canvas.addEventListener("webglcontextlost", (event) => {
       event.preventDefault();
       if (!source.signal.aborted) this.tell("The browser has stopped drawing this scene; click it to go on.");
@@ -195,15 +198,21 @@ class DyngsScene extends HTMLElement {
       s: () => camera.turn(0, -0.1),
       "+": () => camera.zoom(0.9),
       "-": () => camera.zoom(1 / 0.9),
-      r: () => camera.go(camera.index),
-      c: () => camera.go(camera.index + 1),
-      C: () => camera.go(camera.index - 1),
+      r: () => this.go(0),
+      c: () => this.go(1),
+      C: () => this.go(-1),
       f: () => (document.fullscreenElement ? document.exitFullscreen() : this.requestFullscreen?.()),
       "?": () => this.help(),
     };
     if (!actions[event.key]) return;
     event.preventDefault();
     actions[event.key]();
+    this.changed();
+  }
+
+  // Moves to the camera of the capture that is `by` places on.
+  go(by) {
+    this.camera.go(this.camera.index + by);
     this.changed();
   }
 

@@ -81,6 +81,7 @@ def write_page(
     title: str | None = None,
     time: float = 0.0,
     views: Sequence[Cameras] = (),
+    view: str | None = None,
 ) -> WrittenPage:
     """Write a scene as a single HTML file, atomically.
 
@@ -89,10 +90,11 @@ def write_page(
         time: initial scene time.
         views: cameras offered on the page, each a batch of one, the first one initially. Empty uses
             those of the capture, or an orbit.
+        view: name or index of the initial view of the capture, see ``select_view``.
     """
     collect_inputs(opened).require_output(path)
     lists = PackedArrays()
-    header = _header(opened, time, views, lists)
+    header = _header(opened, time, _initial_views(opened, views, view), lists)
     text = _assemble_page(opened, header, lists, title)
     write_text(path, text)
     return WrittenPage(path, len(text.encode()), header, _notes(opened, header))
@@ -106,6 +108,7 @@ def write_page_folder(
     title: str | None = None,
     time: float = 0.0,
     views: Sequence[Cameras] = (),
+    view: str | None = None,
 ) -> WrittenPage:
     """Write a scene as a new folder for a web server: ``PAGE``, ``ELEMENT`` for other pages, and
     data.
@@ -121,15 +124,16 @@ def write_page_folder(
     """
     require_new_folder(folder)
     lists = PackedArrays(chunked=True)
+    cameras = _initial_views(opened, views, view)
     if most is not None or opened.renderable.has_levels:
         levelled = LevelScene.from_scene(opened.renderable, most)
         colour = levelled.scene.colour
         header = add_levels(levelled.levels, colour, lists) | _render_header(levelled.options)
         header["levels"]["most"] = most
-        header |= _view_header(opened, time, *_initial_views(opened, views))
+        header |= _view_header(opened, time, *cameras)
         parts = block_files(levelled.levels, includes_harmonics=colour is None)
     else:
-        header = _header(opened, time, views, lists)
+        header = _header(opened, time, cameras, lists)
         parts = ((f"{i}.bin", chunk.deflated()) for i, chunk in enumerate(lists.chunks or ()))
     text = _assemble_page(opened, header, lists, title)
     with atomic_folder(folder) as started:
@@ -162,9 +166,12 @@ def _notes(opened: OpenedScene, header: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _header(
-    opened: OpenedScene, time: float, views: Sequence[Cameras], lists: PackedArrays
+    opened: OpenedScene,
+    time: float,
+    cameras: tuple[Sequence[Cameras], list[float]],
+    lists: PackedArrays,
 ) -> dict[str, Any]:
-    views, target = _initial_views(opened, views)
+    views, target = cameras
     found = opened.renderable.page_data()
     if found is not None:
         header, own = found
@@ -180,19 +187,20 @@ def _header(
 
 
 def _initial_views(
-    opened: OpenedScene, views: Sequence[Cameras]
+    opened: OpenedScene, views: Sequence[Cameras], view: str | None
 ) -> tuple[Sequence[Cameras], list[float]]:
     """Return the cameras of the page, each a batch of one, and the orbit target.
 
     These are ``views`` if given, else cameras of the capture, else an orbit around the scene.
     """
     cameras = opened.cameras
+    first = None if view is None else select_view(opened.capture, view)
     if not views and cameras is not None:
         capture = opened.capture
         distinct = {view.cam_from_world.tobytes(): view for view in capture.splits["train"][::-1]}
         others = list(distinct.values())[::-1]
         rows = np.linspace(0, len(others) - 1, min(len(others), MOST_VIEWS)).round().astype(int)
-        chosen = (select_view(capture), *(others[i] for i in rows))
+        chosen = (first or select_view(capture), *(others[i] for i in rows))
         return training_cameras(chosen, opened.config.data), estimate_focus(cameras).tolist()
     target = np.median(framing_points(opened.renderable).cpu().numpy(), axis=0)
     if not views:

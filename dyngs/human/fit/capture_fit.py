@@ -492,6 +492,7 @@ class BodyFit:
         observed: Observations,
         on_progress: ProgressCallback = ignore_progress,
         schedule_start: float = 0.0,
+        stage: str = "all parameters",
     ) -> Parameters:
         """Return ``start`` after ``steps`` of Adam on the parameters named in ``learned``.
 
@@ -516,7 +517,7 @@ class BodyFit:
             if loss.requires_grad:
                 loss.backward()
             parameters.step(step, schedule_start + (1 - schedule_start) * step / steps)
-            on_progress("fitting the body", step, steps)
+            on_progress(f"body fit, {stage}", step, steps)
         return parameters
 
     @torch.no_grad()
@@ -629,7 +630,7 @@ def estimate_initial_poses(
         if frame is not None:
             anchors.append(row)
             anchor_poses.append(_try_headings(standing, row, up, body, frame))
-        on_progress("estimating headings", number, len(rows))
+        on_progress("body fit, headings", number, len(rows))
     heading_path = likely_headings([[error for _, _, error in poses] for poses in anchor_poses])
     roots = torch.stack(
         [poses[heading][0][0] for poses, heading in zip(anchor_poses, heading_path, strict=True)]
@@ -643,7 +644,7 @@ def estimate_initial_poses(
     tracks = []
     for number, (index, path_roots) in enumerate(starts, 1):
         tracks.append(_track_poses(standing, anchor_poses[0][index], path_roots, body, observed))
-        on_progress("tracking poses", number, len(starts))
+        on_progress("body fit, tracking poses", number, len(starts))
     return min(tracks, key=lambda track: track[1])[0]
 
 
@@ -951,11 +952,15 @@ def _from_given(
     start = body_fit.initial_parameters()
     halves = rotate_views(fit_views.halves())
     # Padding for clothes and hair, which silhouettes include, is fitted in any case.
-    dressed = body_fit.optimize(start, ("padding",), effort.steps, halves, on_progress)
+    dressed = body_fit.optimize(
+        start, ("padding",), effort.steps, halves, on_progress, stage="clothes"
+    )
     candidates = [body_fit.evaluate("given poses", dressed, fit_views.evaluated)]
     parameters = start
-    for views in (halves, fit_views.used.get):
-        parameters = body_fit.optimize(parameters, shape, effort.steps, views, on_progress)
+    for stage, views in (("shape, small images", halves), ("shape", fit_views.used.get)):
+        parameters = body_fit.optimize(
+            parameters, shape, effort.steps, views, on_progress, stage=stage
+        )
     candidates.append(body_fit.evaluate("shape", parameters, fit_views.evaluated))
     every_frame = (*shape, "turns", "poses", "trans")
     for name, learned, steps in (
@@ -970,11 +975,12 @@ def _from_given(
             fit_views.used.get,
             on_progress,
             schedule_start=0.75,
+            stage=f"{name}, trial",
         )
         candidate = body_fit.evaluate(name, parameters, fit_views.evaluated)
         if candidate.iou > max(x.iou for x in candidates) + 0.75 * MIN_GAIN:
             parameters = body_fit.optimize(
-                parameters, learned, steps, fit_views.used.get, on_progress
+                parameters, learned, steps, fit_views.used.get, on_progress, stage=name
             )
             candidate = body_fit.evaluate(name, parameters, fit_views.evaluated)
         candidates.append(candidate)
@@ -997,9 +1003,12 @@ def _from_silhouettes(
     first = body_fit.evaluate("frame-by-frame poses", parameters, fit_views.evaluated)
     learned = (*shape, "poses", "trans")
     steps = 3 * effort.steps_for(body_fit.clip)
-    for views in (fit_views.halves().get, fit_views.used.get):
+    for stage, views in (
+        ("shape and poses, small images", fit_views.halves().get),
+        ("shape and poses", fit_views.used.get),
+    ):
         parameters = body_fit.optimize(
-            parameters, learned, steps, views, on_progress, schedule_start=-0.3
+            parameters, learned, steps, views, on_progress, schedule_start=-0.3, stage=stage
         )
     return first, body_fit.evaluate("shape and per-frame poses", parameters, fit_views.evaluated)
 
@@ -1158,7 +1167,7 @@ def place_new_poses(
             start[name].copy_(fit.chosen.learned[name])
     # Three parameters need few steps.
     moved = body_fit.optimize(
-        start, ("shift",), min(effort.steps, 40), fit_views.used.get, on_progress
+        start, ("shift",), min(effort.steps, 40), fit_views.used.get, on_progress, stage="new poses"
     )
     before, after = (body_fit.evaluate("", x, fit_views.evaluated) for x in (start, moved))
     is_better = after.iou > before.iou + 0.001

@@ -12,8 +12,10 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from skimage.transform import ProjectiveTransform, resize_local_mean, warp
+from tiny_captures import write_colmap
 
 from dyngs.api.load import read_capture
+from dyngs.capture.sfm import estimate
 from dyngs.capture.sfm.colmap import SfmOptions
 from dyngs.capture.sfm.estimate import SfmModel, SfmResult, choose_better_model, estimate_poses
 from dyngs.core.errors import DyngsError
@@ -204,3 +206,14 @@ def test_the_model_with_a_real_lens_is_taken() -> None:
     unreal = _model(6100)
     assert choose_better_model(unreal, real) is real
     assert choose_better_model(real, unreal) is real
+
+
+def test_images_that_observe_no_points_are_dropped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(estimate, "_FEWEST_OBSERVED", 5)
+    model = pycolmap.Reconstruction(str(write_colmap(tmp_path) / "sparse" / "0"))
+    name = model.images[3].name
+    model.delete_observation(3, 0)
+    assert estimate.drop_unobserving_images(model) == [name]
+    assert model.num_reg_images() == 8

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 import torch
 from tiny_captures import opengl_pose, random_pixels, write_colmap, write_image
@@ -255,3 +256,14 @@ def test_a_quaternion_that_is_no_rotation(tmp_path: Path, factor: float) -> None
         match=rf"right/02.jpg: its rotation quaternion has length {factor:g} instead of 1",
     ):
         read_colmap(root)
+
+
+def test_images_without_points_are_reported(tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path) / "sparse" / "0"
+    assert not read_capture(tmp_path).warnings
+    model = pycolmap.Reconstruction(str(folder))
+    for index in range(5):
+        model.delete_observation(3, index)
+    model.write_binary(str(folder))
+    (line,) = read_capture(tmp_path).warnings
+    assert line.startswith(f"1 image of the model, first {model.images[3].name}, observe")
