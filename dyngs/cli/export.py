@@ -30,6 +30,7 @@ _OTHER_SUFFIXES = {
     ".dyngs": "dyngs",
     ".html": "html",
     ".json": "cameras",
+    ".obj": "mesh",
 }
 _SPLATS = "time times motion static dynamic up from_up"
 _TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree classic") | {
@@ -251,9 +252,13 @@ def _kind(arguments: argparse.Namespace) -> str:
 
     Raises DyngsError: an unknown suffix, or a suffix that contradicts --format.
     """
+    from dyngs.export.video import WRITTEN_SUFFIXES
     from dyngs.io.formats.formats import all_suffixes, find_format
 
     out = arguments.out
+    if out is not None and out.suffix.lower() in WRITTEN_SUFFIXES:
+        run = quote_path(arguments.run_dir)
+        raise DyngsError(f"{out}: a video; use `dyngs render {run} --out {quote_path(out)}`")
     stated = arguments.format
     usual = stated or ("glb" if arguments.bodies else "ply")
     if out is None or out.is_dir():

@@ -20,6 +20,8 @@ _EPILOG = """\
 examples:
   dyngs render runs/bench --out images                          the test views and a contact sheet
   dyngs render runs/bench --out frames --path orbit --video orbit.mp4
+  dyngs render runs/bench --out orbit.gif                       an orbit as .mp4, .webm or .gif
+  dyngs render runs/bench --out orbit.webm --background none    with a transparent background
   dyngs render runs/street --path along --video along.mp4                  along the smoothed training cameras
   dyngs render runs/dance --path orbit --time 0.5 --video frozen.mp4       moving camera, frozen scene
   dyngs render runs/dance --times 0:1:60 --view 3 --video fixed.mp4        fixed camera, moving scene
@@ -37,7 +39,8 @@ def add_parser(commands: args.Commands) -> None:
     parser = args.add_command(commands, "render", run, short, about, _EPILOG)
     source = "run folder, avatar file (.safetensors), or any 3DGS .ply"
     parser.add_argument("source", type=args.input_path, metavar="RUN_OR_FILE", help=source)
-    parser.add_argument("--out", type=args.output_path, metavar="DIR", help="folder for the images")
+    out = "folder for the images; a video file is the same as --video with --path orbit"
+    parser.add_argument("--out", type=args.output_path, metavar="DIR", help=out)
     cameras = parser.add_mutually_exclusive_group()
     args.add_split(cameras, "render the views of this split (default: test)", None)
     path = "camera path: orbit (default for files), spiral, along (the training cameras), or a .json file"
@@ -59,7 +62,10 @@ def add_parser(commands: args.Commands) -> None:
     )
     args.add_keep_feet(parser)
     parser.add_argument(
-        "--video", type=args.output_path, metavar="FILE.mp4", help="also write a video"
+        "--video",
+        type=args.output_path,
+        metavar="FILE.mp4",
+        help="also write a video: .mp4, .mov, .mkv, .webm or .gif",
     )
     frames = "number of frames of orbit, spiral and along (default 120)"
     kind = args.integer_type("a number of frames", 1, 10**9)
@@ -71,8 +77,8 @@ def add_parser(commands: args.Commands) -> None:
     parser.add_argument("--alpha", action="store_true", help="also write opacity")
     size = "image size for a path or fixed camera, in pixels"
     parser.add_argument("--size", type=args.image_size, metavar="WxH", help=size)
-    background = "background of all images (default: that of training)"
-    parser.add_argument("--background", choices=("white", "black"), help=background)
+    background = "background of all images (default: that of training); none: transparent"
+    parser.add_argument("--background", choices=("white", "black", "none"), help=background)
     args.add_up(parser, " of the path")
     args.add_max_gaussians_drawn(
         parser, "static scenes: levels of detail with at most N Gaussians per image"
@@ -89,15 +95,26 @@ def run(arguments: argparse.Namespace) -> int:
     folders = sorted({str(path.parent) for path in written})
     print(f"written: {format_count(len(written), 'file')} in {', '.join(folders)}")
     for path in written:
-        if path.suffix == ".mp4" or path.name == "sheet.png":
+        if path == arguments.video or path.name == "sheet.png":
             print(f"         {path}")
     return 0
 
 
 def _check(arguments: argparse.Namespace) -> None:
     """Raise DyngsError for a missing source or output, or options that do not apply."""
-    from dyngs.io.outputs import suggest_command
+    from dyngs.export.video import WRITTEN_SUFFIXES, require_video_suffix
+    from dyngs.io.outputs import VIDEO_SUFFIXES, suggest_command
 
+    out = arguments.out
+    videos = {*WRITTEN_SUFFIXES, *VIDEO_SUFFIXES}
+    if out is not None and arguments.video is None and out.suffix.lower() in videos:
+        arguments.out = None
+        arguments.video = out
+        if not arguments.split and not _has_fixed_camera(arguments):
+            arguments.path = arguments.path or "orbit"
+    if arguments.video is not None:
+        transparent = arguments.background == "none"
+        require_video_suffix(arguments.video, transparent=transparent)
     args.require_motion_for_feet(arguments)
     arguments.source = args.run_of_scene_file(arguments.source)
     known = suggest_command(arguments.source)
@@ -149,7 +166,13 @@ def _render(arguments: argparse.Namespace) -> list[Path]:
     device = args.computing_device(arguments.device)
     if arguments.threads > 0:
         torch.set_num_threads(arguments.threads)
-    output = OutputOptions(arguments.depth, arguments.alpha, arguments.video, arguments.fps or 30.0)
+    output = OutputOptions(
+        arguments.depth,
+        arguments.alpha,
+        arguments.video,
+        arguments.fps or 30.0,
+        transparent=arguments.background == "none",
+    )
     if not _is_path(arguments):
         with ProgressBar() as report:
             opened = _before(
@@ -187,7 +210,10 @@ def _opened(arguments: argparse.Namespace) -> OpenedScene:
 
 def _before(arguments: argparse.Namespace, opened: OpenedScene) -> OpenedScene:
     """Return the scene with the requested background, if any."""
-    return opened if arguments.background is None else opened.on_background(arguments.background)
+    name: str | None = arguments.background
+    if name is None:
+        return opened
+    return opened.on_background("black" if name == "none" else name)
 
 
 def _coarser(arguments: argparse.Namespace, opened: OpenedScene) -> OpenedScene:

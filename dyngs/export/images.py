@@ -51,8 +51,10 @@ class OutputOptions:
     # unit of the capture)
     depth: bool = False
     alpha: bool = False  # ``NAME_alpha.png``, white = opaque
-    video: Path | None = None  # MP4 of the colour images in order
+    video: Path | None = None  # video of the colour images in order
     fps: float = 30.0  # frames per second of the video
+    # colour images have straight alpha, for scenes on a black background
+    transparent: bool = False
 
 
 def render_frame(
@@ -228,7 +230,8 @@ def _write_images(
         if output.video is not None:
             add = stack.enter_context(video_writer(output.video, output.fps))
         for stem, frame in frames:
-            pixels = {f"{stem}.png": to_uint8(frame.rgb)}
+            shown = _straight_alpha(frame) if output.transparent else frame.rgb
+            pixels = {f"{stem}.png": to_uint8(shown)}
             if add is not None:
                 add(pixels[f"{stem}.png"])
             if output.alpha:
@@ -247,6 +250,13 @@ def _write_images(
                 write_image(path, image)
                 written.append(path)
     return written if output.video is None else [*written, output.video]
+
+
+def _straight_alpha(frame: DrawnImage) -> np.ndarray:
+    """Return an image on black as (H, W, 4) with straight alpha."""
+    alpha = frame.alpha[..., None]
+    colour = frame.rgb / np.maximum(alpha, 1 / 255)
+    return np.concatenate([colour, alpha], axis=-1)
 
 
 def contact_sheet(rows: Sequence[tuple[str, np.ndarray, np.ndarray]]) -> np.ndarray:

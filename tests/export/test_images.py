@@ -19,7 +19,9 @@ from dyngs.core.errors import DyngsError
 from dyngs.data.images.video import read_frames
 from dyngs.export.camera_paths import CameraPath, pick_cameras
 from dyngs.export.images import (
+    DrawnImage,
     OutputOptions,
+    _straight_alpha,
     color_map,
     contact_sheet,
     depth_to_rgb,
@@ -29,7 +31,7 @@ from dyngs.export.images import (
     write_path_images,
     write_split_images,
 )
-from dyngs.export.video import video_writer
+from dyngs.export.video import require_video_suffix, video_writer
 from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.gaussians.static_scene import StaticScene
 from dyngs.runs.opened import OpenedScene, open_run, wrap_scene
@@ -260,3 +262,34 @@ def test_a_video_that_fails_leaves_the_former_file(
         pass
     assert {path.read_bytes() for path in tmp_path.iterdir()} == {b"old"}
     assert len(names(tmp_path)) == 3
+
+
+@pytest.mark.parametrize("name", ["v.webm", "v.gif"])
+def test_transparent_videos_keep_alpha_and_leave_no_trail(tmp_path: Path, name: str) -> None:
+    with video_writer(tmp_path / name, fps=10) as add:
+        for left in (4, 36):
+            image = np.zeros((32, 64, 4), np.uint8)
+            image[8:24, left : left + 20] = 200, 40, 40, 255
+            add(image)
+    with av.open(str(tmp_path / name)) as container:
+        packets = container.demux(container.streams.video[0])
+        # the default decoder of VP9 drops alpha
+        decoder = av.CodecContext.create("gif" if name == "v.gif" else "libvpx-vp9", "r")
+        frames = [frame for packet in packets for frame in decoder.decode(packet)]
+    last = frames[-1].to_ndarray(format="rgba")
+    assert len(frames) == 2
+    assert last.shape == (32, 64, 4)
+    assert np.abs(last[16, 46].astype(int) - (200, 40, 40, 255)).max() < 12
+    assert last[16, 14, 3] < 8
+
+
+def test_videos_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DyngsError, match=r"written as .mp4.*use v.mp4"):
+        require_video_suffix(tmp_path / "v.avi")
+    with pytest.raises(DyngsError, match=r".mp4 has no transparency; use .webm"):
+        require_video_suffix(tmp_path / "v.mp4", transparent=True)
+
+
+def test_straight_alpha_of_an_image_on_black() -> None:
+    frame = DrawnImage(np.full((1, 1, 3), 0.25, np.float32), np.full((1, 1), 0.5, np.float32), None)
+    assert _straight_alpha(frame)[0, 0].tolist() == [0.5, 0.5, 0.5, 0.5]

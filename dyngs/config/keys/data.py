@@ -122,9 +122,10 @@ class DataConfig(Section):
     @classmethod
     def _keep_requested_downscale(cls, given: object) -> object:
         """Remove the default limit on the image size if ``downscale`` determines the size."""
-        if not isinstance(given, dict) or "downscale" not in given:
+        if not isinstance(given, dict):
             return given
-        return {"longest_side": None, **cast("dict[str, Any]", given)}
+        values = cast("dict[str, Any]", given)
+        return {"longest_side": None, **values} if "downscale" in values else values
 
     @field_validator("longest_side")
     @classmethod
