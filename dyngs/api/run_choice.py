@@ -48,7 +48,8 @@ def _continue_run(folder: Path, config: Config) -> Config:
     stored = load_resolved(folder)
     requested = load_requested_config(folder)
     done = checkpoint_step(checkpoint_paths(folder)[-1])
-    steps, minutes = (config.train.steps, config.train.minutes)
+    steps = config.train.steps
+    minutes = config.train.minutes
     was = requested.train
     different = differing_keys(with_length(requested, steps, minutes), config)
     if different:

@@ -349,13 +349,11 @@ class EditControls:
     def _point_at(self, event: Any) -> np.ndarray:
         """Return the point (3,) of the scene under the pointer. Raises DyngsError."""
         session = self._connection.session
-        camera = session.browser_camera
-        if camera is None:
-            raise DyngsError("no surface here")
-        pixel = camera.fov / camera.size[1]
+        request = session.view_request()
+        pixel = 1 / float(request.camera.intrinsics[0, 1, 1])
         origin = np.array(event.ray_origin, np.float64)
         direction = np.array(event.ray_direction, np.float64)
-        point = pick_point(session.opened, origin, direction, pixel, session.view_request())
+        point = pick_point(session.opened, origin, direction, pixel, request)
         if point is None:
             raise DyngsError("no surface here")
         return point

@@ -22,6 +22,7 @@ import dyngs
 from dyngs.cli import main
 from dyngs.core.errors import DyngsError
 from dyngs.core.metrics import ssim
+from dyngs.export.edit.crop import screen_positions
 from dyngs.training.events import Event, StepDone
 from dyngs.view.server import (
     COOKIE,
@@ -177,6 +178,44 @@ def test_two_browsers_have_cameras_of_their_own_and_one_may_go(
     assert threading.active_count() <= threads + 2  # viser's pool may have grown
 
 
+def test_gaussians_are_selected_and_deleted_with_the_pointer(
+    viewer: Viewer, browser: Browser
+) -> None:
+    page, connection = opened(viewer, browser)
+
+    def choose(label: str, value: str) -> None:
+        page.driven.get_by_role("combobox", name=label).click()
+        page.driven.get_by_role("option", name=value).click()
+        page.driven.wait_for_timeout(300)
+
+    choose("Background", "black")
+    until(lambda: connection.session.display.background == (0, 0, 0), page)
+    for folder in ("Show", "Time", "Capture", "Edit"):  # closes all but Edit
+        page.driven.get_by_text(folder, exact=True).first.click()
+    camera = connection.session.browser_camera
+    assert camera is not None
+    width, height = camera.size
+    choose("Tool", "rectangle")
+    page.driven.keyboard.down("Shift")
+    page.drag((2, 2), (width - 2, height - 2))
+    page.driven.keyboard.up("Shift")
+    page.driven.wait_for_selector("text=5 selected")
+    choose("Tool", "sphere")
+    page.driven.keyboard.down("Control")
+    balls = connection.session.opened.scene.at(0.0).means.numpy()
+    x, y = screen_positions(balls, camera.camera())[2] * (width, height)
+    page.driven.mouse.click(x, y)
+    page.driven.keyboard.up("Control")
+    page.driven.wait_for_selector("text=3 selected")  # another ball passes there
+    assert connection.session.browser_camera == camera  # the pointer did not orbit
+    page.driven.get_by_role("button", name="Delete selected").click()
+    page.driven.wait_for_selector("text=2 of 5 Gaussians remaining")
+    page.driven.get_by_role("button", name="Undo").click()
+    page.driven.wait_for_selector("text=5 of 5 Gaussians remaining")
+    assert page.errors == []
+    page.close()
+
+
 def test_a_training_is_paused_and_resumed_on_its_page(
     browser: Browser, still: Path, tmp_path: Path
 ) -> None:
@@ -187,9 +226,9 @@ def test_a_training_is_paused_and_resumed_on_its_page(
     def watch(event: Event) -> None:
         if isinstance(event, StepDone):
             steps.append(event.step)
-            resumed.wait(0.05)  # leaves time for clicks
+            resumed.wait(0.2)  # leaves time for clicks
 
-    settings = [f"data.root={still}", f"run.dir={tmp_path / 'run'}", "train.steps=600"]
+    settings = [f"data.root={still}", f"run.dir={tmp_path / 'run'}", "train.steps=150"]
     config = dyngs.load_config("static", [*settings, "init.num_random=40"])
     with TrainingView(
         config, ServerOptions(), links.append, lambda: {"step": f"{steps[-1]}"}
@@ -208,7 +247,7 @@ def test_a_training_is_paused_and_resumed_on_its_page(
         page.click("text=Resume training")
         resumed.set()
         until(lambda: not thread.is_alive(), page)
-        page.driven.wait_for_selector("text=step: 600")
+        page.driven.wait_for_selector("text=step: 150")
         assert not page.driven.get_by_text("Pause training").is_visible()
         page.close()
 
