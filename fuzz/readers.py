@@ -283,11 +283,10 @@ def read_option_values(root: Path) -> object:
     """Parse values of options of the command line."""
     from dyngs.data.times import parse_frames
     from dyngs.export.camera_paths import parse_times
-    from dyngs.study.tradeoff import parse_requirements, parse_variations
+    from dyngs.study.tradeoff import parse_variations
 
     parsers: tuple[Callable[[str], object], ...]
     parsers = (
-        parse_requirements,
         lambda word: parse_variations([word]),
         parse_frames,
         parse_times,
@@ -359,7 +358,6 @@ CAPTURES: dict[str, dict[str, Seed]] = {
 }
 """Seeds of each capture format, by its name in ``dyngs.data.read.FORMATS``."""
 _NEEDS = {"people_snapshot": "h5py"}
-# USD is read in a process of its own, too slow for thousands of inputs.
 _PACKED = ("compressed-ply", "spz", "splat", "sog", "glb")
 _RUNS: dict[str, Seed] = {
     kind: partial(files.write_moving_runs, kind) for kind in ("hexplane", "mlp", "control_nodes")

@@ -254,7 +254,10 @@ FOR_FEW_SCENES = (
 
 
 def test_the_conda_recipe_needs_what_pip_does() -> None:
-    """Versions, too; two packages have other names on conda-forge. What is not for all platforms is left out."""
+    """Versions, too; two packages have other names on conda-forge.
+
+    Packages that are not for all platforms are left out.
+    """
     project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     recipe = yaml.safe_load((ROOT / "packaging" / "recipe.yaml").read_text(encoding="utf-8"))
     wanted = re.findall(

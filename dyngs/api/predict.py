@@ -84,8 +84,10 @@ def predict(
 
 
 def read_trained_network(network: Path) -> tuple[Config, Checkpoint]:
-    """Return configuration and weights of a network: its run, a file, or a name in ``WEIGHTS``. Raises
-    DyngsError."""
+    """Return configuration and weights of a network: its run, a file, or a name in ``WEIGHTS``.
+
+    Raises DyngsError: unknown or unreadable.
+    """
     if not network.exists() and network.name == str(network):
         network = published_network(network.name)
     if network.is_file():

@@ -24,7 +24,6 @@ _OPTIONAL = {
     "wandb": "wandb",
     "rerun-sdk": "rerun",
     "zstandard": "zstd",
-    "usd-core": "usd",
     "fourdgs": "4dgs",
     "h5py": "people",
     "pillow-heif": "heic",

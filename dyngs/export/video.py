@@ -69,16 +69,18 @@ def video_writer(
     shape: tuple[int, ...] = ()
     count = 0
 
-    def start(height: int, width: int, channels: int) -> None:
-        nonlocal stream, palette
+    def start(height: int, width: int, channels: int) -> Any:
+        nonlocal palette
         require_video_suffix(path, transparent=channels == 4)
         stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001))
         stream.height, stream.width = height, width
         stream.thread_count = 1  # the output depends on the number of threads
         if codec == "gif":
             stream.pix_fmt = "pal8"
+            # Differences of frames are wrong where their palettes differ.
+            stream.options = {"gifflags": "-offsetting-transdiff"}
             palette = _palette_filter(height, width, 1 / stream.codec_context.framerate)
-            return
+            return stream
         stream.pix_fmt = "yuva420p" if channels == 4 else "yuv420p"
         stream.options = {"crf": str(quality), "preset": "medium"}
         if codec == "libvpx-vp9":
@@ -88,15 +90,16 @@ def video_writer(
         stream.codec_context.color_range = int(ColorRange.MPEG)
         stream.codec_context.color_primaries = ColorPrimaries.BT709
         stream.codec_context.color_trc = ColorTrc.BT709
+        return stream
 
     def add(image: np.ndarray) -> None:
-        nonlocal shape, count
+        nonlocal stream, shape, count
         if codec != "gif":
             height, width = image.shape[:2]
             image = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         if stream is None:
             shape = image.shape
-            start(*shape)
+            stream = start(*shape)
         if image.shape != shape:
             height, width = image.shape[:2]
             raise ValueError(f"image {count} has size {width}x{height}, unlike the first one")
@@ -130,10 +133,13 @@ def video_writer(
 
 def _palette_filter(height: int, width: int, time_base: Fraction) -> Any:
     """Return a filter that reduces RGBA frames to 256 colours, each frame to its own."""
+    import av
     import av.filter
 
     graph = av.filter.Graph()
-    source = graph.add_buffer(width=width, height=height, format="rgba", time_base=time_base)
+    source = graph.add_buffer(
+        width=width, height=height, format=av.VideoFormat("rgba"), time_base=time_base
+    )
     split = graph.add("split")
     colours = graph.add("palettegen", "stats_mode=single")
     mapped = graph.add("paletteuse", "new=1")
