@@ -92,8 +92,6 @@ MUTATIONS = (
     ("evaluate/view_scores.py", "(after - now) / (after - before)", "(now - before) / (after - before)", "evaluate/test_temporal.py"),
     ("evaluate/view_scores.py", "psnr(rendering.rgb[0][:, middle:], truth[:, middle:], mask)", "psnr(rendering.rgb[0][:, :middle], truth[:, :middle], mask)", "evaluate/test_view_scores.py"),
     ("evaluate/view_scores.py", "rendering.transmittance[0][..., None] * background", "0 * background", "evaluate/test_view_scores.py"),
-    ("evaluate/tracks.py", "MIN_OPACITY = 0.3", "MIN_OPACITY = 0.0", "evaluate/test_tracks.py"),
-    ("evaluate/tracks.py", "np.minimum(np.nan_to_num(distance, nan=limit), limit)", "np.nan_to_num(distance, nan=limit)", "evaluate/test_tracks.py"),
     ("compress/stage.py", "VOLUME_POWER = 0.1", "VOLUME_POWER = -0.1", "compress/test_stage.py"),
     ("compress/stage.py", "- 2 * profile", "- profile", "compress/test_stage.py"),
     ("compress/search.py", "max(self.loss, self.trained_loss)", "self.loss", "compress/test_search.py"),

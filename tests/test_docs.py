@@ -187,7 +187,7 @@ def with_root(words: list[str]) -> list[str]:
 def require_valid(command: Command, arguments: argparse.Namespace) -> None:
     """Check what a command names besides options: keys, variations, times, presets, files."""
     from dyngs.export.camera_paths import camera_path_file, parse_times
-    from dyngs.study.tradeoff import parse_goal, parse_requirements, parse_variations
+    from dyngs.study.tradeoff import parse_variations
 
     for word in command.words:
         if word.startswith(("configs/", "benchmarks/", "examples/")):
@@ -198,10 +198,6 @@ def require_valid(command: Command, arguments: argparse.Namespace) -> None:
         parse_config(with_root(arguments.overrides), None, arguments.begun)
     elif command.verb == "tradeoff":
         parse_variations(arguments.vary)
-        parse_requirements(arguments.require or "psnr>=1")
-        parse_goal(
-            arguments.minimize or arguments.maximize or "psnr", smallest=bool(arguments.minimize)
-        )
     elif overrides:
         require_overrides(*overrides)
     if getattr(arguments, "times", None) is not None:

@@ -99,12 +99,11 @@ def test_no_message_can_steer_a_terminal() -> None:
 def test_quotes_of_the_command_line_are_short(text: str) -> None:
     from dyngs.data.times import parse_frames
     from dyngs.export.camera_paths import parse_times
-    from dyngs.study.tradeoff import parse_requirements, parse_variations
+    from dyngs.study.tradeoff import parse_variations
 
     for parse in (
         parse_frames,
         parse_times,
-        parse_requirements,
         lambda word: parse_variations([word]),
     ):
         with pytest.raises(DyngsError) as caught:

@@ -142,10 +142,6 @@ def _further_rows(report: EvalReport) -> list[tuple[str, str]]:
         ):
             if value is not None:
                 rows.append((label, f"{value:.3f} of 255"))
-        if report.track_error_px is not None:
-            close = f"{report.track_within_5px or 0:.0%} within 5 px"
-            still = f"{report.track_motion_px or 0:.2f} px if nothing moved"
-            rows.append(("tracks", f"{report.track_error_px:.2f} px off, {close}; {still}"))
     if report.num_moving:
         rows.append(("deformation field", f"{report.field_mb:.1f} MB"))
         rows.append(("time for deforming", f"{report.deform_fraction:.0%} of rendering"))

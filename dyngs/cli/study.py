@@ -33,7 +33,7 @@ _TRADEOFF = """\
 examples:
   dyngs tradeoff runs/dance                                   all settings -> runs/dance/tradeoff
   dyngs tradeoff runs/dance --vary prune=0.5,0.8 --vary storage --finetune 2000
-  dyngs tradeoff runs/dance --require 'psnr>=30,fps>=20,mb<=5' --minimize mb
+  dyngs tradeoff runs/dance --vary storage --vary sh_degree --combine 1
 
 Run an interrupted command again to continue it; only missing results are measured.
 """
@@ -76,10 +76,9 @@ def add_tradeoff_parser(commands: args.Commands) -> None:
         commands,
         "tradeoff",
         run_tradeoff,
-        "measure quality, speed and size of a run with other settings, and pick the best one",
+        "measure quality, speed and size of a run with other settings",
         "Vary the settings of a run one at a time, then several together. Writes tradeoff.csv, "
-        ".json, .md, .html and, with the extra plots, .svg, and selects the best run that meets "
-        "the requirements.",
+        ".json, .md, .html and, with the extra plots, .svg, and a run folder of each variant.",
         _TRADEOFF,
     )
     parser.add_argument("run_dir", type=args.input_path, metavar="RUN", help="run folder")
@@ -88,18 +87,9 @@ def add_tradeoff_parser(commands: args.Commands) -> None:
     for name, low, default, about in (
         ("finetune", 0, 0, "fine-tuning steps after pruning (default: none)"),
         ("combine", 0, 4, "number of combinations in each of three directions (default 4)"),
-        ("rounds", 1, 5, "renders of each timed view (default 5)"),
     ):
         kind = args.integer_type("a number", low, 10**9)
         parser.add_argument(f"--{name}", type=kind, default=default, metavar="N", help=about)
-    require = "requirements of the selected run, such as 'psnr>=30,fps>=20,mb<=5'"
-    parser.add_argument("--require", metavar="LIST", help=require)
-    goal = parser.add_mutually_exclusive_group()
-    metrics = "psnr, ssim, lpips, fps, mb or gaussians"
-    goal.add_argument(
-        "--minimize", metavar="METRIC", help=f"select the run with the lowest {metrics}"
-    )
-    goal.add_argument("--maximize", metavar="METRIC", help="or with the highest (default psnr)")
     _add_common(parser, "RUN/tradeoff")
 
 
@@ -171,7 +161,7 @@ def _print_report(report: Report, *, is_json: bool) -> None:
 
 
 def run_tradeoff(arguments: argparse.Namespace) -> int:
-    """Measure, print and write the tables, and select a run; locks the folder."""
+    """Measure the variants, print and write the table; locks the folder."""
     from dyngs.io.outputs import lock_folder
 
     if not arguments.run_dir.is_dir():
@@ -185,11 +175,8 @@ def run_tradeoff(arguments: argparse.Namespace) -> int:
 
 def _tradeoff(arguments: argparse.Namespace, out: Path) -> int:
     from dyngs.study import tradeoff
-    from dyngs.study.report import RATES, Report, build_table, can_plot, plot_variants, write_report
+    from dyngs.study.report import Report, build_table, can_plot, plot_variants, write_report
 
-    requirements = tradeoff.parse_requirements(arguments.require) if arguments.require else []
-    metric = arguments.minimize or arguments.maximize
-    goal = tradeoff.parse_goal(metric or "psnr", smallest=arguments.minimize is not None)
     args.computing_device(arguments.device)
     study = tradeoff.Tradeoff(
         arguments.run_dir,
@@ -198,7 +185,6 @@ def _tradeoff(arguments: argparse.Namespace, out: Path) -> int:
         arguments.finetune,
         arguments.combine,
         arguments.split,
-        arguments.rounds,
         arguments.threads,
         arguments.device,
         arguments.ray,
@@ -210,24 +196,18 @@ def _tradeoff(arguments: argparse.Namespace, out: Path) -> int:
             raise KeyboardInterrupt(_CONTINUES) from None
     variants = list(found)
     rows = tradeoff.build_rows(list(found.values()))
-    rates = tradeoff.exchange_rates(found)
     about = f"{format_count(found[variants[0]].num_views, 'view')}; {_FRONT}"
     settings = [variant.setting for variant in variants]
     report = Report(
         "Quality, speed and size",
         about,
         rows,
-        [build_table(about, rows), build_table("each setting alone", rates, RATES)],
-        {"exchange_rates": rates, "changes": [variant.changes for variant in variants]},
+        [build_table(about, rows)],
+        {"changes": [variant.changes for variant in variants]},
         figure=plot_variants(rows, settings) if can_plot() else None,
     )
     report = replace(report, files=write_report(out / "tradeoff", report))
     _print_report(report, is_json=arguments.json)
-    if arguments.require or metric:
-        number = tradeoff.choose_variant(rows, requirements, goal)
-        best = rows[number]
-        folder = study.folder(variants[number])
-        if not arguments.json:
-            scores = f"{best['psnr']:.2f} dB, {best['fps']:.1f} fps, {best['mb']:.2f} MB"
-            print(f"selected: {best['name']}: {scores}\n          {folder}")
+    if not arguments.json:
+        print(f"run folders of the variants: {out / 'models'}")
     return 0

@@ -18,11 +18,9 @@ import torch
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.core.metrics import Lpips, LpipsNet, load_lpips, psnr
-from dyngs.data.capture import Capture, View, all_views
+from dyngs.data.capture import Capture, View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
-from dyngs.data.tracks import read_true_tracks
-from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import (
     FLIP_PIXELS,
     POSE_METRICS,
@@ -45,7 +43,7 @@ from dyngs.io.write import write_text
 from dyngs.models.checkpoint import CONFIG_ADVICE, read_run_capture
 from dyngs.models.kind import HasMotion, capability
 from dyngs.models.renderable import Renderable, run_path
-from dyngs.models.views import evaluation_background, training_cameras
+from dyngs.models.views import evaluation_background
 from dyngs.ops.device import CPU, select_device
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import (
@@ -187,10 +185,6 @@ class EvalReport:
     # means over the views that show an object, by its mask label
     psnr_things: dict[int, float] = field(default_factory=dict)
     moving_from: str | None = None  # source of the moving region, None if unknown
-    # see ``TrackScores``
-    track_error_px: float | None = None
-    track_within_5px: float | None = None
-    track_motion_px: float | None = None
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None
     # from poses fitted to the evaluated images, None if not requested
@@ -293,7 +287,6 @@ def evaluate_run(
         flip_every=math.ceil(num_pixels / FLIP_PIXELS),
     )
     temporal = temporal_scores(drawing, loader, views)
-    tracks = _track_scores(run, capture, scene, views)
     fitted = {}
     if split != "train" and (refine_poses or run.config.camera.refine == "always"):
         fitted = score_fitted_poses(drawing, loader, run.info.extent, lpips)
@@ -304,8 +297,6 @@ def evaluate_run(
         reasons |= dict.fromkeys(
             ("psnr_right", "psnr_right_fitted"), "all pixels of one half of a view are masked"
         )
-    if tracks.reason is not None:
-        reasons["track_error_px"] = tracks.reason
     report = EvalReport(
         split=split,
         num_views=len(scores),
@@ -325,9 +316,6 @@ def evaluate_run(
         stored_mb=_stored_mb(run_dir),
         psnr_things=_mean_object_scores(scores),
         moving_from=regions.moving_from,
-        track_error_px=tracks.error_px,
-        track_within_5px=tracks.within_5px,
-        track_motion_px=tracks.motion_px,
         **means,
         **{name: metric.value for name, metric in temporal.items()},
         **fitted,
@@ -415,20 +403,6 @@ def _stored_mb(folder: Path) -> float | None:
 def report_path(run_dir: Path, split: str) -> Path:
     """Return the path of the report of ``split`` in a run folder."""
     return run_dir / ("metrics.json" if split == "test" else f"metrics_{split}.json")
-
-
-def _track_scores(
-    run: LoadedRun, capture: Capture, scene: Renderable, views: Sequence[View]
-) -> TrackScores:
-    if not isinstance(scene, GaussianScene):
-        return TrackScores(reason="only scenes of Gaussians have tracks")
-    cameras = training_cameras(views, run.config.data)
-    return track_scores(
-        scene,
-        read_true_tracks(capture),
-        list(zip(views, cameras, strict=True)),
-        all_views(capture.splits),
-    )
 
 
 def parameter_megabytes(scene: GaussianScene) -> float:

@@ -115,7 +115,7 @@ def video_writer(
         frame.pts = count
         frame.time_base = 1 / stream.codec_context.framerate
         if palette is not None:
-            palette.push(frame.reformat(format=av.VideoFormat("rgba")))
+            palette.push(frame.reformat(format="rgba"))
             frame = palette.pull()
         container.mux(stream.encode(frame))
         count += 1
@@ -133,10 +133,13 @@ def video_writer(
 
 def _palette_filter(height: int, width: int, time_base: Fraction) -> Any:
     """Return a filter that reduces RGBA frames to 256 colours, each frame to its own."""
+    import av
     import av.filter
 
     graph = av.filter.Graph()
-    source = graph.add_buffer(width=width, height=height, format="rgba", time_base=time_base)
+    source = graph.add_buffer(
+        width=width, height=height, format=av.VideoFormat("rgba"), time_base=time_base
+    )
     split = graph.add("split")
     colours = graph.add("palettegen", "stats_mode=single")
     mapped = graph.add("paletteuse", "new=1")

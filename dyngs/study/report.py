@@ -42,12 +42,6 @@ COLUMNS = {
     "steps": ("steps", ",.0f"),
     "seconds": ("s", ".0f"),
 }
-RATES = {
-    "db_per_speed": ("dB lost per doubled speed", "+.2f"),
-    "db_per_size": ("dB lost per halved size", "+.2f"),
-    "speed": ("most speed, times", ".2f"),
-    "size": ("most size, times", ".2f"),
-}
 _HERE = Path(__file__).parent
 Cells = Sequence[Sequence[str]]
 
@@ -87,16 +81,14 @@ def can_plot() -> bool:
     return find_spec("matplotlib") is not None
 
 
-def build_table(
-    title: str, rows: Sequence[Row], columns: Mapping[str, tuple[str, str]] = COLUMNS
-) -> Table:
+def build_table(title: str, rows: Sequence[Row]) -> Table:
     """Return a table of rows, without empty columns. Rows on the Pareto front are marked."""
-    shown = [key for key in columns if any(row.get(key) is not None for row in rows)]
+    shown = [key for key in COLUMNS if any(row.get(key) is not None for row in rows)]
     cells = []
     for row in rows:
-        texts = ("-" if row[key] is None else format(row[key], columns[key][1]) for key in shown)
+        texts = ("-" if row[key] is None else format(row[key], COLUMNS[key][1]) for key in shown)
         cells.append([f"* {row['name']}" if row.get("on_front") else row["name"], *texts])
-    return Table(title, ["", *(columns[key][0] for key in shown)], cells)
+    return Table(title, ["", *(COLUMNS[key][0] for key in shown)], cells)
 
 
 def page_views(out: Path, results: Sequence[Measurement]) -> list[dict[str, Any]]:

@@ -1,5 +1,4 @@
-"""``dyngs tradeoff``: variants of a run, their measurements, and the variant that meets
-requirements.
+"""``dyngs tradeoff``: variants of a run and their measurements.
 
 Settings are varied one at a time, then combined. Variants are run folders that are pruned, masked
 or quantised. Existing folders and measurements are reused.
@@ -9,8 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -50,9 +48,6 @@ from dyngs.training.new_trainer import build_trainer
 MIN_DOUBLINGS = 0.05  # log2 of the smallest gain that counts (a factor of 1.035)
 MAX_LOSS_DB = 6.0  # changes that lose more PSNR are not combined with others
 SEVERAL = "several"  # ``Variant.setting`` of combinations
-# Columns that a requirement or a goal may name
-METRICS = ("psnr", "ssim", "lpips", "fps", "mb", "gaussians")
-_CONDITION = re.compile(r"\s*([a-z_]+)\s*(>=|<=)\s*(\S+)\s*$")
 Row = dict[str, Any]
 Value = float | int | str
 
@@ -200,7 +195,6 @@ class Tradeoff:
         settings: values to measure, by setting.
         finetune: training steps after pruning and masking, for additional variants. 0 adds none.
         combine: number of combinations in each of three directions, see ``combinations``.
-        rounds: renders of each timed view.
         threads: 0 uses all cores.
         device: device for training, pruning and rendering.
         ray_cores: cores per variant with Ray. None runs everything here.
@@ -212,7 +206,6 @@ class Tradeoff:
     finetune: int = 0
     combine: int = 4
     split: str = "test"
-    rounds: int = 5
     threads: int = 0
     device: str = "auto"
     ray_cores: int | None = None
@@ -250,9 +243,7 @@ class Tradeoff:
     def _measure(
         self, variants: Sequence[Variant], ray_cores: int | None
     ) -> dict[Variant, Measurement]:
-        measurer = SceneMeasurer(
-            self.out, self.split, self.threads, self.device, rounds=self.rounds
-        )
+        measurer = SceneMeasurer(self.out, self.split, self.threads, self.device)
         study_scenes = [
             StudyScene(v.name, v.slug, self.run_dir, partial(self.folder, v)) for v in variants
         ]
@@ -368,43 +359,6 @@ def build_rows(measurements: Sequence[Measurement]) -> list[Row]:
     ]
 
 
-# The cost of each setting, and combinations worth measuring
-
-
-def db_per_doubling(losses_and_factors: Iterable[tuple[float, float]]) -> float | None:
-    """Return the PSNR in dB lost per doubling, by a least-squares line through the origin.
-
-    ``losses_and_factors``: PSNR loss in dB and gain as a factor. None if all gains are negligible.
-    """
-    pairs = [(loss, math.log2(factor)) for loss, factor in losses_and_factors]
-    pairs = [(loss, doublings) for loss, doublings in pairs if doublings >= MIN_DOUBLINGS]
-    return sum(loss * x for loss, x in pairs) / sum(x * x for _, x in pairs) if pairs else None
-
-
-def exchange_rates(found: Mapping[Variant, Measurement]) -> list[Row]:
-    """Return a row per setting, from the variants that change only that setting.
-
-    ``db_per_speed`` and ``db_per_size`` are the PSNR lost per doubled speed and per halved size.
-    None if no value gains any, negative if PSNR improves. ``speed`` and ``size`` are the largest
-    gains as factors.
-    """
-    base = found[Variant()]
-    groups: dict[str, list[Measurement]] = {}
-    for variant, m in found.items():
-        if variant.setting not in ("", SEVERAL):
-            groups.setdefault(variant.setting, []).append(m)
-    return [
-        {
-            "name": setting,
-            "db_per_speed": db_per_doubling((base.psnr - m.psnr, m.gain) for m in group),
-            "db_per_size": db_per_doubling((base.psnr - m.psnr, base.mb / m.mb) for m in group),
-            "speed": max(m.gain for m in group),
-            "size": max(base.mb / m.mb for m in group),
-        }
-        for setting, group in groups.items()
-    ]
-
-
 def combinations(found: Mapping[Variant, Measurement], count: int) -> list[Variant]:
     """Return combinations of single changes to measure next.
 
@@ -423,9 +377,9 @@ def combinations(found: Mapping[Variant, Measurement], count: int) -> list[Varia
         costs = []
         for strength, (variant, m) in enumerate(found.items()):
             loss = base.psnr - m.psnr
-            cost = db_per_doubling([(loss, gain_of(m))])
-            if loss <= MAX_LOSS_DB and cost is not None:
-                costs.append((cost, variant.slug, strength, variant))
+            doublings = math.log2(gain_of(m))
+            if loss <= MAX_LOSS_DB and doublings >= MIN_DOUBLINGS:
+                costs.append((loss / doublings, variant.slug, strength, variant))
         now = Variant()
         strongest: dict[str, int] = {}
         steps = []
@@ -438,86 +392,3 @@ def combinations(found: Mapping[Variant, Measurement], count: int) -> list[Varia
                     steps.append(now)
         combined |= dict.fromkeys(variant for variant in steps[:count] if variant not in found)
     return list(combined)
-
-
-# The best variant that meets requirements
-
-
-@dataclass(frozen=True)
-class Requirement:
-    """A condition ``name >= bound``, or ``name <= bound`` if ``at_most``.
-
-    A goal to maximise or minimise is a requirement without bound.
-    """
-
-    name: str
-    at_most: bool
-    bound: float = math.nan
-
-    def __str__(self) -> str:
-        return f"{self.name}{'<=' if self.at_most else '>='}{self.bound:g}"
-
-    def is_met(self, row: Row) -> bool:
-        return self.cost(row) <= (self.bound if self.at_most else -self.bound)
-
-    def cost(self, row: Row) -> float:
-        """Return a value that is smaller for better rows, infinite if the metric was not
-        measured."""
-        value = row[self.name]
-        if value is None:
-            return math.inf
-        return value if self.at_most else -value
-
-
-def parse_requirements(text: str) -> list[Requirement]:
-    """Return the conditions of a list such as ``psnr>=30,fps>=20,mb<=5``."""
-    requirements = []
-    for part in text.split(","):
-        match = _CONDITION.match(part)
-        try:
-            bound = float(match[3]) if match else math.nan
-        except ValueError:
-            bound = math.nan
-        if match is None or not math.isfinite(bound):
-            raise DyngsError(
-                f"--require {format_one_line(part.strip(), 60)!r}: not a condition; example: "
-                "psnr>=30,fps>=20,mb<=5"
-            )
-        requirements.append(replace(parse_goal(match[1], smallest=match[2] == "<="), bound=bound))
-    return requirements
-
-
-def parse_goal(name: str, *, smallest: bool) -> Requirement:
-    """Return the goal of ``--minimize`` or ``--maximize``."""
-    if name not in METRICS:
-        raise DyngsError(f"{format_one_line(name, 60)}: unknown metric; use {', '.join(METRICS)}")
-    return Requirement(name, smallest)
-
-
-def choose_variant(
-    rows: Sequence[Row], requirements: Sequence[Requirement], goal: Requirement
-) -> int:
-    """Return the index of the best row that meets all requirements. Ties are resolved by PSNR.
-
-    Raises:
-        DyngsError: no row meets the requirements. For each requirement, the message names the best
-            value among rows that meet all others.
-    """
-
-    def meeting(needed: Sequence[Requirement]) -> list[int]:
-        return [i for i, row in enumerate(rows) if all(r.is_met(row) for r in needed)]
-
-    fitting = meeting(requirements)
-    if fitting:
-        return min(fitting, key=lambda i: (goal.cost(rows[i]), -rows[i]["psnr"], rows[i]["name"]))
-    hints = []
-    for binding in requirements:
-        near = meeting([r for r in requirements if r is not binding])
-        best = (
-            rows[min(near, key=lambda i: binding.cost(rows[i]))] if near else {binding.name: None}
-        )
-        if best[binding.name] is not None:
-            value = f"{best[binding.name]:.5g} ({best['name']})"
-            hints.append(f"; best {binding.name} with the other conditions: {value}")
-    conditions = ", ".join(map(str, requirements))
-    raise DyngsError(f"no variant meets {conditions}{''.join(hints)}")

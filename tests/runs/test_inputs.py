@@ -61,7 +61,6 @@ UNCHECKED = {
     "data/times.py:write_seconds": OWN,
     "demo.py:run_demo": "in a folder that is empty, and locked",
     "data/synthetic/captures.py:write_split": OWN,
-    "data/tracks.py:write_true_tracks": OWN,
     "evaluate/report.py:evaluate_run": "checks it in _require_possible",
     "export/splat_files.py:write_tracks": VALUES,
     "human/fit/fitted_capture.py:write_body_file": OWN,

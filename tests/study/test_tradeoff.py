@@ -1,5 +1,5 @@
-"""A sweep of a tiny run: measured once, resumed, chosen from; variants, the front, exchange rates,
-combinations and requirements by known answers."""
+"""A sweep of a tiny run: measured once, resumed; variants, the front and combinations by known
+answers."""
 
 from __future__ import annotations
 
@@ -19,19 +19,12 @@ from dyngs.evaluate.report import evaluate_run
 from dyngs.runs.checkpoint import has_only_scene_file, load_run
 from dyngs.study.measure import Measurement, read_measurement
 from dyngs.study.tradeoff import (
-    Requirement,
-    Row,
     Tradeoff,
     Variant,
     build_rows,
-    choose_variant,
     combinations,
     current_settings,
-    db_per_doubling,
-    exchange_rates,
     pareto_mask,
-    parse_goal,
-    parse_requirements,
     parse_variations,
     single_setting_variants,
 )
@@ -48,7 +41,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Tradeoff:
         busy_config(write_tiny_capture(folder / "capture"), folder / "run", "control_nodes")
     )
     settings = parse_variations(SETTINGS)
-    return Tradeoff(run, run / "tradeoff", settings, finetune=2, combine=1, rounds=1, threads=1)
+    return Tradeoff(run, run / "tradeoff", settings, finetune=2, combine=1, threads=1)
 
 
 @pytest.fixture(scope="module")
@@ -207,7 +200,7 @@ def test_unknown_variations_are_refused(word: str, message: str) -> None:
         parse_variations([word])
 
 
-# The front, exchange rates and combinations
+# The front and combinations
 
 GOALS = st.lists(st.tuples(*[st.integers(0, 5)] * 3), min_size=1, max_size=12)
 
@@ -239,30 +232,6 @@ def test_speed_size_and_quality_count() -> None:
     assert [row["on_front"] for row in build_rows(points)] == [True, True, False]
 
 
-@given(st.floats(-3, 3), st.lists(st.integers(1, 4), min_size=1, max_size=5))
-def test_slope_of_points_on_a_line_is_that_line(per_doubling: float, doublings: list[int]) -> None:
-    points = [(per_doubling * k, 2.0**k) for k in doublings]
-    assert db_per_doubling(points) == pytest.approx(per_doubling, abs=1e-9)
-    assert db_per_doubling([(1.0, 1.01), (2.0, 1.0)]) is None
-
-
-def test_exchange_rates_are_those_of_single_settings() -> None:
-    prune, storage = exchange_rates(
-        {
-            Variant(): BASE,
-            Variant(prune=0.5): measured(29.0, 2.0, 4.0),
-            Variant(prune=0.75): measured(28.0, 4.0, 2.0),
-            Variant(storage="auto"): measured(30.0, 1.0, 1.0),
-            Variant(storage="auto", prune=0.5): measured(20.0, 2.0, 0.5),
-        }
-    )
-    one = pytest.approx(1.0)
-    assert prune == {
-        "name": "prune", "db_per_speed": one, "db_per_size": one, "speed": 4.0, "size": 4.0
-    }  # fmt: skip
-    assert (storage["db_per_speed"], storage["db_per_size"]) == (None, pytest.approx(0.0))
-
-
 def test_cheapest_variants_are_combined_first() -> None:
     singles = {
         Variant(): BASE,
@@ -282,58 +251,3 @@ def test_cheapest_variants_are_combined_first() -> None:
     assert all(v.prune != 0.3 for v in together)
     assert len(set(together)) == len(together)
     assert combinations(singles, 0) == []
-
-
-# Requirements
-
-
-def row(prune: float, psnr: float, fps: float, mb: float) -> Row:
-    name = f"prune={prune}"
-    return {"name": name, "psnr": psnr, "fps": fps, "mb": mb, "lpips": None}
-
-
-ROWS = [row(0.0, 32.0, 5.0, 9.0), row(0.5, 30.5, 18.0, 4.5), row(0.8, 27.0, 40.0, 2.0)]
-
-
-def test_conditions() -> None:
-    asked = parse_requirements("psnr>=30, fps >= 2e1,mb<=5")
-    assert [str(x) for x in asked] == ["psnr>=30", "fps>=20", "mb<=5"]
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("psnr>30", ": not a condition; example: psnr>=30"),
-        ("psnr>=30,,mb<=5", "not a condition"),
-        ("speed>=3", "unknown metric; use psnr, ssim, lpips, fps"),
-        ("psnr>=nan", "not a condition"),
-        ("psnr>=__import__('os')", "not a condition"),
-    ],
-)
-def test_invalid_requirements_are_refused(text: str, message: str) -> None:
-    with pytest.raises(DyngsError, match=message):
-        parse_requirements(text)
-
-
-def test_the_best_of_what_qualifies() -> None:
-    asked = parse_requirements("psnr>=30")
-    assert choose_variant(ROWS, asked, parse_goal("mb", smallest=True)) == 1
-    assert choose_variant(ROWS, asked, Requirement("psnr", False)) == 0
-    assert choose_variant(ROWS, (), Requirement("fps", False)) == 2
-
-
-@pytest.mark.parametrize(
-    ("asked", "message"),
-    [
-        (
-            "psnr>=30,fps>=20,mb<=5",
-            r"psnr>=30, fps>=20, mb<=5; best psnr with the other conditions: 27 \(prune=0.8\); "
-            r"best fps with the other conditions: 18 \(prune=0.5\)",
-        ),
-        ("psnr>=50,fps>=90", "meets psnr>=50, fps>=90$"),
-        ("lpips<=0.5", "meets lpips<=0.5$"),
-    ],
-)
-def test_unmet_requirements_are_named(asked: str, message: str) -> None:
-    with pytest.raises(DyngsError, match=message):
-        choose_variant(ROWS, parse_requirements(asked), Requirement("mb", True))
