@@ -110,7 +110,6 @@ def add_parser(commands: args.Commands) -> None:
         "--times", metavar="A:B:N", help="N times from A to B (default for tracks: training times)"
     )
     args.add_motion(parser)
-    args.add_keep_feet(parser)
     about = (
         "--format dyngs: largest RMS change of the images, in grey levels of 255 (default: a loss "
         "of 0.025 dB on training views)"
@@ -200,7 +199,6 @@ def _write(arguments: argparse.Namespace) -> list[Path]:
     with heavy_imports():
         import dyngs.runs.opened  # noqa: F401
 
-    args.require_motion_for_feet(arguments)
     arguments.run_dir = args.run_of_scene_file(arguments.run_dir)
     kind = _kind(arguments)
     if kind == "mesh" and not _has_surface(arguments):
