@@ -43,7 +43,6 @@ _TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree classic") | {
     "mesh of a person": "motion",
     "mesh": "time times up from_up level segments cells",
     "bodies": "time up from_up classic",
-    "joints": "motion",
 }
 """Options that each format accepts."""
 
@@ -58,7 +57,6 @@ examples:
   dyngs export runs/ann --format avatar --out ann.safetensors     an avatar file, for `render` and `export`
   dyngs export runs/ann --format mesh --motion walk.npz --out ann.glb   skinned and textured, for Blender, three.js ...
   dyngs export runs/bench --format mesh --out bench.glb           a mesh with vertex colours
-  dyngs export runs/ann --joints --out ann.ply                    Gaussians of a person with joints and weights
   dyngs export runs/dance --format tracks --dynamic               positions of all moving Gaussians over time, as .npz
   dyngs export runs/dance --format dyngs --out dance_export       a small file, for `eval`, `render` and `export`
   dyngs export runs/refined --format cameras                      runs/refined/cameras/transforms.json
@@ -132,8 +130,6 @@ def add_parser(commands: args.Commands) -> None:
         "--format html: view of the capture that the page starts with, by name or index (default 0)"
     )
     parser.add_argument("--view", metavar="NAME|N", help=about)
-    about = "Gaussians of a person in rest pose, with joints and skinning weights: .ply, .glb"
-    parser.add_argument("--joints", action="store_true", help=about)
     about = "rigidly moving bodies as animated nodes of a .glb; all else is static, as at --time"
     parser.add_argument("--bodies", action="store_true", help=about)
     add_axes(parser)
@@ -203,10 +199,10 @@ def _write(arguments: argparse.Namespace) -> list[Path]:
     kind = _kind(arguments)
     if kind == "mesh" and not _has_surface(arguments):
         kind = "mesh of a person"
-    elif (arguments.bodies and kind == "glb") or (arguments.joints and kind in ("ply", "glb")):
-        kind = "bodies" if arguments.bodies else "joints"
+    elif arguments.bodies and kind == "glb":
+        kind = "bodies"
     taken = {*_TAKES.get(kind, "time motion").split(), kind}
-    for name in (*dict.fromkeys(" ".join(_TAKES.values()).split()), "bodies", "joints"):
+    for name in (*dict.fromkeys(" ".join(_TAKES.values()).split()), "bodies"):
         given = getattr(arguments, name)
         if name not in taken and given is not None and given is not False:
             raise DyngsError(f"--{name.replace('_', '-')} is not supported with --format {kind}")
@@ -222,8 +218,7 @@ def _write(arguments: argparse.Namespace) -> list[Path]:
         "mesh": _export_surface,
         "network": _export_network,
         "bodies": _export_bodies,
-        "joints": _export_rigged,
-        "mesh of a person": _export_rigged,
+        "mesh of a person": _export_person,
     }
     if kind not in _TAKES:
         return _export_by_plugin(arguments, kind[1:])
@@ -511,22 +506,16 @@ def _export_bodies(arguments: argparse.Namespace) -> list[Path]:
     return [written.path]
 
 
-def _export_rigged(arguments: argparse.Namespace) -> list[Path]:
-    """Write a person as a skinned mesh, or as Gaussians with joints."""
-    from dyngs.export.rigged.people import AnimationInfo, write_mesh, write_rigged_splats
+def _export_person(arguments: argparse.Namespace) -> list[Path]:
+    """Write a person as a skinned mesh."""
+    from dyngs.export.rigged.people import AnimationInfo, write_mesh
     from dyngs.runs.opened import FRAME_RATE
 
-    is_ply = arguments.joints and _kind(arguments) == "ply"
-    suffix = ".ply" if is_ply else ".glb"
-    out = _target(arguments, ("rigged" if arguments.joints else "mesh") + suffix)
+    out = _target(arguments, "mesh.glb")
     motion = arguments.motion
-    if is_ply and motion is not None:
-        raise DyngsError(
-            "--joints writes the rest pose to a .ply, without --motion; use --out FILE.glb"
-        )
     opened = _moved(arguments, _open(arguments)).in_edit_frame()
     played = None if motion is None else AnimationInfo(motion.stem, opened.fps or FRAME_RATE)
-    print_notes((write_rigged_splats if arguments.joints else write_mesh)(opened, out, played))
+    print_notes(write_mesh(opened, out, played))
     return [out]
 
 
