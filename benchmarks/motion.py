@@ -34,26 +34,24 @@ from dyngs.config import Config, PointsInit, RandomInit
 from dyngs.config.io import load_config
 from dyngs.core.metrics import Lpips
 from dyngs.core.state import Role
-from dyngs.data.capture import View, all_views
+from dyngs.data.capture import View
 from dyngs.data.loader import ImageLoader
 from dyngs.data.synthetic.captures import (
+    CAMERA_ANGLE_X,
     CaptureStyle,
     DynamicOptions,
     Primitive,
     SceneName,
-    is_in_image,
-    is_visible,
+    nearest_primitives,
     scene_at,
     write_dynamic_capture,
 )
 from dyngs.data.synthetic.captures import Scene as TrueScene
 from dyngs.data.times import evenly_spaced
-from dyngs.data.tracks import read_true_tracks
 from dyngs.deform.field import DeformationField, FieldSetup, Offsets, select_rows
 from dyngs.deform.random_gaussians import box_of
 from dyngs.deform.scene import DynamicScene
 from dyngs.evaluate.report import evaluate_run, split_views
-from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import Regions, score_views
 from dyngs.gaussians import TopologyEdit
 from dyngs.gaussians.filters import FilterUpdate
@@ -63,7 +61,7 @@ from dyngs.gaussians.scene import GaussianScene
 from dyngs.gaussians.schedule import RateSchedule
 from dyngs.gaussians.static_training import StaticTraining
 from dyngs.models.static_section import StaticModel
-from dyngs.models.views import training_cameras, training_times
+from dyngs.models.views import training_times
 from dyngs.ops.adam import Count
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import checkpoint_paths
@@ -72,6 +70,8 @@ from dyngs.training.new_trainer import GaussianTrainer, build_trainer
 PRESET = Path(__file__).parents[1] / "configs" / "dynamic.yaml"
 REST = 1.0
 """Time at which the oracle's canonical Gaussians lie on their surfaces: everything exists then."""
+# world units by which a surface may seem to lie before one of its own points
+SURFACE_TOLERANCE = 3e-3
 PER_MOVER, MOST_STILL = 1500, 3000
 """Points on the surface of each thing that moves, and of each that stands, at most."""
 DRAWN, LOOKS = 20_000, 16
@@ -244,32 +244,37 @@ def _seen(name: SceneName, label: int, local: np.ndarray, looks: Sequence[View])
         if label < len(scene.primitives):
             pose = np.linalg.inv(view.cam_from_world) @ np.diag([1.0, -1.0, -1.0, 1.0])
             points = scene.primitives[label].to_world(local)
-            seen |= is_in_image(points, pose) & is_visible(scene, points, pose)
+            offset = points - pose[:3, 3]
+            x, y, z = (offset @ pose[:3, :3]).T
+            reach = np.tan(0.5 * CAMERA_ANGLE_X) * -z
+            is_inside = (z < 0) & (np.abs(x) < reach) & (np.abs(y) < reach)
+            distance = np.linalg.norm(offset, axis=1)
+            ways = (offset / distance[:, None]).astype(np.float32)
+            _, nearest = nearest_primitives(scene, pose[:3, 3].astype(np.float32), ways)
+            seen |= is_inside & (nearest > distance - SURFACE_TOLERANCE)
     return seen
 
 
 @dataclass(frozen=True)
 class Row:
-    """What is printed of a model: PSNR in dB of whole images and of parts, tracks in px, and
-    Gaussians."""
+    """What is printed of a model: PSNR in dB of whole images and of parts, and Gaussians."""
 
     psnr: float
     foreground: float | None
     moving: float | None
     still: float | None
-    tracks: float | None
     gaussians: int = 0
 
     def minus(self, other: Row) -> Row:
         """Return the differences; None where one is not known."""
-        names = ("foreground", "moving", "still", "tracks")
+        names = ("foreground", "moving", "still")
         pairs = {name: (getattr(self, name), getattr(other, name)) for name in names}
         parts = {name: None if a is None or b is None else a - b for name, (a, b) in pairs.items()}
         return Row(self.psnr - other.psnr, gaussians=0, **parts)
 
     def line(self, scene: str, model: str) -> str:
         """Return a row of the table."""
-        values = (self.psnr, self.foreground, self.moving, self.still, self.tracks)
+        values = (self.psnr, self.foreground, self.moving, self.still)
         shown = [f"{x:.2f}" if x is not None else "-" for x in values]
         return f"| {scene} | {model} | {' | '.join(shown)} | {self.gaussians or ''} |"
 
@@ -285,16 +290,11 @@ def measured(scene: GaussianScene, config: Config) -> Row:
     scores, _ = score_views(
         scene, images, scene.options, background, Lpips("alex", "not measured"), regions
     )
-    cameras = training_cameras(views, config.data)
-    truth = read_true_tracks(capture)
-    pairs = list(zip(views, cameras, strict=True))
-    tracks: TrackScores = track_scores(scene, truth, pairs, all_views(capture.splits))
     return Row(
         psnr=fmean(score.psnr for score in scores),
         foreground=_mean(score.psnr_foreground for score in scores),
         moving=_mean(score.psnr_moving for score in scores),
         still=_mean(score.psnr_static for score in scores),
-        tracks=tracks.error_px,
         gaussians=len(scene),
     )
 
@@ -310,7 +310,7 @@ def preset_row(config: Config, run: Path) -> Row:
         train(config)
     report = evaluate_run(run)
     parts = report.psnr_foreground, report.psnr_moving, report.psnr_static
-    return Row(report.psnr, *parts, report.track_error_px, report.num_gaussians)
+    return Row(report.psnr, *parts, report.num_gaussians)
 
 
 def oracle_row(name: SceneName, config: Config) -> Row:
@@ -335,8 +335,8 @@ def main(words: Sequence[str] | None = None) -> None:
         "--style", choices=get_args(CaptureStyle), help="as dyngs data synth; one per FOLDER"
     )
     given = parser.parse_intermixed_args(words)
-    print("| scene | model | PSNR | foreground | moves | stands | tracks, px | Gaussians |")
-    print("|---|---|---|---|---|---|---|---|")
+    print("| scene | model | PSNR | foreground | moves | stands | Gaussians |")
+    print("|---|---|---|---|---|---|---|")
     for name in get_args(SceneName):
         if name not in given.scenes.split(","):
             continue

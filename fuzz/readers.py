@@ -146,24 +146,6 @@ def read_2d_tracks(root: Path) -> object:
     return read_tracks(only(root))
 
 
-def read_known_tracks(root: Path) -> object:
-    """Read the true tracks of a capture, which are NaN where a point does not exist, and measure a
-    model by them."""
-    import numpy as np
-    from moving_scene import camera, still_scene
-
-    from dyngs.data.capture import Capture, View
-    from dyngs.data.tracks import read_true_tracks
-    from dyngs.evaluate.tracks import track_scores
-
-    views = [
-        View(name, Path(name), np.eye(4), np.eye(3), 8, 8, time=t)
-        for name, t in (("a", 0.0), ("b", 1.0))
-    ]
-    tracks = read_true_tracks(Capture(root, "blender", {}))
-    return vars(track_scores(still_scene(), tracks, [(view, camera()) for view in views], views))
-
-
 def read_a_video(root: Path) -> object:
     """Read size, length and first frames of a video."""
     from dyngs.data.images.video import probe_video, read_frames
@@ -405,7 +387,6 @@ READERS: dict[str, Reader] = {
     "depth": Reader({"png16": files.write_png16, "npz": files.write_depth_npz}, read_a_depth_map),
     "flow": Reader({"npy": files.write_flow_npy, "flo": files.write_flo}, read_a_flow_field),
     "tracks": Reader({"npz": files.write_tracks}, read_2d_tracks),
-    "true_tracks": Reader({"npz": files.write_known_tracks}, read_known_tracks),
     "video": Reader({"mp4": files.write_mp4}, read_a_video),
     "pickles": Reader({"new": files.write_fits, "old": files.write_old_fits}, read_a_pickle),
     "bodies": Reader(_BODIES, read_a_body),

@@ -17,7 +17,6 @@ from tiny_fields import stirred_field
 from dyngs.config import Config, DataConfig, SceneModel
 from dyngs.config.io import RESOLVED_NAME, save_config
 from dyngs.core.state import strip_roles
-from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.deform.fields import field_state
 from dyngs.deform.keys import DynamicModel
 from dyngs.gaussians.scene import GaussianScene, restore_scene
@@ -115,14 +114,6 @@ def write_tracks(root: Path) -> None:
         visible=np.ones((3, 2), bool),
         names=names,
     )
-
-
-def write_known_tracks(root: Path) -> None:
-    """Write true tracks of two points at two times, each shown by one view."""
-    points = np.array([[[0, 0, 2], [1, 0, 2]], [[0, 1, 2], [np.nan, 0, 2]]], np.float32)
-    views = np.array(["a", "b"])
-    seen = np.array([[True, True], [True, False]])
-    write_true_tracks(root, TrueTracks(points, np.array([0.0, 1.0]), views, np.array([0, 1]), seen))
 
 
 def write_exr(root: Path) -> None:

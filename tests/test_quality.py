@@ -84,7 +84,7 @@ def test_a_static_scene_by_mcmc(still_life: Captured) -> None:
 
 
 def test_a_scene_that_moves_beside_a_static_model_of_it(tmp_path: Path) -> None:
-    """The scene ends moving, follows its material points, and is no worse than a static one.
+    """The scene ends moving, and is better than a static one.
 
     That learns at the same rates: its own, for so short a run, would favour it.
     """
@@ -103,9 +103,6 @@ def test_a_scene_that_moves_beside_a_static_model_of_it(tmp_path: Path) -> None:
     assert moving.psnr_moving is not None
     assert static.psnr_moving is not None
     assert moving.psnr_moving > max(19.0, static.psnr_moving + 2)  # 19.86, 16.08
-    assert moving.track_error_px is not None
-    assert moving.track_motion_px is not None
-    assert moving.track_error_px < 0.93 * moving.track_motion_px  # 2.06, 2.42
 
 
 def test_a_ball_that_rolls_is_followed_as_a_body(

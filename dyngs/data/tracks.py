@@ -1,18 +1,16 @@
-"""Point tracks: 2D tracks in images given by users, and ground-truth 3D tracks."""
+"""2D point tracks in images, given by users."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from dyngs.core.errors import DyngsError
-from dyngs.data.capture import Capture, View
-from dyngs.io.containment import check_inside
+from dyngs.data.capture import View
 from dyngs.io.numpy_files import read_npz
-from dyngs.io.write import atomic_file
 
 _LARGEST = 1e6
 
@@ -83,61 +81,3 @@ def _plain(name: str) -> str:
         for part in PurePosixPath(name.replace("\\", "/")).parts
         if part not in (".", "..", "/")
     )
-
-
-TRACKS_FILE = "true_tracks.npz"
-
-
-@dataclass(frozen=True)
-class TrueTracks:
-    """Ground-truth 3D tracks of P material points at T times; the fields are the arrays of the
-    file.
-
-    Attributes:
-        points: (T, P, 3) world units, in the coordinates of the capture's files; NaN where a point
-            does not exist.
-        times: (T,) ascending, as in the capture's files.
-        views: (V,) names of the views of all splits.
-        moments: (V,) index into ``times`` of each view.
-        visible: (V, P) whether the point is in the image and not occluded.
-    """
-
-    points: np.ndarray
-    times: np.ndarray
-    views: np.ndarray
-    moments: np.ndarray
-    visible: np.ndarray
-
-
-def write_true_tracks(root: Path, tracks: TrueTracks, name: str = TRACKS_FILE) -> Path:
-    """Write the tracks of a capture to the file ``name``, atomically; return the path."""
-    path = root / name
-    with atomic_file(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, **asdict(tracks))
-    return path
-
-
-def read_true_tracks(capture: Capture, name: str = TRACKS_FILE) -> TrueTracks | None:
-    """Return the tracks of a capture in scene coordinates (see ``Capture.world_scale``), None
-    without a file."""
-    path = capture.root / name
-    if not check_inside(path).is_file():
-        return None
-    found = read_npz(path, ("points", "times", "views", "moments", "visible"))
-    points, times, views, moments, visible = found.values()
-    kinds = "".join(x.dtype.kind for x in found.values())
-    fits = (
-        visible.ndim == 2
-        and times.ndim == 1
-        and points.shape == (*times.shape, *visible.shape[1:], 3)
-    )
-    if kinds != "ffUib" or not fits or not views.shape == moments.shape == visible.shape[:1]:
-        shapes = ", ".join(f"{name} {x.shape} of {x.dtype}" for name, x in found.items())
-        raise DyngsError(
-            f"{path}: needs points (T, P, 3), times (T,), views (V,) names, moments (V,) whole "
-            f"numbers and visible (V, P) bool, got {shapes}; write it again, or remove it"
-        )
-    if len(moments) and not (moments.min() >= 0 and moments.max() < len(times)):
-        raise DyngsError(f"{path}: moments must be rows of times; write it again, or remove it")
-    points = (points - capture.world_offset) / capture.world_scale
-    return TrueTracks(points, times, views, moments, visible)

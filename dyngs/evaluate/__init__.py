@@ -1,4 +1,4 @@
-"""Metrics of runs over held-out views, regions, point tracks and time."""
+"""Metrics of runs over held-out views, regions and time."""
 
 import sys
 

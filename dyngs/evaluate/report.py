@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -18,11 +17,9 @@ import torch
 from dyngs.core.conventions import ProgressCallback, ignore_progress
 from dyngs.core.errors import DyngsError, wrap_read_errors
 from dyngs.core.metrics import Lpips, LpipsNet, load_lpips, psnr
-from dyngs.data.capture import Capture, View, all_views
+from dyngs.data.capture import Capture, View
 from dyngs.data.loader import Image, ImageLoader
 from dyngs.data.times import evenly_spaced
-from dyngs.data.tracks import read_true_tracks
-from dyngs.evaluate.tracks import TrackScores, track_scores
 from dyngs.evaluate.view_scores import (
     FLIP_PIXELS,
     POSE_METRICS,
@@ -35,7 +32,6 @@ from dyngs.evaluate.view_scores import (
     mean_scores,
     psnr_per_time,
     score_views,
-    temporal_scores,
     time_renders,
 )
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
@@ -45,7 +41,7 @@ from dyngs.io.write import write_text
 from dyngs.models.checkpoint import CONFIG_ADVICE, read_run_capture
 from dyngs.models.kind import HasMotion, capability
 from dyngs.models.renderable import Renderable, run_path
-from dyngs.models.views import evaluation_background, training_cameras
+from dyngs.models.views import evaluation_background
 from dyngs.ops.device import CPU, select_device
 from dyngs.ops.native import kernel_threads
 from dyngs.runs.checkpoint import (
@@ -170,8 +166,6 @@ class EvalReport:
     deform_fraction: float  # median fraction of the time spent on deformation
     seconds_train: float
     step: int
-    flicker: float | None = None
-    flicker_error: float | None = None
     psnr_per_time: tuple[TimeScore, ...] = ()
     reasons: dict[str, str] = field(default_factory=dict)  # why a metric is None, by name
     notes: tuple[str, ...] = ()  # other remarks about the scores
@@ -184,13 +178,7 @@ class EvalReport:
     psnr_foreground: float | None = None
     psnr_moving: float | None = None
     psnr_static: float | None = None
-    # means over the views that show an object, by its mask label
-    psnr_things: dict[int, float] = field(default_factory=dict)
     moving_from: str | None = None  # source of the moving region, None if unknown
-    # see ``TrackScores``
-    track_error_px: float | None = None
-    track_within_5px: float | None = None
-    track_motion_px: float | None = None
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None
     # from poses fitted to the evaluated images, None if not requested
@@ -292,20 +280,15 @@ def evaluate_run(
         regions,
         flip_every=math.ceil(num_pixels / FLIP_PIXELS),
     )
-    temporal = temporal_scores(drawing, loader, views)
-    tracks = _track_scores(run, capture, scene, views)
     fitted = {}
     if split != "train" and (refine_poses or run.config.camera.refine == "always"):
         fitted = score_fitted_poses(drawing, loader, run.info.extent, lpips)
     means = mean_scores(scores, MEAN_METRICS)
-    reasons |= {name: metric.reason for name, metric in temporal.items() if metric.reason}
     reasons |= {name: regions.reason(name) for name in REGION_METRICS if means[name] is None}
     if means["psnr_right"] is None:
         reasons |= dict.fromkeys(
             ("psnr_right", "psnr_right_fitted"), "all pixels of one half of a view are masked"
         )
-    if tracks.reason is not None:
-        reasons["track_error_px"] = tracks.reason
     report = EvalReport(
         split=split,
         num_views=len(scores),
@@ -323,13 +306,8 @@ def evaluate_run(
         per_view=tuple(scores),
         flip_views=sum(score.flip is not None for score in scores),
         stored_mb=_stored_mb(run_dir),
-        psnr_things=_mean_object_scores(scores),
         moving_from=regions.moving_from,
-        track_error_px=tracks.error_px,
-        track_within_5px=tracks.within_5px,
-        track_motion_px=tracks.motion_px,
         **means,
-        **{name: metric.value for name, metric in temporal.items()},
         **fitted,
         **_sizes(scene),
     )
@@ -386,14 +364,6 @@ MEAN_METRICS = (
 MEAN_METRICS += REGION_METRICS
 
 
-def _mean_object_scores(scores: Sequence[ViewScore]) -> dict[int, float]:
-    values: defaultdict[int, list[float]] = defaultdict(list)
-    for score in scores:
-        for label, value in score.psnr_things.items():
-            values[label].append(value)
-    return {label: fmean(values[label]) for label in sorted(values)}
-
-
 def _sizes(scene: Renderable) -> dict[str, Any]:
     if not isinstance(scene, GaussianScene):
         values = sum(x.tensor.numel() for x in scene.drawing_state().values())
@@ -415,20 +385,6 @@ def _stored_mb(folder: Path) -> float | None:
 def report_path(run_dir: Path, split: str) -> Path:
     """Return the path of the report of ``split`` in a run folder."""
     return run_dir / ("metrics.json" if split == "test" else f"metrics_{split}.json")
-
-
-def _track_scores(
-    run: LoadedRun, capture: Capture, scene: Renderable, views: Sequence[View]
-) -> TrackScores:
-    if not isinstance(scene, GaussianScene):
-        return TrackScores(reason="only scenes of Gaussians have tracks")
-    cameras = training_cameras(views, run.config.data)
-    return track_scores(
-        scene,
-        read_true_tracks(capture),
-        list(zip(views, cameras, strict=True)),
-        all_views(capture.splits),
-    )
 
 
 def parameter_megabytes(scene: GaussianScene) -> float:

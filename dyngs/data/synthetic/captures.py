@@ -1,4 +1,4 @@
-"""Synthetic captures in the layout of NeRF-synthetic and D-NeRF, with true tracks.
+"""Synthetic captures in the layout of NeRF-synthetic and D-NeRF.
 
 This module holds a small ray tracer in NumPy, the scenes, and the captures.
 
@@ -21,7 +21,6 @@ from scipy.spatial.transform import Rotation
 
 from dyngs.core.conventions import encode_srgb
 from dyngs.core.errors import DyngsError
-from dyngs.data.tracks import TrueTracks, write_true_tracks
 from dyngs.io.outputs import atomic_folder
 from dyngs.io.write import write_image, write_text
 
@@ -36,9 +35,6 @@ _LAMP_SIZE = 0.9
 _SKY = (0.46, 0.50, 0.56)
 _GROUND = (0.20, 0.17, 0.15)
 _LAMPLIGHT = (0.80, 0.74, 0.66)
-_SURFACE_TOLERANCE = (
-    3e-3  # world units by which a surface may seem to lie before one of its own points
-)
 
 
 @dataclass(frozen=True)
@@ -208,15 +204,6 @@ def render_motion_labels(
     nothing = np.zeros(size * size, np.int64)
     counts = [nothing, *((things == index).sum(axis=0) for index in scene.moving_indices)]
     return np.argmax(counts, axis=0).astype(np.uint8).reshape(size, size)
-
-
-def is_visible(scene: Scene, points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
-    """(R,) bool: points (R, 3) on surfaces that a camera sees, somewhere in its image or not."""
-    origin = world_from_cam[:3, 3]
-    offset = points - origin
-    distance = np.sqrt(_dot(offset, offset))
-    _, nearest = nearest_primitives(scene, f32(origin), f32(offset / distance[:, None]))
-    return nearest > distance - _SURFACE_TOLERANCE
 
 
 def nearest_primitives(
@@ -695,8 +682,7 @@ def write_dynamic_capture(
     hemisphere, or by one on an arc, which a fixed camera in its middle tests. Fixed cameras each
     take all times: ``camAA/frame_BBBB.png``, frames with ``camera``; test has one of its own.
 
-    ``things/`` holds labels of what moves for each image (``render_things``), and
-    ``true_tracks.npz`` the tracks of points on it (``TrueTracks``). Frames of test name
+    ``things/`` holds labels of what moves for each image (``render_things``). Frames of test name
     their labels (``instance_mask_path``), those of train do not: training would take them as a
     prior. Raises DyngsError: no images requested, ``out`` holds something already,
     or cannot be written.
@@ -721,10 +707,6 @@ def write_dynamic_capture(
                 options,
                 name == "room",
             )
-        taken = [shot for shots in splits.values() for shot in shots]
-        write_true_tracks(
-            started, true_tracks(lambda time: scene_at(name, time), taken, options.seed)
-        )
     return out
 
 
@@ -846,49 +828,3 @@ def _look_at_origin(distance: float, azimuths: np.ndarray, elevations: np.ndarra
     columns = [right, np.cross(backward, right), backward, distance * backward]
     poses[:, :3] = np.stack(columns, axis=-1)
     return poses
-
-
-POINTS_PER_THING = 200
-
-
-def true_tracks(
-    scene_of: Callable[[float], Scene], shots: Sequence[SyntheticView], seed: int = 0
-) -> TrueTracks:
-    """Return the tracks of points spread over all that moves in the scene at a time in [0, 1].
-
-    ``seed``: of the points.
-    """
-    moments = [shot.time or 0.0 for shot in shots]
-    times = sorted(set(moments))
-    scenes = [scene_of(time) for time in times]
-    random = np.random.default_rng(seed)
-    local = {
-        i: scenes[0].primitives[i].sample_surface(POINTS_PER_THING, random)
-        for i in scenes[0].moving_indices
-    }
-    points = np.stack(
-        [
-            np.concatenate([scene.primitives[i].to_world(x) for i, x in local.items()])
-            for scene in scenes
-        ]
-    ).astype(np.float32)
-    rows = [times.index(time) for time in moments]
-    visible = [
-        is_in_image(points[row], shot.world_from_cam)
-        & is_visible(scenes[row], points[row], shot.world_from_cam)
-        for row, shot in zip(rows, shots, strict=True)
-    ]
-    return TrueTracks(
-        points,
-        np.array(times, np.float64),
-        np.array([shot.name for shot in shots]),
-        np.array(rows, np.int64),
-        np.stack(visible),
-    )
-
-
-def is_in_image(points: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
-    """(P,) bool: points (P, 3) before the camera and within its square image."""
-    x, y, z = ((points - world_from_cam[:3, 3]) @ world_from_cam[:3, :3]).T
-    reach = np.tan(0.5 * CAMERA_ANGLE_X) * -z
-    return (z < 0) & (np.abs(x) < reach) & (np.abs(y) < reach)
