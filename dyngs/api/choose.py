@@ -1,4 +1,4 @@
-"""Pilot runs: short trainings before a run that resolve its ``auto`` settings.
+"""Pilot runs: short trainings before a run that decide on motion and on a network for colours.
 
 Two trainings of the same images, steps and cap on Gaussians differ in one setting. It is taken if
 its mean gain on held-out training views, pair by pair, exceeds twice its standard error; motion
@@ -62,7 +62,7 @@ class _Size:
     spent: float
 
 
-SETTINGS = _Size(side=128, gaussians=15_000, steps=2000, fewest_steps=1000, spent=0.1)
+COLOUR = _Size(side=128, gaussians=15_000, steps=2000, fewest_steps=1000, spent=0.1)
 MOTION = _Size(side=96, gaussians=5000, steps=600, fewest_steps=600, spent=0.25)
 """In 300 steps the motion of a turning head is not found yet."""
 MOTION_RANDOM = 1000  # Most random Gaussians that motion begins with in a pilot run
@@ -119,10 +119,10 @@ class Choice:
         )
 
 
-def resolve_auto_settings(
+def resolve_by_pilot_runs(
     config: Config, capture: Capture, on_progress: ProgressCallback = ignore_progress
 ) -> tuple[Config, list[Choice], Capture]:
-    """Resolve every setting that is left open by pilot runs.
+    """Resolve motion and colours by pilot runs, where they were not requested.
 
     Returns the resolved config, the results, and the capture with the points that the scene begins
     with.
@@ -259,12 +259,12 @@ def _with_colour(
     views = capture.splits["train"]
     folds = _held_out(views)
     steps, first_side = _affordable(config, views[0], len(folds))
-    if not folds or steps < SETTINGS.fewest_steps:
+    if not folds or steps < COLOUR.fewest_steps:
         log_info(f"{setting} {_TOO_SHORT}")
         return config, [], capture
     log_info(f"pilot runs of {format_count(steps, 'step')}, compared on held-out training views:")
     changed = config.model_copy(update={"colour": NetworkColour()})
-    both = [_small(x, SETTINGS, steps, first_side) for x in (config, changed)]
+    both = [_small(x, COLOUR, steps, first_side) for x in (config, changed)]
     choice = _compared(setting, both, capture, folds, on_progress)
     if choice is None:
         return config, [], capture
@@ -347,10 +347,10 @@ def _affordable(config: Config, view: View, folds: int) -> tuple[int, float]:
     first_side = max(view_size(view, config.data)) / config.train.initial_downscale
     if config.train.minutes is not None:
         return 0, first_side
-    small = _small(config, SETTINGS, 1000, first_side)
+    small = _small(config, COLOUR, 1000, first_side)
     work = config.train.steps * _work_of_step(config, view) / _work_of_step(small, view)
     runs = max(2 * folds, 1)
-    return min(SETTINGS.steps, int(SETTINGS.spent * work / runs)), first_side
+    return min(COLOUR.steps, int(COLOUR.spent * work / runs)), first_side
 
 
 def _work_of_step(config: Config, view: View) -> float:

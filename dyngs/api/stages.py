@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from dyngs.api.choose import resolve_auto_settings
+from dyngs.api.choose import resolve_by_pilot_runs
 from dyngs.api.first_scene import load_initial_gaussians
 from dyngs.capture.sfm.unposed import ensure_poses
 from dyngs.config import AutoColour, FixedStrategy, SceneInit, ShColour
@@ -131,8 +131,8 @@ def read_same_capture(folder: Path, resumed: Checkpoint) -> Stage:
 
 
 def run_pilots(report: ProgressCallback) -> Stage:
-    """Return the stage that reads the capture, finds initial points, and resolves ``auto`` settings
-    by pilot runs."""
+    """Return the stage that reads the capture, finds initial points, and resolves motion and
+    colours by pilot runs."""
 
     def stage(plan: RunPlan) -> tuple[RunPlan, None]:
         config = plan.resolved
@@ -142,7 +142,7 @@ def run_pilots(report: ProgressCallback) -> Stage:
         message = describe_shrinking(capture.splits, config.data)
         if message and "longest_side" not in config.data.model_fields_set:
             log_info(message)
-        config, choices, capture = resolve_auto_settings(config, capture, report)
+        config, choices, capture = resolve_by_pilot_runs(config, capture, report)
         config = apply_pixel_cap(config, capture)
         return replace(plan, resolved=config, capture=capture, choices=tuple(choices)), None
 

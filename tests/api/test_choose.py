@@ -15,7 +15,7 @@ from PIL import Image
 from two_balls import two_balls
 
 from dyngs.api import choose as module
-from dyngs.api.choose import Choice, as_static, resolve_auto_settings
+from dyngs.api.choose import Choice, as_static, resolve_by_pilot_runs
 from dyngs.api.train import train
 from dyngs.config import Config, DataConfig, RunConfig
 from dyngs.config.io import load_config, packaged_preset
@@ -55,7 +55,7 @@ def test_few_views_are_held_out_in_two_folds_and_many_in_one() -> None:
 
 def test_a_capture_without_times_is_refused_with_what_to_add(still: Path) -> None:
     with pytest.raises(DyngsError, match=r"no times.*configs/static.yaml.*data\.times=order"):
-        resolve_auto_settings(preset(still), read_capture(DataConfig(root=still)))
+        resolve_by_pilot_runs(preset(still), read_capture(DataConfig(root=still)))
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_never_worse_than_static(
         keys = ["init.num_random=300", "model.num_random_moving=150", "data.times=order"]
     monkeypatch.setattr(module, "MOTION", replace(module.MOTION, steps=steps))
     config = preset(root, "train.steps=20_000", *keys, "colour.kind=sh")
-    best, (choice,), _ = resolve_auto_settings(config, read_capture(config.data))
+    best, (choice,), _ = resolve_by_pilot_runs(config, read_capture(config.data))
     assert choice.taken is moves, choice
     assert isinstance(best.model, DynamicModel) is moves
 
@@ -149,7 +149,7 @@ def test_interrupted_pilot_runs_leave_nothing_and_repeat(
             train(config)
     assert not list(run.glob("*"))
     capture = read_capture(config.data)
-    first, second = (resolve_auto_settings(config, capture)[1][0] for _ in range(2))
+    first, second = (resolve_by_pilot_runs(config, capture)[1][0] for _ in range(2))
     assert replace(first, seconds=0) == replace(second, seconds=0)
 
 
@@ -166,9 +166,9 @@ def test_a_colour_network_is_used_if_it_gains(
 
     monkeypatch.setattr(module, "_compared", compare)
     config = preset(tmp_path, "train.steps=200_000", "init.num_random=40", "data.longest_side=8")
-    best, choices, _ = resolve_auto_settings(config, read_capture(config.data))
+    best, choices, _ = resolve_by_pilot_runs(config, read_capture(config.data))
     assert [choice.setting for choice in choices] == list(gains)
     assert best.colour.kind == ("network" if gain > 0.05 else "sh")
     own = preset(tmp_path, "train.steps=200_000", "init.num_random=40", "colour.kind=sh")
-    _, choices, _ = resolve_auto_settings(own, read_capture(own.data))
+    _, choices, _ = resolve_by_pilot_runs(own, read_capture(own.data))
     assert [choice.setting for choice in choices] == ["model.kind=dynamic"]
