@@ -49,7 +49,7 @@ MEASUREMENTS = {
     ),
     "street": Measurement(
         "static", "street: 29 photos, sky, a moving car", "street", "static",
-        ("data.longest_side=480", "train.robust=auto", "train.exposure=auto", "train.steps=5000"),
+        ("data.longest_side=480", "train.steps=5000"),
         estimate_poses=True, in_readme=True,
     ),
     "fox": Measurement(

@@ -13,13 +13,11 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from operator import methodcaller
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from dyngs.api.first_scene import load_initial_gaussians
 from dyngs.config import BudgetConfig, Config, NetworkColour, PruneConfig, ShColour
@@ -29,7 +27,7 @@ from dyngs.core.errors import DyngsError, format_count, log_info
 from dyngs.core.metrics import psnr
 from dyngs.core.section import ModelSection, Section
 from dyngs.data.capture import Capture, View
-from dyngs.data.loader import Image, ImageLoader
+from dyngs.data.loader import ImageLoader
 from dyngs.data.read import view_size
 from dyngs.data.times import evenly_spaced
 from dyngs.deform.keys import FreeField
@@ -37,17 +35,13 @@ from dyngs.deform.static_errors import changed_fraction, group_fixed_cameras
 from dyngs.gaussians.colour.network import apply_affine_colour, fit_affine_colour
 from dyngs.io.write import write_text
 from dyngs.models.kind import HasGaussians, HasMotion, capability, find_kind
-from dyngs.models.renderable import Rendering
 from dyngs.models.schedule import image_divisor
 from dyngs.models.views import background_colour, evaluation_background
 from dyngs.runs.folder import CHOICES_NAME
-from dyngs.training.corrections.camera_refinement import fit_camera_to_image
 from dyngs.training.loop import Interrupts
 from dyngs.training.new_trainer import GaussianTrainer, add_initial_points, build_trainer
 
 Pair = tuple[GaussianTrainer, GaussianTrainer]
-Score = Callable[[Pair, int], list[float]]
-"""Returns the PSNR, dB, of a training view by two models that were not trained on it."""
 
 
 @dataclass(frozen=True)
@@ -96,11 +90,6 @@ MIN_DIFFERING = 0.001
 """Fraction of the pixels of fixed cameras that differ from their median from which something
 moves."""
 LOOK_CAMERAS, LOOK_TIMES = 8, 24  # Fixed cameras, and images of each, in which that is looked for
-EXPLAINED = 0.8
-"""Fraction of the pixels of a view that count where people may walk through it: those where the
-smaller of two models' errors is smallest."""
-SQUARES = 8  # The halves of an image are the two colours of a chess board of so many squares a side
-
 
 _TOO_SHORT = "not used: the run is too short, or has too few views, for pilot runs"
 
@@ -148,10 +137,10 @@ def resolve_auto_settings(
         raise DyngsError(f"{config.data.root}: {problem}")
     model: Any = config.model
     if capability(model, HasMotion) is None or not model.pilot_runs:
-        return _with_settings(config, capture, on_progress)
+        return _with_colour(config, capture, on_progress)
     moves = _motion_of_fixed_cameras(capture, config)
     if moves is False:
-        return _with_settings(as_static(config), capture, on_progress)
+        return _with_colour(as_static(config), capture, on_progress)
     moving = _with(config, "model", pilot_runs=False)
     views = capture.splits["train"]
     at_once = len(views) / len({view.time for view in views})
@@ -160,10 +149,10 @@ def resolve_auto_settings(
     choice = _motion(moving, capture, on_progress)
     if choice is None:
         log_info(f"model.kind=dynamic {_TOO_SHORT}; model.pilot_runs=false trains a moving scene")
-        return _with_settings(as_static(config), capture, on_progress)
+        return _with_colour(as_static(config), capture, on_progress)
     log_info(f"  {choice}")
     found = moving if choice.taken else as_static(config)
-    best, choices, capture = _with_settings(found, capture, on_progress, moving=choice.taken)
+    best, choices, capture = _with_colour(found, capture, on_progress, moving=choice.taken)
     return best, [choice, *choices], capture
 
 
@@ -248,7 +237,6 @@ def _motion(config: Config, capture: Capture, on_progress: ProgressCallback) -> 
         [_with(small, "model", motion_from=1.0), small],
         capture,
         folds,
-        plain_psnr,
         on_progress,
         errors=ERRORS_OF_MOTION,
         deadline=begun + MOTION.spent * given,
@@ -259,50 +247,29 @@ def _motion(config: Config, capture: Capture, on_progress: ProgressCallback) -> 
     return choice
 
 
-def _with_settings(
+def _with_colour(
     config: Config, capture: Capture, on_progress: ProgressCallback, *, moving: bool = False
 ) -> tuple[Config, list[Choice], Capture]:
-    """Resolve ``auto`` settings by pilot runs; return config, results and the prepared capture.
-
-    The settings are tried in order of their expected gain, each on top of those accepted before it.
-    If motion improved the held-out views, colours are tried, too.
-    """
-    kind = find_kind(config.model)
-    is_static = capability(config.model, HasMotion) is None
-    found: list[tuple[str, str, Callable[[Section], Section], Score]] = []
-    for section, key, score in (
-        ("camera", "refine", psnr_after_pose_fit),
-        ("train", "exposure", psnr_after_colour_fit),
-        ("train", "robust", explained_psnr),
-    ):
-        if getattr(getattr(config, section), key) == "auto":
-            config = _with(config, section, **{key: "never"})
-            if f"{section}.{key}" in kind.uses and (is_static or key != "robust"):
-                always = methodcaller("model_copy", update={key: "always"})
-                found.append((f"{section}.{key}=always", section, always, score))
-    if moving and config.colour == ShColour() and not config.colour.model_fields_set:
-        found.append(("colour.kind=network", "colour", lambda _: NetworkColour(), plain_psnr))
+    """Return config, results and the prepared capture; if motion improved the held-out views, pilot
+    runs decide about a colour network."""
     capture = add_initial_points(capture, config, on_progress=on_progress)
+    if not moving or config.colour != ShColour() or config.colour.model_fields_set:
+        return config, [], capture
+    setting = "colour.kind=network"
     views = capture.splits["train"]
     folds = _held_out(views)
-    steps, first_side = _affordable(config, views[0], len(found), len(folds))
-    choices = list[Choice]()
-    if found and (not folds or steps < SETTINGS.fewest_steps):
-        log_info(f"{', '.join(text for text, *_ in found)} {_TOO_SHORT}")
-        return config, choices, capture
-    if found:
-        log_info(
-            f"pilot runs of {format_count(steps, 'step')}, compared on held-out training views:"
-        )
-    for text, section, change, score in found:
-        changed = config.model_copy(update={section: change(getattr(config, section))})
-        both = [_small(x, SETTINGS, steps, first_side) for x in (config, changed)]
-        choice = _compared(text, both, capture, folds, score, on_progress)
-        if choice is not None:
-            log_info(f"  {choice}")
-            choices.append(choice)
-            config = changed if choice.taken else config
-    return config, choices, capture
+    steps, first_side = _affordable(config, views[0], len(folds))
+    if not folds or steps < SETTINGS.fewest_steps:
+        log_info(f"{setting} {_TOO_SHORT}")
+        return config, [], capture
+    log_info(f"pilot runs of {format_count(steps, 'step')}, compared on held-out training views:")
+    changed = config.model_copy(update={"colour": NetworkColour()})
+    both = [_small(x, SETTINGS, steps, first_side) for x in (config, changed)]
+    choice = _compared(setting, both, capture, folds, on_progress)
+    if choice is None:
+        return config, [], capture
+    log_info(f"  {choice}")
+    return changed if choice.taken else config, [choice], capture
 
 
 def _compared(
@@ -310,7 +277,6 @@ def _compared(
     both: Sequence[Config],
     capture: Capture,
     folds: Sequence[frozenset[int]],
-    score: Score,
     on_progress: ProgressCallback,
     *,
     errors: float = ERRORS,
@@ -332,7 +298,7 @@ def _compared(
         one, other = (_trained(config, capture, held_out, deadline, on_step) for config in both)
         if one is None or other is None:
             return None
-        pairs += [score((one, other), index) for index in sorted(held_out)]
+        pairs += [view_psnr((one, other), index) for index in sorted(held_out)]
     gains = [after - before for before, after in pairs]
     gain = fmean(gains)
     error = (stdev(gains) if len(gains) > 1 else math.inf) / math.sqrt(len(gains))
@@ -375,7 +341,7 @@ def _trained(
     return trainer if trainer.done >= last else None
 
 
-def _affordable(config: Config, view: View, settings: int, folds: int) -> tuple[int, float]:
+def _affordable(config: Config, view: View, folds: int) -> tuple[int, float]:
     """Return the steps of each pilot run within its part of the work, 0 where a time is given, and
     the longest side of the images that the run itself begins with."""
     first_side = max(view_size(view, config.data)) / config.train.initial_downscale
@@ -383,7 +349,7 @@ def _affordable(config: Config, view: View, settings: int, folds: int) -> tuple[
         return 0, first_side
     small = _small(config, SETTINGS, 1000, first_side)
     work = config.train.steps * _work_of_step(config, view) / _work_of_step(small, view)
-    runs = max(2 * settings * folds, 1)
+    runs = max(2 * folds, 1)
     return min(SETTINGS.steps, int(SETTINGS.spent * work / runs)), first_side
 
 
@@ -460,112 +426,26 @@ def _motion_of_fixed_cameras(capture: Capture, config: Config) -> bool | None:
     return moves
 
 
-def plain_psnr(pair: Pair, index: int) -> list[float]:
-    """Return the PSNR of the view; where either has exposures, after an affine colour fitted to
-    it."""
-    truth, mask, shown = _shown(pair, index)
-    return [psnr(rgb, truth, mask) for rgb in shown]
-
-
-def explained_psnr(pair: Pair, index: int) -> list[float]:
-    """Return the PSNR over the pixels that at least one of the two explains best, the same ones for
-    both.
-
-    Held-out views show people who walk through, too, whom no model can predict.
-    """
-    truth, mask, (one, other) = _shown(pair, index)
-    counts = explained_pixels(one, other, truth, mask)
-    return [psnr(one, truth, counts), psnr(other, truth, counts)]
-
-
-def explained_pixels(one: Tensor, other: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
-    """Return (H, W) the pixels, of those that ``mask`` keeps, where the smaller error of two images
-    is smallest.
-
-    Neither image is favoured: exchanged, they give the same.
-    """
-    error = torch.minimum((one - truth).square().mean(-1), (other - truth).square().mean(-1))
-    weight = torch.ones_like(error) if mask is None else mask
-    known = error[weight > 0]
-    if not known.numel():
-        return weight
-    rank = max(1, round(EXPLAINED * known.numel()))
-    return weight * (error <= known.sort().values[rank - 1])
-
-
-def psnr_after_pose_fit(pair: Pair, index: int) -> list[float]:
-    """Return the PSNR of the right half of the view from the pose in which its left half fits each
-    model best.
-
-    Held-out views have no refined cameras.
-    """
-    scores = []
-    for trainer in pair:
-        image = trainer.images[index]
-        background = background_colour(trainer.background)
-        left = torch.zeros_like(image.rgb_premultiplied[..., 0])
-        left[:, : left.shape[1] // 2] = 1
-        right = 1 - left if image.mask is None else (1 - left) * image.mask
-        scene = trainer.model.scene
-        options = trainer.model.options
-        fitted = fit_camera_to_image(
-            scene, image, background, trainer.extent, options=options, weights=left
-        )
-        rgb = _rendered(trainer, fitted).rgb[0]
-        scores.append(psnr(rgb, image.composite(background), right))
-    return scores
-
-
-def psnr_after_colour_fit(pair: Pair, index: int) -> list[float]:
-    """Return the mean PSNR of a view without and with colours fitted on its other half.
-
-    Held-out views have no exposures of their own. Where exposure goes with the viewpoint, as in a
-    slow walk, colours that depend on the viewpoint explain it: then the scene in one exposure is
-    farther from images as they are.
-    """
-    scores = []
-    for trainer in pair:
-        image = trainer.images[index]
-        background = background_colour(trainer.background)
-        rendering = _rendered(trainer, image)
-        truth = image.composite(background)
-        rgb = rendering.rgb[0]
-        fitted = rgb.clone()
-        light = _chess_board(*rgb.shape[:2])
-        for half in (light, ~light):
-            affine = fit_affine_colour([(image, rendering)], background, half.float())
-            fitted[~half] = apply_affine_colour(affine, image, rendering, background)[~half]
-        scores.append(fmean((psnr(rgb, truth, image.mask), psnr(fitted, truth, image.mask))))
-    return scores
-
-
-def _chess_board(height: int, width: int) -> Tensor:
-    rows, columns = (torch.arange(size, device="cpu") * SQUARES // size for size in (height, width))
-    return (rows[:, None] + columns) % 2 == 0
-
-
 @torch.no_grad()
-def _rendered(trainer: GaussianTrainer, image: Image) -> Rendering:
-    background = background_colour(trainer.background)
-    return trainer.model.scene.render(
-        image.cameras, image.time, options=trainer.model.options, background=background
-    )
-
-
-def _shown(pair: Pair, index: int) -> tuple[Tensor, Tensor | None, list[Tensor]]:
-    """Return the view (H, W, 3), its mask, and the view as both scenes show it.
+def view_psnr(pair: Pair, index: int) -> list[float]:
+    """Return the PSNR, dB, of a training view by two models that were not trained on it.
 
     Where either has exposures, after an affine colour that is fitted to the view.
     """
     image = pair[0].images[index]
     background = background_colour(pair[0].background)
+    truth = image.composite(background)
     has_exposures = any(trainer.config.train.exposure == "always" for trainer in pair)
-    shown = []
+    scores = []
     for trainer in pair:
-        rendering = _rendered(trainer, image)
+        model = trainer.model
+        own = background_colour(trainer.background)
+        rendering = model.scene.render(
+            image.cameras, image.time, options=model.options, background=own
+        )
         rgb = rendering.rgb[0]
         if has_exposures:
             affine = fit_affine_colour([(image, rendering)], background)
             rgb = apply_affine_colour(affine, image, rendering, background)
-        shown.append(rgb)
-    return image.composite(background), image.mask, shown
+        scores.append(psnr(rgb, truth, image.mask))
+    return scores

@@ -63,8 +63,7 @@ def _continue_run(folder: Path, config: Config) -> Config:
     if not is_later or steps < (was.steps if was.minutes is None else done):
         raise DyngsError(f"{folder} has a run of {format_count(was.steps, 'step')}")
     by_hand = f"(`dyngs train --resume {quote_path(folder)} train.steps={steps}` continues it)"
-    settings = (config.camera.refine, config.train.exposure, config.train.robust)
-    if "auto" in settings or getattr(config.model, "pilot_runs", False):
+    if getattr(config.model, "pilot_runs", False):
         raise DyngsError(
             f"{folder} has a shorter run, for which its pilot runs were made {by_hand}"
         )

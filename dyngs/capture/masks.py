@@ -7,7 +7,7 @@ Local letters: F frames of one camera, H height, W width.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,9 +19,7 @@ from dyngs.capture.sfm.frame_choice import FIXED_CAMERA_LIMIT, camera_displaceme
 from dyngs.core.errors import DyngsError, log_info
 from dyngs.data.capture import Capture, Silhouette, View, group_by_camera, map_views
 from dyngs.data.images.images import (
-    SUFFIXES,
     area_downscale_uint8,
-    list_files,
     read_image,
     target_size,
 )
@@ -246,7 +244,7 @@ SAMPLES = 41  # images of a camera whose median is the background
 LEAST = 8  # least number of images of a camera
 SIDE = 960  # longest side of the images that are compared, px
 _MOVES = "moves, so its background is unknown; give masks of the person (--masks)"
-_ADVICE = "give masks of the person (--masks), or an image of the empty background (--background)"
+_ADVICE = "give masks of the person (--masks)"
 
 
 @dataclass(frozen=True)
@@ -271,35 +269,23 @@ class _Camera:
 
 
 def add_background_masks(
-    capture: Capture, folder: Path, empty: Path | None = None, log: Callable[[str], None] = log_info
+    capture: Capture, folder: Path, log: Callable[[str], None] = log_info
 ) -> Capture:
     """Segment the person in a capture of fixed cameras; masks are written to ``folder``.
 
     Raises DyngsError for a moving camera, too few images, or no visible foreground, with advice.
-
-    Args:
-        empty: an image without the person, or a folder with one per camera, named by camera
-            number; None: the median over time.
     """
-    cameras = _fixed_cameras(capture)
-    plates = {} if empty is None else _plates(empty, cameras)
     silhouettes: dict[str, Silhouette] = {}
     found: list[Separation] = []
-    for number, camera in cameras.items():
+    for camera in _fixed_cameras(capture):
         paths = [view.image_path for view in camera.views]
         sampled = np.stack([camera.image(paths[i]) for i in evenly_spaced(len(paths), SAMPLES)])
-        if number in plates:
-            colours = camera.image(plates[number]).astype(np.float32)
-            typical = float(np.median(background_of(sampled).noise))
-            background = Background(colours, np.full(colours.shape[:2], typical, np.float32))
-        elif _moves(sampled):
+        if _moves(sampled):
             raise DyngsError(f"{camera.where}: the camera {_MOVES}")
-        else:
-            background = background_of(sampled)
+        background = background_of(sampled)
         masks = np.stack([person_mask(background, image) for image in sampled])
         found.append(measure_separation(background, sampled, masks))
-        with_plate = number in plates and found[-1].area > 0 and found[-1].on_edges > 0.5
-        if not (found[-1].is_clear or with_plate):
+        if not found[-1].is_clear:
             raise DyngsError(
                 f"{camera.where}: no person stands out from the background, or the person stays "
                 f"in one place, so that the background is never visible ({found[-1].staying:.0%} "
@@ -323,9 +309,9 @@ def add_background_masks(
     return capture.replace(splits=splits, has_alpha=True)
 
 
-def _fixed_cameras(capture: Capture) -> dict[int, _Camera]:
-    """Return the cameras of a capture by number, all of which stand."""
-    cameras = {}
+def _fixed_cameras(capture: Capture) -> list[_Camera]:
+    """Return the cameras of a capture, all of which stand."""
+    cameras = []
     for number, views in group_by_camera(capture.splits).items():
         where = f"{capture.root}, camera {number}"
         first = views[0]
@@ -338,23 +324,8 @@ def _fixed_cameras(capture: Capture) -> dict[int, _Camera]:
                 f"{where}: has {len(views)} images, too few to estimate the background; {_ADVICE}"
             )
         size = target_size(first.width, first.height, 1.0, SIDE)
-        cameras[number] = _Camera(where, tuple(views), size)
+        cameras.append(_Camera(where, tuple(views), size))
     return cameras
-
-
-def _plates(empty: Path, cameras: Mapping[int, _Camera]) -> Mapping[int, Path]:
-    """Return the image of the background for each camera, by number."""
-    if empty.is_file() and len(cameras) == 1:
-        return dict.fromkeys(cameras, empty)
-    found = {path: re.search(r"(\d{1,9})\D*$", path.stem) for path in list_files(empty, SUFFIXES)}
-    plates = {int(number[1]): path for path, number in found.items() if number}
-    missing = sorted(cameras.keys() - plates.keys())
-    if missing:
-        raise DyngsError(
-            f"{empty}: no background image for camera {missing[0]}; add {missing[0]}.png to the "
-            "folder"
-        )
-    return plates
 
 
 def resize_mask(mask: np.ndarray, view: View) -> np.ndarray:

@@ -153,22 +153,11 @@ def add_motion(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--motion", type=input_path, metavar="FILE", help=about)
 
 
-def add_keep_feet(parser: argparse.ArgumentParser) -> None:
-    about = "with --motion: adjust the root position so that feet on the floor do not slide"
-    parser.add_argument("--keep-feet", action="store_true", help=about)
-
-
-def require_motion_for_feet(arguments: argparse.Namespace) -> None:
-    """Raise DyngsError for ``--keep-feet`` without ``--motion``."""
-    if arguments.keep_feet and arguments.motion is None:
-        raise DyngsError("--keep-feet requires --motion FILE; add a motion or remove --keep-feet")
-
-
 def play_motion(arguments: argparse.Namespace, opened: OpenedScene) -> OpenedScene:
     """Apply ``--motion`` to the person, if given, and print the notes about it."""
     if arguments.motion is None:
         return opened
-    moved = opened.play_motion(arguments.motion, keep_feet=arguments.keep_feet)
+    moved = opened.play_motion(arguments.motion)
     print_notes(moved.notes[len(opened.notes) :])
     return replace(moved, notes=opened.notes)
 

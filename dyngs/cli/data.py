@@ -19,10 +19,6 @@ SYNTHETIC_SCENES = ("still", "spin", "room", "roll", "human", "people")
 _OF_A_FIT = {
     "keypoints": ("PATH", "2D key points: a folder of OpenPose files, or a COCO file"),
     "masks": ("DIR", "masks of the person (white), with the names of the images"),
-    "background": (
-        "PATH",
-        "image of the empty scene, or a folder with one per camera, from which masks are computed",
-    ),
     "joints": (
         "PATH",
         "3D joints of another program (.npz), or an output folder of SAM 3D Body",

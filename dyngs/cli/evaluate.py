@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _OUTLINED, _REFINED = ", poses from silhouettes", ", poses refined"
 """Of the tested images, and on them."""
-MOST_THINGS = 5
+WORST_VIEWS = 5
 
 
 def add_parser(commands: args.Commands) -> None:
@@ -40,7 +40,7 @@ def add_parser(commands: args.Commands) -> None:
         "images; always on for runs with camera.refine"
     )
     parser.add_argument("--refine", action="store_true", help=about)
-    about = "more rows: worst views, right halves, per time, flicker, and why metrics are missing"
+    about = "more rows: worst views, right halves, per time, and why metrics are missing"
     parser.add_argument("--verbose", action="store_true", help=about)
     args.add_json(parser)
 
@@ -123,7 +123,7 @@ def missing_metrics(report: EvalReport) -> list[str]:
 def _further_rows(report: EvalReport) -> list[tuple[str, str]]:
     """Return labels and values for ``--verbose``, and the reasons for metrics without a value."""
     rows: list[tuple[str, str]] = []
-    worst = sorted(report.per_view, key=lambda view: view.psnr)[:MOST_THINGS]
+    worst = sorted(report.per_view, key=lambda view: view.psnr)[:WORST_VIEWS]
     rows += [(f"PSNR of {view.name}", f"{view.psnr:.2f} dB") for view in worst]
     if report.psnr_white is not None and report.psnr_black is not None:
         both = f"{report.psnr_white:.2f} dB, {report.psnr_black:.2f} dB"
@@ -136,12 +136,6 @@ def _further_rows(report: EvalReport) -> list[tuple[str, str]]:
         lowest = min(report.psnr_per_time, key=lambda at: at.psnr)
         spread = f"{lowest.psnr:.2f} (time {lowest.time:g}) to {max(values):.2f} dB"
         rows.append((f"PSNR at {format_count(len(values), 'time')}", spread))
-        for label, value in (
-            ("flicker", report.flicker),
-            ("flicker error", report.flicker_error),
-        ):
-            if value is not None:
-                rows.append((label, f"{value:.3f} of 255"))
     if report.num_moving:
         rows.append(("deformation field", f"{report.field_mb:.1f} MB"))
         rows.append(("time for deforming", f"{report.deform_fraction:.0%} of rendering"))
@@ -188,8 +182,4 @@ def _rows_of_regions(report: EvalReport) -> list[tuple[str, str]]:
     ):
         if value is not None:
             rows.append((label, f"{value:.2f} dB (by {report.moving_from})"))
-    if len(report.psnr_things) > 1:
-        worst = sorted(report.psnr_things.items(), key=lambda item: item[1])[:MOST_THINGS]
-        things = ", ".join(f"{label}: {value:.2f} dB" for label, value in worst)
-        rows.append(("on the worst things", things))
     return rows

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from dyngs.cli import arguments as args
 from dyngs.cli.imports import heavy_imports
 from dyngs.cli.output import ProgressBar, print_notes, print_written
-from dyngs.cli.splats import MOVING, SPLAT_FORMATS, add_axes, print_image_difference
+from dyngs.cli.splats import SPLAT_FORMATS, add_axes, print_image_difference
 from dyngs.core.errors import DyngsError, format_count, quote_path
 from dyngs.core.plugins import EXPORTERS, load_plugin, plugin_entries
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from dyngs.runs.opened import OpenedScene
 
 _OTHER_SUFFIXES = {
-    f".{MOVING}": MOVING,
     ".npz": "tracks",
     ".safetensors": "avatar",
     ".dyngs": "dyngs",
@@ -35,7 +34,6 @@ _OTHER_SUFFIXES = {
 _SPLATS = "time times motion static dynamic up from_up"
 _TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree classic") | {
     "sog": f"{_SPLATS} sh_degree classic folder",
-    MOVING: _SPLATS,
     "tracks": "time times motion dynamic",
     "dyngs": "max_change",
     "avatar": "",
@@ -45,7 +43,6 @@ _TAKES = dict.fromkeys(SPLAT_FORMATS, f"{_SPLATS} sh_degree classic") | {
     "mesh of a person": "motion",
     "mesh": "time times up from_up level segments cells",
     "bodies": "time up from_up classic",
-    "joints": "motion",
 }
 """Options that each format accepts."""
 
@@ -55,13 +52,11 @@ examples:
   dyngs export runs/dance --time 0.5 --out middle.ply             the scene at one time
   dyngs export runs/bench --out bench.spz                         the suffix selects the format: .glb, .sog ...
   dyngs export runs/dance --times 0:1:30 --out frames             a sequence frame_0000.ply ...
-  dyngs export runs/dance --out dance.4dgs                        all training times in one file
   dyngs export runs/balls --bodies --out balls.glb                rolling balls as animated nodes
   dyngs export runs/ann --motion walk.npz --out walk              a person (model.kind=human), one file per frame
   dyngs export runs/ann --format avatar --out ann.safetensors     an avatar file, for `render` and `export`
   dyngs export runs/ann --format mesh --motion walk.npz --out ann.glb   skinned and textured, for Blender, three.js ...
   dyngs export runs/bench --format mesh --out bench.glb           a mesh with vertex colours
-  dyngs export runs/ann --joints --out ann.ply                    Gaussians of a person with joints and weights
   dyngs export runs/dance --format tracks --dynamic               positions of all moving Gaussians over time, as .npz
   dyngs export runs/dance --format dyngs --out dance_export       a small file, for `eval`, `render` and `export`
   dyngs export runs/refined --format cameras                      runs/refined/cameras/transforms.json
@@ -91,7 +86,6 @@ def add_parser(commands: args.Commands) -> None:
     )
     formats = (
         *SPLAT_FORMATS,
-        MOVING,
         "tracks",
         "dyngs",
         "avatar",
@@ -112,7 +106,6 @@ def add_parser(commands: args.Commands) -> None:
         "--times", metavar="A:B:N", help="N times from A to B (default for tracks: training times)"
     )
     args.add_motion(parser)
-    args.add_keep_feet(parser)
     about = (
         "--format dyngs: largest RMS change of the images, in grey levels of 255 (default: a loss "
         "of 0.025 dB on training views)"
@@ -137,8 +130,6 @@ def add_parser(commands: args.Commands) -> None:
         "--format html: view of the capture that the page starts with, by name or index (default 0)"
     )
     parser.add_argument("--view", metavar="NAME|N", help=about)
-    about = "Gaussians of a person in rest pose, with joints and skinning weights: .ply, .glb"
-    parser.add_argument("--joints", action="store_true", help=about)
     about = "rigidly moving bodies as animated nodes of a .glb; all else is static, as at --time"
     parser.add_argument("--bodies", action="store_true", help=about)
     add_axes(parser)
@@ -204,15 +195,14 @@ def _write(arguments: argparse.Namespace) -> list[Path]:
     with heavy_imports():
         import dyngs.runs.opened  # noqa: F401
 
-    args.require_motion_for_feet(arguments)
     arguments.run_dir = args.run_of_scene_file(arguments.run_dir)
     kind = _kind(arguments)
     if kind == "mesh" and not _has_surface(arguments):
         kind = "mesh of a person"
-    elif (arguments.bodies and kind == "glb") or (arguments.joints and kind in ("ply", "glb")):
-        kind = "bodies" if arguments.bodies else "joints"
+    elif arguments.bodies and kind == "glb":
+        kind = "bodies"
     taken = {*_TAKES.get(kind, "time motion").split(), kind}
-    for name in (*dict.fromkeys(" ".join(_TAKES.values()).split()), "bodies", "joints"):
+    for name in (*dict.fromkeys(" ".join(_TAKES.values()).split()), "bodies"):
         given = getattr(arguments, name)
         if name not in taken and given is not None and given is not False:
             raise DyngsError(f"--{name.replace('_', '-')} is not supported with --format {kind}")
@@ -228,8 +218,7 @@ def _write(arguments: argparse.Namespace) -> list[Path]:
         "mesh": _export_surface,
         "network": _export_network,
         "bodies": _export_bodies,
-        "joints": _export_rigged,
-        "mesh of a person": _export_rigged,
+        "mesh of a person": _export_person,
     }
     if kind not in _TAKES:
         return _export_by_plugin(arguments, kind[1:])
@@ -242,8 +231,6 @@ def _write(arguments: argparse.Namespace) -> list[Path]:
         print_notes(("the scene is static: all times are the same",))
     if kind == "tracks":
         return _export_tracks(arguments, opened, times)
-    if kind == MOVING:
-        return _export_moving(arguments, opened, times or opened.scene.times or (0.0,))
     return _export_splats(arguments, opened, times, kind)
 
 
@@ -426,34 +413,6 @@ def _shown(count: int) -> list[int]:
     return sorted({0, count // 2, count - 1})
 
 
-def _export_moving(
-    arguments: argparse.Namespace, opened: OpenedScene, times: tuple[float, ...]
-) -> list[Path]:
-    """Write all times as one .4dgs file."""
-    from dyngs.export.images import compare_file_with_run
-    from dyngs.export.splat_files import (
-        FOURDGS_SUFFIX,
-        FOURDGS_UP,
-        choose_write_options,
-        read_4dgs_frame,
-        scene_part,
-        write_4dgs,
-    )
-
-    how, line = choose_write_options(opened, FOURDGS_UP, arguments.up, arguments.from_up)
-    print_notes((line,))
-    part = _part(arguments)
-    scene = scene_part(opened.scene, part)
-    path = _target(arguments, f"splats{FOURDGS_SUFFIX}")
-    splats, notes = write_4dgs(opened, path, times, part, how)
-    found = [
-        compare_file_with_run(opened, scene, times[i], splats[i], read_4dgs_frame(path, i))
-        for i in _shown(len(times))
-    ]
-    print_image_difference(notes, found)
-    return [path]
-
-
 def _export_tracks(
     arguments: argparse.Namespace, opened: OpenedScene, times: tuple[float, ...] | None
 ) -> list[Path]:
@@ -547,22 +506,16 @@ def _export_bodies(arguments: argparse.Namespace) -> list[Path]:
     return [written.path]
 
 
-def _export_rigged(arguments: argparse.Namespace) -> list[Path]:
-    """Write a person as a skinned mesh, or as Gaussians with joints."""
-    from dyngs.export.rigged.people import AnimationInfo, write_mesh, write_rigged_splats
+def _export_person(arguments: argparse.Namespace) -> list[Path]:
+    """Write a person as a skinned mesh."""
+    from dyngs.export.rigged.people import AnimationInfo, write_mesh
     from dyngs.runs.opened import FRAME_RATE
 
-    is_ply = arguments.joints and _kind(arguments) == "ply"
-    suffix = ".ply" if is_ply else ".glb"
-    out = _target(arguments, ("rigged" if arguments.joints else "mesh") + suffix)
+    out = _target(arguments, "mesh.glb")
     motion = arguments.motion
-    if is_ply and motion is not None:
-        raise DyngsError(
-            "--joints writes the rest pose to a .ply, without --motion; use --out FILE.glb"
-        )
     opened = _moved(arguments, _open(arguments)).in_edit_frame()
     played = None if motion is None else AnimationInfo(motion.stem, opened.fps or FRAME_RATE)
-    print_notes((write_rigged_splats if arguments.joints else write_mesh)(opened, out, played))
+    print_notes(write_mesh(opened, out, played))
     return [out]
 
 

@@ -60,7 +60,6 @@ def add_parser(commands: args.Commands) -> None:
     person.add_argument(
         "--pose", choices=("rest",), help="render a person in the rest pose of the template"
     )
-    args.add_keep_feet(parser)
     parser.add_argument(
         "--video",
         type=args.output_path,
@@ -115,7 +114,6 @@ def _check(arguments: argparse.Namespace) -> None:
     if arguments.video is not None:
         transparent = arguments.background == "none"
         require_video_suffix(arguments.video, transparent=transparent)
-    args.require_motion_for_feet(arguments)
     arguments.source = args.run_of_scene_file(arguments.source)
     known = suggest_command(arguments.source)
     if known is not None and not (arguments.source / "config.yaml").is_file():

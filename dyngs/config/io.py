@@ -73,6 +73,8 @@ had no effect; only that value is accepted."""
 RENAMED_KEYS = {"model.choose": "model.pilot_runs", "init.trains": "init.trainable"}
 """Former to current key names. Stored configurations are converted; presets and overrides with a
 former name are refused."""
+_WERE_AUTO = (("camera", "refine"), ("train", "exposure"), ("train", "robust"))
+"""Sections and keys with the former value "auto", in requested configurations only."""
 REMOVED_MODEL_KEYS: dict[str, dict[str, object]] = {
     "human": {
         "refine_from": 0.1,
@@ -215,12 +217,16 @@ def load_resolved(
 
 
 def _convert_renamed_keys(tree: dict[str, Any]) -> None:
-    """Replace former key names by the current ones, in place."""
+    """Replace former key names and values by the current ones, in place."""
     for former, current in RENAMED_KEYS.items():
         section_name, key = former.split(".")
         section = tree.get(section_name)
         if isinstance(section, dict) and key in section:
             section[current.split(".")[1]] = section.pop(key)
+    for section_name, key in _WERE_AUTO:
+        section = tree.get(section_name)
+        if isinstance(section, dict) and section.get(key) == "auto":
+            section[key] = "never"
 
 
 def drop_removed_model_keys(model: dict[str, object]) -> dict[str, object]:

@@ -69,7 +69,6 @@ class Image:
         time: in [0, 1].
         frame: frame number of the view.
         motion_mask: (H, W) float32, moving fraction of each pixel.
-        labels: (H, W) int64 index of the moving object, 0 for none, if the motion mask has labels.
         depth: (H, W) float32 depth, 0 = unknown.
         flow: (H, W, 2) float32 displacement to the view ``flow_to`` in pixels of this image, NaN =
             unknown.
@@ -83,7 +82,6 @@ class Image:
     time: float | None
     frame: int | None = None
     motion_mask: Tensor | None = None
-    labels: Tensor | None = None
     depth: Tensor | None = None
     flow: Tensor | None = None
 
@@ -114,7 +112,7 @@ class Image:
         for name, values in self.tensors().items():
             if name == "flow":
                 small[name] = image_maps.resize_flow(values, *size)
-            elif name in ("depth", "labels"):
+            elif name == "depth":
                 small[name] = _nearest(values, image_maps.nearest_positions(*size))
             elif name == "rgb_premultiplied":
                 small[name] = area_downscale(values, *size)
@@ -414,8 +412,6 @@ class ImageLoader:
             read = image_maps.read_labels if view.motion_mask_labels else read_mask
             found = read(view.motion_mask_path)
             _require_size(view, view.motion_mask_path, found.shape, "motion mask")
-            if view.motion_mask_labels:
-                maps["labels"] = at_pixels(found)
             moves = (found != 0).float()[..., None]
             if lens_map is not None:
                 moves = undistort(moves, lens_map)

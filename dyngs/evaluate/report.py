@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -33,7 +32,6 @@ from dyngs.evaluate.view_scores import (
     mean_scores,
     psnr_per_time,
     score_views,
-    temporal_scores,
     time_renders,
 )
 from dyngs.gaussians.scene import GaussianScene, require_gaussians
@@ -168,8 +166,6 @@ class EvalReport:
     deform_fraction: float  # median fraction of the time spent on deformation
     seconds_train: float
     step: int
-    flicker: float | None = None
-    flicker_error: float | None = None
     psnr_per_time: tuple[TimeScore, ...] = ()
     reasons: dict[str, str] = field(default_factory=dict)  # why a metric is None, by name
     notes: tuple[str, ...] = ()  # other remarks about the scores
@@ -182,8 +178,6 @@ class EvalReport:
     psnr_foreground: float | None = None
     psnr_moving: float | None = None
     psnr_static: float | None = None
-    # means over the views that show an object, by its mask label
-    psnr_things: dict[int, float] = field(default_factory=dict)
     moving_from: str | None = None  # source of the moving region, None if unknown
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None
@@ -286,12 +280,10 @@ def evaluate_run(
         regions,
         flip_every=math.ceil(num_pixels / FLIP_PIXELS),
     )
-    temporal = temporal_scores(drawing, loader, views)
     fitted = {}
     if split != "train" and (refine_poses or run.config.camera.refine == "always"):
         fitted = score_fitted_poses(drawing, loader, run.info.extent, lpips)
     means = mean_scores(scores, MEAN_METRICS)
-    reasons |= {name: metric.reason for name, metric in temporal.items() if metric.reason}
     reasons |= {name: regions.reason(name) for name in REGION_METRICS if means[name] is None}
     if means["psnr_right"] is None:
         reasons |= dict.fromkeys(
@@ -314,10 +306,8 @@ def evaluate_run(
         per_view=tuple(scores),
         flip_views=sum(score.flip is not None for score in scores),
         stored_mb=_stored_mb(run_dir),
-        psnr_things=_mean_object_scores(scores),
         moving_from=regions.moving_from,
         **means,
-        **{name: metric.value for name, metric in temporal.items()},
         **fitted,
         **_sizes(scene),
     )
@@ -372,14 +362,6 @@ MEAN_METRICS = (
     "see_through",
 )
 MEAN_METRICS += REGION_METRICS
-
-
-def _mean_object_scores(scores: Sequence[ViewScore]) -> dict[int, float]:
-    values: defaultdict[int, list[float]] = defaultdict(list)
-    for score in scores:
-        for label, value in score.psnr_things.items():
-            values[label].append(value)
-    return {label: fmean(values[label]) for label in sorted(values)}
 
 
 def _sizes(scene: Renderable) -> dict[str, Any]:

@@ -2,11 +2,9 @@
 
 People are also scored inside their bounding box and on black, as in published results. With
 differing exposures, an affine colour map is fitted on the left half of a view and the right half is
-scored (Martin-Brualla et al. 2021). Flicker metrics are means of absolute values over pixels,
-channels and time steps, in grey levels of 255, for images clamped to [0, 1].
+scored (Martin-Brualla et al. 2021).
 
-Local letters: T images of a camera, H x W pixels, R a rendered image, G the true image, t its time,
-k time steps.
+Local letters: H x W pixels.
 """
 
 from __future__ import annotations
@@ -15,7 +13,7 @@ import math
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from statistics import fmean
 from typing import Any
 
@@ -25,7 +23,7 @@ from torch import Tensor
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
-from dyngs.core.metrics import Lpips, MetricValue, flip, psnr, ssim
+from dyngs.core.metrics import Lpips, flip, psnr, ssim
 from dyngs.data.capture import View
 from dyngs.data.images.maps import silhouette_box
 from dyngs.data.loader import Image, ImageLoader
@@ -91,15 +89,6 @@ class Regions:
             parts[1:] = [x if foreground is None else x & foreground for x in (moves, ~moves)]
         found = [_psnr_inside(part, image, rendered, truth) for part in parts]
         return dict(zip(REGION_METRICS, found, strict=True))
-
-    def object_scores(self, image: Image, rendered: Tensor, truth: Tensor) -> dict[int, float]:
-        """Return the PSNR of each labelled object in a view in dB, by mask label."""
-        if image.labels is None:
-            return {}
-        labels = image.labels if image.alpha is None else image.labels * (image.alpha > 0)
-        shown = labels[labels != 0].unique().cpu().tolist()
-        scores = {label: _psnr_inside(labels == label, image, rendered, truth) for label in shown}
-        return {label: score for label, score in scores.items() if score is not None}
 
     def moving(self, image: Image) -> Tensor | None:
         """Return the moving pixels (H, W) bool, or None if unknown."""
@@ -222,7 +211,6 @@ class ViewScore:
     psnr_foreground: float | None = None
     psnr_moving: float | None = None
     psnr_static: float | None = None
-    psnr_things: dict[int, float] = field(default_factory=dict)
     psnr_right: float | None = None
     psnr_right_fitted: float | None = None
     psnr_white: float | None = None
@@ -298,7 +286,6 @@ def score_views(
         values |= background_scores(image, rendering, background)
         if regions is not None:
             values |= regions.scores(image, rendered, truth)
-            values["psnr_things"] = regions.object_scores(image, rendered, truth)
         score = ViewScore(
             name=image.name,
             width=image.cameras.width,
@@ -424,69 +411,3 @@ def psnr_per_time(scores: Iterable[tuple[float | None, float]]) -> tuple[TimeSco
     return tuple(
         TimeScore(time, fmean(values), len(values)) for time, values in sorted(by_time.items())
     )
-
-
-def flicker(drawing: SceneRenderer, cameras: Cameras, times: Sequence[float]) -> MetricValue:
-    """Return the mean of |R_{k+1} - 2 R_k + R_{k-1}| x 255 at one camera: a second difference in
-    time.
-
-    For uneven time steps, R_k is compared with the line between its neighbours: 2 |w R_{k-1} + (1 -
-    w) R_{k+1} - R_k| with w = (t_{k+1} - t_k) / (t_{k+1} - t_{k-1}). Of more than 60 time steps, 20
-    evenly spaced triples are used. A static scene has 0.
-    """
-    if drawing.scene.is_static:
-        return MetricValue(0.0)
-    if len(times) < 3:
-        return MetricValue(None, f"needs at least three training times, found {len(times)}")
-    seen: dict[int, Tensor] = {}
-    values = []
-    last = len(times) - 1
-    num_triples = last - 1 if last < 60 else 20
-    for k in np.linspace(1, last - 1, num_triples).round().astype(int).tolist():
-        seen = {
-            i: seen[i] if i in seen else drawing.image(cameras, times[i]).clamp(0, 1)
-            for i in (k - 1, k, k + 1)
-        }
-        before, now, after = (times[i] for i in (k - 1, k, k + 1))
-        line = torch.lerp(seen[k + 1], seen[k - 1], (after - now) / (after - before))
-        values.append(2 * 255 * float((line - seen[k]).abs().double().mean()))
-    return MetricValue(fmean(values))
-
-
-def flicker_error(
-    drawing: SceneRenderer, loader: ImageLoader, views: Sequence[View]
-) -> MetricValue:
-    """Return the mean of |(R_{k+1} - R_k) - (G_{k+1} - G_k)| x 255 at static cameras.
-
-    Missing motion and flicker both increase it. Pixels masked in one of the two images are
-    excluded.
-    """
-    total = weight = 0.0
-    for indices in static_cameras(views):
-        before: tuple[Tensor, Tensor] | None = None
-        for image in (loader[i] for i in indices):
-            # R' - R - (G' - G) is the difference of two errors.
-            truth = image.composite(drawing.background).clamp(0, 1)
-            error = drawing.image(image.cameras, image.time).clamp(0, 1) - truth
-            counts = torch.ones_like(truth[..., 0]) if image.mask is None else image.mask
-            if before is not None:
-                weights = torch.minimum(before[1], counts)
-                total += float(((error - before[0]).abs().mean(-1) * weights).double().sum())
-                weight += float(weights.double().sum())
-            before = error, counts
-    if not weight:
-        return MetricValue(None, "no static camera with several time steps in this split")
-    return MetricValue(255 * total / weight)
-
-
-def temporal_scores(
-    drawing: SceneRenderer, loader: ImageLoader, views: Sequence[View]
-) -> dict[str, MetricValue]:
-    """Return ``flicker`` at the first camera of a split, at the training times, and
-    ``flicker_error``."""
-    if all(view.time is None for view in views):
-        return dict.fromkeys(("flicker", "flicker_error"), MetricValue(None, NO_TIMES))
-    return {
-        "flicker": flicker(drawing, loader[0].cameras, drawing.scene.times),
-        "flicker_error": flicker_error(drawing, loader, views),
-    }

@@ -49,17 +49,11 @@ class HumanKind(HasGaussians, HasBody):
         )
 
     def play_motion(
-        self,
-        section: HumanModel,
-        scene: Posable,
-        info: CheckpointInfo,
-        path: Path,
-        *,
-        keep_feet: bool,
+        self, section: HumanModel, scene: Posable, info: CheckpointInfo, path: Path
     ) -> PlayedMotion:
         from dyngs.human.avatar.play_motion import play_motion
 
-        return play_motion(section, scene, info, path, keep_feet=keep_feet)
+        return play_motion(section, scene, info, path)
 
     def read_person(self, path: Path) -> tuple[HumanModel, Posable, CheckpointInfo]:
         from dyngs.human.avatar.avatar_file import read_avatar

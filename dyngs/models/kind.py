@@ -176,13 +176,13 @@ class HasBody(ModelKind):
 
     @abstractmethod
     def play_motion(
-        self, section: Any, scene: Posable, info: CheckpointInfo, path: Path, *, keep_feet: bool
+        self, section: Any, scene: Posable, info: CheckpointInfo, path: Path
     ) -> PlayedMotion:
         """Animate a person by a motion file (AMASS, SMPL-X, BVH, glTF or VRM animation).
 
         Motions are adapted to the size, position and up direction of the person, except files with
-        ``scale``, which are fits in the world of the capture. ``keep_feet`` adjusts the root
-        position so that feet on the floor do not slide. Raises DyngsError: an unreadable file.
+        ``scale``, which are fits in the world of the capture. Raises DyngsError: an unreadable
+        file.
         """
 
     @abstractmethod

@@ -217,7 +217,7 @@ class OpenedScene(LoadedRun, Cache):
         """Return the same as the views of ``split`` show it, see ``scene_of_split``."""
         return self.with_scene(scene_of_split(self, self.capture, split))
 
-    def play_motion(self, path: Path, *, keep_feet: bool = False) -> OpenedScene:
+    def play_motion(self, path: Path) -> OpenedScene:
         """Return the same with its person in the motion of a file, see ``HasBody.in_motion``.
 
         Raises:
@@ -228,7 +228,7 @@ class OpenedScene(LoadedRun, Cache):
         body = capability(self.config.model, HasBody)
         if body is None:
             raise self._no_person(wanted)
-        found = body.play_motion(self.config.model, person, self.info, path, keep_feet=keep_feet)
+        found = body.play_motion(self.config.model, person, self.info, path)
         notes = (*self.notes, *found.notes)
         return replace(self, renderable=found.scene, fps=found.fps, as_captured=False, notes=notes)
 

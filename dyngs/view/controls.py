@@ -206,8 +206,6 @@ class Controls:
         """Add the motion list and the pose sliders."""
         connection = self._connection
         motion = gui.add_dropdown("Motion", (AS_CAPTURED, AT_REST, BY_SLIDERS, *self._motions))
-        hint = "prevent feet on the floor from sliding in motion files"
-        feet = gui.add_checkbox("Keep feet", False, hint=hint)
         joint = gui.add_dropdown("Joint", BODY_JOINTS)
         sliders = [gui.add_slider(axis, -180.0, 180.0, 1.0, 0.0) for axis in "xyz"]
         angles: dict[str, list[float]] = {}
@@ -220,7 +218,7 @@ class Controls:
             elif choice == BY_SLIDERS:
                 opened = pose_person(opened, angles)
             elif choice != AS_CAPTURED:
-                opened = opened.play_motion(self._motions[choice], keep_feet=bool(feet.value))
+                opened = opened.play_motion(self._motions[choice])
             connection.session.show(opened)
 
         def play(_: Any) -> None:
@@ -238,7 +236,6 @@ class Controls:
                 play(event)
 
         motion.on_update(play)
-        feet.on_update(play)
         joint.on_update(pick)
         for slider in sliders:
             slider.on_update(turn)

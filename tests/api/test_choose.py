@@ -15,7 +15,7 @@ from PIL import Image
 from two_balls import two_balls
 
 from dyngs.api import choose as module
-from dyngs.api.choose import Choice, as_static, explained_pixels, resolve_auto_settings
+from dyngs.api.choose import Choice, as_static, resolve_auto_settings
 from dyngs.api.train import train
 from dyngs.config import Config, DataConfig, RunConfig
 from dyngs.config.io import load_config, packaged_preset
@@ -58,23 +58,11 @@ def test_a_capture_without_times_is_refused_with_what_to_add(still: Path) -> Non
         resolve_auto_settings(preset(still), read_capture(DataConfig(root=still)))
 
 
-def test_half_is_explained_and_neither_image_is_favoured() -> None:
-    truth = torch.zeros(10, 10, 3)
-    one = truth.clone()
-    other = truth.clone()
-    one[:5] = 1.0
-    other[5:] = 1.0
-    other[0] = 1.0
-    counts = explained_pixels(one, other, truth, None)
-    assert torch.equal(counts, explained_pixels(other, one, truth, None))
-    assert counts[1:].all()
-
-
 @pytest.mark.parametrize(
     "keys",
     [
         (),
-        ("train.steps=123", "train.minutes=2", "train.robust=auto"),
+        ("train.steps=123", "train.minutes=2", "train.robust=always"),
         ("model.sh_degree=2", "train.ssim_weight=0.5", "optim.lr_means=1e-3"),
         (
             "strategy.kind=mcmc",
@@ -165,27 +153,22 @@ def test_interrupted_pilot_runs_leave_nothing_and_repeat(
     assert replace(first, seconds=0) == replace(second, seconds=0)
 
 
-def test_a_clear_gain_is_taken_and_noise_is_not(
-    still: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("gain", [1.0, 0.01])
+def test_a_colour_network_is_used_if_it_gains(
+    gain: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of two open settings, each tried on top of those before it."""
-    gains = {"camera.refine=always": 1.0, "train.exposure=always": 0.01}
-    compared = list[tuple[str, str]]()
+    """It is tried where motion gained, unless the colours were requested."""
+    write_rolling_ball(tmp_path)
+    gains = {"model.kind=dynamic": 1.0, "colour.kind=network": gain}
 
-    def compare(text: str, both: Any, *_: Any, **__: Any) -> Choice:
-        compared.append((text, both[0].camera.refine))
-        taken = gains[text] > 0.05
-        return Choice(text, 8, 20.0, gains[text], 0.1, 1000, 1.0, taken)
+    def compare(text: str, *_: Any, **__: Any) -> Choice:
+        return Choice(text, 8, 20.0, gains[text], 0.1, 1000, 1.0, gains[text] > 0.05)
 
     monkeypatch.setattr(module, "_compared", compare)
-    monkeypatch.setattr(module, "FEWEST_VIEWS", 2)
-    keys = (
-        "train.steps=200_000",
-        "camera.refine=auto",
-        "train.exposure=auto",
-        "data.longest_side=8",
-    )
-    config = preset(still, *keys, name="static")
+    config = preset(tmp_path, "train.steps=200_000", "init.num_random=40", "data.longest_side=8")
     best, choices, _ = resolve_auto_settings(config, read_capture(config.data))
-    assert compared == [("camera.refine=always", "never"), ("train.exposure=always", "always")]
-    assert (best.camera.refine, best.train.exposure, len(choices)) == ("always", "never", 2)
+    assert [choice.setting for choice in choices] == list(gains)
+    assert best.colour.kind == ("network" if gain > 0.05 else "sh")
+    own = preset(tmp_path, "train.steps=200_000", "init.num_random=40", "colour.kind=sh")
+    _, choices, _ = resolve_auto_settings(own, read_capture(own.data))
+    assert [choice.setting for choice in choices] == ["model.kind=dynamic"]

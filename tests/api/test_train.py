@@ -118,7 +118,9 @@ def _interrupt_after(
 
 
 def test_a_run_learns_and_leaves_its_folder(capture: Path, tmp_path: Path) -> None:
-    config = _config(capture, tmp_path / "run", steps=60, strategy=DefaultStrategy())
+    config = _config(
+        capture, tmp_path / "run", steps=60, strategy=DefaultStrategy(max_gaussians=1000)
+    )
     # a loss whose weights do not change
     of_images = config.train.model_copy(update={"alpha_weight": 0.0})
     config = config.model_copy(update={"train": of_images})

@@ -221,13 +221,6 @@ def test_a_mesh_that_walks(
     assert abs(min(found.posed(frame)[:, 1].min() for frame in range(3))) < 1e-5
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".glb"])
-def test_gaussians_with_joints(avatar: Path, tmp_path: Path, suffix: str) -> None:
-    out = tmp_path / f"ann{suffix}"
-    assert main(["export", str(avatar), "--joints", "--out", str(out)]) == 0
-    assert (b"property float weight_7" if suffix == ".ply" else b"JOINTS_1") in out.read_bytes()
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -243,13 +236,6 @@ def test_gaussians_with_joints(avatar: Path, tmp_path: Path, suffix: str) -> Non
             "--format mesh --cells 30 --out x.glb",
             "--cells is not supported with --format mesh of a person",
         ),
-        (
-            "--format mesh --joints --out x.glb",
-            "--joints is not supported with --format mesh",
-        ),
-        ("--joints --out x.spz", "--joints is not supported with --format spz"),
-        ("--joints --static --out x.ply", "--static is not supported with --format joints"),
-        ("--joints --motion no.npz --out x.ply", "without --motion"),
     ],
 )
 def test_wrong_options_end_in_one_line(
@@ -266,12 +252,6 @@ def test_wrong_options_end_in_one_line(
     assert re.search(words, said)
     assert said.count("\n") == 1
     assert not list(tmp_path.iterdir())
-
-
-def test_a_scene_without_a_person(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = write_moving_run(tmp_path / "run")
-    assert main(["export", str(run), "--joints", "--out", "x.ply"]) == 2
-    assert re.search(r"needs a run of a person \(model\.kind=human\), not", capsys.readouterr().err)
 
 
 @pytest.fixture(scope="module")
@@ -359,10 +339,8 @@ def test_export_accepts_every_suffix_that_its_help_names(
     motions = re.search(r"motion file for a person: (.*?)--max", text, re.DOTALL)
     assert motions is not None
     others = {".kind", ".js", ".root", ".follow_links"}  # model.kind, three.js, data.root
-    found = (
-        set(re.findall(r"(?<=[a-z ])\.(?:4dgs|[a-z]\w+)", text.replace(motions[1], ""))) - others
-    )
-    assert {".ply", ".spz", ".4dgs", ".safetensors", ".html"} <= found
+    found = set(re.findall(r"(?<=[a-z ])\.[a-z]\w+", text.replace(motions[1], ""))) - others
+    assert {".ply", ".spz", ".safetensors", ".html"} <= found
     for suffix in found:
         arguments = argparse.Namespace(
             out=Path(f"x{suffix}"), format=None, times=None, motion=None, time=None, bodies=False

@@ -107,14 +107,15 @@ def test_renamed_keys_are_refused_with_their_new_names(
     assert f"mine.yaml:2: {former} was renamed" in refusal(preset, ROOT)
 
 
-def test_stored_configurations_with_renamed_keys_still_load(tmp_path: Path) -> None:
+def test_stored_configurations_with_former_keys_and_values_still_load(tmp_path: Path) -> None:
     path = tmp_path / RESOLVED_NAME
     path.write_text(
         "data: {root: capture}\nmodel: {kind: dynamic, choose: true}\n"
-        "init: {kind: scene, scene: old.ply, trains: colour}\n"
+        "init: {kind: scene, scene: old.ply, trains: colour}\ntrain: {robust: auto}\n"
     )
     config = load_resolved(path)
     assert config.model.pilot_runs
+    assert config.train.robust == "never"
     assert config.init.trainable == "colour"
 
 

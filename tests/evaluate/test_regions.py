@@ -99,20 +99,6 @@ def test_motion_masks_come_first_and_empty_background_counts_nowhere() -> None:
     assert regions.moving_from == "motion masks"
 
 
-def test_each_thing_of_labelled_masks_has_a_score_of_its_own() -> None:
-    labels = torch.zeros(SIDE, SIDE, dtype=torch.int64)
-    labels[:6, :6], labels[6:12, :6], labels[20, 20] = 1, 7, 3
-    image = replace(images_of_a_walk()[0], labels=labels)
-    truth = image.composite(WHITE)
-    rendered = truth.clone()
-    rendered[:6, :6] -= 0.1
-    rendered[6:12, :6] -= 0.01
-    scores = regions_of([image]).object_scores(image, rendered, truth)
-    assert scores == {1: pytest.approx(20.0, abs=1e-3), 7: pytest.approx(40.0, abs=1e-2)}, (
-        "a single pixel says nothing"
-    )
-
-
 def test_a_mask_of_a_image_holds_in_its_regions() -> None:
     images = images_of_a_walk()
     mask = torch.ones(SIDE, SIDE)

@@ -23,8 +23,10 @@ from dyngs.data.loader import Image
 from dyngs.data.read import read_capture
 from dyngs.evaluate.report import scene_of_split
 from dyngs.evaluate.view_scores import (
+    TimeScore,
     background_scores,
     person_scores,
+    psnr_per_time,
     right_half_scores,
     score_views,
 )
@@ -302,3 +304,13 @@ def test_poses_that_were_trained_on_are_not_refined(
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_psnr_per_time_is_the_mean_of_the_views_of_each_time() -> None:
+    scores = [(0.5, 30.0), (0.0, 10.0), (0.5, 20.0), (None, 99.0), (0.0, 11.0), (1.0, 5.0)]
+    assert psnr_per_time(scores) == (
+        TimeScore(0.0, 10.5, 2),
+        TimeScore(0.5, 25.0, 2),
+        TimeScore(1.0, 5.0, 1),
+    )
+    assert psnr_per_time([(None, 3.0)]) == ()

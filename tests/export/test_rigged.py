@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +22,6 @@ from bare_person import (
 )
 from gltf_skins import SkinnedGlb
 from moving_scene import write_moving_run
-from plyfile import PlyData
 from synthetic_bodies import model, write_npz
 
 from dyngs.core.errors import DyngsError
@@ -37,7 +35,6 @@ from dyngs.export.rigged.people import (
     rest_vertices,
     surface_normals,
     write_mesh,
-    write_rigged_splats,
 )
 from dyngs.export.rigged.surface import MARGINS, FittedSurface, fit_surface
 from dyngs.export.rigged.texture import (
@@ -61,7 +58,6 @@ from dyngs.human.body.skinning import (
 )
 from dyngs.human.motion.gltf import read_gltf
 from dyngs.human.motion.placement import rotate_clip_to_y_up
-from dyngs.io.formats.formats import read_splats
 from dyngs.runs.checkpoint import load_run
 
 
@@ -212,74 +208,10 @@ def test_templates_that_do_not_fit() -> None:
         body_mesh(replace(body, uv=None, uv_faces=None))
 
 
-def test_the_columns_and_comments_suffice_to_pose_the_person(tmp_path: Path) -> None:
-    """With nothing but the file, read by plyfile, and linear blend skinning."""
-    run = bare_run()
-    scene = run.scene
-    assert isinstance(scene, HumanScene)
-    write_rigged_splats(run, tmp_path / "ann.ply")
-    data = PlyData.read(str(tmp_path / "ann.ply"))
-    rows = data["vertex"]
-    joints = np.stack([rows[f"joint_{k}"] for k in range(8)], axis=1).astype(int)
-    weights = np.stack([rows[f"weight_{k}"] for k in range(8)], axis=1)
-    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-6)
-    lines = [line.split() for line in data.comments if line.startswith("joint ")]
-    assert [int(line[1]) for line in lines] == list(range(55))
-    assert lines[1][2:4] == ["left_hip", "0"]
-    parents = tuple(int(line[3]) for line in lines)
-    places = torch.tensor([[float(x) for x in line[4:]] for line in lines])
-    pose = axis_angle_to_matrix(
-        0.4 * torch.randn(55, 3, generator=torch.Generator().manual_seed(1))
-    )
-    moves = joint_transforms(places, parents, pose).numpy()[joints]
-    means = np.stack([rows[axis] for axis in "xyz"], axis=1)
-    blend = (weights[..., None, None] * moves).sum(axis=1)
-    found = np.einsum("nab,nb->na", blend[..., :3], means) + blend[..., 3]
-    skeleton = scene.learned_skeleton
-    own = torch.einsum(
-        "nj,jab->nab", scene.weights, joint_transforms(skeleton.joints, skeleton.parents, pose)
-    )
-    wanted = float(np.exp(0.1)) * (
-        (own[..., :3] @ scene.gaussians.means[..., None])[..., 0] + own[..., 3]
-    )
-    rise = (found - wanted.numpy()).mean(axis=0)
-    np.testing.assert_allclose(found, wanted.numpy() + rise, atol=2e-5)
-    np.testing.assert_allclose(rise[[0, 2]], 0, atol=1e-5)
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".glb"])
-def test_other_readers_see_the_rest_pose(tmp_path: Path, suffix: str) -> None:
-    run = bare_run()
-    write_rigged_splats(run, tmp_path / f"ann{suffix}")
-    splat = read_splats(tmp_path / f"ann{suffix}")
-    assert len(splat.gaussians) == len(run.scene)
-    assert splat.gaussians.means[:, 1].amin() > -0.01
-    torch.testing.assert_close(splat.gaussians.sh, run.scene.gaussians.sh, atol=1e-6, rtol=0)
-    ratio = splat.gaussians.scales / run.scene.gaussians.scales
-    torch.testing.assert_close(ratio, torch.full_like(ratio, float(np.exp(0.1))), atol=1e-4, rtol=0)
-
-
-def test_the_skin_moves_gaussians_as_the_avatar_does(tmp_path: Path) -> None:
-    run = with_motion(bare_run(), random_clip(3, 0.7, seed=2))
-    scene = run.scene
-    assert isinstance(scene, HumanScene)
-    notes = write_rigged_splats(run, tmp_path / "ann.glb", AnimationInfo("walk", 25.0))
-    assert len(notes) == 1
-    assert "viewers may show the rest pose" in notes[0]
-    found = SkinnedGlb(tmp_path / "ann.glb")
-    assert found.primitive["mode"] == 0
-    turned = rotate_clip_to_y_up(scene.played_clip, scene.clip, scene.learned_skeleton.joints)
-    torch.testing.assert_close(turned.poses, scene.played_clip.poses, atol=1e-5, rtol=0)
-    for frame, time in enumerate((0.0, 0.5, 1.0)):
-        difference = found.posed(frame) - scene.at(time).means.numpy()
-        np.testing.assert_allclose(difference, np.tile(difference[0], (len(scene), 1)), atol=1e-5)
-
-
-@pytest.mark.parametrize("write", [write_mesh, write_rigged_splats])
-def test_other_scenes_are_refused(tmp_path: Path, write: Any) -> None:
+def test_other_scenes_are_refused(tmp_path: Path) -> None:
     run = load_run(write_moving_run(tmp_path / "run"))
     with pytest.raises(DyngsError, match=r"needs a run of a person \(model\.kind=human\)"):
-        write(run, tmp_path / "x.glb")
+        write_mesh(run, tmp_path / "x.glb")
     assert not list(tmp_path.glob("x*"))
 
 

@@ -58,18 +58,17 @@ def test_every_body_has_the_joints_with_sliders() -> None:
         assert rows[: len(BODY_JOINTS)] == tuple(range(len(BODY_JOINTS)))
 
 
-def test_feet_are_kept_in_motions_of_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[Path, bool]] = []
+def test_motions_of_files_are_played(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Path] = []
 
-    def play_motion(opened: OpenedScene, path: Path, *, keep_feet: bool) -> OpenedScene:
-        asked.append((path, keep_feet))
+    def play_motion(opened: OpenedScene, path: Path) -> OpenedScene:
+        asked.append(path)
         return opened
 
     monkeypatch.setattr(OpenedScene, "play_motion", play_motion)
     page = page_of(person(), {"walk.npz": Path("walk.npz")})
     page.set("Motion", "walk.npz")
-    page.set("Keep feet", True)
-    assert asked == [(Path("walk.npz"), False), (Path("walk.npz"), True)]
+    assert asked == [Path("walk.npz")]
 
 
 def test_a_screenshot_is_what_is_shown() -> None:

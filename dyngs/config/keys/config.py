@@ -43,10 +43,10 @@ def _default_model() -> AnyModel:
 class CameraConfig(Section):
     """Refinement of the cameras."""
 
-    refine: Literal["never", "auto", "always"] = Field(
+    refine: Literal["never", "always"] = Field(
         default="never",
         description="whether to refine poses, focal lengths and principal points of the training "
-        "views during training; only for scenes of Gaussians; auto: decided by pilot runs",
+        "views during training; only for scenes of Gaussians",
     )
 
 

@@ -63,15 +63,15 @@ class TrainConfig(Section):
         description="priors to use if the capture has them: depth maps, optical flow, 2D tracks, "
         "motion masks",
     )
-    robust: Literal["never", "auto", "always"] = Field(
+    robust: Literal["never", "always"] = Field(
         default="never",
         description="whether to mask pixels that are inconsistent with the other views, such as "
-        "passers-by; static scenes only; auto: decided by pilot runs",
+        "passers-by; static scenes only",
     )
-    exposure: Literal["never", "auto", "always"] = Field(
+    exposure: Literal["never", "always"] = Field(
         default="never",
         description="whether to learn exposure and white balance of each training image as an "
-        "affine colour transform; auto: decided by pilot runs",
+        "affine colour transform",
     )
     losses: tuple[str, ...] = Field(
         default=(),

@@ -1,5 +1,4 @@
-"""Export of people with their skeleton: skinned, textured meshes, and Gaussians with joints and
-weights.
+"""Export of people as skinned, textured meshes.
 
 Local letters: M vertices and T triangles of the template, V vertices of the mesh, J joints, N
 Gaussians, F frames, K joints per Gaussian.
@@ -17,14 +16,12 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dyngs.core.conventions import SH_C0
 from dyngs.core.errors import DyngsError
 from dyngs.export.rigged.surface import fit_surface
 from dyngs.export.rigged.texture import (
     SEEN,
     bake_texels,
     fill_unseen,
-    frontal_colours,
     texture_image,
 )
 from dyngs.human.avatar.posing import Anchors, Skeleton, heaviest_joints
@@ -42,9 +39,6 @@ from dyngs.human.body.skinning import (
 )
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.placement import rotate_clip_to_y_up
-from dyngs.io.formats.gltf import EXTENSION, add_gaussians
-from dyngs.io.formats.ply import write_ply
-from dyngs.io.formats.splat_file import SplatFile, require_writable
 from dyngs.io.gltf import INDICES, VERTICES, GlbDocument
 from dyngs.io.write import atomic_file
 from dyngs.models.kind import HasBody, capability
@@ -200,7 +194,7 @@ def add_animation(
     document.add_animation(played.name, np.arange(len(root)) / played.fps, channels)
 
 
-def add_person(document: GlbDocument, rig: Rig, primitive: dict[str, Any], extension: str) -> None:
+def add_person(document: GlbDocument, rig: Rig, primitive: dict[str, Any]) -> None:
     """Add a mesh of one ``primitive``, a skin, and joint nodes below a node called Armature.
 
     The joints are the first nodes.
@@ -229,7 +223,6 @@ def add_person(document: GlbDocument, rig: Rig, primitive: dict[str, Any], exten
         "scenes": [{"nodes": [len(joints), len(joints) + 1]}],
         "nodes": nodes,
         "meshes": [{"name": "person", "primitives": [primitive]}],
-        "extensionsUsed": [extension],
     }
 
 
@@ -268,7 +261,7 @@ def write_mesh(run: LoadedRun, path: Path, played: AnimationInfo | None = None) 
     Raises:
         DyngsError: not the run of a person, or a missing template or UV map.
     """
-    scene, body = person_and_template(run, "--format mesh")
+    scene, body = person_and_template(run)
     collect_inputs(run).require_output(path)
     with torch.no_grad():
         vertices = rest_vertices(scene, body)
@@ -300,7 +293,7 @@ def write_mesh(run: LoadedRun, path: Path, played: AnimationInfo | None = None) 
     return (*notes, *scene.left_out)
 
 
-def person_and_template(run: LoadedRun, wanted: str) -> tuple[HumanScene, BodyTemplate]:
+def person_and_template(run: LoadedRun) -> tuple[HumanScene, BodyTemplate]:
     """Return the person of a run and its body template.
 
     Raises:
@@ -309,7 +302,9 @@ def person_and_template(run: LoadedRun, wanted: str) -> tuple[HumanScene, BodyTe
     scene = as_human_scene(run.scene)
     model = run.config.model
     if scene is None or capability(model, HasBody) is None:
-        raise DyngsError(f"{wanted} needs a run of a person (model.kind=human), not {model.kind}")
+        raise DyngsError(
+            f"--format mesh needs a run of a person (model.kind=human), not {model.kind}"
+        )
     return scene, load_template(cast(HumanModel, model))
 
 
@@ -350,70 +345,11 @@ def mesh_document(body: BodyTemplate, rig: Rig, vertices: Tensor, image: np.ndar
     texture = {"baseColorTexture": {"index": 0}, "metallicFactor": 0, "roughnessFactor": 1}
     material = {"name": "person", "pbrMetallicRoughness": texture, "extensions": {unlit: {}}}
     document.json |= {
+        "extensionsUsed": [unlit],
         "materials": [material],
         "textures": [{"source": 0, "sampler": 0}],
         "images": [{"name": "albedo", "bufferView": view, "mimeType": "image/png"}],
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
     }
-    add_person(document, rig, primitive, unlit)
+    add_person(document, rig, primitive)
     return document
-
-
-@torch.no_grad()
-def write_rigged_splats(
-    run: LoadedRun, path: Path, played: AnimationInfo | None = None
-) -> tuple[str, ...]:
-    """Write the Gaussians of a person in rest pose with skinning weights: T-pose, y up, facing +z,
-    soles at y = 0.
-
-    A .ply has columns ``joint_0`` to ``joint_7`` (heaviest first) and ``weight_0`` to ``weight_7``
-    after those of 3DGS, and a comment ``joint INDEX NAME PARENT X Y Z`` per joint. A .glb uses
-    KHR_gaussian_splatting with a skin, and ``played`` as an animation.
-
-    Returns:
-        notes about properties that the file cannot store.
-
-    Raises:
-        DyngsError: not the run of a person, or a missing template.
-    """
-    scene, body = person_and_template(run, "--joints")
-    collect_inputs(run).require_output(path)
-    vertices = rest_vertices(scene, body)
-    rig = build_rig(scene, vertices)
-    gaussians = scene.gaussians
-    notes = ()
-    if scene.colour is not None:
-        colours = frontal_colours(scene, anchor_normals(scene.anchors, body, vertices))
-        gaussians = gaussians.replace(sh=((colours - 0.5) / SH_C0)[:, None])
-        notes = ("colours of the network are exported for views perpendicular to the skin",)
-    if scene.shapes is not None:
-        notes = (*notes, "pose-dependent offsets are not exported")
-    notes = (*notes, *scene.left_out)
-    gaussians = gaussians.replace(
-        means=rig.to_file_axes(gaussians.means),
-        log_scales=gaussians.log_scales + float(np.log(rig.scale)),
-    )
-    require_writable(path, gaussians)
-    if path.suffix.lower() == ".glb":
-        document = GlbDocument()
-        primitive = add_gaussians(document, gaussians)
-        primitive["attributes"] |= add_weights(document, scene.weights)
-        add_person(document, rig, primitive, EXTENSION)
-        if played is not None:
-            add_animation(document, scene, rig, vertices, body.weights, played)
-        with atomic_file(path) as temporary:
-            document.write(temporary)
-        unsure = "KHR_gaussian_splatting does not define skinning: viewers may show the rest pose"
-        return (*notes, unsure)
-    joints, weights = heaviest_joints(scene.weights)
-    columns = {f"joint_{k}": joints[:, k].numpy() for k in range(joints.shape[1])}
-    columns |= {f"weight_{k}": weights[:, k].numpy() for k in range(weights.shape[1])}
-    lines = []
-    for i, place in enumerate(rig.joints.tolist()):
-        x, y, z = (f"{number:.6f}" for number in place)
-        lines.append(f"joint {i} {rig.names[i]} {rig.skeleton.parents[i]} {x} {y} {z}")
-    model = run.config.model
-    splat = SplatFile(gaussians, model.rasterize_mode, model.eps2d, comments=tuple(lines), up="y")
-    with atomic_file(path) as temporary:
-        write_ply(temporary, splat, columns)
-    return notes

@@ -10,7 +10,7 @@ from dyngs.human.avatar.scene import HumanScene
 from dyngs.human.body.body_reader import load_template
 from dyngs.human.keys import HumanModel
 from dyngs.human.motion.motion import motion_clip
-from dyngs.human.motion.placement import place_like, reduce_foot_sliding, sole_points, up_direction
+from dyngs.human.motion.placement import place_like
 from dyngs.human.motion.retarget import read_motion
 from dyngs.models.checkpoint import CheckpointInfo
 from dyngs.models.kind import PlayedMotion
@@ -18,12 +18,7 @@ from dyngs.models.renderable import Renderable
 
 
 def play_motion(
-    section: HumanModel,
-    renderable: Renderable,
-    info: CheckpointInfo,
-    path: Path,
-    *,
-    keep_feet: bool,
+    section: HumanModel, renderable: Renderable, info: CheckpointInfo, path: Path
 ) -> PlayedMotion:
     """Return the avatar animated by a motion file, see ``HasBody.in_motion``."""
     if not isinstance(renderable, HumanScene):
@@ -41,12 +36,5 @@ def play_motion(
     if not is_fit:
         clip = place_like(clip, scene.clip, scene.skeleton.joints, scene.skeleton.parents)
     animated = scene.with_motion(clip)
-    notes = tuple(motion.notes)
-    if keep_feet:
-        skeleton = animated.learned_skeleton
-        floor = float(scene.anchors.points[:, 1].min())
-        soles = sole_points(animated.played_clip, skeleton.joints, skeleton.parents, floor)
-        clip, note = reduce_foot_sliding(clip, soles, up_direction(scene.clip), motion.fps)
-        animated = scene.with_motion(clip)
-        notes = (*notes, note)
-    return PlayedMotion(animated.to(renderable.gaussians.means.device), motion.fps, notes)
+    device = renderable.gaussians.means.device
+    return PlayedMotion(animated.to(device), motion.fps, motion.notes)

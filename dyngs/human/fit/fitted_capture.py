@@ -70,7 +70,6 @@ class FitInputs:
 
     keypoints: Path | None = None  # folder or file of 2D key points
     masks: Path | None = None  # folder of masks, white = the person
-    background: Path | None = None  # image without the person, or a folder with one per camera
     joints: Path | None = None  # file or folder of 3D joints, see ``read_joints``
     person: Path | None = None  # fitted capture or run of the same person, whose shape is reused
     avatar: KnownAvatar | None = None  # of the same person; poses are refined by its silhouette
@@ -294,12 +293,12 @@ def read_person_capture(
                     replace(view, silhouette=mask) for view, mask in zip(views, masks, strict=True)
                 )
             capture = capture.replace(splits=splits, has_alpha=True)
-    if inputs.background is not None or not capture.has_alpha:
+    if not capture.has_alpha:
         if capture.format == "neuman":
             raise DyngsError(
                 f"{source}: no silhouettes, and a moving camera; add masks of the person"
             )
-        capture = add_background_masks(capture, work, inputs.background, log)
+        capture = add_background_masks(capture, work, log)
     if capture.format != FORMAT and inputs.masks is None:
         return capture
     # Estimated masks may be empty: skip frames with less than a fifth of the usual area.

@@ -1,19 +1,15 @@
-"""Placement of motions at the size, position and floor of a person; foot sliding reduction."""
+"""Placement of motions at the size, position and floor of a person."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy.linalg import solveh_banded
-from scipy.ndimage import binary_opening
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyngs.human.body.body import BodyTemplate
-from dyngs.human.body.joints import JOINT_NAMES, SMPLX_ROWS
 from dyngs.human.body.skinning import apply_transforms, axis_angle_to_matrix, joint_transforms
 from dyngs.human.motion.motion import Motion, MotionClip
 
@@ -126,90 +122,3 @@ def place_on_floor(motion: Motion, body: BodyTemplate) -> Motion:
     trans = motion.trans.clone()
     trans[:, 1] -= (torch.cat(lowest) * motion.scale + trans[:, 1]).min()
     return replace(motion, trans=trans)
-
-
-def sole_points(clip: MotionClip, joints: Tensor, parents: tuple[int, ...], floor: float) -> Tensor:
-    """Return four points (F, 4, 3) of the soles in world coordinates.
-
-    In the rest pose they lie under the ankles and balls of the feet, at y = ``floor``; ``joints``
-    (J, 3) are in the rest pose, m.
-    """
-    names = ("left_ankle", "left_foot", "right_ankle", "right_foot")
-    rows = [SMPLX_ROWS[len(joints)].index(JOINT_NAMES.index(name)) for name in names]
-    rest_points = joints[rows].clone()
-    rest_points[:, 1] = floor
-    transforms = joint_transforms(joints, parents, axis_angle_to_matrix(clip.poses))[:, rows]
-    posed = apply_transforms(transforms, rest_points)
-    return clip.scale[:, None, None] * posed + clip.trans[:, None]
-
-
-def floor_contact(clip: MotionClip, soles: Tensor, up: Tensor, fps: float) -> Tensor:
-    """Return which sole points (F, P, 3) touch the floor, (F, P) bool.
-
-    A point touches the level floor if it is low and slow for at least 0.1 s: less than 5 cm above
-    its lowest height within a second, less than 15 cm above its 5 % quantile, and slower than 0.5
-    m/s, in the person's size.
-
-    Args:
-        clip: of the person, for the scale.
-        soles: (F, P, 3) in world units.
-        up: (3,) unit vector.
-        fps: frames per second.
-    """
-    unit = float(clip.scale.mean())
-    height = soles @ up / unit
-    if len(soles) < 2:
-        return torch.zeros_like(height, dtype=torch.bool)
-    reach = round(fps)
-    lowest = -torch.nn.functional.max_pool1d(-height.T[None], 2 * reach + 1, 1, reach)[0].T
-    low = (height < lowest + 0.05) & (height < height.quantile(0.05, dim=0) + 0.15)
-    steps = _along_floor(soles, up).norm(dim=-1) / unit * fps
-    speed = (torch.cat([steps[:1], steps]) + torch.cat([steps, steps[-1:]])) / 2
-    is_contact = (low & (speed < 0.5)).cpu().numpy()
-    shortest = max(math.ceil(0.1 * fps), 2)
-    return torch.from_numpy(binary_opening(is_contact, np.ones((shortest, 1)))).to(soles.device)
-
-
-def reduce_foot_sliding(
-    clip: MotionClip, soles: Tensor, up: Tensor, fps: float
-) -> tuple[MotionClip, str]:
-    """Move the root along the floor so that feet in contact do not slide; return the clip and a
-    message.
-
-    The root steps u minimise the squared motion of all touching points plus changes of u; their
-    mean is kept, so that the person stays in place. Two feet that slide apart cannot both be
-    fixed. Arguments as for ``floor_contact``; ``soles`` are those of ``clip``.
-    """
-    touching = floor_contact(clip, soles, up, fps)
-    in_contact = touching[:-1] & touching[1:]
-    if not bool(in_contact.any()):
-        return (
-            clip,
-            f"feet: no floor contact in {len(soles)} frames; root unchanged",
-        )
-    motion = _along_floor(soles, up)
-    targets = -(motion * in_contact[..., None]).sum(1).double().cpu().numpy()
-    # sum_s |counts_s u_s - wanted_s|^2 / counts_s + stiffness sum |u_s+1 - u_s|^2; the velocity of
-    # the root is made smooth over 0.03 s.
-    stiffness = (0.03 * fps) ** 2
-    bands = np.full((2, len(in_contact)), -stiffness)
-    bands[1] = in_contact.sum(1).double().cpu().numpy()
-    bands[1, 1:] += stiffness
-    bands[1, :-1] += stiffness
-    steps = torch.from_numpy(solveh_banded(bands, targets)).to(soles)
-    shift = torch.cat([torch.zeros_like(steps[:1]), steps.cumsum(0)])
-    before, after = (
-        1000 / float(clip.scale.mean()) * float(x.norm(dim=-1)[in_contact].mean())
-        for x in (motion, motion + steps[:, None])
-    )
-    return (
-        replace(clip, trans=clip.trans + shift - shift.mean(0)),
-        f"feet: floor contact in {int(touching.any(1).sum())} of {len(soles)} frames; sliding "
-        f"reduced from {before:.1f} to {after:.1f} mm per frame",
-    )
-
-
-def _along_floor(points: Tensor, up: Tensor) -> Tensor:
-    """Return the motion (F - 1, P, 3) of points (F, P, 3) between frames, along the floor."""
-    steps = points.diff(dim=0)
-    return steps - (steps @ up)[..., None] * up

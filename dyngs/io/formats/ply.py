@@ -77,23 +77,16 @@ def read_ply(path: Path) -> SplatFile:
     return parse_comments(SplatFile(gaussians, comments=comments))
 
 
-def write_ply(
-    path: Path, splat: SplatFile, columns: Mapping[str, np.ndarray] | None = None
-) -> None:
-    """Write a plain .ply, not atomically.
-
-    ``columns`` are further properties (N,) by name, written as float32 after all others, which
-    ``read_ply`` skips.
-    """
-    more = columns or {}
+def write_ply(path: Path, splat: SplatFile) -> None:
+    """Write a plain .ply, not atomically."""
     gaussians = splat.gaussians.detach().to(device="cpu", dtype=torch.float32)
     sh = gaussians.sh
     normals = torch.zeros_like(gaussians.means)
     numbers = [gaussians.means, normals, sh[:, 0], sh[:, 1:].transpose(1, 2).flatten(1)]
     numbers += [gaussians.logit_opacities[:, None], gaussians.log_scales, gaussians.quats]
-    table = np.column_stack([torch.cat(numbers, dim=1).numpy(), *more.values()]).astype("<f4")
+    table = torch.cat(numbers, dim=1).numpy().astype("<f4")
     rest = [f"f_rest_{i}" for i in range(3 * (sh.shape[1] - 1))]
-    names = ("x", "y", "z", "nx", "ny", "nz", *_DC, *rest, "opacity", *_SCALE, *_ROT, *more)
+    names = ("x", "y", "z", "nx", "ny", "nz", *_DC, *rest, "opacity", *_SCALE, *_ROT)
     with open(path, "wb") as file:
         file.write(
             header_bytes(

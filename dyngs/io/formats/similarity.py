@@ -178,14 +178,6 @@ def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
     return Gaussians.joined([part.replace(sh=part.sh[:, :terms]) for part in parts])
 
 
-def mirror_gaussians(gaussians: Gaussians) -> Gaussians:
-    """Return the mirror image of Gaussians, x becoming -x."""
-    flip = torch.tensor([-1.0, 1.0, 1.0], dtype=gaussians.means.dtype, device="cpu")
-    turn = torch.tensor([1.0, 1.0, -1.0, -1.0], dtype=gaussians.quats.dtype, device="cpu")
-    sh = rotate_harmonics(gaussians.sh, flip.double().diag())
-    return gaussians.replace(means=gaussians.means * flip, quats=gaussians.quats * turn, sh=sh)
-
-
 def rotate_harmonics(sh: Tensor, matrix: Tensor) -> Tensor:
     """Return harmonics (N, K, 3) whose colour towards ``matrix @ d`` is that of ``sh`` towards d.
 

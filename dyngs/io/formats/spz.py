@@ -2,8 +2,8 @@
 
 Versions 2 and 3 are one gzip stream of a 16-byte header and the attributes one after the other;
 version 4, which is only read, is a 32-byte header, a table of sizes, and a Zstandard stream per
-attribute, which needs ``pip install 'dyngs[zstd]'``. y is up: axes are right, up, back, unless an
-extension of the header states other ones.
+attribute, which needs ``pip install 'dyngs[zstd]'``. y is up: axes are right, up, back; files
+that state other ones are refused.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,6 @@ from dyngs.core.errors import DyngsError
 from dyngs.core.gaussians import Gaussians
 from dyngs.io.fields import require_at_most
 from dyngs.io.formats.packing import logit, restore_largest, split_largest
-from dyngs.io.formats.similarity import Similarity, mirror_gaussians, quat_from_matrix
 from dyngs.io.formats.splat_file import MAX_GAUSSIANS, SplatFile, unit_rotations
 
 _MAGIC = b"NGSP"
@@ -40,9 +38,10 @@ _TOP = (1 << 9) - 1
 
 
 def read_spz(path: Path) -> SplatFile:
-    """Read a .spz of version 2 to 4, turned to y up where it states other axes.
+    """Read a .spz of version 2 to 4.
 
-    Raises DyngsError or ValueError: it is damaged, or asks for too much memory.
+    Raises DyngsError or ValueError: it is damaged, states other axes, or asks for too much
+    memory.
     """
     data = path.read_bytes()
     is_gzip = data[:2] == b"\x1f\x8b"
@@ -70,7 +69,8 @@ def read_spz(path: Path) -> SplatFile:
     for name, size in rows.items():
         parts[name] = np.frombuffer(content, np.uint8, count * size, begin).reshape(count, size)
         begin += count * size
-    return _standard_axes(_splat(parts, bits, flags), extensions)
+    _require_standard_axes(extensions)
+    return _splat(parts, bits, flags)
 
 
 def _inflated(data: bytes, most: int) -> bytes:
@@ -140,9 +140,8 @@ def write_spz(path: Path, splat: SplatFile) -> None:
     path.write_bytes(b"".join([*map(compressor.compress, parts), compressor.flush()]))
 
 
-def _standard_axes(splat: SplatFile, extensions: bytes) -> SplatFile:
-    """Return the contents with x right, y up and z back, given the extensions of the file: type,
-    size and value."""
+def _require_standard_axes(extensions: bytes) -> None:
+    """Raise ValueError if the extensions (type, size and value each) state other axes."""
     start = 0
     while start < len(extensions):
         kind, size = struct.unpack_from("<II", extensions, start)
@@ -150,36 +149,9 @@ def _standard_axes(splat: SplatFile, extensions: bytes) -> SplatFile:
         start += 8 + size
         if start > len(extensions):
             raise ValueError("its extensions are damaged")
-        if kind == _COORDINATE_SYSTEM:
-            return _from_system(splat, int.from_bytes(value, "little"))
-    return splat
-
-
-def _from_system(splat: SplatFile, number: int) -> SplatFile:
-    """Return the contents in standard axes, given in the coordinate system of that number; 0 states
-    none.
-
-    Bits of the number, less one: x points right, y up, z to the front; with the fourth bit z is the
-    vertical axis, and the third bit is y to the back.
-    """
-    if number > 16:
-        raise ValueError(f"unknown coordinate system {number}, must be 1 to 16")
-    if number in (0, _STANDARD):
-        return splat
-    right, up, front, is_z_vertical = ((number - 1) >> bit & 1 for bit in range(4))
-    axes = np.diag([2.0 * right - 1, 2.0 * up - 1, 1 - 2.0 * (front ^ is_z_vertical)])
-    if is_z_vertical:
-        axes = axes[:, [0, 2, 1]]
-    gaussians = splat.gaussians
-    if np.linalg.det(axes) < 0:
-        gaussians = mirror_gaussians(gaussians)
-        axes[:, 0] *= -1
-    note = "rotated from the axes stated in the file to right, up, back"
-    return replace(
-        splat,
-        gaussians=Similarity(quat_from_matrix(axes)).gaussians(gaussians),
-        notes=(*splat.notes, note),
-    )
+        system = int.from_bytes(value, "little")
+        if kind == _COORDINATE_SYSTEM and system not in (0, _STANDARD):
+            raise ValueError(f"coordinate system {system} is not supported, only {_STANDARD} (RUB)")
 
 
 def _splat(parts: Mapping[str, np.ndarray], fraction_bits: int, flags: int) -> SplatFile:

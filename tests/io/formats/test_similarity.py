@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from splat_scenes import AROUND, cloud, seen
+from splat_scenes import AROUND, cloud
 
 from dyngs.core.camera import Cameras
 from dyngs.core.errors import DyngsError
@@ -18,7 +18,6 @@ from dyngs.gaussians.rendering import RenderOptions, render
 from dyngs.io.formats.similarity import (
     AXES,
     Similarity,
-    mirror_gaussians,
     nearest_axis,
     origin_offset,
     parse_axis,
@@ -138,16 +137,3 @@ def test_names_of_axes() -> None:
     assert nearest_axis((0.0, 0.0, 0.0)) is None
     with pytest.raises(DyngsError, match="no axis 'up'"):
         parse_axis("up")
-
-
-@pytest.mark.parametrize("degree", [0, 2, 4])
-def test_a_mirrored_scene_is_seen_in_a_mirror(degree: int) -> None:
-    """A camera on the plane of the mirror sees the image flipped."""
-    scene = cloud(150, degree)
-    camera = AROUND.select(0)
-    pose = torch.eye(4)[None].clone()
-    pose[0, 2, 3] = 4.0
-    ahead = replace(camera, cam_from_world=pose)
-    got = seen(mirror_gaussians(scene), ahead)
-    torch.testing.assert_close(got, seen(scene, ahead).flip(2), rtol=0, atol=3e-5)
-    assert float((seen(scene, ahead) - got).abs().max()) > 0.1

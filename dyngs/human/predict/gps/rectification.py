@@ -354,7 +354,7 @@ def crop_image(image: Image, top: int, left: int, height: int, width: int) -> Im
     def part(x: Tensor) -> Tensor:
         return x[top : top + height, left : left + width].contiguous()
 
-    names = ("alpha", "mask", "depth", "motion_mask", "labels", "flow")
+    names = ("alpha", "mask", "depth", "motion_mask", "flow")
     maps = {name: part(x) for name in names if (x := getattr(image, name)) is not None}
     return replace(
         image,
