@@ -10,6 +10,8 @@ from dyngs.cli.output import print_notes
 
 SPLAT_FORMATS = ("ply", "compressed-ply", "spz", "splat", "sog", "glb")
 """Names of ``dyngs.io.formats.formats.FORMATS``, repeated so that ``--help`` need not import it."""
+MOVING = "4dgs"
+"""Name and suffix of the format of moving Gaussians."""
 
 
 def add_axes(parser: argparse.ArgumentParser) -> None:
