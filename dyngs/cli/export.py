@@ -139,7 +139,7 @@ def add_parser(commands: args.Commands) -> None:
     add_axes(parser)
     about = (
         "fit opacities, scales and (without SH) colours to viewers without antialiasing (default: "
-        "only for .splat and .glb, which cannot store that a scene is antialiased)"
+        "only for .splat, .glb and USD, which cannot store that a scene is antialiased)"
     )
     parser.add_argument("--classic", action=argparse.BooleanOptionalAction, help=about)
     part = parser.add_mutually_exclusive_group()
