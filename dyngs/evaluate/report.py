@@ -339,9 +339,7 @@ def held_out_psnr(
     images.device = device
 
     def score(index: int) -> float:
-        image = images[index]
-        rendered = drawing.image(image.cameras, image.time)
-        return psnr(rendered, image.composite(drawing.background), image.mask)
+        return _psnr(drawing, images[index])
 
     score(0)  # includes loading and compilation
     start = time.perf_counter()

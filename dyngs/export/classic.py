@@ -11,8 +11,8 @@ from torch import Tensor
 from dyngs.core.camera import Cameras
 from dyngs.core.conventions import SH_C0, RasterizeMode
 from dyngs.core.gaussians import Gaussians
-from dyngs.core.metrics import psnr
 from dyngs.export.camera_paths import pick_cameras
+from dyngs.export.images import compare_with_images
 from dyngs.gaussians.rendering import RenderOptions, contributions, render, splat_options
 from dyngs.io.formats.packing import logit
 from dyngs.io.formats.splat_file import SplatFile, with_sh_degree
@@ -31,7 +31,7 @@ SMALLEST = 0.1  # fraction of a variance that remains at least; 0.02 and 0.25 di
 def fit_classic(
     splat: SplatFile, cameras: Cameras, near: float, sh_degree: int
 ) -> tuple[SplatFile, str]:
-    """Return the best of several versions of a scene for classic viewers, and a note with its PSNR.
+    """Return a scene changed for classic viewers if that helps, and a note with its PSNR.
 
     Variances shrink by what the low-pass of these viewers exceeds that of the scene. Opacities are
     multiplied by the mean ratio of both renderings at the centre of a Gaussian. Colours of SH
@@ -50,31 +50,24 @@ def fit_classic(
     fitted = pick_cameras(cameras, rows[~is_checked])
     own = splat.gaussians
     sh_degree = min(sh_degree, own.sh_degree)
-    versions = {"no change needed": with_sh_degree(own, sh_degree)}
+    unchanged = replace(
+        splat, gaussians=with_sh_degree(own, sh_degree), mode=target.mode, eps2d=None
+    )
     shape, colours = _fit(own, fitted, source, target)
+    parts = "opacities and scales"
     if sh_degree == 0 and own.sh_degree > 0:
-        sh = ((colours - 0.5) / SH_C0)[:, None]
-        versions["mean colours"] = own.replace(sh=sh)
-        versions["opacities, scales and mean colours fitted"] = shape.replace(sh=sh)
-    else:
-        versions["opacities and scales fitted"] = with_sh_degree(shape, sh_degree)
+        parts = "opacities, scales and mean colours"
+        shape = shape.replace(sh=((colours - 0.5) / SH_C0)[:, None])
+    changed = replace(unchanged, gaussians=with_sh_degree(shape, sh_degree))
     wanted = render(own, checked, source).rgb
-    found = {}
-    for name, version in versions.items():
-        images = render(version, checked, target).rgb
-        found[name] = float(np.mean([psnr(a, b) for a, b in zip(images, wanted, strict=True)]))
-    best = max(found, key=found.__getitem__)
-    before = found["no change needed"]
-    gain = (
-        f"{before:.1f} dB"
-        if best == "no change needed"
-        else f"{before:.1f} -> {found[best]:.1f} dB"
-    )
-    note = (
-        f"for viewers without antialiasing at {cameras.width}x{cameras.height} px: {best}, "
-        f"{gain} (PSNR)"
-    )
-    return replace(splat, gaussians=versions[best], mode=target.mode, eps2d=None), note
+    before = compare_with_images(wanted, checked, unchanged, near)
+    after = compare_with_images(wanted, checked, changed, near)
+    text = f"no change needed, {before:.1f} dB"
+    if after > before:
+        text = f"{parts} fitted, {before:.1f} -> {after:.1f} dB"
+    size = f"{cameras.width}x{cameras.height} px"
+    note = f"for viewers without antialiasing at {size}: {text} (PSNR)"
+    return changed if after > before else unchanged, note
 
 
 def _fit(

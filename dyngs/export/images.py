@@ -365,7 +365,9 @@ def compare_file_with_run(
     black = torch.zeros(3, device=scene.device)
     with torch.no_grad():
         wanted = scene.render(cameras, time, background=black).rgb
-    return _compare(wanted, frame.cameras(cameras), read, scene.options.near * frame.scale)
+    return compare_with_images(
+        wanted, frame.cameras(cameras), read, scene.options.near * frame.scale
+    )
 
 
 def compare_file_with_source(splat: SplatFile, written: WrittenFile) -> float:
@@ -381,10 +383,10 @@ def compare_file_with_source(splat: SplatFile, written: WrittenFile) -> float:
     with torch.no_grad():
         wanted = render(splat.gaussians, cameras, options, background=black).rgb
     near = options.near * moved.scale
-    return _compare(wanted, moved.cameras(cameras), read_splats(written.path), near)
+    return compare_with_images(wanted, moved.cameras(cameras), read_splats(written.path), near)
 
 
-def _compare(wanted: Tensor, cameras: Cameras, splat: SplatFile, near: float) -> float:
+def compare_with_images(wanted: Tensor, cameras: Cameras, splat: SplatFile, near: float) -> float:
     """Return the PSNR between a file rendered from ``cameras`` and images ``wanted`` (V, H, W,
     3)."""
     options = replace(splat_options(splat), near=near)
